@@ -30,11 +30,46 @@ MODEL_FAMILIES = {
 }
 """Camera models whose names contain numbers, and the form of these names."""
 
-FORMATS = (
-    "project", "photo-list", "bal", "column-map", "colmap", "bingo", "metashape", "photomodeler",
-    "bundler", "openmvg", "opensfm", "transforms", "kalibr", "micmac", "jaicov", "mrcal",
-    "opencv-stereo", "ros-stereo", "rig", "rig-line",
-)  # fmt: skip
+NETWORK_FILES = {
+    "project": "a .toml file, or a folder with project.toml",
+    "photo-list": "a .txt file whose first line is the focal length",
+    "bal": "a text file (.gz, .bz2) whose first line is three numbers",
+    "column-map": "a .toml file with [table.…] sections",
+    "colmap": "a folder with cameras.bin or cameras.txt",
+    "bingo": "a folder with image.dat and geoin.dat",
+    "metashape": "an .xml file of Metashape's cameras",
+    "photomodeler": 'a .txt file that begins with "Bundle Soln"',
+    "bundler": 'a file that begins with "# Bundle file"',
+    "openmvg": "openMVG's sfm_data.json",
+    "opensfm": "OpenSfM's reconstruction.json, or a folder that has it",
+    "transforms": "transforms.json of nerfstudio or instant-ngp",
+    "kalibr": "a .yaml file of Kalibr with cam0: …",
+    "micmac": "a folder of MicMac with Orientation-….xml",
+    "jaicov": "a .phc file of AICON, with .ior beside it",
+    "mrcal": "a .cameramodel of mrcal, or a folder of them",
+    "opencv-stereo": "a .yaml, .json or .xml in OpenCV's style with several cameras: K1, K2, R, T",
+    "orb-slam": "a .yaml of ORB-SLAM with two cameras, Camera1.fx … and Camera2.fx …",
+    "vins": "a .yaml of VINS-Fusion with cam0_calib and body_T_cam0",
+    "euroc": "a folder of EuRoC with cam0/sensor.yaml",
+    "ros-stereo": "a folder with two camera_info files of ROS, or ost.txt with two cameras",
+    "rig": "result.json of jaxbundle calibrate --rig",
+    "rig-line": "a line of jaxbundle batch: FILE.jsonl#KEY",
+    "nvm": "an .nvm file of VisualSFM",
+    "alicevision": "an .sfm or .json of AliceVision",
+}
+"""Kinds of inputs that are networks, and what they look like."""
+CAMERA_INPUTS = {
+    "colmap-cameras": "cameras.txt or cameras.bin of COLMAP",
+    "cameras": "a .toml with [[camera]] entries",
+    "opensfm-cameras": "camera_models.json of OpenSfM",
+    "autocal": "AutoCal….xml of MicMac",
+    "metashape-lens": "an .xml of Metashape's camera calibration (<calibration><projection>…)",
+    "ros-ini": "ost.ini or ost.txt of ROS",
+    "slam-yaml": "a .yaml of camodocal or VINS (model_type: …), of ORB-SLAM (Camera.fx: …)",
+    "opencv": "a .yaml, .json or .xml of OpenCV, ROS or EuRoC (camera_matrix, K, intrinsics, …)",
+}
+"""Kinds of inputs that are cameras alone."""
+FORMATS = tuple(NETWORK_FILES)
 """Kinds of inputs that are networks."""
 TARGETS = (
     "ply", "dxf", "csv", "bundler", "bal", "colmap", "colmap-text", "openmvg", "opensfm",

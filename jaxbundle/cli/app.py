@@ -42,6 +42,8 @@ class Command(TyperCommand):
     """An example call."""
     computes: bool = True
     once: bool = False
+    accepts: Mapping[str, str] | None = None
+    """Kinds of its input, and what they look like."""
 
     def invoke(self, ctx: typer.Context) -> Any:
         if self.computes:
@@ -61,7 +63,10 @@ class Command(TyperCommand):
         return super().get_short_help_str(max(limit, 1000))  # no sentence is as long
 
     def format_epilog(self, ctx: typer.Context, formatter: Any) -> None:
-        """The end of every help text: an example and the exit statuses."""
+        """The end of every help text: the inputs of some, an example and the exit statuses."""
+        if self.accepts:
+            with formatter.section("Inputs"):
+                formatter.write_dl([*self.accepts.items()])
         with formatter.section("Example"):
             formatter.write(f"  {ctx.command_path} {self.example}\n")
         with formatter.section("Exit status"):
@@ -97,12 +102,14 @@ class Application(typer.Typer):
         example: str,
         computes: bool = True,
         once: bool = False,
+        accepts: Mapping[str, str] | None = None,
         **options: Any,
     ) -> Callable[[Callable], Callable]:
         """Like typer's, with --quiet and --verbose. `example`: the arguments of a line that calls
         it, for its help; `computes`: whether it works with JAX; `once`: whether its time depends on
-        its input, so that programs of a small input are compiled quickly."""
-        fields = {"example": example, "computes": computes, "once": once}
+        its input, so that programs of a small input are compiled quickly; `accepts`: kinds of its
+        input and what they look like, for its help."""
+        fields = {"example": example, "computes": computes, "once": once, "accepts": accepts}
         kind = type("Command", (Command,), fields)
         register = super().command(name, cls=kind, **options)
 

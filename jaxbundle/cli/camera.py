@@ -39,7 +39,7 @@ def camera(
     }
     found: dict[str, CameraDescription] = {}
     for file in files:
-        calibration_given(file)  # its warnings
+        calibration_given(file, sizes["image_size"])  # its warnings
         described = jaxbundle.camera(file, step=step, about_origin=about_origin, **sizes)
         print(described.report())
         # two files may have cameras of one name

@@ -12,13 +12,15 @@ from jaxbundle.io.text.csv_tables import write_bytes
 from jaxbundle.network.tables import Camera
 
 
-def calibration_given(text: str) -> tuple[Camera, Covariance | None]:
+def calibration_given(
+    text: str, image_size: tuple[float, float] | None = None
+) -> tuple[Camera, Covariance | None]:
     """The camera of FILE or FILE#ID, with its covariance where the file has it; a warning if its
     model was fitted to another program's.
 
     **Raises:** `InputError`.
     """
-    camera, covariance = open_calibration(text)
+    camera, covariance = open_calibration(text, image_size)
     for message in fit_messages([camera]):
         print(f"warning: {message}", file=sys.stderr)
     return camera, covariance

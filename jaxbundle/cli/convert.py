@@ -6,12 +6,16 @@ from typing import Annotated
 
 import typer
 
-from jaxbundle.choices import CAMERA_FILES, TARGETS
+from jaxbundle.choices import CAMERA_FILES, CAMERA_INPUTS, NETWORK_FILES, TARGETS
 from jaxbundle.cli.app import Control, Format, Input, Quiet, Settings, app, choice, model_choice
 from jaxbundle.errors import InputError
 
 
-@app.command(example="examples/convergent4/project.toml out/network.ply", once=True)
+@app.command(
+    example="examples/convergent4/project.toml out/network.ply",
+    once=True,
+    accepts=CAMERA_INPUTS | NETWORK_FILES,
+)
 def convert(  # noqa: PLR0913 - the options of the command
     input: Input,
     output: Annotated[Path, typer.Argument(help="file or folder to write")],

@@ -21,8 +21,9 @@ from jaxbundle.cameras.field_of_view import (
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.calibrated import is_result, read_calibrated
-from jaxbundle.io.cameras.camera_files import LOOKS, choose_camera, is_camera_file, read_cameras
-from jaxbundle.io.formats import FORMATS, read_network, recognise_format
+from jaxbundle.io.cameras.camera_files import choose_camera, is_camera_file, read_cameras
+from jaxbundle.io.cameras.nearest_camera import with_messages
+from jaxbundle.io.formats import expected_inputs, read_network, recognise_format
 from jaxbundle.io.networks.assemble import all_parameters
 from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.network.tables import Camera
@@ -40,17 +41,19 @@ MAX_ROWS = 100_000
 """A step that gives more rows was meant in another unit: 1e-3 pixels are a micrometre or less."""
 
 
-def open_camera(given: CameraSource) -> Camera:
-    """The camera of a source.
+def open_camera(given: CameraSource, image_size: Pair | None = None) -> Camera:
+    """The camera of a source; `image_size`: pixels, where a file needs it and has none.
 
     **Raises:** `InputError`.
     """
-    return open_calibration(given)[0]
+    return open_calibration(given, image_size)[0]
 
 
-def open_calibration(given: CameraSource) -> tuple[Camera, Covariance | None]:
+def open_calibration(
+    given: CameraSource, image_size: Pair | None = None
+) -> tuple[Camera, Covariance | None]:
     """The camera of a source, with the covariance of its free parameters where the source has it: a
-    calibration, or a JSON result.
+    calibration, or a JSON result. `image_size`: as of `open_camera`.
 
     **Raises:** `InputError`.
     """
@@ -75,11 +78,14 @@ def open_calibration(given: CameraSource) -> tuple[Camera, Covariance | None]:
         cameras = read_cameras(path)
     elif path.exists() and recognise_format(path) is None:
         raise InputError(
-            f"{path}: not recognised; expected a camera file ({LOOKS}), the result.json "
-            f"of calibrate or adjust, or a network ({', '.join(FORMATS)})"
+            f"{path}: not recognised; expected a camera file, the result.json of calibrate or "
+            f"adjust, or a network; {expected_inputs(path)}"
         )
     else:
-        cameras = read_network(path).cameras
+        network = read_network(path, image_size=image_size)
+        cameras = network.cameras
+        # of the whole file: what was not understood may concern each of its cameras
+        cameras = tuple(with_messages(camera, *network.warnings) for camera in cameras)
     camera = choose_camera(cameras, id, f"{file} (FILE#ID)")
     return camera, covariances.get(camera.id)
 
@@ -195,7 +201,7 @@ def camera(
 
     **Raises:** `InputError`, for a missing size too.
     """
-    found = open_camera(camera)
+    found = open_camera(camera, image_size)
     size, pitch = image_size or found.image_size, pixel_size or found.pixel_size
     unit = get_model(found.model).unit
     if size is None or (unit == "mm" and pitch is None):

@@ -113,7 +113,12 @@ def convert(  # noqa: PLR0913, as the options of the command
             made, warnings=(*fit_messages(cameras), *outside_warnings(cameras))
         )
     network = read_network(
-        input, format=format, overrides=overrides, control=control, models=models
+        input,
+        format=format,
+        overrides=overrides,
+        control=control,
+        models=models,
+        image_size=image_size,
     )
     network = network.replace(cameras=_add_sizes(network.cameras, image_size, pixel_size))
     network = network.warn(*outside_warnings(network.cameras, network))

@@ -10,10 +10,12 @@ from pathlib import Path
 from jaxbundle.arguments import path as given_path
 from jaxbundle.arguments import show, text
 from jaxbundle.cameras import CameraModel
+from jaxbundle.choices import CAMERA_INPUTS, NETWORK_FILES
 from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.camera_files import is_camera_file, write_cameras
 from jaxbundle.io.cameras.opencv_file import SUFFIXES as OPENCV_SUFFIXES
 from jaxbundle.io.cameras.opencv_file import YAML, write_opencv, write_ros
+from jaxbundle.io.networks.alicevision import is_alicevision, read_alicevision
 from jaxbundle.io.networks.bal import OPENERS, is_bal, read_bal, write_bal
 from jaxbundle.io.networks.bingo import is_bingo, read_bingo
 from jaxbundle.io.networks.bundler import is_bundler, read_bundler, write_bundler
@@ -31,9 +33,12 @@ from jaxbundle.io.networks.micmac import FILES as MICMAC_FILES
 from jaxbundle.io.networks.micmac import fill_micmac, is_micmac, read_micmac
 from jaxbundle.io.networks.micmac_camera import MODELS as MICMAC_MODELS
 from jaxbundle.io.networks.micmac_camera import write_autocal
+from jaxbundle.io.networks.mounted_files import is_euroc, is_vins, read_euroc, read_vins
 from jaxbundle.io.networks.mrcal import FILES as MRCAL_FILES
 from jaxbundle.io.networks.mrcal import OFFERED_MODELS as MRCAL_MODELS
 from jaxbundle.io.networks.mrcal import fill_mrcal, is_mrcal, read_mrcal, write_cameramodel
+from jaxbundle.io.networks.nvm import is_nvm, read_nvm
+from jaxbundle.io.networks.opencv_rigs import is_opencv_rig, read_opencv_rig
 from jaxbundle.io.networks.openmvg import is_openmvg, read_openmvg, write_openmvg
 from jaxbundle.io.networks.opensfm import FILES as OPENSFM_FILES
 from jaxbundle.io.networks.opensfm import (
@@ -42,6 +47,7 @@ from jaxbundle.io.networks.opensfm import (
     read_opensfm,
     write_opensfm_cameras,
 )
+from jaxbundle.io.networks.orb_slam import is_orb_slam_pair, read_orb_slam_pair
 from jaxbundle.io.networks.photo_list import read_photo_list
 from jaxbundle.io.networks.photomodeler import is_photomodeler, read_photomodeler
 from jaxbundle.io.networks.project import FILE_NAME, fill_project, project_file, read_project
@@ -57,10 +63,8 @@ from jaxbundle.io.networks.settings import choose_datum
 from jaxbundle.io.networks.stereo import (
     ROS_FILES,
     fill_ros_stereo,
-    is_opencv_stereo,
     is_ros_stereo,
     opencv_stereo_files,
-    read_opencv_stereo,
     read_ros_stereo,
     ros_stereo_folders,
     write_opencv_stereo,
@@ -79,13 +83,15 @@ from jaxbundle.system.file_content import is_plain
 class Format:
     """A kind of input: how it is recognised, how it is read, and a description;
     `adjusted` if its control points have adjusted coordinates and a posteriori σ; `names_models`
-    if cameras name their models, and `read` takes own ones."""
+    if cameras name their models, and `read` takes own ones; `takes_image_size`: `read` takes the
+    image size of cameras that have none and need it."""
 
     recognises: Callable[[Path], bool]
     read: Callable[..., Network]
     looks: str
     adjusted: bool = False
     names_models: bool = False
+    takes_image_size: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,45 +149,51 @@ def _is_photo_list(path: Path) -> bool:
 # The order is that of recognition: a .toml is a project unless it maps columns, a .txt is a list of
 # photographs if its first line is one number, and so on. Each test reads only the beginning.
 FORMATS: dict[str, Format] = {
-    "project": Format(
-        _is_project, read_project, "a .toml file, or a folder with project.toml", names_models=True
-    ),
-    "photo-list": Format(
-        _is_photo_list, read_photo_list, "a .txt file whose first line is the focal length"
-    ),
-    "bal": Format(is_bal, read_bal, "a text file (.gz, .bz2) whose first line is three numbers"),
+    "project": Format(_is_project, read_project, NETWORK_FILES["project"], names_models=True),
+    "photo-list": Format(_is_photo_list, read_photo_list, NETWORK_FILES["photo-list"]),
+    "bal": Format(is_bal, read_bal, NETWORK_FILES["bal"]),
     "column-map": Format(
-        is_column_map, read_column_map, "a .toml file with [table.…] sections", names_models=True
+        is_column_map, read_column_map, NETWORK_FILES["column-map"], names_models=True
     ),
-    "colmap": Format(is_colmap, read_colmap, "a folder with cameras.bin or cameras.txt"),
-    "bingo": Format(is_bingo, read_bingo, "a folder with image.dat and geoin.dat"),
-    "metashape": Format(is_metashape, read_metashape, "an .xml file of Metashape's cameras"),
+    "colmap": Format(is_colmap, read_colmap, NETWORK_FILES["colmap"]),
+    "bingo": Format(is_bingo, read_bingo, NETWORK_FILES["bingo"]),
+    "metashape": Format(is_metashape, read_metashape, NETWORK_FILES["metashape"]),
     "photomodeler": Format(
         is_photomodeler,
         read_photomodeler,
-        'a .txt file that begins with "Bundle Soln"',
+        NETWORK_FILES["photomodeler"],
         adjusted=True,
     ),
-    "bundler": Format(is_bundler, read_bundler, 'a file that begins with "# Bundle file"'),
-    "openmvg": Format(is_openmvg, read_openmvg, "openMVG's sfm_data.json"),
-    "opensfm": Format(
-        is_opensfm, read_opensfm, "OpenSfM's reconstruction.json, or a folder that has it"
-    ),
+    "bundler": Format(is_bundler, read_bundler, NETWORK_FILES["bundler"]),
+    "openmvg": Format(is_openmvg, read_openmvg, NETWORK_FILES["openmvg"]),
+    "opensfm": Format(is_opensfm, read_opensfm, NETWORK_FILES["opensfm"]),
     "transforms": Format(
-        is_transforms, read_transforms, "transforms.json of nerfstudio or instant-ngp"
+        is_transforms,
+        read_transforms,
+        NETWORK_FILES["transforms"],
+        takes_image_size=True,
     ),
-    "kalibr": Format(is_kalibr, read_kalibr, "a .yaml file of Kalibr with cam0: …"),
-    "micmac": Format(is_micmac, read_micmac, "a folder of MicMac with Orientation-….xml"),
-    "jaicov": Format(is_jaicov, read_jaicov, "a .phc file of AICON, with .ior beside it"),
-    "mrcal": Format(is_mrcal, read_mrcal, "a .cameramodel of mrcal, or a folder of them"),
+    "kalibr": Format(is_kalibr, read_kalibr, NETWORK_FILES["kalibr"]),
+    "micmac": Format(is_micmac, read_micmac, NETWORK_FILES["micmac"]),
+    "jaicov": Format(is_jaicov, read_jaicov, NETWORK_FILES["jaicov"]),
+    "mrcal": Format(is_mrcal, read_mrcal, NETWORK_FILES["mrcal"]),
     "opencv-stereo": Format(
-        is_opencv_stereo, read_opencv_stereo, "a .yaml or .json file of OpenCV with M1, M2, R, T"
+        is_opencv_rig,
+        read_opencv_rig,
+        NETWORK_FILES["opencv-stereo"],
     ),
-    "ros-stereo": Format(
-        is_ros_stereo, read_ros_stereo, "a folder with two camera_info files of ROS"
+    "orb-slam": Format(
+        is_orb_slam_pair,
+        read_orb_slam_pair,
+        NETWORK_FILES["orb-slam"],
     ),
-    "rig": Format(is_rig_result, read_rig_result, "result.json of jaxbundle calibrate --rig"),
-    "rig-line": Format(is_rig_line, read_rig_line, "a line of jaxbundle batch: FILE.jsonl#KEY"),
+    "vins": Format(is_vins, read_vins, NETWORK_FILES["vins"]),
+    "euroc": Format(is_euroc, read_euroc, NETWORK_FILES["euroc"]),
+    "ros-stereo": Format(is_ros_stereo, read_ros_stereo, NETWORK_FILES["ros-stereo"]),
+    "rig": Format(is_rig_result, read_rig_result, NETWORK_FILES["rig"]),
+    "rig-line": Format(is_rig_line, read_rig_line, NETWORK_FILES["rig-line"]),
+    "nvm": Format(is_nvm, read_nvm, NETWORK_FILES["nvm"]),
+    "alicevision": Format(is_alicevision, read_alicevision, NETWORK_FILES["alicevision"]),
 }
 
 
@@ -379,6 +391,7 @@ def read_network(
     overrides: Sequence[str] = (),
     control: str | Path | None = None,
     models: Sequence[CameraModel] = (),
+    image_size: Sequence[float] | None = None,
 ) -> Network:
     """The network of an input in any known format.
 
@@ -389,6 +402,8 @@ def read_network(
     - `overrides`: settings `KEY=VALUE` that replace those of the input.
     - `control`: a table whose control points replace those of the input (`networks.control`).
     - `models`: own `CameraModel`s that a project, or a column map, may name.
+    - `image_size`: width and height in pixels, of cameras that have none and need it to be read
+      (`transforms.json` with an angle of view).
 
     **Raises:** `InputError`.
     """
@@ -415,16 +430,32 @@ def read_network(
             "network, is expected (jaxbundle camera, compare and convert read it)"
         )
     if format is None:
-        known = "; ".join(f"{name}: {kind.looks}" for name, kind in FORMATS.items())
-        raise InputError(f"{path}: the kind of input is not recognised; known formats: {known}")
+        raise InputError(f"{path}: the kind of input is not recognised; {expected_inputs(path)}")
     # read before the network, which may take long: its errors come at once
     control_points = None if control is None else read_control(control)
     # other formats have names of their own for their models
     own = (check_own_models(models),) if FORMATS[format].names_models else ()
-    network = FORMATS[format].read(path, overrides, *own)
+    sized = image_size is not None and FORMATS[format].takes_image_size
+    sizes = {"image_size": image_size} if sized else {}
+    network = FORMATS[format].read(path, overrides, *own, **sizes)
     if control_points is not None:
         return with_control(network, control_points, datum=not choose_datum(overrides))
     return _with_adjusted_control(network) if FORMATS[format].adjusted else network
+
+
+def expected_inputs(path: Path) -> str:
+    """The kinds of inputs with the suffix of a path, or of folders, for a message; if there are
+    none, the names of all."""
+    word = "folder" if path.is_dir() else path.suffix.lower() or "…"
+    kinds = {k: look for k, look in (CAMERA_INPUTS | NETWORK_FILES).items() if word in look.lower()}
+    looks = "; ".join(kinds.values())
+    # a message is one line: 200 characters are two lines of a terminal
+    if kinds and len(looks) < 200:
+        return f"known formats of this name: {looks}"
+    names = (
+        f"formats of this name: {', '.join(kinds)}" if kinds else f"formats: {', '.join(FORMATS)}"
+    )
+    return f"known {names} (jaxbundle convert --help describes them)"
 
 
 def check_own_models(models: Sequence[CameraModel]) -> tuple[CameraModel, ...]:

@@ -82,7 +82,8 @@ def test_a_target_by_hand(tmp_path):
     np.testing.assert_allclose(grid.points[11], [right, up, 0], rtol=1e-15)
     for old, new, message in [
         ("'checkerboard'", "hexagons", "target_type hexagons: checkerboard or"),
-        ("targetRows", "rows", "targetRows is missing"), ("Cols: 6", "Cols: 6.5", "targetCols is"),
+        ("targetRows", "rows", "unknown key 'rows'"),
+        ("targetRows: 7", "", "targetRows is missing"), ("Cols: 6", "Cols: 6.5", "targetCols is"),
     ]:  # fmt: skip
         path.write_text(CHECKERBOARD.replace(old, new))
         with pytest.raises(InputError, match=f"target.yaml: .*{message}"):

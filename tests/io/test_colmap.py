@@ -310,6 +310,62 @@ def test_missing_files(tmp_path, folder):
         read_colmap(tmp_path)
 
 
-def test_rigs_are_told(folder):
-    (folder / "rigs.txt").write_text("1 1 CAMERA 1\n")
-    assert "rigs and frames are not read" in read_colmap(folder).notes[-1]
+RIGS = "# Rig list\n4 3 CAMERA 1 CAMERA 7 1 1 0 0 0 0.1 0 0 IMU 2 0\n"
+FRAMES = "# Frame list\n9 4 1 0 0 0 0.5 -0.25 4 3 CAMERA 1 1 CAMERA 7 2 IMU 2 5\n"
+
+
+def binary_rigs(folder):
+    """The same by the layout of COLMAP's writer."""
+    pose = struct.pack("<7d", 1, 0, 0, 0, 0.1, 0, 0)
+    rigs = struct.pack("<QIIiI", 1, 4, 3, 0, 1) + struct.pack("<iIB", 0, 7, 1) + pose
+    (folder / "rigs.bin").write_bytes(rigs + struct.pack("<iIB", 1, 2, 0))
+    frames = struct.pack("<QII7dI", 1, 9, 4, 1, 0, 0, 0, 0.5, -0.25, 4, 3)
+    data = [(0, 1, 1), (0, 7, 2), (1, 2, 5)]
+    (folder / "frames.bin").write_bytes(frames + b"".join(struct.pack("<iIQ", *d) for d in data))
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_frames_are_epochs_of_a_rig(folder, tmp_path, binary):
+    if binary:
+        write_colmap(read_colmap(folder), tmp_path / "binary")
+        folder = tmp_path / "binary"
+        binary_rigs(folder)
+    else:
+        (folder / "rigs.txt").write_text(RIGS)
+        (folder / "frames.txt").write_text(FRAMES)
+    net = read_colmap(folder)
+    (rigs,) = net.further
+    assert (rigs.rig, rigs.epoch) == (("4", "4"), ("9", "9"))
+    assert set(rigs.image) == {"left.jpg", "right.jpg"}
+
+
+@pytest.mark.parametrize("name, old, new, message", [
+    ("frames.txt", "9 4", "9 5", "frames.txt, line 2: rig 5 is not in rigs.txt"),
+    ("frames.txt", "CAMERA 7 2", "CAMERA 7 1", "line 2: image 1 is in frame 9 as well"),
+    ("frames.txt", "4 3 CAMERA", "4 4 CAMERA", "line 2: the line ends; SENSOR_TYPE"),
+    ("frames.txt", "IMU 2 5", "IMU 2 5 1", "line 2: 1 values after the last"),
+    ("rigs.txt", "IMU 2 0", "IMU 2 1", "rigs.txt, line 2: "),
+    ("rigs.txt", "4 3", "4 x", "line 2: NUM_SENSORS is 'x'"),
+])  # fmt: skip
+def test_broken_rigs(folder, name, old, new, message):
+    (folder / "rigs.txt").write_text(RIGS)
+    with pytest.raises(InputError, match="frames.txt: no such file"):
+        read_colmap(folder)
+    (folder / "frames.txt").write_text(FRAMES)
+    text = (folder / name).read_text()
+    assert old in text
+    (folder / name).write_text(text.replace(old, new))
+    with pytest.raises(InputError, match=message):
+        read_colmap(folder)
+
+
+@pytest.mark.parametrize("name", ["rigs.bin", "frames.bin"])
+def test_cut_rigs(folder, tmp_path, name):
+    write_colmap(read_colmap(folder), tmp_path / "binary")
+    binary_rigs(tmp_path / "binary")
+    path = tmp_path / "binary" / name
+    content = path.read_bytes()
+    for cut in (content[:-1], content[:9], content + b"0", b"\xff" * 8 + content[8:]):
+        path.write_bytes(cut)
+        with pytest.raises(InputError, match=name):
+            read_colmap(tmp_path / "binary")

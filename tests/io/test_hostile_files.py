@@ -12,12 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from exchange_cases import CAMERAS, network
+from foreign_samples import NVM, SAMPLES, write_sample
 from garbling import often, read_or_refused, what_is_done
 
 from jaxbundle.batches.stacks import read_camera_stack
 from jaxbundle.errors import InputError
 from jaxbundle.io import read_cameras, read_network, write_project
 from jaxbundle.io.cameras.calibrated import read_calibrated
+from jaxbundle.io.cameras.camera_files import is_camera_file
 from jaxbundle.io.cameras.opencv_file import write_opencv
 from jaxbundle.io.networks.bal import write_bal
 from jaxbundle.io.networks.bundler import write_bundler
@@ -25,6 +27,9 @@ from jaxbundle.io.networks.colmap import write_colmap
 from jaxbundle.io.networks.stereo import fill_ros_stereo, write_opencv_stereo
 from jaxbundle.network.tables import Camera, Network
 
+FURTHER_SAMPLES = ("opencv-xml", "opencv-json", "opencv-nested", "ros-ini", "camodocal", "orb-slam",
+                   "orb-slam-pair", "euroc", "alicevision", "metashape-lens",
+                   "autocal")  # fmt: skip
 EXAMPLE = Path(__file__).parents[2] / "examples" / "convergent4" / "convergent4.txt"
 
 
@@ -97,6 +102,15 @@ def made(kind: str, folder: Path) -> Path:
             from test_rigs_for_others import rig
 
             fill_ros_stereo(rig()[0], folder)
+        case "nvm":
+            (folder / "model.nvm").write_text(NVM)
+        case "colmap-rigs":
+            from test_colmap import FILES, FRAMES, RIGS
+
+            for name, text in {**FILES, "rigs.txt": RIGS, "frames.txt": FRAMES}.items():
+                (folder / name).write_text(text)
+        case name if name in SAMPLES:
+            write_sample(folder, name)
         case "rig":
             from test_rigs_for_others import result_json
 
@@ -143,8 +157,14 @@ def read(kind: str, folder: Path):
             return [Camera(key) for key in read_camera_stack(folder / "cameras.npz").ids]
         case "result":
             return [camera for camera, _ in read_calibrated(folder / "result.json")]
-        case "colmap-text":
+        case "colmap-text" | "colmap-rigs":
             return read_network(folder, format="colmap")
+        case "vins":
+            return read_network(folder / "vins.yaml", format=kind)
+        case name if name in FURTHER_SAMPLES:
+            (file,) = folder.iterdir()
+            # a damaged one may look like nothing, or like another kind
+            return read_cameras(file) if is_camera_file(file) else read_network(file)
         case "colmap" | "project" | "bingo" | "opensfm" | "micmac" | "ros-stereo":
             return read_network(folder, format=kind)
         case "column-map":
@@ -161,7 +181,7 @@ def read(kind: str, folder: Path):
 KINDS = ("colmap", "colmap-text", "bal", "bundler", "project", "photo-list", "opencv", "json",
          "photomodeler", "bingo", "metashape", "openmvg", "opensfm", "transforms", "kalibr",
          "mrcal", "micmac", "jaicov", "column-map", "camera-stack", "result", "opencv-stereo",
-         "ros-stereo", "rig")  # fmt: skip
+         "ros-stereo", "rig", "nvm", "colmap-rigs", "vins", *FURTHER_SAMPLES)  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", KINDS)

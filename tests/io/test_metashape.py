@@ -146,15 +146,58 @@ def test_parameters_that_are_0_have_no_effect(tmp_path, extra):
     assert largest_difference(net.cameras[0], **more) < 1e-9
 
 
-@pytest.mark.parametrize("extra, ignored", [
-    ("<k5>0.3</k5><k6>0</k6>", "k5 0.3"), ("<skew>2</skew>", "skew 2"),
-    ("<covariance><params>f</params></covariance><p5>-1</p5>", "p5 -1"), ("<k5>0</k5>", None),
+@pytest.mark.parametrize("extra, message", [
+    ("<k5>0.3</k5><k6>0</k6>", "sensor 'cam': unknown key 'k5'"),
+    ("<skew>2</skew>", "sensor 'cam': skew beside f"),
+    ("<p5>-1</p5>", "sensor 'cam': unknown key 'p5'"),
 ])  # fmt: skip
-def test_coefficients_that_are_not_known_are_told(tmp_path, extra, ignored):
-    net = read(tmp_path, xml(extra_calibration=extra))
-    told = [w for w in net.warnings if "not known here and not applied" in w]
-    assert [w.rpartition(": ")[2] for w in told] == ([ignored] if ignored else [])
-    assert all("sensor 'cam'" in w for w in told)
+def test_coefficients_that_are_not_known_are_refused(tmp_path, extra, message):
+    with pytest.raises(InputError, match=message):
+        read(tmp_path, xml(extra_calibration=extra))
+
+
+def test_coefficients_that_are_0_do_not_count(tmp_path):
+    assert read(tmp_path, xml(extra_calibration="<k5>0</k5>")).cameras
+
+
+def test_a_sphere_is_the_manuals(tmp_path):
+    text = xml().replace('"cam" type="frame"', '"cam" type="spherical"')
+    (camera,) = read(tmp_path, text).cameras
+    X, Y, Z = 0.3, -0.2, -0.7  # right, down, forward; behind the camera
+    f = 1280 / (2 * np.pi)
+    u = 640 + f * np.arctan2(X, Z) - 0.5
+    v = 360 + f * np.arctan2(Y, np.hypot(X, Z)) - 0.5
+    found = images_of(get_model(camera.model), all_parameters(camera), np.array([[X, -Y, -Z]]))
+    assert_allclose(found[0], [u, v], atol=1e-9)
+
+
+def test_a_project_before_its_alignment(tmp_path):
+    """Marker measurements and references are read, orientations are computed from them."""
+    rays = (POINTS[:8] - POSITION[0]) @ matrix(ANGLES[0]).T * [1, -1, -1]
+    marks, seen = "", ""
+    for k, (X, (u, v)) in enumerate(zip(POINTS, np.stack(published(*rays.T), 1).tolist())):
+        reference = " ".join(f'{axis}="{value!r}"' for axis, value in zip("xyz", X.tolist()))
+        marks += f'<marker id="{k}" label="M{k}"><reference {reference} enabled="true"/></marker>'
+        seen += (f'<marker marker_id="{k}"><location camera_id="0" x="{u!r}" y="{v!r}"/>'
+                 "</marker>")  # fmt: skip
+    more = (f"<markers>{marks}</markers><frames><frame id='0'><markers>{seen}</markers></frame>"
+            "</frames>")  # fmt: skip
+    text = re.sub(r"<transform>[^<]*</transform>", "", xml(more=more))
+    net = read(tmp_path, text)
+    assert net.images.id == ("a",) and np.isnan(net.images.position).all()
+    assert net.points.has_role("control").sum() == 8 and net.datum == "control"
+    assert any("not aligned: orientations" in told for told in net.warnings)
+    import jaxbundle
+
+    found = jaxbundle.orient(net).network.images
+    assert_allclose(found.position[0], POSITION[0], atol=1e-5)
+    # without an adjusted calibration: the focal length in mm over the pixel size
+    focal = '<property name="focal_length" value="5"/>' + PIXEL
+    text = re.sub("<calibration.*?</calibration>", "", text, flags=re.S)
+    text = text.replace("</sensor>", focal.removesuffix("<calibration") + "</sensor>")
+    assert read(tmp_path, text).cameras[0].parameters["fx"] == pytest.approx(1000)
+    with pytest.raises(InputError, match="before their alignment: .*none has a measured marker"):
+        read(tmp_path, text.replace("<location", "<place"))
 
 
 def test_a_fisheye_is_exact(tmp_path):
@@ -181,16 +224,16 @@ def test_an_old_export_is_the_same_camera(tmp_path):
 
 
 def test_photographs_of_a_sensor_that_none_comes_near_are_left_out(tmp_path):
-    spherical = """<sensor id="7" label="ball" type="spherical"><resolution width="10" height="5"/>
-    <calibration type="spherical"><resolution width="10" height="5"/></calibration></sensor>
+    spherical = """<sensor id="7" label="ball" type="cylindrical"><resolution width="10"
+    height="5"/><calibration type="cylindrical"/></sensor>
     <sensor id="8" label="raw" type="frame"/></sensors>"""
     text = xml().replace("</sensors>", spherical)
     text = text.replace('id="1" sensor_id="0"', 'id="1" sensor_id="7"')
     net = read(tmp_path, text)
     assert net.images.id == ("a#0", "a#2") and [c.id for c in net.cameras] == ["cam"]
-    (told,) = [w for w in net.warnings if "spherical" in w]
+    (told,) = [w for w in net.warnings if "cylindrical" in w]
     assert "sensor 'ball'" in told and "left out 1 camera: 'b'" in told
-    with pytest.raises(InputError, match="sensor 'ball': sensors of type 'spherical'"):
+    with pytest.raises(InputError, match="sensor 'ball': sensors of type 'cylindrical'"):
         read(tmp_path, text.replace('sensor_id="0"', 'sensor_id="7"'))
 
 
@@ -263,7 +306,7 @@ BROKEN = {
     "no chunk": (lambda t: "<document></document>", "one <chunk>"),
     "folded": (lambda t: t.replace("<k1>-0.1", "<k4>1</k4><k1>-9"), "turns back inside the image"),
     "spherical": (
-        lambda t: t.replace('"cam" type="frame"', '"cam" type="spherical"'), "type 'spherical'"
+        lambda t: t.replace('"cam" type="frame"', '"cam" type="rpc"'), "type 'rpc'"
     ),
     "NaN": (lambda t: t.replace("<k2>0.02", "<k2>nan"), "sensor 'cam', k2 is 'nan'"),
     "digits": (lambda t: t.replace("<f>1000.0", "<f>1_000"), "sensor 'cam', f is '1_000'"),

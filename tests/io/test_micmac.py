@@ -147,12 +147,13 @@ BROKEN = {
     "row": ("Orientation-0.jpg.xml", "L2>", "X2>", "L2 is missing"),
     "turn": ("Orientation-0.jpg.xml", "<L1>", "<L1>9", "CodageMatr is not a rotation"),
     "centre": ("Orientation-0.jpg.xml", "<Centre>-1.5 ", "<Centre>", "Centre has 2 numbers"),
-    "kind": ("AutoCal_cam.xml", "ModPhgrStd", "ModUnif", "ModUnif without TypeModele"),
+    "kind": ("AutoCal_cam.xml", "ModPhgrStd", "ModUnif", "ModUnif: unknown key 'P1'"),
     "F": ("AutoCal_cam.xml", "<F>4", "<F>-4", "F and SzIm must be positive"),
     "no F": ("AutoCal_cam.xml", "F>", "G>", "F is missing; a calibration of MicMac"),
     "NaN": ("AutoCal_cam.xml", "<P1>", "<P1>x", "P1 is 'x"),
     "size": ("AutoCal_cam.xml", "6000 4000", "6000", "SzIm has 1 numbers; 2"),
-    "entity": ("AutoCal_cam.xml", "<ExportAPERO>", "<!ENTITY a 'b'><ExportAPERO>", "entities"),
+    "entity": ("AutoCal_cam.xml", "<ExportAPERO>", "<!DOCTYPE x [<!ENTITY a 'b'>]><ExportAPERO>",
+               "entities"),
 }  # fmt: skip
 
 

@@ -130,7 +130,7 @@ BROKEN = {
     "name": ("_PINHOLE", "_SPLINED_STEREOGRAPHIC_order=2_Nx=30_Ny=20_fov_x_deg=170",
              "SPLINED_STEREOGRAPHIC_order=2.* is not offered here; these are: PINHOLE"),
     "knots": ("_PINHOLE", "_SPLINED_STEREOGRAPHIC_order=3_Nx=2_Ny=20_fov_x_deg=170", "4 to 40 kn"),
-    "missing": ("'lensmodel'", "'model'", "lensmodel is missing"),
+    "missing": ("'lensmodel'", "'model'", "unknown key 'model'"),
     "short": ("1761.2, ", "", "intrinsics is .* 4 of finite"),
     "long": ("1761.2, ", "1761.2, 1, ", "intrinsics is"),
     "NaN": ("1761.2, ", "1e999, ", "intrinsics is"), "pose": ("0.1, ", "", "extrinsics is .* 6"),

@@ -188,3 +188,54 @@ def test_tracks(tmp_path, old, new, message):
         return
     with pytest.raises(InputError, match=f"tracks.csv, {message}"):
         read_network(tmp_path)
+
+
+def test_ground_control_points(tmp_path):
+    """Latitude and longitude by pyproj's topocentric conversion, an independent one."""
+    from pyproj import Transformer
+
+    reference = {"latitude": 47.3, "longitude": 8.5, "altitude": 400.0}
+    pipeline = (
+        "+proj=pipeline +step +proj=cart +ellps=WGS84 +step +proj=topocentric +ellps=WGS84 "
+        f"+lon_0={reference['longitude']} +lat_0={reference['latitude']} "
+        f"+h_0={reference['altitude']}"
+    )
+    to_local = Transformer.from_pipeline(pipeline)
+    scenes, tracks = files()
+    write(tmp_path, scenes, tracks)
+    (tmp_path / "reference_lla.json").write_text(json.dumps(reference))
+    rows = []
+    for k, X in enumerate(POINTS[:4]):
+        lon, lat, h = to_local.transform(*X, direction="INVERSE", radians=False)
+        seen = []
+        for i, name in enumerate(("a b.jpg", "b.jpg", "c.jpg", "elsewhere.jpg")):
+            R = matrix(ANGLES[i % 3]) * np.array([[1], [-1], [-1]])
+            projection = [*map(float, published("brown", *(R @ (X - POSITION[i % 3]))))]
+            seen.append({"shot_id": name, "projection": projection})
+        position = {"latitude": lat, "longitude": lon, "altitude": h}
+        rows.append({"id": f"gcp{k}", "position": position, "observations": seen})
+    del rows[3]["position"]
+    file = tmp_path / "ground_control_points.json"
+    file.write_text(json.dumps({"points": rows}))
+    net = read_network(tmp_path)
+    index = [net.points.id.index(f"gcp{k}") for k in range(4)]
+    assert [net.points.role[k] for k in index] == ["control"] * 3 + ["tie"]
+    assert_allclose(net.points.position[index[:3]], POINTS[:3], atol=1e-6)
+    assert_allclose(net.points.sigma[index[0]], [0.01, 0.01, 0.1])
+    assert np.isin(net.observations.point, index).sum() == 12 and net.datum == "control"
+    for change, message in [
+        (lambda: rows[0].update(id="gcp1"), "points.1.: the point 'gcp1' occurs twice"),
+        (lambda: rows[0].update(id="3"), "'3' is also a point of"),
+        (lambda: rows[0]["position"].update(offset=1), "unknown key 'offset'"),
+        (lambda: rows[0]["position"].pop("latitude"), "position: latitude is missing"),
+    ]:
+        before = copy.deepcopy(rows)
+        change()
+        file.write_text(json.dumps({"points": rows}))
+        with pytest.raises(InputError, match=f"ground_control_points.json.*{message}"):
+            read_network(tmp_path)
+        rows[:] = before
+    file.write_text(json.dumps({"points": rows}))
+    (tmp_path / "reference_lla.json").unlink()
+    with pytest.raises(InputError, match="need reference_lla.json, which is not beside it"):
+        read_network(tmp_path)

@@ -145,7 +145,7 @@ def test_a_truncated_file_is_refused(write, lines, said):
 
 def test_only_lists_are_recognised(write):
     assert len(read_network(write(SMALL)).images) == 2
-    with pytest.raises(InputError, match="not recognised; .*photo-list: a .txt file whose first"):
+    with pytest.raises(InputError, match="not recognised; .* of this name: .*photo-list"):
         read_network(write("some text\n"))
     with pytest.raises(InputError, match="line 1: the focal length is 'text'"):
         read_network(write("text\n"), format="photo-list")

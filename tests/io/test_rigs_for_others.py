@@ -20,7 +20,7 @@ from jaxbundle.cameras import get_model
 from jaxbundle.cameras.convert_fit import images_of, rays_of
 from jaxbundle.errors import InputError
 from jaxbundle.io.exchange import convert
-from jaxbundle.io.formats import read_network, recognise_format
+from jaxbundle.io.formats import read_network
 from jaxbundle.io.networks.assemble import all_parameters
 from jaxbundle.io.networks.kalibr import write_kalibr
 from jaxbundle.io.networks.poses import angles_of
@@ -224,8 +224,9 @@ def test_what_a_pair_is_not(tmp_path):
     net, _ = rig()
     path = convert_network(net, tmp_path / "stereo.yaml")
     text = path.read_text()
-    path.write_text(text.replace("\nT:", "\nt:"))
-    assert recognise_format(path) is None
+    path.write_text(text.replace("\nT:", "\nx:"))
+    with pytest.raises(InputError, match="stereo.yaml: R without the other of R and T"):
+        read_network(path)
     path.write_text(re.sub(r"(\nR:.*?data: \[ )[^,]+", r"\g<1>7", text, count=1, flags=re.S))
     with pytest.raises(InputError, match="stereo.yaml: R is not a rotation"):
         read_network(path)

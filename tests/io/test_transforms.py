@@ -74,7 +74,7 @@ def test_instant_ngp(tmp_path):
     net = read(tmp_path, given | {"scale": 0.33, "frames": frames()})
     p = all_parameters(net.cameras[0])
     assert [p[k] for k in ("fx", "fy", "cx", "cy")] == pytest.approx([1000, 1000, 639.5, 359.5])
-    assert any("not undone: scale" in told for told in net.warnings)
+    assert any("scale is not read: coordinates are those of" in told for told in net.warnings)
     net = read(tmp_path, given | {"is_fisheye": True, "fl_x": 700.0, "frames": frames(k1=0.1)})
     assert net.cameras[0].model == "kannala-brandt" and len(net.cameras) == 1
     assert net.cameras[0].parameters["k1"] == 0.1

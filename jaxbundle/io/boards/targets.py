@@ -15,11 +15,18 @@ from pathlib import Path
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.json_fields import JsonFields
+from jaxbundle.io.text.sections import refuse_unknown
 from jaxbundle.io.text.yaml_text import parse_yaml
 from jaxbundle.measure.boards import Board
 from jaxbundle.network.columns import show
 
 TYPES = ("checkerboard", "circlegrid", "aprilgrid")
+KEYS = (
+    *("target_type", "targetCols", "targetRows", "rowSpacingMeters", "colSpacingMeters"),
+    *("spacingMeters", "asymmetricGrid", "tagCols", "tagRows", "tagSize", "tagSpacing"),
+    "codeOffset",
+)
+"""All are geometry: a board has no place for a warning, so that any other key is refused."""
 CIRCLES = {False: "circles", True: "asymmetric-circles"}
 
 
@@ -30,6 +37,10 @@ def read_target(path: str | Path) -> Board:
     """
     fields = JsonFields(path, parse_yaml(path, read_text(Path(path))))
     kind = fields.text("target_type")
+    for key in fields.document:
+        refuse_unknown(key, KEYS, f"{path}: ")
+    if fields.integer("codeOffset", 0):
+        raise InputError(f"{path}: codeOffset is not 0; expected a board whose first tag is tag 0")
     if kind not in TYPES:
         raise InputError(f"{path}: target_type {kind}: {' or '.join(TYPES)} is expected")
     if kind == "aprilgrid":

@@ -1,25 +1,26 @@
 """Camera files: which files hold cameras, and how cameras are written without a network.
 
-| file | read | written |
-|---|---|---|
-| `.yaml`, `.yml`, `.json` of OpenCV | its camera | one, of model `opencv` or `kannala-brandt` |
-| `.toml` with `[[camera]]` entries, a project file among them | its cameras | all cameras |
-| `cameras.txt`, `cameras.bin` of COLMAP | its cameras | all, as `cameras.txt` |
-| `camera_models.json` of OpenSfM | its cameras | all |
-| `AutoCal….xml` of MicMac | its camera | one, of model `opencv`, `brown`, `brown-projected` |
-| any input of `jaxbundle adjust` | its cameras | |
+Reading: `CAMERA_FORMATS`, and any input of `jaxbundle adjust`. Written are a file of OpenCV, ROS,
+mrcal or MicMac for one camera, of OpenSfM, COLMAP or a `.toml` for all (`io.formats.CAMERA_KINDS`).
 """
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from jaxbundle.cameras import CameraModel
+from jaxbundle.choices import CAMERA_INPUTS
 from jaxbundle.errors import InputError
-from jaxbundle.io.cameras.opencv_file import is_opencv, read_opencv
+from jaxbundle.io.cameras.metashape_lens import is_metashape_lens, read_metashape_lens
+from jaxbundle.io.cameras.opencv_file import READ_SUFFIXES, is_opencv, read_opencv
+from jaxbundle.io.cameras.ros_ini import is_ros_ini, is_ros_ini_pair, read_ros_ini
+from jaxbundle.io.cameras.slam_yaml import is_slam_yaml, read_slam_yaml
 from jaxbundle.io.networks.colmap import read_colmap_cameras
 from jaxbundle.io.networks.column_map import is_column_map
 from jaxbundle.io.networks.micmac_camera import is_autocal, read_autocal
+from jaxbundle.io.networks.opencv_rigs import is_opencv_rig
 from jaxbundle.io.networks.opensfm import is_opensfm_cameras, read_opensfm_cameras
+from jaxbundle.io.networks.orb_slam import is_orb_slam_pair
 from jaxbundle.io.networks.project import cameras_text
 from jaxbundle.io.text.csv_tables import read_toml, write_text
 from jaxbundle.network.build import make_cameras
@@ -27,21 +28,68 @@ from jaxbundle.network.columns import did_you_mean
 from jaxbundle.network.tables import Camera
 
 COLMAP_FILES = ("cameras.txt", "cameras.bin")
-LOOKS = (
-    "OpenCV's or ROS's .yaml, .yml or .json; a .toml with [[camera]] entries; cameras.txt or "
-    "cameras.bin of COLMAP; camera_models.json of OpenSfM; AutoCal….xml of MicMac"
-)
-"""Description of camera files."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraFormat:
+    """A kind of file with cameras only: how it is recognised, read, and described."""
+
+    recognises: Callable[[Path], bool]
+    read: Callable[[Path], Sequence[Camera]]
+    looks: str
+
+
+def _single(read: Callable[[Path], Camera]) -> Callable[[Path], Sequence[Camera]]:
+    return lambda path: (read(path),)
+
+
+def _is_colmap_cameras(path: Path) -> bool:
+    return path.name.lower() in COLMAP_FILES and path.is_file()
+
+
+def _is_toml_cameras(path: Path) -> bool:
+    # a project and a column map are TOML with cameras too, but hold a network
+    return _is_toml(path) and not is_column_map(path) and "project" not in read_toml(path)
+
+
+# In the order of recognition: OpenCV's habits, which many programs share, come last.
+CAMERA_FORMATS: dict[str, CameraFormat] = {
+    "colmap-cameras": CameraFormat(
+        _is_colmap_cameras, read_colmap_cameras, CAMERA_INPUTS["colmap-cameras"]
+    ),
+    "cameras": CameraFormat(
+        _is_toml_cameras, lambda path: _read_toml_cameras(path), CAMERA_INPUTS["cameras"]
+    ),
+    "opensfm-cameras": CameraFormat(
+        is_opensfm_cameras, read_opensfm_cameras, CAMERA_INPUTS["opensfm-cameras"]
+    ),
+    "autocal": CameraFormat(is_autocal, _single(read_autocal), CAMERA_INPUTS["autocal"]),
+    "metashape-lens": CameraFormat(
+        is_metashape_lens,
+        _single(read_metashape_lens),
+        CAMERA_INPUTS["metashape-lens"],
+    ),
+    "ros-ini": CameraFormat(
+        lambda path: is_ros_ini(path) and not is_ros_ini_pair(path),
+        read_ros_ini,
+        CAMERA_INPUTS["ros-ini"],
+    ),
+    "slam-yaml": CameraFormat(
+        lambda path: is_slam_yaml(path) and not is_orb_slam_pair(path),
+        _single(read_slam_yaml),
+        CAMERA_INPUTS["slam-yaml"],
+    ),
+    "opencv": CameraFormat(
+        lambda path: is_opencv(path) and not is_opencv_rig(path),
+        _single(read_opencv),
+        CAMERA_INPUTS["opencv"],
+    ),
+}
 
 
 def is_camera_file(path: Path) -> bool:
     """Whether a file holds only cameras."""
-    if path.name.lower() in COLMAP_FILES and path.is_file():
-        return True
-    # a project and a column map are TOML with cameras too, but hold a network
-    if _is_toml(path):
-        return not is_column_map(path) and "project" not in read_toml(path)
-    return is_opencv(path) or is_opensfm_cameras(path) or is_autocal(path)
+    return any(kind.recognises(path) for kind in CAMERA_FORMATS.values())
 
 
 def read_cameras(path: str | Path, models: Sequence[CameraModel] = ()) -> tuple[Camera, ...]:
@@ -52,19 +100,25 @@ def read_cameras(path: str | Path, models: Sequence[CameraModel] = ()) -> tuple[
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file")
-    if path.name.lower() in COLMAP_FILES:
-        cameras = read_colmap_cameras(path)
-        if not cameras:
-            raise InputError(f"{path}: there is no camera in it")
-        return cameras
     if _is_toml(path):
-        cameras = read_toml(path).get("camera", [])
-        if not isinstance(cameras, list) or not all(isinstance(c, dict) for c in cameras):
-            raise InputError(f"{path}: write [[camera]] in double brackets, one for each camera")
-        return make_cameras(cameras, f"{path}, ", models)
-    if is_opensfm_cameras(path):
-        return read_opensfm_cameras(path)
-    return (read_autocal(path) if is_autocal(path) else read_opencv(path),)
+        return _read_toml_cameras(path, models)
+    kind = next((kind for kind in CAMERA_FORMATS.values() if kind.recognises(path)), None)
+    if kind is None and path.suffix.lower() in READ_SUFFIXES:
+        return (read_opencv(path),)  # says what is missing of a camera
+    if kind is None:
+        names = ", ".join(CAMERA_FORMATS)
+        raise InputError(f"{path}: not recognised as a camera file; known formats: {names}")
+    cameras = tuple(kind.read(path))
+    if not cameras:
+        raise InputError(f"{path}: there is no camera in it")
+    return cameras
+
+
+def _read_toml_cameras(path: Path, models: Sequence[CameraModel] = ()) -> tuple[Camera, ...]:
+    cameras = read_toml(path).get("camera", [])
+    if not isinstance(cameras, list) or not all(isinstance(c, dict) for c in cameras):
+        raise InputError(f"{path}: write [[camera]] in double brackets, one for each camera")
+    return make_cameras(cameras, f"{path}, ", models)
 
 
 def write_cameras(cameras: Sequence[Camera], path: str | Path) -> None:

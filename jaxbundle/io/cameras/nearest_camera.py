@@ -149,9 +149,17 @@ def nearest_camera(
 
 @dataclasses.dataclass(frozen=True)
 class FittedCamera(Camera):
-    """A camera fitted to one of another program, and a message with its differences."""
+    """A camera with a message about how it was read: its differences from one of another program,
+    entries of the file that are not understood."""
 
     told: str = ""
+
+
+def with_messages(camera: Camera, *messages: str) -> Camera:
+    """The camera with further messages, if there are any."""
+    told = "; ".join([*fit_messages([camera]), *messages])
+    fields = {field.name: getattr(camera, field.name) for field in dataclasses.fields(Camera)}
+    return FittedCamera(**fields, told=told) if messages else camera
 
 
 def fit_camera(
@@ -179,8 +187,9 @@ def fit_camera(
 
 
 def fit_messages(cameras: Iterable[Camera]) -> tuple[str, ...]:
-    """Messages about the fitted cameras."""
-    return tuple(camera.told for camera in cameras if isinstance(camera, FittedCamera))
+    """Messages about how cameras were read."""
+    told = (camera.told for camera in cameras if isinstance(camera, FittedCamera))
+    return tuple(dict.fromkeys(filter(None, told)))
 
 
 def _rays(

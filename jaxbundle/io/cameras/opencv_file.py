@@ -1,4 +1,4 @@
-"""A camera in the form of OpenCV's FileStorage: YAML or JSON.
+"""A camera in the form of OpenCV's FileStorage: YAML, JSON or XML.
 
     %YAML:1.0
     ---
@@ -14,7 +14,8 @@
        data: [ k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 ]      4, 5, 8, 12 or 14 of them
 
 The similar files of ROS are read as well, and its message CameraInfo as printed
-(height, width, K and D, in ROS 2 k and d): with `distortion_model` "equidistant" or "fisheye" the
+(height, width, K and D, in ROS 2 k and d), and files of other programs with the same entries under
+other names (`spellings.py`). With `distortion_model` "equidistant" or "fisheye" the
 four coefficients are those of `kannala-brandt`. Pixels have their origin at the
 centre of the first pixel, as here. A skew and a tilted sensor (τx, τy),
 
@@ -24,8 +25,6 @@ centre of the first pixel, as here. A skew and a tilted sensor (τx, τy),
     u = fx·x'' + skew·y'' + cx
 
 are not part of our models: if they are not 0 the nearest is fitted, which needs the image size.
-
-Other entries are skipped.
 
 Source: OpenCV 4 documentation, XML/YAML/JSON file storages; ROS wiki, camera_calibration_parsers.
 """
@@ -46,12 +45,28 @@ from jaxbundle.cameras import get_model
 from jaxbundle.cameras.model import project
 from jaxbundle.cameras.scalars import Scalar
 from jaxbundle.errors import InputError
-from jaxbundle.io.cameras.nearest_camera import FittedCamera, Foreign, fit_camera
+from jaxbundle.io.cameras.file_storage import storage_entries
+from jaxbundle.io.cameras.nearest_camera import FittedCamera, Foreign, fit_camera, with_messages
+from jaxbundle.io.cameras.spellings import (
+    CORE,
+    LEFT,
+    MEANING,
+    MODEL_NAMES,
+    TILT,
+    Found,
+    camera_entries,
+    cameras_within,
+    fold,
+    has_camera,
+    meaning_of,
+)
 from jaxbundle.io.networks.assemble import all_parameters
+from jaxbundle.io.networks.kalibr import is_kalibr
 from jaxbundle.io.networks.losses import check_others_zero, size_of
 from jaxbundle.io.text.csv_tables import read_text, write_text
+from jaxbundle.io.text.known_keys import Keys, UnknownKeys
 from jaxbundle.io.text.rows import join_numbers
-from jaxbundle.io.text.yaml_text import parse_yaml
+from jaxbundle.io.text.yaml_text import parse_document
 from jaxbundle.network.columns import show
 from jaxbundle.network.rules import check_camera
 from jaxbundle.network.tables import Camera
@@ -59,82 +74,312 @@ from jaxbundle.system.file_content import beginning, parse_json
 
 YAML = (".yaml", ".yml")
 SUFFIXES = (*YAML, ".json")
-MATRIX = ("camera_matrix", "cameraMatrix", "K", "k")
-COEFFICIENTS = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "D", "d")
-MESSAGE_KEY = b"distortion_model"
-"""Required in addition to a lone `k` in a message of ROS 2."""
+"""Of files that are written."""
+READ_SUFFIXES = (*SUFFIXES, ".xml")
 ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
 COEFFICIENT_COUNTS = (4, 5, 8, 12, 14)
 """Lengths of a vector of distortion coefficients that OpenCV accepts (`calibrateCamera`); the last
 two of 14 are the tilt."""
 FISHEYE = ("equidistant", "fisheye")
+FOREIGN_MODELS = re.compile(
+    "omni|mei|unified|scaramuzza|ocam|sphere|eucm|ucm|fov|prism|division|cylind|equirect|ftheta|"
+    "inverse|modified|atan|poly|stereographic|orthographic|equisolid|spline|generic"
+)
+"""Parts of the names of lens models that are none of OpenCV's; what has none of them under the key
+`model` names a product, "HERO7 Black"."""
+MODEL_KEYS = ("distortion_model", "camera_model")
+FILE_STORAGE = b"<opencv_storage"
+LARGEST_FILE = 20_000_000
+"""Bytes of a file that is looked into: calibrations with all their measurements have a megabyte,
+networks of other programs in JSON hundreds."""
 
 
 def is_opencv(path: Path) -> bool:
-    """Whether a file has a name of this kind and mentions a camera matrix."""
-    text = beginning(path, 1_000_000) if path.suffix.lower() in SUFFIXES else b""
-    names = MATRIX if MESSAGE_KEY in text else MATRIX[:-1]
-    return any(re.search(rb"^[\s{]*\"?%s\"?\s*:" % name.encode(), text, re.M) for name in names)
+    """Whether a file has a name of this kind, and one camera in OpenCV's or a similar form."""
+    return len(find_cameras(path)) == 1
+
+
+def find_cameras(path: Path) -> list[tuple[str, Mapping[str, Any]]]:
+    """The names and entries of the cameras in a YAML, JSON or XML file, without any complaint."""
+    head = beginning(path, 1_000_000) if path.suffix.lower() in READ_SUFFIXES else b""
+    if path.suffix.lower() == ".xml" and FILE_STORAGE not in head:
+        return []
+    # every spelling of a camera has one of these
+    if not re.search(rb"(?i)[km]\b|intrinsic|matri|mat\b|mtx|fx\b|focal_?length", head):
+        return []
+    if path.stat().st_size > LARGEST_FILE or is_kalibr(path):
+        return []
+    try:
+        return list(cameras_within(read_document(path)))
+    except InputError:
+        # a damaged file is reported by its reader
+        return [("", {})] if re.search(rb"(?i)\bcamera_?matrix\b", head) else []
+
+
+def read_document(path: Path) -> Any:
+    """The document of a YAML, JSON or XML file of OpenCV."""
+    text = read_text(path)
+    if path.suffix.lower() == ".xml":
+        return storage_entries(path)
+    if path.suffix.lower() == ".json" or text.lstrip().startswith("{"):
+        return parse_json(path, text)
+    return parse_document(path, text)
 
 
 def read_entries(path: Path) -> dict[str, Any]:
-    """The entries of a YAML or JSON file."""
-    text = read_text(path)
-    is_json = path.suffix.lower() == ".json" or text.lstrip().startswith("{")
-    if not is_json:
-        return parse_yaml(path, text, lenient=True)
-    document = parse_json(path, text)
+    """The entries of a YAML, JSON or XML file.
+
+    **Raises:** `InputError`."""
+    document = read_document(path)
+    if document is None:
+        raise InputError(f"{path}: the file is empty; keys and values are expected")
     if not isinstance(document, dict):
         raise InputError(f"{path}: an object with camera_matrix is expected")
     return document
 
 
 def matrix_in(
-    path: Path, entries: Mapping, names: Sequence[str], shape: tuple[int, int]
+    path: str | Path, entries: Mapping, names: Sequence[str], shape: tuple[int, int]
 ) -> Float[np.ndarray, "rows columns"]:
     """A matrix by the first of these names.
 
     **Raises:** `InputError` naming file and entry: missing, or of another shape."""
-    return _matrix(path, entries, names, shape)[1]
+    name = next((name for name in names if name in entries), None)
+    if name is None:
+        raise InputError(f"{path}: {names[0]} is missing")
+    return matrix_of(path, name, entries[name], shape)
 
 
 def read_opencv(
     path: str | Path, entries: Mapping[str, Any] | None = None, id: str | None = None
 ) -> Camera:
     """The camera of a file, or of some of its `entries`; its id is the name of the file, if none
-    is given.
+    is given. Messages about what was not understood go with it (`nearest_camera`).
 
     **Raises:** `InputError` naming the entry.
     """
     path = Path(path)
-    entries = read_entries(path) if entries is None else entries
-    name, K = _matrix(path, entries, MATRIX, (3, 3))
+    unknown = UnknownKeys()
+    entries = _only_camera(path, read_entries(path), unknown) if entries is None else entries
+    found = camera_entries(entries, path, unknown)
+    if id is None:
+        # EuRoC: cam0/sensor.yaml
+        id = path.stem if path.stem != "sensor" else path.resolve().parent.name
+    return with_messages(camera_of(path, found, id), *unknown.messages())
+
+
+def _only_camera(path: Path, entries: Mapping[str, Any], unknown: UnknownKeys) -> Mapping[str, Any]:
+    """The entries of the camera, also where they stand within another object."""
+    if has_camera(entries):
+        return entries
+    inside = list(cameras_within(entries))
+    if len(inside) != 1 or meaning_of(*inside[0]) == "camera_matrix":
+        return entries
+    name, own = inside[0]
+    # {"camera": {…}, "software": …}: what stands around it is checked as well
+    around = {fold(key): key for key in entries if key != name}
+    unknown.check((around[key] for key in LEFT.unknown(around)), Keys(()), path)
+    return own
+
+
+def camera_of(path: str | Path, found: Found, id: str) -> Camera:
+    """The camera of the entries by meaning.
+
+    **Raises:** `InputError` naming the entry.
+    """
+    core, skew = _core(path, found)
+    fisheye = _is_fisheye(path, found)
+    values = _coefficients(path, found, fisheye)
+    coefficients, tilt = values[: len(ORDER)], values[len(ORDER) :]
+    if fisheye and (any(coefficients[4:]) or any(tilt)):
+        raise InputError(f"{path}: {len(values)} distortion coefficients; a fisheye has 4")
+    size = _image_size(path, found)
+    core, size, told = _published_image(path, found, core, size)
+    names = ORDER if not fisheye else ("k1", "k2", "k3", "k4")
+    camera = Camera(
+        id=id,
+        model="kannala-brandt" if fisheye else "opencv",
+        parameters=core | dict(zip(names, coefficients)),
+        image_size=size,
+    )
+    check_camera(camera, f"{path}, ")
+    if skew or any(tilt):
+        camera = _fit(Path(path), camera, skew, tilt)
+    return with_messages(camera, *told)
+
+
+def _core(path: str | Path, found: Found) -> tuple[dict[str, float], float]:
+    """fx, fy, cx, cy and the skew."""
+    extra = _number(path, found, "skew", 0.0)
+    if "camera_matrix" not in found and {"fx", "fy"} <= found.keys():
+        return {name: _number(path, found, name) for name in CORE}, extra
+    if "camera_matrix" not in found:
+        raise InputError(f"{path}: camera_matrix is missing")
+    name, value = found["camera_matrix"]
+    # as Kalibr and ROS write `intrinsics`
+    if "intrinsic" in name.lower() and isinstance(value, list) and len(value) == 4:
+        four = matrix_of(path, name, value, None).tolist()
+        return dict(zip(CORE, four)), extra
+    K = matrix_of(path, name, value, (3, 3))
     for row, column, wanted in ((1, 0, 0), (2, 0, 0), (2, 1, 0), (2, 2, 1)):
         if K[row, column] != wanted:
             raise InputError(
                 f"{path}: {name}[{row}][{column}] is {K[row, column]:g}; {wanted} is expected"
             )
-    coefficients = _coefficients(path, entries)
-    coefficients, tilt = coefficients[: len(ORDER)], coefficients[len(ORDER) :]
-    parameters = dict(zip(("fx", "fy", "cx", "cy"), (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
-    flag = entries.get("fisheye_model")
-    fisheye = entries.get("distortion_model") in FISHEYE or (_is_number(flag) and flag == 1)
-    if fisheye:
-        if any(coefficients[4:]) or any(tilt):
+    core: dict[str, float] = dict(zip(CORE, map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))))
+    for key in CORE:
+        # programs that write both round one of them
+        if key in found and abs(_number(path, found, key) - core[key]) > 1e-3:
             raise InputError(
-                f"{path}: {len(coefficients)} distortion coefficients; a fisheye has 4"
+                f"{path}: {found[key][0]} is {found[key][1]:g}, but {name} has {core[key]:g}; "
+                "expected equal numbers"
             )
-        names = ("k1", "k2", "k3", "k4")
-    else:
-        names = ORDER
-    camera = Camera(
-        id=path.stem if id is None else id,
-        model="kannala-brandt" if fisheye else "opencv",
-        parameters={k: float(v) for k, v in parameters.items()} | dict(zip(names, coefficients)),
-        image_size=_image_size(path, entries),
-    )
-    check_camera(camera, f"{path}, ")
-    return camera if K[0, 1] == 0 and not any(tilt) else _fit(path, camera, K[0, 1], tilt)
+    if K[0, 1] and extra and K[0, 1] != extra:
+        raise InputError(f"{path}: {found['skew'][0]} and {name}[0][1] differ; expected one skew")
+    return core, float(K[0, 1]) or extra
+
+
+def _number(path: str | Path, found: Found, kind: str, default: float | None = None) -> float:
+    if kind not in found and default is not None:
+        return default
+    if kind not in found:
+        raise InputError(f"{path}: {kind} is missing")
+    name, value = found[kind]
+    if not _is_number(value):
+        raise InputError(f"{path}: {name} is {show(value)}; a finite number is expected")
+    return float(value)
+
+
+def _is_fisheye(path: str | Path, found: Found) -> bool:
+    """Whether the model is that of `cv2.fisheye`.
+
+    **Raises:** `InputError` for a lens model that is not OpenCV's."""
+    _, flag = found.get("fisheye_model", ("", False))
+    if isinstance(flag, str):
+        flag = flag.strip().lower() in ("1", "true", "yes")
+    models = [flag is True or (_is_number(flag) and flag == 1)]
+    for meaning in MODEL_KEYS:
+        key, kind = found.get(meaning, ("", ""))
+        if not kind:
+            continue
+        folded = fold(str(kind))
+        model = MODEL_NAMES.get(folded)
+        foreign = model is None and FOREIGN_MODELS.search(folded)
+        # `model` may be a product's name; without any distortion all models are the same
+        named = model is None and meaning == "distortion_model"
+        if foreign or (named and not _all_zero(path, found)):
+            raise InputError(
+                f"{path}: {key} {show(kind)} is not known here; expected plumb_bob, "
+                "rational_polynomial (OpenCV's), equidistant or fisheye"
+            )
+        models.append(model == "kannala-brandt")
+    return any(models)
+
+
+def _all_zero(path: str | Path, found: Found) -> bool:
+    """Whether coefficients are given and are all 0."""
+    given = not found.keys().isdisjoint(("distortion_coefficients", *ORDER, *TILT))
+    return given and not any(_coefficients(path, found, False))
+
+
+def _coefficients(path: str | Path, found: Found, fisheye: bool) -> list[float]:
+    """The coefficients in OpenCV's order."""
+    named = {name: _number(path, found, name) for name in (*ORDER, *TILT) if name in found}
+    if "distortion_coefficients" not in found:
+        order = ("k1", "k2", "k3", "k4") if fisheye else (*ORDER, *TILT)
+        other = [name for name, value in named.items() if value and name not in order]
+        if other:
+            raise InputError(f"{path}: {', '.join(other)}: a fisheye has k1 to k4")
+        return [named.get(name, 0.0) for name in order]
+    name, value = found["distortion_coefficients"]
+    values = matrix_of(path, name, value, None).tolist()
+    if any(named.values()) and [named.get(k, 0.0) for k in ORDER[: len(values)]] != values:
+        raise InputError(f"{path}: {name} and {', '.join(named)} differ; expected one of them")
+    # Programs pad with zeros: [k1, k2, p1, p2, k3, 0] is a vector of five.
+    while values and len(values) not in COEFFICIENT_COUNTS and values[-1] == 0:
+        values = values[:-1]
+    values = values or [0.0] * 4
+    if len(values) not in COEFFICIENT_COUNTS:
+        raise InputError(f"{path}: {name} has {len(values)} values; 4, 5, 8, 12 or 14 are known")
+    return values
+
+
+def _image_size(path: str | Path, found: Found) -> tuple[int, int] | None:
+    sides = [found.get(f"image_{n}", ("", None))[1] for n in ("width", "height")]
+    if sides == [None, None]:
+        size = found.get("image_size", ("", None))[1]
+        if size is None:
+            return None
+        if isinstance(size, Mapping):
+            own = {MEANING.get(fold(name)): value for name, value in size.items()}
+            size = [own.get("image_width"), own.get("image_height")]
+            size = found["image_size"][1]["data"] if size == [None, None] else size
+        size = size[0] if isinstance(size, list) and len(size) == 1 else size
+        sides = size if isinstance(size, list) and len(size) == 2 else [None, None]
+    width, height = (_whole(x) for x in sides)
+    if width is None or height is None:
+        raise InputError(f"{path}: the image size is {show(sides)}; two whole numbers expected")
+    return width, height
+
+
+def _published_image(
+    path: str | Path, found: Found, core: dict[str, float], size: tuple[int, int] | None
+) -> tuple[dict[str, float], tuple[int, int] | None, list[str]]:
+    """The camera of the image that a camera of ROS publishes: a region of the whole one (`roi`),
+    whose pixels are binned.
+
+        fx = fx/bx   cx = (cx − x_offset)/bx   w = width of the region/bx    0 means none of it
+
+    Source: ROS, sensor_msgs/CameraInfo; image_geometry, PinholeCameraModel::fromCameraInfo.
+    """
+    name, roi = found.get("roi", ("", {}))
+    whole = {}
+    for key, value in roi.items():
+        if fold(key) in ("dorectify",):
+            continue  # how it is displayed
+        if fold(key) not in ("xoffset", "yoffset", "width", "height"):
+            raise InputError(f"{path}: unknown key {show(key)} in {name}; expected x_offset, …")
+        if value is not None:
+            whole[fold(key)] = _count(path, f"{name}: {key}", value)
+    x, y = whole.get("xoffset", 0), whole.get("yoffset", 0)
+    bins = [
+        _count(path, *found[kind]) or 1 if kind in found else 1
+        for kind in ("binning_x", "binning_y")
+    ]
+    region = [whole.get(key, 0) for key in ("width", "height")]
+    told = []
+    if size is None and any((x, y, *region)):
+        raise InputError(f"{path}: {name} needs the size of the whole image, which is missing")
+    if size is not None:
+        region = [part or n for part, n in zip(region, size)]
+        if x + region[0] > size[0] or y + region[1] > size[1]:
+            raise InputError(
+                f"{path}: {name} of {region[0]} × {region[1]} px at ({x}, {y}) is not inside the "
+                f"image of {size[0]} × {size[1]} px"
+            )
+        if (x, y, *region, *bins) == (0, 0, *size, 1, 1):
+            return core, size, told
+        size = region[0] // bins[0], region[1] // bins[1]
+        told = [
+            f"{path}: roi and binning are applied: the camera is that of the published image, "
+            f"{size[0]} × {size[1]} px"
+        ]
+    core = {
+        "fx": core["fx"] / bins[0],
+        "fy": core["fy"] / bins[1],
+        "cx": (core["cx"] - x) / bins[0],
+        "cy": (core["cy"] - y) / bins[1],
+    }
+    return core, size, told
+
+
+def _count(path: str | Path, name: str, value: object) -> int:
+    if value == 0:
+        return 0
+    number = _whole(value)
+    if number is None:
+        raise InputError(f"{path}: {name} is {show(value)}; a whole number is expected")
+    return number
 
 
 def _fit(path: Path, camera: Camera, skew: float, tilt: Sequence[float]) -> FittedCamera:
@@ -298,14 +543,12 @@ def _as_json(entries: Mapping) -> str:
     return json.dumps(document, indent=4) + "\n"
 
 
-def _matrix(
-    path: Path, entries: Mapping, names: Sequence[str], shape: tuple[int, int] | None
-) -> tuple[str, Float[np.ndarray, "..."]]:
-    """The first name there is, and its numbers in the shape; without one as they stand."""
-    name = next((name for name in names if name in entries), None)
-    if name is None:
-        raise InputError(f"{path}: {names[0]} is missing")
-    value = entries[name]
+def matrix_of(
+    path: str | Path, name: str, value: Any, shape: tuple[int, int] | None
+) -> Float[np.ndarray, "..."]:
+    """The numbers of an entry in the shape; without one as they stand.
+
+    **Raises:** `InputError` naming file and entry."""
     if isinstance(value, Mapping):
         stated = tuple(_whole(value.get(key)) for key in ("rows", "cols"))
         data = value.get("data")
@@ -318,41 +561,15 @@ def _matrix(
             )
     else:
         data, stated = value, None
-        if isinstance(value, list) and all(isinstance(row, list) for row in value):
-            data = [x for row in value for x in row]
+        # [[…]], [[[…]]]: rows of a matrix, and of lists of lists of one
+        while isinstance(data, list) and data and all(isinstance(row, list) for row in data):
+            data = [x for row in data for x in row]
     if not isinstance(data, list) or not all(_is_number(x) for x in data):
         raise InputError(f"{path}: {name}: a list of finite numbers is expected")
     if shape is not None and (stated not in (None, shape) or len(data) != shape[0] * shape[1]):
         raise InputError(f"{path}: {name} must have {shape[0]} rows and {shape[1]} columns")
     array = np.array(data, float)
-    return name, array if shape is None else array.reshape(shape)
-
-
-def _coefficients(path: Path, entries: Mapping) -> list[float]:
-    if not any(name in entries for name in COEFFICIENTS):
-        return [0.0] * 4
-    name, values = _matrix(path, entries, COEFFICIENTS, None)
-    values = values.tolist()
-    # Programs pad with zeros: [k1, k2, p1, p2, k3, 0] is a vector of five.
-    while values and len(values) not in COEFFICIENT_COUNTS and values[-1] == 0:
-        values = values[:-1]
-    values = values or [0.0] * 4
-    if len(values) not in COEFFICIENT_COUNTS:
-        raise InputError(f"{path}: {name} has {len(values)} values; 4, 5, 8, 12 or 14 are known")
-    return values
-
-
-def _image_size(path: Path, entries: Mapping) -> tuple[int, int] | None:
-    sides = [entries.get(f"image_{n}", entries.get(n)) for n in ("width", "height")]
-    if sides == [None, None]:
-        size = entries.get("image_size", entries.get("image_Size"))
-        if size is None:
-            return None
-        sides = size if isinstance(size, list) and len(size) == 2 else [None, None]
-    width, height = (_whole(x) for x in sides)
-    if width is None or height is None:
-        raise InputError(f"{path}: the image size is {show(sides)}; two whole numbers expected")
-    return width, height
+    return array if shape is None else array.reshape(shape)
 
 
 def _whole(value: object) -> int | None:

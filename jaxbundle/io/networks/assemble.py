@@ -17,7 +17,7 @@ from jaxbundle.geometry.pose_conventions import exterior_from_cv
 from jaxbundle.io.networks.poses import angles_of
 from jaxbundle.io.networks.settings import SETTINGS, Document, apply_overrides, check_settings
 from jaxbundle.network.build import make_cameras, make_network
-from jaxbundle.network.columns import Columns
+from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.kinds import Rigs
 from jaxbundle.network.rules import check_unique
 from jaxbundle.network.tables import (
@@ -107,11 +107,12 @@ def _without_points(cameras: Sequence[Camera], images: Columns, project: Mapping
 
 
 def network_of_cameras(cameras: Sequence[Camera], where: str) -> Network:
-    """Cameras with one image each, with the same names, at the origin and not rotated."""
-    names, none = [camera.id for camera in cameras], np.zeros((len(cameras), 3, 3))
-    images = image_columns(
-        Source(where, None, "camera"), names, names, none + np.eye(3), none[:, 0]
-    )
+    """Cameras with one image each, with the same names: a single one in its own frame, several
+    without orientation, since nothing tells where they are."""
+    names = [camera.id for camera in cameras]
+    M = np.full((len(names), 3, 3), np.eye(3) if len(names) == 1 else np.nan)
+    X0 = np.full((len(names), 3), 0.0 if len(names) == 1 else np.nan)
+    images = image_columns(Source(where, None, "camera"), names, names, M, X0)
     project = {"datum": "inner", "residuals": "measured", "object_unit": "model"}
     return _without_points(cameras, images, project)
 
@@ -122,17 +123,26 @@ def rig_network(
     R: Sequence[Float[np.ndarray, "3 3"]],
     t: Sequence[Float[np.ndarray, "3"]],
     overrides: Sequence[str] = (),
-    mounted: bool = True,
     warnings: Iterable[str] = (),
     unit: str = "m",
 ) -> Network:
-    """Cameras with one image each, of the same names, taken at one moment by a rig (`mounted`).
+    """Cameras with one image each, of the same names, taken at one moment by a rig.
 
-    `R`, `t`: x = R·X + t, the frame of a camera with x right, y down, z forward. Nothing can be
-    adjusted.
+    `R`, `t`: x = R·X + t, the frame of a camera with x right, y down, z forward; NaN where a file
+    does not have them. Images without a pose, and a single one with a pose among several cameras,
+    have no orientation and are not part of the rig. Nothing can be adjusted.
     """
     names = [camera.id for camera in cameras]
     M, X0 = exterior_from_cv(np.stack(R), np.stack(t))
+    known = np.asarray(np.isfinite(np.concatenate([X0, M.reshape(-1, 9)], 1)).all(axis=1))
+    if known.sum() < 2 and len(names) > 1:
+        # a pose relative to nothing
+        known[:] = False
+    M[~known], X0[~known] = np.nan, np.nan
+    apart = [name for name, there in zip(names, known) if not there]
+    if apart and len(names) > 1:
+        what = f"{count(len(apart), 'camera')} without a pose relative to another in the file"
+        warnings = (*warnings, f"{path}: {what}, left without orientation: {list_some(apart)}")
     source = Source(str(path), None, "camera")
     network = assemble(
         path,
@@ -141,9 +151,10 @@ def rig_network(
         image_columns(source, names, names, M, X0),
         warnings=warnings,
     )
-    if not mounted:
+    mounted = [name for name, there in zip(names, known) if there]
+    if len(mounted) < 2:
         return network
-    columns = {"rig": [RIG] * len(names), "epoch": [MOMENT] * len(names), "image": names}
+    columns = {"rig": [RIG] * len(mounted), "epoch": [MOMENT] * len(mounted), "image": mounted}
     return network.replace(further=(Rigs.from_columns(Columns(columns, source), {}, 1.0),))
 
 

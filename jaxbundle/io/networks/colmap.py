@@ -6,6 +6,7 @@ from pathlib import Path
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.colmap_binary import binary_files, read_binary_cameras, read_binary_model
 from jaxbundle.io.networks.colmap_model import from_network, numbers_of, to_network
+from jaxbundle.io.networks.colmap_rigs import read_frames, rigs_of_frames
 from jaxbundle.io.networks.colmap_text import (
     camera_lines,
     read_text_cameras,
@@ -49,10 +50,16 @@ def read_colmap(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     for part in PARTS:
         if not (path / f"{part}{suffix}").is_file():
             raise InputError(f"{path / part}{suffix}: no such file")
-    network = to_network(path, read(path), overrides)
-    if (path / f"rigs{suffix}").is_file():
-        return network.note("rigs and frames are not read: every image has its own pose")
-    return network
+    model = read(path)
+    network = to_network(path, model, overrides)
+    there = [part for part in RIGS if (path / f"{part}{suffix}").is_file()]
+    if not there:
+        return network
+    if len(there) == 1:
+        missing = next(part for part in RIGS if part not in there)
+        raise InputError(f"{path / missing}{suffix}: no such file; expected it beside {there[0]}")
+    names = {image.id: image.name for image in model.images}
+    return network.replace(further=rigs_of_frames(path, read_frames(path, suffix), names))
 
 
 def read_colmap_cameras(path: str | Path) -> tuple[Camera, ...]:

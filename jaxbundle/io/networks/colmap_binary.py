@@ -39,7 +39,7 @@ POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<u8")])
 NO_POINT_ID = np.uint64(2**64 - 1)
 
 
-class _Bytes:
+class BinaryFile:
     """The bytes of a file in sequence; errors name the file and the item being read."""
 
     def __init__(self, path: Path):
@@ -102,7 +102,7 @@ def read_binary_model(folder: Path) -> ColmapModel:
 
 def read_binary_cameras(path: Path) -> dict[int, Camera]:
     """The cameras of a cameras.bin by number."""
-    file, cameras = _Bytes(path), {}
+    file, cameras = BinaryFile(path), {}
     for k in range(file.count("cameras", 24)):  # bytes of a camera without parameters
         file.what = f"camera {k + 1}"
         id, model, width, height = file.take("IiQQ")
@@ -119,7 +119,7 @@ def read_binary_cameras(path: Path) -> dict[int, Camera]:
 
 
 def _images(path: Path) -> list[ColmapImage]:
-    file, images = _Bytes(path), []
+    file, images = BinaryFile(path), []
     for k in range(file.count("images", 73)):  # without a name and image points
         file.what = f"image {k + 1}"
         (id,) = file.take("I")
@@ -154,7 +154,7 @@ def _points(
     path: Path, images: set[int]
 ) -> tuple[Int[np.ndarray, " points"], Float[np.ndarray, "points 3"], Source]:
     """Numbers and coordinates of the points; as of the text form."""
-    file, ids, positions = _Bytes(path), [], []
+    file, ids, positions = BinaryFile(path), [], []
     known = np.array(sorted(images), "<u4")
     for k in range(file.count("points", 51)):  # without a track
         file.what = f"point {k + 1}"

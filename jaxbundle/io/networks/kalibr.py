@@ -17,10 +17,11 @@
 
 Camera frames have x right, y down, z forward; the centre of the first pixel is (0, 0). A chain
 becomes one image per camera, taken at one moment by a rig: the first at the origin, looking
-along Z with Y down. Uncoupled cameras (no T_cn_cnm1) form no rig.
+along Z with Y down. Without T_cn_cnm1 the poses follow from those in the body (T_cam_imu, or
+T_imu_cam as of OpenVINS, …). A camera with none of them has no orientation, and is not in the rig.
 A camera with more coefficients than radtan is fitted, with the difference in a message.
 The written mounting is that of the first moment with an image of every camera, or of the
-images if each camera has one. T_cam_imu and time shifts are not read.
+images if each camera has one. Time shifts are not read.
 
 Source: Kalibr's wiki, "yaml formats", "Supported models".
 """
@@ -42,6 +43,7 @@ from jaxbundle.io.networks.losses import describe_losses, need_values, size_of
 from jaxbundle.io.networks.poses import check_rotations, matrices_of
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.json_fields import JsonFields
+from jaxbundle.io.text.known_keys import Keys, UnknownKeys
 from jaxbundle.io.text.rows import join_numbers
 from jaxbundle.io.text.yaml_text import parse_yaml
 from jaxbundle.network.kinds import Rigs
@@ -62,6 +64,39 @@ MODELS: dict[tuple[str, str], tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     ("ds", "none"): ("double-sphere", ("xi", "alpha", *CORE), ()),
 }
 """Our model, intrinsics and coefficients; the first of a model is written."""
+DISTORTION_NAMES = {
+    **dict.fromkeys(("equidistant", "equidist"), "equi"),
+    **dict.fromkeys(("radial-tangential",), "radtan"),
+}
+"""Names in files of other programs."""
+COEFFICIENT_KEYS = ("distortion_coeffs", "distortion_coefficients")
+READ_MODELS = MODELS | {
+    ("pinhole", "plumb_bob"): ("opencv", CORE, (*RADTAN, "k3")),
+    ("pinhole", "rational_polynomial"): ("opencv", CORE, (*RADTAN, "k3", "k4", "k5", "k6")),
+}
+"""Also those of chains that others write, with OpenCV's coefficients."""
+CAMERA_KEY = re.compile(r"cam\d+")
+BODY = {
+    **dict.fromkeys(("T_cam_imu", "T_C_B", "T_cam_body", "T_C_I"), "to camera"),
+    **dict.fromkeys(("T_imu_cam", "T_B_C", "T_BS", "T_body_cam", "T_I_C"), "from camera"),
+}
+"""Names of the transformation between body (IMU) and camera, and its direction."""
+KEYS = Keys(
+    (
+        *("camera_model", "intrinsics", "distortion_model", "distortion_coeffs", "resolution"),
+        *("distortion_coefficients", "T_cn_cnm1", *BODY),
+    ),
+    {
+        "cam_overlaps": "which cameras see the same, a setting of the calibration",
+        "rostopic": "where the images come from",
+        "timeshift_cam_imu": "time between camera and IMU, not of the images",
+        "label": "a name beside cam0",
+        "rate_hz": "how often it takes images",
+    },
+)
+"""Of a camera."""
+FILE = Keys((), {"imu*": "an IMU has no images", "T_imu_body": "where the IMU is in the body"})
+"""Beside the cameras."""
 OFFERED_MODELS = tuple(dict.fromkeys(model for model, *_ in MODELS.values()))
 
 
@@ -70,7 +105,8 @@ def is_kalibr(path: Path) -> bool:
     if path.suffix.lower() not in (".yaml", ".yml"):
         return False
     head = beginning(path, 100_000)
-    return re.search(rb"^cam\d+\s*:", head, re.M) is not None and b"camera_model" in head
+    chain = b"camera_model" in head or b"T_cn_cnm1" in head
+    return re.search(rb"^cam\d+\s*:", head, re.M) is not None and chain
 
 
 def read_kalibr(path: str | Path, overrides: Sequence[str] = ()) -> Network:
@@ -79,38 +115,86 @@ def read_kalibr(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     **Raises:** `InputError` naming file, camera and key.
     """
     path = Path(path)
-    chain = JsonFields(path, {"": parse_yaml(path, read_text(path))}).objects("")
+    unknown = UnknownKeys()
+    document = parse_yaml(path, read_text(path))
+    unknown.check((key for key in document if not CAMERA_KEY.fullmatch(key)), FILE, path)
     chain = {
-        id: JsonFields(f"{path}, {id}", chain[id].document)
+        id: JsonFields(f"{path}, {id}", document[id])
         # by number: cam10 after cam9
-        for id in sorted(chain, key=_number)
-        if re.fullmatch(r"cam\d+", id)
+        for id in sorted(filter(CAMERA_KEY.fullmatch, document), key=_number)
+        if isinstance(document[id], dict)
     }
     if not chain:
         raise InputError(f"{path}: there is no camera cam0")
+    for fields in chain.values():
+        unknown.check(fields.document, KEYS, fields.path)
     cameras = [_camera(id, fields) for id, fields in chain.items()]
-    R, t = np.eye(3), np.zeros(3)
-    poses, mounted, told = [], [], []
-    for k, (id, fields) in enumerate(chain.items()):
-        if k and fields.get("T_cn_cnm1") is not None:
-            T = fields.array("T_cn_cnm1", (4, 4))
-            check_rotations(T[:3, :3], f"{fields.path}: T_cn_cnm1")
-            R, t = T[:3, :3] @ R, T[:3, :3] @ t + T[:3, 3]  # chained: from cam0 to this one
-            mounted.append(id)
-        elif k:
-            R, t = np.eye(3), np.zeros(3)
-        poses.append((R, t))
-    if 0 < len(mounted) < len(chain) - 1:
-        raise InputError(f"{path}: T_cn_cnm1 is missing at some of the cameras")
+    poses, told = _poses(list(chain.values()))
+    return rig_network(
+        path,
+        cameras,
+        [*poses[:, :3, :3]],
+        [*poses[:, :3, 3]],
+        overrides,
+        (*told, *unknown.messages()),
+    )
+
+
+def _poses(chain: Sequence[JsonFields]) -> tuple[Float[np.ndarray, "cameras 4 4"], list[str]]:
+    """From the frame of the first camera to that of each, NaN where the file does not tell; of a
+    single camera from the body. Messages about what is not read."""
+    body = [_body_pose(fields) for fields in chain]
+    poses = np.full((len(chain), 4, 4), np.nan)
+    if len(chain) == 1:
+        poses[0] = np.nan if body[0] is None else body[0]
+        return poses, []
+    poses[0] = np.eye(4)
+    for k, fields in enumerate(chain[1:], 1):
+        # a chain may be broken and go on through the body
+        if fields.get("T_cn_cnm1") is not None:
+            poses[k] = _transform(fields, "T_cn_cnm1") @ poses[k - 1]
+    for k, mine in enumerate(body):
+        known = (
+            (other, poses[j])
+            for j, other in enumerate(body)
+            if other is not None and j != k and np.isfinite(poses[j]).all()
+        )
+        if mine is not None and np.isnan(poses[k]).any():
+            for other, place in known:
+                poses[k] = mine @ np.linalg.inv(other) @ place
+                break
+    for k, fields in enumerate(chain[1:], 1):
+        if fields.get("T_cn_cnm1") is not None and np.isnan(poses[k]).any():
+            poses[k] = _transform(fields, "T_cn_cnm1") @ poses[k - 1]
     unread = [
         key
-        for key in ("T_cam_imu", "T_imu_cam", "timeshift_cam_imu")
-        if any(fields.get(key) is not None for fields in chain.values())
+        for key in (*BODY, "timeshift_cam_imu")
+        if any(fields.get(key) is not None for fields in chain)
     ]
-    if unread:
-        told.append(f"not read: {', '.join(unread)}")
-    turns, shifts = [R for R, _ in poses], [t for _, t in poses]
-    return rig_network(path, cameras, turns, shifts, overrides, bool(mounted), told)
+    told = [
+        f"{chain[0].path}: the frame is that of the first camera; not kept: {', '.join(unread)}"
+    ]
+    return poses, told if unread else []
+
+
+def _body_pose(fields: JsonFields) -> Float[np.ndarray, "4 4"] | None:
+    """From the frame of the body to that of the camera."""
+    key = next((key for key in BODY if fields.get(key) is not None), None)
+    if key is None:
+        return None
+    T = _transform(fields, key)
+    return T if BODY[key] == "to camera" else np.linalg.inv(T)
+
+
+def _transform(fields: JsonFields, key: str) -> Float[np.ndarray, "4 4"]:
+    value = fields.get(key)
+    if isinstance(value, dict):
+        # rows, cols, data, as in EuRoC's files
+        value = JsonFields(f"{fields.path}: {key}", value).array("data", (16,)).reshape(4, 4)
+        value = value.tolist()
+    T = JsonFields(fields.path, {key: value}).array(key, (4, 4))
+    check_rotations(T[:3, :3], f"{fields.path}: {key}")
+    return T
 
 
 def _number(id: str) -> int:
@@ -119,17 +203,20 @@ def _number(id: str) -> int:
 
 
 def _camera(id: str, fields: JsonFields) -> Camera:
-    kind = fields.text("camera_model"), fields.text("distortion_model", "none").lower()
-    kind = kind[0], "equi" if kind[1] == "equidistant" else kind[1]
-    if kind not in MODELS:
-        known = ", ".join("-".join(names) for names in MODELS)
+    kind = fields.text("camera_model", "pinhole"), fields.text("distortion_model", "none").lower()
+    kind = kind[0], DISTORTION_NAMES.get(kind[1], kind[1])
+    if kind not in READ_MODELS:
+        known = ", ".join("-".join(names) for names in READ_MODELS)
         raise InputError(
             f"{fields.path}: camera_model {kind[0]} with distortion_model {kind[1]}; one of "
             f"{known} is expected"
         )
-    model, core, coefficients = MODELS[kind]
+    model, core, coefficients = READ_MODELS[kind]
     values = fields.array("intrinsics", (len(core),))
-    more = fields.array("distortion_coeffs", (len(coefficients),)) if coefficients else ()
+    spelled = next((k for k in COEFFICIENT_KEYS if fields.get(k) is not None), COEFFICIENT_KEYS[0])
+    more = fields.array(spelled, (len(coefficients),)) if coefficients else ()
+    if not coefficients and np.any(fields.get(spelled) or 0):
+        raise InputError(f"{fields.path}: {spelled} of distortion_model none; expected none")
     w, h = fields.array("resolution", (2,))
     size = JsonFields(f"{fields.path}: resolution", {"w": w, "h": h})
     parameters = dict(zip((*core, *coefficients), map(float, (*values, *more))))

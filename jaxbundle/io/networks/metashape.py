@@ -10,9 +10,10 @@
       frames/frame/markers/marker             location camera_id x y [valid]
       settings/property accuracy_markers      default σ of references
 
-The sensors are in `metashape_camera.py`. Cameras that are disabled or not aligned are left out, and
-those of sensors that no model fits (spherical, RPC, of size 0, with a distortion that turns
-back inside the image). A chunk with a transform gives world coordinates (geocentric if it is
+The sensors are in `metashape_camera.py`. Cameras that are disabled or not aligned are left out; if
+none is aligned, those with measured markers are read without orientation. Cameras of sensors that
+no model fits are left out (cylindrical, RPC, of size 0, with a distortion that turns back inside
+the image). A chunk with a transform gives world coordinates (geocentric if it is
 georeferenced), otherwise chunk coordinates.
 
 Markers are points. If their references are in a local coordinate system, three of them or more
@@ -42,18 +43,62 @@ from jaxbundle.io.networks.assemble import (
 )
 from jaxbundle.io.networks.control import with_control
 from jaxbundle.io.networks.metashape_camera import (
+    check_sensor,
     label_of,
     numbers_of,
     sensor_camera,
 )
 from jaxbundle.io.networks.poses import check_rotations
 from jaxbundle.io.networks.settings import choose_datum
+from jaxbundle.io.text.known_keys import Keys, UnknownKeys
 from jaxbundle.io.text.xml_fields import number_in, read_xml
 from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.tables import Network, Points, Source
 from jaxbundle.system.file_content import beginning
 
 LOCAL = "LOCAL_CS"
+UNKNOWN_POSE = np.full((3, 3), np.nan), np.full(3, np.nan)
+DOCUMENT_KEYS = Keys(("chunk", "version"), {"meta": "names and dates"})
+CHUNK_KEYS = Keys(
+    (
+        *("sensors", "cameras", "transform", "components", "reference", "markers", "frames"),
+        *("settings", "label", "enabled"),
+    ),
+    {
+        **dict.fromkeys(("region", "meta", "images", "version"), "the region of interest, names"),
+        **dict.fromkeys(
+            ("depth_maps*", "dense_cloud*", "point_cloud*", "model*", "elevation*", "orthomosaic*",
+             "tiled_model*", "shapes*", "masks*", "thumbnails*", "camera_tracks*", "frame_*"),
+            "products of Metashape in files of their own",
+        ),
+    },
+    {
+        "scalebars": "give distances in a project (distances.csv)",
+        "euler_angles": "references of cameras are not read",
+    },
+)  # fmt: skip
+CAMERA_KEYS = Keys(
+    ("id", "sensor_id", "component_id", "label", "enabled", "transform"),
+    {
+        **dict.fromkeys(
+            ("rotation_covariance", "location_covariance"), "σ that an adjustment gives anew"
+        ),
+        "orientation": "how the photograph is displayed",
+        "master_id": "a rig: every camera has its own transform",
+        **dict.fromkeys(("photo", "property", "meta", "layer_index", "key"), "files and names"),
+    },
+    {
+        "reference": "measured positions and angles; give them as antennas and attitudes",
+        "rolling_shutter": "one pose a photograph is read",
+    },
+)
+MARKER_KEYS = Keys(
+    ("id", "label", "reference", "enabled"),
+    {
+        **dict.fromkeys(("position", "property", "meta", "key", "type"), "names, and the estimate"),
+        "covariance": "σ that an adjustment gives anew",
+    },
+)
 
 
 def is_metashape(path: Path) -> bool:
@@ -70,18 +115,34 @@ def read_metashape(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     **Raises:** `InputError` naming file and element.
     """
     path = Path(path)
-    chunk = _chunk(path)
+    unknown = UnknownKeys()
+    chunk = _chunk(path, unknown)
     sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
     cameras = [camera for camera in chunk.iterfind("cameras//camera")]
+    for camera in cameras:
+        unknown.check_element(camera, CAMERA_KEYS, f"{path}, camera {label_of(camera)!r}")
     used = [c for c in cameras if _true(c.get("enabled")) and c.find("transform") is not None]
-    left = [label_of(c) for c in cameras if c not in used]
+    aligned = bool(used)
+    if not aligned:
+        seen = {e.get("camera_id") for e in chunk.iterfind("frames/frame/markers/marker/location")}
+        used = [c for c in cameras if _true(c.get("enabled")) and c.get("id") in seen]
     if not used:
-        raise InputError(f"{path}: no camera is enabled and aligned")
+        raise InputError(
+            f"{path}: cameras of Metashape before their alignment: no camera is enabled and "
+            "aligned, and none has a measured marker; expected cameras with a <transform>, or "
+            "markers with locations"
+        )
+    left = [label_of(c) for c in cameras if c not in used]
+    for id in dict.fromkeys(camera.get("sensor_id") for camera in used):
+        if id in sensors:
+            where = f"{path}, sensor {label_of(sensors[id])!r}"
+            check_sensor(unknown, sensors[id], where)
     entries, told = _entries(path, sensors, used)
     used = [camera for camera in used if camera.get("sensor_id") in entries]
     labels = unique_labels([label_of(c) for c in used], [c.get("id", "") for c in used])
     poses = [
-        _pose(f"{path}, camera {label!r}", camera, chunk) for label, camera in zip(labels, used)
+        _pose(f"{path}, camera {label!r}", camera, chunk) if aligned else UNKNOWN_POSE
+        for label, camera in zip(labels, used)
     ]
     names = unique_labels([e["id"] for e in entries.values()], list(entries))
     for entry, name in zip(entries.values(), names):
@@ -98,12 +159,15 @@ def read_metashape(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     points, rays, control = _markers(path, chunk, by_id)
     document = foreign_document(path.stem, entries.values(), object_unit="m")
     if left:
-        what = f"left out {count(len(left), 'camera')} that are disabled or not aligned"
+        why = "not aligned" if aligned else "without a measured marker"
+        what = f"left out {count(len(left), 'camera')} that are disabled or {why}"
         told.append(f"{what}: {list_some(left)}")
     network = assemble(path, document, overrides, images, points, rays)
     if control is not None:
         network = with_control(network, control, datum=not choose_datum(overrides))
-    return network.warn(*told, *_about_references(chunk, control))
+    if not aligned:
+        told.append("the cameras are not aligned: orientations and coordinates are computed")
+    return network.warn(*told, *_about_references(chunk, control), *unknown.messages())
 
 
 def _entries(
@@ -133,13 +197,17 @@ def _entries(
     return entries, told
 
 
-def _chunk(path: Path) -> ET.Element:
+def _chunk(path: Path, unknown: UnknownKeys) -> ET.Element:
     root = read_xml(path)
     chunks = root.findall("chunk")
     if root.tag != "document" or len(chunks) != 1:
         raise InputError(
             f"{path}: one <chunk> in a <document> is expected; there are {len(chunks)}"
         )
+    unknown.check_element(root, DOCUMENT_KEYS, path)
+    unknown.check_element(chunks[0], CHUNK_KEYS, path)
+    for marker in chunks[0].iterfind("markers//marker"):
+        unknown.check_element(marker, MARKER_KEYS, f"{path}, marker {label_of(marker)!r}")
     return chunks[0]
 
 

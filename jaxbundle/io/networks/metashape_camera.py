@@ -12,7 +12,9 @@ and p2 are 0, p3 and p4 have no effect),
     fx = f + b1   fy = f   cx_cv = w/2 + cx − ½   cy_cv = h/2 + cy − ½   p1_cv = p2   p2_cv = p1
 
 A fisheye has (x, y) = (X, Y)/√(X² + Y²)·θ, θ the angle to the axis, in the same formula, or
-2·sin(θ/2) for θ (equisolid); the first is exactly `kannala-brandt` if p1 = p2 = b2 = 0. Everything
+2·sin(θ/2) for θ (equisolid); the first is exactly `kannala-brandt` if p1 = p2 = b2 = 0. A spherical
+sensor is `equirectangular` with f = w/(2π). Before an alignment f follows from the focal length and
+the pixel size in mm (`property`). Everything
 else is fitted by the nearest model, with a warning that gives the largest difference.
 
 Old exports (PhotoScan to 1.2) have fx, fy, skew for f, b1, b2, cx and cy from the corner of the
@@ -22,7 +24,6 @@ Source: Agisoft Metashape user manual, appendix "Camera models"; PhotoScan user 
 appendix.
 """
 
-import re
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from functools import partial
@@ -38,6 +39,7 @@ from jaxbundle.cameras.scalars import Scalar
 from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.nearest_camera import Foreign, NoPlaceError, nearest_camera, root
 from jaxbundle.io.networks.assemble import PIXEL_CENTRE
+from jaxbundle.io.text.known_keys import Keys, UnknownKeys
 from jaxbundle.io.text.xml_fields import number_in
 from jaxbundle.network.columns import show
 
@@ -45,11 +47,33 @@ COEFFICIENTS = ("f", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4",
 OLD_COEFFICIENTS = ("fx", "fy", "skew")
 FISHEYE = ("fisheye", "equidistant", "equidistant_fisheye", "equisolid", "equisolid_fisheye")
 TYPES = ("frame", *FISHEYE)
+SPHERICAL = "spherical"
+CALIBRATION_KEYS = Keys(
+    ("resolution", "type", "class", *COEFFICIENTS, *OLD_COEFFICIENTS),
+    {"date": "when it was saved", "label": "the name of the camera"},
+)
+SENSOR_KEYS = Keys(
+    ("id", "label", "type", "resolution", "calibration", "property"),
+    {
+        **dict.fromkeys(
+            ("bands", "data_type", "black_level", "sensitivity", "vignetting", "planes", "meta"),
+            "brightness",
+        ),
+        "covariance": "σ of the calibration, which an adjustment gives anew",
+        **dict.fromkeys(
+            ("master_id", "location", "rotation", "layer_index", "location_covariance",
+             "rotation_covariance", "reference"),
+            "a rig of sensors: every camera has a transform of its own",
+        ),
+    },
+    {"rolling_shutter": "one pose a photograph is read", "film": "fiducial marks are not read",
+     "fiducials": "the image is taken as digital"},
+)  # fmt: skip
 PIXEL = ("pixel_width", "pixel_height")
 
 
 def sensor_camera(path: Path, sensor: ET.Element) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """The entry of a sensor in a document, and warnings about a fit and unknown coefficients.
+    """The entry of a sensor in a document, and warnings about a fit.
 
     **Raises:** `InputError` naming file, sensor and element; `NoPlaceError` for a sensor of
     another kind, of size 0, or that no model fits.
@@ -57,6 +81,9 @@ def sensor_camera(path: Path, sensor: ET.Element) -> tuple[dict[str, Any], tuple
     label = label_of(sensor)
     where = f"{path}, sensor {label!r}"
     kinds = sensor.findall("calibration")
+    if sensor.get("type") == SPHERICAL:
+        return _sphere(where, label, sensor), ()
+    kinds = kinds or _nominal(where, sensor)
     if not kinds:
         raise NoPlaceError(f"{where}: there is no <calibration>")
     calibration = next((c for c in kinds if c.get("class") == "adjusted"), kinds[0])
@@ -65,15 +92,10 @@ def sensor_camera(path: Path, sensor: ET.Element) -> tuple[dict[str, Any], tuple
         if name not in TYPES:
             raise NoPlaceError(
                 f"{where}: sensors of type {show(name)} are not offered; these are: "
-                f"{', '.join(TYPES)}"
+                f"{', '.join((*TYPES, SPHERICAL))}"
             )
-    size = calibration.find("resolution")
-    size = sensor.find("resolution") if size is None else size
-    if size is None:
-        raise InputError(f"{where}: there is no <resolution>")
-    w, h = (number_in(size.get(k, ""), f"{where}, resolution, {k}") for k in ("width", "height"))
-    p, ignored = _coefficients(where, calibration, w, h)
-    told = (f"sensor {label!r}: not known here and not applied: {ignored}",) if ignored else ()
+    w, h = _size(where, sensor if calibration.find("resolution") is None else calibration)
+    p = _coefficients(where, calibration, w, h)
     values = {
         "fx": p["f"] + p["b1"],
         "fy": p["f"],
@@ -95,7 +117,7 @@ def sensor_camera(path: Path, sensor: ET.Element) -> tuple[dict[str, Any], tuple
         rest = {name: p[name] for name in ("p1", "p2", "b2")}
     rest = {name: value for name, value in rest.items() if value != 0}
     if not rest and "equisolid" not in kind:
-        return entry | {"model": "opencv" if kind == "frame" else "kannala-brandt", **values}, told
+        return entry | {"model": "opencv" if kind == "frame" else "kannala-brandt", **values}, ()
     foreign = Foreign(
         FORMULAS[kind],
         p | {"w": w, "h": h},
@@ -107,13 +129,40 @@ def sensor_camera(path: Path, sensor: ET.Element) -> tuple[dict[str, Any], tuple
     found, fit = nearest_camera(foreign, where)
     has = "".join(f"{name} {value:g}, " for name, value in rest.items()).rstrip(", ")
     why = f"has {has}" if has else "is equisolid"
-    return entry | found, (*told, f"sensor {label!r} {why}: {fit}")
+    return entry | found, (f"sensor {label!r} {why}: {fit}",)
 
 
-def _coefficients(
-    where: str, calibration: ET.Element, w: float, h: float
-) -> tuple[dict[str, float], str]:
-    """All coefficients in the current form, and the names of unknown ones that are not 0."""
+def _sphere(where: str, label: str, sensor: ET.Element) -> dict[str, Any]:
+    """u = w/2 + f·atan2(X, Z), v = h/2 + f·atan2(Y, √(X² + Z²)), f = w/(2π)."""
+    w, h = _size(where, sensor)
+    f = w / (2 * np.pi)
+    core = {"fx": f, "fy": f, "cx": w / 2 - PIXEL_CENTRE, "cy": h / 2 - PIXEL_CENTRE}
+    return {"id": label, "image_size": [w, h], "model": "equirectangular", **core}
+
+
+def _nominal(where: str, sensor: ET.Element) -> list[ET.Element]:
+    """The calibration that the properties of a sensor give before an alignment: f from the focal
+    length and the pixel size in mm."""
+    properties = {e.get("name"): e.get("value") for e in sensor.iterfind("property")}
+    pixel = _pixel_size(where, sensor)
+    if pixel is None or not properties.get("focal_length"):
+        return []
+    focal = number_in(properties["focal_length"] or "", f"{where}, focal_length")
+    calibration = ET.Element("calibration", {"class": "initial"})
+    ET.SubElement(calibration, "f").text = repr(focal / pixel[0])
+    return [calibration] if focal > 0 else []
+
+
+def _size(where: str, holder: ET.Element) -> tuple[float, float]:
+    size = holder.find("resolution")
+    if size is None:
+        raise InputError(f"{where}: there is no <resolution>")
+    w, h = (number_in(size.get(k, ""), f"{where}, resolution, {k}") for k in ("width", "height"))
+    return w, h
+
+
+def _coefficients(where: str, calibration: ET.Element, w: float, h: float) -> dict[str, float]:
+    """All coefficients in the current form."""
     tags = [element.tag for element in calibration]
     twice = next((tag for tag in (*COEFFICIENTS, *OLD_COEFFICIENTS) if tags.count(tag) > 1), None)
     if twice:
@@ -121,14 +170,16 @@ def _coefficients(
     values = {
         element.tag: number_in(element.text or "", f"{where}, {element.tag}")
         for element in calibration
-        # k5 and the like are unknown here, but must not be dropped in silence
         if element.tag in (*COEFFICIENTS, *OLD_COEFFICIENTS)
-        or (re.fullmatch(r"[a-z]\d+", element.tag) and not len(element))
     }
     old = "f" not in values and "fy" in values
-    known = {*COEFFICIENTS, *OLD_COEFFICIENTS} - {"f", "b1", "b2"} if old else {*COEFFICIENTS}
-    ignored = [f"{tag} {value:g}" for tag, value in values.items() if tag not in known and value]
-    p = dict.fromkeys(COEFFICIENTS, 0.0) | {k: v for k, v in values.items() if k in known}
+    wrong = ("f", "b1", "b2") if old else OLD_COEFFICIENTS
+    if mixed := [tag for tag in wrong if values.get(tag)]:
+        raise InputError(
+            f"{where}: {', '.join(mixed)} beside {'fy' if old else 'f'}; expected f, b1 and b2, or "
+            "fx, fy and skew"
+        )
+    p = dict.fromkeys(COEFFICIENTS, 0.0) | {k: v for k, v in values.items() if k not in wrong}
     if old:
         fy = p.pop("fy")
         p |= {
@@ -140,7 +191,24 @@ def _coefficients(
             "p1": p["p2"],
             "p2": p["p1"],
         }
-    return p, ", ".join(ignored)
+    return p
+
+
+def check_sensor(unknown: UnknownKeys, sensor: ET.Element, where: str) -> None:
+    """Notice what a sensor has and the reader does not know; coefficients that are 0 do not count.
+
+    **Raises:** `InputError` for what may change the geometry."""
+    unknown.check_element(sensor, SENSOR_KEYS, where)
+    for calibration in sensor.iterfind("calibration"):
+        names = [e.tag for e in calibration if isinstance(e.tag, str) and not _is_zero(e.text)]
+        unknown.check((*names, *calibration.attrib), CALIBRATION_KEYS, where)
+
+
+def _is_zero(text: str | None) -> bool:
+    try:
+        return float(text or "") == 0
+    except ValueError:
+        return False
 
 
 def _pixel_size(where: str, sensor: ET.Element) -> list[float] | None:

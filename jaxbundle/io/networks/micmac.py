@@ -31,6 +31,7 @@ from jaxbundle.io.networks.losses import describe_losses, need_values
 from jaxbundle.io.networks.micmac_camera import C2M, M2C, calibration, calibration_lines, document
 from jaxbundle.io.networks.poses import check_rotations, matrices_of
 from jaxbundle.io.text.csv_tables import write_text
+from jaxbundle.io.text.known_keys import Keys, UnknownKeys
 from jaxbundle.io.text.rows import join_numbers
 from jaxbundle.io.text.xml_fields import XmlFields, read_xml
 from jaxbundle.io.writing.folders import replace_folder
@@ -38,6 +39,24 @@ from jaxbundle.network.tables import Camera, Network, Source
 
 ORIENTATION, CALIBRATION = "Orientation-", "AutoCal_"
 FILES = (f"{ORIENTATION}*.xml", f"{CALIBRATION}*.xml")
+ORIENTATION_KEYS = Keys(
+    (
+        *("OrIntImaM2C", "TypeProj", "FileInterne", "Interne", "Externe", "ConvOri"),
+        "RelativeNameFI",
+    ),
+    {
+        **dict.fromkeys(("Verif", "ZoneUtileInPixel"), "checks by MicMac"),
+        "ControleGPS": "measured positions",
+    },
+)
+EXTERNAL_KEYS = Keys(
+    ("KnownConv", "Centre", "ParamRotation"),
+    {
+        **dict.fromkeys(("AltiSol", "Profondeur", "Time", "VitFiable", "IncCentre"),
+                        "the depth of the scene, the time, and σ"),
+    },
+    {"Vitesse": "one pose a photograph is read"},
+)  # fmt: skip
 IDENTITY = {"I00": (0.0, 0.0), "V10": (1.0, 0.0), "V01": (0.0, 1.0)}
 
 
@@ -57,8 +76,12 @@ def read_micmac(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         raise InputError(f"{path}: there is no {FILES[0]} in it")
     cameras: dict[Path, Camera] = {}
     names, used, rotations, centres = [], [], [], []
+    unknown = UnknownKeys()
     for file in files:
         xml = XmlFields(file, read_xml(file), "an orientation of MicMac")
+        for tag, keys in (("OrientationConique", ORIENTATION_KEYS), ("Externe", EXTERNAL_KEYS)):
+            for part in xml.root.iter(tag):
+                unknown.check_element(part, keys, f"{file}: {tag}")
         where, root = _calibration(file, xml)
         if where not in cameras:
             id = where.stem.removeprefix(CALIBRATION if where != file else ORIENTATION)
@@ -77,7 +100,8 @@ def read_micmac(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         np.array(centres),
     )
     made = foreign_document(path.name, map(entry_of, cameras.values()), object_unit="m")
-    return assemble(path, made, overrides, images, warnings=fit_messages(cameras.values()))
+    told = (*fit_messages(cameras.values()), *unknown.messages())
+    return assemble(path, made, overrides, images, warnings=told)
 
 
 def _calibration(file: Path, xml: XmlFields) -> tuple[Path, ET.Element]:

@@ -1,4 +1,5 @@
-"""Calibrations of MicMac: `AutoCal….xml`, a `CalibrationInternConique`.
+"""Calibrations of MicMac: `AutoCal….xml`, a `CalibrationInternConique`, the root of the document or
+inside `ExportAPERO`.
 
     KnownConv         eConvApero_DistM2C, eConvOriLib: the distortion leads from the world to the
                       camera; eConvApero_DistC2M: from the camera to the world
@@ -40,11 +41,12 @@ from jaxtyping import Float
 from jaxbundle.cameras.inverse import implicit_inverse
 from jaxbundle.cameras.scalars import Formula, Pair, Parameters, Scalar
 from jaxbundle.errors import InputError
-from jaxbundle.io.cameras.nearest_camera import FittedCamera, Foreign, fit_camera
+from jaxbundle.io.cameras.nearest_camera import FittedCamera, Foreign, fit_camera, with_messages
 from jaxbundle.io.networks.assemble import all_parameters
 from jaxbundle.io.networks.losses import check_others_zero, one_focal_length, size_of
 from jaxbundle.io.networks.micmac_unified import unified_camera
 from jaxbundle.io.text.csv_tables import write_text
+from jaxbundle.io.text.known_keys import Keys, UnknownKeys
 from jaxbundle.io.text.xml_fields import XmlFields, number_in, read_xml
 from jaxbundle.network.tables import Camera
 from jaxbundle.system.file_content import beginning
@@ -54,6 +56,26 @@ M2C = ("eConvApero_DistM2C", "eConvOriLib")
 C2M = ("eConvApero_DistC2M",)
 MODELS = ("opencv", "brown-projected", "brown")
 """Models that can be written."""
+KEYS = Keys(
+    ("KnownConv", "PP", "F", "SzIm", "CalibDistortion", "OrIntGlob", "ParamAF"),
+    {
+        **dict.fromkeys(("RayonUtile", "RayonUtileInDMO"), "how far the image is used"),
+        **dict.fromkeys(("ScannedAnalogik", "PixelSzIm"), "the size of its pixels in mm"),
+        "PrecMesh*": "settings of the program",
+    },
+)
+DISTORTION_KEYS = Keys(("ModNoDist", "ModRad", "ModPhgrStd", "ModUnif", "ModGrid", "ModGridDef"))
+INVERSE = {"CoeffDistInv": "the approximate inverse of the same polynomial"}
+SAME_CENTRE = {"PPaEqPPs": "whether CDist equals PP: both are read"}
+RADIAL_KEYS = Keys(("CDist", "CoeffDist"), INVERSE | SAME_CENTRE)
+KIND_KEYS = {
+    "ModNoDist": Keys((), {"Inutile": "always empty"}),
+    "ModRad": RADIAL_KEYS,
+    "RadialePart": RADIAL_KEYS,
+    "ModPhgrStd": Keys(("RadialePart", "P1", "P2", "b1", "b2")),
+    "ModUnif": Keys(("TypeModele", "Params", "Etats")),
+}
+"""Of the parts of a distortion."""
 RADIAL = ("R1", "R2", "R3", "R4", "R5")
 """Coefficients CoeffDist of MicMac's models."""
 AFFINE = ("P1", "P2", "b1", "b2")
@@ -63,7 +85,7 @@ COEFFICIENTS = (*RADIAL, *AFFINE)
 def is_autocal(path: Path) -> bool:
     """Whether an XML file holds a calibration of MicMac."""
     head = beginning(path, 100_000) if path.suffix.lower() == ".xml" else b""
-    return f"<{CALIBRATION}>".encode() in head and b"<OrientationConique>" not in head
+    return f"<{CALIBRATION}".encode() in head and b"<OrientationConique>" not in head
 
 
 def read_autocal(path: str | Path) -> Camera:
@@ -82,10 +104,37 @@ def calibration(path: Path, root: ET.Element, id: str, pixel_size: float = 0.005
     same image; 5 µm is a common one, so that c in mm looks like that of a lens.
     """
     whole = XmlFields(path, root, "a calibration of MicMac")
-    found = whole.find(CALIBRATION)
+    # Tapas writes it inside <ExportAPERO>, other tools as the root
+    found = root if root.tag == CALIBRATION else whole.find(CALIBRATION)
     if found is None:
         raise whole.missing(CALIBRATION)
     xml = XmlFields(path, found, "a calibration of MicMac")
+    unknown = UnknownKeys()
+    _check_keys(unknown, path, found)
+    camera = _calibrated(path, xml, id, pixel_size)
+    return with_messages(camera, *unknown.messages())
+
+
+def _check_keys(unknown: UnknownKeys, path: Path, found: ET.Element) -> None:
+    unknown.check_element(found, KEYS, f"{path}: {CALIBRATION}")
+    if any(float(e.text or 0) for e in found.iter("ParamAF") if _is_number(e.text)):
+        raise InputError(f"{path}: ParamAF, an afocal system, is not supported")
+    for distortion in found.iter("CalibDistortion"):
+        unknown.check_element(distortion, DISTORTION_KEYS, f"{path}: CalibDistortion")
+        for tag, keys in KIND_KEYS.items():
+            for part in distortion.iter(tag):
+                unknown.check_element(part, keys, f"{path}: {tag}")
+
+
+def _is_number(text: str | None) -> bool:
+    try:
+        float(text or "")
+    except ValueError:
+        return False
+    return True
+
+
+def _calibrated(path: Path, xml: XmlFields, id: str, pixel_size: float) -> Camera:
     direction = xml.text("KnownConv", M2C[0])
     if direction not in (*M2C, *C2M):
         known = ", ".join((*M2C, *C2M))

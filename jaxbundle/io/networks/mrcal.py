@@ -57,6 +57,7 @@ from jaxbundle.io.networks.poses import (
 )
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.json_fields import JsonFields
+from jaxbundle.io.text.known_keys import Keys, UnknownKeys
 from jaxbundle.io.text.rows import join_numbers
 from jaxbundle.io.writing.folders import replace_folder
 from jaxbundle.network.rules import model_of
@@ -77,6 +78,16 @@ MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
 CAHVOR = ("alpha", "beta", "r0", "r1", "r2")
 SPLINE = re.compile(r"SPLINED_STEREOGRAPHIC_order=3_Nx=(\d+)_Ny=(\d+)_fov_x_deg=(\d+(?:\.\d+)?)")
 OUR_SPLINE = re.compile(r"spline-(\d+)x(\d+)-(\d+(?:\.\d+)?)")
+KEYS = Keys(
+    ("lensmodel", "intrinsics", "extrinsics", "rt_cam_ref", "imagersize"),
+    {
+        **dict.fromkeys(
+            ("valid_intrinsics_region", "icam_intrinsics", "icam_intrinsics_exact",
+             "icam_extrinsics", "optimization_inputs", "optimization_inputs_hash"),
+            "where the calibration is good, and how it was made",
+        ),
+    },
+)  # fmt: skip
 OFFERED_MODELS = (*dict.fromkeys(model for model, _ in MODELS.values()), "spline-*")
 
 
@@ -97,6 +108,9 @@ def read_mrcal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     if not files:
         raise InputError(f"{path}: there is no {FILES[0]} in it")
     models = {file.stem: _fields(file) for file in files}
+    unknown = UnknownKeys()
+    for fields in models.values():
+        unknown.check(fields.document, KEYS, fields.path)
     cameras = [_camera(id, fields) for id, fields in models.items()]
     rt = np.array(
         [
@@ -112,7 +126,7 @@ def read_mrcal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         foreign_document(path.stem, map(entry_of, cameras), object_unit="m"),
         overrides,
         image_columns(Source(str(path), None, "file"), list(models), list(models), M, X0),
-        warnings=fit_messages(cameras),
+        warnings=(*fit_messages(cameras), *unknown.messages()),
     )
 
 

@@ -31,7 +31,7 @@ Source: openMVG documentation, "SfM_Data", "cameras"; the serialisation of its c
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +58,7 @@ from jaxbundle.io.networks.poses import check_rotations, matrices_of
 from jaxbundle.io.networks.settings import choose_datum
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.json_fields import JsonFields, read_object, stack_rows
+from jaxbundle.io.text.known_keys import Keys, UnknownKeys
 from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.tables import Camera, Network, Points, Source
 from jaxbundle.system.file_content import beginning
@@ -71,6 +72,23 @@ KINDS = {
 }
 """Our model, the field of the coefficients, and their names here."""
 SPHERICAL = "spherical"
+SCENE_KEYS = Keys(
+    ("sfm_data_version", "views", "intrinsics", "extrinsics", "structure", "control_points"),
+    {"root_path": "where the images are"},
+)
+VIEW_KEYS = Keys(
+    ("local_path", "filename", "width", "height", "id_view", "id_intrinsic", "id_pose", "value0"),
+    {"use_pose_*": "told where it is used", "center*": "the same", "rotation*": "the same"},
+)
+INTRINSIC_KEYS = Keys(
+    (
+        *("width", "height", "focal_length", "principal_point", "value0"),
+        *filter(None, (field for _, field, _ in KINDS.values())),
+    )
+)
+POSE_KEYS = Keys(("rotation", "center"))
+POINT_KEYS = Keys(("X", "observations"))
+RAY_KEYS = Keys(("id_feat", "x"))
 MIRROR = np.array([1.0, -1.0, 1.0])
 UNDEFINED_INDEX = 2**32 - 1
 """Index of a missing entry, the largest of 32 bits (openMVG, `types.hpp`, UndefinedIndexT)."""
@@ -97,6 +115,8 @@ def read_openmvg(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     path = Path(path)
     scene = JsonFields(path, read_object(path, read_text(path), "openMVG's scene"))
     scene.text("sfm_data_version")
+    unknown = UnknownKeys()
+    _check_keys(scene, unknown)
     cameras, spherical = _cameras(scene)
     mirror = MIRROR if spherical and not cameras else np.ones(3)
     if spherical and not cameras:
@@ -129,7 +149,7 @@ def read_openmvg(path: str | Path, overrides: Sequence[str] = ()) -> Network:
             },
             Source(str(path), None, "observation"),
         ),
-        _describe_unread(views, left, lost, mirror is MIRROR),
+        (*_describe_unread(views, left, lost, mirror is MIRROR), *unknown.messages()),
     )
     if not control or not len(network.points):
         return network
@@ -139,6 +159,32 @@ def read_openmvg(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     source = Source(str(path), None, "control point")
     table = Points(tuple(names.values()), ("control",) * len(control), X, unknown, source)
     return with_control(network, table, datum=not choose_datum(overrides))
+
+
+def _check_keys(scene: JsonFields, unknown: UnknownKeys) -> None:
+    """Notice what the reader does not know.
+
+    **Raises:** `InputError` for what may change the geometry."""
+    unknown.check(scene.document, SCENE_KEYS, scene.path)
+    for name, keys in (("views", VIEW_KEYS), ("intrinsics", INTRINSIC_KEYS)):
+        for value in _entries(scene, name).values():
+            data = _data(value)
+            unknown.check(data.document, keys, data.path)
+    for pose in _entries(scene, "extrinsics").values():
+        unknown.check(pose.document, POSE_KEYS, pose.path)
+    # millions of points and image points: plain dictionaries, looked at once
+    for name in ("structure", "control_points"):
+        for value in _plain_values(scene.get(name)):
+            unknown.check(value, POINT_KEYS, f"{scene.path}, {name}")
+            for ray in _plain_values(value.get("observations")):
+                unknown.check(ray, RAY_KEYS, f"{scene.path}, {name}, observations")
+
+
+def _plain_values(rows: Any) -> Iterator[dict[str, Any]]:
+    """The values of rows of keys and values; what is none is reported by its reader."""
+    for row in rows if isinstance(rows, list) else ():
+        if isinstance(row, dict) and isinstance(row.get("value"), dict):
+            yield row["value"]
 
 
 def _describe_unread(

@@ -1,4 +1,5 @@
-"""Reconstructions of OpenSfM: `reconstruction.json`, with `tracks.csv` and `reference_lla.json`.
+"""Reconstructions of OpenSfM: `reconstruction.json`, with `tracks.csv`, `reference_lla.json` and
+`ground_control_points.json` (`opensfm_control`).
 
     [{"cameras": {id: {projection_type, width, height, …}},
       "shots": {image: {camera, rotation, translation, gps_position, gps_dop}},
@@ -25,6 +26,7 @@ Source: OpenSfM documentation, "Geometric Models", "Dataset Structure"; its form
 the tangential part, where the page has 2x, 2y.
 """
 
+import dataclasses
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -44,8 +46,10 @@ from jaxbundle.io.cameras.nearest_camera import (
     fit_camera,
     fit_messages,
     root,
+    with_messages,
 )
 from jaxbundle.io.networks.assemble import assemble, entry_of, foreign_document, image_columns
+from jaxbundle.io.networks.control import with_control
 from jaxbundle.io.networks.losses import (
     GREY,
     check_others_zero,
@@ -54,13 +58,16 @@ from jaxbundle.io.networks.losses import (
     one_focal_length,
     size_of,
 )
+from jaxbundle.io.networks.opensfm_control import CONTROL, GroundControl, read_ground_control
 from jaxbundle.io.networks.poses import (
     matrices_of,
     matrices_of_rotation_vectors,
     rotation_vectors_of,
 )
+from jaxbundle.io.networks.settings import choose_datum
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.json_fields import JsonFields, read_object, stack_rows
+from jaxbundle.io.text.known_keys import Keys, UnknownKeys
 from jaxbundle.io.text.rows import TextRows
 from jaxbundle.io.writing.folders import replace_folder
 from jaxbundle.network.columns import Columns, count, list_some
@@ -89,6 +96,47 @@ KINDS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
 }
 """Our model, focal lengths, coefficients."""
 PRISM = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s0", "s1", "s2", "s3")
+CAMERA_KEYS = Keys(
+    (
+        *("projection_type", "width", "height", "focal", "focal_x", "focal_y", "c_x", "c_y"),
+        *(*PRISM, "transition", "aspect_ratio"),
+    ),
+    {
+        "*_prior": "start values of a reconstruction",
+        "*_sigma": "of the start values",
+        **dict.fromkeys(("focal_ratio", "name", "make", "model", "rig*"), "names of the camera"),
+    },
+)
+SHOT_KEYS = Keys(
+    ("camera", "rotation", "translation", "gps_position", "gps_dop"),
+    {
+        "orientation": "how the photograph is displayed",
+        **dict.fromkeys(
+            ("capture_time", "vertices", "faces", "merge_cc", "skey", "is_interpolated", "color",
+             "name", "exif*"),
+            "time, mesh and names",
+        ),
+        **dict.fromkeys(
+            ("rig_camera_id", "rig_instance_id", "covariance", "scale"),
+            "every shot has its own pose",
+        ),
+        **dict.fromkeys(
+            ("compass", "opk*", "gravity*", "accelerometer"), "measured angles of the start",
+        ),
+    },
+)  # fmt: skip
+POINT_KEYS = Keys(
+    ("coordinates",),
+    dict.fromkeys(("color", "reprojection_errors", "reprojection_error", "rig*"), "colours"),
+)
+SCENE_KEYS = Keys(
+    ("cameras", "shots", "points"),
+    {
+        **dict.fromkeys(("biases", "rig_cameras", "rig_instances", "main_shots", "pano_shots"),
+                        "every shot has its own pose"),
+        "reference_lla": "as in its own file",
+    },
+)  # fmt: skip
 FITTED_KINDS = ("fisheye62", "fisheye624", "dual")
 SPHERICAL = ("spherical", "equirectangular")
 
@@ -106,8 +154,12 @@ def is_opensfm_cameras(path: Path) -> bool:
 
 
 def _has_cameras(path: Path, begin: bytes) -> bool:
-    head = beginning(path, 100_000).lstrip() if path.suffix.lower() == ".json" else b""
-    return head.startswith(begin) and b'"projection_type"' in head
+    head = beginning(path, 1_000_000).lstrip() if path.suffix.lower() == ".json" else b""
+    if not head.startswith(begin) or b'"transform_matrix"' in head or b'"viewId"' in head:
+        return False
+    # models of 2015 and before have no projection_type: all were perspective
+    old = b'"focal_prior"' in head or (begin == b"[" and b'"shots"' in head)
+    return b'"projection_type"' in head or old
 
 
 def read_opensfm_cameras(path: str | Path) -> tuple[Camera, ...]:
@@ -117,7 +169,12 @@ def read_opensfm_cameras(path: str | Path) -> tuple[Camera, ...]:
     """
     path = Path(path)
     document = JsonFields(path, {"": read_object(path, read_text(path), "OpenSfM's cameras")})
-    return tuple(_camera(id, fields) for id, fields in document.objects("").items())
+    unknown = UnknownKeys()
+    cameras = []
+    for id, fields in document.objects("").items():
+        unknown.check(fields.document, CAMERA_KEYS, fields.path)
+        cameras.append(_camera(id, fields))
+    return tuple(with_messages(camera, *unknown.messages()) for camera in cameras)
 
 
 def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
@@ -131,9 +188,14 @@ def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     path = Path(path)
     file = path / RECONSTRUCTION if path.is_dir() else path
     scene, told = _largest(file)
+    unknown = UnknownKeys()
+    unknown.check(scene.document, SCENE_KEYS, file)
+    for fields in scene.objects("cameras").values():
+        unknown.check(fields.document, CAMERA_KEYS, fields.path)
     cameras, refused = _cameras(scene)
     shots, lost = {}, []
     for id, shot in scene.objects("shots").items():
+        unknown.check(shot.document, SHOT_KEYS, shot.path)
         camera = shot.text("camera")
         if camera in cameras:
             shots[id] = shot
@@ -148,6 +210,8 @@ def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         told.append(f"{why}; left out {count(len(lost), 'shot')}: {list_some(lost)}")
     gps = _positions(shots)
     points = scene.objects("points")
+    for point in points.values():
+        unknown.check(point.document, POINT_KEYS, point.path)
     at = stack_rows(
         [p.get("coordinates") for p in points.values()],
         3,
@@ -156,6 +220,12 @@ def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     rays, missing = _tracks(file.parent / TRACKS, cameras, shots, points)
     if missing:
         told.append(f"left out {count(missing, 'image point')} of tracks that have no point")
+    names, control = list(points), None
+    if (file.parent / CONTROL).is_file():
+        used = {id: cameras[shot.text("camera")] for id, shot in shots.items()}
+        control = read_ground_control(file.parent / CONTROL, file.parent / REFERENCE, used)
+        told += control.messages
+        names, at, rays = _add_control(file, control, names, at, rays)
     if (file.parent / REFERENCE).is_file():
         told.append(_reference(file.parent / REFERENCE))
     datum = {"datum": "control"} if gps else {}
@@ -167,13 +237,42 @@ def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         overrides,
         _images(file, shots),
         Columns(
-            {"id": list(points), "role": ["tie"] * len(points), **dict(zip("XYZ", at.T))},
+            {"id": names, "role": ["tie"] * len(names), **dict(zip("XYZ", at.T))},
             Source(str(file), None, "point"),
         ),
         rays,
-        (*told, *fit_messages(cameras.values())),
+        (*told, *fit_messages(cameras.values()), *unknown.messages()),
     )
-    return network.replace(further=gps)
+    network = network.replace(further=gps)
+    if control is None or control.points is None or not len(network.points):
+        return network
+    return with_control(network, control.points, datum=not choose_datum(overrides))
+
+
+def _add_control(
+    file: Path,
+    control: GroundControl,
+    names: Sequence[str],
+    at: Float[np.ndarray, "n 3"],
+    rays: Columns | None,
+) -> tuple[list[str], Float[np.ndarray, "m 3"], Columns]:
+    """Points and image points with those of ground control.
+
+    **Raises:** `InputError` for a control point called as a tie point."""
+    added = [*(control.points.id if control.points else ()), *control.unknown]
+    if twice := next((id for id in added if id in {*names}), None):
+        raise InputError(f"{file.parent / CONTROL}: {twice!r} is also a point of {file.name}")
+    columns: dict[str, list] = {}
+    for k, name in enumerate(("image", "point", "x", "y")):
+        tracked = () if rays is None else rays.values[name]
+        columns[name] = [*tracked, *(row[k] for row in control.rays)]
+    unknown = np.full((len(added), 3), np.nan)
+    source = Source(str(file.parent / CONTROL), None, "observation")
+    if rays is not None and rays.source.numbers is not None:
+        # lines of the tracks; the image points of control have none
+        lines = np.r_[rays.source.numbers, np.zeros(len(control.rays), np.int64)]
+        source = dataclasses.replace(rays.source, numbers=lines)
+    return [*names, *added], np.concatenate([at, unknown]), Columns(columns, source)
 
 
 def _largest(file: Path) -> tuple[JsonFields, list[str]]:

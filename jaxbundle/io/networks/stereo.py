@@ -23,7 +23,7 @@ Source: OpenCV 4 documentation, calib3d; ROS, sensor_msgs/CameraInfo.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,8 +31,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.errors import InputError
+from jaxbundle.io.cameras.nearest_camera import fit_messages
 from jaxbundle.io.cameras.opencv_file import (
-    SUFFIXES,
     YAML,
     file_text,
     matrix_in,
@@ -41,6 +41,7 @@ from jaxbundle.io.cameras.opencv_file import (
     read_opencv,
     ros_text,
 )
+from jaxbundle.io.cameras.ros_ini import is_ros_ini_pair, read_ros_sections
 from jaxbundle.io.networks.assemble import all_parameters, rig_network
 from jaxbundle.io.networks.kalibr import mountings_of
 from jaxbundle.io.networks.losses import describe_losses, size_of
@@ -51,14 +52,10 @@ from jaxbundle.network.tables import Camera, Network
 from jaxbundle.system.file_content import beginning
 
 ROS_FILES = ("*.yaml", "*/*.yaml")
+RECTIFIED_ENTRIES = "rectification_matrix", "projection_matrix"
 FISHEYE_ENTRIES = "fisheye_model", "distortion_model"
-NAMES = (
-    ("M1", "D1", "M2", "D2"),
-    ("K1", "D1", "K2", "D2"),
-    ("cameraMatrix1", "distCoeffs1", "cameraMatrix2", "distCoeffs2"),
-    ("camera_matrix_1", "dist_coeffs_1", "camera_matrix_2", "dist_coeffs_2"),
-)
-"""Names of matrices and coefficients; the first are written."""
+NAMES = ("M1", "D1", "M2", "D2")
+"""Written names of matrices and coefficients; read ones are in `opencv_rigs`."""
 
 
 class Rectification(NamedTuple):
@@ -211,45 +208,12 @@ def _stereo_entries(pair: StereoPair) -> dict[str, Any]:
     entries: dict[str, Any] = {}
     for k, camera in enumerate(pair.cameras, 1):
         own = opencv_entries(camera)
-        names = NAMES[0][2 * k - 2 : 2 * k]
+        names = NAMES[2 * k - 2 : 2 * k]
         w, h = size_of(camera, "OpenCV")
         entries |= {f"image_width_{k}": w, f"image_height_{k}": h, f"camera_name_{k}": camera.id}
         entries |= dict(zip(names, (own["camera_matrix"], own["distortion_coefficients"])))
         entries |= {name: own[name] for name in FISHEYE_ENTRIES if name in own}
     return entries | {"R": (3, 3, pair.R.ravel()), "T": (3, 1, pair.T)}
-
-
-def is_opencv_stereo(path: Path) -> bool:
-    """Whether a YAML or JSON file has R, T and two camera matrices."""
-    text = beginning(path, 1_000_000) if path.suffix.lower() in SUFFIXES else b""
-    has = lambda name: re.search(rb"^[\s{]*\"?%s\"?\s*:" % name.encode(), text, re.M) is not None
-    return has("R") and has("T") and any(has(row[0]) and has(row[2]) for row in NAMES)
-
-
-def read_opencv_stereo(path: str | Path, overrides: Sequence[str] = ()) -> Network:
-    """Both cameras of a stereo file, on one mounting; nothing can be adjusted.
-
-    **Raises:** `InputError` naming file and entry.
-    """
-    path = Path(path)
-    entries = read_entries(path)
-    names = next((row for row in NAMES if row[0] in entries and row[2] in entries), NAMES[0])
-    cameras = []
-    for k in (1, 2):
-        matrix, coefficients = names[2 * k - 2 : 2 * k]
-        own = {name: entries[name] for name in FISHEYE_ENTRIES if name in entries}
-        for size in ("image_width", "image_height"):
-            if (value := entries.get(f"{size}_{k}", entries.get(size))) is not None:
-                own[size] = value
-        own |= {"camera_matrix": entries.get(matrix)}
-        if coefficients in entries:
-            own["distortion_coefficients"] = entries[coefficients]
-        id = entries.get(f"camera_name_{k}", ("left", "right")[k - 1])
-        cameras.append(read_opencv(path, own, str(id)))
-    R = matrix_in(path, entries, ("R",), (3, 3))
-    T = matrix_in(path, entries, ("T",), (3, 1))[:, 0]
-    check_rotations(R, f"{path}: R")
-    return rig_network(path, cameras, [np.eye(3), R], [np.zeros(3), T], overrides)
 
 
 def ros_stereo_folders(network: Network, folder: Path) -> tuple[Path, ...]:
@@ -284,8 +248,11 @@ def fill_ros_stereo(network: Network, folder: Path) -> tuple[str, ...]:
 
 
 def is_ros_stereo(path: Path) -> bool:
-    """Whether a folder has two YAML files, each with a projection_matrix."""
-    files = _yaml_files(path) if path.is_dir() else []
+    """Whether a folder has two YAML files, each with a projection_matrix, or a text of
+    camera_calibration has two cameras."""
+    if not path.is_dir():
+        return is_ros_ini_pair(path)
+    files = _yaml_files(path)
     return len(files) == 2 and all(b"projection_matrix" in beginning(p, 100_000) for p in files)
 
 
@@ -293,24 +260,38 @@ def _yaml_files(folder: Path) -> list[Path]:
     return sorted(p for p in folder.iterdir() if p.suffix.lower() in YAML)
 
 
+def _rectified_cameras(path: Path) -> Iterator[tuple[str, Camera, Mapping[str, Any]]]:
+    """Places, cameras, and the entries that have R and P."""
+    if not path.is_dir():
+        for camera, section in read_ros_sections(path):
+            names = dict(zip(RECTIFIED_ENTRIES, ("rectification", "projection")))
+            entries = {key: section[name] for key, name in names.items() if name in section}
+            yield f"{path}, [{camera.id}]", camera, entries
+        return
+    for file in _yaml_files(path):
+        entries = read_entries(file)
+        name = entries.get("camera_name")
+        yield str(file), read_opencv(file, entries, str(name or file.stem)), entries
+
+
 def read_ros_stereo(path: str | Path, overrides: Sequence[str] = ()) -> Network:
-    """Both cameras of a folder of camera_info files; the first is the one whose projection has no
-    shift. Nothing can be adjusted.
+    """Both cameras of a folder of camera_info files, or of `ost.ini`; the first is the one whose
+    projection has no shift. Nothing can be adjusted.
 
     **Raises:** `InputError` naming file and entry.
     """
     path = Path(path)
     parts = []
-    for file in _yaml_files(path):
-        entries = read_entries(file)
-        R = matrix_in(file, entries, ("rectification_matrix", "R"), (3, 3))
-        P = matrix_in(file, entries, ("projection_matrix", "P"), (3, 4))
-        check_rotations(R, f"{file}: rectification_matrix")
+    for where, camera, entries in _rectified_cameras(path):
+        R = matrix_in(where, entries, (RECTIFIED_ENTRIES[0], "R"), (3, 3))
+        P = matrix_in(where, entries, (RECTIFIED_ENTRIES[1], "P"), (3, 4))
+        check_rotations(R, f"{where}: rectification_matrix")
         if P[0, 0] == 0 or P[1, 1] == 0:
-            raise InputError(f"{file}: projection_matrix has no focal length")
+            raise InputError(f"{where}: projection_matrix has no focal length")
         shift = np.array([P[0, 3] / P[0, 0], P[1, 3] / P[1, 1], 0.0])
-        name = entries.get("camera_name")
-        parts.append((read_opencv(file, entries, str(name or file.stem)), R, shift))
+        parts.append((camera, R, shift))
+    if len(parts) != 2:
+        raise InputError(f"{path}: {len(parts)} cameras; expected two")
     # the one without a shift is the first, whatever the files are called
     parts.sort(key=lambda part: bool(part[2].any()))
     (left, R1, none), (right, R2, shift) = parts
@@ -319,6 +300,5 @@ def read_ros_stereo(path: str | Path, overrides: Sequence[str] = ()) -> Network:
             f"{path}: expected the projection_matrix of one camera with and of the other without "
             f"a shift in its last column, got {'two' if none.any() else 'none'} with"
         )
-    return rig_network(
-        path, [left, right], [np.eye(3), R2.T @ R1], [np.zeros(3), R2.T @ shift], overrides
-    )
+    turns, shifts = [np.eye(3), R2.T @ R1], [np.zeros(3), R2.T @ shift]
+    return rig_network(path, [left, right], turns, shifts, overrides, fit_messages([left, right]))

@@ -11,7 +11,7 @@ fl_x, and cx, cy the image centre if not given. k4 of OPENCV is the coefficient 
 model does not have: if it is not 0 the nearest camera is fitted. `is_fisheye` of instant-ngp is
 OPENCV_FISHEYE. The point cloud (`ply_file_path`), masks and depths are not read. Coordinates are
 those of the file: earlier transformations (`applied_transform`, `scale`, `offset`) are not
-undone.
+undone. Without fl_y and camera_angle_y pixels are square.
 
 Source: nerfstudio documentation, "Data conventions"; instant-ngp, "Tips for training NeRF models".
 """
@@ -40,6 +40,7 @@ from jaxbundle.io.networks.losses import check_others_zero, describe_losses, nee
 from jaxbundle.io.networks.poses import check_rotations, matrices_of
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.json_fields import JsonFields, read_object
+from jaxbundle.io.text.known_keys import Keys, UnknownKeys
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import Camera, Network, Source
 from jaxbundle.system.file_content import beginning
@@ -54,7 +55,42 @@ INTRINSICS = (
     *("camera_model", "is_fisheye", "camera_angle_x", "camera_angle_y", "fl_x", "fl_y"),
     *("cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2"),
 )
-APPLIED_TRANSFORMATIONS = ("applied_transform", "applied_scale", "scale", "offset")
+TRAINING = "how a field is trained and displayed"
+KEYS = Keys(
+    ("frames", *INTRINSICS),
+    {
+        **dict.fromkeys(
+            ("aabb_scale", "aabb", "render_aabb*", "up", "n_frames", "sharpness*", "white_*",
+             "black_*", "bg_color*", "envmap", "from_na", "from_mitsuba", "enable_depth_loading",
+             "integer_depth_scale", "depth_unit_scale_factor", "near", "far", "*_filenames",
+             "centroid", "avglen", "totw", "hdr", "sun_*", "time*", "fps", "num_frames", "wave*",
+             "background*", "bounding_box*", "scene_box", "comment*", "version", "crop_box*"),
+            TRAINING,
+        ),
+        **dict.fromkeys(("ply_file_path", "orientation_override", "auto_scale_poses_override"),
+                        "the point cloud, and what nerfstudio does with the frames"),
+    },
+    {
+        **dict.fromkeys(
+            ("applied_transform", "applied_scale", "scale", "offset", "applied_offset"),
+            "coordinates are those of the file",
+        ),
+        "rolling_shutter": "one pose a frame is read",
+    },
+)  # fmt: skip
+FRAME_KEYS = Keys(
+    ("file_path", "transform_matrix", *INTRINSICS),
+    dict.fromkeys(
+        ("sharpness", "mask_path", "depth_file_path", "*_path", "colmap_im_id", "colmap_id",
+         "rotation", "time*", "timestamp*", "bg_color", "split", "light*", "exposure*", "*_id",
+         "id", "near", "far", "frame*", "name", "image_name", "motion_mask*", "depth_scale", "hdr"),
+        TRAINING,
+    ),
+    {"rolling_shutter": "one pose a frame is read",
+     "transform_matrix_start": "one pose a frame is read",
+     "transform_matrix_end": "one pose a frame is read"},
+)  # fmt: skip
+"""`rotation` is the step of Blender's turntable, in `transforms_train.json`."""
 
 
 def is_transforms(path: Path) -> bool:
@@ -63,19 +99,29 @@ def is_transforms(path: Path) -> bool:
     return b'"transform_matrix"' in head and b'"frames"' in head
 
 
-def read_transforms(path: str | Path, overrides: Sequence[str] = ()) -> Network:
+def read_transforms(
+    path: str | Path,
+    overrides: Sequence[str] = (),
+    *,
+    image_size: Sequence[float] | None = None,
+) -> Network:
     """The cameras and images of a file; frames with the same intrinsics share a camera.
 
-    Nothing can be adjusted: there are no image points.
+    Nothing can be adjusted: there are no image points. `image_size`: of cameras without w and h.
 
     **Raises:** `InputError` naming file, frame and field.
     """
     path = Path(path)
     file = JsonFields(path, read_object(path, read_text(path), "transforms"))
+    unknown = UnknownKeys()
+    unknown.check(file.document, KEYS, path)
+    if image_size is not None and file.get("w") is None and file.get("h") is None:
+        file.document |= dict(zip("wh", image_size))
     cameras: dict[str, Camera] = {}
     names, used, M, X0, lost = [], [], [], [], []
     why = None
     for frame in file.rows("frames"):
+        unknown.check(frame.document, FRAME_KEYS, frame.path)
         name, fields = frame.text("file_path"), _intrinsics(file, frame)
         # frames may repeat the intrinsics, in any order of the keys
         key = json.dumps(fields.document, sort_keys=True)
@@ -100,9 +146,7 @@ def read_transforms(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     if twice:
         raise InputError(f"{path}: two frames have the file_path {twice!r}")
     told = [f"{why}; left out {count(len(lost), 'frame')}: {list_some(lost)}"] if lost else []
-    undone = [name for name in APPLIED_TRANSFORMATIONS if file.get(name) is not None]
-    if undone:
-        told.append(f"coordinates are those of the file; not undone: {', '.join(undone)}")
+    told += unknown.messages()
     images = image_columns(Source(str(path), None, "frame"), names, used, np.array(M), np.array(X0))
     document = foreign_document(path.stem, map(entry_of, cameras.values()))
     return assemble(
@@ -155,7 +199,10 @@ def _focal_length(fields: JsonFields, axis: str, size: int | None, other: float 
     """Focal length along an axis: given, from the angle of view, or that of the other axis."""
     if fields.get(f"fl_{axis}") is None and fields.get(f"camera_angle_{axis}") is not None:
         if size is None:
-            raise InputError(f"{fields.path}: w and h are missing, which camera_angle_{axis} needs")
+            raise InputError(
+                f"{fields.path}: w and h are missing, which camera_angle_{axis} needs; expected "
+                "them in the file, or --image-size W,H (convert, camera)"
+            )
         return size / 2 / np.tan(fields.number(f"camera_angle_{axis}") / 2)
     return fields.number(f"fl_{axis}", other)
 

@@ -1,180 +1,191 @@
-"""The part of YAML that calibration files use, read into dictionaries, lists, numbers and texts.
+"""YAML documents, by PyYAML: dictionaries, lists, numbers and texts.
 
-Blocks of keys and of lists by indentation, lists in brackets (over several lines too), texts with
-and without quotes, numbers, true, false, null, comments. Tags (`!!opencv-matrix`), the `%YAML` line
-and `---` are skipped. Dictionaries in braces, anchors, texts over several lines, and a second
-document are refused by name; or read as None in files with many unused entries.
+The types are those of YAML 1.2 (core schema), which calibration files mean: `1e-3` is a number;
+`on`, `010` and `2020-01-01` are no Booleans, octal numbers and dates as in YAML 1.1. Tags of
+programs (`!!opencv-matrix`, `!!python/tuple`) are dropped, their content is read. OpenCV writes
+`%YAML:1.0` for `%YAML 1.0`, and reads `key:1`.
 
-Source: YAML 1.2, the chapters on block and flow collections.
+A document is looked through as a stream of events before it is built: levels of nesting, what
+aliases unfold to, a second document.
+
+Source: YAML 1.2.2, chapter 10.3 "Core Schema"; OpenCV 4 documentation, XML/YAML/JSON file storages.
 """
 
 import re
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import show
+from jaxbundle.system.file_content import DEEPEST_NESTING, LARGEST_INTEGER, TOO_LARGE
 
-MAX_NESTING = 32
-"""Levels of blocks and of brackets: calibration files have four; Python's own limit, a thousand
-calls, would be reached at some 300 levels and end in a RecursionError."""
-KEY = re.compile(r"""("[^"]*"|'[^']*'|[^\s\[\]{},"'#&*!|>%@-][^\s:]*|-[^\s:]+)\s*:(?:\s+(.*))?""")
-NUMBER = re.compile(r"[-+]?(\d{1,300}\.?\d*|\.\d+)([eE][-+]?\d{1,4})?")
-COMMENT = re.compile(r"""((?:"[^"]*"|'[^']*'|[^"'#]|(?<=\S)#)*)(?:(?:^|(?<=\s))#.*)?""")
-TAG = re.compile(r"!\S*\s*")
-OPEN_BRACKET, CLOSE_BRACKET = re.compile(r"[\[{]"), re.compile(r"[\]}]")
-WORDS = {"true": True, "false": False, "null": None, "~": None, "": None}
-UNREAD_KINDS = {
-    "{": "a dictionary in braces",
-    "&": "an anchor",
-    "*": "an alias",
-    "|": "a block of text",
-    ">": "a block of text",
-}
-
-
-class YamlLine:
-    """A line with content: its number, its indentation, and the rest."""
-
-    def __init__(self, path: str | Path, number: int, text: str, lenient: bool = False):
-        self.path, self.number, self.lenient = path, number, lenient
-        self.indent, self.text = len(text) - len(text.lstrip()), text.strip()
-
-    def error(self, message: str) -> InputError:
-        """An error about this line, to be raised."""
-        return InputError(f"{self.path}, line {self.number}: {message}")
+MOST_VALUES = 10_000_000
+"""Values of a document with its aliases unfolded: some gigabytes. Without aliases a file of 20 MB
+has as many; nested aliases ("billion laughs") have any number."""
+DIRECTIVE = re.compile(r"^\ufeff?%YAML.*$", re.M)
+TIGHT_KEY = re.compile(r"^(\s*[\w.]+):(?=[-+.\d\[\"'])", re.M)
+CORE_SCHEMA = (
+    ("null", r"~|null|Null|NULL|", ("~", "n", "N", "")),
+    ("bool", r"true|True|TRUE|false|False|FALSE", tuple("tTfF")),
+    ("int", r"[-+]?[0-9]+", tuple("-+0123456789")),
+    (
+        "float",
+        r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
+        r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)",
+        tuple("-+0123456789."),
+    ),
+    ("merge", r"<<", ("<",)),
+)
+"""Tag, form, and first letters of the scalars that are not texts."""
 
 
-def parse_yaml(path: str | Path, text: str, *, lenient: bool = False) -> dict[str, Any]:
-    """The document of a text, which must consist of keys; `lenient`: values of an unsupported kind
-    are None.
+def parse_yaml(path: str | Path, text: str) -> dict[str, Any]:
+    """The document of a text, which must consist of keys.
 
     **Raises:** `InputError` naming the line.
     """
-    lines = _lines(path, text, lenient)
-    if not lines:
+    document = parse_document(path, text)
+    if document is None:
         raise InputError(f"{path}: the file is empty; keys and values are expected")
-    value, rest = _block(lines, lines[0].indent, 0)
-    if rest:
-        raise rest[0].error(f"{show(rest[0].text)} is indented differently from the lines before")
-    if not isinstance(value, dict):
-        raise lines[0].error("keys and values are expected")
-    return value
+    if not isinstance(document, dict):
+        raise InputError(f"{path}: keys and values are expected")
+    return document
 
 
-def _lines(path: str | Path, text: str, lenient: bool) -> list[YamlLine]:
-    """The lines without comments; content in brackets or braces becomes one line."""
-    lines: list[YamlLine] = []
-    open_brackets, ended = 0, 0
-    for number, raw in enumerate(text.splitlines(), 1):
-        found = COMMENT.match(raw)
-        bare = (found[1] if found else raw).rstrip()
-        if not bare or (raw.startswith(("%", "---", "...")) and not open_brackets):
-            if raw.startswith("---") and lines:
-                ended = ended or number
-            continue
-        if ended:
-            raise InputError(f"{path}, line {ended}: a second document is not expected")
-        if "\t" in bare[: len(bare) - len(bare.lstrip())] and not open_brackets:
-            raise InputError(f"{path}, line {number}: indentation by tabs; YAML has blanks")
-        if open_brackets:
-            # a list over several lines is read as one line
-            lines[-1].text += " " + bare.strip()
-        else:
-            lines.append(YamlLine(path, number, bare, lenient))
-        # brackets in texts open nothing
-        plain = re.sub(r"\"[^\"]*\"|'[^']*'", "", bare)
-        open_brackets = max(
-            0, open_brackets + len(OPEN_BRACKET.findall(plain)) - len(CLOSE_BRACKET.findall(plain))
-        )
-    if open_brackets:
-        raise lines[-1].error(f"the list {show(lines[-1].text)} has no end")
-    return lines
+def parse_document(path: str | Path, text: str) -> Any:
+    """The document of a text, of any kind; None if it is empty.
+
+    **Raises:** `InputError` naming the line."""
+    import yaml
+
+    # as many lines as before, so that messages name the right one
+    opencv = re.match(r"\s*%YAML:", text) is not None
+    text = DIRECTIVE.sub("", text, count=1)
+    if opencv:
+        text = TIGHT_KEY.sub(r"\1: ", text)
+    try:
+        _look_through(path, text)
+        return yaml.load(text, _loader())  # noqa: S506 - a subclass of the safe loader
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line = f", line {mark.line + 1}" if mark else ""
+        told = error.problem or error.context or "damaged"
+        if mark and any("\t" in line for line in text.split("\n")[mark.line : mark.line + 1]):
+            told += "; blanks indent, not tabs"
+        raise InputError(f"{path}{line}: not valid YAML: {told}") from None
+    except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: not valid YAML: {show(str(error))}") from None
 
 
-def _block(lines: list[YamlLine], indent: int, depth: int) -> tuple[Any, list[YamlLine]]:
-    """The value of the lines of one indentation, and the lines after it."""
-    if depth > MAX_NESTING:
-        raise lines[0].error(f"nested too deeply: more than {MAX_NESTING} levels")
-    read = _items if _is_item(lines[0]) else _keys
-    return read(lines, indent, depth)
+def _look_through(path: str | Path, text: str) -> None:
+    """Refuse nesting that would exhaust the stack, aliases that unfold to gigabytes or contain
+    themselves, and a second document."""
+    import yaml
+
+    def error(message: str) -> InputError:
+        return InputError(f"{path}, line {event.start_mark.line + 1}: {message}")
+
+    open_nodes: list[tuple[str | None, int]] = []  # anchor, values so far
+    sizes: dict[str, int] = {}
+    documents, size = 0, 0
+    for event in yaml.parse(text, _base_loader()):
+        if isinstance(event, yaml.DocumentStartEvent):
+            documents += 1
+        elif isinstance(event, yaml.CollectionStartEvent):
+            open_nodes.append((event.anchor, size))
+            if len(open_nodes) > DEEPEST_NESTING:
+                raise error(f"nested too deeply: more than {DEEPEST_NESTING} levels")
+        elif isinstance(event, yaml.CollectionEndEvent):
+            anchor, before = open_nodes.pop()
+            size += 1
+            if anchor:
+                sizes[anchor] = size - before
+        elif isinstance(event, yaml.AliasEvent):
+            if event.anchor in (anchor for anchor, _ in open_nodes):
+                raise error(f"the alias *{event.anchor} contains itself")
+            size += sizes.get(event.anchor, 1)
+        elif isinstance(event, yaml.ScalarEvent):
+            size += 1
+            sizes |= {event.anchor: 1} if event.anchor else {}
+            # a message of ROS ends with --- and nothing after it
+            if documents > 1 and event.value:
+                raise error("a second document is not expected")
+        if documents > 1 and open_nodes:
+            raise error("a second document is not expected")
+        if size > MOST_VALUES:
+            raise error(f"more than {MOST_VALUES} values")
 
 
-def _is_item(line: YamlLine) -> bool:
-    return line.text == "-" or line.text.startswith("- ")
+@cache
+def _base_loader() -> Any:
+    """The loader by libyaml where PyYAML has it: ten times faster."""
+    import yaml
+
+    return getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
-def _items(lines: list[YamlLine], indent: int, depth: int) -> tuple[list[Any], list[YamlLine]]:
-    values = []
-    while lines and lines[0].indent == indent and _is_item(lines[0]):
-        line, lines = lines[0], lines[1:]
-        # "- key: value" is a block whose indentation is that of the key
-        inner = YamlLine(line.path, line.number, " " * (indent + 1) + line.text[1:], line.lenient)
-        if inner.text and not _is_item(inner) and not KEY.fullmatch(inner.text):
-            values.append(_value(inner, inner.text))
-        elif inner.text:
-            value, lines = _block([inner, *lines], inner.indent, depth + 1)
-            values.append(value)
-        else:
-            value, lines = _parse_nested(lines, indent, depth)
-            values.append(value)
-    return values, lines
+@cache
+def _loader() -> Any:
+    """A safe loader with the types of the core schema, without repeated keys and foreign tags."""
+    import yaml
 
+    tags = [f"tag:yaml.org,2002:{name}" for name in ("null", "bool", "seq", "str", "binary")]
 
-def _keys(lines: list[YamlLine], indent: int, depth: int) -> tuple[dict[str, Any], list[YamlLine]]:
-    values: dict[str, Any] = {}
-    while lines and lines[0].indent == indent and not _is_item(lines[0]):
-        line, lines = lines[0], lines[1:]
-        found = KEY.fullmatch(line.text)
-        if not found:
-            raise line.error(f"{show(line.text)}: a key and a value, KEY: VALUE, are expected")
-        key, text = found[1].strip("\"'"), TAG.sub("", found[2] or "", count=1)
-        if key in values:
-            raise line.error(f"{key} occurs twice")
-        if text:
-            values[key] = _value(line, text)
-        else:
-            values[key], lines = _parse_nested(lines, indent, depth)
-    return values, lines
+    class Loader(_base_loader()):
+        yaml_implicit_resolvers: dict = {}
+        # others, such as dates, stay as they are written
+        yaml_constructors = {tag: yaml.SafeLoader.yaml_constructors[tag] for tag in tags}
 
+        def construct_mapping(self, node: Any, deep: bool = False) -> dict[str, Any]:
+            if not isinstance(node, yaml.MappingNode):
+                return super().construct_mapping(node, deep)
+            keys = [key for key, _ in node.value]
+            seen: set[str] = set()
+            for key in keys:
+                if not isinstance(key, yaml.ScalarNode):
+                    raise yaml.MarkedYAMLError(
+                        problem="a key is a list or a dictionary", problem_mark=key.start_mark
+                    )
+                if key.value in seen and key.value != "<<":
+                    raise yaml.MarkedYAMLError(
+                        problem=f"{key.value} occurs twice", problem_mark=key.start_mark
+                    )
+                seen.add(key.value)
+            self.flatten_mapping(node)
+            # the keys as texts, as in JSON: 0 and on are names
+            return {key.value: self.construct_object(value, deep=True) for key, value in node.value}
 
-def _parse_nested(lines: list[YamlLine], indent: int, depth: int) -> tuple[Any, list[YamlLine]]:
-    """The value below a key or the dash of a list; a list may have the indentation of its key."""
-    if not lines or lines[0].indent < indent:
-        return None, lines
-    if lines[0].indent == indent and not _is_item(lines[0]):
-        return None, lines
-    return _block(lines, lines[0].indent, depth + 1)
+        def get_single_data(self) -> Any:
+            # the second document, if there is one, is empty (_look_through)
+            node = self.get_node() if self.check_node() else None
+            return None if node is None else self.construct_document(node)
 
+    def whole(loader: Any, node: Any) -> int:
+        digits = node.value.lstrip("+-0")
+        if len(digits) > len(str(LARGEST_INTEGER)):
+            raise yaml.MarkedYAMLError(problem=TOO_LARGE, problem_mark=node.start_mark)
+        return int(node.value)
 
-def _value(line: YamlLine, text: str) -> Any:
-    """A scalar, or a list in brackets."""
-    text = text.strip()
-    if text[:1] in UNREAD_KINDS and line.lenient:
-        return None
-    if text[:1] in UNREAD_KINDS:
-        raise line.error(f"{show(text)}: {UNREAD_KINDS[text[0]]} is not read here")
-    if not text.startswith("["):
-        return _scalar(text)
-    stack: list[list[Any]] = [[]]  # the lists that are open, the outermost a holder of one list
-    for part in re.findall(r"\[|\]|\"[^\"]*\"|'[^']*'|[^][,\"']+", text):
-        if part == "[":
-            stack.append([])
-            stack[-2].append(stack[-1])
-        elif part == "]":
-            stack.pop()
-        elif part.strip():
-            stack[-1].append(_scalar(part.strip()))
-        if not stack or len(stack) > MAX_NESTING or (len(stack) == 1 and len(stack[0]) > 1):
-            raise line.error(f"{show(text)}: brackets that do not match")
-    return stack[0][0]
+    def real(loader: Any, node: Any) -> float:
+        text = node.value.lower()
+        return float(text.replace(".", "") if text.endswith(("inf", "nan")) else text)
 
+    def content(loader: Any, suffix: str, node: Any) -> Any:
+        """What is under an unknown tag."""
+        if isinstance(node, yaml.MappingNode):
+            return loader.construct_mapping(node, deep=True)
+        if isinstance(node, yaml.SequenceNode):
+            return loader.construct_sequence(node, deep=True)
+        return loader.construct_scalar(node)
 
-def _scalar(text: str) -> Any:
-    if text[:1] in ("'", '"'):
-        return text.strip(text[0])
-    if text.lower() in WORDS:
-        return WORDS[text.lower()]
-    if not NUMBER.fullmatch(text):
-        return text
-    return int(text) if text.lstrip("+-").isdigit() and len(text) < 16 else float(text)
+    for tag, form, first in CORE_SCHEMA:
+        tag = f"tag:yaml.org,2002:{tag}"
+        Loader.add_implicit_resolver(tag, re.compile(f"(?:{form})$"), list(first))
+    Loader.add_constructor("tag:yaml.org,2002:int", whole)
+    Loader.add_constructor("tag:yaml.org,2002:float", real)
+    for prefix in ("tag:yaml.org,2002:", "!", ""):
+        Loader.add_multi_constructor(prefix, content)
+    return Loader

@@ -1,0 +1,171 @@
+"""Models of VisualSFM: an `.nvm` file.
+
+    NVM_V3 [FixedK fx cx fy cy]
+    cameras      their number, and for each: name, f, quaternion w x y z, centre X Y Z, r, 0
+    points       their number, and for each: X Y Z, R G B, rays, and for each of them image,
+                 feature, x y
+    …            further models; 0 ends them
+
+x, y count from the centre of the image, x right, y down, in pixels; the camera frame has z forward.
+The distortion is of the measured point: with m = (x, y)/f
+
+    X/Z, Y/Z of a ray = m·(1 + r·|m|²)
+
+which is `brown` with K1 = r/c². That model is in mm: the file has no pixel size, which is taken as
+0.005 mm; another would scale c and K1 and change nothing in pixels. The file has no image size.
+The largest model is read. FixedK, whose principal point moves the measurements, is refused unless
+it is in the middle (cx = cy = 0).
+
+Source: VisualSFM documentation, "NVM file format"; Multicore Bundle Adjustment, the comments of its
+data interface, for r.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.pose_conventions import flip_rows
+from jaxbundle.io.networks.assemble import (
+    assemble,
+    foreign_document,
+    image_columns,
+    unique_labels,
+)
+from jaxbundle.io.networks.poses import matrices_of_quaternions
+from jaxbundle.io.text.rows import TextRow, TextRows
+from jaxbundle.network.columns import Columns, count
+from jaxbundle.network.tables import Network, Source
+from jaxbundle.system.file_content import beginning
+
+HEAD = "NVM_V3"
+NUMBERS = ("f", "QW", "QX", "QY", "QZ", "X", "Y", "Z", "r")
+PIXEL = 0.005
+
+
+def is_nvm(path: Path) -> bool:
+    """Whether a file begins as VisualSFM's."""
+    return beginning(path, 20).lstrip().startswith(HEAD.encode())
+
+
+class _Model:
+    """The rows of one model."""
+
+    def __init__(self, rows: TextRows, number: int):
+        self.cameras = [rows.take(f"camera {k} of {number}") for k in range(number)]
+        self.points: list[TextRow] = []
+        if rows.more():
+            points = rows.take("the number of points").integer(0, "the number of points")
+            self.points = [rows.take(f"point {k} of {points}") for k in range(points)]
+
+
+def read_nvm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
+    """The network of the largest model: one camera per image, f and K1 free, σ 1 px.
+
+    **Raises:** `InputError` naming file and line.
+    """
+    path = Path(path)
+    rows = TextRows(path)
+    head = rows.take(HEAD)
+    if not head.words or head.words[0] != HEAD:
+        raise head.error(f"{head.text.strip()[:40]!r}; expected {HEAD}, with quaternions")
+    if "FixedK" in head.words:
+        fixed = head.words[head.words.index("FixedK") + 1 :]
+        if len(fixed) < 4 or any(float(word) for word in (fixed[1], fixed[3]) if _is_number(word)):
+            raise head.error(
+                "FixedK, a calibration with a principal point of its own, is not read; expected "
+                "a model without it"
+            )
+    models = []
+    while rows.more() and (row := rows.take("the number of cameras")).words:
+        # after the models: comments about PLY files
+        if not row.words[0].isdigit() or not row.integer(0, "the number of cameras"):
+            break
+        models.append(_Model(rows, row.integer(0, "the number of cameras")))
+    if not models:
+        raise InputError(f"{path}: there is no model in it; expected a number of cameras")
+    model = max(models, key=lambda model: (len(model.points), len(model.cameras)))
+    told = [f"the largest of {len(models)} models is read"] if len(models) > 1 else []
+    return _network(path, model, overrides, told)
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _network(path: Path, model: _Model, overrides: Sequence[str], told: Sequence[str]) -> Network:
+    names, values, lines = [], [], []
+    for row in model.cameras:
+        # a name may have blanks; ten numbers follow it
+        names.append(" ".join(row.words[:-10]) if len(row) > 10 else "")
+        if not names[-1]:
+            raise row.error(f"{len(row)} values; a name and {', '.join(NUMBERS)}, 0 are expected")
+        values.append(row.numbers(NUMBERS, len(row) - 10, more=True))
+        lines.append(row.number)
+        if not values[-1][0] > 0 or not values[-1][1:5].any():
+            raise row.error(
+                f"f is {values[-1][0]:g}; a positive number and a rotation are expected"
+            )
+    names = unique_labels(names, range(len(names)))
+    p = np.array(values)
+    M = flip_rows(matrices_of_quaternions(p[:, 1:5]))
+    c = p[:, 0] * PIXEL
+    cameras = [
+        {"id": name, "model": "brown", "c": f, "K1": r / f**2, "pixel_size": [PIXEL, PIXEL]}
+        | {"free": ["c", "K1"]}
+        for name, f, r in zip(names, c.tolist(), p[:, 8].tolist())
+    ]
+    position, rays = _points(path, model, len(names))
+    kept = {}
+    for k, (image, point, *_) in enumerate(rays[:, :2].astype(np.int64).tolist()):
+        kept.setdefault((image, point), k)
+    if len(kept) < len(rays):
+        what = count(len(rays) - len(kept), "image point")
+        told = [*told, f"left out {what} of object points that have another in the same image"]
+        rays = rays[list(kept.values())]
+    source = Source(str(path), rays[:, 4].astype(np.int64), "line")
+    xy = rays[:, 2:4] * [PIXEL, -PIXEL]
+    return assemble(
+        path,
+        foreign_document(path.stem, cameras, image_unit="mm", residuals="corrected"),
+        overrides,
+        image_columns(Source(str(path), np.array(lines), "line"), names, names, M, p[:, 5:8]),
+        Columns(
+            {"id": range(len(position)), "role": ["tie"] * len(position),
+             **dict(zip("XYZ", np.reshape(position, (-1, 3)).T))},
+            Source(str(path), np.array([row.number for row in model.points], np.int64), "line"),
+        ),
+        Columns(
+            {"image": [names[i] for i in rays[:, 0].astype(np.int64)],
+             "point": rays[:, 1].astype(np.int64), **dict(zip("xy", xy.T)),
+             **dict.fromkeys(("sx", "sy"), np.full(len(xy), PIXEL))},
+            source,
+        ),
+        told,
+    )  # fmt: skip
+
+
+def _points(path: Path, model: _Model, images: int) -> tuple[np.ndarray, np.ndarray]:
+    """Coordinates, and image, point, x, y, line of all rays."""
+    position, rays = [], [np.zeros((0, 5))]
+    for k, row in enumerate(model.points):
+        numbers = row.all_numbers("a point")
+        claimed = row.integer(6, "the number of rays")
+        if len(numbers) != 7 + 4 * claimed:
+            raise row.error(
+                f"{claimed} rays are announced; {4 * claimed} numbers should follow, not "
+                f"{len(numbers) - 7}"
+            )
+        views = numbers[7:].reshape(-1, 4)
+        for image in views[:, 0]:
+            if not (0 <= image < images and image % 1 == 0):
+                raise row.error(f"image {image:g} does not exist; there are {images}, from 0")
+        rest = np.full((claimed, 1), 1.0)
+        position.append(numbers[:3])
+        rays.append(np.hstack([views[:, :1], k * rest, views[:, 2:], row.number * rest]))
+    return np.array(position), np.concatenate(rays)

@@ -1,0 +1,271 @@
+"""Several cameras in one YAML, JSON or XML file in OpenCV's style, with their poses.
+
+    K1, D1, K2, D2, R, T               of `stereoCalibrate`: X₂ = R·X₁ + T; also M1, cameraMatrix1,
+                                       camera_matrix_left, left_camera_matrix, LEFT.K, …
+    left: {K, D}, right: {K, D}, R, T  the same with an object a camera
+    cam0: {K, D, R, T}, …              of any number of cameras: X = R·X_world + T of each, R a
+                                       matrix or a rotation vector; or a matrix 4 × 4
+
+Frames have x right, y down, z forward; the first pixel has its centre at 0. Entries of a camera are
+spelled as in `cameras.spellings`. Without R and T the poses are unknown.
+
+Source: OpenCV 4 documentation, calib3d.
+"""
+
+import dataclasses
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.cameras.nearest_camera import fit_messages
+from jaxbundle.io.cameras.opencv_file import (
+    LARGEST_FILE,
+    READ_SUFFIXES,
+    camera_of,
+    find_cameras,
+    matrix_of,
+    read_document,
+)
+from jaxbundle.io.cameras.slam_yaml import is_slam_yaml
+from jaxbundle.io.cameras.spellings import (
+    LEFT,
+    Found,
+    camera_entries,
+    cameras_within,
+    fold,
+    is_matrix,
+    meaning_of,
+)
+from jaxbundle.io.networks.assemble import rig_network, unique_labels
+from jaxbundle.io.networks.poses import check_rotations, matrices_of_rotation_vectors
+from jaxbundle.io.text.known_keys import Keys, UnknownKeys
+from jaxbundle.network.columns import count
+from jaxbundle.network.tables import Camera, Network
+from jaxbundle.system.file_content import beginning, is_plain
+
+SIDES = (("1", "2"), ("0", "1"), ("left", "right"), ("l", "r"), ("a", "b"))
+"""Endings, or beginnings, of the names of the entries of two cameras."""
+ROTATION = "r rotation rotationmatrix rot rmat stereor rotationvector rvec rotationlefttoright om"
+TRANSLATION = "t translation translationvector trans tvec transvec stereot translationlefttoright"
+POSE = "transform transformation transformmatrix extrinsicmatrix extrinsics extrinsic pose rt"
+POSES = {
+    **dict.fromkeys(ROTATION.split(), "R"),
+    **dict.fromkeys(TRANSLATION.split(), "T"),
+    **dict.fromkeys(POSE.split(), "pose"),
+}
+SHARED = (
+    "image_size",
+    "image_width",
+    "image_height",
+    "distortion_model",
+    "camera_model",
+    "fisheye_model",
+)
+"""Entries that stand once for both cameras."""
+UNKNOWN = np.full((3, 3), np.nan), np.full(3, np.nan)
+RECTIFIED = Keys((), {
+    **LEFT.left,
+    **dict.fromkeys(("r1", "r2", "p1", "p2", "q", "r*", "p*", "rectification*", "projection*"),
+                    "the rectification, which follows from R and T"),
+})  # fmt: skip
+
+
+class Pose(NamedTuple):
+    """x = R·X + t."""
+
+    R: Float[np.ndarray, "3 3"]
+    t: Float[np.ndarray, "3"]
+
+
+def is_opencv_rig(path: Path) -> bool:
+    """Whether a file has the entries of two cameras or more."""
+    # ORB-SLAM's LEFT.K, RIGHT.K stand beside the camera of the rectified images
+    if is_slam_yaml(path):
+        return False
+    found = find_cameras(path)
+    if len(found) > 1:
+        return True
+    if found and found[0][1]:
+        return _sides(found[0][1]) is not None  # {K: …, K1: …} is none
+    return _is_pair(path)
+
+
+def _is_pair(path: Path) -> bool:
+    if path.suffix.lower() not in READ_SUFFIXES or not is_plain(path):
+        return False
+    head = beginning(path, 1_000_000)
+    # the second side of each of the `SIDES`, at the beginning or the end of a name
+    if path.stat().st_size > LARGEST_FILE or not re.search(
+        rb"(?i)\w(2|1|r|right|b)\b|\b(2|1|r|right|b)[_.]?\w", head
+    ):
+        return False
+    try:
+        document = read_document(path)
+    except InputError:
+        # a damaged file of this kind is reported by its reader
+        return re.search(rb"(?m)^\s*\"?[MK]1\"?\s*:", head) is not None
+    return isinstance(document, Mapping) and _sides(document) is not None
+
+
+def _sides(document: Mapping[str, Any]) -> tuple[str, str] | None:
+    """The two sides by which the matrices of a pair are named."""
+    for pair in SIDES:
+        kinds = [
+            {
+                kind
+                for name, value in document.items()
+                if (kind := _of_side(name, value, side)) == "camera_matrix" and is_matrix(value)
+            }
+            for side in pair
+        ]
+        if all(kinds):
+            return pair
+    return None
+
+
+def _base(name: str, side: str) -> str | None:
+    """The name of an entry without its side."""
+    folded = fold(name)
+    if folded.endswith(side) and folded != side:
+        return folded.removesuffix(side)
+    return folded.removeprefix(side) if folded.startswith(side) and folded != side else None
+
+
+def _of_side(name: str, value: Any, side: str) -> str | None:
+    """What an entry is of the camera of a side."""
+    base = _base(name, side)
+    if base is None or (isinstance(value, int | float) and base in ("k", "p", "s")):
+        return None
+    return meaning_of(base, value)
+
+
+def read_opencv_rig(path: str | Path, overrides: Sequence[str] = ()) -> Network:
+    """The cameras of a file, each with an image; nothing can be adjusted.
+
+    **Raises:** `InputError` naming file and entry.
+    """
+    path = Path(path)
+    document, unknown = read_document(path), UnknownKeys()
+    pair = _sides(document) if isinstance(document, Mapping) else None
+    if pair is not None:
+        cameras, poses = _read_pair(path, document, pair, unknown)
+    else:
+        cameras, poses = _read_nested(path, document, unknown)
+    told = (*fit_messages(cameras), *unknown.messages())
+    return rig_network(path, cameras, *zip(*poses), overrides, told)  # type: ignore[arg-type]
+
+
+def _read_pair(
+    path: Path, document: Mapping[str, Any], pair: tuple[str, str], unknown: UnknownKeys
+) -> tuple[list[Camera], list[Pose]]:
+    """Two cameras whose entries are told apart by their names."""
+    own: list[dict[str, Any]] = [{}, {}]
+    rest: dict[str, Any] = {}
+    for name, value in document.items():
+        sides = [_of_side(name, value, side) for side in pair]
+        # `distCoeffsL`: of one side; `R1`, `P1`: of the rectification
+        if fold(name) in POSES or meaning_of(name, value) in SHARED or not any(sides):
+            rest[name] = value
+        else:
+            own[sides.index(next(filter(None, sides)))][name] = value
+    shared = camera_entries({k: v for k, v in rest.items() if meaning_of(k, v) in SHARED}, path,
+                            unknown)  # fmt: skip
+    left = {k: v for k, v in rest.items() if meaning_of(k, v) not in SHARED}
+    pose = _take_pose(path, left)
+    folded = {fold(name): name for name in left}
+    unknown.check((folded[name] for name in RECTIFIED.unknown(folded)), Keys(POSES), path)
+    cameras = []
+    for k, (side, entries) in enumerate(zip(pair, own)):
+        found: Found = dict(shared)
+        for name, value in entries.items():
+            found[str(_of_side(name, value, side))] = (name, value)
+        id = found.pop("camera_name", ("", side if len(side) > 1 else ("left", "right")[k]))[1]
+        cameras.append(camera_of(path, found, str(id)))
+    return cameras, [Pose(np.eye(3), np.zeros(3)), pose or Pose(*UNKNOWN)]
+
+
+def _read_nested(
+    path: Path, document: Any, unknown: UnknownKeys
+) -> tuple[list[Camera], list[Pose]]:
+    """Cameras that are objects of their own."""
+    inside = list(cameras_within(document))
+    if len(inside) < 2:
+        raise InputError(f"{path}: {count(len(inside), 'camera')} in it; expected two or more")
+    cameras, poses = [], []
+    for k, (name, entries) in enumerate(inside):
+        where, own = f"{path}, {name}", dict(entries)
+        poses.append(_take_pose(where, own))
+        found = camera_entries(own, where, unknown)
+        id = str(found.get("camera_name", ("", name or k))[1])
+        cameras.append(camera_of(where, found, id))
+    ids = [camera.id for camera in cameras]
+    if len({*ids}) < len(ids):
+        names = unique_labels([name for name, _ in inside], range(len(inside)))
+        cameras = [dataclasses.replace(camera, id=name) for camera, name in zip(cameras, names)]
+    if isinstance(document, Mapping):
+        names = {name for name, _ in inside}
+        left = {key: value for key, value in document.items() if key not in names}
+        shared = _take_pose(path, left) if len(inside) == 2 and not any(poses) else None
+        if shared is not None:
+            poses = [Pose(np.eye(3), np.zeros(3)), shared]
+        around = {fold(key): key for key, value in left.items() if not _holds(value, inside)}
+        unknown.check((around[key] for key in RECTIFIED.unknown(around)), Keys(POSES), path)
+    # with the first as reference, which many files leave out
+    if any(poses[1:]) and poses[0] is None:
+        poses[0] = Pose(np.eye(3), np.zeros(3))
+    return cameras, [pose or Pose(*UNKNOWN) for pose in poses]
+
+
+def _holds(value: Any, inside: Sequence[tuple[str, Any]]) -> bool:
+    """Whether a value contains one of the cameras."""
+    if any(value is entries for _, entries in inside):
+        return True
+    parts = value.values() if isinstance(value, Mapping) else value
+    return isinstance(value, Mapping | list) and any(
+        _holds(part, inside) for part in parts if isinstance(part, Mapping | list)
+    )
+
+
+def _take_pose(where: object, entries: dict[str, Any]) -> Pose | None:
+    """The pose among entries, which are removed; None without one.
+
+    **Raises:** `InputError` for half a pose, and what is no rotation."""
+    named = {
+        POSES[fold(name)]: name
+        for name, value in entries.items()
+        if fold(name) in POSES and value not in (None, [])
+    }
+    taken = {kind: (name, entries.pop(name)) for kind, name in named.items()}
+    path = str(where)
+    if "pose" in taken and isinstance(taken["pose"][1], Mapping) and "data" not in taken["pose"][1]:
+        return _take_pose(f"{where}, {taken['pose'][0]}", dict(taken["pose"][1]))
+    if "pose" not in taken and "T" in taken and "R" not in taken:
+        taken["pose"] = taken.pop("T")  # T, 4 × 4
+    if "pose" in taken:
+        name, value = taken["pose"]
+        T = matrix_of(path, name, value, None)
+        if T.size not in (12, 16) or (T.size == 16 and (T[12:] != (0, 0, 0, 1)).any()):
+            raise InputError(f"{where}: {name} is no pose; expected 4 × 4 numbers, or R and T")
+        T = T[:12].reshape(3, 4)
+        R, t = T[:, :3], T[:, 3]
+    elif {"R", "T"} <= taken.keys():
+        name, value = taken["R"]
+        R, t = matrix_of(path, name, value, None), matrix_of(path, *taken["T"], None)
+        if R.size not in (3, 9) or t.size != 3:
+            raise InputError(
+                f"{where}: {name} and {taken['T'][0]} have {R.size} and {t.size} numbers; expected "
+                "9, or 3 of a rotation vector, and 3"
+            )
+        R = R.reshape(3, 3) if R.size == 9 else matrices_of_rotation_vectors(R[None])[0]
+    elif taken:
+        ((_, (name, _)),) = taken.items()
+        raise InputError(f"{where}: {name} without the other of R and T; expected both, or none")
+    else:
+        return None
+    check_rotations(R, f"{where}: {name}")
+    return Pose(R, t)

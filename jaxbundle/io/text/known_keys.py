@@ -1,0 +1,132 @@
+"""The rule of keys: nothing that a file says is dropped in silence.
+
+A reader declares, for every object of its format, the keys it uses and the keys it may leave, with
+the reason. Any other key is reported by name and place, as a warning; if its name says that it may
+change the geometry, the file is refused: a camera read without its distortion looks right and is
+wrong.
+"""
+
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Mapping
+from fnmatch import fnmatchcase
+from functools import cached_property
+
+from jaxbundle.errors import InputError
+from jaxbundle.network.columns import closest_name, show
+
+STEMS = (
+    *("distort", "skew", "binning", "offset", "transform", "undist", "focallength", "principal"),
+    *("rectif", "homograph", "lens", "intrinsic", "extrinsic", "calib", "affin", "fisheye"),
+)
+"""Parts of words that concern geometry, wherever they stand in a name."""
+WORDS = frozenset(
+    "scale scales scaling scaled model models unit units sign signs origin roi crop cropped flip "
+    "flipped mirror mirrored axis axes aspect tilt shear prism radial tangential decentering "
+    "decentring shutter convention coefficient coefficients coeff coeffs coef coefs rotation "
+    "rotate rotated translation shift shifted pose projection fov focal dist resize resized "
+    "datum crs epsg refraction".split()
+)
+"""Whole words that concern geometry; within other words they mean something else (`roi` in
+`android`, `sign` in `design`)."""
+ENDINGS = ("scale", "scalefactor", "model", "unit", "units", "origin", "roi", "matrix")
+"""Such words at the end of a name without separators, `imagescale`."""
+HARMLESS = re.compile(r"gr[ae]y_?scale", re.I)
+COEFFICIENT = re.compile(r"(?:[kpbs]|tau|[xy]i)_?\d{1,2}|[fc][xy]|[xy]0", re.I)
+
+
+def may_change_geometry(name: str) -> bool:
+    """Whether a key of this name may say how images and rays are related."""
+    name = HARMLESS.sub("grey", name)
+    tokens = re.split(r"[\W_]+", name)
+    words = {word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)}
+    joined = "".join(tokens).lower()
+    return (
+        re.search(r"(?:^|_)T_[A-Za-z]", name) is not None  # T_cam_imu, body_T_cam0: a pose
+        or any(stem in joined for stem in STEMS)
+        or not WORDS.isdisjoint(words)
+        or joined.endswith(ENDINGS)
+        or any(COEFFICIENT.fullmatch(word) for word in (*tokens, name))
+    )
+
+
+class Keys:
+    """The keys of one kind of object: those a reader uses, and those it may leave.
+
+    **Arguments:**
+
+    - `left`: names, or patterns with *, that do not concern the result, and why.
+    - `warned`: the same for what would concern it and is not read: each is a warning.
+    """
+
+    def __init__(
+        self,
+        used: Iterable[str],
+        left: Mapping[str, str] | None = None,
+        warned: Mapping[str, str] | None = None,
+    ):
+        self.used, self.left, self.warned = tuple(used), dict(left or {}), dict(warned or {})
+
+    @cached_property
+    def known(self) -> frozenset[str]:
+        """All names and patterns."""
+        return frozenset((*self.used, *self.left, *self.warned))
+
+    @cached_property
+    def patterns(self) -> tuple[str, ...]:
+        """The names with a *."""
+        return tuple(name for name in self.known if "*" in name)
+
+    def unknown(self, names: Iterable[str]) -> list[str]:
+        """The names that are not known."""
+        return [name for name in names if not self._has(name)]
+
+    def _has(self, name: str) -> bool:
+        return name in self.known or any(fnmatchcase(name, part) for part in self.patterns)
+
+    def __or__(self, other: "Keys") -> "Keys":
+        return Keys((*self.used, *other.used), self.left | other.left, self.warned | other.warned)
+
+
+class UnknownKeys:
+    """The keys met while a file is read that are not understood, or understood and not read; one
+    message a key, however often it stands there."""
+
+    def __init__(self):
+        self._places: dict[tuple[str, str], list[str]] = {}
+
+    def check(self, names: Iterable[str], keys: Keys, where: object) -> None:
+        """Notice the unknown names of an object; `where`: its file and place.
+
+        **Raises:** `InputError` for a name that may change the geometry.
+        """
+        names = tuple(names)
+        if not keys.warned and keys.known.issuperset(names):
+            return  # millions of points have the same few keys
+        for name in keys.warned.keys() & {*names}:
+            self._places.setdefault((name, keys.warned[name]), []).append(str(where))
+        for name in keys.unknown(names):
+            if may_change_geometry(name):
+                # a name of the list is near enough to be meant: "Distortion" for "distortion"
+                close = closest_name(name, keys.used)
+                hint = f" (did you mean {close!r}?)" if close else ""
+                raise InputError(
+                    f"{where}: unknown key {show(name)}{hint}, which by its name may change the "
+                    "geometry; expected a key that is known here. If it does not, delete it from a "
+                    "copy of the file"
+                )
+            self._places.setdefault((name, ""), []).append(str(where))
+
+    def check_element(self, element: ET.Element, keys: Keys, where: object) -> None:
+        """The same for the children and attributes of an element of XML."""
+        children = (child.tag for child in element if isinstance(child.tag, str))
+        self.check((*dict.fromkeys(children), *element.attrib), keys, where)
+
+    def messages(self) -> tuple[str, ...]:
+        """Warnings about the unknown keys."""
+        return tuple(
+            f"{places[0]}: "
+            + (f"{name} is not read: {why}" if why else f"unknown key {show(name)} is not read")
+            + (f" (there, and in {len(places) - 1} more places)" if len(places) > 1 else "")
+            for (name, why), places in self._places.items()
+        )

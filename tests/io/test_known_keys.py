@@ -1,0 +1,61 @@
+"""The rule of keys: a further key in any keyed format is a warning that names it; one that may
+change the geometry is refused."""
+
+import pytest
+from foreign_samples import SAMPLES, places, write_sample
+
+from jaxbundle.errors import InputError
+from jaxbundle.io import read_cameras, read_network
+from jaxbundle.io.cameras.camera_files import is_camera_file
+from jaxbundle.io.cameras.nearest_camera import fit_messages
+from jaxbundle.io.text.known_keys import Keys, UnknownKeys, may_change_geometry
+
+GEOMETRY = (
+    "distortion_extra", "skew2", "roi_x", "binning_z", "image_scale", "pixelOffset", "transform2",
+    "lens_model", "lengthUnit", "y_sign", "frame_origin", "K9", "p7", "imagescale", "crop", "flipY",
+)  # fmt: skip
+HARMLESS = ("vendor_remark", "android", "design", "grayscale", "original_name", "community")
+
+
+def messages(path) -> tuple[str, ...]:
+    """What reading a file tells."""
+    if is_camera_file(path):
+        return fit_messages(read_cameras(path))
+    return read_network(path).warnings
+
+
+@pytest.mark.parametrize("name", SAMPLES)
+def test_a_harmless_key_is_named_and_a_geometric_one_refused(tmp_path, name):
+    plain = messages(write_sample(tmp_path, name))
+    assert not any("unknown key" in told for told in plain)
+    for place in range(places(name)):
+        path = write_sample(tmp_path, name, "vendor_remark", place)
+        told = [told for told in messages(path) if "unknown key 'vendor_remark'" in told]
+        assert told and all(path.name in message for message in told)
+        path = write_sample(tmp_path, name, "lens_offset", place)
+        with pytest.raises(InputError, match=rf"{path.name}.*unknown key 'lens_offset'.*geometry"):
+            messages(path)
+
+
+def test_the_words_of_geometry():
+    assert not [name for name in GEOMETRY if not may_change_geometry(name)]
+    assert not [name for name in HARMLESS if may_change_geometry(name)]
+
+
+def test_one_message_a_key():
+    unknown, keys = UnknownKeys(), Keys(("a",), {"b*": "x"}, {"c": "of no use here"})
+    for place in range(3):
+        unknown.check(("a", "bb", "c", "d"), keys, f"row {place}")
+    assert unknown.messages() == (
+        "row 0: c is not read: of no use here (there, and in 2 more places)",
+        "row 0: unknown key 'd' is not read (there, and in 2 more places)",
+    )
+
+
+@pytest.mark.parametrize("arguments", [
+    ("camera", "{}"), ("convert", "{}", "{}.toml"), ("convert", "{}", "{}transforms.json"),
+])  # fmt: skip
+def test_the_user_sees_it(command, tmp_path, arguments):
+    path = write_sample(tmp_path, "opencv", "vendor_remark")
+    told = command(*(word.format(path) for word in arguments))
+    assert told.status == 0 and "unknown key 'vendor_remark' is not read" in told.err
