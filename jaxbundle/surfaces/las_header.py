@@ -81,11 +81,9 @@ def _check_records(
     form = struct.Struct("<2x16sHQ32x" if extended else "<2x16sHH32x")
     found = {}
     for _ in range(number):
-        file.seek(place)
-        head = file.read(form.size)
-        if place < 0 or place + form.size > end or len(head) < form.size:
+        if place + form.size > end:
             raise _beyond(path, what)
-        user, record, length = form.unpack(head)
+        user, record, length = form.unpack(_read(path, file, place, form.size))
         place += form.size + length
         if place > end:
             raise _beyond(path, what)
@@ -115,6 +113,10 @@ def _check_compression(
     known = all(k in ITEMS and ITEMS[k][0] in (None, length) for k, length, _ in items)
     if not known or sum(length for _, length, _ in items) != row or not chunk:
         raise InputError(f"{path}: damaged: its compression does not fit points of {row} bytes")
+    # lazrs makes room for a whole chunk, of 50 000 points unless a program was told otherwise
+    room = largest_unpacked_size(size, harmless=2**28)
+    if chunk != VARIABLE_CHUNKS and chunk * row > room:
+        raise InputError(f"{path}: damaged: chunks of {chunk} points in a file of {size} bytes")
     if not points:
         return
     unpack = lambda form, at: struct.unpack(form, _read(path, file, at, struct.calcsize(form)))

@@ -18,6 +18,7 @@ from jaxbundle.io.text.json_fields import JsonFields
 from jaxbundle.io.text.yaml_text import parse_yaml
 from jaxbundle.measure.boards import Board
 from jaxbundle.network.columns import show
+from jaxbundle.system.file_content import naming_file
 
 TYPES = ("checkerboard", "circlegrid", "aprilgrid")
 CIRCLES = {False: "circles", True: "asymmetric-circles"}
@@ -28,7 +29,11 @@ def read_target(path: str | Path) -> Board:
 
     **Raises:** `InputError` naming file and key.
     """
-    fields = JsonFields(path, parse_yaml(path, read_text(Path(path))))
+    with naming_file(path):  # a Board checks its own values
+        return _board(path, JsonFields(path, parse_yaml(path, read_text(Path(path)))))
+
+
+def _board(path: str | Path, fields: JsonFields) -> Board:
     kind = fields.text("target_type")
     if kind not in TYPES:
         raise InputError(f"{path}: target_type {kind}: {' or '.join(TYPES)} is expected")

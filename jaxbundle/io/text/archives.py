@@ -107,6 +107,8 @@ def read_member(
             content[begin : begin + 2**20] = stream.read(2**20)
         stream.read(1)  # at its end zipfile compares the checksum
         array = np.frombuffer(content, member.dtype, math.prod(member.shape), member.begin)
+        if member.dtype.kind == "U":
+            array.tolist()  # raises for code points that are none
         return array.reshape(member.shape, order="F" if member.by_columns else "C")
 
 
