@@ -107,8 +107,10 @@ def read_member(
             content[begin : begin + 2**20] = stream.read(2**20)
         stream.read(1)  # at its end zipfile compares the checksum
         array = np.frombuffer(content, member.dtype, math.prod(member.shape), member.begin)
-        if member.dtype.kind == "U":
-            array.tolist()  # raises for code points that are none
+        if member.dtype.kind == "U":  # NumPy takes any number for a letter
+            codes = np.frombuffer(content, f"{member.dtype.byteorder}u4", offset=member.begin)
+            if ((codes > 0x10FFFF) | ((codes >= 0xD800) & (codes < 0xE000))).any():
+                raise ValueError("its texts have letters that are none in Unicode")
         return array.reshape(member.shape, order="F" if member.by_columns else "C")
 
 
