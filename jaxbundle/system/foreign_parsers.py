@@ -19,11 +19,12 @@ NOT_OF_FILES = (KeyboardInterrupt, SystemExit, GeneratorExit)
 
 
 @contextmanager
-def foreign_parser(path: str | Path, expected: str) -> Iterator[None]:
+def foreign_parser(path: str | Path, expected: str, *, shortage: bool = True) -> Iterator[None]:
     """The context of a call of a third-party parser.
 
     **Arguments:** `path`: the file, with the place in it if that is known (`"c.npz, array xy"`);
-    `expected`: what the file should be, with its article (`"a saved adjustment"`).
+    `expected`: what the file should be, with its article (`"a saved adjustment"`); `shortage`:
+    whether an error for lack of memory is one of the file, too; otherwise it is raised as it is.
 
     **Raises:** `InputError` for any error of the parser.
     """
@@ -34,7 +35,7 @@ def foreign_parser(path: str | Path, expected: str) -> Iterator[None]:
     except (FileNotFoundError, NotADirectoryError):
         raise InputError(f"{path}: no such file") from None
     except BaseException as error:  # panics of Rust (pyo3) are no `Exception`
-        if isinstance(error, NOT_OF_FILES):
+        if isinstance(error, NOT_OF_FILES) or (not shortage and is_memory_shortage(error)):
             raise
         raise InputError(f"{path}: {_describe(error, expected)}") from None
 

@@ -129,9 +129,9 @@ def check_georeference(path: str | Path, source: "DatasetReader") -> None:
     """Refuse one that is no number, beyond any map, or without an inverse.
 
     **Raises:** `InputError`."""
-    # 1e9: degrees, metres or feet, of pixels up to the size of the Earth
-    transform = tuple(source.transform)[:6]
-    if not all(abs(v) < 1e9 for v in transform) or source.transform.is_degenerate:
+    # 1e9: degrees, metres or feet, of pixels up to the size of the Earth; 1e-12 degrees are 0.1 µm
+    transform, area = tuple(source.transform)[:6], abs(source.transform.determinant)
+    if not (all(abs(v) < 1e9 for v in transform) and area > 1e-24):
         raise InputError(
             f"{path}: is damaged: its georeference is {', '.join(f'{v:g}' for v in transform)}"
         )
