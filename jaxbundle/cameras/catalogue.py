@@ -111,7 +111,7 @@ def _built_in(name: str) -> CameraModel | None:
 
     **Raises:** `ValueError` for a name of a family whose numbers are impossible.
     """
-    if name in MODELS:
+    if isinstance(name, str) and name in MODELS:  # a file may have anything there
         return MODELS[name]
     found = _of_family(name)
     return None if found is None else found()

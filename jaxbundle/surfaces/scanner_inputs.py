@@ -16,9 +16,10 @@ from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, geodetic
-from jaxbundle.io.rasters.reading import check_pixels, open_raster, read_pixels
+from jaxbundle.io.rasters.reading import check_pixels, check_raw, open_raster, read_pixels
 from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.io.scanner.rpc import RASTERS, read_rpc
+from jaxbundle.photographs.places import utm_system
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.image_to_ground import locate_point
 from jaxbundle.pushbroom.rpc import Rpc
@@ -64,6 +65,9 @@ def read_ground_views(
         names = [str(raster) for _, raster in found]
     views = []
     for name, (orientation, raster), earth in zip(names, found, earths):
+        if not isinstance(orientation, Rpc):
+            with open_raster(raster) as source:
+                check_raw(raster, source)
         grey = read_grey(raster)
         if isinstance(orientation, Rpc):
             assert around is not None, "an RPC is not in a local frame"
@@ -122,9 +126,7 @@ def system_of(around: Neighbourhood, crs: str | None) -> str:
     if crs is not None:
         return crs
     longitude, latitude = (np.degrees(float(a)) for a in (around.longitude, around.latitude))
-    # zones of 6° from 180° W; EPSG 32601 to 32660 are those of the north, 32701 on of the south
-    zone = int((longitude + 180) // 6) % 60 + 1
-    return f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}"
+    return utm_system(latitude, longitude)
 
 
 def to_map(cloud: Cloud, around: Neighbourhood, crs: str) -> Cloud:

@@ -265,3 +265,35 @@ def test_what_is_no_json(tmp_path):
         (tmp_path / "isd.json").write_text(text)
         with pytest.raises(InputError, match=word):
             read_csm(tmp_path / "isd.json")
+
+
+@pytest.mark.parametrize("change", [
+    {"projection": "+proj=eqc +R=1737400", "geotransform": [-9e5, 5.0, 0, 4e5, 0, -5.0]},
+    {"projection": "", "geotransform": [1000.0, 1, 0, 2000, 0, 1]},
+    {"geotransform": [0.0, 2, 0, 0, 0, 2]},
+])  # fmt: skip
+def test_a_map_or_a_crop_is_not_taken_for_the_raw_image(tmp_path, change):
+    with pytest.raises(InputError, match="isd.json: .*whole raw image"):
+        read_csm(write(tmp_path, support_data(older=True) | change))
+
+
+def test_the_identity_is_a_raw_image(tmp_path):
+    raw = {"projection": "", "geotransform": [0.0, 1, 0, 0, 0, 1]}
+    assert read_csm(write(tmp_path, support_data(older=True) | raw)).warnings == ()
+
+
+@pytest.mark.parametrize("factor, used", [(1000.0, False), (-1.0, False), (0.94, True)])
+def test_velocities_that_contradict_their_positions_are_said(tmp_path, factor, used):
+    """Of metres instead of kilometres, of another direction, and 6 % off, by which the positions
+    between rows of a second are off by less than 100 m."""
+    isd = support_data()
+    good = read_csm(write(tmp_path, isd))
+    table = isd["instrument_position"]
+    table["velocities"] = (factor * np.array(table["velocities"])).tolist()
+    bad = read_csm(write(tmp_path, isd))
+    (said,) = bad.warnings
+    assert "velocities, row 2: positions move by 7" in said
+    assert ("used all the same" in said) == used and ("not used" in said) != used
+    track, known = (image.image.trajectory.position.values for image in (bad, good))
+    limit = 100 if used else 1.2  # at the ends a line: 9 m/s²·(1 s)²/8
+    np.testing.assert_allclose(track, known, rtol=0, atol=limit)

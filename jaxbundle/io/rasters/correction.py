@@ -13,7 +13,7 @@ from jaxbundle.choices import Resampling
 from jaxbundle.errors import InputError
 from jaxbundle.io.rasters.map_blocks import write_map
 from jaxbundle.io.rasters.maps import MapGrid, MapSystem, contiguous, grid_around
-from jaxbundle.io.rasters.reading import Window, open_raster, read_pixels
+from jaxbundle.io.rasters.reading import Window, check_raw, open_raster, read_pixels
 from jaxbundle.pushbroom.ground_to_image import Search
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.image_to_ground import locate_lines
@@ -98,6 +98,7 @@ def write_corrected(
     **Raises:** `InputError` if the raster does not have the size of the image, or cannot be read.
     """
     with open_raster(source) as bands:
+        check_raw(source, bands)
         if (bands.height, bands.width) != (image.lines, image.pixels):
             raise InputError(
                 f"{source}: {bands.height} lines of {bands.width} pixels; the scanner file has "

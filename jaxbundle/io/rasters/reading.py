@@ -49,9 +49,7 @@ def raster_parser(path: str | Path) -> Iterator[None]:
                 yield
         except InputError as error:
             if "not recognized" in str(error):
-                raise InputError(
-                    f"{path}: expected {EXPECTED[2:]}; GDAL does not know it"
-                ) from None
+                raise InputError(f"{path}: expected {EXPECTED}; GDAL does not know it") from None
             raise
 
 
@@ -134,6 +132,26 @@ def check_georeference(path: str | Path, source: "DatasetReader") -> None:
     if not (all(abs(v) < 1e9 for v in transform) and area > 1e-24):
         raise InputError(
             f"{path}: is damaged: its georeference is {', '.join(f'{v:g}' for v in transform)}"
+        )
+
+
+def check_raw(path: str | Path, source: "DatasetReader") -> None:
+    """Refuse a raster that is a map, or a crop, where one of the lines of a scanner is expected.
+
+    **Raises:** `InputError`."""
+    place = source.transform
+    todo = "; give the whole image as the scanner took it, or the coefficients (RPC) of this one"
+    if source.crs is not None and not place.is_identity:
+        raise InputError(
+            f"{path}: is a map, in {source.crs.to_string()[:60]} with pixels of {place.a:g}: its "
+            f"rows are not the lines of the scanner{todo}"
+        )
+    # GDAL's coordinates of pixels, rows downwards; programs leave them when they cut a part out
+    steps = (place.a, place.b, place.d, place.e)
+    if source.crs is None and steps == (1, 0, 0, 1) and not place.is_identity:
+        raise InputError(
+            f"{path}: is a part that begins at line {place.f:g}, pixel {place.c:g} of a larger "
+            f"image{todo}"
         )
 
 

@@ -91,10 +91,35 @@ def _read_support_data(path: Path) -> tuple[JsonFields, int]:
             f"{path}: JSON of another kind, without image_lines and line_scan_rate; expected an "
             "ISD or a model state of a line scanner"
         )
+    _refuse_map(isd)
     model = isd.get("name_model", MODEL)
     if model != MODEL:
         raise InputError(f"{path}: name_model is {show(model)}; {MODEL} is expected")
     return isd, order
+
+
+def _refuse_map(isd: JsonFields) -> None:
+    """Refuse an image whose rows are not the lines of the scanner: ALE states the projection and
+    GDAL's transformation (x₀, dx, 0, y₀, 0, dy) of the file, empty and the identity for a raw one.
+    """
+    todo = (
+        "; give the support data (ISD) and the file of the whole raw image, before map projection"
+    )
+    projection = isd.get("projection")
+    if projection:
+        raise InputError(
+            f"{isd.path}: its image is a map, projection {show(projection)}: its rows are not the "
+            f"lines of the scanner{todo}"
+        )
+    if isd.get("geotransform") is None:
+        return
+    x, dx, rx, y, ry, dy = isd.array("geotransform", (6,))
+    if (x, dx, rx, y, ry, abs(dy)) != (0, 1, 0, 0, 0, 1):
+        raise InputError(
+            f"{isd.path}: geotransform is {show(isd.get('geotransform'))}: its image is a crop, or "
+            f"resampled: line {y:g}, sample {x:g} and steps of {dy:g} and {dx:g} of the image that "
+            f"the scanner took{todo}"
+        )
 
 
 def _earth(isd: JsonFields) -> Ellipsoid:

@@ -32,6 +32,7 @@ from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.ancillary import (
     attitude_table,
     check_times,
+    contradiction,
     extrapolation_limit,
     normalise_quaternions,
     position_table,
@@ -166,7 +167,8 @@ def _resample(isd: JsonFields, lines: Float[np.ndarray, " lines"], interpolation
     # short image, of which the file may have two states. Hermite's cubic between states h seconds
     # apart errs by r·ω⁴·h⁴/384: in a low orbit of the Earth below a millimetre up to 14 s.
     t = np.linspace(position_times[0], position_times[-1], max(25, len(position_times)))
-    P = body(t).apply(_positions(isd, position_times)(t))
+    inertial, contradicted = _positions(isd, position_times)
+    P = body(t).apply(inertial(t))
     if interpolation == "usgscsm":
         merged = np.union1d(body_times, pointing_times)
         if len(merged) == 1:
@@ -180,7 +182,7 @@ def _resample(isd: JsonFields, lines: Float[np.ndarray, " lines"], interpolation
     limits = extrapolation_limit(position_times), extrapolation_limit(pointing_times)
     sources = isd.source("instrument_position"), isd.source("instrument_pointing")
     lengths = *body_lengths, *pointing_lengths
-    return States(t, P, rows, R, limits, sources, (*lengths, *warnings))
+    return States(t, P, rows, R, limits, sources, (*lengths, *contradicted, *warnings))
 
 
 def _check_rows(isd: JsonFields, key: str, t: Float[np.ndarray, " n"]) -> None:
@@ -191,15 +193,23 @@ def _check_rows(isd: JsonFields, key: str, t: Float[np.ndarray, " n"]) -> None:
 
 def _positions(
     isd: JsonFields, t: Float[np.ndarray, " n"]
-) -> Callable[[Times], Float[np.ndarray, "n 3"]]:
-    """Positions in the inertial frame, metres, at times."""
+) -> tuple[Callable[[Times], Float[np.ndarray, "n 3"]], tuple[str, ...]]:
+    """Positions in the inertial frame, metres, at times; warnings."""
     scale = unit_of(isd, "instrument_position", "km")
     P = scale * isd.array("instrument_position.positions", (len(t), 3))
-    if isd.get("instrument_position.velocities") is None:
-        table = position_table(t, P, method="usgscsm", order=3, gap=np.inf)
-        return lambda times: np.array(jax.vmap(lambda time: interpolate(table, time))(times))
-    V = scale * isd.array("instrument_position.velocities", (len(t), 3))
-    return CubicHermiteSpline(t, P, V)
+    said: tuple[str, ...] = ()
+    if isd.get("instrument_position.velocities") is not None:
+        V = scale * isd.array("instrument_position.velocities", (len(t), 3))
+        wrong = contradiction(t, P, V, isd.source("instrument_position.velocities"))
+        # orbits are known to better than 100 m; a smaller error is interpolated as usgscsm does
+        used = wrong is None or wrong.shift < 100
+        if wrong is not None:
+            todo = "used all the same" if used else "not used; positions are interpolated alone"
+            said = (f"{wrong.message}: up to {wrong.shift:.2g} m between the rows; {todo}",)
+        if used:
+            return CubicHermiteSpline(t, P, V), said
+    table = position_table(t, P, method="usgscsm", order=3, gap=np.inf)
+    return lambda times: np.array(jax.vmap(lambda time: interpolate(table, time))(times)), said
 
 
 def _times(isd: JsonFields, key: str) -> Float[np.ndarray, " n"]:
