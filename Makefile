@@ -1,4 +1,5 @@
-# `make demo`, `make test` (`make test-further`: the further cases of its dear tests, `make test-all`: both), `make test-commands`,
+# `make demo`, `make test` (`make test-further`: the further cases of its dear tests, `make test-all`: both), `make types`,
+# `make test-commands`,
 # `make test-oldest`, `make test-newest`, `make docs` and `make bench` (or a part of it, below). All make .venv first (uv where
 # installed, else venv and pip) and install the package: `demo` with plots, the others with what the tests
 # need; `docs` also Sphinx, `bench` also what it compares with; `test-oldest` and `test-newest` have
@@ -19,7 +20,7 @@ MORE_BENCHES = large pushbroom orientation measuring blunders
 BAL ?=
 PEERS ?=
 
-.PHONY: demo test test-further test-all test-commands random-problems mutants bench docs install install-demo \
+.PHONY: demo test types test-further test-all test-commands random-problems mutants bench docs install install-demo \
   install-docs clean \
   bench-gpu $(BOUNDS:%=install-%) $(BOUNDS:%=test-%) $(BENCHES:%=bench-%) $(MORE_BENCHES:%=bench-%)
 
@@ -68,8 +69,11 @@ test-further: CASES = -m further -x
 test test-further test-all: install
 	$(BIN)/python -m ruff check jaxbundle tests benchmarks docs
 	$(BIN)/python -m ruff format --check --quiet jaxbundle
-	$(BIN)/basedpyright --pythonpath $(BIN)/python
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(CASES)
+
+# The types of the whole package: a minute and a half.
+types: install
+	$(BIN)/basedpyright --pythonpath $(BIN)/python
 
 # Commands and Python blocks of README and docs, and commands on every camera model, as processes from a
 # clone with an empty home, cold and warm: an hour on two cores, or as much as fits: make test-commands SECONDS=500

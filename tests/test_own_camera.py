@@ -115,6 +115,7 @@ VALUES = {"c": 24.0, "x0": 0.1, "K1": -1e-4, "K2": 2e-8, "P1": 1e-5, "b1": 1e-4,
 FREE = ("c", "x0", "y0", "K1")
 
 
+@pytest.mark.further
 def test_brown_said_again_has_the_figures_of_brown():
     """Residuals and derivatives, to rounding, in the measured image, which needs the inverse. (The
     whole of an adjustment is compared in tests/calibration/test_own_camera_model.py.)"""
@@ -145,6 +146,7 @@ def bulge(p, xi, yi):
     return xi * (1 + k * r2) / (1 + m * r2), yi * (1 + k * r2) / (1 + m * r2)
 
 
+@pytest.mark.further
 def test_cameras_of_several_models():
     """A network with own and built-in models; the object of a built-in one is its name; what is not
     significant is so against its default."""

@@ -125,6 +125,7 @@ print(repr(jaxbundle.adjust(jaxbundle.read_network(sys.argv[1])).sigma0))
 """
 
 
+@pytest.mark.further
 def test_a_replaced_method_is_seen_by_a_later_process(home, convergent4):
     project = ROOT / "examples" / "convergent4" / "project.toml"
     first, again = (float(run(ADJUST, project, environment=home)) for _ in range(2))

@@ -127,6 +127,7 @@ def points_of(found):
     return found.kind == "point"
 
 
+@pytest.mark.further
 def test_the_datum_does_not_matter_after_a_similarity(epochs):
     inner = jaxbundle.adjust(epochs(1).replace(datum="inner"))
     minimal = jaxbundle.adjust(epochs(1).replace(datum="minimal"))

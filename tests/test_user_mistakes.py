@@ -246,7 +246,7 @@ def said_of(given) -> str:
     return said
 
 
-@pytest.mark.parametrize("unit", [1.0, 100.0])
+@pytest.mark.parametrize("unit", [pytest.param(1.0, marks=pytest.mark.further), 100.0])
 def test_a_mirrored_control_is_named_whatever_the_unit_of_weight(unit):
     """σ that nobody stated only scale σ0: the residuals, in principal distances, are the same."""
     given = network(dataclasses.replace(PX, free=("fx", "cx", "cy")), **CONTROL)

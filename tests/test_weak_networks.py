@@ -103,6 +103,7 @@ def test_weak_lines_compare_with_the_extent():
         assert f"{said} principal distance" in line
 
 
+@pytest.mark.further
 def test_blunders_do_not_make_good_geometry_weak():
     """σ0 is that of 3 in 100 rays, which are wrong by 150 σ."""
     given = network(RING, **CONTROL)

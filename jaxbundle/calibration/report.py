@@ -164,6 +164,8 @@ def as_dict(calibration: "Calibration", brief: bool = False) -> dict:
             "columns": views.board.columns,
             "rows": views.board.rows,
             "square": views.board.square,
+            "row_spacing": views.board.spacing[1],
+            "first_marker": views.board.first_marker,
         },
         "image_size": list(views.image_size),
         "photographs": {"used": list(views.names), "failed": dict(views.failed)},

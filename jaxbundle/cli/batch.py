@@ -35,11 +35,19 @@ def batch(  # noqa: PLR0913 - the options of the command
         str, typer.Option(help="of photographs, COLUMNSxROWS as of calibrate; a folder a camera")
     ] = "",
     square: Annotated[
-        float | None, typer.Option(help="side of a square, distance of circles")
-    ] = None,
+        str,
+        typer.Option(
+            metavar="S or S,S",
+            help="side of a square, distance of circles; "
+            "two of a stretched print: of columns, of rows",
+        ),
+    ] = "",
     kind: Annotated[str, choice(BOARDS)] = "chessboard",
     marker: Annotated[float | None, typer.Option(help="side of a marker or tag")] = None,
     dictionary: Annotated[str, choice(DICTIONARIES, "of markers or tags")] = "DICT_4X4_50",
+    first_marker: Annotated[
+        int, typer.Option(min=0, help="number of the first marker or tag of the board")
+    ] = 0,
     rig: Annotated[
         bool,
         typer.Option("--rig", help="folders of rigs: in each a folder of photographs a camera"),
@@ -125,9 +133,11 @@ def batch(  # noqa: PLR0913 - the options of the command
     from jaxbundle.io.text.csv_tables import read_csv, write_text
     from jaxbundle.network.columns import count
 
-    if not board and (square is not None or marker is not None):
+    if not board and (square or marker is not None):
         raise InputError("--board is missing: COLUMNSxROWS, inner corners of a chessboard, as 9x6")
-    known = board_given(board, square, kind, None, marker, dictionary) if board else None
+    known = (
+        board_given(board, square, kind, None, marker, dictionary, first_marker) if board else None
+    )
     check_page(html, None, [*inputs, json_lines], force)
     given = [*inputs, json_lines, *filter(None, (html, against and str(against)))]
     check_outputs(table, summary, given, force)
@@ -162,6 +172,7 @@ def batch(  # noqa: PLR0913 - the options of the command
             kind,
             marker,
             dictionary,
+            first_marker,
             rig,
             pixel_size,
             set,

@@ -26,8 +26,13 @@ def calibrate(  # noqa: PLR0913 - the options of the command
         ),
     ] = "",
     square: Annotated[
-        float | None, typer.Option(help="side of a square, spacing of circles, in --unit")
-    ] = None,
+        str,
+        typer.Option(
+            metavar="S or S,S",
+            help="side of a square, spacing of circles, in --unit; "
+            "two of a stretched print: of columns, of rows",
+        ),
+    ] = "",
     kind: Annotated[str, choice(BOARDS)] = "chessboard",
     camera: Annotated[
         list[str] | None, typer.Option(help="NAME=PATTERN: one of several cameras; repeatable")
@@ -48,6 +53,9 @@ def calibrate(  # noqa: PLR0913 - the options of the command
     ] = None,
     marker: Annotated[float | None, typer.Option(help="side of a marker or tag")] = None,
     dictionary: Annotated[str, choice(DICTIONARIES, "of markers or tags")] = "DICT_4X4_50",
+    first_marker: Annotated[
+        int, typer.Option(min=0, help="number of the first marker or tag of the board")
+    ] = 0,
     board_sigma: Annotated[
         float | None, typer.Option(help="σ of a board coordinate, for an inexact board")
     ] = None,
@@ -112,7 +120,7 @@ def calibrate(  # noqa: PLR0913 - the options of the command
 
     test = None if snooping == "none" else snooping
     check_test(test, significance, "--")
-    known = board_given(board, square, kind, diameter, marker, dictionary)
+    known = board_given(board, square, kind, diameter, marker, dictionary, first_marker)
     cameras = _cameras(photos, camera)
     need_opencv()
     files = [path for paths in cameras.values() for path in photographs(paths)]
@@ -133,6 +141,10 @@ def calibrate(  # noqa: PLR0913 - the options of the command
                 "--board": board,
                 "--square": square,
                 "--kind": kind,
+                "--diameter": diameter,
+                "--marker": marker,
+                "--dictionary": dictionary if marker or kind in ("charuco", "aprilgrid") else "",
+                "--first-marker": first_marker or "",
                 "--model": models or model,
                 "--free": free,
                 "--given": ", ".join(given or ()),

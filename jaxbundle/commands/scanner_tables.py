@@ -180,6 +180,14 @@ def project(scanner: str | Path, points: str | Path, *, tell: Tell = ignore) -> 
     return ScannerTable(columns, {"scanner": file.name})
 
 
+def check_draws(draws: int) -> None:
+    """Refuse a Monte Carlo simulation of too few draws; 0: none is wanted."""
+    if 0 < draws < MIN_DRAWS:
+        raise InputError(
+            f"--draws {draws}: too few for an RMS; at least {MIN_DRAWS}, 1000 are accurate to 3 %"
+        )
+
+
 def accuracy(  # noqa: PLR0913 (public: the options of the command, all but one by name)
     scanner: str | Path,
     *,
@@ -211,10 +219,7 @@ def accuracy(  # noqa: PLR0913 (public: the options of the command, all but one 
 
     **Raises:** `InputError`.
     """
-    if 0 < draws < MIN_DRAWS:
-        raise InputError(
-            f"--draws {draws}: too few for an RMS; at least {MIN_DRAWS}, 1000 are accurate to 3 %"
-        )
+    check_draws(draws)
     file = open_scanner(scanner, tell)
     surface = surface_of(file.earth, height, dem, file.image, geoid)
     size = file.image.lines, file.image.pixels

@@ -55,6 +55,10 @@ class Board:
     - `diameter`: of the circles, object unit: their images are then corrected for eccentricity.
     - `marker`, `dictionary`: side and OpenCV dictionary of the markers of `charuco`, or of the tags
       of `aprilgrid`.
+    - `row_spacing`: distance of neighbouring rows (of tags for `aprilgrid`), if a print has
+      stretched them: `square` is then that along the rows only.
+    - `first_marker`: number of the first marker of `charuco` or `aprilgrid` in the dictionary, of
+      the second and third board of a set for instance.
 
     **Raises:** `InputError` for an impossible board.
     """
@@ -66,6 +70,8 @@ class Board:
     diameter: float | None = None
     marker: float | None = None
     dictionary: str = ARUCO
+    row_spacing: float | None = None
+    first_marker: int = 0
 
     def __post_init__(self):
         if not isinstance(self.kind, str) or self.kind not in BOARDS:
@@ -78,7 +84,7 @@ class Board:
                 f"board {self.columns}x{self.rows}: a {self.kind} board needs at least "
                 f"{least} columns and rows"
             )
-        for name in ("square", "diameter", "marker"):
+        for name in ("square", "diameter", "marker", "row_spacing"):
             value = getattr(self, name)
             if value is not None or name == "square":
                 is_length = lambda x: 0 < x < np.inf
@@ -89,10 +95,28 @@ class Board:
             if self.dictionary == ARUCO:
                 object.__setattr__(self, "dictionary", APRILTAGS)
         object.__setattr__(self, "dictionary", find_dictionary(self.dictionary))
-        if self.marker is not None and self.marker >= self.square:
+        smallest = min(self.spacing)
+        if self.marker is not None and self.marker >= smallest:
             raise InputError(
-                f"board: a marker of {self.marker:g} does not fit into a square of {self.square:g}"
+                f"board: a marker of {self.marker:g} does not fit into a square of {smallest:g}"
             )
+        if self.row_spacing is not None and self.kind == "asymmetric-circles":
+            raise InputError("board: asymmetric-circles have one spacing, that of their rows")
+        integer("board: first marker", self.first_marker, least=0)
+        if self.first_marker and self.kind not in ("charuco", "aprilgrid"):
+            raise InputError(f"board: a {self.kind} board has no markers, so no first one")
+
+    @property
+    def spacing(self) -> tuple[float, float]:
+        """Distances of neighbouring columns and of neighbouring rows, object unit."""
+        return self.square, self.row_spacing or self.square
+
+    @property
+    def markers(self) -> int:
+        """Number of markers or tags."""
+        if self.kind == "aprilgrid":
+            return self.columns * self.rows
+        return self.columns * self.rows // 2 if self.kind == "charuco" else 0
 
     @property
     def marker_side(self) -> float:
@@ -121,11 +145,12 @@ class Board:
         """Coordinates in the object unit, in the order of `ids`."""
         rows, columns = self.grid
         i, j = np.mgrid[0:rows, 0:columns].reshape(2, -1)
+        across, down = self.spacing
         if self.marker is not None and self.kind == "aprilgrid":
-            place = lambda k: k // 2 * self.square + k % 2 * self.marker
-            return np.stack([place(j), place(rows - 1 - i), np.zeros(len(i))], 1)
+            place = lambda k, step: k // 2 * step + k % 2 * self.marker
+            return np.stack([place(j, across), place(rows - 1 - i, down), np.zeros(len(i))], 1)
         along = 2 * j + i % 2 if self.kind == "asymmetric-circles" else j
-        return self.square * np.stack([along, rows - 1 - i, np.zeros(len(i))], 1)
+        return np.stack([across * along, down * (rows - 1 - i), np.zeros(len(i))], 1)
 
     @property
     def unique(self) -> bool:
@@ -137,7 +162,9 @@ class Board:
         return self.kind in ("charuco", "aprilgrid")
 
     def __str__(self) -> str:
-        return f"{self.kind} {self.columns}x{self.rows}, square {self.square:g}"
+        sides = " × ".join(f"{side:g}" for side in dict.fromkeys(self.spacing))
+        first = f", markers from {self.first_marker}" if self.first_marker else ""
+        return f"{self.kind} {self.columns}x{self.rows}, square {sides}{first}"
 
 
 def find_dictionary(name: str) -> str:

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jaxbundle.choices import DICTIONARIES
 from jaxbundle.errors import InputError
 from jaxbundle.measure.board_points import BoardPoints, make_points
 from jaxbundle.measure.boards import SMALLEST_SIDE, Board
+from jaxbundle.measure.marker_boards import board_of_markers
 from jaxbundle.measure.saddles import Saddles, fit_saddles, lines_of_grid
 from jaxbundle.measure.tag_grids import find_tags, get_dictionary
 from jaxbundle.measure.targets import centre_by_ellipse
@@ -91,15 +91,14 @@ def other_sizes(grey: Grey, board: Board) -> Board | None:
     """The largest board of another size, of the same kind, in the photograph.
 
     Chessboards of any size; circles with columns and rows exchanged, or some less or more of
-    either; ChArUco boards of the same size with markers of another dictionary.
+    either; boards of markers as the markers seen tell: of another size, with another first number,
+    or of another dictionary.
     """
     if board.kind == "chessboard":
         other = largest_chessboard(grey, board)
         return None if other == board else other
-    if board.kind == "charuco":
-        return _with_other_markers(grey, board)
-    if board.kind == "aprilgrid":
-        return None
+    if board.kind in ("charuco", "aprilgrid"):
+        return board_of_markers(grey, board)
     m, n = board.columns, board.rows
     near = [(n, m)] + [(m + i, n + j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
     grey, _ = _reduce(need_opencv(), grey, QUICK_SIDE)
@@ -112,24 +111,6 @@ def other_sizes(grey: Grey, board: Board) -> Board | None:
         except InputError:
             continue
     return None
-
-
-def _with_other_markers(grey: Grey, board: Board) -> Board | None:
-    """The board with the dictionary of most markers in the photograph; of several with
-    the same markers the smallest."""
-    aruco = need_opencv().aruco
-    names = sorted(name for name in DICTIONARIES if hasattr(aruco, name))
-    known = {name: get_dictionary(name) for name in names}
-    markers = board.columns * board.rows // 2
-    best, most = None, 3  # up to three markers may be false readings of another dictionary
-    for name, dictionary in sorted(known.items(), key=lambda item: len(item[1].bytesList)):
-        if name == board.dictionary or len(dictionary.bytesList) < markers:
-            continue
-        _, ids, _ = aruco.ArucoDetector(dictionary).detectMarkers(grey)
-        number = 0 if ids is None else len(np.unique(ids[ids < markers]))
-        if number > most:
-            best, most = name, number
-    return None if best is None else dataclasses.replace(board, dictionary=best)
 
 
 def largest_chessboard(grey: Grey, board: Board) -> Board | None:
@@ -274,10 +255,15 @@ def _charuco(cv2: ModuleType, grey: Grey, board: Board) -> BoardPoints:
     aruco, dictionary = cv2.aruco, get_dictionary(board.dictionary)
     marker = board.marker_side
     best, seen = None, {}
+    numbers = np.arange(board.first_marker, board.first_marker + board.markers)
+    if numbers[-1] >= len(dictionary.bytesList):
+        raise InputError(
+            f"{board}: {board.dictionary} has {len(dictionary.bytesList)} markers, from 0"
+        )
     # OpenCV before 4.6 began boards of an even number of rows with a white square
     for legacy in (False, True):
         size = (board.columns, board.rows)
-        known = aruco.CharucoBoard(size, board.square, marker, dictionary)
+        known = aruco.CharucoBoard(size, min(board.spacing), marker, dictionary, numbers)
         known.setLegacyPattern(legacy)
         # markers are searched once: they take the time
         xy, ids, *markers = aruco.CharucoDetector(known).detectBoard(grey, **seen)
@@ -292,7 +278,7 @@ def _charuco(cv2: ModuleType, grey: Grey, board: Board) -> BoardPoints:
             f"with {board.dictionary} markers found"
         )
     xy, ids = best
-    X = board.points[ids, :2] / board.square
+    X = board.points[ids, :2] / board.spacing
     on_grid = np.full((*board.grid, 2), np.nan)
     on_grid.reshape(-1, 2)[ids] = xy
     lines = lines_of_grid(on_grid).reshape(-1, 2, 2)[ids]
@@ -314,13 +300,13 @@ def _strips(
 ) -> Float[np.ndarray, "n 2 2 2"]:
     """Distances of the corners of markers from the lines through the corners of a ChArUco board,
     for `fit_saddles`."""
-    width = (1 - board.marker_side / board.square) / 2
+    width = (1 - board.marker_side / np.array(board.spacing)) / 2
     normal = np.stack([-lines[..., 1], lines[..., 0]], 2)
     normal /= np.linalg.norm(normal, axis=2)[..., None]
     strips, rows = np.empty((len(X), 2, 2, 2)), np.arange(len(X))
-    for right in (-width, width):
-        for up in (-width, width):
-            away = np.einsum("ni,nki->nk", image(X + [right, up]) - image(X), normal)
+    for right in (-1, 1):
+        for up in (-1, 1):
+            away = np.einsum("ni,nki->nk", image(X + width * [right, up]) - image(X), normal)
             first, second = (away > 0).astype(int).T
             strips[rows, first, second] = np.abs(away)
     return strips

@@ -24,6 +24,9 @@ Grey = UInt8[np.ndarray, "rows columns"]
 MIN_TAGS = 4
 """Four middles, not in one row, determine the homography of the grid."""
 
+BORDER_BITS = 2, 1
+"""Kalibr prints tags with borders of two bits, everybody else of one."""
+
 
 def get_dictionary(name: str) -> Any:
     """OpenCV's dictionary of this name.
@@ -37,16 +40,32 @@ def get_dictionary(name: str) -> Any:
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 
+def read_markers(
+    grey: Grey, dictionary: str, border_bits: int = 1
+) -> tuple[Int[np.ndarray, " markers"], Float[np.ndarray, "markers 4 2"]]:
+    """Numbers and corners of the markers of a dictionary in a photograph, without those that are
+    seen twice."""
+    import cv2
+
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.markerBorderBits = border_bits
+    detector = cv2.aruco.ArucoDetector(get_dictionary(dictionary), parameters)
+    corners, ids, _ = detector.detectMarkers(grey)
+    ids = np.zeros(0, int) if ids is None else ids.ravel().astype(int)
+    once = np.bincount(ids, minlength=1)[ids] == 1
+    seen = np.array([four[0] for four in corners], float).reshape(-1, 4, 2)
+    return ids[once], seen[once]
+
+
 def find_tags(cv2: ModuleType, grey: Grey, board: Board) -> BoardPoints:
     """The corners of the tags in a photograph.
 
     **Raises:** `InputError` for fewer than four tags, or tags in one row.
     """
-    # Kalibr prints borders of two bits, everybody else of one
     ids, seen = max(
-        (_read_tags(cv2, grey, board, bits) for bits in (2, 1)), key=lambda found: len(found[0])
+        (_read_tags(grey, board, bits) for bits in BORDER_BITS), key=lambda found: len(found[0])
     )
-    rows, columns = np.divmod(ids, board.columns)
+    rows, columns = np.divmod(ids - board.first_marker, board.columns)
     if len(ids) < MIN_TAGS or not (np.ptp(rows) and np.ptp(columns)):
         raise InputError(
             f"fewer than {MIN_TAGS} tags of a grid of {board.columns} × {board.rows} tags "
@@ -63,7 +82,7 @@ def find_tags(cv2: ModuleType, grey: Grey, board: Board) -> BoardPoints:
         raise InputError(f"the tags found are not those of a flat grid: {board}")
     side = np.linalg.norm(np.diff(seen, axis=1), axis=2).min(1)
     # the squares of the gaps end where the next tag begins, in sides of a tag
-    gap = min(1.0, board.square / board.marker_side - 1)
+    gap = min(1.0, min(board.spacing) / board.marker_side - 1)
     xy, rows, lines = [], [], []
     for which, there, four, length in zip(corners, near, seen, side):
         apart = np.linalg.norm(there[:, None] - four, axis=2)
@@ -80,17 +99,13 @@ def find_tags(cv2: ModuleType, grey: Grey, board: Board) -> BoardPoints:
 
 
 def _read_tags(
-    cv2: ModuleType, grey: Grey, board: Board, bits: int
+    grey: Grey, board: Board, bits: int
 ) -> tuple[Int[np.ndarray, " tags"], Float[np.ndarray, "tags 4 2"]]:
     """Numbers and corners of the tags of a board; those read twice are left out."""
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.markerBorderBits = bits
-    detector = cv2.aruco.ArucoDetector(get_dictionary(board.dictionary), parameters)
-    corners, ids, _ = detector.detectMarkers(grey)
-    ids = np.zeros(0, int) if ids is None else ids.ravel().astype(int)
-    once = (ids < board.columns * board.rows) & (np.bincount(ids, minlength=1)[ids] == 1)
-    seen = np.array([four[0] for four in corners], float).reshape(-1, 4, 2)
-    return ids[once], seen[once]
+    ids, seen = read_markers(grey, board.dictionary, bits)
+    number = ids - board.first_marker
+    of_board = (number >= 0) & (number < board.markers)
+    return ids[of_board], seen[of_board]
 
 
 def _places(

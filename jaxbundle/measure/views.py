@@ -41,8 +41,7 @@ there is nothing to find; most of three decide about a larger board."""
 
 Look = tuple[tuple[int, int], Float[np.ndarray, "points 2"]] | str
 """Search result of a board in a photograph: image size and image points, or why none."""
-HINT = "give --board"
-HINTS = (HINT, "give --dictionary")
+HINT = "give --"
 
 
 @print_in_one_screen
@@ -282,7 +281,7 @@ def _find_saved_again(used: Sequence[tuple[str, np.ndarray]]) -> dict[str, str]:
 
 def _nothing_found(paths: Mapping[str, Path], failed: Mapping[str, str]) -> str:
     """One line about photographs without a board, preferably about one with another board."""
-    hinted = (name for name in failed if any(hint in failed[name] for hint in HINTS))
+    hinted = (name for name in failed if HINT in failed[name])
     first = next(hinted, next(iter(failed)))
     return f"no photograph of {len(failed)} shows the board: {paths[first]}: {failed[first]}"
 
@@ -297,19 +296,30 @@ def _other_boards(
             sizes[name] = other_sizes(read_photograph(paths[name]), board)
         except InputError:
             continue
-    if board.kind == "charuco":
+    if board.kind in ("charuco", "aprilgrid"):
         return {
-            name: f"{failed[name]}. But there are markers of {other.dictionary}: give --dictionary "
-            f"{other.dictionary}"
+            name: f"{failed[name]}. But {_markers_seen(other, board)}"
             for name, other in sizes.items()
             if other is not None
         }
     return {
-        name: f"{failed[name]}. But there is one of {other.columns}x{other.rows}: {HINT} "
+        name: f"{failed[name]}. But there is one of {other.columns}x{other.rows}: {HINT}board "
         f"{other.columns}x{other.rows}, if it is seen whole"
         for name, other in sizes.items()
         if other is not None
     }
+
+
+def _markers_seen(other: Board, board: Board) -> str:
+    """The board that the markers seen tell, and what to give."""
+    options = []
+    if other.dictionary != board.dictionary:
+        options.append(f"--dictionary {other.dictionary}")
+    if (other.columns, other.rows) != (board.columns, board.rows):
+        options.append(f"--board {other.columns}x{other.rows} (or more rows)")
+    if other.first_marker != board.first_marker:
+        options.append(f"--first-marker {other.first_marker}")
+    return f"the markers seen are those of another board: give {', '.join(options)}"
 
 
 def _part_of_a_larger(
@@ -329,7 +339,7 @@ def _part_of_a_larger(
     size = f"{other.columns}x{other.rows}"
     return (
         f"the board of {board.columns}x{board.rows} is a part of a larger one, of {size} "
-        f"({few[0]}), and not the same part everywhere; if {size} is the board: {HINT} {size}",
+        f"({few[0]}), and not the same part everywhere; if {size} is the board: {HINT}board {size}",
     )
 
 

@@ -41,6 +41,7 @@ def dense():
     return jaxbundle.adjust(street(), reduction="dense")
 
 
+@pytest.mark.further
 def test_a_network_solved_by_iteration_is_the_same_network(dense):
     found = jaxbundle.adjust(street(), reduction="iterative")
     assert found.reduction == "iterative" and found.converged and dense.counts.datum == 7

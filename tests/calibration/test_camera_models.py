@@ -76,8 +76,8 @@ TRUTH = {
 }  # fmt: skip
 
 
-FURTHER = ("fov", "eucm", "division", "stereographic", "equidistant", "equisolid", "orthographic",
-           "kannala-brandt-tangential", "scaramuzza", "thin-prism-fisheye",
+FURTHER = ("fov", "mei", "eucm", "division", "stereographic", "equidistant", "equisolid",
+           "orthographic", "kannala-brandt-tangential", "scaramuzza", "thin-prism-fisheye",
            "double-sphere")  # fmt: skip
 
 
@@ -216,6 +216,7 @@ def test_the_spline_follows_a_lens_that_no_parametric_model_fits(bumpy_views):
     assert ratio < 1.6 and largest < 0.5
 
 
+@pytest.mark.further
 def test_the_command_compares_models(fisheye, command, tmp_path, monkeypatch):
     """Of the corners above, in place of those of the photographs."""
     monkeypatch.setattr("jaxbundle.calibration.choice.views_of", lambda *_: fisheye)

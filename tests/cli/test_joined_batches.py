@@ -39,6 +39,7 @@ def joined(cameras: Path, file: Path, *options: str) -> list[tuple[int, str, str
     return [(process.returncode, *of) for process, of in zip(running, said)]
 
 
+@pytest.mark.further
 @pytest.mark.slow
 def test_joined_processes_write_the_lines_of_one(cameras, tmp_path):
     """In its order; the parts are gone; other settings are refused by all of them."""

@@ -50,7 +50,8 @@ def test_broken_corners(tmp_path, old, new, message):
 
 
 @pytest.mark.parametrize("board", [
-    Board(6, 7, 0.06), Board(6, 7, 0.02, "circles"), Board(4, 11, 0.01, "asymmetric-circles"),
+    Board(9, 6, 0.03, row_spacing=0.0302), Board(6, 7, 0.06), Board(6, 7, 0.02, "circles"),
+    Board(4, 11, 0.01, "asymmetric-circles"),
     Board(6, 5, 0.0625, "aprilgrid", marker=0.05),
 ])  # fmt: skip
 def test_targets_there_and_back(tmp_path, board):
@@ -70,6 +71,8 @@ def test_a_target_by_hand(tmp_path):
     path = tmp_path / "target.yaml"
     path.write_text(CHECKERBOARD)
     assert read_target(path) == Board(6, 7, 0.06)
+    path.write_text(CHECKERBOARD.replace("rowSpacingMeters: 0.06", "rowSpacingMeters: 0.05"))
+    assert read_target(path) == Board(6, 7, 0.06, row_spacing=0.05)
     path.write_text("target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 5\ntagSize: 0.088 #[m]\n"
                     "tagSpacing: 0.3 #ratio of space between tags to tagSize\n")
     grid = read_target(path)
@@ -79,7 +82,6 @@ def test_a_target_by_hand(tmp_path):
     np.testing.assert_allclose(grid.points[11], [right, up, 0], rtol=1e-15)
     for old, new, message in [
         ("'checkerboard'", "hexagons", "target_type hexagons: checkerboard or"),
-        ("colSpacingMeters: 0.06", "colSpacingMeters: 0.05", "squares are expected"),
         ("targetRows", "rows", "targetRows is missing"), ("Cols: 6", "Cols: 6.5", "targetCols is"),
     ]:  # fmt: skip
         path.write_text(CHECKERBOARD.replace(old, new))
@@ -87,6 +89,8 @@ def test_a_target_by_hand(tmp_path):
             read_target(path)
     with pytest.raises(InputError, match="charuco"):
         write_target(Board(6, 7, 0.06, "charuco"), path)
+    with pytest.raises(InputError, match="tags begin at 0"):
+        write_target(Board(6, 7, 0.06, "aprilgrid", first_marker=3), path)
 
 
 RESULTS = """Calibration results

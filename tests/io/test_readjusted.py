@@ -58,6 +58,7 @@ def georeferenced():
     ))  # fmt: skip
 
 
+@pytest.mark.further
 def test_another_process_finds_the_same_result(georeferenced, tmp_path):
     first = georeferenced
     assert first.converged

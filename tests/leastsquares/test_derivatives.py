@@ -257,7 +257,9 @@ def minimum(problem, data):
     return find_minimum(make_solver(problem, atol=1e-7), data, data.start).values
 
 
-@pytest.mark.parametrize("name", ["a point held", "of a known camera"])
+@pytest.mark.parametrize(
+    "name", ["a point held", pytest.param("of a known camera", marks=pytest.mark.further)]
+)
 def test_first_and_second_derivatives_by_everything_that_was_given(name):
     problem, of = made(name), program(name)
     found = dict(directions(problem, 0.3 if name == "a point held" else 2e-3))
@@ -278,6 +280,7 @@ def test_first_and_second_derivatives_by_everything_that_was_given(name):
     assert moving == set(found) - {"start: pose"}
 
 
+@pytest.mark.further
 def test_conjugate_gradients_give_the_same_as_a_factor():
     """S and its derivative by everything, as above; the precision of points."""
     problem = made("a point held")

@@ -51,7 +51,9 @@ def assert_same(found, name):
         np.testing.assert_allclose(a, b, rtol=1e-7, atol=1e-8)
 
 
-@pytest.mark.parametrize("name", ["network", "traverse, iterative"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("network", marks=pytest.mark.further), "traverse, iterative"]
+)
 def test_on_two_devices(name):
     assert_same(on_two_devices()[name], name)
 
@@ -61,6 +63,7 @@ def test_a_problem_solved_again_compiles_nothing():
     assert first > 0 and again == 0
 
 
+@pytest.mark.further
 def test_in_two_processes():
     port, name = free_port(), "traverse, banded"
     running = [start(1, name, 2, k, port) for k in range(2)]

@@ -31,7 +31,8 @@ def printed(board):
     if board.kind == "charuco":
         dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
         size = (board.columns, board.rows)
-        drawn = cv2.aruco.CharucoBoard(size, board.square, 0.75 * board.square, dictionary)
+        numbers = np.arange(board.first_marker, board.first_marker + board.markers)
+        drawn = cv2.aruco.CharucoBoard(size, board.square, 0.75 * board.square, dictionary, numbers)
         picture = drawn.generateImage((120 * board.columns, 120 * board.rows), marginSize=0)
         pattern = render.print_of(picture, board.columns * board.square, MARGIN)
         return lambda X, Y: pattern(X + board.square, Y + board.square)
@@ -250,6 +251,52 @@ def test_markers_of_another_dictionary_are_named():
     other = dataclasses.replace(CHARUCO, dictionary="DICT_6X6_250")
     assert other_sizes(picture, other).dictionary == "DICT_4X4_50"
     assert other_sizes(np.full_like(picture, 128), other) is None
+
+
+@pytest.mark.parametrize("wrong", [
+    {"columns": 6, "rows": 9}, {"columns": 8}, {"columns": 10, "rows": 7}, {"columns": 12},
+])  # fmt: skip
+def test_the_markers_seen_tell_the_size_of_a_charuco_board(wrong):
+    """Also of its negative."""
+    picture, _ = taken(CHARUCO, *POSES[0])
+    given = dataclasses.replace(CHARUCO, **wrong)
+    for image in (picture, 255 - picture):
+        with pytest.raises(InputError):
+            find_board(image, given)
+        assert other_sizes(image, given) == CHARUCO
+
+
+def test_the_tags_seen_tell_the_columns_of_a_grid():
+    picture, _ = taken(TAGS, *POSES[2])
+    given = dataclasses.replace(TAGS, columns=6, rows=4)
+    found = other_sizes(picture, given)
+    assert (found.columns, found.rows) == (5, 4)
+    assert other_sizes(picture, TAGS) is None
+
+
+def test_a_board_whose_markers_do_not_begin_at_0():
+    board = dataclasses.replace(CHARUCO, first_marker=20)
+    picture, true = taken(board, *POSES[1])
+    found = find_board(picture, board)
+    there = ~np.isnan(found).any(1)
+    assert there.sum() >= len(there) - 2
+    assert np.abs((found - true)[there]).max() < 0.3
+    assert other_sizes(picture, CHARUCO) == board
+    with pytest.raises(InputError, match="DICT_4X4_50 has 50 markers"):
+        find_board(picture, dataclasses.replace(board, first_marker=30))
+
+
+def test_a_stretched_print_has_two_spacings():
+    stretched = [30.0, 30.3, 1.0]
+    for kind in ("chessboard", "circles", "charuco", "aprilgrid"):
+        board = Board(5, 4, 30.0, kind, row_spacing=30.3)
+        np.testing.assert_allclose(board.points[:, 0], Board(5, 4, 30.0, kind).points[:, 0])
+    board = Board(5, 4, 30.0, row_spacing=30.3)
+    np.testing.assert_allclose(board.points / stretched, Board(5, 4, 1.0).points)
+    tags = Board(5, 4, 30.0, "aprilgrid", marker=20.0, row_spacing=30.3)
+    Y = tags.points[:, 1].reshape(8, 10)[:, 0]
+    np.testing.assert_allclose(-np.diff(Y), [20.0, 10.3, 20.0, 10.3, 20.0, 10.3, 20.0])
+    assert "square 30 × 30.3" in str(board)
 
 
 @pytest.mark.parametrize("content", [b"", b"id,X,Y,Z\n"])

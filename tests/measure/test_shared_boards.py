@@ -10,6 +10,7 @@ import pytest
 FOLDER = Path(__file__).parents[3] / "shared" / "data" / "real" / "small" / "charuco_inverted"
 
 
+@pytest.mark.further
 @pytest.mark.skipif(not FOLDER.is_dir(), reason="the folder ../shared/data/real is not here")
 def test_a_white_on_black_board_is_calibrated(tmp_path):
     """Rendered with fx 620, fy 621, cx 319.5, cy 239.5, no distortion; nothing was found."""

@@ -122,6 +122,7 @@ def test_what_is_held_along_its_ray_keeps_its_distance_to_first_order():
 # --- the adjustment -------------------------------------------------------------------------
 
 
+@pytest.mark.further
 def test_coordinates_and_their_covariance_do_not_depend_on_how_points_move(moderate):
     one, other = moderate
     assert other.problem.lengths is not None

@@ -98,6 +98,7 @@ def test_counts_and_datum(result):
     assert result.residuals["r"].sum() == pytest.approx(result.redundancy, abs=1e-6)
 
 
+@pytest.mark.further
 def test_figures_are_found(simulated, result):
     """Radii within 3.5 σ; adjusted points off their figures by no more than σ allows."""
     found = result.further_unknowns

@@ -47,6 +47,7 @@ def test_one_unknown_less(both):
     assert abs(fx["value"] - 900.0) < 3.5 * fx["sigma"]
 
 
+@pytest.mark.further
 def test_it_is_the_condition_fx_minus_fy(both):
     """At the same values: cofactors Q − Q·B·(Bᵀ·Q·B)⁻¹·Bᵀ·Q of the network with both free, B of the
     condition fx − fy = 0; and vᵀPv grows by (fx − fy)²/q, to first order."""

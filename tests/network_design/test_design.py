@@ -101,6 +101,7 @@ def oracle(plain):
     return dense(plain)
 
 
+@pytest.mark.further
 def test_aims_are_those_of_dense_algebra(plain, oracle):
     blocks, _ = oracle
     pairs = make_pairs(plain, Aim(), jaxbundle.Conditions(), SIGMA)

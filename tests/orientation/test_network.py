@@ -129,6 +129,7 @@ def test_a_strip_that_hangs_together_by_pairs():
     assert len(truth) == len(position)
 
 
+@pytest.mark.further
 def test_several_cameras_of_several_models():
     """A metric camera, one in pixels and a fisheye around the same targets."""
     pixels = {"fx": 2000.0, "fy": 2000.0, "cx": 1499.5, "cy": 999.5, "k1": -0.1}
@@ -333,6 +334,7 @@ def test_one_measurement_in_twenty_wrong(with_control):
     assert abs(result.sigma0 - 1) < 0.15
 
 
+@pytest.mark.further
 def test_blunders_that_leave_least_squares_no_solution(with_control):
     """Even with good start values, observations that contradict them completely are removed before
     data snooping."""
@@ -354,6 +356,7 @@ def test_a_plane_without_control():
     assert_same_answer(without, bare(network.replace(observations=rays.take(keep))))
 
 
+@pytest.mark.further
 def test_a_principal_distance_far_from_the_truth():
     """Observations left out because they contradict the given one come back with the adjusted
     one."""

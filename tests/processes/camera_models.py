@@ -5,7 +5,8 @@ from documents import Process
 
 from jaxbundle.cameras.catalogue import MODELS as BUILT_IN
 
-MODELS = (*BUILT_IN, "radial-spline-6-70", "spline-8x6-80")
+MODELS = (*BUILT_IN, "radial-spline-6-45", "spline-8x6-80")
+"""The radial spline ends where the photographs do: nothing determines its values beyond."""
 
 FREE = {"mei": "fx,fy,cx,cy,k1,k2"}
 """Where the photographs, of a lens of 42°, do not determine all that is free by default: xi is

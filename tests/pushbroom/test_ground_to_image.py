@@ -162,6 +162,7 @@ def test_the_other_side_of_the_earth():
     assert list(found.status) == [ProjectionStatus.SEEN, ProjectionStatus.HIDDEN]
 
 
+@pytest.mark.further
 def test_all_lines_that_see_a_point():
     """Against the changes of sign over 100 000 times, in numpy."""
     size, period = 0.06, 2.0
@@ -205,6 +206,7 @@ def test_nothing_is_seen_through_the_earth():
     np.testing.assert_allclose(found.line[0], lines, atol=1e-6)
 
 
+@pytest.mark.further
 def test_the_footprint_changes_nothing():
     """With it and without, on points in the image, beside it, and above all heights it knows."""
     image = CASES[LINEAR]

@@ -64,10 +64,11 @@ def test_points_of_three_rays_confirm_a_result_with_many_gross_errors(
     camera = Camera("cam", "brown", {"c": 24.0}, free=("c",))
     targets = grid_of_targets(4, 4, 0.5)
     network = simulate(ring_of_stations(4, 2.5, 6.0), targets, camera, noise=0.002)
-    result = lambda converged: adjusting.WeightedAdjustment(
-        SimpleNamespace(converged=converged, removed=range(removed), network=network), {}, 64
-    )
-    results = [result(True), result(confirmed)]
+    results = []
+    for converged in (True, confirmed):
+        found = SimpleNamespace(converged=converged, removed=range(removed), network=network)
+        found.with_changes = lambda found=found, **_: found
+        results.append(adjusting.WeightedAdjustment(found, {}, 64))
     attempts = iter(results)
     monkeypatch.setattr(adjusting, "_weight", lambda *_: next(attempts))
     monkeypatch.setattr(adjusting, "_count_agreeing", lambda *_: 64)

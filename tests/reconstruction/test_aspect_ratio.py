@@ -63,6 +63,7 @@ def test_the_ratio_of_the_photographs_alone_is_that_without_the_observation(sque
     assert abs(found.deviation - 3 / 900) < 4 * sigma
 
 
+@pytest.mark.further
 def test_both_halves_confirm_pixels_that_are_not_square(squeezed):
     (halves,) = replicated_ratios(squeezed).values()
     assert is_replicated(*halves)
@@ -88,6 +89,7 @@ def test_halves_must_agree(one, other, confirmed):
     assert is_replicated(Ratio(*one), Ratio(*other)) == confirmed
 
 
+@pytest.mark.further
 def test_six_photographs_have_no_halves():
     network = photographs(fy=903.0)
     fewer = network.images.take(np.arange(6))

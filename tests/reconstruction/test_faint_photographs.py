@@ -4,6 +4,7 @@ from itertools import combinations
 
 import cv2
 import numpy as np
+import pytest
 from rendered_photographs import CAMERA, scene, stations
 
 from jaxbundle.planning.rendering import Sensor, render
@@ -22,6 +23,7 @@ def faint(grey, seed, blur=1.6, contrast=0.2, noise=1.0):
     return np.clip(128 + contrast * (grey - 128) + noise, 0, 255).astype(np.uint8)
 
 
+@pytest.mark.further
 def test_faint_photographs_are_oriented_relatively():
     """25 degrees apart; with features of usual contrast no pair was found."""
     world, views = scene(1), list(zip(*stations(3, 1, 0.9)))

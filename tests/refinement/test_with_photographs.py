@@ -146,6 +146,7 @@ def minimum(rows, jacobian, y):
     return y, np.asarray(rows(y)), np.linalg.inv(J.T @ J) * scale * scale[:, None]
 
 
+@pytest.mark.further
 def test_the_same_as_a_dense_solution(case, equations):
     """Distances between points included: without them it would be another."""
     result, _, _, unknown = case

@@ -78,6 +78,7 @@ def test_precision_is_that_of_the_dense_inverse(problem, program):
     assert (np.asarray(found.cameras) > 0).sum() == 2  # what is held has none
 
 
+@pytest.mark.further
 def test_derivatives_by_stations_targets_cameras_and_weights(problem, program):
     slopes, _ = program(problem.data)
     places = {

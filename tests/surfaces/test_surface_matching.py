@@ -48,6 +48,7 @@ def test_matches_are_within_a_fifth_of_a_pixel(pair):
     assert (off < 0.2).mean() > 0.95
 
 
+@pytest.mark.further
 def test_nothing_is_found_where_there_is_no_texture():
     blank = lambda s, t: s > 0.5
     views, truth = photographs(two_shapes(blank=blank), [(-1.0, 0, 10), (1.0, 0, 10)])

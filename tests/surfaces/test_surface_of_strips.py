@@ -45,6 +45,7 @@ def view():
     return view_of(strip(0.2))
 
 
+@pytest.mark.further
 def test_points_are_projected_where_they_came_from(view):
     uv = np.random.default_rng(0).uniform([2, 2], [PIXELS - 3, LINES - 3], (50, 2))
     h = np.linspace(-20, 40, 50)

@@ -69,6 +69,7 @@ def cloud():
     return rng, X, list(stations(5, rng))
 
 
+@pytest.mark.further
 def test_principal_distance_and_distortion_from_pairs(cloud):
     rng, X, views = cloud
     uv = [pixels(seen(X, *view), rng) for view in views]

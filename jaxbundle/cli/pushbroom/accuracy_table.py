@@ -6,6 +6,7 @@ import numpy as np
 
 from jaxbundle.choices import AttitudeError
 from jaxbundle.cli.pushbroom.shared import surface_of, write_rows
+from jaxbundle.commands.scanner_tables import check_draws
 from jaxbundle.errors import InputError
 from jaxbundle.io.scanner.flight import read_flight
 from jaxbundle.pushbroom.study import TRAJECTORIES, AccuracyTable, accuracy_table
@@ -17,6 +18,7 @@ def table_of(
     path: Path, kind: AttitudeError, levels: str, draws: int, seed: int, height: float | None
 ) -> AccuracyTable:
     """The table of a flight file, the levels as `0.01,0.1` in degrees."""
+    check_draws(draws)
     try:
         sigmas = [float(level) for level in levels.split(",")]
         if not min(sigmas) > 0:

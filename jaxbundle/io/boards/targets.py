@@ -1,7 +1,7 @@
 """Boards of Kalibr: the YAML of a target.
 
     target_type: checkerboard    targetCols, targetRows: inner corners; rowSpacingMeters,
-                                 colSpacingMeters, which must be equal
+                                 colSpacingMeters
     target_type: circlegrid      targetCols, targetRows, spacingMeters, asymmetricGrid
     target_type: aprilgrid       tagCols, tagRows, tagSize, tagSpacing: gap / tagSize
 
@@ -49,23 +49,23 @@ def _board(path: str | Path, fields: JsonFields) -> Board:
         if asymmetric not in CIRCLES:
             raise InputError(f"{path}: asymmetricGrid is {show(asymmetric)}; True or False")
         return Board(columns, rows, fields.number("spacingMeters"), CIRCLES[asymmetric])
-    # Kalibr allows oblong fields; a Board has one spacing
-    across, along = fields.number("rowSpacingMeters"), fields.number("colSpacingMeters")
-    if across != along:
-        raise InputError(
-            f"{path}: rowSpacingMeters {across:g} and colSpacingMeters {along:g}: squares are "
-            "expected"
-        )
-    return Board(columns, rows, along)
+    rows_apart, columns_apart = fields.number("rowSpacingMeters"), fields.number("colSpacingMeters")
+    oblong = None if rows_apart == columns_apart else rows_apart
+    return Board(columns, rows, columns_apart, row_spacing=oblong)
 
 
 def write_target(board: Board, path: str | Path) -> None:
     """Write a board in metres.
 
-    **Raises:** `InputError` for ChArUco, which Kalibr does not have.
+    **Raises:** `InputError` for what Kalibr does not have: ChArUco, numbers of tags that do not
+    begin at 0, circles and tags with two spacings.
     """
     if board.kind == "charuco":
         raise InputError(f"{path}: Kalibr has no board of kind charuco")
+    if board.first_marker:
+        raise InputError(f"{path}: Kalibr's tags begin at 0, not {board.first_marker}")
+    if board.row_spacing not in (None, board.square) and board.kind != "chessboard":
+        raise InputError(f"{path}: Kalibr has one spacing for a board of kind {board.kind}")
     if board.kind == "aprilgrid" and board.marker:
         lines = [f"tagCols: {board.columns}", f"tagRows: {board.rows}"]
         gap = board.square / board.marker - 1  # tagSpacing is relative to tagSize
@@ -77,7 +77,7 @@ def write_target(board: Board, path: str | Path) -> None:
         lines = [
             "target_type: 'checkerboard'",
             *lines,
-            f"rowSpacingMeters: {board.square!r}",
+            f"rowSpacingMeters: {board.spacing[1]!r}",
             f"colSpacingMeters: {board.square!r}",
         ]
     else:

@@ -1,0 +1,141 @@
+"""The board that the markers in a photograph belong to: a hint where the given one is not found.
+
+Markers of a ChArUco board are numbered row by row from the upper left, in its white squares, tags
+of a grid row by row: numbers and places of the markers seen tell the number of columns, and the
+largest number the least number of rows.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from jaxbundle.choices import DICTIONARIES
+from jaxbundle.measure.boards import SMALLEST_SIDE, Board
+from jaxbundle.measure.tag_grids import BORDER_BITS, get_dictionary, read_markers
+from jaxbundle.photographs.opencv import need_opencv
+
+Grey = UInt8[np.ndarray, "rows columns"]
+
+MAX_COLUMNS = 40
+"""More than any board sold has: 1000 markers, the largest dictionary, are 45 × 45 squares."""
+MIN_MARKERS = 6
+"""Three points of two rows fit an affine map of any numbering; six leave as many conditions."""
+
+
+class SeenMarkers(NamedTuple):
+    """Markers of one dictionary in a photograph: numbers, middles and half diagonals, pixels."""
+
+    number: Int[np.ndarray, " n"]
+    middle: Float[np.ndarray, "n 2"]
+    size: Float[np.ndarray, " n"]
+
+
+def board_of_markers(grey: Grey, board: Board) -> Board | None:
+    """The board of the markers in a photograph: the given one with another number of columns and
+    rows, another first marker, or another dictionary; None: not told by them, or no other."""
+    for image in (grey, 255 - grey):
+        seen = _see_markers(image, board)
+        if len(seen.number) >= MIN_MARKERS:
+            other = _of_numbers(seen, board)
+            return None if other is None or _is_part(other, board) else other
+        name = _other_dictionary(image, board)
+        if name is not None:
+            other = dataclasses.replace(board, dictionary=name)
+            return _of_numbers(_see_markers(image, other), other) or other
+    return None
+
+
+def _see_markers(grey: Grey, board: Board) -> SeenMarkers:
+    """The markers of the board's dictionary in a photograph."""
+    borders = BORDER_BITS if board.kind == "aprilgrid" else (1,)
+    found = (read_markers(grey, board.dictionary, bits) for bits in borders)
+    numbers, corners = max(found, key=lambda seen: len(seen[0]))
+    size = np.linalg.norm(corners[:, 0] - corners[:, 2], axis=1) / 2
+    return SeenMarkers(numbers, corners.mean(1), size)
+
+
+def _is_part(other: Board, board: Board) -> bool:
+    """Whether the other board differs in nothing but rows that may not be seen."""
+    return dataclasses.replace(other, rows=board.rows) == board and other.rows <= board.rows
+
+
+def _other_dictionary(grey: Grey, board: Board) -> str | None:
+    """The dictionary of most markers in the photograph; of several with the same markers the
+    smallest."""
+    aruco = need_opencv().aruco
+    known = {name: get_dictionary(name) for name in sorted(DICTIONARIES) if hasattr(aruco, name)}
+    best, most = None, 3  # up to three markers may be false readings of another dictionary
+    for name, dictionary in sorted(known.items(), key=lambda item: len(item[1].bytesList)):
+        if name == board.dictionary or len(dictionary.bytesList) < board.markers:
+            continue
+        numbers = _see_markers(grey, dataclasses.replace(board, dictionary=name)).number
+        number = int((numbers < board.markers).sum())
+        if number > most:
+            best, most = name, number
+    return best
+
+
+def _of_numbers(seen: SeenMarkers, board: Board) -> Board | None:
+    """The board whose numbering puts the markers seen into a plane grid; None: none, or several."""
+    if len(seen.number) < MIN_MARKERS:
+        return None
+    for first in _first_numbers(seen, board):
+        fits = {
+            columns: max(_fits(seen, board.kind, seen.number - first, columns))
+            for columns in range(SMALLEST_SIDE[board.kind], MAX_COLUMNS)
+        }
+        most = max(agreeing for agreeing, _ in fits.values())
+        best = [columns for columns, (agreeing, _) in fits.items() if agreeing == most]
+        # wrongly read numbers are rare: the codes of a dictionary differ in several bits
+        if most >= max(MIN_MARKERS, 0.9 * len(seen.number)) and len(best) == 1:
+            rows = max(fits[best[0]][1], SMALLEST_SIDE[board.kind])
+            return dataclasses.replace(board, columns=best[0], rows=rows, first_marker=first)
+    return None
+
+
+def _first_numbers(seen: SeenMarkers, board: Board) -> Iterator[int]:
+    """First numbers to try: the given one, 0, and the ends of the numbers seen."""
+    least = int(seen.number.min())
+    yield from dict.fromkeys(n for n in (board.first_marker, 0, least) if n <= least)
+
+
+def _fits(
+    seen: SeenMarkers, kind: str, k: Int[np.ndarray, " n"], columns: int
+) -> Iterator[tuple[int, int]]:
+    """How many markers a board of so many columns explains, and its least number of rows, for each
+    numbering there is; `k` counts the markers from the first."""
+    for place in _places(kind, k, columns):
+        yield int(_agree(seen, place).sum()), int(place[:, 1].max()) + 1
+
+
+def _places(
+    kind: str, k: Int[np.ndarray, " n"], columns: int
+) -> Iterator[Float[np.ndarray, "n 2"]]:
+    """Column and row of the markers, counted from 0."""
+    if kind == "aprilgrid":
+        yield np.stack([k % columns, k // columns], 1).astype(float)
+        return
+    # the second square of a ChArUco board is its first white one; in OpenCV before 4.6 the first of
+    # boards of an even number of rows. Two rows of squares have as many markers as columns.
+    for shift in (1, 0):
+        in_first_row = len(range(shift, columns, 2))
+        pair, rest = np.divmod(k, columns)
+        second = rest >= in_first_row
+        along = np.where(second, 2 * (rest - in_first_row) + 1 - shift, 2 * rest + shift)
+        yield np.stack([along, 2 * pair + second], 1).astype(float)
+
+
+def _agree(seen: SeenMarkers, place: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
+    """Which markers are where a homography of the numbered places puts them."""
+    cv2, nobody = need_opencv(), np.zeros(len(place), bool)
+    if np.linalg.matrix_rank(place - place.mean(0)) < 2:
+        return nobody
+    H, _ = cv2.findHomography(place, seen.middle, cv2.RANSAC, float(np.median(seen.size)))
+    if H is None:
+        return nobody
+    there = cv2.perspectiveTransform(place[None], H)[0]
+    # half a diagonal of a marker: distortion bends a board less, and the next place is further
+    return np.linalg.norm(there - seen.middle, axis=1) < seen.size
