@@ -17,6 +17,7 @@ import dataclasses
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -146,9 +147,7 @@ def _names(path: str | Path, arrays: Mapping[str, np.ndarray], name: str) -> tup
     return tuple(map(str, texts.tolist()))
 
 
-def _rows(
-    path: str | Path, archive: zipfile.ZipFile, name: str, member: Member
-) -> np.ndarray | StoredRows:
+def _rows(path: str | Path, archive: zipfile.ZipFile, name: str, member: Member) -> Any:
     """An array, or on demand the rows of a large one with one row per camera."""
     by_camera = len(member.shape) in BY_CAMERA.get(name, ())
     # a stack may exceed the memory: rows are read from the file when needed

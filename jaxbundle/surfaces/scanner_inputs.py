@@ -187,7 +187,7 @@ def _transformer(crs: str) -> "pyproj.Transformer":
         raise InputError("coordinate systems need pyproj: pip install 'jaxbundle[geo]'") from None
     try:
         return pyproj.Transformer.from_crs("EPSG:4326", crs, always_xy=True)
-    except pyproj.exceptions.CRSError as error:
+    except pyproj.exceptions.ProjError as error:
         raise InputError(f"--crs {crs!r}: {' '.join(str(error).split())}") from None
 
 

@@ -1,6 +1,7 @@
 """Damaged clouds, tables and archives: an error that names the file, and no other."""
 
 import io
+import sqlite3
 import struct
 import zipfile
 
@@ -9,8 +10,10 @@ import pytest
 
 from jaxbundle.batches.stacks import read_camera_stack
 from jaxbundle.errors import InputError
+from jaxbundle.io.boards.kept_corners import KeptCorners
 from jaxbundle.io.results.stored_tree import read_tree
 from jaxbundle.io.text.archives import read_arrays
+from jaxbundle.measure.boards import Board
 from jaxbundle.photographs.xmp import parse_xmp
 from jaxbundle.reconstruction.control import read_control_measurements
 from jaxbundle.surfaces.cloud import Cloud
@@ -304,3 +307,17 @@ def test_a_packet_with_a_namespace_that_is_not_utf_8():
               b'xmlns:c="c" c:Yaw="10" c:Pitch="5" c:Roll="1"/></rdf:RDF></x:xmpmeta>')  # fmt: skip
     attitude = parse_xmp(packet).attitude
     assert attitude is not None and attitude.yaw == 10
+
+
+@pytest.mark.parametrize("cell", [b"short", bytes(16 * 11), "text", 7, None])
+def test_kept_corners_of_another_length_are_searched_again(tmp_path, cell):
+    board, xy = Board(4, 3, 1.0), np.arange(24.0).reshape(12, 2)
+    path = tmp_path / "kept.sqlite"
+    with KeptCorners(path) as kept:
+        kept.keep("content", board, ((640, 480), xy))
+        assert (kept.look("content", board)[1] == xy).all()
+    with sqlite3.connect(path) as file:
+        file.execute("UPDATE boards SET xy = ?", (cell,))
+    file.close()
+    with KeptCorners(path) as kept:
+        assert kept.look("content", board) is None

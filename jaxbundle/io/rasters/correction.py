@@ -13,7 +13,7 @@ from jaxbundle.choices import Resampling
 from jaxbundle.errors import InputError
 from jaxbundle.io.rasters.map_blocks import write_map
 from jaxbundle.io.rasters.maps import MapGrid, MapSystem, contiguous, grid_around
-from jaxbundle.io.rasters.reading import Window, check_raw, open_raster, read_pixels
+from jaxbundle.io.rasters.reading import Window, check_raw, open_raster, read_values
 from jaxbundle.pushbroom.ground_to_image import Search
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.image_to_ground import locate_lines
@@ -140,7 +140,7 @@ def _values(
     for part, window in _parts(line, pixel, image, 2**22 / bands.count):
         # only reading is locked, the other worker computes meanwhile
         with reading:
-            seen = read_pixels(source, bands, None, window).astype(float).filled(np.nan)
+            seen = read_values(source, bands, None, window)
         # Widened to a multiple of 128, or of an eighth of the size: the compiled program is one for
         # every shape, and there are only a few shapes then.
         pad = [(0, -n % max(128, 2 ** (n.bit_length() - 3))) for n in seen.shape[1:]]

@@ -119,8 +119,9 @@ def describe_distance(
     if crs is None:
         return ""
     transformer, _ = _transformer(crs)
-    area = None if transformer.target_crs is None else transformer.target_crs.area_of_use
-    if area is None:
+    target = transformer.target_crs
+    area = None if target is None else target.area_of_use
+    if target is None or area is None:
         return ""
     # an area across the date line has its east smaller than its west
     width = (area.east - area.west) % 360 or 360
@@ -128,7 +129,7 @@ def describe_distance(
     if not beyond and area.south - margin <= latitude <= area.north + margin:
         return ""
     return (
-        f"--crs {crs} ({transformer.target_crs.name}) is made for longitude {area.west:g}° to "
+        f"--crs {crs} ({target.name}) is made for longitude {area.west:g}° to "
         f"{area.east:g}°, latitude {area.south:g}° to {area.north:g}°; the image is at "
         f"{longitude:.4g}°, {latitude:.4g}°: distances are distorted there; is it meant? Its zone "
         f"of UTM is {utm_system(latitude, longitude)}"
@@ -191,7 +192,7 @@ def _transformer(crs: str) -> tuple["Transformer", float | None]:
                 "give a projected one, such as EPSG:32633, or a geographic one, such as EPSG:4326"
             )
         transformer = pyproj.Transformer.from_crs("EPSG:4326", system, always_xy=True)
-    except pyproj.exceptions.CRSError as error:
+    except pyproj.exceptions.ProjError as error:
         raise InputError(f"coordinate system {crs!r}: {' '.join(str(error).split())}") from None
     if not system.is_geographic:
         return transformer, None

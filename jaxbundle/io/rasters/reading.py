@@ -98,6 +98,17 @@ def read_pixels(
         return source.read(bands, window=window, masked=True)
 
 
+def read_values(
+    path: str | Path,
+    source: "DatasetReader",
+    bands: int | Sequence[int] | None = None,
+    window: Window | None = None,
+) -> np.ndarray:
+    """As `read_pixels`, in double precision, NaN where there is no data."""
+    values: Any = read_pixels(path, source, bands, window)
+    return values.astype(float).filled(np.nan)
+
+
 def check_pixels(
     path: str | Path,
     source: "DatasetReader",
@@ -288,5 +299,5 @@ def _heights(
     window: tuple[tuple[int, int], tuple[int, int]] | None,
     height: HeightScale,
 ) -> Float[np.ndarray, "rows columns"]:
-    values = read_pixels(path, source, 1, window).astype(float).filled(np.nan)
+    values = read_values(path, source, 1, window)
     return height.scale * values + height.offset

@@ -11,7 +11,7 @@ from jaxbundle.choices import Resampling
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.io.rasters.maps import MapSystem
-from jaxbundle.io.rasters.reading import as_type, check_georeference, open_raster, read_pixels
+from jaxbundle.io.rasters.reading import as_type, check_georeference, open_raster, read_values
 from jaxbundle.io.rasters.writing import write_raster
 from jaxbundle.pushbroom.flight import take_image
 from jaxbundle.pushbroom.image import PushbroomImage
@@ -33,7 +33,7 @@ def read_scene(path: str | Path, earth: Ellipsoid | None) -> SceneRaster:
     with open_raster(path) as source:
         check_georeference(path, source)
         transform, crs, dtype = source.transform, source.crs, source.dtypes[0]
-        bands = read_pixels(path, source).astype(float).filled(np.nan)
+        bands = read_values(path, source)
         scale, offset = (np.array(v, float)[:, None, None] for v in (source.scales, source.offsets))
     if (scale != 1).any() or (offset != 0).any():
         bands, dtype = scale * bands + offset, "float32"
