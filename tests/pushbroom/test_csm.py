@@ -14,6 +14,7 @@ from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.io.scanner.csm import read_csm
+from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.pushbroom.earth_frames import EARTH_RATE
 from jaxbundle.pushbroom.ground_to_image import make_search, project_points
 from jaxbundle.pushbroom.image import pose_at
@@ -297,3 +298,34 @@ def test_velocities_that_contradict_their_positions_are_said(tmp_path, factor, u
     track, known = (image.image.trajectory.position.values for image in (bad, good))
     limit = 100 if used else 1.2  # at the ends a line: 9 m/s²·(1 s)²/8
     np.testing.assert_allclose(track, known, rtol=0, atol=limit)
+
+
+@pytest.mark.parametrize("rows", [1, 2])
+def test_lines_in_reverse_order(tmp_path, rows):
+    """With a negative period, in one row or two, line l is the line `LINES` − 1 − l of the same
+    scanner read forwards."""
+    isd = support_data(older=True)
+    forward = read_csm(write(tmp_path, isd))
+    ((first, start, period),) = isd["line_scan_rate"]
+    end = start + period * (LINES - 1 + 2 * first)
+    half = LINES // 2
+    isd["line_scan_rate"] = [[first, end, -period],
+                             [first + half, end - half * period, -period]][:rows]  # fmt: skip
+    backward = read_csm(write(tmp_path, isd))
+    lines, pixels = PLACES
+    there = locate(backward.image, Ground(WGS84), lines, pixels)
+    expected = locate(forward.image, Ground(WGS84), LINES - 1 - lines, pixels)
+    np.testing.assert_allclose(there, expected, atol=1e-6)
+    search = make_search(backward.image, WGS84)
+    found = project_points(backward.image, search, np.asarray(there).reshape(3, -1))
+    seen = found.line[0], found.pixel[0]
+    for place, wanted in zip(seen, np.meshgrid(lines, pixels, indexing="ij")):
+        np.testing.assert_allclose(np.asarray(place).ravel(), wanted.ravel(), atol=1e-5)
+    (tmp_path / "scanner.toml").write_text(
+        '[scanner]\nsource = "isd.json"\n[corrections]\naberration = true\n'
+    )
+    with pytest.raises(InputError, match="in reverse order"):
+        read_scanner(tmp_path / "scanner.toml")
+    isd["line_scan_rate"] = [[0.5, 0.0, period], [9.5, 9 * period, -period]]
+    with pytest.raises(InputError, match="all of a negative one"):
+        read_csm(write(tmp_path, isd))

@@ -72,6 +72,11 @@ def _read_source(file: TomlFile, scanner: TomlSection) -> ScannerInput:
     switches = file.section("corrections")
     switched = {name: switches.switch(name) for name in switches.values}
     corrections = product.image.corrections._replace(**switched)
+    if corrections.any and product.backwards:
+        raise InputError(
+            f"{switches.where}the lines of {source.name} were taken in reverse order, which "
+            "corrections do not know; omit them"
+        )
     image = dataclasses.replace(product.image, corrections=corrections)
     product = dataclasses.replace(product, image=image, name=scanner.text("name", product.name))
     # what the user switched is compared, but not replaced
