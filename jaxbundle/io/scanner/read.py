@@ -99,12 +99,19 @@ def _read_xml(path: Path) -> ScannerInput:
     """The image of a product in XML, by the name of its root and the groups in it."""
     root = read_xml(path)
     has = lambda key: root.find(f".//{key}") is not None
-    if root.tag == "Dimap_Document":
+    # early products of Pléiades have PHR_DIMAP_Document or PHR_Dimap_Document
+    if root.tag.lower().endswith("dimap_document"):
         if has(MODEL):
             return read_dimap2(XmlFields(path, root, "DIMAP 2 of sensor level"))
         if has("Rational_Function_Model"):
             raise InputError(
                 f"{path}: DIMAP of RPC alone; give it to `pushbroom rpc`, or the DIM_….XML here"
+            )
+        if root.tag != "Dimap_Document":
+            profile = root.findtext(".//METADATA_PROFILE", "without a profile")[:60]
+            raise InputError(
+                f"{path}: DIMAP of Pléiades ({profile}) without {MODEL}: the sensor level is "
+                "expected; of other levels give the RPC (RPC_….XML) to `pushbroom rpc`"
             )
         return read_dimap(XmlFields(path, root, "DIMAP of SPOT 5"))
     if has("GEO") and has("EPH") and has("ATT"):
