@@ -329,3 +329,30 @@ def test_lines_in_reverse_order(tmp_path, rows):
     isd["line_scan_rate"] = [[0.5, 0.0, period], [9.5, 9 * period, -period]]
     with pytest.raises(InputError, match="all of a negative one"):
         read_csm(write(tmp_path, isd))
+
+
+def test_short_tables_with_a_stated_extrapolation(tmp_path):
+    """Positions that end a second before the last line, in a file and as `source`."""
+    isd = support_data(older=True)
+    whole = read_csm(write(tmp_path, isd))
+    last = (LINES - 1) * PERIOD
+    rows = isd["sensor_position"]["positions"]
+    isd["sensor_position"]["positions"] = rows[: int(np.floor(last - 1 - isd["t0_ephemeris"])) + 1]
+    path = write(tmp_path, isd)
+    with pytest.raises(InputError, match="outside the table"):
+        read_csm(path)
+    (tmp_path / "scanner.toml").write_text(
+        '[scanner]\nsource = "isd.json"\nextrapolate = 2.5\n'
+    )
+    short = read_scanner(tmp_path / "scanner.toml")
+    assert any("does not cover the whole image: extrapolated by" in w for w in short.warnings)
+    # straight on: 9 m/s²·t²/2, for at most two seconds
+    times = np.linspace(0, last, 9)
+    there, known = (
+        np.asarray(jax.vmap(lambda t, image=image: pose_at(image.image, t).P)(times))
+        for image in (short, whole)
+    )
+    assert 0.1 < np.linalg.norm(there - known, axis=1).max() < 30
+    (tmp_path / "scanner.toml").write_text('[scanner]\nsource = "isd.json"\nextrapolate = -1\n')
+    with pytest.raises(InputError, match="extrapolate is -1"):
+        read_scanner(tmp_path / "scanner.toml")

@@ -12,6 +12,7 @@ The fields have the meaning of usgscsm:
 The camera looks towards the planet. No correction is set, as usgscsm applies none.
 """
 
+import dataclasses
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -33,16 +34,20 @@ from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.io.text.json_fields import JsonFields, read_object
 from jaxbundle.network.columns import show
 from jaxbundle.network.tables import Source
-from jaxbundle.pushbroom.ancillary import check_times
+from jaxbundle.pushbroom.ancillary import DEFAULTS, check_times
 from jaxbundle.pushbroom.image import check_size, make_image
 from jaxbundle.pushbroom.scanner import LineTimes
 
 
-def read_csm(path: str | Path, interpolation: str = "usgscsm") -> ScannerInput:
+def read_csm(
+    path: str | Path, interpolation: str = "usgscsm", extrapolate: float | None = None
+) -> ScannerInput:
     """The pushbroom image of an ISD or a model state.
 
     **Arguments:** `interpolation` of positions and attitudes: `"usgscsm"`, as usgscsm does it, or
-    `"lagrange"`, through eight rows up to the ends of the tables (`csm_trajectory`).
+    `"lagrange"`, through eight rows up to the ends of the tables (`csm_trajectory`);
+    `extrapolate`: seconds by which tables may end before the image, default those of
+    `AncillarySettings`.
 
     **Raises:** `InputError` naming file and field: missing, of another kind, not a number,
     an unknown distortion; tables that end too long before the image.
@@ -54,7 +59,11 @@ def read_csm(path: str | Path, interpolation: str = "usgscsm") -> ScannerInput:
     times, backwards = _line_times(isd, lines)
     ends = np.array([float(times.time(line)) for line in (0.0, lines - 1.0)])
     when = np.linspace(ends[0], ends[1], lines) if times.table is None else np.asarray(times.table)
-    states = states_of(isd, -when if backwards else when, interpolation)
+    settings = DEFAULTS
+    if extrapolate is not None:
+        limits = {"min_extrapolation": extrapolate, "max_extrapolation": extrapolate}
+        settings = dataclasses.replace(settings, **limits)
+    states = states_of(isd, -when if backwards else when, interpolation, settings)
     if backwards:
         # the same poses in the same lines; only corrections depend on the direction of time
         t, P, rows, R = states[:4]

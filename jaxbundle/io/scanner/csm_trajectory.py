@@ -30,6 +30,7 @@ from jaxbundle.io.text.json_fields import JsonFields
 from jaxbundle.network.columns import did_you_mean, show
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.ancillary import (
+    AncillarySettings,
     attitude_table,
     check_times,
     contradiction,
@@ -74,8 +75,14 @@ def unit_of(isd: JsonFields, key: str, default: str) -> float:
     return UNITS[unit]
 
 
-def states_of(isd: JsonFields, lines: Float[np.ndarray, " lines"], interpolation: str) -> States:
-    """The states of an ISD for lines at these times; tables may end a little before them.
+def states_of(
+    isd: JsonFields,
+    lines: Float[np.ndarray, " lines"],
+    interpolation: str,
+    settings: AncillarySettings,
+) -> States:
+    """The states of an ISD for lines at these times; tables may end a little before them, by what
+    the settings allow.
 
     **Raises:** `InputError` naming file, field and row.
     """
@@ -85,7 +92,9 @@ def states_of(isd: JsonFields, lines: Float[np.ndarray, " lines"], interpolation
             f"{did_you_mean(interpolation, INTERPOLATIONS)}"
         )
     older = "sensor_position" in isd.document and "instrument_position" not in isd.document
-    return _read_even_table(isd, lines) if older else _resample(isd, lines, interpolation)
+    if older:
+        return _read_even_table(isd, lines, settings)
+    return _resample(isd, lines, interpolation, settings)
 
 
 def trajectory_of(states: States, turn: Rotation, interpolation: str, order: int) -> Trajectory:
@@ -131,7 +140,9 @@ def view_directions(
     return camera.apply(-here), camera.apply(after - here)
 
 
-def _read_even_table(isd: JsonFields, lines: Float[np.ndarray, " lines"]) -> States:
+def _read_even_table(
+    isd: JsonFields, lines: Float[np.ndarray, " lines"], settings: AncillarySettings
+) -> States:
     """Even tables as they are."""
     P = isd.array("sensor_position.positions", (None, 3)) * unit_of(isd, "sensor_position", "m")
     q = isd.array("sensor_orientation.quaternions", (None, 4))
@@ -140,14 +151,19 @@ def _read_even_table(isd: JsonFields, lines: Float[np.ndarray, " lines"]) -> Sta
         t = isd.number(f"t0_{name}") + isd.number(f"dt_{name}") * np.arange(n)
         _check_rows(isd, f"sensor_{key}", t)
         tables.append((t, isd.source(f"sensor_{key}")))
-    warnings = [w for t, source in tables for w in warn_of_extrapolation(t, lines, source)]
+    warnings = [w for t, at in tables for w in warn_of_extrapolation(t, lines, at, settings)]
     (t, rows), sources = zip(*tables)
     R, lengths = _rotations(isd, "sensor_orientation", q)
-    limits = extrapolation_limit(t), extrapolation_limit(rows)
+    limits = extrapolation_limit(t, settings), extrapolation_limit(rows, settings)
     return States(t, P, rows, R, limits, sources, (*lengths, *warnings))
 
 
-def _resample(isd: JsonFields, lines: Float[np.ndarray, " lines"], interpolation: str) -> States:
+def _resample(
+    isd: JsonFields,
+    lines: Float[np.ndarray, " lines"],
+    interpolation: str,
+    settings: AncillarySettings,
+) -> States:
     position_times = _times(isd, "instrument_position")
     _check_rows(isd, "instrument_position", position_times)
     body_times, body, body_lengths = _turns(isd, "body_rotation")
@@ -161,7 +177,7 @@ def _resample(isd: JsonFields, lines: Float[np.ndarray, " lines"], interpolation
         warning
         for key, t in tables.items()
         if len(t) > 1
-        for warning in warn_of_extrapolation(t, lines, isd.source(key))
+        for warning in warn_of_extrapolation(t, lines, isd.source(key), settings)
     ]
     # At least 25 rows, so that the eight rows of the polynomial lie close about every line of a
     # short image, of which the file may have two states. Hermite's cubic between states h seconds
@@ -179,7 +195,7 @@ def _resample(isd: JsonFields, lines: Float[np.ndarray, " lines"], interpolation
     else:
         rows = np.linspace(pointing_times[0], pointing_times[-1], max(2, len(pointing_times)))
         R = body(rows) * pointing(rows).inv()
-    limits = extrapolation_limit(position_times), extrapolation_limit(pointing_times)
+    limits = tuple(extrapolation_limit(t, settings) for t in (position_times, pointing_times))
     sources = isd.source("instrument_position"), isd.source("instrument_pointing")
     lengths = *body_lengths, *pointing_lengths
     return States(t, P, rows, R, limits, sources, (*lengths, *contradicted, *warnings))
