@@ -16,6 +16,7 @@ interpolated by Lagrange's polynomial of fewer rows near the ends (`pushbroom.in
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -195,7 +196,8 @@ def _resample(
     else:
         rows = np.linspace(pointing_times[0], pointing_times[-1], max(2, len(pointing_times)))
         R = body(rows) * pointing(rows).inv()
-    limits = tuple(extrapolation_limit(t, settings) for t in (position_times, pointing_times))
+    allowed = partial(extrapolation_limit, settings=settings)
+    limits = allowed(position_times), allowed(pointing_times)
     sources = isd.source("instrument_position"), isd.source("instrument_pointing")
     lengths = *body_lengths, *pointing_lengths
     return States(t, P, rows, R, limits, sources, (*lengths, *contradicted, *warnings))
