@@ -103,7 +103,7 @@ def key_of(model: str | CameraModel) -> str | CameraModel:
 
 def is_known(name: str) -> bool:
     """Whether a built-in model has this name, or a family has names of this form."""
-    return name in MODELS or _of_family(name) is not None
+    return _of_family(name) is not None or (isinstance(name, str) and name in MODELS)
 
 
 def _built_in(name: str) -> CameraModel | None:

@@ -10,6 +10,7 @@ import pytest
 
 from jaxbundle.batches.stacks import read_camera_stack
 from jaxbundle.errors import InputError
+from jaxbundle.io import read_cameras
 from jaxbundle.io.boards.kept_corners import KeptCorners
 from jaxbundle.io.results.stored_tree import read_tree
 from jaxbundle.io.text.archives import read_arrays
@@ -321,3 +322,10 @@ def test_kept_corners_of_another_length_are_searched_again(tmp_path, cell):
     file.close()
     with KeptCorners(path) as kept:
         assert kept.look("content", board) is None
+
+
+@pytest.mark.parametrize("model", ["[1, 2]", "{ a = 1 }", "7", "true"])
+def test_a_camera_model_that_is_no_name(tmp_path, model):
+    path = tmp_path / "cameras.toml"
+    path.write_text(f'[[camera]]\nid = "c"\nmodel = {model}\nfx = 1.0\n')
+    refused(read_cameras, path, "model")
