@@ -36,6 +36,10 @@ _HOME = {
     ),
     "jaxbundle.adjustment.load": ("load_adjustment",),
     "jaxbundle.adjustment.orient": ("orient",),
+    "jaxbundle.adjustment.replicate": (
+        "Replication",
+        "replicate",
+    ),
     "jaxbundle.adjustment.result": ("Adjustment",),
     "jaxbundle.adjustment.sensitivity": (
         "Budget",

@@ -36,6 +36,8 @@ from jaxbundle.adjustment.orient import orient as orient
 from jaxbundle.adjustment.quality.precision import Precision as Precision
 from jaxbundle.adjustment.quality.precision import precision as precision
 from jaxbundle.adjustment.quality.precision import redundancy as redundancy
+from jaxbundle.adjustment.replicate import Replication as Replication
+from jaxbundle.adjustment.replicate import replicate as replicate
 from jaxbundle.adjustment.result import Adjustment as Adjustment
 from jaxbundle.adjustment.sensitivity import Budget as Budget
 from jaxbundle.adjustment.sensitivity import sensitivity as sensitivity
@@ -128,6 +130,7 @@ __all__ = [
     "Precision",
     "Problem",
     "Reconstruction",
+    "Replication",
     "RigBatch",
     "Stability",
     "Surface",
@@ -164,6 +167,7 @@ __all__ = [
     "read_network",
     "reconstruct",
     "redundancy",
+    "replicate",
     "ring_of_stations",
     "sensitivity",
     "show_progress",

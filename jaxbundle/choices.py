@@ -85,3 +85,6 @@ RPC_BIASES = ("shift", "affine")
 
 EXPLORED = ("network", "camera", "scanner")
 """Inputs of the explorer."""
+
+REPLICATION = ("photographs", "points", "runs", "views")
+"""How `replicate` forms halves."""

@@ -40,6 +40,8 @@ from jaxbundle.adjustment.mirror_image import name_mirrored, name_other_side
 from jaxbundle.adjustment.orient import orient, orient_again, screen
 from jaxbundle.adjustment.problem import NetworkProblem, make_problem
 from jaxbundle.adjustment.quality.blunder_names import name_suspect
+from jaxbundle.adjustment.quality.correlated_errors import DEFAULTS as CORRELATIONS
+from jaxbundle.adjustment.quality.correlated_errors import CorrelationSettings, correlated_errors
 from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.adjustment.quality.misfit import doubt_of_robust
 from jaxbundle.adjustment.readjust import (
@@ -116,6 +118,7 @@ def adjust(
     eliminate: bool = False,
     critical_t: float = 2.0,
     estimate_components: bool = False,
+    correlated: bool = False,
     progress: Progress | None = None,
 ) -> Adjustment:
     """Adjust a network by least squares, with self-calibration of all free parameters.
@@ -147,6 +150,9 @@ def adjust(
       first, adjusting again each time.
     - `estimate_components`: scale the σ of each group of observations until its variance component
       is 1; the factors are `Adjustment.sigma_factors`.
+    - `correlated`: look for errors that image points share (a field on the sensor, interior
+      orientations that move between photographs, errors along tracks), and state the σ under them
+      beside the classical ones (`Adjustment.error_model`). The estimates do not change.
     - `progress(stage, done, total)`: called for every evaluation, with vᵀPv and the damping in
       the stage; up to 200 000 observations at the end of the iterations (`jaxbundle.show_progress`
       shows bars).
@@ -166,6 +172,7 @@ def adjust(
         eliminate=eliminate,
         critical_t=critical_t,
         estimate_components=estimate_components,
+        correlated=correlated,
         progress=progress,
     )
     given = without_placeholders(
@@ -218,7 +225,23 @@ def adjust(
     if misfit and not also and not name_conventions(problem, minimum, found.inspection):
         if mirrored := mirror(sigma0):
             result = result.with_changes(findings=(mirrored,))
-    return result
+    return with_error_model(result) if correlated and result.converged else result
+
+
+def with_error_model(
+    result: Adjustment, settings: CorrelationSettings = CORRELATIONS
+) -> Adjustment:
+    """The same estimates with the σ of errors that image points share; unchanged, with a finding,
+    where the network cannot show any."""
+    why = f"no camera has {settings.min_images} photographs, and no point two rays"
+    try:
+        model = correlated_errors(result.cofactors.solution, result.problem, settings)
+    except NotSolvedError as error:
+        model, why = None, str(error)
+    if model is None:
+        line = f"correlated errors were not looked for: {why}"
+        return result.with_changes(findings=(*result.findings, line))
+    return result.with_changes(error_model=model)
 
 
 def _compare_with_start(given: Network, result: Adjustment) -> tuple[str, ...]:
@@ -471,6 +494,7 @@ def check_options(
     eliminate: bool = False,
     critical_t: float = 2.0,
     estimate_components: bool = False,
+    correlated: bool = False,
     progress: Progress | None = None,
 ) -> None:
     """Refuse invalid options of `adjust`.
@@ -486,6 +510,7 @@ def check_options(
     truth("eliminate", eliminate)
     at_least_zero("critical_t", critical_t)
     truth("estimate_components", estimate_components)
+    truth("correlated", correlated)
     if progress is not None and not callable(progress):
         raise InputError(f"progress must be a function, but is {show(progress)}")
 

@@ -53,6 +53,7 @@ from jaxbundle.leastsquares.iterations.solver import Minimum
 from jaxbundle.leastsquares.iterations.stopping import SINGULAR, TERMINATIONS
 from jaxbundle.leastsquares.iterations.stopping import converged as reached_minimum
 from jaxbundle.leastsquares.quality.components import Component, variance_components
+from jaxbundle.leastsquares.quality.error_components import ErrorModel
 from jaxbundle.leastsquares.quality.global_test import chi_squared_test, is_tested
 from jaxbundle.leastsquares.quality.names import Name
 from jaxbundle.leastsquares.quality.reliability import Reliability
@@ -66,7 +67,7 @@ from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.orientation.exchanges import CONTRADICTORY_CONTROL
 from jaxbundle.results import data_frame, finite
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray
+from jaxbundle.types import AnyArray, present
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -122,6 +123,7 @@ class Adjustment:
         doubts: tuple[str, ...] = (),
         weakness: Weakness | None = None,
         findings: tuple[str, ...] = (),
+        error_model: ErrorModel | None = None,
     ):
         self.network = network
         self.problem = problem
@@ -140,6 +142,7 @@ class Adjustment:
         self.suspects = suspects
         self.given_doubts = doubts
         self.findings = findings
+        self.error_model = error_model
         self._weakness = weakness
         self._inspection = inspection
         self.check = check
@@ -151,9 +154,10 @@ class Adjustment:
         *,
         sigma_factors: Mapping[str, float] | None = None,
         findings: tuple[str, ...] | None = None,
+        error_model: ErrorModel | None = None,
     ) -> "Adjustment":
-        """The same result with other factors of σ, or other findings; what follows from neither is
-        not computed again."""
+        """The same result with other factors of σ, other findings, or a model of correlated errors;
+        what follows from none of them is not computed again."""
         changed = copy.copy(self)
         for name in ("verdict", "doubts", "variance_components", "check_points", "fingerprint"):
             changed.__dict__.pop(name, None)
@@ -161,6 +165,10 @@ class Adjustment:
             changed.sigma_factors = dict(sigma_factors)
         if findings is not None:
             changed.findings = findings
+        if error_model is not None:
+            changed.error_model = error_model
+            for name in ("cameras", "images", "points"):
+                changed.__dict__.pop(name, None)
         return changed
 
     @property
@@ -403,6 +411,49 @@ class Adjustment:
         free = self.problem.table("image").free
         Q = Q * free[:, :, None] * free[:, None, :]
         return self.sigma0**2 * A @ Q @ A.transpose(0, 2, 1)
+
+    @property
+    def correlated_image_covariance(self) -> Float[np.ndarray, "images 6 6"] | None:
+        """`image_covariance` under the error model; None without one."""
+        if self.error_model is None:
+            return None
+        A = np.zeros((len(self.angle_jacobian), 6, 6))
+        A[:, :3, :3] = np.eye(3)
+        A[:, 3:, 3:] = self.angle_jacobian
+        return A @ self.error_model.covariance("image") @ A.transpose(0, 2, 1)
+
+    @property
+    def correlated_point_covariance(self) -> Float[np.ndarray, "points 3 3"] | None:
+        """`point_covariance` under the error model; None without one."""
+        if self.error_model is None:
+            return None
+        C = self.error_model.covariance("point")
+        C = self.problem.cofactors_of_coordinates(self.values["point"], C)
+        return self._where_known(np.asarray(C))
+
+    def correlated_camera_covariance(self, camera: str) -> Float[np.ndarray, "n n"] | None:
+        """`camera_covariance` under the error model, of the same parameters; None without one."""
+        if self.error_model is None:
+            return None
+        table, row = self.problem.table_of_camera(self._camera(camera))
+        _, free = self.problem.free_parameters(self._camera(camera))
+        return self.error_model.covariance(table.name)[row][np.ix_(free, free)]
+
+    @property
+    def sigma_ratio(self) -> float:
+        """The median of σ under the error model over classical σ, of the interior and exterior
+        orientations; 1 without a model."""
+        if self.error_model is None:
+            return 1.0
+        pairs = [(self.image_covariance, present(self.correlated_image_covariance))]
+        for camera in self.problem.network.cameras:
+            other = present(self.correlated_camera_covariance(camera.id))
+            pairs.append((self.camera_covariance(camera.id)[1][None], other[None]))
+        ratios = []
+        for classical, correlated in pairs:
+            a, b = (np.diagonal(C, axis1=1, axis2=2).ravel() for C in (classical, correlated))
+            ratios.append(np.sqrt(b[a > 0] / a[a > 0]))
+        return float(np.median(np.concatenate(ratios)))
 
     @functools.cached_property
     def point_values(self) -> Float[np.ndarray, "points 3"]:

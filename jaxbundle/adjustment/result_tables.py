@@ -31,12 +31,16 @@ def cameras(adjustment: "Adjustment") -> dict[str, dict]:
         values = adjustment.camera_parameters(given.id)
         free, Q = adjustment.camera_cofactor(given.id)
         sigma = dict(zip(free, adjustment.sigma0 * np.sqrt(np.diagonal(Q))))
+        C = adjustment.correlated_camera_covariance(given.id)
+        correlated = {} if C is None else dict(zip(free, np.sqrt(np.diagonal(C))))
         total = dict(zip(free, total_correlation(Q))) if free else {}
         # Tied parameters are one unknown: all have its σ and its correlations.
         for first, *others in given.tie:
             if first in sigma:
                 sigma |= dict.fromkeys(others, sigma[first])
                 total |= dict.fromkeys(others, total[first])
+                if first in correlated:
+                    correlated |= dict.fromkeys(others, correlated[first])
         default = default_parameters(get_model(given.model))
         tables[given.id] = {
             "model": str(given.model),
@@ -50,6 +54,7 @@ def cameras(adjustment: "Adjustment") -> dict[str, dict]:
                     else None,
                     "total_correlation": float(total[name]) if name in sigma else None,
                 }
+                | ({"sigma_correlated": float(correlated[name])} if name in correlated else {})
                 for name, value in values.items()
             },
             "free": free,
@@ -66,12 +71,13 @@ def parameters(adjustment: "Adjustment") -> dict[str, np.ndarray]:
         for camera, given in adjustment.cameras.items()
         for parameter, entry in given["parameters"].items()
     ]
-    return {key: np.array([row[key] for row in rows], dtype=object) for key in rows[0]}
+    keys = dict.fromkeys(key for row in rows for key in row)
+    return {key: np.array([row.get(key) for row in rows], dtype=object) for key in keys}
 
 
 def images(adjustment: "Adjustment") -> dict[str, np.ndarray]:
     """Columns id, X0 … kappa, sX0 … skappa (angles in the network's unit), rays, rms (of v,
-    image unit)."""
+    image unit); with an error model sX0_correlated … skappa_correlated."""
     problem = adjustment.problem
     scale = np.array([1, 1, 1, *[adjustment.angle_scale] * 3])
     values = adjustment.image_values * scale
@@ -80,6 +86,9 @@ def images(adjustment: "Adjustment") -> dict[str, np.ndarray]:
     table = {"id": np.array(problem.network.images.id, dtype=object)}
     table |= {name: values[:, i] for i, name in enumerate(EXTERIOR)}
     table |= {f"s{name}": sigma[:, i] for i, name in enumerate(EXTERIOR)}
+    if (C := adjustment.correlated_image_covariance) is not None:
+        sigma = np.sqrt(np.diagonal(C, axis1=1, axis2=2)) * scale
+        table |= {f"s{name}_correlated": sigma[:, i] for i, name in enumerate(EXTERIOR)}
     return table | _rays_and_rms(adjustment, problem.image, len(values))
 
 
@@ -93,6 +102,9 @@ def points(adjustment: "Adjustment") -> dict[str, np.ndarray]:
     }
     table |= {axis: adjustment.point_values[:, i] for i, axis in enumerate("XYZ")}
     table |= {f"s{axis}": sigma[:, i] for i, axis in enumerate("XYZ")}
+    if (C := adjustment.correlated_point_covariance) is not None:
+        sigma = np.sqrt(np.diagonal(C, axis1=1, axis2=2))
+        table |= {f"s{axis}_correlated": sigma[:, i] for i, axis in enumerate("XYZ")}
     return table | _rays_and_rms(adjustment, problem.point, len(network.points))
 
 

@@ -28,6 +28,7 @@ COMMANDS = (
     "camera",
     "compare",
     "stability",
+    "replicate",
     "explore",
     "convert",
     "surface",

@@ -59,6 +59,10 @@ def adjust(  # noqa: PLR0913 - the options of the command
     components: Annotated[
         bool, typer.Option("--components", help="estimate variance components")
     ] = False,
+    correlated: Annotated[
+        bool,
+        typer.Option("--correlated", help="look for errors that image points share; σ under them"),
+    ] = False,
     budget: Annotated[
         list[str] | None,
         typer.Option(
@@ -122,6 +126,7 @@ def adjust(  # noqa: PLR0913 - the options of the command
             significance,
             eliminate,
             components,
+            correlated,
             budget,
             check,
         )
@@ -151,6 +156,7 @@ def adjust(  # noqa: PLR0913 - the options of the command
                 "--significance": significance,
                 "--eliminate": eliminate,
                 "--components": components,
+                "--correlated": correlated,
                 "--budget": ", ".join(budget or ()),
             },
         )
@@ -166,6 +172,7 @@ def adjust(  # noqa: PLR0913 - the options of the command
                 significance=significance,
                 eliminate=eliminate,
                 estimate_components=components,
+                correlated=correlated,
                 progress=tell,
             )
     except NotSolvedError as error:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from jaxbundle.report import head, observations, unknowns
 from jaxbundle.report.budget import budget_lines
+from jaxbundle.report.correlated import correlated_lines
 from jaxbundle.report.head import unit_of_weight
 from jaxbundle.report.summary import html, one_line, short
 from jaxbundle.report.verdict import Verdict, conclude
@@ -78,6 +79,7 @@ def text(
     lines += observations.residuals(adjustment, residual_limit, test)
     lines += observations.redundancy(adjustment)
     lines += observations.components(adjustment)
+    lines += correlated_lines(adjustment)
     lines += observations.downweighted(adjustment, max_rows)
     lines += observations.removals(adjustment)
     lines += [] if budget is None else budget_lines(budget)

@@ -1,5 +1,6 @@
 """The command line as a user sees it: exit status, one line of error, nothing half-written."""
 
+import dataclasses
 import hashlib
 import json
 import shutil
@@ -11,6 +12,7 @@ import pytest
 
 import jaxbundle
 from jaxbundle.io import exchange
+from jaxbundle.io.cameras.calibrated import read_calibrated
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "convergent4"
@@ -62,6 +64,21 @@ def test_adjust_writes_everything(command, tmp_path):
     assert page.read_bytes() == (out / "report.html").read_bytes()
     for given in ("project.toml", "images.csv", "points.csv", "observations.csv"):
         assert hashlib.sha256((EXAMPLE / given).read_bytes()).hexdigest() in page.read_text()
+
+
+def test_results_of_cameras_in_mm_are_compared(command, convergent4, tmp_path):
+    """Their area in mm follows from the size of images and pixels in the file."""
+    network = convergent4.network
+    sized = dataclasses.replace(
+        network.cameras[0], image_size=(3000, 2000), pixel_size=(0.0078, 0.0079)
+    )
+    result = jaxbundle.adjust(network.replace(cameras=(sized,)))
+    file = tmp_path / "result.json"
+    file.write_text(json.dumps(result.to_dict(brief=True)))
+    ((camera, _),) = read_calibrated(file)
+    assert camera.image_size == (3000, 2000) and camera.pixel_size == (0.0078, 0.0079)
+    done = command("compare", file, file)
+    assert done.status == 0, done.err
 
 
 @pytest.mark.slow

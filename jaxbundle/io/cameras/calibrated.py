@@ -64,8 +64,9 @@ def _calibrate(
     """The camera of an entry of `cameras`; `settings`: those of its calibration, in the JSON."""
     parameters = entry["parameters"]
     row = {"id": id, "model": entry["model"]} | {n: p["value"] for n, p in parameters.items()}
-    if settings.get("image_size"):
-        row["image_size"] = settings["image_size"]
+    # results of before 0.3 have the size of images with the calibration only
+    sizes = {"image_size": settings.get("image_size"), **entry}
+    row |= {name: sizes[name] for name in ("image_size", "pixel_size") if sizes.get(name)}
     (camera,) = make_cameras([row], f"{path}, ")
     free = [name for name, p in parameters.items() if p["free"]]
     sigma = np.array([float(parameters[name]["sigma"]) for name in free])

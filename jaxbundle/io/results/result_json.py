@@ -21,6 +21,7 @@ from jaxbundle.types import present
 
 if TYPE_CHECKING:
     from jaxbundle.adjustment.result import Adjustment
+    from jaxbundle.network.tables import Camera
     from jaxbundle.report.verdict import Verdict
 
 
@@ -61,7 +62,10 @@ def result_dict(adjustment: "Adjustment", brief: bool = False) -> dict:
     head |= {"sigma_factors": adjustment.sigma_factors, "robust": adjustment.robust}
     head |= {"robust_scale": adjustment.robust_scale, "global_test": adjustment.global_test()}
     head |= {
-        "cameras": {name: _camera(table) for name, table in adjustment.cameras.items()},
+        "cameras": {
+            given.id: _camera(adjustment.cameras[given.id], given)
+            for given in adjustment.problem.network.cameras
+        },
         "images": _images(adjustment),
         "further_unknowns": adjustment.further_unknowns,
         "far_points": _far_points(adjustment),
@@ -75,6 +79,9 @@ def result_dict(adjustment: "Adjustment", brief: bool = False) -> dict:
         ],
     }
     head |= {"check_points": _checks(adjustment)}
+    if adjustment.error_model is not None:
+        head |= {"error_components": [size._asdict() for size in adjustment.error_model.sizes]}
+        head |= {"sigma_ratio": adjustment.sigma_ratio}
     if brief:
         return head
     return head | {
@@ -147,13 +154,15 @@ def verdict_dict(verdict: "Verdict") -> dict:
     }
 
 
-def _camera(table: dict) -> dict:
+def _camera(table: dict, given: "Camera") -> dict:
     free, C = table["free"], table["correlations"]
     correlations = {
         a: {b: float(C[i, j]) for j, b in enumerate(free) if j != i} for i, a in enumerate(free)
     }
     return {
         "model": table["model"],
+        "image_size": given.image_size and list(given.image_size),
+        "pixel_size": given.pixel_size and list(given.pixel_size),
         "parameters": table["parameters"],
         "correlations": correlations,
     }
@@ -165,8 +174,16 @@ def _estimate(value: float, sigma: float) -> dict:
 
 def _images(adjustment: "Adjustment") -> dict:
     columns = {name: column.tolist() for name, column in adjustment.images.items()}
+    correlated = lambda name, i: (
+        {"sigma_correlated": columns[f"s{name}_correlated"][i]}
+        if f"s{name}_correlated" in columns
+        else {}
+    )
     return {
-        image: {name: _estimate(columns[name][i], columns[f"s{name}"][i]) for name in EXTERIOR}
+        image: {
+            name: _estimate(columns[name][i], columns[f"s{name}"][i]) | correlated(name, i)
+            for name in EXTERIOR
+        }
         | {"rays": columns["rays"][i], "rms": columns["rms"][i]}
         for i, image in enumerate(columns["id"])
     }
@@ -190,6 +207,9 @@ def _points(table: Mapping[str, np.ndarray]) -> Iterator[tuple[str, dict]]:
     for row in table_rows(table):
         point = dict(zip(table, row))
         estimates = {axis: _estimate(point[axis], point[f"s{axis}"]) for axis in "XYZ"}
+        if "sX_correlated" in point:
+            for axis, entry in estimates.items():
+                entry["sigma_correlated"] = point[f"s{axis}_correlated"]
         yield (
             point["id"],
             {"role": point["role"]} | estimates | {"rays": point["rays"], "rms": point["rms"]},

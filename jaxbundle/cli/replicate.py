@@ -1,0 +1,60 @@
+"""`jaxbundle replicate`: a network in two halves, each adjusted alone."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import jaxbundle
+from jaxbundle.choices import REPLICATION, TESTS
+from jaxbundle.cli.app import Control, Force, Format, Input, Quiet, Settings, app, choice
+
+
+@app.command(example="out/board/network --by views --repeat 4", once=True)
+def replicate(
+    input: Input,
+    by: Annotated[str, choice(REPLICATION, "what the halves do not share")] = "photographs",
+    repeat: Annotated[int, typer.Option(min=1, help="random halves; runs have one")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="of the random halves")] = 0,
+    json: Annotated[str, typer.Option(help="write the result as JSON; - prints only JSON")] = "",
+    force: Force = False,
+    set: Settings = None,
+    format: Format = None,
+    control: Control = None,
+    snooping: Annotated[str | None, choice(TESTS, "remove blunders by data snooping")] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Adjust halves of a network and compare them: do the stated σ hold?
+
+    The difference of the interior orientations of two halves over its covariance, d²/n, is about 1
+    where σ are right; stated are that of independent errors, and that of errors which image points
+    share.
+    """
+    from jaxbundle.cli.outputs import check_writable
+    from jaxbundle.cli.progress import staging
+    from jaxbundle.io.results.result_json import json_text
+    from jaxbundle.io.text.csv_tables import write_text
+    from jaxbundle.system.terminals import write_json
+
+    jaxbundle.use_cores()
+    check_writable(json, None, "replicate", (), [input], force)
+    with staging(quiet or json == "-") as show:
+        found = jaxbundle.replicate(
+            input,
+            by=by,
+            repeat=repeat,
+            seed=seed,
+            format=format,
+            overrides=tuple(set or ()),
+            control=control,
+            snooping=snooping,
+            progress=show,
+        )
+    text = json_text(found.to_dict())
+    if json == "-":
+        write_json(text)
+        return
+    if json:
+        write_text(Path(json), text)
+    if not (quiet and json):
+        print(found.report())

@@ -1,0 +1,371 @@
+"""Error components: how large errors are that observations share, and the covariance they give.
+
+Residuals of real measurements are not white: they hold a field fixed on the sensor, a principal
+point that moves between photographs, errors along a track. In units of the a priori σ
+
+    Σ = Σ_k θ_k·V_k,   V_k = F_k·F_kᵀ,   θ_k ≥ 0,   V_0 = 1 (independent errors)
+
+The unknowns stay those of least squares; their covariance is that of x = N⁻¹Aᵀe with e of Σ,
+
+    C = Σ_k θ_k·X_k·X_kᵀ,   X_k = N⁻¹AᵀF_k      (θ_0·Q for the independent part)
+
+The sizes follow from the residuals v = M·e, M = 1 − A·N⁻¹·Aᵀ, whose quadratic forms have the
+expectations (MINQUE: Rao 1971; Koch 1999, section 3.6)
+
+    vᵀV_k·v = Σ_j θ_j·tr(M·V_k·M·V_j),      tr(M·V_k·M·V_j) = ‖F_kᵀ·M·F_j‖²
+
+Roots of many columns are replaced by random combinations of them, F·Ξ/√R with E ΞΞᵀ = R·1, on one
+side of a trace (Hutchinson 1990). V_k that fit the residuals no better than the independent part
+get the size zero.
+
+Estimating the effects as unknowns with priors gives honest σ too, and estimates that are not nearer
+to each other in halves of real networks; so does whitening. Covariances clustered by image or point
+(White 1980; Bell and McCaffrey 2002) do not help: unknowns of an image absorb what its residuals
+should show.
+"""
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbundle.leastsquares.datum.conditions import (
+    of_groups,
+    s_transform,
+    s_transform_transposed,
+    zeros_of_tables,
+)
+from jaxbundle.leastsquares.equations.elimination import NormalFactor, solve
+from jaxbundle.leastsquares.equations.normal import Tangent, zero_tangent
+from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.indexing.rows import Data, Declared, Values, restore_order
+from jaxbundle.leastsquares.quality.derivatives import LinearisedSolution
+from jaxbundle.leastsquares.solution import Solution
+from jaxbundle.system.programs import compile_once
+
+AT_ONCE = 16
+"""Columns a call: half and double take the same time a column, and the last call is filled up."""
+
+
+class ErrorComponent(NamedTuple):
+    """One V = F·Fᵀ: `root`: F as a sparse matrix [rows, columns], rows of all observations in
+    units of their a priori σ, set by set (`stack_rows`), one after the other; of size 1 in the
+    `unit` of the component."""
+
+    name: str
+    unit: str
+    root: Any
+
+
+class ErrorSize(NamedTuple):
+    """The estimated size of a component, √θ, and its σ, in its unit; `score`: how far its quadratic
+    form exceeds that of independent errors, in units of its σ (standard normal without it)."""
+
+    name: str
+    unit: str
+    size: float
+    sigma: float
+    score: float
+
+
+@dataclasses.dataclass(frozen=True)
+class ErrorSettings:
+    """How components are estimated.
+
+    - `max_columns`: roots of more columns are replaced by random combinations: a column is a
+      solution of the normal equations (10 ms for 60 images and 26 000 points).
+    - `draws`: their number. Variances from 100 are right to √(2/100) = 14 %, σ to 7 %.
+    - `seed`: of the combinations.
+    """
+
+    max_columns: int = 1000
+    draws: int = 100
+    seed: int = 0
+
+
+DEFAULTS = ErrorSettings()
+
+
+@dataclasses.dataclass(frozen=True)
+class ErrorModel:
+    """The covariance of the observations of a solved problem. `theta` [k]: of the independent part
+    and of the `components`; `own`: by table the blocks [rows, width, width] of the covariance of
+    the unknowns that a component of θ = 1 gives, in the order of `components`."""
+
+    found: Solution
+    components: tuple[ErrorComponent, ...]
+    theta: Float[np.ndarray, " k"]
+    theta_sigma: Float[np.ndarray, " k"]
+    score: Float[np.ndarray, " k"]
+    own: tuple[dict[str, Float[np.ndarray, "rows width width"]], ...]
+
+    @property
+    def sizes(self) -> tuple[ErrorSize, ...]:
+        """√θ of the independent part, as a factor of the a priori σ, and of all components."""
+        names = [("independent errors", "σ"), *((c.name, c.unit) for c in self.components)]
+        # σ of √θ: σ_θ/(2√θ); not more than the size that one σ of θ would have, as at zero
+        root, most = np.sqrt(self.theta), np.sqrt(self.theta_sigma)
+        sigma = np.minimum(self.theta_sigma, 2 * root * most) / np.where(root > 0, 2 * root, 1.0)
+        sigma = np.where(root > 0, sigma, most)
+        return tuple(
+            ErrorSize(name, unit, float(s), float(d), float(z))
+            for (name, unit), s, d, z in zip(names, root, sigma, self.score)
+        )
+
+    def covariance(self, table: str) -> Float[np.ndarray, "rows width width"]:
+        """The covariance blocks of all rows of a table."""
+        blocks = self.theta[0] * np.asarray(self.found.cofactor(table))
+        return blocks + sum(t * own[table] for t, own in zip(self.theta[1:], self.own) if t > 0)
+
+    def propagate_rows(
+        self, rows: Mapping[str, Float[np.ndarray, "n rows width"]]
+    ) -> Float[np.ndarray, "n n"]:
+        """The covariance of linear functions of the changes of tables (`Solution.slopes`)."""
+        D = effects(self.found, rows)
+        C = self.theta[0] * D @ D.T
+        for theta, component in zip(self.theta[1:], self.components):
+            if theta > 0:
+                B = np.asarray(component.root.T @ D.T)
+                C = C + theta * B.T @ B
+        return C
+
+
+def fit_error_model(
+    found: Solution, components: Sequence[ErrorComponent], settings: ErrorSettings = DEFAULTS
+) -> ErrorModel:
+    """The sizes of components from the residuals of a solution."""
+    rng = np.random.default_rng(settings.seed)
+    F, number = [component.root.tocsr() for component in components], len(components) + 1
+    v = stack_rows(found, found.residuals)
+    T, q = np.zeros((number, number)), np.zeros(number)
+    T[0, 0], q[0] = found.problem.counts.redundancy, v @ v
+    own: list[dict[str, np.ndarray]] = []
+    for k, root in enumerate(F, 1):
+        q[k] = np.sum((root.T @ v) ** 2)
+        blocks: dict[str, np.ndarray] = {}
+        for columns in _columns(root, settings, rng):
+            remaining, changes = remove_fit(found, columns)
+            T[0, k] += np.sum(columns * remaining)
+            T[1:, k] += [np.sum((other.T @ remaining.T) ** 2) for other in F]
+            for table, x in changes.items():
+                more = np.einsum("cni,cnj->nij", x, x)
+                blocks[table] = blocks[table] + more if table in blocks else more
+        T[k, 0] = T[0, k]
+        own.append(blocks)
+    T[1:, 1:] = (T[1:, 1:] + T[1:, 1:].T) / 2
+    theta = _nonnegative(T, q)
+    score = _scores(T, q)
+    sigma = np.sqrt(np.diag(_covariance_of_sizes(found, F, theta, T, settings, rng)))
+    return ErrorModel(found, tuple(components), theta, sigma, score, tuple(own))
+
+
+def _columns(
+    root: Any, settings: ErrorSettings, rng: np.random.Generator
+) -> Iterator[Float[np.ndarray, "columns rows"]]:
+    """The columns of a root, or random combinations of them, some at a time."""
+    number = root.shape[1]
+    exact = number <= settings.max_columns
+    total = number if exact else settings.draws
+    root = root.tocsc()
+    for first in range(0, total, AT_ONCE):
+        last = min(first + AT_ONCE, total)
+        if exact:
+            yield root[:, first:last].toarray().T
+        else:
+            signs = rng.choice([-1.0, 1.0], (number, last - first))
+            yield np.asarray(root @ signs).T / np.sqrt(total)
+
+
+def _nonnegative(
+    T: Float[np.ndarray, "k k"], q: Float[np.ndarray, " k"]
+) -> Float[np.ndarray, " k"]:
+    """θ ≥ 0 of T·θ = q, in the metric of T itself (the covariance of q is 2·T for white errors)."""
+    from scipy.optimize import nnls
+
+    scale = np.sqrt(np.where(np.diag(T) > 0, np.diag(T), 1.0))
+    A = T / scale[:, None] / scale
+    # T is symmetric and positive semidefinite: T = L·Lᵀ, and ‖Lᵀθ − L⁻¹q‖ is the least-squares form
+    w, E = np.linalg.eigh(A)
+    some = w > 1e-10 * w.max()
+    L = E[:, some] * np.sqrt(w[some])
+    right = (E[:, some].T @ (q / scale)) / np.sqrt(w[some])
+    return nnls(L.T, right)[0] / scale
+
+
+def _scores(T: Float[np.ndarray, "k k"], q: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+    """How far each quadratic form exceeds that of independent errors alone, in units of its σ."""
+    white = q[0] / T[0, 0]
+    variance = np.diag(T) - T[:, 0] ** 2 / T[0, 0]
+    away = q - T[:, 0] * white
+    # the form of the independent part determines its size: it exceeds nothing
+    good = variance > 1e-9 * np.diag(T)
+    return np.where(good, away / np.sqrt(2 * np.where(good, variance, 1.0)) / white, 0.0)
+
+
+def _covariance_of_sizes(
+    found: Solution,
+    F: Sequence[Any],
+    theta: Float[np.ndarray, " k"],
+    T: Float[np.ndarray, "k k"],
+    settings: ErrorSettings,
+    rng: np.random.Generator,
+    draws: int = AT_ONCE,
+) -> Float[np.ndarray, "k k"]:
+    """T⁻¹·cov(q)·T⁻¹ of normal errors of the fitted Σ: cov(q)_ij = 2·tr(V_i·MΣM·V_j·MΣM), by
+    residuals drawn from it."""
+    rows = F[0].shape[0] if F else len(stack_rows(found, found.residuals))
+    times = [lambda e: e, *(lambda e, f=f: np.asarray((f @ (f.T @ e.T)).T) for f in F)]
+    sigma = lambda e: sum(t * V(e) for t, V in zip(theta, times) if t > 0)
+    errors = np.sqrt(theta[0]) * rng.standard_normal((draws, rows))
+    for t, f in zip(theta[1:], F):
+        if t > 0:
+            errors += np.sqrt(t) * np.asarray((f @ rng.standard_normal((f.shape[1], draws))).T)
+    u, _ = remove_fit(found, errors)
+    b = [remove_fit(found, V(u))[0] for V in times]
+    Sb = [sigma(x) for x in b]
+    G = np.array([[np.sum(x * y) / draws for y in Sb] for x in b])
+    inverse = np.linalg.pinv(T, 1e-10, hermitian=True)
+    return inverse @ (G + G.T) @ inverse
+
+
+def stack_rows(
+    found: Solution, by_set: Mapping[str, Float[np.ndarray, "n r"]]
+) -> Float[np.ndarray, " rows"]:
+    """Residuals of all sets in one vector, in the order of the declarations."""
+    return np.concatenate([np.asarray(by_set[o.name]).ravel() for o in found.problem.observations])
+
+
+def first_rows(found: Solution) -> dict[str, int]:
+    """Where the rows of each set begin in `stack_rows`."""
+    sizes = [np.asarray(found.residuals[o.name]).size for o in found.problem.observations]
+    starts = np.cumsum([0, *sizes])
+    return {o.name: int(start) for o, start in zip(found.problem.observations, starts)}
+
+
+def remove_fit(
+    found: Solution, errors: Float[np.ndarray, "k rows"]
+) -> tuple[Float[np.ndarray, "k rows"], dict[str, Float[np.ndarray, "k rows width"]]]:
+    """What errors of the observations (units of their σ) leave in the residuals, M·e, and how they
+    change the tables, N⁻¹Aᵀe in the datum of the problem."""
+    k = len(errors)
+    wide = np.zeros((-(-k // AT_ONCE) * AT_ONCE, errors.shape[1]))
+    wide[:k] = errors
+    remaining, changes = [], []
+    for first in range(0, len(wide), AT_ONCE):
+        given = _unstack(found, wide[first : first + AT_ONCE])
+        left, changed = _remove_fit(*found.arguments, found.factor, given)
+        remaining.append(_stack(found, left))
+        changes.append(
+            {t.name: np.asarray(changed[t.name])[:, : t.rows] for t in found.problem.tables}
+        )
+    tables = {name: np.concatenate([x[name] for x in changes])[:k] for name in changes[0]}
+    return np.concatenate(remaining)[:k], tables
+
+
+def effects(
+    found: Solution, rows: Mapping[str, Float[np.ndarray, "f rows width"]]
+) -> Float[np.ndarray, "f rows"]:
+    """The change of linear functions of the changes of tables by one σ of every observation."""
+    number = len(next(iter(rows.values())))
+    size = found.problem.sizes
+    wide = {
+        t: np.pad(
+            np.asarray(x),
+            ((0, -number % AT_ONCE), (0, size["table", t] - x.shape[1]), (0, 0)),
+        )
+        for t, x in rows.items()
+    }
+    parts = [
+        _stack(
+            found,
+            _effects(
+                *found.arguments, found.factor, {t: x[k : k + AT_ONCE] for t, x in wide.items()}
+            ),
+        )
+        for k in range(0, number, AT_ONCE)
+    ]
+    return np.concatenate(parts)[:number]
+
+
+def _unstack(
+    found: Solution, errors: Float[np.ndarray, "k rows"]
+) -> dict[str, Float[np.ndarray, "k n r"]]:
+    """Rows of all sets, filled up to the sizes of the plan."""
+    given, start, data = {}, 0, found.arguments[3]
+    for o in found.problem.observations:
+        n, r = np.asarray(found.residuals[o.name]).shape
+        rows = errors[:, start : start + n * r].reshape(len(errors), n, r)
+        more = len(data.weight[o.name]) - n
+        given[o.name] = np.pad(rows, ((0, 0), (0, more), (0, 0)))
+        start += n * r
+    return given
+
+
+def _stack(found: Solution, by_set: Mapping[str, Array]) -> Float[np.ndarray, "k rows"]:
+    parts = [np.asarray(by_set[o.name])[:, : o.number] for o in found.problem.observations]
+    return np.concatenate([x.reshape(len(x), -1) for x in parts], 1)
+
+
+@compile_once
+def _remove_fit(
+    declared: Declared,
+    plan: Plan,
+    values: Values,
+    data: Data,
+    factor: NormalFactor,
+    errors: dict[str, Float[Array, "k n r"]],
+) -> tuple[dict[str, Float[Array, "k n r"]], dict[str, Float[Array, "k rows width"]]]:
+    forward, backward = _jacobian(declared, plan, values, data, factor)
+
+    def remove_one(e: dict[str, Float[Array, "n r"]]) -> tuple[Any, Any]:
+        (right,) = backward(e)
+        x = s_transform(declared, plan, values, solve(factor, right))
+        left = jax.tree.map(jnp.subtract, e, forward(x))
+        return left, _to_tables(declared, plan, values, x)
+
+    return jax.lax.map(remove_one, errors)
+
+
+@compile_once
+def _effects(
+    declared: Declared,
+    plan: Plan,
+    values: Values,
+    data: Data,
+    factor: NormalFactor,
+    rows: dict[str, Float[Array, "f rows width"]],
+) -> dict[str, Float[Array, "f n r"]]:
+    forward, _ = _jacobian(declared, plan, values, data, factor)
+
+    def effect_of_one(row: dict[str, Float[Array, "rows width"]]) -> dict[str, Float[Array, "n r"]]:
+        given = zeros_of_tables(declared, values) | row
+        right = s_transform_transposed(declared, plan, values, of_groups(plan, given))
+        return forward(solve(factor, right))
+
+    return jax.lax.map(effect_of_one, rows)
+
+
+def _jacobian(
+    declared: Declared, plan: Plan, values: Values, data: Data, factor: NormalFactor
+) -> tuple[Any, Any]:
+    """A and Aᵀ, from changes of the groups to residuals by set in the given order."""
+    at, still = LinearisedSolution(declared, plan, values, data, factor, {}), zero_tangent(plan)
+    rows = lambda change: restore_order(plan, at.residuals(change, data))
+    _, forward = jax.linearize(rows, still)
+    return forward, jax.linear_transpose(forward, still)
+
+
+def _to_tables(
+    declared: Declared, plan: Plan, values: Values, change: Tangent
+) -> dict[str, Float[Array, "rows width"]]:
+    """Changes of the groups as those of the tables; zero for held unknowns."""
+    found = zeros_of_tables(declared, values)
+    for name, group in plan.groups.items():
+        for m in group.members:
+            part, rows = change[name][:, m.start : m.start + m.width], m.rows
+            found[m.table] = found[m.table].at[slice(None) if rows is None else rows].add(part)
+    return found

@@ -1,0 +1,137 @@
+"""Error components against dense algebra, and against errors drawn from them."""
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from scipy.optimize import nnls
+
+from jaxbundle import leastsquares as ls
+from jaxbundle.leastsquares.quality.error_components import (
+    ErrorComponent,
+    ErrorSettings,
+    effects,
+    fit_error_model,
+    remove_fit,
+    stack_rows,
+)
+
+RANGE = ls.Kind(
+    "distance", lambda a, b, d: ((a - b) @ (a - b)) ** 0.5 - d, of=("point", "point")
+)
+POINTS, SIGMA = 14, 0.01
+
+
+@pytest.fixture(scope="module")
+def network():
+    """A free trilateration of its true coordinates, and dense: A, pinv(AᵀA), and the rows i, j."""
+    rng = np.random.default_rng(5)
+    X = rng.uniform(-10, 10, (POINTS, 3))
+    i, j = np.triu_indices(POINTS, 1)
+    true = np.linalg.norm(X[i] - X[j], axis=1)
+    unit = (X[i] - X[j]) / true[:, None]
+    A = np.zeros((len(i), POINTS, 3))
+    A[np.arange(len(i)), i], A[np.arange(len(i)), j] = unit, -unit
+    A = A.reshape(len(i), -1) / SIGMA
+
+    def adjust(errors):
+        result = ls.adjust(
+            [ls.Table("point", X)], [RANGE((i, j), true + SIGMA * errors, sigma=SIGMA)],
+            datum="inner", motions=ls.similarity(["point"]),
+        )  # fmt: skip
+        return result.solution
+
+    return adjust, A, np.linalg.pinv(A.T @ A, rcond=1e-9), (i, j)
+
+
+def components(rows):
+    """An offset of each instrument (all distances from a point), and one of a quarter of them."""
+    i, j = rows
+    by_first = sp.csr_matrix((np.ones(len(i)), (np.arange(len(i)), i)))
+    by_group = sp.csr_matrix(np.cos(np.outer(np.arange(len(i)), 1 + np.arange(4))))
+    return [
+        ErrorComponent("instrument", "σ", by_first),
+        ErrorComponent("waves", "σ", by_group),
+    ]
+
+
+def test_maps_are_those_of_dense_algebra(network):
+    adjust, A, Q, _ = network
+    rng = np.random.default_rng(1)
+    found = adjust(rng.normal(size=len(A)))
+    e = rng.normal(size=(3, len(A)))
+    left, tables = remove_fit(found, e)
+    # A of the true coordinates and that of the solution differ by errors of 0.01 of 10 m
+    np.testing.assert_allclose(left, e - e @ A @ Q @ A.T, atol=5e-3)
+    np.testing.assert_allclose(tables["point"].reshape(3, -1), e @ A @ Q, atol=5e-3 * SIGMA)
+    F = rng.normal(size=(5, POINTS, 3))
+    D = effects(found, {"point": F})
+    np.testing.assert_allclose(D, F.reshape(5, -1) @ Q @ A.T, atol=5e-3 * SIGMA)
+
+
+def test_sizes_and_covariances_are_those_of_dense_algebra(network):
+    adjust, A, Q, rows = network
+    rng = np.random.default_rng(4)
+    parts = components(rows)
+    roots = [part.root.toarray() for part in parts]
+    e = rng.normal(size=len(A)) + sum(2 * F @ rng.normal(size=F.shape[1]) for F in roots)
+    found = adjust(e)
+    model = fit_error_model(found, parts)
+    M = np.eye(len(A)) - A @ Q @ A.T
+    V = [np.eye(len(A)), *(F @ F.T for F in roots)]
+    v = stack_rows(found, found.residuals)
+    q = np.array([v @ W @ v for W in V])
+    T = np.array([[np.trace(M @ W @ M @ U) for U in V] for W in V])
+    theta = np.linalg.solve(T, q)
+    assert (theta > 0).all()  # the constraint is not active here
+    np.testing.assert_allclose(model.theta, theta, rtol=0.02)
+    C = Q @ A.T @ sum(t * W for t, W in zip(model.theta, V)) @ A @ Q
+    blocks = np.stack([C[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(POINTS)])
+    np.testing.assert_allclose(model.covariance("point"), blocks, rtol=0.02, atol=1e-3 * C.max())
+    rows_of = np.eye(3 * POINTS).reshape(-1, POINTS, 3)[:6]
+    np.testing.assert_allclose(
+        model.propagate_rows({"point": rows_of}), C[:6, :6], rtol=0.02, atol=1e-3 * C.max()
+    )
+    # σ of θ: T⁻¹·2·tr(V·MΣM·V·MΣM)·T⁻¹, here by 16 draws
+    P = M @ sum(t * W for t, W in zip(theta, V)) @ M
+    G = np.array([[2 * np.trace(W @ P @ U @ P) for U in V] for W in V])
+    sigma = np.sqrt(np.diag(np.linalg.solve(T, np.linalg.solve(T, G).T)))
+    np.testing.assert_allclose(model.theta_sigma, sigma, rtol=0.5)
+
+
+def test_sizes_are_those_of_the_errors_in_the_mean(network):
+    adjust, A, _, rows = network
+    rng, parts, theta = np.random.default_rng(7), components(rows), []
+    for _ in range(60):
+        e = rng.normal(size=len(A))
+        e += sum(2 * part.root @ rng.normal(size=part.root.shape[1]) for part in parts)
+        theta.append(fit_error_model(adjust(e), parts).theta)
+    mean, error = np.mean(theta, 0), np.std(theta, 0) / np.sqrt(60)
+    # θ ≥ 0 leaves a bias of a part of σ where it is active
+    assert (np.abs(mean - [1, 4, 4]) < 3.5 * error).all(), (mean, error)
+
+
+def test_roots_of_many_columns_are_combined_at_random(network):
+    adjust, A, _, rows = network
+    rng = np.random.default_rng(3)
+    parts = components(rows)
+    e = rng.normal(size=len(A)) + 2 * parts[0].root @ rng.normal(size=POINTS - 1)
+    found = adjust(e)
+    exact = fit_error_model(found, parts[:1])
+    drawn = fit_error_model(found, parts[:1], ErrorSettings(max_columns=4, draws=600))
+    np.testing.assert_allclose(drawn.theta, exact.theta, rtol=0.15)
+    own = [np.trace(m.own[0]["point"].sum(0)) for m in (exact, drawn)]
+    assert abs(own[1] / own[0] - 1) < 0.15
+
+
+def test_scores_are_standard_normal_without_shared_errors(network):
+    adjust, A, _, rows = network
+    rng, scores, sizes = np.random.default_rng(4), [], []
+    for _ in range(40):
+        model = fit_error_model(adjust(rng.normal(size=len(A))), components(rows))
+        scores.append(model.score[1:])
+        sizes.append(np.sqrt(model.theta))
+    scores = np.array(scores)
+    # mean 0 ± 1/√40, σ 1 ± 1/√80; forms of 13 and 4 squares are skew
+    assert (np.abs(scores.mean(0)) < 0.5).all() and (np.abs(scores.std(0) - 1) < 0.4).all()
+    assert abs(np.mean([s[0] for s in sizes]) - 1) < 0.1
+    assert model.sizes[0].name == "independent errors" and model.score[0] == 0
