@@ -20,7 +20,7 @@ MORE_BENCHES = large pushbroom orientation measuring blunders
 BAL ?=
 PEERS ?=
 
-.PHONY: demo test types test-further test-all test-commands random-problems mutants bench docs install install-demo \
+.PHONY: demo test types test-further test-all test-commands random-problems mutants mutations bench docs install install-demo \
   install-docs clean \
   bench-gpu $(BOUNDS:%=install-%) $(BOUNDS:%=test-%) $(BENCHES:%=bench-%) $(MORE_BENCHES:%=bench-%)
 
@@ -84,6 +84,13 @@ test-commands: install
 random-problems: install
 	cd tests/leastsquares && seq 0 $$(($(WORKERS) - 1)) | \
 	  xargs -P $(WORKERS) -I{} ../../$(BIN)/python test_random_problems.py 500 {} $(WORKERS)
+
+# CASES_EACH damaged inputs of every reader, in WORKERS processes that may be killed (60 s, 3 GB a case); the first
+# 20 of each are in `make test`, 300 in `make test-all`. Another SEED damages them otherwise.
+CASES_EACH ?= 300
+SEED ?= 37
+mutations: install
+	$(BIN)/python tests/mutate_inputs.py $(CASES_EACH) --seed $(SEED) --workers $(WORKERS)
 
 # 300 changes of the package, 10 s each, with the single tests that execute the changed line, which the
 # first call finds in an hour; resumes. Those that survived, once more: python tests/mutants.py --again.

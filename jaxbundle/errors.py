@@ -3,6 +3,8 @@
 import re
 from collections.abc import Sequence
 
+CONTROL = re.compile("[\0-\x1f\x7f-\x9f\u2028\u2029]+")
+"""Characters that end a line (`str.splitlines`), or that move the cursor of a terminal."""
 TOO_LONG = re.compile(r"([^\s/\\]{40})[^\s/\\]{260,}")
 """A word of 300 characters or more, longer than any file name with its context."""
 
@@ -10,11 +12,11 @@ TOO_LONG = re.compile(r"([^\s/\\]{40})[^\s/\\]{260,}")
 class InputError(ValueError):
     """The input cannot be used; the message names file, row, cause and remedy.
 
-    Extremely long words are cut to 40 characters.
+    It is one line, whatever a file contains; extremely long words are cut to 40 characters.
     """
 
     def __init__(self, message: str = ""):
-        super().__init__(TOO_LONG.sub(r"\1…", message))
+        super().__init__(TOO_LONG.sub(r"\1…", CONTROL.sub(" ", message)))
 
 
 class NotSolvedError(RuntimeError):

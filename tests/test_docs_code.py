@@ -113,7 +113,7 @@ def test_result(tmp_path, monkeypatch):
     page = run_page("result")
     found = page["found"].to_pandas()
     assert {name for name, row in zip(found.index, found.differs) if row} != set()
-    assert float(page["sigma_c"](page["start"].position)) > 0
+    assert float(page["sigma_c"](page["start"]["image"].position)) > 0
     assert "bent board" in str(page["budget"]) and "c" in str(page["influence"])
 
 

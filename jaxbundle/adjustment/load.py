@@ -20,6 +20,7 @@ from jaxbundle.leastsquares import problem as engine
 from jaxbundle.leastsquares.declarations import ObservationSet, Table
 from jaxbundle.leastsquares.iterations.solver import History, Minimum
 from jaxbundle.network.columns import list_some
+from jaxbundle.system.file_content import naming_file
 
 WHAT = "a saved adjustment (Adjustment.save, jaxbundle adjust --save)"
 
@@ -44,16 +45,10 @@ def load_adjustment(
     found = read_tree(path, CLASSES, WHAT)
     if not isinstance(found, Stored) or found.format != FORMAT:
         raise InputError(f"{path}: is not {WHAT} of this version of jaxbundle")
-    missing = sorted(set(found.own_models) - {model.name for model in models})
-    if missing:
-        raise InputError(
-            f"{path}: the camera models {list_some(missing)} are not built in; give "
-            "them as models=[…]"
-        )
-    found = dataclasses.replace(found, network=with_own_models(found.network, models))
     try:
-        result = _restore(found, _problem(found, also, path))
-        sigma0 = result.sigma0
+        with naming_file(path):
+            result = _restored(found, models, also, path)
+            sigma0 = result.sigma0
     except (ValueError, TypeError, LookupError) as error:
         if isinstance(error, InputError):
             raise
@@ -66,6 +61,22 @@ def load_adjustment(
             f"{sigma0:.6g}: it is damaged, or was saved by another version ({found.version})"
         )
     return result
+
+
+def _restored(
+    found: Stored,
+    models: Sequence[CameraModel],
+    also: Sequence[Table | ObservationSet],
+    path: str | Path,
+) -> Adjustment:
+    missing = sorted(set(found.own_models) - {model.name for model in models})
+    if missing:
+        raise InputError(
+            f"{path}: the camera models {list_some(missing)} are not built in; give "
+            "them as models=[…]"
+        )
+    found = dataclasses.replace(found, network=with_own_models(found.network, models))
+    return _restore(found, _problem(found, also, path))
 
 
 def _problem(

@@ -14,11 +14,10 @@ Of rigs, as of `calibrate_rigs`, with an axis more: `image_points` [rigs, camera
 """
 
 import dataclasses
-import os
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -27,10 +26,11 @@ from jaxbundle.batches.calibrate_rigs import check_rigs, rigs_of_arrays
 from jaxbundle.batches.input import check_shapes, single_list
 from jaxbundle.batches.rigs import RigViews
 from jaxbundle.errors import InputError
+from jaxbundle.io.text.archives import Member, open_archive, read_member
 from jaxbundle.io.text.stored_rows import StoredRows, find_stored_rows
-from jaxbundle.io.text.unpacking import UNREADABLE_ARCHIVE, largest_unpacked_size
 from jaxbundle.io.writing.fingerprints import of_arrays
 
+EXPECTED = "a readable .npz file of plain arrays"
 REQUIRED_ARRAYS = ("object_points", "image_points", "image_size")
 KNOWN_ARRAYS = (*REQUIRED_ARRAYS, "visible", "ids", "cameras")
 BY_CAMERA = {"object_points": (3,), "image_points": (4, 5), "visible": (3, 4)}
@@ -96,16 +96,8 @@ def read_camera_stack(path: str | Path) -> CameraStack:
     """
     if not Path(path).is_file():
         raise InputError(f"{path}: no such file")
-    try:
-        with open(path, "rb") as stream:
-            if not zipfile.is_zipfile(stream):
-                raise zipfile.BadZipFile("it is not an archive")
-            _check_size(stream)
-            with np.load(stream, allow_pickle=False) as file:
-                arrays = {name: _rows(path, name, file) for name in KNOWN_ARRAYS if name in file}
-    except UNREADABLE_ARCHIVE as error:
-        why = " ".join(str(error).split())[:200]
-        raise InputError(f"{path}: not a readable .npz file of plain arrays ({why})") from None
+    with open_archive(path, EXPECTED, KNOWN_ARRAYS) as (archive, members):
+        arrays = {name: _rows(path, archive, name, member) for name, member in members.items()}
     missing = [name for name in REQUIRED_ARRAYS if name not in arrays]
     if missing:
         raise InputError(
@@ -155,29 +147,12 @@ def _names(path: str | Path, arrays: Mapping[str, np.ndarray], name: str) -> tup
     return tuple(map(str, texts.tolist()))
 
 
-def _rows(path: str | Path, name: str, file: Mapping[str, Any]) -> Any:
-    """An array, or on demand the rows of a large uncompressed one with one row per camera."""
-    # a stack may exceed the memory: rows of an uncompressed array are read from the file when
-    # needed
-    found = find_stored_rows(path, name) if name in BY_CAMERA else None
-    cameras = found is not None and found.ndim in BY_CAMERA[name]
-    truths = name == "visible"
-    if found is None or not cameras or (found.dtype.kind == "b") != truths:
-        found = file[name]
-        if not isinstance(found, np.ndarray):  # NumPy gives the bytes of other members
-            raise ValueError(f"{name} is no array")
-    return found
-
-
-def _check_size(stream: BinaryIO) -> None:
-    """Refuse an archive whose arrays unpack to implausible sizes."""
-    with zipfile.ZipFile(stream) as archive:
-        unpacked = sum(
-            member.file_size
-            for member in archive.infolist()
-            if member.filename.removesuffix(".npy") in KNOWN_ARRAYS
-        )
-    size = stream.seek(0, os.SEEK_END)
-    stream.seek(0)
-    if unpacked > largest_unpacked_size(size):
-        raise ValueError(f"{size} bytes that claim to unpack to {unpacked}")
+def _rows(path: str | Path, archive: zipfile.ZipFile, name: str, member: Member) -> Any:
+    """An array, or on demand the rows of a large one with one row per camera."""
+    by_camera = len(member.shape) in BY_CAMERA.get(name, ())
+    # a stack may exceed the memory: rows are read from the file when needed
+    if by_camera and (member.dtype.kind == "b") == (name == "visible"):
+        found = find_stored_rows(path, EXPECTED, archive, name, member)
+        if found is not None:
+            return found
+    return read_member(path, EXPECTED, archive, name, member)

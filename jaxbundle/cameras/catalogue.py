@@ -103,7 +103,7 @@ def key_of(model: str | CameraModel) -> str | CameraModel:
 
 def is_known(name: str) -> bool:
     """Whether a built-in model has this name, or a family has names of this form."""
-    return name in MODELS or _of_family(name) is not None
+    return _of_family(name) is not None or (isinstance(name, str) and name in MODELS)
 
 
 def _built_in(name: str) -> CameraModel | None:
@@ -111,7 +111,7 @@ def _built_in(name: str) -> CameraModel | None:
 
     **Raises:** `ValueError` for a name of a family whose numbers are impossible.
     """
-    if name in MODELS:
+    if isinstance(name, str) and name in MODELS:  # a file may have anything there
         return MODELS[name]
     found = _of_family(name)
     return None if found is None else found()

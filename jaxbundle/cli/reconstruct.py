@@ -62,7 +62,7 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
     from jaxbundle.cli.camera_inputs import calibration_given
     from jaxbundle.cli.outputs import check_writable, trace_files
     from jaxbundle.cli.progress import staging
-    from jaxbundle.cli.reconstruct_files import COMMAND, FILES, make_store, write_reconstruction
+    from jaxbundle.cli.reconstruct_files import COMMAND, FILES, keep_matches, write_reconstruction
     from jaxbundle.commands.reconstruction import open_control
     from jaxbundle.measure.coded_targets import check_kind
     from jaxbundle.reconstruction.named import read_distances
@@ -82,9 +82,8 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
     check_writable(json, out, COMMAND, FILES, files, force)
     found, _ = find_photographs(photos)
     check_writable(json, out, COMMAND, FILES, [*files, *(p.path for p in found)], force, html)
-    store = make_store(out, force)
-    advise(f"run the same command again to resume; matches are kept in {store}")
-    with staging(quiet or json == "-") as tell:
+    with keep_matches(out, force) as store, staging(quiet or json == "-") as tell:
+        advise(f"run the same command again to resume; matches are kept in {store}")
         result = jaxbundle.reconstruct(
             photos,
             camera=given,

@@ -1,6 +1,7 @@
 """Output of `jaxbundle reconstruct`: every part with model and cloud, pairs, figures."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from jaxbundle.io.results.ply import write_ply
 from jaxbundle.io.results.result_json import result_text, verdict_dict
 from jaxbundle.io.results.result_project import adjusted_network
 from jaxbundle.io.text.csv_tables import write_csv, write_text
-from jaxbundle.io.writing.folders import read_marker, replace_folder
+from jaxbundle.io.writing.folders import MARKER, read_marker, replace_folder
 from jaxbundle.photographs.reading import read_photograph
 from jaxbundle.plotting.files import PAIRS as PAIR_FIGURES
 from jaxbundle.plotting.files import TRACKS, draw_pairs, draw_tracks
@@ -32,12 +33,25 @@ PART_FILES = (*RESULTS, CONTROL, POSITIONS, *(f"{MODEL}/{name}" for name in COLM
 FILES = (*PART_FILES, *(f"part_*/{name}" for name in PART_FILES), PAIRS, *PAIR_FIGURES)
 
 
-def make_store(out: Path, force: bool) -> Path:
-    """The folder of stored features and matches; --out belongs to the command from now on."""
-    if read_marker(out) is None:
+@contextmanager
+def keep_matches(out: Path, force: bool) -> Iterator[Path]:
+    """The folder of stored features and matches; --out belongs to the command from now on. Bad
+    input leaves no trace of a new one, unless features of the photographs are in it already, which
+    the next run uses."""
+    store, new = out / STORE, read_marker(out) is None
+    made = [p for p in (out, *out.absolute().parents) if not p.exists()]
+    if new:
         with replace_folder(out, COMMAND, (), force):
             pass
-    return out / STORE
+    try:
+        yield store
+    except InputError:
+        if new and not any(store.glob("*.npz")):
+            (out / MARKER).unlink(missing_ok=True)
+            for folder in (store, *made):
+                with suppress(OSError):  # not there yet, or somebody has put a file into it
+                    folder.rmdir()
+        raise
 
 
 def write_reconstruction(

@@ -14,7 +14,7 @@ from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.io.rasters.correction import map_of, write_corrected
 from jaxbundle.io.rasters.error_maps import write_error_map
-from jaxbundle.io.rasters.maps import MapSystem
+from jaxbundle.io.rasters.maps import MapSystem, describe_distance
 from jaxbundle.io.rasters.scenes import read_scene, write_taken
 from jaxbundle.io.scanner.flight import read_flight
 from jaxbundle.io.scanner.refinement import RefineFile, read_refinement
@@ -105,6 +105,9 @@ def correct(  # noqa: PLR0913 (public: the options of the command, all but three
     surface = surface_of(file.earth, height, dem, file.image, geoid)
     system = MapSystem(file.earth, crs)
     grid = map_of(file.image, surface, system, spacing, None if dem is None else Path(dem))
+    if crs is not None and (place := system.degrees_of(grid)):
+        if said := describe_distance(crs, *place):
+            tell(said)
     search = make_search(file.image, file.earth)
     true = None if truth is None else _open_truth(Path(truth), file, tell)
     write_corrected(

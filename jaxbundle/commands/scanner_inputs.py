@@ -56,7 +56,7 @@ def surface_of(
             extent = rpc_extent(image)
         elif image is not None and earth is not None:
             extent = image_extent(image, earth)
-        terrain = read_terrain(dem, earth, extent)
+        terrain = read_terrain(dem, earth, extent, above_geoid=geoid is not None)
         return terrain if geoid is None else add_geoid(terrain, Path(geoid))
     if earth is None:
         return Plane(level=height or 0.0)

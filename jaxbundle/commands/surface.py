@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
+from jaxbundle.io.rasters.maps import describe_distance
 from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.results import TableMethods
@@ -194,6 +195,9 @@ def _match_ground_images(
     views, around = read_ground_views(inputs, photos)
     bounds, messages = ground_bounds(views, heights)
     messages = (*messages, *align_all(views, bounds))
+    if around is not None and crs is not None:
+        place = (float(np.degrees(float(a))) for a in (around.longitude, around.latitude))
+        messages = (*messages, *filter(None, [describe_distance(crs, *place)]))
     _say_all(messages, say)
     found = reconstruct_surface(views, bounds, _partners(pairs, views), **options)
     _say_all(found.messages, say)

@@ -91,7 +91,7 @@ def to_map(
     pyproj = _need_pyproj()
     try:
         known = pyproj.CRS.from_user_input("EPSG:4326" if system.upper() == "WGS84" else system)
-    except pyproj.exceptions.CRSError:
+    except pyproj.exceptions.ProjError:
         raise InputError(f"{where}: coordinate system {system!r} is not known") from None
     if not known.is_geographic:
         code = known.to_epsg()
@@ -105,7 +105,7 @@ def _transformer(source: Any, target: str, where: str) -> Any:
     pyproj = _need_pyproj()
     try:
         return pyproj.Transformer.from_crs(source, target, always_xy=True)
-    except pyproj.exceptions.CRSError as error:
+    except pyproj.exceptions.ProjError as error:
         raise InputError(f"{where}: {error}") from None
 
 

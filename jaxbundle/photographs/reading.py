@@ -4,6 +4,7 @@ The pixels are used in the orientation of the sensor: EXIF orientation is ignore
 would rotate the camera axes. Images with more than 8 bits are stretched to 8 bits.
 """
 
+import io
 import os
 import threading
 import warnings
@@ -20,12 +21,14 @@ from jaxbundle.errors import InputError
 from jaxbundle.photographs.formats import OF_RAW, RAW, register_heic, remedy
 from jaxbundle.photographs.opencv import need_opencv, need_pillow
 from jaxbundle.system.file_content import check_plain, read_content
+from jaxbundle.system.foreign_parsers import foreign_parser
 from jaxbundle.system.memory import free_memory, is_memory_shortage
 
 MOST_PIXELS = 2**30
 """Limit of OpenCV (CV_IO_MAX_IMAGE_PIXELS)."""
 LIMIT = threading.Lock()
 """Held while Pillow's limit, which is global, is changed."""
+EXPECTED = "an image (JPEG, PNG, TIFF are read)"
 START, SCAN, END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
 """Marks of JPEG: start of the file, of a scan, end of the image."""
 
@@ -83,12 +86,13 @@ def _read(
     if not len(content):
         raise InputError(f"{path}: the file is empty")
     if _looks_cut(content):
-        _refuse_cut(path)
+        _refuse_cut(path, content)
+    _refuse_hollow(path, len(content))
     way = cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE
     flags = way | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     pixels = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     if pixels is None:
-        pixels = _read_by_pillow(path, colour)
+        pixels = _read_by_pillow(path, content, colour)
     elif colour:
         pixels = pixels[..., ::-1]  # OpenCV's order is blue, green, red
     return np.ascontiguousarray(_stretch(pixels))
@@ -103,26 +107,24 @@ def photograph_size(path: str | Path) -> tuple[int, int]:
         return image.size
 
 
-def open_image(path: str | Path) -> Any:
+def open_image(path: str | Path, content: bytes | None = None) -> Any:
     """The file opened by Pillow with its header read, without decoding pixels. Close it, by `with`.
+
+    **Arguments:** `content`: of the file, if it is in memory.
 
     **Raises:** `InputError` if it cannot be read, is not an image, or has more than 2³⁰ pixels.
     """
     check_plain(path)
     _refuse_raw(path)
     try:
-        image = _open_any_size(path)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except OSError as error:
-        if os.path.isfile(path) and not os.path.getsize(path):
+        with foreign_parser(path, EXPECTED):
+            image = _open_any_size(path if content is None else io.BytesIO(content))
+    except InputError as error:
+        if not os.path.isfile(path) or "cannot be read" in str(error):
+            raise
+        if not os.path.getsize(path):
             raise InputError(f"{path}: the file is empty") from None
-        if todo := remedy(path):
-            raise InputError(f"{path}: {todo}") from None
-        raise InputError(
-            f"{path}: not an image that can be read (JPEG, PNG, TIFF are)"
-            + (f": {error.strerror}" if error.strerror else "")
-        ) from None
+        raise InputError(f"{path}: {remedy(path) or f'not {EXPECTED}'}") from None
     columns, rows = image.size
     if columns * rows > MOST_PIXELS:
         image.close()
@@ -150,7 +152,7 @@ def _refuse_raw(path: str | Path) -> None:
         raise InputError(f"{path}: {OF_RAW}")
 
 
-def _open_any_size(path: str | Path) -> Any:
+def _open_any_size(file: str | Path | io.BytesIO) -> Any:
     """The file opened without Pillow's limit against decompression bombs: 179 million pixels, which
     a photograph may have."""
     Image = need_pillow()
@@ -160,9 +162,23 @@ def _open_any_size(path: str | Path) -> Any:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # about damaged headers: missing fields are unknown
-                return Image.open(path)
+                return Image.open(file)
         finally:
             Image.MAX_IMAGE_PIXELS = limit
+
+
+def _refuse_hollow(path: str | Path, size: int, harmless: int = 2**26, ratio: int = 2000) -> None:
+    """Refuse a header of more pixels than so many bytes hold; `harmless`: pixels that are always
+    decoded; `ratio`: for a byte, beyond them. DEFLATE packs 1032 bytes into one at most, JPEG 512
+    pixels of one colour."""
+    try:
+        columns, rows = photograph_size(path)
+    except InputError:
+        return  # OpenCV may read what Pillow does not
+    if columns * rows > max(harmless, ratio * size):
+        raise InputError(
+            f"{path}: damaged: {size} bytes that claim to hold {columns} × {rows} pixels"
+        )
 
 
 def _looks_cut(content: bytes) -> bool:
@@ -174,23 +190,21 @@ def _looks_cut(content: bytes) -> bool:
     return content.startswith(b"\x89PNG") and b"IEND" not in content[-64:]
 
 
-def _refuse_cut(path: str | Path) -> None:
+def _refuse_cut(path: str | Path, content: bytes) -> None:
     """Refuse a file that Pillow cannot decode to its end: the marks alone are no proof."""
     try:
-        with open_image(path) as image:
+        # of a file Python makes room for as many bytes as a damaged length says; not of memory
+        with open_image(path, content) as image, foreign_parser(path, EXPECTED, shortage=False):
             image.load()
-    except (OSError, SyntaxError, ValueError):
+    except InputError:
         raise InputError(f"{path}: the file is truncated; copy it again") from None
 
 
-def _read_by_pillow(path: str | Path, colour: bool) -> UInt8[np.ndarray, "rows columns *channels"]:
-    try:
-        with open_image(path) as image:
-            return np.asarray(image.convert("RGB" if colour else "L"))
-    except InputError:
-        raise
-    except (OSError, SyntaxError, ValueError):
-        raise InputError(f"{path}: not an image that can be read (JPEG, PNG, TIFF, …)") from None
+def _read_by_pillow(
+    path: str | Path, content: bytes, colour: bool
+) -> UInt8[np.ndarray, "rows columns *channels"]:
+    with open_image(path, content) as image, foreign_parser(path, EXPECTED, shortage=False):
+        return np.asarray(image.convert("RGB" if colour else "L"))
 
 
 def _stretch(pixels: Shaped[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:

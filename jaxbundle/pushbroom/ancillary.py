@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Literal, cast
+from typing import Literal, NamedTuple, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -134,6 +134,52 @@ def normalise_quaternions(
     )
     rounded = np.abs(length - 1) <= settings.rounded_length
     return values / length[:, None], () if rounded.all() else (message,)
+
+
+class Contradiction(NamedTuple):
+    """Velocities that are not the rates of the positions: the row and what it shows, in words;
+    `shift`: metres by which Hermite's interpolation is off between two rows, at most."""
+
+    message: str
+    shift: float
+
+
+def contradiction(
+    times: Float[np.ndarray, " rows"],
+    positions: Float[np.ndarray, "rows k"],
+    velocities: Float[np.ndarray, "rows k"],
+    source: Source = POSITIONS,
+    tolerance: float = 0.02,
+) -> Contradiction | None:
+    """What shows that velocities are not the rates of the positions; None if nothing does.
+
+    The mean velocity between two rows is compared with the mean of theirs, which differ by h²/12
+    times the second derivative of the velocity: by less than half of the change of velocity for
+    steps up to a sixth of a revolution (of a circular orbit, |ΔV|/2 = |V|·sin(ωh/2) against
+    |V|·(ωh)²/12). Hermite's cubic with velocities that are off by δ at one end of a step is off by
+    4/27·h·δ at most.
+
+    **Arguments:** `tolerance`: of the speed, beside that: differences of rounded positions of
+    neighbouring rows; a velocity relative to inertial axes differs by 6 % in a low orbit of the
+    Earth.
+    """
+    step = np.diff(times)
+    mean = np.diff(positions, axis=0) / step[:, None]
+    trapezoid = (velocities[1:] + velocities[:-1]) / 2
+    speed = np.linalg.norm(mean, axis=1)
+    change = np.linalg.norm(np.diff(velocities, axis=0), axis=1)
+    off = np.linalg.norm(mean - trapezoid, axis=1)
+    # velocities that are much too large excuse nothing
+    allowed = tolerance * np.median(speed) + np.minimum(change, speed) / 2
+    if not (bad := off > allowed).any():
+        return None
+    k = int(bad.argmax())
+    return Contradiction(
+        f"{source(k + 1)}: positions move by {speed[k]:.6g} m/s from the row before, velocities "
+        f"say {np.linalg.norm(trapezoid[k]):.6g} m/s, {off[k]:.6g} m/s from that; expected metres "
+        "a second in the frame of the positions",
+        float((4 / 27 * step * off)[bad].max()),
+    )
 
 
 def continuous(quaternions: Float[np.ndarray, "rows 4"]) -> Float[np.ndarray, "rows 4"]:
@@ -274,6 +320,9 @@ def _table(
             f"{source.name}: {len(times)} rows; {method!r} needs {fewest}; give more rows{advice}"
         )
     check_times(times, source)
+    if method == "hermite" and rates is not None:
+        if wrong := contradiction(times, values, rates, source):
+            raise InputError(f"{wrong.message}, or another interpolation than 'hermite'")
     if gap is not None and not gap > 0:
         raise InputError(
             f"{source.name}: gap is {gap:g}; the longest step that is interpolated, in seconds, "

@@ -25,6 +25,7 @@ from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.network.rules import check_choice
 from jaxbundle.network.tables import ROLES, Points, Source
 from jaxbundle.photographs.places import to_map
+from jaxbundle.system.foreign_parsers import foreign_parser
 
 MANUAL_SIGMA = 1.0
 """Default σ of a manual measurement, pixels: a person hits a mark to about that. If the rays of the
@@ -112,7 +113,8 @@ def _read_gcp_list(path: Path, system: str, rows: Sequence[tuple[int, str]]) -> 
 def _read_table(path: Path, head: Sequence[str], rows: Sequence[tuple[int, str]]) -> Control:
     records, sigmas = [], {}
     for number, line in rows:
-        row = next(csv.reader([line], skipinitialspace=True))
+        with foreign_parser(f"{path}, line {number}", "a row of a CSV table"):
+            (row,) = csv.reader([line], skipinitialspace=True)
         if len(row) != len(head):
             raise InputError(
                 f"{path}, line {number}: {len(row)} cells where the header has {len(head)} "

@@ -165,9 +165,10 @@ def _average_cells(
     spread = NORMAL_SIGMA_BY_MAD * _sorted_medians(away[again], first, count)
     least = settings.min_spread * size
     keep = away <= settings.max_deviation * np.maximum(spread, least)[group]
-    weight = np.where(np.isfinite(sigma) & (sigma > 0), 1 / sigma**2, np.nan)
+    # a point without σ, or of a σ of 0, which no measurement has, counts as one of the median σ
+    with np.errstate(divide="ignore", over="ignore", under="ignore"):
+        weight = np.where(sigma > 0, 1 / sigma**2, np.nan)
     known = np.isfinite(weight)
-    # a point without σ counts as one of the median σ
     weight = np.where(known, weight, np.nanmedian(weight) if known.any() else 1.0) * keep
     total = np.bincount(group, weight)
     mean = np.bincount(group, weight * Z) / total

@@ -1,6 +1,7 @@
 """Clouds as files: CSV with σ and the pixel of the base image; the report as a dictionary."""
 
 import csv
+import dataclasses
 import io
 import itertools
 from collections.abc import Mapping, Sequence
@@ -8,15 +9,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
+from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import read_csv, write_text
+from jaxbundle.network.tables import Source
 from jaxbundle.surfaces.accuracy import accuracy_of, at_check_points
 from jaxbundle.surfaces.cloud import Cloud
 from jaxbundle.surfaces.reconstruct import SurfaceResult
 
 COLUMNS = ("X", "Y", "Z", "sX", "sY", "sZ", "rays", "image", "u", "v")
 REQUIRED_COLUMNS = COLUMNS[:3]
+SIGMAS = COLUMNS[3:6]
 
 
 def write_cloud_csv(cloud: Cloud, path: str | Path) -> None:
@@ -59,20 +63,56 @@ def read_cloud_csv(path: str | Path) -> Cloud:
     """
     table = read_csv(Path(path))
     X = np.stack([table.numbers(name, required=True) for name in REQUIRED_COLUMNS], axis=1)
-    n = len(X)
-    column = lambda name, default: (
-        table.numbers(name) if name in table.values else np.full(n, default)
-    )
-    sigma = np.stack([column(name, np.nan) for name in COLUMNS[3:6]], axis=1)
-    covariance = np.zeros((n, 3, 3))
-    covariance[:, [0, 1, 2], [0, 1, 2]] = sigma**2
-    ids = list(table.values["image"]) if "image" in table.values else [""] * n
+    ids = list(table.values["image"]) if "image" in table.values else [""] * len(X)
     names = tuple(dict.fromkeys(ids)) or ("",)
     index = {name: k for k, name in enumerate(names)}
-    image = np.array([index[i] for i in ids], int).reshape(n)
-    uv = np.stack([column("u", np.nan), column("v", np.nan)], axis=1)
-    rays = np.nan_to_num(column("rays", 0)).astype(int)
-    return Cloud(X, covariance, rays, image, uv, names)
+    image = np.array([index[i] for i in ids], int).reshape(len(X))
+    columns = {name: table.numbers(name) for name in (*SIGMAS, "rays") if name in table.values}
+    cloud = make_cloud(table.source, X, columns)
+    uv = np.stack([table.numbers("u"), table.numbers("v")], axis=1)
+    return dataclasses.replace(cloud, image=image, images=names, uv=uv)
+
+
+def make_cloud(
+    source: Source,
+    X: Float[np.ndarray, "n 3"],
+    columns: Mapping[str, np.ndarray],
+    colour: UInt8[np.ndarray, "n 3"] | None = None,
+    system: str | None = None,
+    max_coordinate: float = 1e15,
+) -> Cloud:
+    """The cloud of the columns of a file: its σ (`SIGMAS`) and `rays`, where it has them.
+
+    **Arguments:** `max_coordinate`: larger ones are damaged: the Sun is at 1.5e14 mm.
+
+    **Raises:** `InputError` naming the point: a coordinate that is not finite, a negative or
+    infinite σ, a number of rays that is none."""
+    n = len(X)
+    bad = ~(np.abs(X) < max_coordinate).all(axis=1)
+    if bad.any():
+        where = source(int(bad.argmax()))
+        raise InputError(
+            f"{where}: coordinates {', '.join(f'{x:g}' for x in X[bad.argmax()])}: {bad.sum()} of "
+            f"{n} points have coordinates that are not finite, or too large"
+        )
+    read = lambda name, missing: np.asarray(columns.get(name, np.full(n, missing)), float)
+    for name, limit, what in (
+        *((name, max_coordinate, "a positive number, or nothing,") for name in SIGMAS),
+        ("rays", np.iinfo(np.int32).max, "a number of images"),
+    ):
+        values = read(name, np.nan)
+        if values.shape != (n,):
+            raise InputError(f"{source.name}: {name} has {values.shape[1:]} values a point; one is")
+        if (bad := (values < 0) | (values > limit)).any():
+            row = int(bad.argmax())
+            raise InputError(f"{source(row)}: {name} is {values[row]:g}; {what} is expected")
+    covariance = np.zeros((n, 3, 3))
+    for k, name in enumerate(SIGMAS):
+        covariance[:, k, k] = read(name, np.nan) ** 2
+    rays = np.nan_to_num(read("rays", 0)).astype(int)
+    return Cloud(
+        X, covariance, rays, np.zeros(n, int), np.full((n, 2), np.nan), ("",), colour, system
+    )
 
 
 def report_of(

@@ -6,26 +6,25 @@ entities on the layer POINTS.
 """
 
 import io
-import struct
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
 
 from jaxbundle.choices import CLOUD_FILES
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import write_bytes, write_text
+from jaxbundle.io.text.rows import TextRow
+from jaxbundle.network.tables import Source
 from jaxbundle.surfaces.cloud import Cloud
-from jaxbundle.surfaces.files import read_cloud_csv, write_cloud_csv
-from jaxbundle.system.file_content import missing
+from jaxbundle.surfaces.files import SIGMAS, make_cloud, read_cloud_csv, write_cloud_csv
+from jaxbundle.surfaces.las_header import EXPECTED, check_las
+from jaxbundle.system.file_content import missing, read_content
+from jaxbundle.system.foreign_parsers import foreign_parser
 
-if TYPE_CHECKING:
-    import laspy
-
-SIGMAS = ("sX", "sY", "sZ")
+COLOURS = ("red", "green", "blue")
 VERTEX = np.dtype([
     ("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("red", "u1"), ("green", "u1"), ("blue", "u1"),
     *((name, "<f4") for name in SIGMAS), ("rays", "<i4"),
@@ -35,8 +34,8 @@ PLY_READ = {"double": "<f8", "float64": "<f8", "float": "<f4", "float32": "<f4",
             "uint8": "u1", "char": "i1", "int8": "i1", "int": "<i4", "int32": "<i4",
             "uint": "<u4", "uint32": "<u4", "short": "<i2", "int16": "<i2", "ushort": "<u2",
             "uint16": "<u2"}  # fmt: skip
-LAS_HEAD = 375
-"""Bytes of the header of LAS 1.4 (specification R15, table 3); shorter in earlier versions."""
+PLY_END = re.compile(rb"end_header\r?\n")
+BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 
 def write_cloud(cloud: Cloud, path: str | Path) -> None:
@@ -71,14 +70,7 @@ def read_cloud(path: str | Path) -> Cloud:
     suffix = path.suffix.lower()
     if suffix not in readers:
         raise InputError(f"{path}: suffix {suffix!r}; .csv, .ply, .las or .laz is expected")
-    cloud = readers[suffix](path)
-    bad = ~np.isfinite(cloud.X).all(axis=1)
-    if bad.any():
-        raise InputError(
-            f"{path}: {bad.sum()} of {len(bad)} points have coordinates that are not finite, the "
-            f"first is point {bad.argmax() + 1}"
-        )
-    return cloud
+    return readers[suffix](path)
 
 
 def _write_ply(cloud: Cloud, path: Path) -> None:
@@ -86,7 +78,7 @@ def _write_ply(cloud: Cloud, path: Path) -> None:
     for k, axis in enumerate("xyz"):
         rows[axis] = cloud.X[:, k]
     colour = cloud.colour if cloud.colour is not None else np.full((len(cloud), 3), 160, np.uint8)
-    for k, name in enumerate(("red", "green", "blue")):
+    for k, name in enumerate(COLOURS):
         rows[name] = colour[:, k]
     for k, name in enumerate(SIGMAS):
         rows[name] = cloud.sigma[:, k]
@@ -97,33 +89,55 @@ def _write_ply(cloud: Cloud, path: Path) -> None:
 
 
 def _read_ply(path: Path) -> Cloud:
-    content = path.read_bytes()
-    head, mark, body = content.partition(b"end_header\n")
+    head, *rest = PLY_END.split(read_content(path, text=False), maxsplit=1)
     lines = head.decode("ascii", "replace").splitlines()
-    if not mark or not lines or lines[0].strip() != "ply":
+    if not rest or not lines or lines[0].strip() != "ply":
         raise InputError(f"{path}: not a PLY file")
+    (body,) = rest
     form, number, fields = _ply_head(path, lines)
     names = [n for n, _ in fields]
     if not {"x", "y", "z"} <= {*names}:
         raise InputError(f"{path}: vertices without x, y, z")
+    if len({*names}) < len(names):
+        raise InputError(f"{path}: two properties of a vertex have one name")
+    if form == "ascii":
+        columns = _ply_numbers(path, body, names, number, len(lines) + 2)
+    elif form in BYTE_ORDERS:
+        kinds = np.dtype([(n, t.replace("<", BYTE_ORDERS[form])) for n, t in fields])
+        _check_ply_count(path, number, len(body) // kinds.itemsize)
+        rows = np.frombuffer(body, kinds, number)
+        columns = {name: rows[name] for name in names}
+    else:
+        raise InputError(f"{path}: format {form!r}; ascii, {', '.join(BYTE_ORDERS)} are expected")
+    with np.errstate(invalid="ignore"):  # signalling NaN, which are refused
+        X = np.stack([columns[axis].astype(float) for axis in "xyz"], 1)
+        colour = None
+        if {*COLOURS} <= {*names}:
+            colour = np.stack([columns[c] for c in COLOURS], 1).astype(np.uint8)
+    return make_cloud(Source(str(path), None, "point"), X, columns, colour)
+
+
+def _ply_numbers(
+    path: Path, body: bytes, names: Sequence[str], number: int, first: int
+) -> dict[str, np.ndarray]:
+    """The columns of an ASCII file, whose first point is in the line `first`."""
+    lines = body.decode("ascii", "replace").splitlines()
+    _check_ply_count(path, number, len(lines))
+    lines = lines[:number]
     try:
-        if form == "ascii":
-            table = np.array(
-                [
-                    line.split()[: len(fields)]
-                    for line in body.decode("ascii").splitlines()[:number]
-                ],
-                float,
-            )
-            column = lambda name: table.reshape(number, -1)[:, names.index(name)]
-        else:
-            order = ">" if "big" in form else "<"
-            kinds = [(n, t.replace("<", order)) for n, t in fields]
-            rows = np.frombuffer(body, np.dtype(kinds), number)
-            column = lambda name: rows[name]
-        return _cloud_of_columns(column, names, number)
-    except (ValueError, IndexError) as error:
-        raise InputError(f"{path}: {error}") from None
+        table = np.array([line.split()[: len(names)] for line in lines], float)
+        table = table.reshape(number, len(names))
+    except ValueError:  # which point? the slow way
+        rows = [TextRow(path, k, line) for k, line in enumerate(lines, first)]
+        table = np.array([row.numbers(names, more=True) for row in rows])
+    return dict(zip(names, table.T))
+
+
+def _check_ply_count(path: Path, stated: int, present: int) -> None:
+    if stated > present:
+        raise InputError(
+            f"{path}: is cut, or damaged: its header counts {stated} points, there are {present}"
+        )
 
 
 def _ply_head(path: Path, lines: Sequence[str]) -> tuple[str, int, list[tuple[str, str]]]:
@@ -133,8 +147,11 @@ def _ply_head(path: Path, lines: Sequence[str]) -> tuple[str, int, list[tuple[st
         match line.split():
             case ["format", form, *_]:
                 pass
-            case ["element", current, text] if current != "vertex" or text.isdecimal():
-                number = int(text) if current == "vertex" else number
+            case ["element", "vertex", text] if text.isdecimal() and len(text) < 19:
+                current, number = "vertex", int(text)
+            case ["element", current, _] if current != "vertex":
+                if not fields:
+                    raise InputError(f"{path}, line {place}: {line!r} before the vertices")
             case ["property", kind, name] if current == "vertex":
                 if kind not in PLY_READ:
                     raise InputError(f"{path}: property of type {kind} of a vertex is not read")
@@ -144,36 +161,6 @@ def _ply_head(path: Path, lines: Sequence[str]) -> tuple[str, int, list[tuple[st
             case ["property", *_] if current == "vertex":
                 raise InputError(f"{path}, line {place}: {line!r} of a vertex is not read")
     return form, number, fields
-
-
-def _cloud_of_columns(column: Callable[[str], np.ndarray], names: Sequence[str], n: int) -> Cloud:
-    X = np.stack([column(axis).astype(float) for axis in "xyz"], 1)
-    sigma = np.stack(
-        [column(s).astype(float) if s in names else np.full(n, np.nan) for s in SIGMAS], 1
-    )
-    colours = ("red", "green", "blue")
-    colour = (
-        np.stack([column(c) for c in colours], 1).astype(np.uint8)
-        if ({*colours} <= {*names})
-        else None
-    )
-    rays = np.asarray(column("rays")).astype(int) if "rays" in names else np.zeros(n, int)
-    return _plain_cloud(X, sigma, rays, colour)
-
-
-def _plain_cloud(
-    X: Float[np.ndarray, "n 3"],
-    sigma: Float[np.ndarray, "n 3"],
-    rays: Int[np.ndarray, " n"],
-    colour: UInt8[np.ndarray, "n 3"] | None,
-    system: str | None = None,
-) -> Cloud:
-    n = len(X)
-    covariance = np.zeros((n, 3, 3))
-    covariance[:, [0, 1, 2], [0, 1, 2]] = sigma**2
-    return Cloud(
-        X, covariance, rays, np.zeros(n, int), np.full((n, 2), np.nan), ("",), colour, system
-    )
 
 
 def _laspy() -> ModuleType:
@@ -219,58 +206,19 @@ def _write_las(cloud: Cloud, path: Path) -> None:
 
 def _read_las(path: Path) -> Cloud:
     laspy = _laspy()
-    _check_las_counts(path)
-    try:
-        return _las_cloud(laspy.read(path))
-    except Exception as error:  # laspy and its backends raise any exception
-        why = " ".join(str(error).split())[:200]
-        raise InputError(f"{path}: damaged, or not LAS as expected: {why}") from None
-
-
-def _check_las_counts(path: Path) -> None:
-    """Refuse counts in a header that the file has no room for: laspy would read records for hours,
-    lazrs allocate for all chunks and abort the process (LAS 1.4 R15, table 3; LAZ 1.4)."""
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        # offsets of the fields: 25 minor version, 96 first point, 100 records, 104 point format
-        # (bit 7: compressed), 235 and 243 first and number of the extended records
-        head = file.read(LAS_HEAD)
-        unpack = lambda form, offset: (
-            struct.unpack_from(form, head, offset)[0] if len(head) >= offset + 8 else 0
-        )
-        begin = unpack("<I", 96)
-        # a variable length record has 54 bytes at least, an extended one 60
-        room = {"records": (54 * unpack("<I", 100), size)}
-        if unpack("<B", 25) >= 4 and unpack("<I", 243):
-            room["extended records"] = 60 * unpack("<I", 243), size - unpack("<Q", 235)
-        if unpack("<B", 104) & 128:  # compressed: points begin with the offset of the chunk table
-            file.seek(begin)
-            (table,) = struct.unpack("<q", file.read(8).rjust(8, b"\0"))
-            if table == -1:  # written at the end, by a program that could not go back
-                file.seek(max(size - 8, 0))
-                (table,) = struct.unpack("<q", file.read(8).rjust(8, b"\0"))
-            file.seek(max(table, 0))
-            room["chunks"] = struct.unpack("<II", file.read(8).ljust(8, b"\0"))[1], size
-    for what, (needed, present) in room.items():
-        if needed > present:
-            raise InputError(f"{path}: damaged: its header counts more {what} than it has room for")
-
-
-def _las_cloud(las: "laspy.LasData") -> Cloud:
-    names = {*las.point_format.dimension_names}
-    n = len(las.points)
-    X = np.stack([np.asarray(a, float) for a in (las.x, las.y, las.z)], 1)
-    sigma = np.stack(
-        [np.asarray(las[s], float) if s in names else np.full(n, np.nan) for s in SIGMAS], 1
-    )
+    check_las(path)
+    with foreign_parser(path, EXPECTED):
+        las = laspy.read(path)
+        names = {*las.point_format.dimension_names}
+        X = np.stack([np.asarray(a, float) for a in (las.x, las.y, las.z)], 1)
+        rgb = [np.asarray(las[name]) for name in COLOURS if name in names]
+        columns = {name: np.asarray(las[name]) for name in (*SIGMAS, "rays") if name in names}
+        crs = las.header.parse_crs() if len(X) else None
+        system = None if crs is None else (crs.to_string() if crs.to_epsg() else crs.to_wkt())
     colour = None
-    if "red" in names:
-        colour = np.stack([np.asarray(las[c]) // 257 for c in ("red", "green", "blue")], 1)
-        colour = colour.astype(np.uint8)
-    rays = np.asarray(las["rays"]).astype(int) if "rays" in names else np.zeros(n, int)
-    crs = las.header.parse_crs() if n else None
-    system = None if crs is None else (crs.to_string() if crs.to_epsg() else crs.to_wkt())
-    return _plain_cloud(X, sigma, rays, colour, system)
+    if len(rgb) == len(COLOURS):
+        colour = (np.stack(rgb, 1) // 257).astype(np.uint8)
+    return make_cloud(Source(str(path), None, "point"), X, columns, colour, system)
 
 
 def _write_dxf(cloud: Cloud, path: Path) -> None:

@@ -16,9 +16,10 @@ from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, geodetic
-from jaxbundle.io.rasters.reading import open_plain, rasterio, unreadable
+from jaxbundle.io.rasters.reading import check_pixels, check_raw, open_raster, read_pixels
 from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.io.scanner.rpc import RASTERS, read_rpc
+from jaxbundle.photographs.places import utm_system
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.image_to_ground import locate_point
 from jaxbundle.pushbroom.rpc import Rpc
@@ -64,6 +65,9 @@ def read_ground_views(
         names = [str(raster) for _, raster in found]
     views = []
     for name, (orientation, raster), earth in zip(names, found, earths):
+        if not isinstance(orientation, Rpc):
+            with open_raster(raster) as source:
+                check_raw(raster, source)
         grey = read_grey(raster)
         if isinstance(orientation, Rpc):
             assert around is not None, "an RPC is not in a local frame"
@@ -97,29 +101,22 @@ def read_grey(path: Path, pixels_at_once: int = 1 << 23) -> Grey:
 
     **Raises:** `InputError` if it cannot be read.
     """
-    package = rasterio()
-    try:
-        with open_plain(path) as source:
-            bands = list(range(1, min(source.count, 3) + 1))
-            plain = len(bands) < 3 and source.dtypes[0] in ("uint8", "uint16")
-            out = np.empty(source.shape, source.dtypes[0] if plain else np.float32)
-            # red, green and blue in the luminance (ITU-R BT.601, two digits)
-            weights = np.array([0.3, 0.59, 0.11], np.float32)
-            rows = max(1, pixels_at_once // source.width)
-            for first in range(0, source.height, rows):
-                window = package.windows.Window(
-                    0, first, source.width, min(rows, source.height - first)
-                )
-                values = source.read(bands, window=window, masked=True).filled(0)
-                if not plain:
-                    values = np.nan_to_num(values.astype(np.float32))
-                colour = len(values) == 3
-                out[first : first + rows] = (
-                    np.tensordot(weights, values, 1) if colour else values[0]
-                )
-            return out
-    except package.errors.RasterioError as error:
-        raise unreadable(path, error) from None
+    with open_raster(path) as source:
+        bands = list(range(1, min(source.count, 3) + 1))
+        plain = len(bands) < 3 and source.dtypes[0] in ("uint8", "uint16")
+        # red, green and blue in the luminance (ITU-R BT.601, two digits)
+        weights = np.array([0.3, 0.59, 0.11], np.float32)
+        rows = max(1, pixels_at_once // source.width)
+        check_pixels(path, source, bands)
+        out = np.empty(source.shape, source.dtypes[0] if plain else np.float32)
+        for first in range(0, source.height, rows):
+            window = (first, min(first + rows, source.height)), (0, source.width)
+            values = read_pixels(path, source, bands, window).filled(0)
+            if not plain:
+                values = np.nan_to_num(values.astype(np.float32))
+            colour = len(values) == 3
+            out[slice(*window[0])] = np.tensordot(weights, values, 1) if colour else values[0]
+        return out
 
 
 def system_of(around: Neighbourhood, crs: str | None) -> str:
@@ -129,9 +126,7 @@ def system_of(around: Neighbourhood, crs: str | None) -> str:
     if crs is not None:
         return crs
     longitude, latitude = (np.degrees(float(a)) for a in (around.longitude, around.latitude))
-    # zones of 6° from 180° W; EPSG 32601 to 32660 are those of the north, 32701 on of the south
-    zone = int((longitude + 180) // 6) % 60 + 1
-    return f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}"
+    return utm_system(latitude, longitude)
 
 
 def to_map(cloud: Cloud, around: Neighbourhood, crs: str) -> Cloud:
@@ -192,7 +187,7 @@ def _transformer(crs: str) -> "pyproj.Transformer":
         raise InputError("coordinate systems need pyproj: pip install 'jaxbundle[geo]'") from None
     try:
         return pyproj.Transformer.from_crs("EPSG:4326", crs, always_xy=True)
-    except pyproj.exceptions.CRSError as error:
+    except pyproj.exceptions.ProjError as error:
         raise InputError(f"--crs {crs!r}: {' '.join(str(error).split())}") from None
 
 

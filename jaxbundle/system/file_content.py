@@ -6,7 +6,8 @@ import os
 import re
 import stat
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,18 @@ def check_plain(path: str | Path) -> None:
     system = stat.S_ISREG(mode) and real.startswith(SYSTEM)
     if system or not (stat.S_ISREG(mode) or stat.S_ISDIR(mode) or given):
         raise InputError(f"{path}: a file of the system, a device or a pipe; give a plain file")
+
+
+@contextmanager
+def naming_file(path: str | Path) -> Iterator[None]:
+    """The context of code that does not know from which file its values are: its errors get the
+    name."""
+    try:
+        yield
+    except InputError as error:
+        if str(path) in str(error):
+            raise
+        raise InputError(f"{path}: {error}") from None
 
 
 def is_plain(path: str | Path) -> bool:

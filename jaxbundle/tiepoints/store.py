@@ -11,9 +11,10 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
-from jaxbundle.io.text.unpacking import UNREADABLE_ARCHIVE
+from jaxbundle.errors import InputError
+from jaxbundle.io.text.archives import read_arrays
 from jaxbundle.io.writing.replacing import unwritable
 from jaxbundle.system.temporaries import temporary
 from jaxbundle.tiepoints.features import Detection, Features
@@ -22,6 +23,8 @@ from jaxbundle.tiepoints.matching import FeatureMatchingSettings
 RULES = "6"
 """Version of features and matches: files of others are not used. To be raised with every change of
 the program, other than of settings, that changes either."""
+DIGEST = "digest"
+"""The array of a file that tells whether the others are as they were written."""
 
 
 class Store:
@@ -47,10 +50,8 @@ class Store:
 
     def load_features(self, fingerprint: str) -> Features | None:
         """The stored features of a photograph, if any."""
-        found = self._load(self.name(fingerprint))
-        if found is None or set(found) != {"xy", "size", "angle", "descriptor"}:
-            return None
-        return Features(found["xy"], found["size"], found["angle"], found["descriptor"])
+        found = self._load(self.name(fingerprint), "xy", "size", "angle", "descriptor")
+        return None if found is None else Features(*found)
 
     def save_features(self, fingerprint: str, features: Features) -> None:
         """Store the features of a photograph."""
@@ -65,10 +66,7 @@ class Store:
     def load_matches(self, one: str, other: str) -> tuple[np.ndarray, ...] | None:
         """The stored rows of matching features of two photographs, their clarity, and which are
         single, if any."""
-        found = self._load(self.name(one, other))
-        if found is None or set(found) != {"rows", "clarity", "single"}:
-            return None
-        return found["rows"], found["clarity"], found["single"]
+        return self._load(self.name(one, other), "rows", "clarity", "single")
 
     def save_matches(
         self,
@@ -94,17 +92,18 @@ class Store:
                     if time.time() - path.stat().st_mtime > 600:
                         path.unlink()
 
-    def _load(self, name: str) -> dict[str, np.ndarray] | None:
-        if self.folder is None:
+    def _load(self, name: str, *columns: str) -> tuple[np.ndarray, ...] | None:
+        """The arrays of a file; None, to be computed again, if it is missing or damaged."""
+        path = None if self.folder is None else self.folder / f"{name}.npz"
+        if path is None or not path.is_file():
             return None
         try:
-            with (self.folder / f"{name}.npz").open("rb") as file:
-                with np.load(file, allow_pickle=False) as found:
-                    arrays = dict(found)
-        except UNREADABLE_ARCHIVE:
+            arrays = read_arrays(path, "a file of features or matches")
+        except InputError:
             return None
-        # NumPy gives the bytes of other members
-        return arrays if all(isinstance(a, np.ndarray) for a in arrays.values()) else None
+        found = tuple(arrays.get(column, np.zeros(0)) for column in columns)
+        whole = np.array_equal(arrays.get(DIGEST, np.zeros(0)), _digest(*found))
+        return found if whole else None
 
     def _save(self, name: str, **arrays: np.ndarray) -> None:
         if self.folder is None:
@@ -114,7 +113,16 @@ class Store:
         with temporary(self.folder / f"{name}.part{os.getpid()}") as part:
             try:
                 with part.open("wb") as file:
-                    np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
+                    content = {**arrays, DIGEST: _digest(*arrays.values())}
+                    np.savez(file, **content)  # pyright: ignore[reportArgumentType]
                 part.replace(path)
             except OSError as error:
                 raise unwritable(path, error) from None
+
+
+def _digest(*arrays: np.ndarray) -> UInt8[np.ndarray, "16"]:
+    found = hashlib.blake2b(digest_size=16)
+    for array in arrays:
+        found.update(f"{array.dtype.str} {array.shape}".encode())
+        found.update(np.ascontiguousarray(array).tobytes())
+    return np.frombuffer(found.digest(), np.uint8)

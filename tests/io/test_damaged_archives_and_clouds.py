@@ -1,6 +1,7 @@
 """Damaged clouds, tables and archives: an error that names the file, and no other."""
 
 import io
+import sqlite3
 import struct
 import zipfile
 
@@ -9,12 +10,17 @@ import pytest
 
 from jaxbundle.batches.stacks import read_camera_stack
 from jaxbundle.errors import InputError
+from jaxbundle.io import read_cameras
+from jaxbundle.io.boards.kept_corners import KeptCorners
 from jaxbundle.io.results.stored_tree import read_tree
+from jaxbundle.io.text.archives import read_arrays
+from jaxbundle.measure.boards import Board
 from jaxbundle.photographs.xmp import parse_xmp
 from jaxbundle.reconstruction.control import read_control_measurements
 from jaxbundle.surfaces.cloud import Cloud
+from jaxbundle.surfaces.dsm import make_dsm
 from jaxbundle.surfaces.point_files import read_cloud, write_cloud
-from jaxbundle.tiepoints.features import Detection
+from jaxbundle.tiepoints.features import Detection, Features
 from jaxbundle.tiepoints.store import Store
 
 EVLR_COUNT, RECORDS, TABLE = 243, 100, 96
@@ -97,7 +103,98 @@ def test_the_count_of_laz_chunks_beyond_the_file(tmp_path):
     assert struct.unpack_from("<II", content, table) == (0, 1)  # version, chunks
     struct.pack_into("<I", content, table + 4, 2**32 - 1)
     path.write_bytes(content)
-    refused(read_cloud, path, "more chunks")
+    refused(read_cloud, path, "4294967295 chunks for 5 points")
+
+
+def damage(path, offset, form, *values):
+    content = bytearray(path.read_bytes())
+    struct.pack_into(form, content, offset, *values)
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("length", [10, 100, 226, 300, 374, 375, 500])
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_a_las_file_cut_in_its_header_is_no_cloud_of_no_points(tmp_path, suffix, length):
+    pytest.importorskip("laspy")
+    path = tmp_path / f"c{suffix}"
+    write_cloud(some_points(), path)
+    path.write_bytes(path.read_bytes()[:length])
+    refused(read_cloud, path)
+
+
+LAS_FIELDS = {
+    "scale NaN": (131, "<d", np.nan), "scale 0": (139, "<d", 0.0),
+    "offset inf": (155, "<d", np.inf), "points": (247, "<Q", 2**40),
+    "length of a point": (105, "<H", 1), "first point": (96, "<I", 10),
+    "extended records": (235, "<QI", 2**63, 1), "version": (25, "<B", 9),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+@pytest.mark.parametrize("case", LAS_FIELDS)
+def test_fields_of_the_header_of_las(tmp_path, suffix, case):
+    pytest.importorskip("laspy")
+    path = tmp_path / f"c{suffix}"
+    write_cloud(some_points(), path)
+    damage(path, *LAS_FIELDS[case])
+    refused(read_cloud, path)
+
+
+def test_chunks_of_laz_larger_than_the_memory(tmp_path):
+    """lazrs would allocate 175 GB and abort the process."""
+    laspy = pytest.importorskip("laspy")
+    path = tmp_path / "c.laz"
+    write_cloud(some_points(), path)
+    begin = path.read_bytes().index(b"laszip encoded") - 2 + 54
+    assert len(laspy.read(path).points) == 5
+    damage(path, begin + 12, "<I", 2_617_295_696)
+    refused(read_cloud, path, "chunks of 2617295696 points")
+
+
+@pytest.mark.parametrize("column, value", [
+    ("sX", -1.0), ("sZ", np.inf), ("rays", -1), ("rays", 1e300), ("X", 1e300), ("Y", np.nan),
+])  # fmt: skip
+@pytest.mark.parametrize("suffix", [".csv", ".ply", ".las"])
+def test_values_that_no_point_has(tmp_path, suffix, column, value):
+    names = ["X", "Y", "Z", "sX", "sY", "sZ", "rays"]
+    rows = np.tile([1.0, 2, 3, 0.1, 0.1, 0.1, 2], (4, 1))
+    rows[2, names.index(column)] = value
+    path = tmp_path / f"c{suffix}"
+    if suffix == ".csv":
+        text = "\n".join(",".join(map(repr, row)) for row in rows.tolist())
+        path.write_text(f"{','.join(names)}\n{text}\n")
+    elif suffix == ".ply":
+        fields = "".join(f"property double {n if n in names[3:] else n.lower()}\n" for n in names)
+        text = "\n".join(" ".join(map(repr, row)) for row in rows.tolist())
+        path.write_text(
+            f"ply\nformat ascii 1.0\nelement vertex 4\n{fields}end_header\n{text}\n"
+        )
+    else:
+        laspy = pytest.importorskip("laspy")
+        if column in "XYZ":
+            return  # whole numbers
+        header = laspy.LasHeader(point_format=7, version="1.4")
+        header.add_extra_dims([laspy.ExtraBytesParams(n, np.float64) for n in names[3:]])
+        las = laspy.LasData(header)
+        las.x, las.y, las.z = rows[:, :3].T
+        for name, values in zip(names[3:], rows[:, 3:].T):
+            las[name] = values
+        las.write(path)
+    refused(read_cloud, path, {".csv": "line 4"}.get(suffix, "3"))
+
+
+def test_a_dsm_of_points_of_no_sigma():
+    """They count as those without a σ: the same heights."""
+    X = np.random.default_rng(0).uniform(0, 4, (60, 3))
+    C = np.tile(1e-4 * np.eye(3), (60, 1, 1))
+    models = []
+    for value in (0.0, 1e-320, np.nan):
+        C[::7, 2, 2] = value
+        cloud = Cloud(X, C.copy(), np.full(60, 2), np.zeros(60, int), np.zeros((60, 2)), ("a",))
+        models.append(make_dsm(cloud, 1.0))
+    for model in models[:2]:
+        np.testing.assert_array_equal(model.height, models[2].height)
+        np.testing.assert_array_equal(model.sigma, models[2].sigma)
 
 
 def test_a_vector_where_las_has_a_number(tmp_path):
@@ -158,8 +255,77 @@ def test_a_damaged_member_of_an_archive(tmp_path, case):
     assert store.load_features("photograph") is None  # searched again
 
 
+BOMBS = {
+    "unpacks to 6 GB": lambda f: f.writestr("xy.npy", array_bytes(np.zeros(3))[:118].ljust(128)
+                                            + bytes(2**26), zipfile.ZIP_DEFLATED),
+    "other packing": lambda f: f.writestr("xy.npy", array_bytes(np.zeros(3)), zipfile.ZIP_LZMA),
+    "twice": lambda f: [f.writestr(n, array_bytes(np.zeros(3))) for n in ("xy", "xy.npy")],
+    "objects": lambda f: f.writestr("xy.npy", object_bytes()),
+    "fields": lambda f: f.writestr("xy.npy", array_bytes(np.zeros(2, [("a", int)]))),
+    "letters that are none": lambda f: f.writestr("xy.npy", array_bytes(np.array(["ab"])).replace(
+        b"a\0\0\0", b"\xff\xff\xff\xff")),
+    "more than its shape": lambda f: f.writestr("xy.npy", array_bytes(np.zeros(3)) + bytes(8)),
+}  # fmt: skip
+
+
+def object_bytes():
+    stream = io.BytesIO()
+    np.save(stream, np.array([{}], object), allow_pickle=True)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize("case", BOMBS)
+def test_archives_of_other_than_plain_arrays(tmp_path, case):
+    path = tmp_path / "c.npz"
+    with zipfile.ZipFile(path, "w") as file:
+        BOMBS[case](file)
+    refused(lambda p: read_arrays(p, "an archive"), path)
+
+
+def test_kept_features_with_a_changed_number_are_computed_again(tmp_path):
+    """The archive is whole; what was kept before a version with digests is computed again, too."""
+    store, ones = Store(tmp_path, Detection()), np.ones((3, 2))
+    features = Features(ones, np.ones(3), np.zeros(3), np.zeros((3, 128), np.uint8))
+    store.save_features("photograph", features)
+    assert (store.load_features("photograph").xy == ones).all()
+    (path,) = tmp_path.glob("*.npz")
+    with np.load(path) as file:
+        arrays = dict(file)
+    for changed in (arrays | {"xy": 2 * ones}, arrays | {"xy": ones.astype(int)},
+                    {n: a for n, a in arrays.items() if n != "digest"}):  # fmt: skip
+        np.savez(path, **changed)
+        assert store.load_features("photograph") is None
+
+
+def test_a_cell_of_a_control_table_beyond_the_limit_of_csv(tmp_path):
+    path = tmp_path / "gcp.csv"
+    path.write_text(f"id,X,Y,Z,image,u,v\nP,1,2,3,{'a' * 200_000},5,6\n")
+    refused(read_control_measurements, path, "line 2", "field larger than field limit")
+
+
 def test_a_packet_with_a_namespace_that_is_not_utf_8():
     packet = (b'<x:xmpmeta xmlns:x="\xe9"><rdf:RDF xmlns:rdf="r"><rdf:Description '
               b'xmlns:c="c" c:Yaw="10" c:Pitch="5" c:Roll="1"/></rdf:RDF></x:xmpmeta>')  # fmt: skip
     attitude = parse_xmp(packet).attitude
     assert attitude is not None and attitude.yaw == 10
+
+
+@pytest.mark.parametrize("cell", [b"short", bytes(16 * 11), "text", 7, None])
+def test_kept_corners_of_another_length_are_searched_again(tmp_path, cell):
+    board, xy = Board(4, 3, 1.0), np.arange(24.0).reshape(12, 2)
+    path = tmp_path / "kept.sqlite"
+    with KeptCorners(path) as kept:
+        kept.keep("content", board, ((640, 480), xy))
+        assert (kept.look("content", board)[1] == xy).all()
+    with sqlite3.connect(path) as file:
+        file.execute("UPDATE boards SET xy = ?", (cell,))
+    file.close()
+    with KeptCorners(path) as kept:
+        assert kept.look("content", board) is None
+
+
+@pytest.mark.parametrize("model", ["[1, 2]", "{ a = 1 }", "7", "true"])
+def test_a_camera_model_that_is_no_name(tmp_path, model):
+    path = tmp_path / "cameras.toml"
+    path.write_text(f'[[camera]]\nid = "c"\nmodel = {model}\nfx = 1.0\n')
+    refused(read_cameras, path, "model")

@@ -14,6 +14,7 @@ from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.io.scanner.csm import read_csm
+from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.pushbroom.earth_frames import EARTH_RATE
 from jaxbundle.pushbroom.ground_to_image import make_search, project_points
 from jaxbundle.pushbroom.image import pose_at
@@ -265,3 +266,93 @@ def test_what_is_no_json(tmp_path):
         (tmp_path / "isd.json").write_text(text)
         with pytest.raises(InputError, match=word):
             read_csm(tmp_path / "isd.json")
+
+
+@pytest.mark.parametrize("change", [
+    {"projection": "+proj=eqc +R=1737400", "geotransform": [-9e5, 5.0, 0, 4e5, 0, -5.0]},
+    {"projection": "", "geotransform": [1000.0, 1, 0, 2000, 0, 1]},
+    {"geotransform": [0.0, 2, 0, 0, 0, 2]},
+])  # fmt: skip
+def test_a_map_or_a_crop_is_not_taken_for_the_raw_image(tmp_path, change):
+    with pytest.raises(InputError, match="isd.json: .*whole raw image"):
+        read_csm(write(tmp_path, support_data(older=True) | change))
+
+
+def test_the_identity_is_a_raw_image(tmp_path):
+    raw = {"projection": "", "geotransform": [0.0, 1, 0, 0, 0, 1]}
+    assert read_csm(write(tmp_path, support_data(older=True) | raw)).warnings == ()
+
+
+@pytest.mark.parametrize("factor, used", [(1000.0, False), (-1.0, False), (0.94, True)])
+def test_velocities_that_contradict_their_positions_are_said(tmp_path, factor, used):
+    """Of metres instead of kilometres, of another direction, and 6 % off, by which the positions
+    between rows of a second are off by less than 100 m."""
+    isd = support_data()
+    good = read_csm(write(tmp_path, isd))
+    table = isd["instrument_position"]
+    table["velocities"] = (factor * np.array(table["velocities"])).tolist()
+    bad = read_csm(write(tmp_path, isd))
+    (said,) = bad.warnings
+    assert "velocities, row 2: positions move by 7" in said
+    assert ("used all the same" in said) == used and ("not used" in said) != used
+    track, known = (image.image.trajectory.position.values for image in (bad, good))
+    limit = 100 if used else 1.2  # at the ends a line: 9 m/s²·(1 s)²/8
+    np.testing.assert_allclose(track, known, rtol=0, atol=limit)
+
+
+@pytest.mark.parametrize("rows", [1, 2])
+def test_lines_in_reverse_order(tmp_path, rows):
+    """With a negative period, in one row or two, line l is the line `LINES` − 1 − l of the same
+    scanner read forwards."""
+    isd = support_data(older=True)
+    forward = read_csm(write(tmp_path, isd))
+    ((first, start, period),) = isd["line_scan_rate"]
+    end = start + period * (LINES - 1 + 2 * first)
+    half = LINES // 2
+    isd["line_scan_rate"] = [[first, end, -period],
+                             [first + half, end - half * period, -period]][:rows]  # fmt: skip
+    backward = read_csm(write(tmp_path, isd))
+    lines, pixels = PLACES
+    there = locate(backward.image, Ground(WGS84), lines, pixels)
+    expected = locate(forward.image, Ground(WGS84), LINES - 1 - lines, pixels)
+    np.testing.assert_allclose(there, expected, atol=1e-6)
+    search = make_search(backward.image, WGS84)
+    found = project_points(backward.image, search, np.asarray(there).reshape(3, -1))
+    seen = found.line[0], found.pixel[0]
+    for place, wanted in zip(seen, np.meshgrid(lines, pixels, indexing="ij")):
+        np.testing.assert_allclose(np.asarray(place).ravel(), wanted.ravel(), atol=1e-5)
+    (tmp_path / "scanner.toml").write_text(
+        '[scanner]\nsource = "isd.json"\n[corrections]\naberration = true\n'
+    )
+    with pytest.raises(InputError, match="in reverse order"):
+        read_scanner(tmp_path / "scanner.toml")
+    isd["line_scan_rate"] = [[0.5, 0.0, period], [9.5, 9 * period, -period]]
+    with pytest.raises(InputError, match="all of a negative one"):
+        read_csm(write(tmp_path, isd))
+
+
+def test_short_tables_with_a_stated_extrapolation(tmp_path):
+    """Positions that end a second before the last line, in a file and as `source`."""
+    isd = support_data(older=True)
+    whole = read_csm(write(tmp_path, isd))
+    last = (LINES - 1) * PERIOD
+    rows = isd["sensor_position"]["positions"]
+    isd["sensor_position"]["positions"] = rows[: int(np.floor(last - 1 - isd["t0_ephemeris"])) + 1]
+    path = write(tmp_path, isd)
+    with pytest.raises(InputError, match="outside the table"):
+        read_csm(path)
+    (tmp_path / "scanner.toml").write_text(
+        '[scanner]\nsource = "isd.json"\nextrapolate = 2.5\n'
+    )
+    short = read_scanner(tmp_path / "scanner.toml")
+    assert any("does not cover the whole image: extrapolated by" in w for w in short.warnings)
+    # straight on: 9 m/s²·t²/2, for at most two seconds
+    times = np.linspace(0, last, 9)
+    there, known = (
+        np.asarray(jax.vmap(lambda t, image=image: pose_at(image.image, t).P)(times))
+        for image in (short, whole)
+    )
+    assert 0.1 < np.linalg.norm(there - known, axis=1).max() < 30
+    (tmp_path / "scanner.toml").write_text('[scanner]\nsource = "isd.json"\nextrapolate = -1\n')
+    with pytest.raises(InputError, match="extrapolate is -1"):
+        read_scanner(tmp_path / "scanner.toml")

@@ -80,16 +80,18 @@ def test_a_raster_of_errors_on_a_full_disk(tmp_path):
 def test_a_source_that_cannot_be_read_is_named_itself(tmp_path, monkeypatch):
     source = tmp_path / "source.tif"
     with rasterio.open(source, "w", driver="GTiff", width=4, height=4, count=1, dtype="uint8",
-                       transform=rasterio.transform.Affine(1, 0, 5, 0, -1, 5)):  # fmt: skip
-        pass
-
-    def fail(*_):
-        raise rasterio.errors.RasterioIOError("Read failed.")
-
-    monkeypatch.setattr(correction, "block_places", lambda *_: ())
-    monkeypatch.setattr(correction, "_values", fail)
+                       compress="deflate",
+                       transform=rasterio.transform.Affine(1, 0, 5, 0, -1, 5)) as raster:
+        raster.write(np.arange(16, dtype=np.uint8).reshape(1, 4, 4))
+        window = raster.block_window(1, 0, 0)
+    content = source.read_bytes()
+    begin = content.index(b"x\x9c")  # of zlib
+    source.write_bytes(content[: begin + 2] + b"\xff" * 6 + content[begin + 8 :])
+    assert window.height == 4  # one strip
+    anywhere = np.ones((correction.BLOCK_SIZE, correction.BLOCK_SIZE))
+    monkeypatch.setattr(correction, "block_places", lambda *_: (anywhere, anywhere))
     image = type("", (), {"lines": 4, "pixels": 4})
-    with pytest.raises(InputError, match=f"^{source}: Read failed.$"):
+    with pytest.raises(InputError, match=f"^{source}: is not a raster.*: Read failed"):
         correction.write_corrected(
             source, tmp_path / "map.tif", image, None, Plane(0.0), MapSystem(None, None),
             MapGrid(5.0, 5.0, 1.0, 4, 4),

@@ -270,6 +270,24 @@ def test_dimap2(tmp_path, polynomial):
     check_image(scanner, by_dimap(polynomial))
 
 
+@pytest.mark.parametrize("root", ["PHR_DIMAP_Document", "PHR_Dimap_Document"])
+def test_early_products_of_pleiades(tmp_path, root):
+    """The same document under another root is the same image; without the model it is refused as
+    what it is."""
+    images = []
+    for tag in ("Dimap_Document", root):
+        (tmp_path / "DIM.XML").write_text(
+            dimap(change=lambda t, tag=tag: t.replace("Dimap_Document", tag)), encoding="latin-1"
+        )
+        images.append(read_scanner(tmp_path / "DIM.XML").image)
+    for a, b in zip(*map(jax.tree.leaves, images), strict=True):
+        np.testing.assert_array_equal(a, b)
+    text = f"<{root}><METADATA_PROFILE>PHR_SYSTEM_RECTIFIED_PRODUCT</METADATA_PROFILE></{root}>"
+    (tmp_path / "DIM.XML").write_text(text)
+    with pytest.raises(InputError, match="Pléiades .PHR_SYSTEM_RECTIFIED_PRODUCT. without"):
+        read_scanner(tmp_path / "DIM.XML")
+
+
 def test_the_unit_of_the_period_of_few_lines_is_that_of_the_product(tmp_path):
     """START to END says nothing of it where there is one line."""
     text = dimap(change=lambda t: t.replace(f"<NROWS>{LINES}<", "<NROWS>1<")

@@ -212,3 +212,18 @@ def test_the_command_refuses_before_it_writes(tmp_path, command):
     assert told.status == 2 and "no photographs" in told.err and not out.exists()
     told = command("reconstruct", empty, "--out", out, "--features", "surf")
     assert told.status == 2 and "sift, akaze, orb" in told.err
+
+
+@pytest.mark.parametrize("inner, left", [("new/out", False), ("empty", True)])
+def test_bad_input_found_late_leaves_nothing(tmp_path, command, inner, left):
+    """The size of the camera is compared with opened photographs, when --out has been made."""
+    write_photographs(tmp_path / "photos", "a", 2, 3)
+    camera, out = tmp_path / "camera.toml", tmp_path / inner
+    camera.write_text(
+        '[[camera]]\nid = "c"\nmodel = "opencv"\nfx = 9.0\nfy = 9.0\nimage_size = [9, 6]\n'
+    )
+    (tmp_path / "empty").mkdir()
+    told = command("reconstruct", tmp_path / "photos", "--camera", camera, "--out", out)
+    assert told.status == 2 and "camera c has 9 × 6" in told.err
+    assert out.exists() == left and not (tmp_path / "new").exists()
+    assert not list((tmp_path / "empty").iterdir())

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.measure.boards import Board
+from jaxbundle.measure.boards import Board, require_board
 from jaxbundle.measure.views import Look
 from jaxbundle.system.file_content import read_content
 
@@ -93,9 +93,13 @@ class KeptCorners:
         if result is None:
             return None
         columns, rows, xy, why = result
-        if xy is None:
+        if xy is None and isinstance(why, str):
             return why
-        return (columns, rows), np.frombuffer(xy, "<f8").reshape(-1, 2)
+        # of a damaged file a cell may hold anything: the photograph is searched again
+        if isinstance(xy, bytes) and isinstance(columns, int) and isinstance(rows, int):
+            if len(xy) == 16 * len(require_board(board).ids):
+                return (columns, rows), np.frombuffer(xy, "<f8").reshape(-1, 2)
+        return None
 
     def keep(self, content: str, board: Board, look: Look) -> None:
         """Add a search result; it is in the file when this returns."""

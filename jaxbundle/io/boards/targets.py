@@ -19,6 +19,7 @@ from jaxbundle.io.text.sections import refuse_unknown
 from jaxbundle.io.text.yaml_text import parse_yaml
 from jaxbundle.measure.boards import Board
 from jaxbundle.network.columns import show
+from jaxbundle.system.file_content import naming_file
 
 TYPES = ("checkerboard", "circlegrid", "aprilgrid")
 KEYS = (
@@ -35,7 +36,11 @@ def read_target(path: str | Path) -> Board:
 
     **Raises:** `InputError` naming file and key.
     """
-    fields = JsonFields(path, parse_yaml(path, read_text(Path(path))))
+    with naming_file(path):  # a Board checks its own values
+        return _board(path, JsonFields(path, parse_yaml(path, read_text(Path(path)))))
+
+
+def _board(path: str | Path, fields: JsonFields) -> Board:
     kind = fields.text("target_type")
     for key in fields.document:
         refuse_unknown(key, KEYS, f"{path}: ")

@@ -37,8 +37,8 @@ from jaxbundle.io.networks.poses import (
     rotation_vectors_of,
 )
 from jaxbundle.io.networks.settings import apply_overrides, check_settings
+from jaxbundle.io.text.archives import largest_unpacked_size
 from jaxbundle.io.text.csv_tables import write_bytes
-from jaxbundle.io.text.unpacking import largest_unpacked_size
 from jaxbundle.network.build import make_cameras, make_network
 from jaxbundle.network.columns import Columns, show
 from jaxbundle.network.tables import EXTERIOR, Network, Source

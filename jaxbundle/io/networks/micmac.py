@@ -16,6 +16,7 @@ Source: MicMac's documentation, "Orientation"; its conventions eConvApero_DistM2
 """
 
 import html
+import os
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from pathlib import Path
@@ -113,7 +114,7 @@ def _calibration(file: Path, xml: XmlFields) -> tuple[Path, ET.Element]:
     name = xml.text("FileInterne")
     places = (file.parent / name, file.parent.parent / name, file.parent / Path(name).name)
     for place in places:
-        if place.is_file():
+        if os.path.isfile(place):  # also of names too long for a file
             return place, read_xml(place)
     raise InputError(f"{file}: FileInterne {name}: there is no such file beside it, nor above")
 

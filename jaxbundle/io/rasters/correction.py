@@ -13,7 +13,7 @@ from jaxbundle.choices import Resampling
 from jaxbundle.errors import InputError
 from jaxbundle.io.rasters.map_blocks import write_map
 from jaxbundle.io.rasters.maps import MapGrid, MapSystem, contiguous, grid_around
-from jaxbundle.io.rasters.reading import open_plain, rasterio, unreadable
+from jaxbundle.io.rasters.reading import Window, check_raw, open_raster, read_values
 from jaxbundle.pushbroom.ground_to_image import Search
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.image_to_ground import locate_lines
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 
 Part = tuple[slice, slice]
 """Rows and columns of a block."""
-Window = tuple[tuple[int, int], tuple[int, int]]
-"""First and last line, first and last pixel of an image."""
 
 _resample = compile_once(resample, 3)
 _locate = compile_once(locate_lines, ())
@@ -93,36 +91,42 @@ def write_corrected(
 ) -> None:
     """Write the raster `source`, taken by the image, as the map `target`.
 
-    All bands, in the type of the source; NaN or 0 (declared as no data) outside the image and,
-    with `occlusion`, also for hidden terrain.
+    All bands, in the type of the source, with its scales and offsets; NaN or 0 (declared as no
+    data) outside the image, where the source has no data, and, with `occlusion`, also for hidden
+    terrain.
 
     **Raises:** `InputError` if the raster does not have the size of the image, or cannot be read.
     """
-    package = rasterio()
-    try:
-        with open_plain(source) as bands:
-            if (bands.height, bands.width) != (image.lines, image.pixels):
-                raise InputError(
-                    f"{source}: {bands.height} lines of {bands.width} pixels; the scanner file has "
-                    f"{image.lines} of {image.pixels}"
-                )
-            reading = threading.Lock()  # GDAL: one thread at a time in a data set
+    with open_raster(source) as bands:
+        check_raw(source, bands)
+        if (bands.height, bands.width) != (image.lines, image.pixels):
+            raise InputError(
+                f"{source}: {bands.height} lines of {bands.width} pixels; the scanner file has "
+                f"{image.lines} of {image.pixels}"
+            )
+        reading = threading.Lock()  # GDAL: one thread at a time in a data set
 
-            def block(nodes: MapNodes) -> Float[np.ndarray, "bands rows columns"] | None:
-                places = block_places(image, search, surface, nodes, occlusion)
-                if places is None:
-                    return None
-                try:
-                    return _values(bands, reading, image, places, resampling)
-                except package.errors.RasterioError as error:
-                    raise unreadable(source, error) from None
+        def block(nodes: MapNodes) -> Float[np.ndarray, "bands rows columns"] | None:
+            places = block_places(image, search, surface, nodes, occlusion)
+            if places is None:
+                return None
+            return _values(source, bands, reading, image, places, resampling)
 
-            write_map(target, system, grid, surface, bands.count, bands.dtypes[0], block, progress)
-    except package.errors.RasterioError as error:
-        raise unreadable(source, error) from None
+        write_map(
+            target,
+            system,
+            grid,
+            surface,
+            bands.count,
+            bands.dtypes[0],
+            block,
+            progress,
+            scales=(bands.scales, bands.offsets),
+        )
 
 
 def _values(
+    source: str | Path,
     bands: "DatasetReader",
     reading: threading.Lock,
     image: PushbroomImage,
@@ -136,11 +140,11 @@ def _values(
     for part, window in _parts(line, pixel, image, 2**22 / bands.count):
         # only reading is locked, the other worker computes meanwhile
         with reading:
-            seen = bands.read(window=window)
+            seen = read_values(source, bands, None, window)
         # Widened to a multiple of 128, or of an eighth of the size: the compiled program is one for
         # every shape, and there are only a few shapes then.
         pad = [(0, -n % max(128, 2 ** (n.bit_length() - 3))) for n in seen.shape[1:]]
-        seen = np.pad(seen.astype(float), [(0, 0), *pad], mode="edge")
+        seen = np.pad(seen, [(0, 0), *pad], mode="edge")
         (top, _), (left, _) = window
         values[:, *part] = _resample(seen, line[part] - top, pixel[part] - left, resampling)
     return values

@@ -24,11 +24,13 @@ def write_map(
     block: Callable[[MapNodes], np.ndarray | None],
     progress: Progress | None = None,
     names: Sequence[str] = (),
+    scales: tuple[Sequence[float], Sequence[float]] | None = None,
 ) -> None:
     """Write the map of `grid`, `count` bands of the type `dtype`.
 
     `block` computes the values [count, `BLOCK_SIZE`, `BLOCK_SIZE`] of a block from its nodes, NaN
-    if missing; None if all are missing. `names` describe the bands.
+    if missing; None if all are missing. `names` describe the bands, `scales` are the scales and
+    offsets of their stored values.
 
     **Raises:** `InputError` if the file cannot be written.
     """
@@ -62,6 +64,8 @@ def write_map(
     ) as map_:
         if names:
             map_.describe(names)
+        if scales is not None:
+            map_.scale(*scales)
         # Two workers: while one computes, the other reads or writes.
         with ThreadPoolExecutor(2) as workers:
             for done, _ in enumerate(workers.map(write_block, corners), 1):

@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid, geodetic
+from jaxbundle.photographs.places import utm_system
 from jaxbundle.pushbroom.rectification import MapNodes, geographic_nodes, local_nodes
 from jaxbundle.pushbroom.surfaces import GroundSurface
 from jaxbundle.system.programs import compile_once
@@ -66,6 +67,14 @@ class MapSystem:
             x, y = self.transformer.transform(x, y, direction="INVERSE")
         return geographic_nodes(surface, np.radians(x), np.radians(y))
 
+    def degrees_of(self, grid: "MapGrid") -> tuple[float, float] | None:
+        """Longitude and latitude of the middle of a map; None without a system."""
+        if not self.transformer:
+            return None
+        x, y = grid.x + grid.columns * grid.size / 2, grid.y - grid.rows * grid.size / 2
+        longitude, latitude = self.transformer.transform(x, y, direction="INVERSE")
+        return float(longitude), float(latitude)
+
     @property
     def text(self) -> str | None:
         """The system in the form of rasterio."""
@@ -97,6 +106,34 @@ class MapGrid(NamedTuple):
     def place(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Row and column, whole numbers at the centres, of map coordinates."""
         return (self.y - y) / self.size - 0.5, (x - self.x) / self.size - 0.5
+
+
+def describe_distance(
+    crs: str | None, longitude: float, latitude: float, margin: float = 6.0
+) -> str:
+    """What to say of a system made for another part of the Earth than a place, degrees; empty if
+    there is nothing to say.
+
+    **Arguments:** `margin`: degrees around its area of use within which it is used all the same: a
+    zone of UTM, whose neighbours are often mapped in it."""
+    if crs is None:
+        return ""
+    transformer, _ = _transformer(crs)
+    target = transformer.target_crs
+    area = None if target is None else target.area_of_use
+    if target is None or area is None:
+        return ""
+    # an area across the date line has its east smaller than its west
+    width = (area.east - area.west) % 360 or 360
+    beyond = (longitude - area.west + margin) % 360 > width + 2 * margin and width < 360
+    if not beyond and area.south - margin <= latitude <= area.north + margin:
+        return ""
+    return (
+        f"--crs {crs} ({target.name}) is made for longitude {area.west:g}° to "
+        f"{area.east:g}°, latitude {area.south:g}° to {area.north:g}°; the image is at "
+        f"{longitude:.4g}°, {latitude:.4g}°: distances are distorted there; is it meant? Its zone "
+        f"of UTM is {utm_system(latitude, longitude)}"
+    )
 
 
 def contiguous(system: MapSystem, x: Float[np.ndarray, "r c"]) -> Float[np.ndarray, "r c"]:
@@ -155,7 +192,7 @@ def _transformer(crs: str) -> tuple["Transformer", float | None]:
                 "give a projected one, such as EPSG:32633, or a geographic one, such as EPSG:4326"
             )
         transformer = pyproj.Transformer.from_crs("EPSG:4326", system, always_xy=True)
-    except pyproj.exceptions.CRSError as error:
+    except pyproj.exceptions.ProjError as error:
         raise InputError(f"coordinate system {crs!r}: {' '.join(str(error).split())}") from None
     if not system.is_geographic:
         return transformer, None

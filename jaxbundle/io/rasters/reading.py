@@ -2,6 +2,8 @@
 
 import os
 import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -12,13 +14,18 @@ from jaxtyping import Float
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.io.rasters.extent import Extent
+from jaxbundle.io.rasters.vertical import KNOWN_SYSTEM, HeightScale, with_vertical_unit
 from jaxbundle.pushbroom.terrain import Terrain, make_terrain
-from jaxbundle.system.file_content import check_plain
+from jaxbundle.system.file_content import check_plain, naming_file
+from jaxbundle.system.foreign_parsers import foreign_parser
 
 if TYPE_CHECKING:
     from rasterio.io import DatasetReader
 
 GEOGRAPHIC = "EPSG:4326"
+EXPECTED = "a raster, such as a GeoTIFF"
+Window = tuple[tuple[int, int], tuple[int, int]]
+"""First row and the one after the last, first column and the one after the last."""
 
 
 def rasterio() -> ModuleType:
@@ -33,15 +40,38 @@ def rasterio() -> ModuleType:
     return rasterio
 
 
-def unreadable(path: str | Path, error: Exception) -> InputError:
-    """The message of rasterio about a file, in one line; what GDAL does not know is said as
-    that."""
+@contextmanager
+def raster_parser(path: str | Path) -> Iterator[None]:
+    """The context of a call of rasterio on a file; what GDAL does not know is said as that."""
+    with naming_file(path):
+        try:
+            with foreign_parser(path, EXPECTED):
+                yield
+        except InputError as error:
+            if "not recognized" in str(error):
+                raise InputError(f"{path}: expected {EXPECTED}; GDAL does not know it") from None
+            raise
+
+
+@contextmanager
+def open_raster(path: str | Path) -> Iterator["DatasetReader"]:
+    """A raster to read, without a warning about missing georeference.
+
+    **Raises:** `InputError` if it is missing, a folder, or no raster."""
+    package = rasterio()
+    check_plain(path)
     if os.path.isdir(path):
-        return InputError(f"{path}: is a folder; expected a raster, such as a GeoTIFF")
-    said = " ".join(str(error).split())
-    if "not recognized" in said:
-        return InputError(f"{path}: expected a raster, such as a GeoTIFF; GDAL does not know it")
-    return InputError(f"{path}: {said}")
+        raise InputError(f"{path}: is a folder; expected {EXPECTED}")
+    with raster_parser(path):
+        source = open_plain(path)
+    with source:
+        # imaging spectrometers have hundreds of bands; of a hundred thousand GDAL would think long
+        if not 1 <= source.count <= 4096:
+            raise InputError(f"{path}: is damaged, or no image: it has {source.count} bands")
+        try:
+            yield source
+        except package.errors.RasterioError as error:  # of a property that is read late
+            raise InputError(f"{path}: is damaged: {' '.join(str(error).split())[:200]}") from None
 
 
 def open_plain(path: str | Path, *arguments: str, **options: Any) -> Any:
@@ -53,6 +83,89 @@ def open_plain(path: str | Path, *arguments: str, **options: Any) -> Any:
         return package.open(path, *arguments, **options)
 
 
+def read_pixels(
+    path: str | Path,
+    source: "DatasetReader",
+    bands: int | Sequence[int] | None = None,
+    window: Window | None = None,
+) -> np.ma.MaskedArray:
+    """The stored values of bands, [rows, columns] of one and [bands, rows, columns] of several;
+    no-data is masked.
+
+    **Raises:** `InputError` if the file cannot be read, or as `check_pixels`."""
+    check_pixels(path, source, [bands] if isinstance(bands, int) else bands, window)
+    with raster_parser(path):
+        return source.read(bands, window=window, masked=True)
+
+
+def read_values(
+    path: str | Path,
+    source: "DatasetReader",
+    bands: int | Sequence[int] | None = None,
+    window: Window | None = None,
+) -> np.ndarray:
+    """As `read_pixels`, in double precision, NaN where there is no data."""
+    values: Any = read_pixels(path, source, bands, window)
+    return values.astype(float).filled(np.nan)
+
+
+def check_pixels(
+    path: str | Path,
+    source: "DatasetReader",
+    bands: Sequence[int] | None = None,
+    window: Window | None = None,
+    harmless: int = 2**28,
+    ratio: int = 2000,
+) -> None:
+    """Refuse to make room for more values than a file can hold.
+
+    **Arguments:** `harmless`: bytes that are always read; `ratio`: beyond them, bytes for one of
+    the file: the densest packing of DEFLATE is 1032.
+
+    **Raises:** `InputError`."""
+    (top, bottom), (left, right) = window or ((0, source.height), (0, source.width))
+    size = sum(np.dtype(source.dtypes[k - 1]).itemsize for k in bands or source.indexes)
+    needed, present = (bottom - top) * (right - left) * size, os.path.getsize(path)
+    # a VRT is a text about other files
+    if needed > harmless and needed > ratio * present and source.driver != "VRT":
+        raise InputError(
+            f"{path}: is damaged, or nearly empty: {present} bytes that claim to hold {needed} of "
+            f"{bottom - top} × {right - left} pixels"
+        )
+
+
+def check_georeference(path: str | Path, source: "DatasetReader") -> None:
+    """Refuse one that is no number, beyond any map, or without an inverse.
+
+    **Raises:** `InputError`."""
+    # 1e9: degrees, metres or feet, of pixels up to the size of the Earth; 1e-12 degrees are 0.1 µm
+    transform, area = tuple(source.transform)[:6], abs(source.transform.determinant)
+    if not (all(abs(v) < 1e9 for v in transform) and area > 1e-24):
+        raise InputError(
+            f"{path}: is damaged: its georeference is {', '.join(f'{v:g}' for v in transform)}"
+        )
+
+
+def check_raw(path: str | Path, source: "DatasetReader") -> None:
+    """Refuse a raster that is a map, or a crop, where one of the lines of a scanner is expected.
+
+    **Raises:** `InputError`."""
+    place = source.transform
+    todo = "; give the whole image as the scanner took it, or the coefficients (RPC) of this one"
+    if source.crs is not None and not place.is_identity:
+        raise InputError(
+            f"{path}: is a map, in {source.crs.to_string()[:60]} with pixels of {place.a:g}: its "
+            f"rows are not the lines of the scanner{todo}"
+        )
+    # GDAL's coordinates of pixels, rows downwards; programs leave them when they cut a part out
+    steps = (place.a, place.b, place.d, place.e)
+    if source.crs is None and steps == (1, 0, 0, 1) and not place.is_identity:
+        raise InputError(
+            f"{path}: is a part that begins at line {place.f:g}, pixel {place.c:g} of a larger "
+            f"image{todo}"
+        )
+
+
 def as_type(values: np.ndarray, dtype: np.dtype | str) -> np.ndarray:
     """Values as stored: whole numbers are rounded and clipped to the range, NaN becomes 0."""
     if np.issubdtype(dtype, np.floating):
@@ -62,48 +175,60 @@ def as_type(values: np.ndarray, dtype: np.dtype | str) -> np.ndarray:
 
 
 def read_terrain(
-    path: str | Path, earth: Ellipsoid | None, extent: Extent | None = None
+    path: str | Path,
+    earth: Ellipsoid | None,
+    extent: Extent | None = None,
+    above_geoid: bool = False,
 ) -> Terrain:
     """The terrain model of the first band of a raster; its heights are those above `earth`.
 
-    A projected system is resampled to longitude and latitude first (bilinear, about the same
+    Scale, offset and no-data of the band are applied, and so is the unit of a vertical system. A
+    projected system is resampled to longitude and latitude first (bilinear, about the same
     spacing). With `earth` None its x and y are those of the local frame. Otherwise
     only the `extent` is read.
 
-    **Raises:** `InputError` if it cannot be read, has no georeference, or no heights in the extent.
+    **Arguments:** `above_geoid`: the caller will add the geoid (`add_geoid`).
+
+    **Raises:** `InputError` if it cannot be read, has no georeference, or no heights in the extent;
+    for a vertical system of heights above a geoid that nobody adds.
     """
     package = rasterio()
-    check_plain(path)
     from rasterio.vrt import WarpedVRT
 
-    try:
-        with package.open(path) as source:
-            if earth is None or (source.crs is not None and source.crs.is_geographic):
-                return _terrain(source, earth, path, extent)
-            if source.crs is None:
-                raise InputError(
-                    f"{path}: the raster has no coordinate system; add one, such as with "
-                    "gdal_translate -a_srs EPSG:4326"
-                )
-            with WarpedVRT(
+    with open_raster(path) as source:
+        check_georeference(path, source)
+        height = HeightScale(source.scales[0], source.offsets[0])
+        if earth is None:
+            return _terrain(source, earth, path, extent, height)
+        if source.crs is None:
+            raise InputError(
+                f"{path}: the raster has no coordinate system; add one, such as with "
+                "gdal_translate -a_srs EPSG:4326"
+            )
+        height = with_vertical_unit(path, source.crs.to_wkt(), height, above_geoid)
+        if source.crs.is_geographic:
+            return _terrain(source, earth, path, extent, height)
+        degrees = _degrees_around(path, source)
+        with raster_parser(path):
+            warped = WarpedVRT(
                 source,
-                crs=_degrees_around(source),
+                crs=degrees,
                 dtype="float64",
                 nodata=np.nan,
                 resampling=package.enums.Resampling.bilinear,
-            ) as warped:
-                return _terrain(warped, earth, path, extent)
-    except package.errors.RasterioError as error:
-        raise unreadable(path, error) from None
+            )
+        with warped:
+            return _terrain(warped, earth, path, extent, height)
 
 
-def _degrees_around(source: "DatasetReader") -> str:
+def _degrees_around(path: str | Path, source: "DatasetReader") -> str:
     """Longitude and latitude with the jump of longitudes opposite to a raster."""
     import pyproj
 
     left, bottom, right, top = source.bounds
-    back = pyproj.Transformer.from_crs(source.crs.to_wkt(), GEOGRAPHIC, always_xy=True)
-    middle, _ = back.transform((left + right) / 2, (bottom + top) / 2)
+    with foreign_parser(path, KNOWN_SYSTEM):
+        back = pyproj.Transformer.from_crs(source.crs.to_wkt(), GEOGRAPHIC, always_xy=True)
+        middle, _ = back.transform((left + right) / 2, (bottom + top) / 2)
     return (
         f"+proj=longlat +datum=WGS84 +lon_wrap={middle:.0f}"
         if np.isfinite(middle)
@@ -112,7 +237,11 @@ def _degrees_around(source: "DatasetReader") -> str:
 
 
 def _terrain(
-    source: "DatasetReader", earth: Ellipsoid | None, path: str | Path, extent: Extent | None
+    source: "DatasetReader",
+    earth: Ellipsoid | None,
+    path: str | Path,
+    extent: Extent | None,
+    height: HeightScale,
 ) -> Terrain:
     """The terrain model of a raster, whole or the `extent` of it."""
     transform = source.transform
@@ -121,9 +250,9 @@ def _terrain(
     step = transform.a, transform.e
     first = (0, 0)
     if earth is None or extent is None:
-        heights = _heights(source, None)
+        heights = _heights(path, source, None, height)
     else:
-        heights, first = _cut(source, path, extent)
+        heights, first = _cut(source, path, extent, height)
     unit = 1.0 if earth is None else np.pi / 180
     x, y = transform.c + (first[1] + 0.5) * step[0], transform.f + (first[0] + 0.5) * step[1]
     if not np.isfinite(heights).any():
@@ -133,7 +262,7 @@ def _terrain(
 
 
 def _cut(
-    source: "DatasetReader", path: str | Path, extent: Extent
+    source: "DatasetReader", path: str | Path, extent: Extent, height: HeightScale
 ) -> tuple[Float[np.ndarray, "rows columns"], tuple[int, int]]:
     """The heights of the extent and a cell around it, and the row and column of the first."""
     (dx, dy), (x0, y0) = (source.transform.a, source.transform.e), source.transform[2:6:3]
@@ -160,11 +289,15 @@ def _cut(
         )
     # the last column of a model of the whole Earth is beside its first
     parts = [(left % columns, columns), (0, right % columns)] if seam else [(left, right)]
-    heights = [_heights(source, ((top, bottom), part)) for part in parts]
+    heights = [_heights(path, source, ((top, bottom), part), height) for part in parts]
     return np.concatenate(heights, axis=1), (top, left)
 
 
 def _heights(
-    source: "DatasetReader", window: tuple[tuple[int, int], tuple[int, int]] | None
+    path: str | Path,
+    source: "DatasetReader",
+    window: tuple[tuple[int, int], tuple[int, int]] | None,
+    height: HeightScale,
 ) -> Float[np.ndarray, "rows columns"]:
-    return source.read(1, window=window, masked=True).astype(float).filled(np.nan)
+    values = read_values(path, source, 1, window)
+    return height.scale * values + height.offset

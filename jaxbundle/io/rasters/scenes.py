@@ -11,11 +11,12 @@ from jaxbundle.choices import Resampling
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.io.rasters.maps import MapSystem
-from jaxbundle.io.rasters.reading import as_type, open_plain, rasterio, unreadable
+from jaxbundle.io.rasters.reading import as_type, check_georeference, open_raster, read_values
 from jaxbundle.io.rasters.writing import write_raster
 from jaxbundle.pushbroom.flight import take_image
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.surfaces import GroundSurface
+from jaxbundle.system.file_content import naming_file
 from jaxbundle.types import Progress
 
 
@@ -29,16 +30,17 @@ class SceneRaster(NamedTuple):
 
 def read_scene(path: str | Path, earth: Ellipsoid | None) -> SceneRaster:
     """A raster in any coordinate system; for a local frame its coordinates are X and Y."""
-    package = rasterio()
-    try:
-        with open_plain(path) as source:
-            bands, transform, crs = source.read().astype(float), source.transform, source.crs
-            dtype = source.dtypes[0]
-    except package.errors.RasterioError as error:
-        raise unreadable(path, error) from None
+    with open_raster(path) as source:
+        check_georeference(path, source)
+        transform, crs, dtype = source.transform, source.crs, source.dtypes[0]
+        bands = read_values(path, source)
+        scale, offset = (np.array(v, float)[:, None, None] for v in (source.scales, source.offsets))
+    if (scale != 1).any() or (offset != 0).any():
+        bands, dtype = scale * bands + offset, "float32"
     if earth is not None and crs is None:
         raise InputError(f"{path}: the raster has no coordinate system; add one")
-    system = MapSystem(earth, None if earth is None else crs.to_wkt())
+    with naming_file(path):
+        system = MapSystem(earth, None if earth is None else crs.to_wkt())
     back = ~transform
     middle = transform.c + transform.a * bands.shape[2] / 2 + transform.b * bands.shape[1] / 2
 

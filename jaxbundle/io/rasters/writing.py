@@ -44,6 +44,11 @@ class RasterWriter:
         """Name the bands."""
         self._raster.descriptions = tuple(names)
 
+    def scale(self, scales: Sequence[float], offsets: Sequence[float]) -> None:
+        """Scales and offsets of the stored values of the bands; 1 and 0 need none."""
+        if any(s != 1 for s in scales) or any(o != 0 for o in offsets):
+            self._raster.scales, self._raster.offsets = tuple(scales), tuple(offsets)
+
 
 @contextmanager
 def write_raster(

@@ -15,9 +15,9 @@ import jax
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.text.unpacking import UNREADABLE_ARCHIVE
+from jaxbundle.io.text.archives import read_arrays
 from jaxbundle.io.writing.replacing import replace_file
-from jaxbundle.system.file_content import check_plain
+from jaxbundle.system.file_content import parse_json
 
 HEAD = "head"
 """The array of the file that holds the JSON text."""
@@ -37,18 +37,16 @@ def read_tree(path: str | Path, classes: Sequence[type], what: str) -> Any:
     """Read a tree of `write_tree`; `what` names the expected content in messages.
 
     **Raises:** `InputError` for a missing file, or other content."""
-    check_plain(Path(path))
+    arrays = read_arrays(path, what)
+    damaged = InputError(f"{path}: is not {what}, or is damaged")
+    if HEAD not in arrays:
+        raise damaged
+    document = parse_json(path, arrays.pop(HEAD).tobytes().decode(errors="replace"))
     try:
-        with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        head = json.loads(arrays.pop(HEAD).tobytes())
-        return _restore(head, arrays, {one.__name__: one for one in classes})
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or 'damaged'}") from None
-    except UNREADABLE_ARCHIVE:
-        raise InputError(f"{path}: is not {what}, or is damaged") from None
+        return _restore(document, arrays, {one.__name__: one for one in classes})
+    except (ValueError, TypeError, LookupError, AttributeError):
+        # classes refuse what does not fit their fields by errors of their own
+        raise damaged from None
 
 
 def fingerprint(tree: Any, classes: Sequence[type], without: Sequence[type] = ()) -> str:

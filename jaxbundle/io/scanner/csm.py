@@ -4,7 +4,7 @@ The fields have the meaning of usgscsm:
 
 - lines and samples: (0.5, 0.5) is the centre of the first pixel, here (0, 0);
 - `line_scan_rate`: rows of line L₀, start t₀ after the centre time, period p: line l here is taken
-  at t₀ + p·(l + 1 − L₀);
+  at t₀ + p·(l + 1 − L₀); with a negative period the tables are read backwards in time;
 - position, pointing and rotation of the body: `csm_trajectory`;
 - focal plane and distortion: `csm_optics`;
 - radii in km, or in their `unit`.
@@ -12,6 +12,7 @@ The fields have the meaning of usgscsm:
 The camera looks towards the planet. No correction is set, as usgscsm applies none.
 """
 
+import dataclasses
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -33,16 +34,20 @@ from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.io.text.json_fields import JsonFields, read_object
 from jaxbundle.network.columns import show
 from jaxbundle.network.tables import Source
-from jaxbundle.pushbroom.ancillary import check_times
+from jaxbundle.pushbroom.ancillary import DEFAULTS, check_times
 from jaxbundle.pushbroom.image import check_size, make_image
 from jaxbundle.pushbroom.scanner import LineTimes
 
 
-def read_csm(path: str | Path, interpolation: str = "usgscsm") -> ScannerInput:
+def read_csm(
+    path: str | Path, interpolation: str = "usgscsm", extrapolate: float | None = None
+) -> ScannerInput:
     """The pushbroom image of an ISD or a model state.
 
     **Arguments:** `interpolation` of positions and attitudes: `"usgscsm"`, as usgscsm does it, or
-    `"lagrange"`, through eight rows up to the ends of the tables (`csm_trajectory`).
+    `"lagrange"`, through eight rows up to the ends of the tables (`csm_trajectory`);
+    `extrapolate`: seconds by which tables may end before the image, default those of
+    `AncillarySettings`.
 
     **Raises:** `InputError` naming file and field: missing, of another kind, not a number,
     an unknown distortion; tables that end too long before the image.
@@ -51,10 +56,18 @@ def read_csm(path: str | Path, interpolation: str = "usgscsm") -> ScannerInput:
     lines, pixels = (isd.number(key) for key in ("image_lines", "image_samples"))
     check_size(lines, pixels, f"{path}: image_lines, image_samples")
     lines, pixels = int(lines), int(pixels)
-    times = _line_times(isd, lines)
+    times, backwards = _line_times(isd, lines)
     ends = np.array([float(times.time(line)) for line in (0.0, lines - 1.0)])
     when = np.linspace(ends[0], ends[1], lines) if times.table is None else np.asarray(times.table)
-    states = states_of(isd, when, interpolation)
+    settings = DEFAULTS
+    if extrapolate is not None:
+        limits = {"min_extrapolation": extrapolate, "max_extrapolation": extrapolate}
+        settings = dataclasses.replace(settings, **limits)
+    states = states_of(isd, -when if backwards else when, interpolation, settings)
+    if backwards:
+        # the same poses in the same lines; only corrections depend on the direction of time
+        t, P, rows, R = states[:4]
+        states = states._replace(t=-t[::-1], P=P[::-1], rows=-rows[::-1], R=R[::-1])
     middle = view_directions(states.t, states.P, states.rows, states.R, ends.mean())
     optics, turn = optics_of(isd, pixels, *middle)
     image = make_image(
@@ -66,7 +79,7 @@ def read_csm(path: str | Path, interpolation: str = "usgscsm") -> ScannerInput:
         sources=states.sources,
     )
     name = str(isd.get("name_sensor") or Path(path).stem)
-    return ScannerInput(name, image, _earth(isd), states.warnings)
+    return ScannerInput(name, image, _earth(isd), states.warnings, backwards)
 
 
 def _read_support_data(path: Path) -> tuple[JsonFields, int]:
@@ -91,10 +104,35 @@ def _read_support_data(path: Path) -> tuple[JsonFields, int]:
             f"{path}: JSON of another kind, without image_lines and line_scan_rate; expected an "
             "ISD or a model state of a line scanner"
         )
+    _refuse_map(isd)
     model = isd.get("name_model", MODEL)
     if model != MODEL:
         raise InputError(f"{path}: name_model is {show(model)}; {MODEL} is expected")
     return isd, order
+
+
+def _refuse_map(isd: JsonFields) -> None:
+    """Refuse an image whose rows are not the lines of the scanner: ALE states the projection and
+    GDAL's transformation (x₀, dx, 0, y₀, 0, dy) of the file, empty and the identity for a raw one.
+    """
+    todo = (
+        "; give the support data (ISD) and the file of the whole raw image, before map projection"
+    )
+    projection = isd.get("projection")
+    if projection:
+        raise InputError(
+            f"{isd.path}: its image is a map, projection {show(projection)}: its rows are not the "
+            f"lines of the scanner{todo}"
+        )
+    if isd.get("geotransform") is None:
+        return
+    x, dx, rx, y, ry, dy = isd.array("geotransform", (6,))
+    if (x, dx, rx, y, ry, abs(dy)) != (0, 1, 0, 0, 0, 1):
+        raise InputError(
+            f"{isd.path}: geotransform is {show(isd.get('geotransform'))}: its image is a crop, or "
+            f"resampled: line {y:g}, sample {x:g} and steps of {dy:g} and {dx:g} of the image that "
+            f"the scanner took{todo}"
+        )
 
 
 def _earth(isd: JsonFields) -> Ellipsoid:
@@ -105,17 +143,22 @@ def _earth(isd: JsonFields) -> Ellipsoid:
     return Ellipsoid(a, a, c)
 
 
-def _line_times(isd: JsonFields, lines: int) -> LineTimes:
+def _line_times(isd: JsonFields, lines: int) -> tuple[LineTimes, bool]:
+    """The times of the lines; of negative periods (lines from the last one taken to the first, as
+    of the Apollo panoramic camera) those of a clock that runs backwards, −t, and True."""
     rates = isd.array("line_scan_rate", (None, 3))
-    if not len(rates) or (rates[:, 2] <= 0).any():
-        raise InputError(f"{isd.path}: line_scan_rate needs rows of a positive period")
-    first, start, period = rates.T
+    backwards = bool(len(rates) and (rates[:, 2] < 0).all())
+    if not len(rates) or (rates[:, 2] <= 0).any() != backwards:
+        raise InputError(
+            f"{isd.path}: line_scan_rate needs rows of a positive period, or all of a negative one"
+        )
+    first, start, period = (rates * np.array([1, -1, -1]) if backwards else rates).T
     # the centre of line l is l + ½ in the coordinates of the ISD
     l = np.arange(lines)
     row = np.clip(np.searchsorted(first, l + 0.5, side="right") - 1, 0, None)
     t = start[row] + period[row] * (l + 1 - first[row])
     # one rate: times follow from it, and need no table
     if (row == row[0]).all():
-        return LineTimes(jnp.asarray(t[0]), jnp.asarray(period[row[0]]))
+        return LineTimes(jnp.asarray(t[0]), jnp.asarray(period[row[0]])), backwards
     check_times(t, Source(f"{isd.path}, line_scan_rate", None, "line"))
-    return LineTimes(jnp.zeros(()), jnp.zeros(()), jnp.asarray(t))
+    return LineTimes(jnp.zeros(()), jnp.zeros(()), jnp.asarray(t)), backwards

@@ -16,6 +16,7 @@ interpolated by Lagrange's polynomial of fewer rows near the ends (`pushbroom.in
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -30,8 +31,10 @@ from jaxbundle.io.text.json_fields import JsonFields
 from jaxbundle.network.columns import did_you_mean, show
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.ancillary import (
+    AncillarySettings,
     attitude_table,
     check_times,
+    contradiction,
     extrapolation_limit,
     normalise_quaternions,
     position_table,
@@ -73,8 +76,14 @@ def unit_of(isd: JsonFields, key: str, default: str) -> float:
     return UNITS[unit]
 
 
-def states_of(isd: JsonFields, lines: Float[np.ndarray, " lines"], interpolation: str) -> States:
-    """The states of an ISD for lines at these times; tables may end a little before them.
+def states_of(
+    isd: JsonFields,
+    lines: Float[np.ndarray, " lines"],
+    interpolation: str,
+    settings: AncillarySettings,
+) -> States:
+    """The states of an ISD for lines at these times; tables may end a little before them, by what
+    the settings allow.
 
     **Raises:** `InputError` naming file, field and row.
     """
@@ -84,7 +93,9 @@ def states_of(isd: JsonFields, lines: Float[np.ndarray, " lines"], interpolation
             f"{did_you_mean(interpolation, INTERPOLATIONS)}"
         )
     older = "sensor_position" in isd.document and "instrument_position" not in isd.document
-    return _read_even_table(isd, lines) if older else _resample(isd, lines, interpolation)
+    if older:
+        return _read_even_table(isd, lines, settings)
+    return _resample(isd, lines, interpolation, settings)
 
 
 def trajectory_of(states: States, turn: Rotation, interpolation: str, order: int) -> Trajectory:
@@ -130,7 +141,9 @@ def view_directions(
     return camera.apply(-here), camera.apply(after - here)
 
 
-def _read_even_table(isd: JsonFields, lines: Float[np.ndarray, " lines"]) -> States:
+def _read_even_table(
+    isd: JsonFields, lines: Float[np.ndarray, " lines"], settings: AncillarySettings
+) -> States:
     """Even tables as they are."""
     P = isd.array("sensor_position.positions", (None, 3)) * unit_of(isd, "sensor_position", "m")
     q = isd.array("sensor_orientation.quaternions", (None, 4))
@@ -139,14 +152,19 @@ def _read_even_table(isd: JsonFields, lines: Float[np.ndarray, " lines"]) -> Sta
         t = isd.number(f"t0_{name}") + isd.number(f"dt_{name}") * np.arange(n)
         _check_rows(isd, f"sensor_{key}", t)
         tables.append((t, isd.source(f"sensor_{key}")))
-    warnings = [w for t, source in tables for w in warn_of_extrapolation(t, lines, source)]
+    warnings = [w for t, at in tables for w in warn_of_extrapolation(t, lines, at, settings)]
     (t, rows), sources = zip(*tables)
     R, lengths = _rotations(isd, "sensor_orientation", q)
-    limits = extrapolation_limit(t), extrapolation_limit(rows)
+    limits = extrapolation_limit(t, settings), extrapolation_limit(rows, settings)
     return States(t, P, rows, R, limits, sources, (*lengths, *warnings))
 
 
-def _resample(isd: JsonFields, lines: Float[np.ndarray, " lines"], interpolation: str) -> States:
+def _resample(
+    isd: JsonFields,
+    lines: Float[np.ndarray, " lines"],
+    interpolation: str,
+    settings: AncillarySettings,
+) -> States:
     position_times = _times(isd, "instrument_position")
     _check_rows(isd, "instrument_position", position_times)
     body_times, body, body_lengths = _turns(isd, "body_rotation")
@@ -160,13 +178,14 @@ def _resample(isd: JsonFields, lines: Float[np.ndarray, " lines"], interpolation
         warning
         for key, t in tables.items()
         if len(t) > 1
-        for warning in warn_of_extrapolation(t, lines, isd.source(key))
+        for warning in warn_of_extrapolation(t, lines, isd.source(key), settings)
     ]
     # At least 25 rows, so that the eight rows of the polynomial lie close about every line of a
     # short image, of which the file may have two states. Hermite's cubic between states h seconds
     # apart errs by r·ω⁴·h⁴/384: in a low orbit of the Earth below a millimetre up to 14 s.
     t = np.linspace(position_times[0], position_times[-1], max(25, len(position_times)))
-    P = body(t).apply(_positions(isd, position_times)(t))
+    inertial, contradicted = _positions(isd, position_times)
+    P = body(t).apply(inertial(t))
     if interpolation == "usgscsm":
         merged = np.union1d(body_times, pointing_times)
         if len(merged) == 1:
@@ -177,10 +196,11 @@ def _resample(isd: JsonFields, lines: Float[np.ndarray, " lines"], interpolation
     else:
         rows = np.linspace(pointing_times[0], pointing_times[-1], max(2, len(pointing_times)))
         R = body(rows) * pointing(rows).inv()
-    limits = extrapolation_limit(position_times), extrapolation_limit(pointing_times)
+    allowed = partial(extrapolation_limit, settings=settings)
+    limits = allowed(position_times), allowed(pointing_times)
     sources = isd.source("instrument_position"), isd.source("instrument_pointing")
     lengths = *body_lengths, *pointing_lengths
-    return States(t, P, rows, R, limits, sources, (*lengths, *warnings))
+    return States(t, P, rows, R, limits, sources, (*lengths, *contradicted, *warnings))
 
 
 def _check_rows(isd: JsonFields, key: str, t: Float[np.ndarray, " n"]) -> None:
@@ -191,15 +211,23 @@ def _check_rows(isd: JsonFields, key: str, t: Float[np.ndarray, " n"]) -> None:
 
 def _positions(
     isd: JsonFields, t: Float[np.ndarray, " n"]
-) -> Callable[[Times], Float[np.ndarray, "n 3"]]:
-    """Positions in the inertial frame, metres, at times."""
+) -> tuple[Callable[[Times], Float[np.ndarray, "n 3"]], tuple[str, ...]]:
+    """Positions in the inertial frame, metres, at times; warnings."""
     scale = unit_of(isd, "instrument_position", "km")
     P = scale * isd.array("instrument_position.positions", (len(t), 3))
-    if isd.get("instrument_position.velocities") is None:
-        table = position_table(t, P, method="usgscsm", order=3, gap=np.inf)
-        return lambda times: np.array(jax.vmap(lambda time: interpolate(table, time))(times))
-    V = scale * isd.array("instrument_position.velocities", (len(t), 3))
-    return CubicHermiteSpline(t, P, V)
+    said: tuple[str, ...] = ()
+    if isd.get("instrument_position.velocities") is not None:
+        V = scale * isd.array("instrument_position.velocities", (len(t), 3))
+        wrong = contradiction(t, P, V, isd.source("instrument_position.velocities"))
+        # orbits are known to better than 100 m; a smaller error is interpolated as usgscsm does
+        used = wrong is None or wrong.shift < 100
+        if wrong is not None:
+            todo = "used all the same" if used else "not used; positions are interpolated alone"
+            said = (f"{wrong.message}: up to {wrong.shift:.2g} m between the rows; {todo}",)
+        if used:
+            return CubicHermiteSpline(t, P, V), said
+    table = position_table(t, P, method="usgscsm", order=3, gap=np.inf)
+    return lambda times: np.array(jax.vmap(lambda time: interpolate(table, time))(times)), said
 
 
 def _times(isd: JsonFields, key: str) -> Float[np.ndarray, " n"]:

@@ -23,6 +23,8 @@ EXPECTED_PRODUCTS = (
     "a file of the Community Sensor Model (.json), DIMAP of SPOT 5, Pléiades, SPOT 6 or 7 "
     "(.xml, .dim), or support data of DigitalGlobe (.xml, .imd)"
 )
+OF_SOURCES = ("interpolation", "extrapolate")
+"""Keys of [scanner] beside a source."""
 WORLDVIEW = "support data of DigitalGlobe with IMD, EPH, ATT, GEO"
 
 
@@ -48,13 +50,16 @@ def read_scanner(path: str | Path) -> ScannerInput:
     scanner = file.section("scanner")
     if "source" in scanner:
         return _read_source(file, scanner)
+    for name in OF_SOURCES:
+        if name in scanner:
+            raise InputError(f"{scanner.where}{name}: give it in [position] and [attitude]")
     file.require(REQUIRED_FIELDS, f", or source in [scanner], the name of {EXPECTED_PRODUCTS}")
     return scanner_of(file)
 
 
 def _read_source(file: TomlFile, scanner: TomlSection) -> ScannerInput:
     """The image of the source, with the name, interpolation and corrections of the file."""
-    scanner.check_keys(("source", "name", "interpolation"))
+    scanner.check_keys(("source", "name", *OF_SOURCES))
     for name in file.document:
         if name not in ("scanner", "corrections"):
             raise InputError(
@@ -68,23 +73,35 @@ def _read_source(file: TomlFile, scanner: TomlSection) -> ScannerInput:
             f"{scanner.where}source = {show(str(scanner.values['source']))}: expected "
             f"{EXPECTED_PRODUCTS}"
         )
-    product = _read_product(source, choice)
+    seconds = scanner.number("extrapolate") if "extrapolate" in scanner else None
+    if seconds is not None and seconds < 0:
+        raise InputError(f"{scanner.where}extrapolate is {seconds:g}; seconds are expected")
+    product = _read_product(source, choice, seconds)
     switches = file.section("corrections")
     switched = {name: switches.switch(name) for name in switches.values}
     corrections = product.image.corrections._replace(**switched)
+    if corrections.any and product.backwards:
+        raise InputError(
+            f"{switches.where}the lines of {source.name} were taken in reverse order, which "
+            "corrections do not know; omit them"
+        )
     image = dataclasses.replace(product.image, corrections=corrections)
     product = dataclasses.replace(product, image=image, name=scanner.text("name", product.name))
     # what the user switched is compared, but not replaced
     return check_against_rpc(product, source, choose=not switched)
 
 
-def _read_product(path: Path, interpolation: str | None = None) -> ScannerInput:
-    """The image of a product; `interpolation` applies to CSM files only."""
+def _read_product(
+    path: Path, interpolation: str | None = None, extrapolate: float | None = None
+) -> ScannerInput:
+    """The image of a product; `interpolation` and `extrapolate` apply to CSM files only."""
     suffix = path.suffix.lower()
     if suffix == ".json":
-        return read_csm(path) if interpolation is None else read_csm(path, interpolation)
-    if interpolation is not None:
-        raise InputError(f"{path}: interpolation can be chosen for CSM files only; omit it")
+        choice = {} if interpolation is None else {"interpolation": interpolation}
+        return read_csm(path, **choice, extrapolate=extrapolate)
+    for name, value in zip(OF_SOURCES, (interpolation, extrapolate)):
+        if value is not None:
+            raise InputError(f"{path}: {name} can be chosen for CSM files only; omit it")
     if suffix == ".imd":
         return read_worldview(XmlFields(path, read_support_data(path), WORLDVIEW))
     return _read_xml(path)
@@ -94,12 +111,19 @@ def _read_xml(path: Path) -> ScannerInput:
     """The image of a product in XML, by the name of its root and the groups in it."""
     root = read_xml(path)
     has = lambda key: root.find(f".//{key}") is not None
-    if root.tag == "Dimap_Document":
+    # early products of Pléiades have PHR_DIMAP_Document or PHR_Dimap_Document
+    if root.tag.lower().endswith("dimap_document"):
         if has(MODEL):
             return read_dimap2(XmlFields(path, root, "DIMAP 2 of sensor level"))
         if has("Rational_Function_Model"):
             raise InputError(
                 f"{path}: DIMAP of RPC alone; give it to `pushbroom rpc`, or the DIM_….XML here"
+            )
+        if root.tag != "Dimap_Document":
+            profile = root.findtext(".//METADATA_PROFILE", "without a profile")[:60]
+            raise InputError(
+                f"{path}: DIMAP of Pléiades ({profile}) without {MODEL}: the sensor level is "
+                "expected; of other levels give the RPC (RPC_….XML) to `pushbroom rpc`"
             )
         return read_dimap(XmlFields(path, root, "DIMAP of SPOT 5"))
     if has("GEO") and has("EPH") and has("ATT"):

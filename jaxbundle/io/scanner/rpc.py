@@ -21,14 +21,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.rasters.reading import rasterio
+from jaxbundle.io.rasters.reading import open_raster, rasterio
 from jaxbundle.io.scanner.rpc_products import from_geom, from_xml
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.xml_fields import number_in
 from jaxbundle.io.writing.replacing import disk_of, replace_file
 from jaxbundle.network.columns import show
 from jaxbundle.pushbroom.rpc import TERMS, Rpc
-from jaxbundle.system.file_content import check_plain
+from jaxbundle.system.foreign_parsers import foreign_parser
 
 OFFSETS = {
     "line": ("LINE", "line"),
@@ -177,15 +177,8 @@ def _from_rpb(path: Path, text: str) -> dict[str, Any]:
 
 
 def _from_raster(path: Path) -> dict[str, Any]:
-    package = rasterio()
-    check_plain(path)
-    try:
-        with package.open(path) as source:
-            tags = source.rpcs
-    except package.errors.RasterioError as error:
-        raise InputError(f"{path}: {' '.join(str(error).split())}") from None
-    except (KeyError, ValueError) as error:
-        raise InputError(f"{path}: the RPC tags are damaged: {error}") from None
+    with open_raster(path) as source, foreign_parser(f"{path}: its RPC", "those of a raster"):
+        tags = source.rpcs
     if tags is None:
         raise InputError(f"{path}: the raster has no RPC tags; give a file of coefficients")
     values = {}

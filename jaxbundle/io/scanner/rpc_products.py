@@ -49,7 +49,8 @@ def from_xml(path: Path) -> dict[str, Any]:
     **Raises:** `InputError` for XML of another kind, naming the kind.
     """
     root = read_xml(path)
-    if root.tag == "Dimap_Document" or root.find(".//Rational_Function_Model") is not None:
+    has_rpc = root.find(".//Rational_Function_Model") is not None
+    if root.tag.lower().endswith("dimap_document") or has_rpc:
         if root.find(".//RFM_Validity") is not None:
             return _from_dimap(XmlFields(path, root, DIMAP))
         raise InputError(

@@ -8,9 +8,11 @@ from jaxbundle.pushbroom.image import PushbroomImage
 
 @dataclasses.dataclass(frozen=True)
 class ScannerInput:
-    """The image, the ellipsoid of its Earth (None: a local frame), warnings of the reader."""
+    """The image, the ellipsoid of its Earth (None: a local frame), warnings of the reader;
+    `backwards`: whether its clock runs against time, so that no correction can be applied."""
 
     name: str
     image: PushbroomImage
     earth: Ellipsoid | None
     warnings: tuple[str, ...] = ()
+    backwards: bool = False

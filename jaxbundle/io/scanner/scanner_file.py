@@ -47,6 +47,7 @@ Or the file of a product, with changes:
 [scanner]
 source = "image.json"
 interpolation = "lagrange"          # CSM files: usgscsm | lagrange
+extrapolate = 2.0                   # CSM files: seconds by which tables may end before the image
 
 [corrections]
 refraction = true
@@ -94,6 +95,7 @@ SECTIONS = {
         "angle_unit",
         "source",
         "interpolation",
+        "extrapolate",
     ),
     "times": ("first", "period", "table"),
     "position": (*KINDS, "at", "j2", "frame", "span", "step", *INTERPOLATION),

@@ -20,13 +20,11 @@ import numpy as np
 from jaxtyping import Int
 
 from jaxbundle.errors import InputError
+from jaxbundle.io.text.archives import Member
+from jaxbundle.system.foreign_parsers import foreign_parser
 
 LOCAL_HEADER = struct.Struct("<4s22xHH")
 """Signature, length of the name, of the field after it."""
-READERS = {
-    (1, 0): np.lib.format.read_array_header_1_0,
-    (2, 0): np.lib.format.read_array_header_2_0,
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,44 +64,38 @@ class StoredRows:
         return found[0] if np.ndim(rows) == 0 else found
 
 
-def find_stored_rows(path: str | Path, name: str, smallest: int = 2**20) -> StoredRows | None:
-    """The rows of an array of an `.npz`, if they can be read singly and the array is large enough;
-    its checksum is tested once.
+def find_stored_rows(
+    path: str | Path,
+    expected: str,
+    archive: zipfile.ZipFile,
+    name: str,
+    member: Member,
+    smallest: int = 2**20,
+) -> StoredRows | None:
+    """The rows of an array of an open archive, if they can be read singly and the array is large
+    enough; its checksum is tested once.
 
     **Arguments:** `smallest`: bytes of an array that is worth it; a smaller one fits in memory.
 
-    **Raises:** as `zipfile` and NumPy for a damaged archive."""
-    with zipfile.ZipFile(path) as archive:
-        try:
-            member = archive.getinfo(f"{name}.npy")
-        except KeyError:
-            return None
-        if member.file_size < smallest:
-            return None
-        with archive.open(member) as stream:
-            version = np.lib.format.read_magic(stream)
-            if version not in READERS:
-                return None
-            shape, by_columns, dtype = READERS[version](stream)
-            head = stream.tell()
-            whole = head + int(np.prod(shape)) * dtype.itemsize
-            # rows that do not lie in one piece, objects, or trailing bytes
-            if by_columns or dtype.kind not in "biuf" or not shape or member.file_size != whole:
-                return None
-            if member.compress_type != zipfile.ZIP_STORED:
-                unpacked = _unpack(stream)
-                rows = StoredRows(Path(path), 0, tuple(shape), dtype, unpacked)
-                weakref.finalize(rows, unpacked.close)
-                return rows
-            while stream.read(2**20):  # to its end, where zipfile compares the checksum
-                pass
-    with open(path, "rb") as stream:
-        stream.seek(member.header_offset)
-        signature, *lengths = LOCAL_HEADER.unpack(stream.read(LOCAL_HEADER.size))
-    if signature != b"PK\3\4":
+    **Raises:** `InputError` if it is damaged."""
+    info, shape, dtype = member.info, member.shape, member.dtype
+    # rows that do not lie in one piece, texts
+    if info.file_size < smallest or member.by_columns or dtype.kind not in "biuf" or not shape:
         return None
-    offset = member.header_offset + LOCAL_HEADER.size + sum(lengths) + head
-    return StoredRows(Path(path), offset, tuple(shape), dtype)
+    with foreign_parser(f"{path}, array {name!r}", expected), archive.open(info) as stream:
+        stream.read(member.begin)
+        if info.compress_type != zipfile.ZIP_STORED:
+            unpacked = _unpack(stream)
+            rows = StoredRows(Path(path), 0, shape, dtype, unpacked)
+            weakref.finalize(rows, unpacked.close)
+            return rows
+        while stream.read(2**20):  # to its end, where zipfile compares the checksum
+            pass
+    with open(path, "rb") as stream:
+        stream.seek(info.header_offset)
+        _, *lengths = LOCAL_HEADER.unpack(stream.read(LOCAL_HEADER.size))
+    offset = info.header_offset + LOCAL_HEADER.size + sum(lengths) + member.begin
+    return StoredRows(Path(path), offset, shape, dtype)
 
 
 def _unpack(stream: IO[bytes]) -> BinaryIO:
