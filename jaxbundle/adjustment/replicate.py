@@ -27,6 +27,7 @@ from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.formats import as_network
 from jaxbundle.io.results.result_project import readjustable_network
+from jaxbundle.leastsquares.quality.correlation import squared_difference
 from jaxbundle.leastsquares.quality.error_components import ErrorModel, effects, first_rows
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.network.columns import count
@@ -63,14 +64,14 @@ class Difference:
     @property
     def d2(self) -> float:
         """δᵀC⁻¹δ of the classical covariance."""
-        return _square(self.difference, self.classical)
+        return squared_difference(self.difference, self.classical)
 
     @property
     def d2_correlated(self) -> float:
         """δᵀC⁻¹δ of the covariance of the error model; NaN without."""
         if self.correlated is None:
             return float("nan")
-        return _square(self.difference, self.correlated)
+        return squared_difference(self.difference, self.correlated)
 
 
 @print_in_one_screen
@@ -352,8 +353,3 @@ def _add_rows(
         else:
             rest.append(block)
     return np.concatenate([np.zeros((len(D), 0)), *rest], 1)
-
-
-def _square(d: Float[np.ndarray, " n"], C: Float[np.ndarray, "n n"]) -> float:
-    scale = np.sqrt(np.diag(C))
-    return float((d / scale) @ np.linalg.solve(C / np.outer(scale, scale), d / scale))

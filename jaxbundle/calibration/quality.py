@@ -23,6 +23,7 @@ from jaxbundle.cameras.compare import Comparison, compare_cameras
 from jaxbundle.cameras.pixel_frame import in_model_units, in_pixels
 from jaxbundle.display import data_set, print_in_one_screen
 from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.leastsquares.quality.correlation import squared_difference
 from jaxbundle.network.tables import Camera, Network
 
 GRID = (11, 9)
@@ -277,13 +278,12 @@ def cross_validation(result: Adjustment) -> CrossValidation | None:
         return None
     if not all(other.converged for other in held):
         return None
-    # independent halves: Σ(p₁ − p₂) = C₁ + C₂, scaled to σ before the solution, as f and k3 differ
-    # by ten powers of ten
+    # independent halves: Σ(p₁ − p₂) = C₁ + C₂
     names, C = halves[0].camera_covariance(name)
     C = C + halves[1].camera_covariance(name)[1]
     d = np.array([own[0][n] - own[1][n] for n in names])
     scale = np.sqrt(np.diagonal(C))
-    test = float((d / scale) @ np.linalg.solve(C / np.outer(scale, scale), d / scale)) / len(d)
+    test = squared_difference(d, C) / len(d)
     v = lambda half: residuals_in_pixels(half, half.problem.network.cameras[0])[0]
     rms_of = lambda half: float(np.sqrt(np.nanmean((v(half) ** 2).sum(1))))
     rms = lambda parts: float(np.sqrt(np.mean([rms_of(p) ** 2 for p in parts])))

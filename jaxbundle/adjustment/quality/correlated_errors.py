@@ -70,14 +70,18 @@ class ImageRows:
         """Rows of all observations from columns in the image unit: [rays, k] of x and of y."""
         import scipy.sparse as sp
 
-        rows = []
-        for axis, columns in enumerate((x, y)):
-            place = sp.csr_matrix(
-                (1 / self.sigma[:, axis], (self.row + axis, np.arange(len(self.row)))),
-                shape=(self.number, len(self.row)),
-            )
-            rows.append(place @ sp.csr_matrix(columns))
+        rows = [
+            self.place(axis, 1 / self.sigma[:, axis]) @ sp.csr_matrix(columns)
+            for axis, columns in enumerate((x, y))
+        ]
         return (rows[0] + rows[1]).tocsr()
+
+    def place(self, axis: int, value: Float[np.ndarray, " rays"]) -> Any:
+        """The matrix that puts values of the rays, times `value`, into the rows of x or y."""
+        import scipy.sparse as sp
+
+        shape = (self.number, len(self.row))
+        return sp.csr_matrix((value, (self.row + axis, np.arange(len(self.row)))), shape=shape)
 
     def by_image(self, column: Float[np.ndarray, " rays"]) -> Any:
         """A column for every image."""
@@ -92,9 +96,8 @@ def image_rows(found: Solution, problem: NetworkProblem) -> ImageRows:
     """The rows of the image points that take part."""
     starts = first_rows(found)
     row = np.zeros(len(problem.image), int)
-    width = 2
     for name, rays in problem.image_rows.items():
-        row[rays] = starts[name] + width * np.arange(len(rays))
+        row[rays] = starts[name] + 2 * np.arange(len(rays))  # x and y of each
     weight = problem.image_weights
     used = (weight > 0).all(1)
     number = sum(np.asarray(v).size for v in found.residuals.values())
@@ -237,11 +240,5 @@ def _along_tracks(
         (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))),
         shape=(len(rays.row), first),
     )
-    parts = []
-    for axis in (0, 1):
-        place = sp.csr_matrix(
-            (np.ones(len(rays.row)), (rays.row + axis, np.arange(len(rays.row)))),
-            shape=(rays.number, len(rays.row)),
-        )
-        parts.append(place @ of_rays)
+    parts = [rays.place(axis, np.ones(len(rays.row))) @ of_rays for axis in (0, 1)]
     return ErrorComponent("along tracks", "σ", sp.hstack(parts).tocsr())

@@ -143,17 +143,7 @@ def _points(
         lines.append(row.number)
         rows.take(f"colour of {thing}")
         row = rows.take(f"rays of {thing}")
-        numbers = row.all_numbers("a ray")
-        claimed = row.integer(0, f"the number of rays of {thing}")
-        if len(numbers) != 1 + 4 * claimed:
-            raise row.error(
-                f"{claimed} rays are announced; {4 * claimed} numbers should follow, not "
-                f"{len(numbers) - 1}"
-            )
-        views = numbers[1:].reshape(-1, 4)
-        for camera in views[:, 0]:
-            if not (0 <= camera < cameras and camera % 1 == 0):
-                raise row.error(f"camera {camera:g} does not exist; there are {cameras}, from 0")
+        views = row.rays(0, "a ray", cameras, "camera")
         rest = np.full((len(views), 1), row.number)
         rays.append(np.concatenate([views[:, :1], np.full_like(rest, k), views[:, 2:], rest], 1))
     rays = np.concatenate(rays) if rays else np.zeros((0, 5))

@@ -155,17 +155,8 @@ def _points(path: Path, model: _Model, images: int) -> tuple[np.ndarray, np.ndar
     position, rays = [], [np.zeros((0, 5))]
     for k, row in enumerate(model.points):
         numbers = row.all_numbers("a point")
-        claimed = row.integer(6, "the number of rays")
-        if len(numbers) != 7 + 4 * claimed:
-            raise row.error(
-                f"{claimed} rays are announced; {4 * claimed} numbers should follow, not "
-                f"{len(numbers) - 7}"
-            )
-        views = numbers[7:].reshape(-1, 4)
-        for image in views[:, 0]:
-            if not (0 <= image < images and image % 1 == 0):
-                raise row.error(f"image {image:g} does not exist; there are {images}, from 0")
-        rest = np.full((claimed, 1), 1.0)
+        views = row.rays(6, "a point", images, "image")
+        rest = np.ones((len(views), 1))
         position.append(numbers[:3])
         rays.append(np.hstack([views[:, :1], k * rest, views[:, 2:], row.number * rest]))
     return np.array(position), np.concatenate(rays)

@@ -71,6 +71,21 @@ class TextRow:
             raise self.error(f"{what} is {show(word)}; a whole number from {least} is expected")
         return int(word)
 
+    def rays(self, k: int, thing: str, images: int, image: str) -> Float[np.ndarray, "n 4"]:
+        """The rays that end a row, of which number `k` is the count: image, key, x, y each; images
+        are numbered from 0 to `images` − 1."""
+        numbers, claimed = self.all_numbers(thing), self.integer(k, "the number of rays")
+        if len(numbers) != k + 1 + 4 * claimed:
+            raise self.error(
+                f"{claimed} rays are announced; {4 * claimed} numbers should follow, not "
+                f"{len(numbers) - k - 1}"
+            )
+        rays = numbers[k + 1 :].reshape(-1, 4)
+        for one in rays[:, 0]:
+            if not (0 <= one < images and one % 1 == 0):
+                raise self.error(f"{image} {one:g} does not exist; there are {images}, from 0")
+        return rays
+
     def _number(self, word: str, what: str) -> float:
         try:
             number = float(word)

@@ -1,4 +1,4 @@
-"""Correlations of unknowns."""
+"""Correlations of unknowns, and differences in units of their covariance."""
 
 import numpy as np
 from jaxtyping import Float
@@ -21,3 +21,11 @@ def total_correlation(cofactor: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "
     """
     C = correlation_matrix(cofactor)
     return 1 - 1 / np.diagonal(np.linalg.inv(C))
+
+
+def squared_difference(d: Float[np.ndarray, " n"], C: Float[np.ndarray, "n n"]) -> float:
+    """d² = dᵀC⁻¹d; in the mean n where C is the covariance of d.
+
+    Scaled to correlations first: f and k3 differ by ten powers of ten."""
+    scale = np.sqrt(np.diagonal(C))
+    return float((d / scale) @ np.linalg.solve(C / np.outer(scale, scale), d / scale))
