@@ -15,8 +15,8 @@ from jaxbundle.io.boards.targets import write_target as write_target
 from jaxbundle.io.cameras.camera_files import read_cameras as read_cameras
 from jaxbundle.io.cameras.camera_files import write_cameras as write_cameras
 from jaxbundle.io.cameras.opencv_file import read_opencv as read_opencv
-from jaxbundle.io.cameras.opencv_file import write_opencv as write_opencv
-from jaxbundle.io.cameras.opencv_file import write_ros as write_ros
+from jaxbundle.io.cameras.opencv_writing import write_opencv as write_opencv
+from jaxbundle.io.cameras.opencv_writing import write_ros as write_ros
 from jaxbundle.io.exchange import Converted as Converted
 from jaxbundle.io.exchange import convert as convert
 from jaxbundle.io.formats import FORMATS as FORMATS

@@ -14,7 +14,8 @@ from jaxbundle.choices import CAMERA_INPUTS, NETWORK_FILES
 from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.camera_files import is_camera_file, write_cameras
 from jaxbundle.io.cameras.opencv_file import SUFFIXES as OPENCV_SUFFIXES
-from jaxbundle.io.cameras.opencv_file import YAML, write_opencv, write_ros
+from jaxbundle.io.cameras.opencv_file import YAML
+from jaxbundle.io.cameras.opencv_writing import write_opencv, write_ros
 from jaxbundle.io.networks.alicevision import is_alicevision, read_alicevision
 from jaxbundle.io.networks.bal import OPENERS, is_bal, read_bal, write_bal
 from jaxbundle.io.networks.bingo import is_bingo, read_bingo

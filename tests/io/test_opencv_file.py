@@ -11,7 +11,8 @@ from numpy.testing import assert_array_equal
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.convert_fit import images_of
 from jaxbundle.errors import InputError
-from jaxbundle.io.cameras.opencv_file import is_opencv, read_opencv, write_opencv
+from jaxbundle.io.cameras.opencv_file import is_opencv, read_opencv
+from jaxbundle.io.cameras.opencv_writing import write_opencv
 from jaxbundle.io.networks.assemble import all_parameters
 from jaxbundle.network import Camera
 

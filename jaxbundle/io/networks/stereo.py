@@ -32,15 +32,8 @@ from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.nearest_camera import fit_messages
-from jaxbundle.io.cameras.opencv_file import (
-    YAML,
-    file_text,
-    matrix_in,
-    opencv_entries,
-    read_entries,
-    read_opencv,
-    ros_text,
-)
+from jaxbundle.io.cameras.opencv_file import YAML, matrix_in, read_entries, read_opencv
+from jaxbundle.io.cameras.opencv_writing import file_text, opencv_entries, ros_text
 from jaxbundle.io.cameras.ros_ini import is_ros_ini_pair, read_ros_sections
 from jaxbundle.io.networks.assemble import all_parameters, rig_network
 from jaxbundle.io.networks.kalibr import mountings_of
