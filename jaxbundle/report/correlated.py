@@ -12,9 +12,10 @@ if TYPE_CHECKING:
 
 TITLE = "Correlated errors"
 LEGEND = (
-    "Size: standard deviation of the effect on an image coordinate, of the last three at the edge "
-    "of the image; score: how far the residuals exceed those of independent errors, in σ. The "
-    "estimates are those of least squares; only their σ change."
+    "Size: standard deviation of the effect on an image coordinate; that of a principal distance "
+    "and of an affine distortion at the edge of the measured area. Score: how far the residuals "
+    "exceed those of independent errors, in σ. The estimates are those of least squares; only "
+    "their σ change."
 )
 
 
@@ -76,5 +77,11 @@ def correlated_lines(adjustment: "Adjustment") -> list[str]:
     header = ("component", "size", "σ", "unit", "score")
     lines = [*heading(TITLE), *table(header, component_rows(adjustment), "lrrlr"), ""]
     lines += paragraph(LEGEND)
+    found = {size.name for size in present(adjustment.error_model).sizes}
+    if not any(name.startswith("field on the sensor") for name in found):
+        lines += paragraph(
+            "A field on the sensor was not looked for: it needs four photographs of a camera, and "
+            "four image points for each of its splines."
+        )
     header = ("unknown", "σ classical", "σ correlated", "ratio")
     return [*lines, "", *table(header, sigma_rows(adjustment), "lrrr")]

@@ -49,6 +49,11 @@ class CorrelationSettings:
     reach: float = 0.6
     estimation: ErrorSettings = ErrorSettings()
 
+    @property
+    def min_points_of_field(self) -> int:
+        """Image points of a camera from which a field on its sensor is looked for."""
+        return self.min_points_of_knot * self.knots[0] * self.knots[1]
+
 
 DEFAULTS = CorrelationSettings()
 
@@ -131,7 +136,7 @@ def error_components(
         here = of.astype(float)
         columns, rows = settings.knots
         roots: list[tuple[str, list[Any]]] = []
-        if of.sum() >= settings.min_points_of_knot * columns * rows:
+        if of.sum() >= settings.min_points_of_field:
             B = sp.diags(here) @ _sparse_splines(at, _aspect(rays.xy[of]), (columns, rows))
             # √θ is then the RMS of the field, not the σ of its coefficients
             B = B / np.sqrt(B.power(2).sum() / of.sum())
