@@ -80,7 +80,7 @@ def correlated_lines(adjustment: "Adjustment") -> list[str]:
     found = {size.name for size in present(adjustment.error_model).sizes}
     if not any(name.startswith("field on the sensor") for name in found):
         lines += paragraph(
-            "A field on the sensor was not looked for: it needs four photographs of a camera, and "
+            "A field on the sensor was not looked for: it needs eight photographs of a camera, and "
             "four image points for each of its splines."
         )
     header = ("unknown", "σ classical", "σ correlated", "ratio")
