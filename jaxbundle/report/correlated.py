@@ -77,11 +77,16 @@ def correlated_lines(adjustment: "Adjustment") -> list[str]:
     header = ("component", "size", "σ", "unit", "score")
     lines = [*heading(TITLE), *table(header, component_rows(adjustment), "lrrlr"), ""]
     lines += paragraph(LEGEND)
-    found = {size.name for size in present(adjustment.error_model).sizes}
-    if not any(name.startswith("field on the sensor") for name in found):
+    found = " ".join(size.name for size in present(adjustment.error_model).sizes)
+    if "by photograph" not in found:
         lines += paragraph(
-            "A field on the sensor was not looked for: it needs eight photographs of a camera, and "
-            "four image points for each of its splines."
+            "Errors of photographs and a field on the sensor were not looked for: they need eight "
+            "photographs of a camera."
+        )
+    elif "field on the sensor" not in found:
+        lines += paragraph(
+            "A field on the sensor was not looked for: it needs four image points for each of its "
+            "splines."
         )
     header = ("unknown", "σ classical", "σ correlated", "ratio")
     return [*lines, "", *table(header, sigma_rows(adjustment), "lrrr")]
