@@ -110,7 +110,7 @@ def _part(
     angles[model.placed] = many.angles(model.M[model.placed])
     held = model.control & use
     roles = tuple("fixed" if h else "tie" for h in held)
-    cameras = tuple(dataclasses.replace(c, free=(), sigma={}) for c in network.cameras)
+    cameras = tuple(dataclasses.replace(c, free=(), sigma={}, observed={}) for c in network.cameras)
     part = network.replace(
         cameras=cameras,
         images=dataclasses.replace(

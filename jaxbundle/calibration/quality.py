@@ -24,6 +24,7 @@ from jaxbundle.cameras.pixel_frame import in_model_units, in_pixels
 from jaxbundle.display import data_set, print_in_one_screen
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.leastsquares.quality.correlation import squared_difference
+from jaxbundle.network.camera_tables import with_start
 from jaxbundle.network.tables import Camera, Network
 
 GRID = (11, 9)
@@ -312,14 +313,12 @@ def _compare(camera: Camera, halves: Sequence[Mapping[str, float]]) -> Compariso
 def start_at_result(
     network: Network, result: Adjustment, keep: Bool[np.ndarray, " rays"] | None = None
 ) -> Network:
-    """The network with adjusted values as start values; parameters with a prior keep theirs, to
-    which the prior refers. `keep`: remaining rays, by default those not removed."""
+    """The network with adjusted values as start values; priors observe what they did.
+
+    `keep`: remaining rays, by default those not removed."""
     camera, exterior = network.cameras[0], result.image_values
-    parameters = result.camera_parameters(camera.id)
-    # a prior is an observation of the value it was stated for
-    parameters |= {name: camera.parameters.get(name, 0.0) for name in camera.sigma}
     return network.replace(
-        cameras=(dataclasses.replace(camera, parameters=parameters),),
+        cameras=(with_start(camera, result.camera_parameters(camera.id)),),
         images=dataclasses.replace(
             network.images, position=exterior[:, :3], angles=exterior[:, 3:]
         ),

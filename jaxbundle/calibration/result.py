@@ -76,7 +76,9 @@ class Calibration(TableMethods):
     def camera(self) -> Camera:
         """The calibrated camera with no free parameters."""
         given = self.adjustment.network.cameras[0]
-        return dataclasses.replace(given, parameters=self.parameters, free=(), sigma={})
+        return dataclasses.replace(
+            given, parameters=self.parameters, free=(), sigma={}, observed={}
+        )
 
     @functools.cached_property
     def _residuals(self) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:

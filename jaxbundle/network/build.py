@@ -63,7 +63,7 @@ from jaxbundle.network.tables import (
 )
 from jaxbundle.network.units import ANGLE_UNITS, from_image_unit
 
-CAMERA_FIELDS = ("id", "model", "image_size", "pixel_size", "free", "sigma", "tie")
+CAMERA_FIELDS = ("id", "model", "image_size", "pixel_size", "free", "sigma", "observed", "tie")
 IMAGE_COLUMNS = ("id", "camera", *EXTERIOR)
 GROUPS = EXTERIOR[:3], EXTERIOR[3:]
 """Columns of images that may be omitted together."""
@@ -257,9 +257,10 @@ def _camera(
                 raise InputError(
                     f"{where}unknown key {key!r}{did_you_mean(key, (*CAMERA_FIELDS, *known))}"
                 )
-    sigma = row.get("sigma", {})
-    if not isinstance(sigma, Mapping):
-        raise InputError(f"{where}sigma is {sigma!r}; expected a table such as {{ c = 0.1 }}")
+    sigma, observed = row.get("sigma", {}), row.get("observed", {})
+    for key, given in (("sigma", sigma), ("observed", observed)):
+        if not isinstance(given, Mapping):
+            raise InputError(f"{where}{key} is {given!r}; expected a table such as {{ c = 0.1 }}")
     free = row.get("free", ())
     if isinstance(free, str):
         free = [name.strip() for name in free.split(",") if name.strip()]
@@ -274,6 +275,7 @@ def _camera(
         image_size=_pair(where, "image_size", row.get("image_size"), int),
         pixel_size=_pair(where, "pixel_size", row.get("pixel_size"), float),
         tie=_ties(where, row.get("tie", ())),
+        observed={k: _number(where, f"observed {k}", v) for k, v in observed.items()},
     )
 
 

@@ -1,7 +1,7 @@
 """The cameras of a network as tables of unknowns: those of one model share one."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -80,6 +80,13 @@ def camera_tables(cameras: Sequence[Camera]) -> tuple[CameraTable, ...]:
         )
         for model, tie in different
     )
+
+
+def with_start(camera: Camera, parameters: Mapping[str, float]) -> Camera:
+    """The camera with other start values; its priors observe what they did."""
+    start = dict(zip(get_model(camera.model).parameters, start_of(camera)))
+    observed = {name: camera.observed.get(name, start[name]) for name in camera.sigma}
+    return dataclasses.replace(camera, parameters=parameters, observed=observed)
 
 
 def start_of(camera: Camera) -> list[float]:

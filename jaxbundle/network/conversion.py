@@ -122,6 +122,7 @@ def _convert(
         model=model,
         parameters=conversion.parameters,
         sigma={},
+        observed={},
         free=_counterparts(camera.free, source, target),
         tie=camera.tie if source == target else (),
     )

@@ -115,6 +115,14 @@ def check_camera(camera: Camera, where: str = "") -> None:
             )
         if not _positive(sigma):
             raise InputError(f"{where}sigma of {name} is {sigma}; it must be finite and positive")
+    for name, value in camera.observed.items():
+        if name not in camera.sigma:
+            raise InputError(
+                f"{where}observed is given for {name!r}, which has no sigma; expected one, or a "
+                "start value"
+            )
+        if not math.isfinite(value):
+            raise InputError(f"{where}observed value of {name} is {value}; it must be finite")
     _check_ties(camera, values, where)
     _check_pair(where, "image_size", camera.image_size, "[columns, rows]")
     _check_pair(where, "pixel_size", camera.pixel_size, "[width, height] in mm")
@@ -124,7 +132,7 @@ def _check_fields(camera: Camera, where: str) -> None:
     """Refuse fields that are not numbers by name, names, or groups of names."""
     if not isinstance(camera.model, str | CameraModel):
         raise InputError(f"{where}model is {show(camera.model)}; expected a name or a CameraModel")
-    for field in ("parameters", "sigma"):
+    for field in ("parameters", "sigma", "observed"):
         given = getattr(camera, field)
         if not isinstance(given, Mapping):
             raise InputError(

@@ -72,8 +72,9 @@ class Camera:
 
     `model` is the name of a built-in model, or your own `CameraModel`. Missing `parameters`
     start at 0 (or the model's default); `sigma` gives a parameter a prior: a pseudo-observation
-    of its start value. `image_size` is (columns, rows), `pixel_size` (width, height) in mm. `tie`:
-    groups of parameters that are one unknown, such as `(("fx", "fy"),)`.
+    of its start value, or of the value in `observed`. `image_size` is (columns, rows), `pixel_size`
+    (width, height) in mm. `tie`: groups of parameters that are one unknown, such as
+    `(("fx", "fy"),)`.
     """
 
     id: str
@@ -84,6 +85,7 @@ class Camera:
     image_size: tuple[int, int] | None = None
     pixel_size: tuple[float, float] | None = None
     tie: tuple[tuple[str, ...], ...] = ()
+    observed: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
         object.__setattr__(self, "model", key_of(self.model))

@@ -59,7 +59,7 @@ def adjusted_photographs(result: Refinement) -> Network | None:
     held = network.images.sigma == 0
     return network.replace(
         cameras=tuple(
-            dataclasses.replace(camera, parameters=parameters[camera.id], sigma={})
+            dataclasses.replace(camera, parameters=parameters[camera.id], sigma={}, observed={})
             for camera in network.cameras
         ),
         images=Images(

@@ -1,5 +1,6 @@
 """The adjusted network: adjusted again it does not change, and other programs can read it."""
 
+import dataclasses
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from jaxbundle.cli.outputs import NETWORK_FILES, check_targets, write_targets
 from jaxbundle.io import adjusted_network, read_network, write_project
 from jaxbundle.io.networks.orientation_covariance import read_orientation_covariance
 from jaxbundle.leastsquares.problem import with_data
+from jaxbundle.network.camera_tables import with_start
 
 
 def test_it_is_a_fixed_point(convergent4, tmp_path):
@@ -62,3 +64,22 @@ def test_it_is_written_with_the_result_and_read_from_its_folder(convergent4, tmp
     write_targets(jaxbundle.NotSolvedError("why"), "", tmp_path, brief=True, plots=False)
     left = {".jaxbundle", "report.txt", "report.html", "result.json"}
     assert {p.name for p in tmp_path.iterdir()} == left
+
+
+def test_a_prior_observes_its_value_whatever_the_start(convergent4, tmp_path):
+    """Of a camera that starts at its adjusted values, by way of a project."""
+    network = convergent4.network
+    # The fixture weighs image points by 1, a σ of 1 mm: this one is of their weight.
+    camera = dataclasses.replace(network.cameras[0], sigma={"c": 50.0})
+    found = jaxbundle.adjust(network.replace(cameras=(camera,)))
+    values = found.camera_parameters("cam")
+    assert abs(values["c"] - camera.parameters["c"]) > 1e-4
+    restarted = with_start(camera, values)
+    assert restarted.observed == {"c": camera.parameters["c"]}
+    back = read_network(write_project(network.replace(cameras=(restarted,)), tmp_path))
+    again = jaxbundle.adjust(back)
+    assert again.sigma0 == pytest.approx(found.sigma0, rel=1e-9)
+    assert again.camera_parameters("cam")["c"] == pytest.approx(values["c"], rel=1e-9)
+    unobserved = dataclasses.replace(camera, observed={"K1": 0.0})
+    with pytest.raises(jaxbundle.InputError, match="observed is given for 'K1', which has no si"):
+        jaxbundle.check_network(network.replace(cameras=(unobserved,)))

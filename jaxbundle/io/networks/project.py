@@ -329,4 +329,6 @@ def _camera_entry(camera: Camera) -> dict[str, Any]:
         entry["tie"] = camera.tie
     if camera.sigma:
         entry["sigma"] = {name: float(value) for name, value in camera.sigma.items()}
+    if camera.observed:
+        entry["observed"] = {name: float(value) for name, value in camera.observed.items()}
     return entry

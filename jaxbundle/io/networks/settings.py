@@ -22,7 +22,7 @@ TABLES = (*REQUIRED_TABLES, "distances", *KINDS)
 TEXT = ("name", "object_unit", "image_unit", "angle_unit", "datum", "residuals")
 SETTINGS = (*TEXT, "sigma_image", "sigma_origin", "datum_points")
 CAMERA_KEYS = ("camera.ID.PARAMETER", "camera.ID.sigma.PARAMETER") + tuple(
-    f"camera.ID.{field}" for field in CAMERA_FIELDS if field not in ("id", "sigma")
+    f"camera.ID.{field}" for field in CAMERA_FIELDS if field not in ("id", "sigma", "observed")
 )
 ALL_CAMERAS = "*"
 """Means all cameras, unless one has this id."""
@@ -101,7 +101,7 @@ def _override_camera(camera: dict, key: str, field: str, text: str) -> None:
                 "{ c = 0.1 }"
             )
         sigma[field.removeprefix("sigma.")] = _number(key, text)
-    elif field in ("id", "sigma"):
+    elif field in ("id", "sigma", "observed"):
         raise InputError(f"--set {key}: cannot be set; known: {', '.join(CAMERA_KEYS)}")
     else:
         camera[field] = _number(key, text)

@@ -7,10 +7,11 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.cameras import get_model
+from jaxbundle.network.camera_tables import with_start
 from jaxbundle.network.kinds import CameraParameters, ExteriorPriors, Further, RollingShutter
 from jaxbundle.network.kinds.base import among
 from jaxbundle.network.sightings import keep_points, without_distances
-from jaxbundle.network.tables import ESTIMATED, Images, Network, Points
+from jaxbundle.network.tables import ESTIMATED, Camera, Images, Network, Points
 
 if TYPE_CHECKING:
     from jaxbundle.adjustment.problem import NetworkProblem
@@ -23,10 +24,11 @@ def adjusted_network(adjustment: "Adjustment") -> Network:
     Cameras, orientations and points have their adjusted values; observations removed by data
     snooping are left out. Control points with σ are tie points here; priors and observations of
     further kinds are dropped: their information is already in the adjusted values and would count
-    twice. Only priors required by a camera model, such as a grid of splines, stay: without them it
-    has no solution. So the datum is inner; a second adjustment changes nothing. σ of image
-    coordinates are the given ones, even if variance components were estimated. Check points are
-    left out, and so are points without coordinates: at infinity, or excluded by data snooping.
+    twice. Only priors required by a camera model, such as a grid of splines, stay, of the values
+    that were observed: without them it has no solution. So the datum is inner; a second adjustment
+    changes nothing. σ of image coordinates are the given ones, even if variance components were
+    estimated. Check points are left out, and so are points without coordinates: at infinity, or
+    excluded by data snooping.
     """
     problem = adjustment.problem
     network = problem.network
@@ -35,9 +37,9 @@ def adjusted_network(adjustment: "Adjustment") -> Network:
     gone = {(name.id, name.parameter) for name in adjustment.eliminated}
     cameras = tuple(
         dataclasses.replace(
-            camera,
-            parameters=adjustment.camera_parameters(camera.id),
-            sigma=camera.sigma if get_model(camera.model).prior else {},
+            with_start(camera, adjustment.camera_parameters(camera.id))
+            if get_model(camera.model).prior
+            else _unobserved(camera, adjustment),
             free=tuple(name for name in camera.unknowns if (camera.id, name) not in gone),
         )
         for camera in network.cameras
@@ -88,9 +90,7 @@ def readjustable_network(adjustment: "Adjustment") -> Network:
     values, gone = adjustment.image_values, {(n.id, n.parameter) for n in adjustment.eliminated}
     cameras = tuple(
         dataclasses.replace(
-            camera,
-            parameters=adjustment.camera_parameters(camera.id),
-            sigma={},
+            _unobserved(camera, adjustment),
             free=tuple(name for name in camera.unknowns if (camera.id, name) not in gone),
         )
         for camera in network.cameras
@@ -120,6 +120,12 @@ def readjustable_network(adjustment: "Adjustment") -> Network:
     )
     adjusted = without_distances(adjusted, distance_weight <= 0)
     return keep_points(adjusted, np.asarray(np.isfinite(adjustment.point_values).all(1)))
+
+
+def _unobserved(camera: Camera, adjustment: "Adjustment") -> Camera:
+    """A camera at its adjusted values, without priors."""
+    parameters = adjustment.camera_parameters(camera.id)
+    return dataclasses.replace(camera, parameters=parameters, sigma={}, observed={})
 
 
 def _weights(

@@ -1,5 +1,7 @@
-"""Priors of interior orientation: start values of camera parameters with σ."""
+"""Priors of interior orientation: camera parameters with σ, observed at their start values or at
+other ones (`Camera.observed`)."""
 
+import dataclasses
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,6 +31,10 @@ def declare_interior_orientation(
 ) -> list[ObservationSet]:
     """A set for every table of cameras of which one has a σ, one row a camera that has."""
     found = []
+    observed = [
+        dataclasses.replace(camera, parameters={**camera.parameters, **camera.observed})
+        for camera in network.cameras
+    ]
     for table in tables:
         own = [network.cameras[c] for c in table.cameras]
         sigma = np.array(
@@ -43,6 +49,6 @@ def declare_interior_orientation(
         rows = np.flatnonzero(np.isfinite(sigma).any(1))
         if len(rows):
             kind = interior_orientation(table.name, table.parameters)
-            value = table.start(network.cameras)[rows]
+            value = table.start(observed)[rows]
             found.append(kind((rows,), value, sigma=sigma[rows], name=table.interior_set))
     return found
