@@ -41,7 +41,6 @@ from jaxbundle.adjustment.orient import orient, orient_again, screen
 from jaxbundle.adjustment.problem import NetworkProblem, make_problem
 from jaxbundle.adjustment.quality.blunder_names import name_suspect
 from jaxbundle.adjustment.quality.correlated_errors import DEFAULTS as CORRELATIONS
-from jaxbundle.adjustment.quality.correlated_errors import CorrelationSettings, correlated_errors
 from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.adjustment.quality.misfit import doubt_of_robust
 from jaxbundle.adjustment.readjust import (
@@ -225,23 +224,7 @@ def adjust(
     if misfit and not also and not name_conventions(problem, minimum, found.inspection):
         if mirrored := mirror(sigma0):
             result = result.with_changes(findings=(mirrored,))
-    return with_error_model(result) if correlated and result.converged else result
-
-
-def with_error_model(
-    result: Adjustment, settings: CorrelationSettings = CORRELATIONS
-) -> Adjustment:
-    """The same estimates with the σ of errors that image points share; unchanged, with a finding,
-    where the network cannot show any."""
-    why = f"no camera has {settings.min_images} photographs, and no point two rays"
-    try:
-        model = correlated_errors(result.cofactors.solution, result.problem, settings)
-    except NotSolvedError as error:
-        model, why = None, str(error)
-    if model is None:
-        line = f"correlated errors were not looked for: {why}"
-        return result.with_changes(findings=(*result.findings, line))
-    return result.with_changes(error_model=model)
+    return result.with_changes(correlations=CORRELATIONS) if correlated else result
 
 
 def _compare_with_start(given: Network, result: Adjustment) -> tuple[str, ...]:

@@ -20,6 +20,7 @@ from jaxbundle import plotting, report
 from jaxbundle.adjustment import result_tables
 from jaxbundle.adjustment.problem import Counts, NetworkProblem, coordinates
 from jaxbundle.adjustment.quality.check_points import CheckPoints, intersect_check_points
+from jaxbundle.adjustment.quality.correlated_errors import CorrelationSettings, correlated_errors
 from jaxbundle.adjustment.quality.distortion_reach import (
     Reach,
     distortion_reach,
@@ -28,6 +29,13 @@ from jaxbundle.adjustment.quality.distortion_reach import (
 from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.adjustment.quality.misfit import doubt_of_fit, doubt_of_unit
 from jaxbundle.adjustment.quality.points_at_any_distance import FarPoints, find_far_points
+from jaxbundle.adjustment.quality.replication import (
+    MIN_IMAGES,
+    Difference,
+    Replication,
+    compare_halves,
+    random_halves,
+)
 from jaxbundle.adjustment.quality.variance_components import groups
 from jaxbundle.adjustment.quality.weakness import Weakness, weakness
 from jaxbundle.adjustment.storage import network_fingerprint, store
@@ -98,6 +106,9 @@ class Adjustment:
       `robust_scale`: of the residuals, a posteriori (MAD), in a priori σ; `suspects`: image points
       whose residuals exceed the critical value.
     - `doubts`: the warnings about a priori σ, σ0 and blunders
+    - `error_model`: of errors that image points share, if it was requested (`correlations`, its
+      settings) and the network can show any, else None; `replication`: two halves of the network
+      compared, if requested (`halves_by`), else None
     - `fingerprint`: of the adjusted network; `save` writes the result into a file
     """
 
@@ -123,7 +134,8 @@ class Adjustment:
         doubts: tuple[str, ...] = (),
         weakness: Weakness | None = None,
         findings: tuple[str, ...] = (),
-        error_model: ErrorModel | None = None,
+        correlations: CorrelationSettings | None = None,
+        halves_by: str = "",
     ):
         self.network = network
         self.problem = problem
@@ -142,7 +154,8 @@ class Adjustment:
         self.suspects = suspects
         self.given_doubts = doubts
         self.findings = findings
-        self.error_model = error_model
+        self.correlations = correlations
+        self.halves_by = halves_by
         self._weakness = weakness
         self._inspection = inspection
         self.check = check
@@ -154,10 +167,12 @@ class Adjustment:
         *,
         sigma_factors: Mapping[str, float] | None = None,
         findings: tuple[str, ...] | None = None,
-        error_model: ErrorModel | None = None,
+        correlations: CorrelationSettings | None = None,
+        halves_by: str | None = None,
     ) -> "Adjustment":
-        """The same result with other factors of σ, other findings, or a model of correlated errors;
-        what follows from none of them is not computed again."""
+        """The same result with other factors of σ or findings, or with errors that image points
+        share (`correlations`) and halves by photographs, points or runs; what follows from none of
+        them is not computed again."""
         changed = copy.copy(self)
         for name in ("verdict", "doubts", "variance_components", "check_points", "fingerprint"):
             changed.__dict__.pop(name, None)
@@ -165,10 +180,13 @@ class Adjustment:
             changed.sigma_factors = dict(sigma_factors)
         if findings is not None:
             changed.findings = findings
-        if error_model is not None:
-            changed.error_model = error_model
-            for name in ("cameras", "images", "points"):
+        if correlations is not None:
+            changed.correlations = correlations
+            for name in ("cameras", "images", "points", "_modelled", "replication"):
                 changed.__dict__.pop(name, None)
+        if halves_by is not None:
+            changed.halves_by = halves_by
+            changed.__dict__.pop("replication", None)
         return changed
 
     @property
@@ -412,6 +430,63 @@ class Adjustment:
         Q = Q * free[:, :, None] * free[:, None, :]
         return self.sigma0**2 * A @ Q @ A.transpose(0, 2, 1)
 
+    # --- correlated errors ------------------------------------------------------------------
+
+    @functools.cached_property
+    def _modelled(self) -> tuple[ErrorModel | None, str]:
+        """The error model; why there is none although it was requested."""
+        if self.correlations is None or not self.converged:
+            return None, ""
+        why = f"no camera has {self.correlations.min_images} photographs, and no point two rays"
+        try:
+            found = self.cofactors.solution
+            return correlated_errors(found, self.problem, self.correlations), why
+        except NotSolvedError as error:
+            return None, str(error)
+
+    def keep(self, model: ErrorModel | None, halves: Replication | None) -> None:
+        """Take over an error model and halves that were computed before (`load_adjustment`);
+        None: they are computed when they are needed."""
+        if model is not None:
+            self.__dict__["_modelled"] = model, ""
+        if halves is not None:
+            self.__dict__["replication"] = halves
+
+    @property
+    def error_model(self) -> ErrorModel | None:
+        """Errors that image points share; None if they were not requested, or cannot be found."""
+        return self._modelled[0]
+
+    @property
+    def why_no_error_model(self) -> str:
+        """Why a requested error model cannot be found; empty if it was."""
+        model, why = self._modelled
+        return why if model is None else ""
+
+    @functools.cached_property
+    def replication(self) -> Replication | None:
+        """One split of the network into halves, adjusted and compared; None if not requested."""
+        if not self.halves_by or not self.converged:
+            return None
+        try:
+            if len(self.problem.network.images) < 2 * MIN_IMAGES and self.halves_by != "points":
+                raise NotSolvedError(f"they need {2 * MIN_IMAGES} photographs")
+            second = next(random_halves(self.problem.network, self.halves_by, 1, 0))
+            split = self.compare_halves(second)
+        except NotSolvedError as error:
+            return Replication(self.halves_by, (), (str(error),), self.error_model)
+        return Replication(self.halves_by, (split,), (), self.error_model)
+
+    def compare_halves(self, second: Bool[np.ndarray, " rays"]) -> Difference:
+        """The interior orientations of two halves of the network, each adjusted alone; `second`:
+        the image points of the second one.
+
+        **Raises:** `NotSolvedError` if a half has too few photographs, or no solution."""
+        # The program of the iterations depends on the length of their history.
+        steps = max(len(np.asarray(self.minimum.history.cost)) - 1, 100)
+        found = self.cofactors.solution
+        return compare_halves(found, self.problem, second, self.error_model, steps)
+
     @property
     def correlated_image_covariance(self) -> Float[np.ndarray, "images 6 6"] | None:
         """`image_covariance` under the error model; None without one."""
@@ -430,6 +505,12 @@ class Adjustment:
         C = self.error_model.covariance("point")
         C = self.problem.cofactors_of_coordinates(self.values["point"], C)
         return self._where_known(np.asarray(C))
+
+    def modelled_camera_covariance(self, camera: str) -> tuple[list[str], Float[np.ndarray, "n n"]]:
+        """`camera_covariance` under the error model, or the classical one without."""
+        names, C = self.camera_covariance(camera)
+        modelled = self.correlated_camera_covariance(camera)
+        return names, C if modelled is None else modelled
 
     def correlated_camera_covariance(self, camera: str) -> Float[np.ndarray, "n n"] | None:
         """`camera_covariance` under the error model, of the same parameters; None without one."""
@@ -536,6 +617,15 @@ class Adjustment:
         """Covariance of any differentiable function of the adjusted unknowns (`Values` → [n])."""
         self._require_solved()
         return self.sigma0**2 * self.inspection.propagate(function)
+
+    def modelled_covariance_of(
+        self, function: Callable[[Values], jax.Array]
+    ) -> Float[np.ndarray, "n n"]:
+        """`covariance_of` under the error model, or the classical one without."""
+        if self.error_model is None:
+            return self.covariance_of(function)
+        slopes = self.cofactors.solution.slopes(function)
+        return self.error_model.propagate_rows({t: np.asarray(x) for t, x in slopes.items()})
 
     # --- tables -----------------------------------------------------------------------------
 

@@ -60,7 +60,7 @@ def cameras(adjustment: "Adjustment") -> dict[str, dict]:
             "free": free,
             "tied": [list(group) for group in given.tie],
             "correlations": correlation_matrix(Q),
-        }
+        } | ({} if C is None else {"correlations_correlated": correlation_matrix(C)})
     return tables
 
 

@@ -54,9 +54,7 @@ def program():
 
         return jax.jvp(scalar, (data,), (u,))
 
-    return problem, lambda data, u: map(
-        float, derivative(solved(problem, data).values, data, u)
-    )
+    return problem, lambda data, u: map(float, derivative(solved(problem, data).values, data, u))
 
 
 SETS = ("image", "control", "exterior", "interior", "distance")

@@ -25,6 +25,10 @@ if TYPE_CHECKING:
     from jaxbundle.report.verdict import Verdict
 
 
+CORRELATIONS = ("correlations", "correlations_correlated")
+"""Of the parameters of a camera: classical, and under correlated errors where these are known."""
+
+
 def result_dict(adjustment: "Adjustment", brief: bool = False) -> dict:
     """The result as plain dicts and numbers; `brief` leaves points and residuals out."""
     counts = adjustment.counts
@@ -82,6 +86,8 @@ def result_dict(adjustment: "Adjustment", brief: bool = False) -> dict:
     if adjustment.error_model is not None:
         head |= {"error_components": [size._asdict() for size in adjustment.error_model.sizes]}
         head |= {"sigma_ratio": adjustment.sigma_ratio}
+    if adjustment.replication is not None:
+        head |= {"replication": adjustment.replication.brief()}
     if brief:
         return head
     return head | {
@@ -155,8 +161,8 @@ def verdict_dict(verdict: "Verdict") -> dict:
 
 
 def _camera(table: dict, given: "Camera") -> dict:
-    free, C = table["free"], table["correlations"]
-    correlations = {
+    free = table["free"]
+    by_name = lambda C: {
         a: {b: float(C[i, j]) for j, b in enumerate(free) if j != i} for i, a in enumerate(free)
     }
     return {
@@ -164,7 +170,7 @@ def _camera(table: dict, given: "Camera") -> dict:
         "image_size": given.image_size and list(given.image_size),
         "pixel_size": given.pixel_size and list(given.pixel_size),
         "parameters": table["parameters"],
-        "correlations": correlations,
+        **{name: by_name(table[name]) for name in CORRELATIONS if name in table},
     }
 
 

@@ -125,7 +125,10 @@ class ErrorModel:
         self, rows: Mapping[str, Float[np.ndarray, "n rows width"]]
     ) -> Float[np.ndarray, "n n"]:
         """The covariance of linear functions of the changes of tables (`Solution.slopes`)."""
-        D = effects(self.found, rows)
+        return self.of_effects(effects(self.found, rows))
+
+    def of_effects(self, D: Float[np.ndarray, "n rows"]) -> Float[np.ndarray, "n n"]:
+        """The covariance D·Σ·Dᵀ of linear functions D of the errors, in units of their σ."""
         C = self.theta[0] * D @ D.T
         for theta, component in zip(self.theta[1:], self.components):
             if theta > 0:
@@ -251,44 +254,45 @@ def remove_fit(
 ) -> tuple[Float[np.ndarray, "k rows"], dict[str, Float[np.ndarray, "k rows width"]]]:
     """What errors of the observations (units of their σ) leave in the residuals, M·e, and how they
     change the tables, N⁻¹Aᵀe in the datum of the problem."""
-    k = len(errors)
-    wide = np.zeros((-(-k // AT_ONCE) * AT_ONCE, errors.shape[1]))
-    wide[:k] = errors
-    remaining, changes = [], []
-    for first in range(0, len(wide), AT_ONCE):
-        given = _unstack(found, wide[first : first + AT_ONCE])
-        left, changed = _remove_fit(*found.arguments, found.factor, given)
-        remaining.append(_stack(found, left))
-        changes.append(
-            {t.name: np.asarray(changed[t.name])[:, : t.rows] for t in found.problem.tables}
-        )
-    tables = {name: np.concatenate([x[name] for x in changes])[:k] for name in changes[0]}
-    return np.concatenate(remaining)[:k], tables
+    return _solve_columns(found, len(errors), errors, {})
 
 
 def effects(
     found: Solution, rows: Mapping[str, Float[np.ndarray, "f rows width"]]
 ) -> Float[np.ndarray, "f rows"]:
-    """The change of linear functions of the changes of tables by one σ of every observation."""
+    """The change of linear functions of the changes of tables by one σ of every observation,
+    D = R·N⁻¹Aᵀ, of the rows R of the functions."""
     number = len(next(iter(rows.values())))
-    size = found.problem.sizes
-    wide = {
-        t: np.pad(
-            np.asarray(x),
-            ((0, -number % AT_ONCE), (0, size["table", t] - x.shape[1]), (0, 0)),
-        )
-        for t, x in rows.items()
-    }
-    parts = [
-        _stack(
-            found,
-            _effects(
-                *found.arguments, found.factor, {t: x[k : k + AT_ONCE] for t, x in wide.items()}
-            ),
-        )
-        for k in range(0, number, AT_ONCE)
-    ]
-    return np.concatenate(parts)[:number]
+    size = sum(np.asarray(found.residuals[o.name]).size for o in found.problem.observations)
+    # without errors the residuals are −A·N⁻¹Rᵀ
+    return -_solve_columns(found, number, np.zeros((0, size)), rows)[0]
+
+
+def _solve_columns(
+    found: Solution,
+    number: int,
+    errors: Float[np.ndarray, "k rows"],
+    rows: Mapping[str, Float[np.ndarray, "f rows width"]],
+) -> tuple[Float[np.ndarray, "n rows"], dict[str, Float[np.ndarray, "n rows width"]]]:
+    """x = N⁻¹(Aᵀe + Rᵀ) by table and e − A·x, of a number of errors or of rows of functions."""
+    remaining, changes = [], []
+    tables = [(t.name, t.rows, found.problem.sizes["table", t.name]) for t in found.problem.tables]
+    none = {t.name: np.zeros((0, t.rows, t.space.width)) for t in found.problem.tables}
+    for first in range(0, number, AT_ONCE):
+        # the last call is filled up, and tables to the sizes of the plan
+        some = lambda x, first=first: _fill(np.asarray(x)[first : first + AT_ONCE], AT_ONCE)
+        given = {t: _fill(some(rows.get(t, none[t])), size, 1) for t, _, size in tables}
+        left, changed = _solve(*found.arguments, found.factor, _unstack(found, some(errors)), given)
+        remaining.append(_stack(found, left))
+        changes.append({t: np.asarray(changed[t])[:, :length] for t, length, _ in tables})
+    by_table = {t: np.concatenate([x[t] for x in changes])[:number] for t, *_ in tables}
+    return np.concatenate(remaining)[:number], by_table
+
+
+def _fill(x: np.ndarray, length: int, axis: int = 0) -> np.ndarray:
+    """The array with zeros behind it, up to a length of an axis."""
+    room = [(0, length - n if k == axis else 0) for k, n in enumerate(x.shape)]
+    return np.pad(x, room)
 
 
 def _unstack(
@@ -311,42 +315,27 @@ def _stack(found: Solution, by_set: Mapping[str, Array]) -> Float[np.ndarray, "k
 
 
 @compile_once
-def _remove_fit(
+def _solve(
     declared: Declared,
     plan: Plan,
     values: Values,
     data: Data,
     factor: NormalFactor,
     errors: dict[str, Float[Array, "k n r"]],
+    rows: dict[str, Float[Array, "k rows width"]],
 ) -> tuple[dict[str, Float[Array, "k n r"]], dict[str, Float[Array, "k rows width"]]]:
+    """`_solve_columns` of some columns: one program for errors and for functions."""
     forward, backward = _jacobian(declared, plan, values, data, factor)
 
-    def remove_one(e: dict[str, Float[Array, "n r"]]) -> tuple[Any, Any]:
+    def solve_one(given: Any) -> tuple[Any, Any]:
+        e, row = given
         (right,) = backward(e)
-        x = s_transform(declared, plan, values, solve(factor, right))
+        of_row = s_transform_transposed(declared, plan, values, of_groups(plan, row))
+        x = solve(factor, jax.tree.map(jnp.add, right, of_row))
         left = jax.tree.map(jnp.subtract, e, forward(x))
-        return left, _to_tables(declared, plan, values, x)
+        return left, _to_tables(declared, plan, values, s_transform(declared, plan, values, x))
 
-    return jax.lax.map(remove_one, errors)
-
-
-@compile_once
-def _effects(
-    declared: Declared,
-    plan: Plan,
-    values: Values,
-    data: Data,
-    factor: NormalFactor,
-    rows: dict[str, Float[Array, "f rows width"]],
-) -> dict[str, Float[Array, "f n r"]]:
-    forward, _ = _jacobian(declared, plan, values, data, factor)
-
-    def effect_of_one(row: dict[str, Float[Array, "rows width"]]) -> dict[str, Float[Array, "n r"]]:
-        given = zeros_of_tables(declared, values) | row
-        right = s_transform_transposed(declared, plan, values, of_groups(plan, given))
-        return forward(solve(factor, right))
-
-    return jax.lax.map(effect_of_one, rows)
+    return jax.lax.map(solve_one, (errors, rows))
 
 
 def _jacobian(
