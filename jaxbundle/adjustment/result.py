@@ -20,6 +20,7 @@ from jaxbundle import plotting, report
 from jaxbundle.adjustment import result_tables
 from jaxbundle.adjustment.problem import Counts, NetworkProblem, coordinates
 from jaxbundle.adjustment.quality.check_points import CheckPoints, intersect_check_points
+from jaxbundle.adjustment.quality.correlated_errors import DEFAULTS as CORRELATIONS
 from jaxbundle.adjustment.quality.correlated_errors import CorrelationSettings, correlated_errors
 from jaxbundle.adjustment.quality.distortion_reach import (
     Reach,
@@ -30,7 +31,6 @@ from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.adjustment.quality.misfit import doubt_of_fit, doubt_of_unit
 from jaxbundle.adjustment.quality.points_at_any_distance import FarPoints, find_far_points
 from jaxbundle.adjustment.quality.replication import (
-    MIN_IMAGES,
     Difference,
     Replication,
     compare_halves,
@@ -80,6 +80,10 @@ from jaxbundle.types import AnyArray, present
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from mpl_toolkits.mplot3d import Axes3D
+
+
+MAX_SPLITS = 3
+"""Random halves that are tried for the replication of a result."""
 
 
 @print_anywhere
@@ -188,6 +192,16 @@ class Adjustment:
             changed.halves_by = halves_by
             changed.__dict__.pop("replication", None)
         return changed
+
+    def with_correlated_errors(
+        self, halves_by: str = "photographs", settings: CorrelationSettings = CORRELATIONS
+    ) -> "Adjustment":
+        """The same result with an error model and one split into halves, as `reconstruct` and
+        `calibrate` state them; unchanged without a result, and with fewer photographs than
+        `settings.min_images`. Both are computed when they are needed."""
+        if not self.converged or len(self.problem.network.images) < settings.min_images:
+            return self
+        return self.with_changes(correlations=settings, halves_by=halves_by)
 
     @property
     def converged(self) -> bool:
@@ -468,14 +482,16 @@ class Adjustment:
         """One split of the network into halves, adjusted and compared; None if not requested."""
         if not self.halves_by or not self.converged:
             return None
-        try:
-            if len(self.problem.network.images) < 2 * MIN_IMAGES and self.halves_by != "points":
-                raise NotSolvedError(f"they need {2 * MIN_IMAGES} photographs")
-            second = next(random_halves(self.problem.network, self.halves_by, 1, 0))
-            split = self.compare_halves(second)
-        except NotSolvedError as error:
-            return Replication(self.halves_by, (), (str(error),), self.error_model)
-        return Replication(self.halves_by, (split,), (), self.error_model)
+        failed = []
+        # a random half may have all rolled photographs, or none, and not determine the camera
+        for second in random_halves(self.problem.network, self.halves_by, MAX_SPLITS, 0):
+            try:
+                split = self.compare_halves(second)
+            except NotSolvedError as error:
+                failed.append(str(error))
+            else:
+                return Replication(self.halves_by, (split,), (), self.error_model)
+        return Replication(self.halves_by, (), tuple(failed[:1]), self.error_model)
 
     def compare_halves(self, second: Bool[np.ndarray, " rays"]) -> Difference:
         """The interior orientations of two halves of the network, each adjusted alone; `second`:

@@ -235,8 +235,8 @@ def compare_halves(
         raise NotSolvedError(
             f"no camera has {MIN_IMAGES} photographs with {MIN_RAYS_OF_IMAGE} image points in both"
         )
-    values, D = [], 0.0
-    for sign, keep in zip((1, -1), halves):
+    values, D = [], []
+    for keep in halves:
         scale = np.where(keep, 1.0, FAINT)[:, None]
         data = problem.with_image_weights(problem.data, problem.image_weights * scale)
         half = engine.with_data(problem, data)
@@ -249,11 +249,11 @@ def compare_halves(
         values.append(
             [float(np.asarray(minimum.values[t.name])[row, k]) for *_, (t, row, k, _) in names]
         )
-        D = D + sign * effects(alone, _unit_rows(problem, names)) * _row_scale(
-            whole, problem, scale
-        )
-    white = D @ D.T
-    correlated = None if model is None else model.of_effects(D)
+        of_half = effects(alone, _unit_rows(problem, names))
+        D.append(of_half * _row_scale(whole, problem, scale))
+    between = D[0] - D[1]
+    white = between @ between.T
+    correlated = None if model is None else model.of_effects(between)
     found = tuple((camera, name) for camera, name, _ in names)
     difference = np.subtract(*map(np.array, values))
     return Difference(found, difference, whole.sigma0**2 * white, correlated)
