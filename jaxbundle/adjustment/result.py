@@ -20,6 +20,7 @@ from jaxbundle import plotting, report
 from jaxbundle.adjustment import result_tables
 from jaxbundle.adjustment.problem import Counts, NetworkProblem, coordinates
 from jaxbundle.adjustment.quality.check_points import CheckPoints, intersect_check_points
+from jaxbundle.adjustment.quality.control_prediction import ControlPrediction, predict_control
 from jaxbundle.adjustment.quality.correlated_errors import DEFAULTS as CORRELATIONS
 from jaxbundle.adjustment.quality.correlated_errors import CorrelationSettings, correlated_errors
 from jaxbundle.adjustment.quality.distortion_reach import (
@@ -408,6 +409,15 @@ class Adjustment:
             return None
         return intersect_check_points(self.inspection, *self.check, self.sigma_factors)
 
+    @functools.cached_property
+    def control_prediction(self) -> ControlPrediction | None:
+        """Every control point with σ, and every image measurement of control, predicted from all
+        other observations; None without control with σ, or without a factor for cofactors."""
+        self._require_solved()
+        if self.problem.reduction not in FACTORS:
+            return None
+        return predict_control(self.inspection, self.sigma0)
+
     # --- unknowns ---------------------------------------------------------------------------
 
     @functools.cached_property
@@ -693,9 +703,11 @@ class Adjustment:
         return result_tables.residuals(self)
 
     def table(self, name: str) -> dict[str, np.ndarray]:
-        """A table by name: images, points, residuals, cameras (one row per parameter), checks or
-        far_points."""
+        """A table by name: images, points, residuals, cameras (one row per parameter), checks,
+        far_points, or of predicted control, control and control_measurements."""
         made = {
+            "control": result_tables.control,
+            "control_measurements": result_tables.control_measurements,
             "cameras": result_tables.parameters,
             "checks": result_tables.checks,
             "far_points": result_tables.far_points,
@@ -703,7 +715,7 @@ class Adjustment:
         if name in made:
             return made[name](self)
         if name not in ("images", "points", "residuals"):
-            known = "cameras, images, points, residuals, checks, far_points"
+            known = ", ".join(("images", "points", "residuals", *made))
             raise KeyError(f"tables are {known}; not {name!r}")
         return getattr(self, name)
 

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from jaxbundle.leastsquares.quality.distributions import level_of_one
 from jaxbundle.leastsquares.quality.global_test import contradicts
-from jaxbundle.network.columns import count
+from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import ESTIMATED
 from jaxbundle.report.correlated import has_shared_errors
 from jaxbundle.report.head import chi_squared, open_datum
@@ -181,13 +181,30 @@ def _control(adjustment: "Adjustment") -> Finding:
     largest, limit, words = _tested(adjustment, adjustment.residuals["kind"] == "control")
     if np.isnan(largest):
         return _held_control(adjustment, parts)
-    words = f"{parts}; largest |τ| {words}"
+    words = f"{parts}; largest |τ| {words}{name_contradicted(adjustment)}"
     if largest > limit:
         return Finding("Control", BAD, words, "control contradicted")
     if vague := adjustment.weakness.georeference:
         brief = vague.partition(",")[0]
         return Finding("Control", NOTED, f"{words}; {vague}", brief)
     return Finding("Control", GOOD, words)
+
+
+def name_contradicted(adjustment: "Adjustment") -> str:
+    """Control points and image measurements of control that all other observations contradict, in
+    words; empty without."""
+    found = adjustment.control_prediction
+    if found is None:
+        return ""
+    points = found.contradicted(level_of_one(LEVEL, len(found.id)))
+    rays = found.wrong_measurements(level_of_one(LEVEL, len(found.measurement)))
+    said = []
+    if points:
+        said.append(f"contradicted by all others: {list_some(points, 5, clean)}")
+    if rays:
+        names = (f"{point} in {image}" for image, point in rays)
+        said.append(f"measurements contradicted by all others: {list_some(names, 5, clean)}")
+    return "".join(f"; {words}" for words in said)
 
 
 def _free_network(adjustment: "Adjustment") -> Finding:

@@ -83,6 +83,8 @@ def result_dict(adjustment: "Adjustment", brief: bool = False) -> dict:
         ],
     }
     head |= {"check_points": _checks(adjustment)}
+    if adjustment.control_prediction is not None:
+        head |= {"control_prediction": _predicted(adjustment)}
     if adjustment.error_model is not None:
         head |= {"error_components": [size._asdict() for size in adjustment.error_model.sizes]}
         head |= {"sigma_ratio": adjustment.sigma_ratio}
@@ -245,6 +247,22 @@ def _far_points(adjustment: "Adjustment") -> dict:
 def _residuals(table: Mapping[str, np.ndarray]) -> Iterator[dict]:
     for row in table_rows(table):
         yield dict(zip(table, row))
+
+
+def _predicted(adjustment: "Adjustment") -> dict:
+    points, rays = (adjustment.table(name) for name in ("control", "control_measurements"))
+    error = lambda row, axes: (
+        {a: {"error": row[f"d{a}"], "sigma": row[f"s{a}"]} for a in axes}
+        | {"probability": row["probability"]}
+    )
+    row_dicts = lambda table: (dict(zip(table, row)) for row in table_rows(table))
+    return {
+        "points": {row["id"]: error(row, "XYZ") for row in row_dicts(points)},
+        "measurements": [
+            {"image": row["image"], "point": row["point"]} | error(row, "xy")
+            for row in row_dicts(rays)
+        ],
+    }
 
 
 def _checks(adjustment: "Adjustment") -> dict:
