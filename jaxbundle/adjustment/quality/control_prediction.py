@@ -15,7 +15,7 @@ open, such as the distance of a point of one ray, is not predicted.
 import dataclasses
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.adjustment.quality.inspection import Inspection
@@ -63,10 +63,10 @@ def predict_control(
     problem = inspection.problem
     if not any(o.name == "control" for o in problem.observations):
         return None
-    freedom = problem.counts.redundancy
-    ids, points = _predict_points(inspection, sigma0, freedom)
-    names, rays = _predict_measurements(inspection, sigma0, freedom, max_measurements)
-    return ControlPrediction(ids, *points, names, *rays)
+    ids, points = _predict_points(inspection, sigma0, problem.counts.redundancy)
+    rays = np.flatnonzero(problem.network.points.has_role("control", "fixed")[problem.point])
+    rays = rays if len(rays) <= max_measurements else rays[:0]
+    return ControlPrediction(ids, *points, *predict_measurements(inspection, sigma0, rays))
 
 
 Prediction = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -86,14 +86,13 @@ def _predict_points(
     return tuple(ids[row] for row in rows), _collect(found, 3)
 
 
-def _predict_measurements(
-    inspection: Inspection, sigma0: float, freedom: int, most: int
-) -> tuple[tuple[tuple[str, str], ...], Prediction]:
-    problem = inspection.problem
-    known = problem.network.points.has_role("control", "fixed")
-    rays = np.flatnonzero(known[problem.point] & problem.used)
-    if len(rays) > most:
-        rays = rays[:0]
+def predict_measurements(
+    inspection: Inspection, sigma0: float, rays: Int[np.ndarray, " n"]
+) -> tuple[tuple[tuple[str, str], ...], np.ndarray, np.ndarray, np.ndarray]:
+    """(photograph, point) of image points, by row of the network, that take part; the error of
+    their prediction from all other observations [n, 2], its σ [n, 2] and probability [n]."""
+    problem, freedom = inspection.problem, inspection.problem.counts.redundancy
+    rays = rays[problem.used[rays]]
     tested, weight = inspection.reliability, problem.image_weights
     v, h, joint = (
         np.asarray(problem.image_points(x)) for x in (tested.residual, tested.hat, tested.joint)
@@ -102,7 +101,7 @@ def _predict_measurements(
     for k in rays.tolist():
         H = np.diag(h[k]) + joint[k] * (1 - np.eye(2))
         found.append(_delete(v[k], H, weight[k], sigma0, freedom))
-    return _names(problem, rays), _collect(found, 2)
+    return (_names(problem, rays), *_collect(found, 2))
 
 
 def _names(problem: NetworkProblem, rays: np.ndarray) -> tuple[tuple[str, str], ...]:
