@@ -40,12 +40,20 @@ from jaxbundle.leastsquares.datum.conditions import (
     zeros_of_tables,
 )
 from jaxbundle.leastsquares.equations.elimination import NormalFactor, solve
+from jaxbundle.leastsquares.equations.linearise import differentiate
 from jaxbundle.leastsquares.equations.normal import Tangent, zero_tangent
 from jaxbundle.leastsquares.indexing.plan import Plan
-from jaxbundle.leastsquares.indexing.rows import Data, Declared, Values, restore_order
-from jaxbundle.leastsquares.quality.derivatives import LinearisedSolution
+from jaxbundle.leastsquares.indexing.rows import (
+    Data,
+    Declared,
+    Values,
+    lay_out_data,
+    prepare,
+    restore_order,
+)
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.system.programs import compile_once
+from jaxbundle.types import present
 
 AT_ONCE = 16
 """Columns a call: half and double take the same time a column, and the last call is filled up."""
@@ -325,7 +333,7 @@ def _solve(
     rows: dict[str, Float[Array, "k rows width"]],
 ) -> tuple[dict[str, Float[Array, "k n r"]], dict[str, Float[Array, "k rows width"]]]:
     """`_solve_columns` of some columns: one program for errors and for functions."""
-    forward, backward = _jacobian(declared, plan, values, data, factor)
+    forward, backward = _jacobian(declared, plan, values, data)
 
     def solve_one(given: Any) -> tuple[Any, Any]:
         e, row = given
@@ -338,14 +346,27 @@ def _solve(
     return jax.lax.map(solve_one, (errors, rows))
 
 
-def _jacobian(
-    declared: Declared, plan: Plan, values: Values, data: Data, factor: NormalFactor
-) -> tuple[Any, Any]:
-    """A and Aᵀ, from changes of the groups to residuals by set in the given order."""
-    at, still = LinearisedSolution(declared, plan, values, data, factor, {}), zero_tangent(plan)
-    rows = lambda change: restore_order(plan, at.residuals(change, data))
-    _, forward = jax.linearize(rows, still)
-    return forward, jax.linear_transpose(forward, still)
+def _jacobian(declared: Declared, plan: Plan, values: Values, data: Data) -> tuple[Any, Any]:
+    """A and Aᵀ, from changes of the groups to residuals by set in the given order, as products with
+    the blocks of A: a tenth of the time of the derivative of the residuals along a change."""
+    laid, prepared = lay_out_data(plan, data), prepare(declared, values)
+    numbers = range(len(plan.parts))
+    blocks = [differentiate(declared, plan, k, prepared, laid) for k in numbers]
+
+    def forward(change: Tangent) -> dict[str, Float[Array, "n r"]]:
+        found = []
+        for part, (r, touches, E) in zip(plan.parts, blocks):
+            rows = jnp.zeros_like(r)
+            for touch, J in zip(part.touches, touches):
+                x = change[touch.group][touch.row, touch.start : touch.stop]
+                rows = rows + (J * x[:, None, None, :]).sum(-1)
+            if E is not None:
+                x = change[present(plan.eliminated)][part.eliminated]
+                rows = rows + (E * x[:, :, None, :]).sum(-1)
+            found.append(rows)
+        return restore_order(plan, found)
+
+    return forward, jax.linear_transpose(forward, zero_tangent(plan))
 
 
 def _to_tables(
