@@ -508,10 +508,7 @@ class Adjustment:
         the image points of the second one.
 
         **Raises:** `NotSolvedError` if a half has too few photographs, or no solution."""
-        # The program of the iterations depends on the length of their history.
-        steps = max(len(np.asarray(self.minimum.history.cost)) - 1, 100)
-        found = self.cofactors.solution
-        return compare_halves(found, self.problem, second, self.error_model, steps)
+        return compare_halves(self.cofactors.solution, self.problem, second, self.error_model)
 
     @property
     def correlated_image_covariance(self) -> Float[np.ndarray, "images 6 6"] | None:

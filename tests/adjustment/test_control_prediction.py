@@ -8,6 +8,7 @@ import pytest
 
 import jaxbundle
 from jaxbundle.leastsquares import problem as engine
+from jaxbundle.leastsquares.quality.error_components import first_rows
 from jaxbundle.leastsquares.solution import Solution, find_minimum
 from jaxbundle.report.page import compose
 
@@ -107,6 +108,27 @@ def test_a_wrong_point_and_a_wrong_measurement_are_named(network):
     assert abs(entry["x"]["error"]) > 0.02
     title = "Control predicted from all other observations"
     assert title in found.report() and title in "".join(compose(found))
+
+
+def test_control_keeps_its_sigma_under_errors_of_image_points(network, tmp_path):
+    """Errors along tracks and independent ones share the variance of image points; control has σ0
+    times its own, whatever they are."""
+    result = jaxbundle.adjust(network, correlated=True)
+    model, found = result.error_model, result.cofactors.solution
+    start = first_rows(found)["control"]
+    D = np.zeros((3 * CONTROL, sum(v.size for v in found.residuals.values())))
+    D[:, start : start + 3 * CONTROL] = np.eye(3 * CONTROL)
+    np.testing.assert_allclose(
+        model.of_effects(D), result.sigma0**2 * np.eye(3 * CONTROL), atol=1e-12
+    )
+    assert [size.name for size in model.sizes] == ["independent errors", "along tracks"]
+    # the blocks of unknowns are those of the same Σ
+    rows = {"point": np.zeros((3, len(network.points), 3))}
+    rows["point"][:, 0] = np.eye(3)
+    np.testing.assert_allclose(model.propagate_rows(rows), model.covariance("point")[0], rtol=0.3)
+    result.save(tmp_path / "a.npz")
+    again = jaxbundle.load_adjustment(tmp_path / "a.npz")
+    np.testing.assert_allclose(again.error_model.of_effects(D), model.of_effects(D), rtol=1e-12)
 
 
 def test_good_control_is_not_called_wrong(network):

@@ -11,7 +11,14 @@ errors d² shows how much too small classical σ are, with that of the error mod
 A half is the problem of the whole network, in which the image points of the other half keep σ that
 are 10 000 times larger: what only they determine stays determined, so that the plan and all
 compiled programs are those of the whole network, and they add 1e-8 of their information to the
-half. The iterations begin at the solution of the whole.
+half. Its adjustment is one Gauss-Newton step from the solution of the whole, with the residuals v
+there,
+
+    x₁ = x̂ − D₁·v
+
+A half moves by a few σ, over which the observations are nearly linear: iterated, halves of six
+photographs end within 0.05 σ of it. And it has an answer where iterations have none, as in halves of a block that
+fall into parts.
 """
 
 import dataclasses
@@ -25,11 +32,10 @@ from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.leastsquares import problem as engine
-from jaxbundle.leastsquares.iterations.stopping import TERMINATIONS, converged
 from jaxbundle.leastsquares.quality.correlation import squared_difference
 from jaxbundle.leastsquares.quality.distributions import chi2_tail
-from jaxbundle.leastsquares.quality.error_components import ErrorModel, effects
-from jaxbundle.leastsquares.solution import Solution, find_minimum
+from jaxbundle.leastsquares.quality.error_components import ErrorModel, effects, stack_rows
+from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.network.columns import count
 from jaxbundle.network.tables import Network
 from jaxbundle.report.correlated import DIFFERENCE_HEADER, REPLICATION_LEGEND, difference_rows
@@ -219,15 +225,13 @@ def compare_halves(
     problem: NetworkProblem,
     second: Bool[np.ndarray, " rays"],
     model: ErrorModel | None,
-    max_steps: int = 100,
 ) -> Difference:
-    """The interior orientations of two halves of a solved network, which are adjusted from its
-    solution.
+    """The interior orientations of two halves of a solved network, each adjusted alone.
 
     **Arguments:** `second`: the image points of the second half; `model`: of the errors of the
-    whole network; `max_steps` of the iterations.
+    whole network.
 
-    **Raises:** `NotSolvedError` if a half has too few photographs, or no solution.
+    **Raises:** `NotSolvedError` if a half has too few photographs, or is not determined.
     """
     halves = [problem.used & ~second, problem.used & second]
     names = compared_parameters(problem, halves)
@@ -235,35 +239,29 @@ def compare_halves(
         raise NotSolvedError(
             f"no camera has {MIN_IMAGES} photographs with {MIN_RAYS_OF_IMAGE} image points in both"
         )
-    values, D = [], []
+    D = []
     for keep in halves:
         scale = np.where(keep, 1.0, FAINT)[:, None]
         data = problem.with_image_weights(problem.data, problem.image_weights * scale)
         half = engine.with_data(problem, data)
-        minimum = find_minimum(half, whole.values, max_steps=max_steps)
-        alone = Solution(half, minimum.values)
-        if not bool(converged(int(minimum.termination))):
-            raise NotSolvedError(f"a half: {TERMINATIONS[int(minimum.termination)]}")
+        alone = Solution(half, whole.values)
         if not alone.determined:
             raise NotSolvedError("a half does not determine its unknowns")
-        values.append(
-            [float(np.asarray(minimum.values[t.name])[row, k]) for *_, (t, row, k, _) in names]
-        )
         of_half = effects(alone, _unit_rows(problem, names))
         D.append(of_half * _row_scale(whole, problem, scale))
     between = D[0] - D[1]
     white = between @ between.T
     correlated = None if model is None else model.of_effects(between)
     found = tuple((camera, name) for camera, name, _ in names)
-    difference = np.subtract(*map(np.array, values))
+    difference = -between @ stack_rows(whole, whole.residuals)
     return Difference(found, difference, whole.sigma0**2 * white, correlated)
 
 
 def compared_parameters(
     problem: NetworkProblem, halves: list[Bool[np.ndarray, " rays"]]
-) -> list[tuple[str, str, tuple[Any, int, int, int]]]:
+) -> list[tuple[str, str, tuple[Any, int, int]]]:
     """Camera and name of the free parameters of the cameras that are in both halves; their table,
-    row, column there, and column among the unknowns of the row."""
+    row, and column among the unknowns of the row."""
     found = []
     for c, camera in enumerate(problem.network.cameras):
         rays = [
@@ -274,19 +272,16 @@ def compared_parameters(
             continue
         table, row = problem.table_of_camera(c)
         parameters, free = problem.free_parameters(c)
-        found += [
-            (camera.id, parameters[k], (table, row, table.parameters.index(parameters[k]), int(k)))
-            for k in free
-        ]
+        found += [(camera.id, parameters[k], (table, row, int(k))) for k in free]
     return found
 
 
 def _unit_rows(
-    problem: NetworkProblem, names: list[tuple[str, str, tuple[Any, int, int, int]]]
+    problem: NetworkProblem, names: list[tuple[str, str, tuple[Any, int, int]]]
 ) -> dict[str, Float[np.ndarray, "n rows width"]]:
     """One for the parameter of each name, by table."""
     rows: dict[str, np.ndarray] = {}
-    for n, (*_, (of_camera, row, _, k)) in enumerate(names):
+    for n, (*_, (of_camera, row, k)) in enumerate(names):
         given = problem.table(of_camera.name)
         rows.setdefault(of_camera.name, np.zeros((len(names), given.rows, given.space.width)))
         rows[of_camera.name][n, row, k] = 1.0

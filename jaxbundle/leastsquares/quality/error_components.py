@@ -16,7 +16,8 @@ expectations (MINQUE: Rao 1971; Koch 1999, section 3.6)
 
 Roots of many columns are replaced by random combinations of them, F·Ξ/√R with E ΞΞᵀ = R·1, on one
 side of a trace (Hutchinson 1990). V_k that fit the residuals no better than the independent part
-get the size zero.
+get the size zero. Observations that are said to have their own σ (`OTHERS`: control, priors beside
+image points) are independent errors of the size σ0, whatever that of the others is.
 
 Estimating the effects as unknowns with priors gives honest σ too, and estimates that are not nearer
 to each other in halves of real networks; so does whitening. Covariances clustered by image or point
@@ -31,7 +32,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxbundle.leastsquares.datum.conditions import (
     of_groups,
@@ -67,6 +68,11 @@ class ErrorComponent(NamedTuple):
     name: str
     unit: str
     root: Any
+
+
+OTHERS = "other observations"
+"""The name of a component whose size is not estimated: independent errors of some rows, σ0 times
+their a priori σ; its θ is added to that of all independent errors."""
 
 
 class ErrorSize(NamedTuple):
@@ -115,9 +121,11 @@ class ErrorModel:
     def sizes(self) -> tuple[ErrorSize, ...]:
         """√θ of the independent part, as a factor of the a priori σ, and of all components."""
         names = [("independent errors", "σ"), *((c.name, c.unit) for c in self.components)]
+        names = [one for one in names if one[0] != OTHERS]
         # σ of √θ: σ_θ/(2√θ); not more than the size that one σ of θ would have, as at zero
-        root, most = np.sqrt(self.theta), np.sqrt(self.theta_sigma)
-        sigma = np.minimum(self.theta_sigma, 2 * root * most) / np.where(root > 0, 2 * root, 1.0)
+        theta, spread = self.theta[: len(names)], self.theta_sigma[: len(names)]
+        root, most = np.sqrt(theta), np.sqrt(spread)
+        sigma = np.minimum(spread, 2 * root * most) / np.where(root > 0, 2 * root, 1.0)
         sigma = np.where(root > 0, sigma, most)
         return tuple(
             ErrorSize(name, unit, float(s), float(d), float(z))
@@ -127,7 +135,7 @@ class ErrorModel:
     def covariance(self, table: str) -> Float[np.ndarray, "rows width width"]:
         """The covariance blocks of all rows of a table."""
         blocks = self.theta[0] * np.asarray(self.found.cofactor(table))
-        return blocks + sum(t * own[table] for t, own in zip(self.theta[1:], self.own) if t > 0)
+        return blocks + sum(t * own[table] for t, own in zip(self.theta[1:], self.own) if t != 0)
 
     def propagate_rows(
         self, rows: Mapping[str, Float[np.ndarray, "n rows width"]]
@@ -139,7 +147,7 @@ class ErrorModel:
         """The covariance D·Σ·Dᵀ of linear functions D of the errors, in units of their σ."""
         C = self.theta[0] * D @ D.T
         for theta, component in zip(self.theta[1:], self.components):
-            if theta > 0:
+            if theta != 0:
                 B = np.asarray(component.root.T @ D.T)
                 C = C + theta * B.T @ B
         return C
@@ -148,7 +156,7 @@ class ErrorModel:
 def fit_error_model(
     found: Solution, components: Sequence[ErrorComponent], settings: ErrorSettings = DEFAULTS
 ) -> ErrorModel:
-    """The sizes of components from the residuals of a solution."""
+    """The sizes of components from the residuals of a solution; `OTHERS` comes last."""
     rng = np.random.default_rng(settings.seed)
     F, number = [component.root.tocsr() for component in components], len(components) + 1
     v = stack_rows(found, found.residuals)
@@ -168,9 +176,23 @@ def fit_error_model(
         T[k, 0] = T[0, k]
         own.append(blocks)
     T[1:, 1:] = (T[1:, 1:] + T[1:, 1:].T) / 2
+    given = np.zeros(len(v), bool)
+    if components and components[-1].name == OTHERS:
+        # V_0 without the given rows, whose part of the forms is known
+        given[F[-1].nonzero()[0]] = True
+        F = F[:-1]
+        part = np.eye(number)
+        part[-1, 0] = -1
+        T, q = part.T @ T @ part, part.T @ q
+        T, q = T[:-1, :-1], q[:-1] - found.sigma0**2 * T[:-1, -1]
     theta = _nonnegative(T, q)
     score = _scores(T, q)
-    sigma = np.sqrt(np.diag(_covariance_of_sizes(found, F, theta, T, settings, rng)))
+    independent = np.where(given, found.sigma0**2, theta[0])
+    covariance = _covariance_of_sizes(found, F, theta, independent, given, T, rng)
+    sigma = np.sqrt(np.diag(covariance))
+    if given.any():
+        more = found.sigma0**2 - theta[0], 0.0, 0.0
+        theta, sigma, score = (np.append(x, y) for x, y in zip((theta, sigma, score), more))
     return ErrorModel(found, tuple(components), theta, sigma, score, tuple(own))
 
 
@@ -221,17 +243,19 @@ def _covariance_of_sizes(
     found: Solution,
     F: Sequence[Any],
     theta: Float[np.ndarray, " k"],
+    independent: Float[np.ndarray, " rows"],
+    given: Bool[np.ndarray, " rows"],
     T: Float[np.ndarray, "k k"],
-    settings: ErrorSettings,
     rng: np.random.Generator,
     draws: int = AT_ONCE,
 ) -> Float[np.ndarray, "k k"]:
     """T⁻¹·cov(q)·T⁻¹ of normal errors of the fitted Σ: cov(q)_ij = 2·tr(V_i·MΣM·V_j·MΣM), by
-    residuals drawn from it."""
-    rows = F[0].shape[0] if F else len(stack_rows(found, found.residuals))
-    times = [lambda e: e, *(lambda e, f=f: np.asarray((f @ (f.T @ e.T)).T) for f in F)]
-    sigma = lambda e: sum(t * V(e) for t, V in zip(theta, times) if t > 0)
-    errors = np.sqrt(theta[0]) * rng.standard_normal((draws, rows))
+    residuals drawn from it; `independent`: variances of the rows, of which some are `given`."""
+    of_components = [lambda e, f=f: np.asarray((f @ (f.T @ e.T)).T) for f in F]
+    times = [lambda e: e * ~given, *of_components]
+    parts = list(zip(theta[1:], of_components))
+    sigma = lambda e: independent * e + sum(t * V(e) for t, V in parts if t > 0)
+    errors = np.sqrt(independent) * rng.standard_normal((draws, len(given)))
     for t, f in zip(theta[1:], F):
         if t > 0:
             errors += np.sqrt(t) * np.asarray((f @ rng.standard_normal((f.shape[1], draws))).T)
