@@ -151,7 +151,8 @@ def adjust(
       is 1; the factors are `Adjustment.sigma_factors`.
     - `correlated`: look for errors that image points share (a field on the sensor, interior
       orientations that move between photographs, errors along tracks), and state the σ under them
-      beside the classical ones (`Adjustment.error_model`). The estimates do not change.
+      beside the classical ones (`Adjustment.error_model`); of eight photographs or more, compare
+      halves of them (`Adjustment.replication`). The estimates do not change.
     - `progress(stage, done, total)`: called for every evaluation, with vᵀPv and the damping in
       the stage; up to 200 000 observations at the end of the iterations (`jaxbundle.show_progress`
       shows bars).
@@ -224,7 +225,9 @@ def adjust(
     if misfit and not also and not name_conventions(problem, minimum, found.inspection):
         if mirrored := mirror(sigma0):
             result = result.with_changes(findings=(mirrored,))
-    return result.with_changes(correlations=CORRELATIONS) if correlated else result
+    if not correlated:
+        return result
+    return result.with_changes(correlations=CORRELATIONS).with_correlated_errors()
 
 
 def _compare_with_start(given: Network, result: Adjustment) -> tuple[str, ...]:

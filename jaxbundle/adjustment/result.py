@@ -492,6 +492,10 @@ class Adjustment:
         """One split of the network into halves, adjusted and compared; None if not requested."""
         if not self.halves_by or not self.converged:
             return None
+        # of held cameras alone there is nothing to compare
+        cameras = range(len(self.problem.network.cameras))
+        if not any(len(self.problem.free_parameters(c)[1]) for c in cameras):
+            return None
         failed = []
         # a random half may have all rolled photographs, or none, and not determine the camera
         for second in random_halves(self.problem.network, self.halves_by, MAX_SPLITS, 0):
@@ -545,19 +549,30 @@ class Adjustment:
 
     @property
     def sigma_ratio(self) -> float:
-        """The median of σ under the error model over classical σ, of the interior and exterior
-        orientations; 1 without a model."""
+        """The median of σ under the error model over classical σ, of the interior orientations or
+        of the exterior ones, whichever is larger: control determines only the latter. 1 without a
+        model."""
         if self.error_model is None:
             return 1.0
-        pairs = [(self.image_covariance, present(self.correlated_image_covariance))]
-        for camera in self.problem.network.cameras:
-            other = present(self.correlated_camera_covariance(camera.id))
-            pairs.append((self.camera_covariance(camera.id)[1][None], other[None]))
-        ratios = []
-        for classical, correlated in pairs:
-            a, b = (np.diagonal(C, axis1=1, axis2=2).ravel() for C in (classical, correlated))
-            ratios.append(np.sqrt(b[a > 0] / a[a > 0]))
-        return float(np.median(np.concatenate(ratios)))
+        cameras = [camera.id for camera in self.problem.network.cameras]
+        interior = [
+            (
+                self.camera_covariance(c)[1][None],
+                present(self.correlated_camera_covariance(c))[None],
+            )
+            for c in cameras
+        ]
+        exterior = [(self.image_covariance, present(self.correlated_image_covariance))]
+        medians = []
+        for pairs in (interior, exterior):
+            variances = [
+                [np.diagonal(C, axis1=1, axis2=2).ravel() for C in classical_and_correlated]
+                for classical_and_correlated in pairs
+            ]
+            ratios = np.concatenate([np.sqrt(b[a > 0] / a[a > 0]) for a, b in variances])
+            if len(ratios):
+                medians.append(float(np.median(ratios)))
+        return max(medians, default=1.0)
 
     @functools.cached_property
     def point_values(self) -> Float[np.ndarray, "points 3"]:

@@ -67,7 +67,7 @@ def first_facts(adjustment: "Adjustment") -> list[tuple[str, str]]:
             (
                 "σ shown",
                 f"under correlated errors {significant(adjustment.sigma_ratio, 3)} times the "
-                "classical ones (median); the larger of both is shown",
+                "classical ones (median of the orientations); the larger of both is shown",
             )
         )
     return rows

@@ -17,8 +17,8 @@ there,
     x₁ = x̂ − D₁·v
 
 A half moves by a few σ, over which the observations are nearly linear: iterated, halves of six
-photographs end within 0.05 σ of it. And it has an answer where iterations have none, as in halves of a block that
-fall into parts.
+photographs end within 0.05 σ of it. And it has an answer where iterations have none, as in halves
+of a block that fall into parts.
 """
 
 import dataclasses
