@@ -25,7 +25,7 @@ from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.plotting import files, quality
 from jaxbundle.plotting.distortion import distortion_at
 from jaxbundle.plotting.style import extent, round_number
-from jaxbundle.plotting.views import Ellipses, camera_pyramids, error_ellipses
+from jaxbundle.plotting.views import Ellipses, camera_pyramids, error_ellipses, principal_sections
 
 matplotlib.use("Agg")
 
@@ -283,6 +283,19 @@ def test_error_ellipses_lean_as_the_covariance(convergent4):
     moment = np.einsum("pni,pnj->pij", away, away) / away.shape[1]
     expected = convergent4.point_covariance[:, :2, :2]
     np.testing.assert_allclose(2 * moment, expected, rtol=1e-6, atol=1e-14)
+
+
+def test_sections_of_error_ellipsoids_lie_on_them_in_planes_of_two_axes(convergent4):
+    number = len(convergent4.points["id"])
+    sections = principal_sections(convergent4, Ellipses(np.arange(number), 0, 3.0))
+    away = sections.reshape(3, number, -1, 3) - convergent4.point_values[:, None]
+    covariance = convergent4.point_covariance
+    distance = np.einsum("spci,pij,spcj->spc", away, np.linalg.inv(covariance), away)
+    np.testing.assert_allclose(distance, 9.0, rtol=1e-6)
+    for p, (_, axes) in enumerate(zip(*np.linalg.eigh(covariance))):
+        along = np.abs(away[:, p] @ axes).max(1)
+        absent = along < 1e-9 * along.max(0)
+        np.testing.assert_array_equal(absent, np.eye(3, dtype=bool)[::-1])
 
 
 def test_pyramids_are_the_corners_of_the_images(convergent4):
