@@ -308,8 +308,8 @@ def predicted_rows(
     return [
         (
             *(str(found[name][i]) for name in names),
-            *(fixed(found[f"{kind}{axis}"][i], places) for kind in "ds" for axis in axes),
-            significant(100 * found["probability"][i], 2),
+            *(fixed(float(found[f"{kind}{axis}"][i]), places) for kind in "ds" for axis in axes),
+            significant(100 * float(found["probability"][i]), 2),
         )
         for i in order
     ]
