@@ -386,6 +386,7 @@ def test_save_figures(convergent4, tmp_path, monkeypatch):
         assert content.startswith(b"\x89PNG") and b"IEND" in content[-12:]
 
 
+@pytest.mark.further
 def test_files_have_safe_names_of_their_own(convergent4, tmp_path, monkeypatch):
     network = convergent4.problem.network
     images = dataclasses.replace(network.images, id=("../a/b", "A?B", "$x_1$\n", "図"))
