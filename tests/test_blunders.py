@@ -53,7 +53,9 @@ def with_blunders(network, seed, part=0.05):
     bad = rng.random(len(rays)) < part
     size, angle = rng.uniform(5, 50, len(rays)), rng.uniform(0, 2 * np.pi, len(rays))
     shift = (bad * size * SIGMA)[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
-    return network.replace(observations=dataclasses.replace(rays, xy=rays.xy + shift)), bad, size
+    return network.replace(
+        observations=dataclasses.replace(rays, xy=rays.xy + shift)
+    ), bad, size
 
 
 def rows_of(removed, network):

@@ -171,8 +171,7 @@ def test_variance_components_are_estimated(estimated):
 def test_what_was_estimated_is_told(estimated, result):
     right, wrong = estimated
     assert set(wrong.sigma_factors) == {
-        "image coordinates",
-        *(f"control points in {axis}" for axis in "XYZ"),
+        "image coordinates", *(f"control points in {axis}" for axis in "XYZ")
     }
     for name, factor in wrong.sigma_factors.items():
         given = 500 if name == "image coordinates" else 0.5
@@ -199,7 +198,9 @@ def test_components_that_do_not_settle_are_told(simulation, monkeypatch):
     for module in ("leastsquares.quality.components", "adjustment.readjust"):
         monkeypatch.setattr(f"jaxbundle.{module}.ROUNDS", 1)
     network = simulation.network
-    observations = dataclasses.replace(network.observations, sigma=2 * network.observations.sigma)
+    observations = dataclasses.replace(
+        network.observations, sigma=2 * network.observations.sigma
+    )
     found = adjust(network.replace(observations=observations), estimate_components=True)
     assert any("did not converge in 1 rounds (" in warning for warning in found.warnings)
     assert found.sigma_factors["image coordinates"] != 1
@@ -276,7 +277,9 @@ def test_angles_come_back_on_the_branch_they_were_given(simulation, result):
     angles = images.angles.copy()
     angles[0] += [2 * np.pi, 0, 0]
     angles[1] = [angles[1, 0] + np.pi, np.pi - angles[1, 1], angles[1, 2] - np.pi]
-    other = adjust(simulation.network.replace(images=dataclasses.replace(images, angles=angles)))
+    other = adjust(
+        simulation.network.replace(images=dataclasses.replace(images, angles=angles))
+    )
     assert np.abs(other.image_values[:2, 3:] - angles[:2]).max() < 0.1
     for name in ("omega", "phi", "kappa"):
         np.testing.assert_allclose(other.images[f"s{name}"], result.images[f"s{name}"], rtol=1e-6)

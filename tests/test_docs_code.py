@@ -69,7 +69,9 @@ def views():
 def test_coming_from(views):
     """Views projected by OpenCV come back with its camera and its poses."""
     board, images, turns, shifts = views
-    page = run_page("howto/coming_from", objpoints=[board] * 5, imgpoints=images, image_size=SIZE)
+    page = run_page(
+        "howto/coming_from", objpoints=[board] * 5, imgpoints=images, image_size=SIZE
+    )
     values = dict(zip(page["found"].parameters, page["found"].values[0]))
     assert [values[n] for n in ("fx", "fy", "cx", "cy", "k1")] == pytest.approx(
         [1600, 1610, 961, 541, -0.2], rel=1e-3

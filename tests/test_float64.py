@@ -43,7 +43,9 @@ def scanner_image():
     rows = position_table(t, np.array([[0, 0, 1e3], [0, 5e3, 1e3]]), method="linear")
     level = attitude_table(t, np.zeros((2, 3)), method="linear")
     optics = AnglePolynomial(jnp.zeros(1), jnp.ones(2), jnp.ones(()), jnp.ones(()))
-    return make_image(Trajectory(rows, level), LineTimes(jnp.zeros(()), jnp.ones(())), optics, 5, 5)
+    return make_image(
+        Trajectory(rows, level), LineTimes(jnp.zeros(()), jnp.ones(())), optics, 5, 5
+    )
 
 
 ENDS_IN_COORDINATES = {
@@ -71,11 +73,9 @@ def brown(**parameters):
 
 
 NUMPY_IN_NUMPY_OUT = {
-    "compare": lambda: (
-        compare_cameras(
-            brown(), brown(c=50.1, K2=1e-9), area=((-12.0, -8.0), (12.0, 8.0))
-        ).difference
-    ),
+    "compare": lambda: compare_cameras(
+        brown(), brown(c=50.1, K2=1e-9), area=((-12.0, -8.0), (12.0, 8.0))
+    ).difference,
     "distortion_table": lambda: np.stack(list(distortion_table(*brown(), 2.0, 12.0).values())),
     "point_errors": lambda: point_errors(NETWORK)[0],
 }

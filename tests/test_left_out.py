@@ -188,7 +188,9 @@ def video(seed):
     """Six frames of a camera that moves along its axis; points '31' to '36' near the focus of
     expansion."""
     rng = np.random.default_rng(seed)
-    stations = Stations(np.outer(np.arange(6), [0, 0, -0.5]), rng.normal(0, 0.002, (6, 3)))
+    stations = Stations(
+        np.outer(np.arange(6), [0, 0, -0.5]), rng.normal(0, 0.002, (6, 3))
+    )
     points = rng.uniform([-6, -4, -20], [6, 4, -8], (30, 3))
     depth = rng.uniform(15, 60, (6, 1))
     ahead = np.hstack([rng.uniform(-0.004, 0.004, (6, 2)), -np.ones((6, 1))]) * depth

@@ -115,8 +115,8 @@ def test_the_demo_installs_what_it_needs_alone(tmp_path):
         check=True,
     ).stdout  # fmt: skip
     demo, whole = call("demo"), call("install")
-    assert ".[plots,tables]" in demo and ".[tests]" not in demo and 'echo "Installing' in demo
-    assert ".[tests]" in whole and 'echo "Installing' in whole
+    assert ".[plots,tables]" in demo and ".[tests]" not in demo and "echo \"Installing" in demo
+    assert ".[tests]" in whole and "echo \"Installing" in whole
     (tmp_path / "installed").touch()
     assert "-m pip install" not in subprocess.run(
         [make, "install-demo", f"VENV={tmp_path}"], cwd=ROOT, capture_output=True, text=True,

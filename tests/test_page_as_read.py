@@ -207,8 +207,8 @@ def test_a_page_says_which_ellipsoids_it_draws(convergent4, monkeypatch):
     scene = data_of("".join(compose(convergent4)), "network-data")
     rows = scene["ellipsoids"]["points"]
     assert 2 < len(rows) <= 6
-    assert (
-        f"of {len(rows)} of 10 points: the 2 largest and {len(rows) - 2} others" in (scene["drawn"])
+    assert f"of {len(rows)} of 10 points: the 2 largest and {len(rows) - 2} others" in (
+        scene["drawn"]
     )
     ax = convergent4.plot_plan()
     assert f"{len(rows)} of 10 points" in ax.get_title(loc="left")

@@ -179,3 +179,5 @@ def test_bars_are_as_high_as_their_counts():
     heights = np.array([float(given["height"]) for given in bars[:3]])
     assert_allclose(heights / heights[1], counted / 4, atol=2e-3)
     assert len({given["width"] for given in bars[:3]}) == 1  # the open class, too
+
+

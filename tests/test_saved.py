@@ -102,10 +102,9 @@ def test_a_damaged_file_is_refused(network, tmp_path):
     np.savez(tmp_path / "short.npz", **short)
     head = arrays["head"].tobytes().decode()
     sigma0 = json.loads(head)["Stored"]["sigma0"]
-    np.savez(
-        tmp_path / "other.npz",
-        **{**arrays, "head": np.frombuffer(head.replace(repr(sigma0), "0.5").encode(), np.uint8)},
-    )
+    np.savez(tmp_path / "other.npz", **{
+        **arrays, "head": np.frombuffer(head.replace(repr(sigma0), "0.5").encode(), np.uint8)
+    })
     for name, said in (("short", "damaged|other version"), ("other", "its σ0 is 0.5, but")):
         with pytest.raises(InputError, match=said):
             jaxbundle.load_adjustment(tmp_path / f"{name}.npz")

@@ -99,12 +99,10 @@ def test_camcal_with_blunders():
     spoilt = network.replace(observations=dataclasses.replace(rays, xy=xy))
 
     removed = {r.name for r in adjust(spoilt, snooping="pope").removed}
-    gone = np.array(
-        [
-            f"point {network.points.id[p]} in image {network.images.id[i]}" in removed
-            for i, p in zip(rays.image, rays.point)
-        ]
-    )
+    gone = np.array([
+        f"point {network.points.id[p]} in image {network.images.id[i]}" in removed
+        for i, p in zip(rays.image, rays.point)
+    ])
     clear = bad & (size > 8) & (clean.residuals["r"][: 2 * len(rays)].reshape(-1, 2).min(1) > 0.3)
     assert gone[clear].mean() >= 0.95
     assert gone[~bad].mean() <= 0.01

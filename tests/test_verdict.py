@@ -194,7 +194,6 @@ def test_handheld_control_is_an_uncertain_georeference_and_no_weak_network():
     control = finding(result, "Control")
     assert control.state == NOTED and told in control.words
     assert "georeference uncertain to" in result.verdict.words
-
     # What is said of the images holds: ratios of distances, which no datum changes.
     def ratio(values):
         X0 = values["image"].position

@@ -194,7 +194,9 @@ _angles_of = jax.jit(jax.vmap(omega_phi_kappa_from_matrix))
 
 def _measure(given, of_image, truth, image, point, rng, noise):
     xy, sigma = np.zeros((len(image), 2)), np.zeros((len(image), 2))
-    rays = np.einsum("nij,nj->ni", truth.matrix[image], truth.point[point] - truth.position[image])
+    rays = np.einsum(
+        "nij,nj->ni", truth.matrix[image], truth.point[point] - truth.position[image]
+    )
     of_ray = of_image[image]
     for name in dict.fromkeys(one.model for one in given):
         model = cameras.get_model(name)

@@ -412,8 +412,7 @@ BAD = {
     "mask of NaN": (dict(visible=np.full((2, 3, 40), np.nan)), "1 or 0"),
     "ragged mask": (dict(visible=[[1], [1, 0]]), "differ in length"),
     "views of other objects": (
-        dict(object_points=np.arange(360.0).reshape(3, 40, 3)),
-        "differ from view to view",
+        dict(object_points=np.arange(360.0).reshape(3, 40, 3)), "differ from view to view"
     ),
     "size": (dict(image_size=(0, 960)), "image_size"),
     "size in words": (dict(image_size=("a", "b")), "width and height"),

@@ -55,7 +55,9 @@ def test_points_seen_from_one_place():
     # Every point may lie anywhere on its ray.
     problem = problem_of("one centre", hold_images=True)
     centre = problem.data.start["image"].position
-    image = problem.data.start["image"]._replace(position=jnp.broadcast_to(centre[0], centre.shape))
+    image = problem.data.start["image"]._replace(
+        position=jnp.broadcast_to(centre[0], centre.shape)
+    )
     start = problem.data.start | {"image": image}
     data = dataclasses.replace(problem.data, start=start)
     assert int(solved(problem, data).termination) == SINGULAR

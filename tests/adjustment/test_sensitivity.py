@@ -54,7 +54,9 @@ def program():
 
         return jax.jvp(scalar, (data,), (u,))
 
-    return problem, lambda data, u: map(float, derivative(solved(problem, data).values, data, u))
+    return problem, lambda data, u: map(
+        float, derivative(solved(problem, data).values, data, u)
+    )
 
 
 SETS = ("image", "control", "exterior", "interior", "distance")

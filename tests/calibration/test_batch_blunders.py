@@ -125,7 +125,9 @@ def test_snooping_is_the_calibration_without_the_corner(clean, shifted, plain, s
     without = jaxbundle.calibrate_batch(BOARD, shifted, SIZE, visible=visible)
     equal(snooped, without, untouched)
     # The middle of the object is that of the points seen: other roundings.
-    np.testing.assert_allclose((snooped.values - without.values) / without.sigma, 0, atol=1e-5)
+    np.testing.assert_allclose(
+        (snooped.values - without.values) / without.sigma, 0, atol=1e-5
+    )
     np.testing.assert_allclose(snooped.sigma, without.sigma, rtol=1e-6)
     assert snooped.redundancy[BAD] == plain.redundancy[BAD] - 2 * VIEWS
 

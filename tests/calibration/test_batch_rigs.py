@@ -60,7 +60,9 @@ def test_each_rig_has_its_status_and_is_that_of_calibrate(rigs, tmp_path):
         # the network's mounting is M_ref·(X0 − X0_ref), R: in the frame of the reference
         for value, one in zip(truth[:3], list(mounting(row).values())[:3]):
             assert abs(one["value"] - value) < 4 * one["sigma"]
-    single = calibrate_cameras(pair(seed=0), rig=True, snooping=None, cross_validation=False).rig
+    single = calibrate_cameras(
+        pair(seed=0), rig=True, snooping=None, cross_validation=False
+    ).rig
     base = single.mountings["right"]
     one = list(mounting(first).values())
     assert [x["value"] for x in one[:3]] == pytest.approx(base.base, abs=1e-3 * base.sigma.min())

@@ -134,7 +134,9 @@ def test_a_bent_board_is_estimated_with_a_camera_in_millimetres():
     views = simulated(InPixels("brown-projected"), points=bent(taken.BOARD), noise=0.02)
     trusting = calibrate(views, snooping=None)
     free = ("c", "x0", "y0", "K1", "K2", "P1", "P2")
-    found = calibrate(views, model="brown-projected", pixel_size=PITCH, free=free, board_free=True)
+    found = calibrate(
+        views, model="brown-projected", pixel_size=PITCH, free=free, board_free=True
+    )
     assert found.rms < 0.4 * trusting.rms
     assert found.camera.pixel_size == (PITCH, PITCH)
     errors = normalised(found, BROWN | {"P2": 0.0})

@@ -1,5 +1,6 @@
 """`calibrate` with every camera model: truth, χ², σ; which model suffices; the spline."""
 
+
 import json
 from pathlib import Path
 
@@ -164,12 +165,8 @@ def bumpy_views():
     board, xy = Board(10, 8, 0.02), []
     middle = board.points.mean(0)[:2]
     for i in range(12):
-        M, X0 = render.pose(
-            *rng.uniform(-30, 30, 2),
-            (0, 90, 180, -90)[i % 4],
-            middle + rng.uniform(-0.06, 0.06, 2),
-            rng.uniform(0.1, 0.2),
-        )
+        M, X0 = render.pose(*rng.uniform(-30, 30, 2), (0, 90, 180, -90)[i % 4],
+                            middle + rng.uniform(-0.06, 0.06, 2), rng.uniform(0.1, 0.2))
         xy.append(images_of(BUMPY, LENS, (board.points - X0) @ M.T))
     xy = np.array(xy) + NOISE * rng.normal(size=(12, 80, 2))
     outside = ((xy < 0) | (xy > np.array(SIZE) - 1)).any(-1)

@@ -121,7 +121,9 @@ def test_the_uncertainty_map_of_a_spline_is_that_of_a_sample():
     views, model, draws = simulated(), get_model("spline-6x5-60"), 64
     exact = simulated(noise=0.0).xy
     noise = NOISE * np.random.default_rng(5).normal(size=(draws, 1, *exact.shape))
-    batch = calibrate_rigs(taken.BOARD.points, exact + noise, views.image_size, model=model.name)
+    batch = calibrate_rigs(
+        taken.BOARD.points, exact + noise, views.image_size, model=model.name
+    )
     assert (batch.status == "converged").all()
     near, poses, grid = 1 / 0.5, taken.poses(len(views)), (9, 7)
     uv = grid_of((480, 360), *grid).reshape(-1, 2)
@@ -338,13 +340,10 @@ def test_figures(calibration, tmp_path):
         "coverage": calibration.plot_coverage, "map": calibration.plot_uncertainty,
         "curve": calibration.plot_uncertainty_over_distance, "halves": calibration.plot_halves,
     }  # fmt: skip
-    written = write_figures(
-        tmp_path,
-        {
-            name: ((6, 5), None, lambda ax, name=name, draw=draw: axes.update({name: draw(ax=ax)}))
-            for name, draw in drawings.items()
-        },
-    )
+    written = write_figures(tmp_path, {
+        name: ((6, 5), None, lambda ax, name=name, draw=draw: axes.update({name: draw(ax=ax)}))
+        for name, draw in drawings.items()
+    })
     assert [path.stem for path in written] == list(drawings)
     assert axes["map"].get_ylim() == (359.5, -0.5)
     assert axes["curve"].get_xscale() == "log"

@@ -73,27 +73,15 @@ def test_second_derivatives_against_finite_differences():
 
 THESIS = Case(  # examples/convergent4, all ten parameters; its measured points lie within 12 mm
     "brown",
-    dict(
-        c=18.528014315,
-        x0=0.2834298,
-        y0=0.02675643,
-        K1=2.2723256e-4,
-        K2=2.4496753e-6,
-        K3=-3.4431701e-8,
-        P1=3.5647508e-5,
-        P2=-3.6367571e-5,
-        b1=-1.5800064e-3,
-        b2=2.7737157e-4,
-        r0=0.0,
-    ),
-    (0, 0),
-    (9, 7),
+    dict(c=18.528014315, x0=0.2834298, y0=0.02675643, K1=2.2723256e-4, K2=2.4496753e-6,
+         K3=-3.4431701e-8, P1=3.5647508e-5, P2=-3.6367571e-5, b1=-1.5800064e-3, b2=2.7737157e-4,
+         r0=0.0),
+    (0, 0), (9, 7),
 )
 FLAT_FISHEYE = Case(  # nearly flat towards 2 rad: the slowest known
     "kannala-brandt",
     dict(fx=285.0, fy=286.0, cx=420.0, cy=400.0, k1=-0.0070, k2=0.0412, k3=-0.0384, k4=0.0064),
-    (420, 400),
-    (420, 400),
+    (420, 400), (420, 400),
 )
 
 

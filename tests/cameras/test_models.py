@@ -66,7 +66,9 @@ def residuals_of(case, domain):
 
     def v(a):
         a = tuple(a)
-        return jnp.stack(cameras.residual(case.model, domain, a[:n], a[n : n + 3], a[n + 3 :]))
+        return jnp.stack(
+            cameras.residual(case.model, domain, a[:n], a[n : n + 3], a[n + 3 :])
+        )
 
     def jacobians(a):
         return jax.jacfwd(v)(a), jax.jacrev(v)(a)
@@ -80,7 +82,9 @@ def residuals_of(case, domain):
     rays = rays.at[-1].set(jnp.array([0.0, 0.0, -5.0]))  # on the optical axis
     samples = jnp.concatenate([jnp.broadcast_to(jnp.array(case.p), (len(xy), n)), rays, xy], 1)
     jit = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
-    return (samples, jit(jax.vmap(v)), jit(jax.vmap(jacobians)), jit(jax.vmap(second, (0, None))))
+    return (
+        samples, jit(jax.vmap(v)), jit(jax.vmap(jacobians)), jit(jax.vmap(second, (0, None)))
+    )
 
 
 def difference(f, samples, step):

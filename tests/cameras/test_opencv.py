@@ -31,7 +31,9 @@ def ours(case, values, points):
 
 
 def matrix(values):
-    return np.array([[values["fx"], 0, values["cx"]], [0, values["fy"], values["cy"]], [0, 0, 1]])
+    return np.array([
+        [values["fx"], 0, values["cx"]], [0, values["fy"], values["cy"]], [0, 0, 1]
+    ])
 
 
 @pytest.mark.parametrize("coefficients", [4, 5, 8, 12])
@@ -41,10 +43,7 @@ def test_opencv_equals_project_points(coefficients):
     values = {name: case.values[name] for name in used}
     points = rays(0.5)
     theirs, _ = cv2.projectPoints(
-        points * [1, -1, -1],
-        np.zeros(3),
-        np.zeros(3),
-        matrix(values),
+        points * [1, -1, -1], np.zeros(3), np.zeros(3), matrix(values),
         np.array([values[name] for name in used[4:]]),
     )
     assert_allclose(ours(case, values, points), theirs[:, 0], atol=1e-10)
@@ -54,10 +53,7 @@ def test_kannala_brandt_equals_fisheye_project_points():
     case = CASE["kannala-brandt"]
     points = rays(1.5)
     theirs, _ = cv2.fisheye.projectPoints(
-        (points * [1, -1, -1])[:, None],
-        np.zeros(3),
-        np.zeros(3),
-        matrix(case.values),
+        (points * [1, -1, -1])[:, None], np.zeros(3), np.zeros(3), matrix(case.values),
         np.array([case.values[f"k{i}"] for i in (1, 2, 3, 4)]),
     )
     assert_allclose(project(case, points), theirs[:, 0], atol=1e-9)

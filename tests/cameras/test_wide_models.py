@@ -104,10 +104,7 @@ def test_mei_is_opencvs_omnidir():
     flat = dict(v, xi=0.0)
     K = np.array([[v["fx"], 0, v["cx"]], [0, v["fy"], v["cy"]], [0, 0, 1]])
     theirs, _ = cv2.projectPoints(
-        np.stack([X, Y, Z], 1)[:2],
-        np.zeros(3),
-        np.zeros(3),
-        K,
+        np.stack([X, Y, Z], 1)[:2], np.zeros(3), np.zeros(3), K,
         np.array([v[n] for n in ("k1", "k2", "p1", "p2")]),
     )
     assert_allclose(images_of(get_model("mei"), flat, DIRECTIONS[1:3]), theirs[:, 0], atol=1e-10)
@@ -148,7 +145,9 @@ def test_the_spline_beside_mrcal():
 def test_a_point_sees_sixteen_knots():
     case = CASE["spline-6x5-160"]
     ray = jnp.asarray(DIRECTIONS[1])
-    image = lambda p: jnp.stack(case.model.from_ideal(tuple(p), *case.model.ideal(tuple(p), *ray)))
+    image = lambda p: jnp.stack(
+        case.model.from_ideal(tuple(p), *case.model.ideal(tuple(p), *ray))
+    )
     J = jax.jacfwd(image)(jnp.array(case.p))
     assert (np.abs(np.asarray(J[:, 4:])) > 0).sum() == 2 * 16
 

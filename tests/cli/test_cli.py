@@ -106,10 +106,7 @@ BROKEN = {
     "unknown key": ("project.toml", "sigma_image", "sigma_imge", ["sigma_imge", "sigma_image"]),
     "zero principal distance": ("project.toml", "c = 18.556", "c = 0.0", ["c"]),
     "negative sigma": (
-        "project.toml",
-        "sigma_image = 0.0007",
-        "sigma_image = -1.0",
-        ["sigma_image"],
+        "project.toml", "sigma_image = 0.0007", "sigma_image = -1.0", ["sigma_image"]
     ),
     "duplicate point": ("points.csv", "\n2,tie", "\n1,tie", ["points.csv", "'1'"]),
     "unfixed datum": ("project.toml", '"inner"', '"control"', ["datum", "rotation", "scale"]),

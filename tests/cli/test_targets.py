@@ -36,7 +36,9 @@ def test_what_cannot_be_written_is_refused(network, tmp_path, json, out, said):
     (tmp_path / "file").write_text("")
     (tmp_path / "folder").mkdir()
     with pytest.raises(InputError, match=said):
-        check_targets(EXAMPLE, network, json and str(tmp_path / json), out and tmp_path / out)
+        check_targets(
+            EXAMPLE, network, json and str(tmp_path / json), out and tmp_path / out
+        )
     assert names(tmp_path) == {"file", "folder"}
 
 

@@ -303,8 +303,7 @@ def predicted_network(adjustment, values):
     return network.replace(
         cameras=(dataclasses.replace(camera, parameters=parameters),),
         images=dataclasses.replace(
-            network.images,
-            angles=angles,
+            network.images, angles=angles,
             position=np.asarray(values["image"].position) + problem.origin,
         ),
         points=dataclasses.replace(

@@ -71,7 +71,6 @@ for kind, read in scanners.READ.items():
 
 
 for suffix in ("gz", "bz2"):
-
     @reader(f"bal {suffix}", lambda f: read_network(next(f.iterdir()), format="bal"))
     def _(folder, suffix=suffix):
         write_bal(network("snavely", ("0", "1", "2"), 0), folder / f"problem.bal.{suffix}")
@@ -165,7 +164,6 @@ def _(folder):
 
 
 for board in (Board(6, 7, 0.06), Board(6, 5, 0.088 * 1.3, "aprilgrid", marker=0.088)):
-
     @reader(f"target {board.kind}", lambda f: read_target(f / "target.yaml"))
     def _(folder, board=board):
         write_target(board, folder / "target.yaml")
@@ -306,7 +304,6 @@ def _cloud(folder: Path):
 
 
 for suffix in ("csv", "ply", "las", "laz"):
-
     @reader(f"cloud {suffix}", _cloud)
     def _(folder, suffix=suffix):
         from jaxbundle.surfaces.point_files import write_cloud
@@ -324,7 +321,6 @@ def _(folder):
 
 
 for kind, suffix in ((1, "laz"), (3, "las"), (10, "laz")):
-
     @reader(f"cloud {suffix}, points of format {kind}", _cloud)
     def _(folder, kind=kind, suffix=suffix):
         import laspy
@@ -376,7 +372,6 @@ def _metadata():
 
 
 for suffix in ("jpg", "png", "tif", "bmp", "webp", "ppm", "jp2"):
-
     @reader(f"photograph {suffix}", _photograph)
     def _(folder, suffix=suffix):
         from test_xmp import DJI
@@ -404,7 +399,6 @@ def _(folder):
 
 
 for name in ("image.RPB", "image.tif"):
-
     @reader(f"rpc {name}", lambda f: scanners.read_rpc(next(f.iterdir())))
     def _(folder, name=name):
         from test_rpc_files import RPC, write_raster
@@ -548,7 +542,6 @@ def _grey(folder: Path):
 
 
 for suffix in ("tif", "png", "jpg", "jp2"):
-
     @reader(f"grey values {suffix}", _grey)
     def _(folder, suffix=suffix):
         Image.fromarray(_picture()).save(folder / f"a.{suffix}")

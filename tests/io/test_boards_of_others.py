@@ -73,10 +73,8 @@ def test_a_target_by_hand(tmp_path):
     assert read_target(path) == Board(6, 7, 0.06)
     path.write_text(CHECKERBOARD.replace("rowSpacingMeters: 0.06", "rowSpacingMeters: 0.05"))
     assert read_target(path) == Board(6, 7, 0.06, row_spacing=0.05)
-    path.write_text(
-        "target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 5\ntagSize: 0.088 #[m]\n"
-        "tagSpacing: 0.3 #ratio of space between tags to tagSize\n"
-    )
+    path.write_text("target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 5\ntagSize: 0.088 #[m]\n"
+                    "tagSpacing: 0.3 #ratio of space between tags to tagSize\n")
     grid = read_target(path)
     assert (grid.kind, grid.grid, grid.marker) == ("aprilgrid", (10, 12), 0.088)
     # the last corner of the first row: five steps and a side to the right, four and a side up

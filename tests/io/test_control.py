@@ -51,7 +51,8 @@ def test_control_replaces_that_of_any_input(tmp_path, form, frame):
     X = FRAME[frame](POINTS)
     net = read_network(input, control=table(tmp_path, X, first))
     assert net.datum == "control" and [net.points.role[k] for k in range(12)] == [
-        "control" if id in {str(k + first) for k in (0, 2, 4, 6)} else "tie" for id in net.points.id
+        "control" if id in {str(k + first) for k in (0, 2, 4, 6)} else "tie"
+        for id in net.points.id
     ]
     at = [net.points.id.index(str(k + first)) for k in range(12)]
     assert_allclose(net.points.position[at], X, rtol=1e-12, atol=1e-9)

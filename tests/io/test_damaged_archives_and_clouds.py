@@ -166,7 +166,9 @@ def test_values_that_no_point_has(tmp_path, suffix, column, value):
     elif suffix == ".ply":
         fields = "".join(f"property double {n if n in names[3:] else n.lower()}\n" for n in names)
         text = "\n".join(" ".join(map(repr, row)) for row in rows.tolist())
-        path.write_text(f"ply\nformat ascii 1.0\nelement vertex 4\n{fields}end_header\n{text}\n")
+        path.write_text(
+            f"ply\nformat ascii 1.0\nelement vertex 4\n{fields}end_header\n{text}\n"
+        )
     else:
         laspy = pytest.importorskip("laspy")
         if column in "XYZ":

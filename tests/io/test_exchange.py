@@ -68,7 +68,9 @@ def test_a_principal_point_is_no_hindrance(tmp_path, name):
     assert back.cameras[0].parameters == dict(f=900, k1=-0.1, k2=0)
     xy = network("opencv").observations.xy
     order = np.lexsort((back.observations.point, back.observations.image))
-    np.testing.assert_allclose(back.observations.xy[order], (xy - [650, 350]) * [1, -1], atol=1e-10)
+    np.testing.assert_allclose(
+        back.observations.xy[order], (xy - [650, 350]) * [1, -1], atol=1e-10
+    )
 
 
 def test_bundlers_cameras_need_an_image_size_to_become_colmaps(tmp_path):
@@ -86,9 +88,8 @@ def test_bundlers_cameras_need_an_image_size_to_become_colmaps(tmp_path):
     convert(tmp_path / "colmap", tmp_path / "q.txt")
     again = read_network(tmp_path / "q.txt")
     np.testing.assert_allclose(again.observations.xy, net.observations.xy, atol=1e-9)
-    many = dataclasses.replace(
-        done, conversions={str(k): cost for k in range(12) for cost in [done.conversions["0"]]}
-    )
+    many = dataclasses.replace(done, conversions={str(k): cost for k in range(12)
+                                                  for cost in [done.conversions["0"]]})
     assert len(str(many).splitlines()) == 11 and "and 4 more cameras" in str(many)
     assert again.cameras[2].parameters == pytest.approx(net.cameras[0].parameters)
     with pytest.raises(InputError, match="image_size"):

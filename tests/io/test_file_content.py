@@ -82,7 +82,7 @@ def test_the_line_of_what_is_beyond_bounds(parse, text, line):
 
 
 def test_long_numbers_in_quotes_and_usual_depths_are_read():
-    assert parse_toml("f", f'a = "{LONG}"\nb.c.d = [[1], [2.5]]\n')["b"]["c"]["d"] == [[1], [2.5]]
+    assert parse_toml("f", f"a = \"{LONG}\"\nb.c.d = [[1], [2.5]]\n")["b"]["c"]["d"] == [[1], [2.5]]
     assert parse_json("f", json.dumps({"a": LONG, "b": 10**300})) == {"a": LONG, "b": 10**300}
 
 

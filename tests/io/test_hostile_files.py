@@ -131,19 +131,15 @@ def made(kind: str, folder: Path) -> Path:
             write(folder)
         case "camera-stack":
             np.savez(
-                folder / "cameras.npz",
-                object_points=np.ones((4, 3)),
-                ids=np.arange(2),
-                image_points=np.ones((2, 3, 4, 2)),
-                image_size=np.array([640, 480]),
+                folder / "cameras.npz", object_points=np.ones((4, 3)), ids=np.arange(2),
+                image_points=np.ones((2, 3, 4, 2)), image_size=np.array([640, 480]),
                 visible=np.ones((2, 3, 4), bool),
             )
         case "result":
             names = ("fx", "fy", "cx")
             parameter = {"value": 900.0, "sigma": 0.5, "free": True}
             camera = {
-                "model": "opencv",
-                "parameters": dict.fromkeys(names, parameter),
+                "model": "opencv", "parameters": dict.fromkeys(names, parameter),
                 "correlations": {a: dict.fromkeys(names, 0.1) for a in names},
             }
             (folder / "result.json").write_text(
@@ -179,6 +175,7 @@ def read(kind: str, folder: Path):
             (file,) = (p for p in folder.iterdir() if p.name != "list.txt")
             settings = ["sigma_image=1"] if kind == "photo-list" else []
             return read_network(file, format=kind, overrides=settings)
+
 
 
 KINDS = ("colmap", "colmap-text", "bal", "bundler", "project", "photo-list", "opencv", "json",

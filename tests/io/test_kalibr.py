@@ -148,7 +148,7 @@ def test_a_camera_file_becomes_a_chain(tmp_path):
     (back,) = read_network(tmp_path / "my-camchain.yaml").cameras
     assert all_parameters(back) == all_parameters(net.cameras[0])
     convert(tmp_path / "my-camchain.yaml", tmp_path / "camera_info.yaml")
-    assert 'distortion_model: "equidistant"' in (tmp_path / "camera_info.yaml").read_text()
+    assert "distortion_model: \"equidistant\"" in (tmp_path / "camera_info.yaml").read_text()
 
 
 @pytest.mark.parametrize("name, values", [

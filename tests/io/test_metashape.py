@@ -301,12 +301,13 @@ def test_references_that_are_no_control(tmp_path):
 BROKEN = {
     "not XML": (lambda t: t[: len(t) // 2], "not valid XML"),
     "entities": (
-        lambda t: t.replace("<document", '<!DOCTYPE x [<!ENTITY a "b">]><document', 1),
-        "entities",
+        lambda t: t.replace("<document", '<!DOCTYPE x [<!ENTITY a "b">]><document', 1), "entities"
     ),
     "no chunk": (lambda t: "<document></document>", "one <chunk>"),
     "folded": (lambda t: t.replace("<k1>-0.1", "<k4>1</k4><k1>-9"), "turns back inside the image"),
-    "spherical": (lambda t: t.replace('"cam" type="frame"', '"cam" type="rpc"'), "type 'rpc'"),
+    "spherical": (
+        lambda t: t.replace('"cam" type="frame"', '"cam" type="rpc"'), "type 'rpc'"
+    ),
     "NaN": (lambda t: t.replace("<k2>0.02", "<k2>nan"), "sensor 'cam', k2 is 'nan'"),
     "digits": (lambda t: t.replace("<f>1000.0", "<f>1_000"), "sensor 'cam', f is '1_000'"),
     "repeated": (lambda t: t.replace("<k1>", "<f>1</f><k1>"), "sensor 'cam': <f> occurs twice"),

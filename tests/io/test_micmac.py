@@ -36,12 +36,10 @@ def published(X, Y, Z, R=(), C=PP, P1=0.0, P2=0.0, b1=0.0, b2=0.0, known="", kin
         dx, dy = q[0] - C[0], q[1] - C[1]
         r2 = dx * dx + dy * dy
         radial = sum(k * r2 ** (i + 1) for i, k in enumerate(R))
-        return np.array(
-            [
-                q[0] + dx * radial + P1 * (2 * dx * dx + r2) + 2 * P2 * dx * dy + b1 * dx + b2 * dy,
-                q[1] + dy * radial + P2 * (2 * dy * dy + r2) + 2 * P1 * dx * dy,
-            ]
-        )
+        return np.array([
+            q[0] + dx * radial + P1 * (2 * dx * dx + r2) + 2 * P2 * dx * dy + b1 * dx + b2 * dy,
+            q[1] + dy * radial + P2 * (2 * dy * dy + r2) + 2 * P1 * dx * dy,
+        ])
 
     q = np.array([PP[0] + F * X / Z, PP[1] + F * Y / Z])
     if known.endswith("C2M"):

@@ -33,10 +33,8 @@ def published(kind, X, Y, Z):
         k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = (MORE[kind] + [0] * 8)[:12]
         r2 = x * x + y * y
         radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
-        x, y = (
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + s1 * r2 + s2 * r2**2,
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + s3 * r2 + s4 * r2**2,
-        )
+        x, y = (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + s1 * r2 + s2 * r2**2,
+                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + s3 * r2 + s4 * r2**2)
     elif kind == "STEREOGRAPHIC":
         off, theta = np.hypot(X, Y), np.arctan2(np.hypot(X, Y), Z)
         x, y = 2 * np.tan(theta / 2) * X / off, 2 * np.tan(theta / 2) * Y / off

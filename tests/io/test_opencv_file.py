@@ -90,8 +90,7 @@ def test_messages_of_ros(tmp_path, names, listed):
     path = tmp_path / "info.yaml"
     path.write_text(
         "header:\n  stamp: {sec: 17, nanosec: 3}\n  frame_id: left\nheight: 480\nwidth: 640\n"
-        "distortion_model: plumb_bob\n"
-        + "".join(f"{k}:{shown(x)}" for k, x in values)
+        "distortion_model: plumb_bob\n" + "".join(f"{k}:{shown(x)}" for k, x in values)
         + "binning_x: 0\nroi:\n  x_offset: 0\n  do_rectify: false\n---\n"
     )
     assert is_opencv(path)
@@ -152,14 +151,8 @@ def test_a_skew_and_a_tilt_are_fitted_and_the_difference_told(tmp_path, skew, ti
 
 BROKEN = {
     "no matrix": (_with(camera_matrix=None), "camera_matrix is missing"),
-    "skew": (
-        _with(
-            camera_matrix=_matrix(3, 3, [5, 0.1, 3, 0, 5, 2, 0, 0, 1]),
-            image_width=None,
-            image_height=None,
-        ),
-        "skew or a tilted sensor; .* image size is needed",
-    ),
+    "skew": (_with(camera_matrix=_matrix(3, 3, [5, 0.1, 3, 0, 5, 2, 0, 0, 1]), image_width=None,
+                   image_height=None), "skew or a tilted sensor; .* image size is needed"),
     "not a camera": (_with(camera_matrix=_matrix(3, 3, [5, 0, 3, 0, 5, 2, 0, 0, 2])), r"\[2\]"),
     "too few": (_with(camera_matrix=_matrix(3, 3, [5, 0, 3])), "3 numbers for 3 rows"),
     "wrong shape": (_with(camera_matrix=_matrix(1, 9, [5, 0, 3, 0, 5, 2, 0, 0, 1])), "3 rows"),
@@ -169,10 +162,8 @@ BROKEN = {
     "focal": (_with(camera_matrix=_matrix(3, 3, [0, 0, 3, 0, 5, 2, 0, 0, 1])), "fx must be posi"),
     "coefficients": (_with(distortion_coefficients=_matrix(6, 1, [0.1] * 6)), "has 6 values"),
     "size": (_with(image_width=640.5), "image size"),
-    "fisheye": (
-        _with(distortion_model="fisheye", distortion_coefficients=_matrix(5, 1, [0.1] * 5)),
-        "a fisheye has 4",
-    ),
+    "fisheye": (_with(distortion_model="fisheye",
+                      distortion_coefficients=_matrix(5, 1, [0.1] * 5)), "a fisheye has 4"),
     "list": ([1, 2], "an object"),
     "huge": (_with(camera_matrix=_matrix(3, 3, [10**400] * 9)), "finite numbers"),
 }

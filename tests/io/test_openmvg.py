@@ -57,16 +57,9 @@ def scene(kind="pinhole_brown_t2", nested=False) -> dict:
         "polymorphic_id": 1 + 2**31 * (k == 0), **({"polymorphic_name": kind} if k == 0 else {}),
         "ptr_wrapper": {"id": 2**31 + 9 + k, "data": data},
     }} for k in (0, 1)]  # fmt: skip
-    intrinsics.append(
-        {
-            "key": 2,
-            "value": {
-                "polymorphic_id": 2**31 + 2,
-                "polymorphic_name": "spherical",
-                "ptr_wrapper": {"id": 2**31 + 12, "data": {}},
-            },
-        }
-    )
+    intrinsics.append({"key": 2, "value": {"polymorphic_id": 2**31 + 2,
+                                           "polymorphic_name": "spherical",
+                                           "ptr_wrapper": {"id": 2**31 + 12, "data": {}}}})
     R = [matrix(a) * np.array([[1], [-1], [-1]]) for a in ANGLES]
     image = lambda i, X: [*map(float, published(kind, *(R[i] @ (X - POSITION[i]))))]
     seen = lambda X: [{"key": i, "value": {"id_feat": 0, "x": image(i, X)}} for i in range(3)]

@@ -145,8 +145,7 @@ def test_overrides(folder):
     assert (camera.parameters, camera.free) == ({"c": 51.0}, ("c", "x0"))
     assert (camera.sigma, camera.image_size) == ({"c": 0.1, "x0": 0.2}, (100, 200))
     assert read_project(folder / "project.toml", ["free=c,K2", "camera.cam.1.sigma.c=1"]).cameras[
-        0
-    ].free == ("c", "K2")
+        0].free == ("c", "K2")
 
 
 def test_settings_of_all_cameras():

@@ -1,5 +1,6 @@
 """The adjusted network: adjusted again it does not change, and other programs can read it."""
 
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal

@@ -199,11 +199,8 @@ def test_ros_pair(tmp_path, base):
     infos = []
     for k in range(2):
         text = (folder / f"c{k}.yaml").read_text()
-        of = lambda key, text=text: np.array(
-            ast.literal_eval(
-                re.search(rf"{key}:\s+rows: \d+\s+cols: \d+\s+data: (\[.*?\])", text, re.S)[1]
-            )
-        )
+        of = lambda key, text=text: np.array(ast.literal_eval(
+            re.search(rf"{key}:\s+rows: \d+\s+cols: \d+\s+data: (\[.*?\])", text, re.S)[1]))
         infos.append((of("camera_matrix").reshape(3, 3), of("distortion_coefficients"),
                       of("rectification_matrix").reshape(3, 3),
                       of("projection_matrix").reshape(3, 4)))  # fmt: skip

@@ -33,7 +33,9 @@ def problem():
     near = lambda x: x + 0.1 * random.normal(size=x.shape)
     start = ls.PoseValue(near(centre), turn(near(turns)))
     place = ls.Kind("place", lambda pose, X, x: jnp.stack(pose.ray(X)) - x, of=("pose", "point"))
-    length = ls.Kind("length", lambda a, b, d: jnp.linalg.norm(a - b) - d, of=("point", "point"))
+    length = ls.Kind(
+        "length", lambda a, b, d: jnp.linalg.norm(a - b) - d, of=("point", "point")
+    )
     some = np.where(free[:, None], near(X), X)
     return ls.make_problem(
         [ls.Table("pose", start), ls.Table("point", some, free=free)],

@@ -14,7 +14,9 @@ from jaxbundle.leastsquares.quality.error_components import (
     stack_rows,
 )
 
-RANGE = ls.Kind("distance", lambda a, b, d: ((a - b) @ (a - b)) ** 0.5 - d, of=("point", "point"))
+RANGE = ls.Kind(
+    "distance", lambda a, b, d: ((a - b) @ (a - b)) ** 0.5 - d, of=("point", "point")
+)
 POINTS, SIGMA = 14, 0.01
 
 

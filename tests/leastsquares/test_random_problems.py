@@ -153,7 +153,9 @@ def _dense_solution(given: Random, held, values, data) -> np.ndarray:
     ]
     weights = [data.weight[o.name] for o in given.observations]
     roots = [w if w.ndim == 3 else np.eye(w.shape[1]) * w[:, :, None] for w in weights]
-    start = {name: np.where(held[name] > 0, data.start[name], values[name]) for name in data.start}
+    start = {
+        name: np.where(held[name] > 0, data.start[name], values[name]) for name in data.start
+    }
     changed = dataclasses.replace(given, observations=observations)
     dense = Dense(changed, start, roots).solve()
     return dense.estimable(dense.vector())

@@ -60,7 +60,9 @@ def _project(model, p, M, X0, X):
     return jnp.stack(project(model, p, *(M @ (X - X0).T)), -1)
 
 
-LENS = Lens.of(fx=620.0, fy=621.0, cx=242.3, cy=177.8, k1=-0.12, k2=0.05, p1=4e-4, p2=-3e-4)
+LENS = Lens.of(
+    fx=620.0, fy=621.0, cx=242.3, cy=177.8, k1=-0.12, k2=0.05, p1=4e-4, p2=-3e-4
+)
 
 
 def pose(omega=0.0, phi=0.0, kappa=0.0, middle=(0.0, 0.0), distance=1.0):

@@ -214,7 +214,7 @@ def test_antennas_give_the_frame(flight):
     )  # fmt: skip
     result = jaxbundle.adjust(network)
     assert result.converged and result.counts.datum == 0
-    off = result.point_values - flight.truth.points.position[: len(result.point_values)]
+    off = (result.point_values - flight.truth.points.position[: len(result.point_values)])
     sigma = np.sqrt(np.diagonal(result.point_covariance, axis1=1, axis2=2))
     assert np.abs(off / sigma).max() < 5
 

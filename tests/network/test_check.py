@@ -49,6 +49,7 @@ def network(**changes) -> Network:
     return make_network(**{**tables(), **changes})
 
 
+
 def broken(table, k, **changes):
     given = tables()
     given[table][k].update(changes)
@@ -282,8 +283,7 @@ def two_parts(**changes):
     """Images i0, i1 see p0 to p3, images i2, i3 see p4 to p7."""
     given = tables(images=4)
     given["observations"] = [
-        o
-        for o in given["observations"]
+        o for o in given["observations"]
         if (o["image"] in ("i0", "i1")) == (o["point"] in ("p0", "p1", "p2", "p3"))
     ]
     for k in range(4):
@@ -436,9 +436,9 @@ def far_away(shift=0.0, scale=1.0):
     return make_network(**given)
 
 
-@pytest.mark.parametrize(
-    "shift, scale", [(0.0, 1e150), (1e17, 1.0), (1e13, 1e-4), (1e20, 1.0), (0.0, 1e-150)]
-)
+@pytest.mark.parametrize("shift, scale", [
+    (0.0, 1e150), (1e17, 1.0), (1e13, 1e-4), (1e20, 1.0), (0.0, 1e-150)
+])
 def test_coordinates_that_cannot_be_computed_with_are_refused(shift, scale):
     with pytest.raises(InputError, match="within ±1e|subtract a common offset|in a smaller unit"):
         check_network(far_away(shift, scale))

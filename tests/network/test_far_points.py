@@ -242,7 +242,9 @@ def test_vtpv_would_fall_beyond_infinity_and_nowhere_else(horizon):
 
 def _vtpv_of_images(problem, values):
     laid = lay_out_data(problem.plan, pad_data(problem, problem.data))
-    rows = residuals(problem.declared, problem.plan, pad_values(problem, values), laid)
+    rows = residuals(
+        problem.declared, problem.plan, pad_values(problem, values), laid
+    )
     of_images = [*problem.image_rows]
     return sum(jnp.vdot(rows[k], rows[k]) for k, part in enumerate(problem.plan.parts)
                if part.set_name in of_images)  # fmt: skip

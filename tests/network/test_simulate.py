@@ -105,7 +105,9 @@ def test_all_and_only_what_lies_in_the_format_is_imaged(name):
     parameters, size = CAMERAS[name]
     camera = Camera("cam", name, parameters)
     targets = cloud_of_targets(300, 9.0, seed=1)  # around and behind the stations too
-    truth = simulate_with_truth(RING, targets, camera, noise=0, image_format=size, min_rays=1).truth
+    truth = simulate_with_truth(
+        RING, targets, camera, noise=0, image_format=size, min_rays=1
+    ).truth
     assert (camera_rays(truth)[:, 2] < 0).all()
     low = np.array([-0.5, -0.5]) if name == "opencv" else -np.array(size) / 2
     xy = truth.observations.xy

@@ -210,7 +210,9 @@ def test_a_minimal_datum_is_worse_than_inner_constraints(network):
 
 def test_a_board_is_held_where_the_camera_was(designed):
     poses, images = designed.board_poses, designed.network.images
-    np.testing.assert_allclose(np.linalg.inv(poses)[:, :3, 3], images.position, atol=1e-9)
+    np.testing.assert_allclose(
+        np.linalg.inv(poses)[:, :3, 3], images.position, atol=1e-9
+    )
     middle = poses[:, :3, 3]
     assert (middle[:, 2] > 0).all()
 
@@ -338,7 +340,7 @@ def test_refusals_in_one_line(command, project, tmp_path):
         (("--incidence", "60", "--normals", normals), "no row for point '2'"),
         (("--order", "second"), "needs the number of candidates"),
         (("--stations", "1,77"), "there is no image '77'"),
-        (("--order", "zero", "--photographs", "2", "--aim", "reliability"), 'order "zero"'),
+        (("--order", "zero", "--photographs", "2", "--aim", "reliability"), "order \"zero\""),
     ):
         told = command("design", project, *options, "--draws", "0")
         assert told.status == 2 and message in told.err, (options, told.err)

@@ -1,5 +1,6 @@
 """Functions that promise derivatives keep them to second order, against differences of values."""
 
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,7 +32,9 @@ RAYS = POINTS[0] - CENTRES + 5 * noisy((4, 3))
 
 CASES = {
     "resection": (lambda xy: resection(xy, jnp.asarray(POINTS)).pose.X0, FIRST + noisy((9, 2))),
-    "relative orientation": (lambda xy: relative_orientation(xy, SECOND).b, FIRST + noisy((9, 2))),
+    "relative orientation": (
+        lambda xy: relative_orientation(xy, SECOND).b, FIRST + noisy((9, 2))
+    ),
     "intersection": (lambda d: intersection(CENTRES, d).X, RAYS),
     "homography": (lambda xy: homography(PLANE, xy)[0].ravel(), FIRST + noisy((9, 2))),
 }

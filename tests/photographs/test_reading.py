@@ -43,7 +43,6 @@ def test_pixels_of_a_turned_photograph_are_those_of_the_sensor(tmp_path):
 
 def test_photographs_of_any_size_but_what_cannot_be_decoded(tmp_path):
     """Headers without pixels."""
-
     def head(columns, rows):
         found = struct.pack(">IIBBBBB", columns, rows, 8, 0, 0, 0, 0)
         chunk = lambda kind, data: (struct.pack(">I", len(data)) + kind + data

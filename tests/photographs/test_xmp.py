@@ -65,16 +65,8 @@ def test_attitudes_take_part_where_they_agree():
 
     def network(turn):
         kappa = -np.radians([0, 10, 20, 30]) + turn
-        images = {
-            "id": names,
-            "camera": ["c"] * 4,
-            "X0": [0.0] * 4,
-            "Y0": [0.0] * 4,
-            "Z0": [50.0] * 4,
-            "omega": [0.0] * 4,
-            "phi": [0.0] * 4,
-            "kappa": kappa,
-        }
+        images = {"id": names, "camera": ["c"] * 4, "X0": [0.0] * 4, "Y0": [0.0] * 4,
+                  "Z0": [50.0] * 4, "omega": [0.0] * 4, "phi": [0.0] * 4, "kappa": kappa}
         return make_network(
             [{"id": "c", "model": "brown", "c": 50.0}], images,
             {"id": ["1"], "role": ["tie"], "X": [0.0], "Y": [0.0], "Z": [0.0]},

@@ -129,7 +129,9 @@ def test_pixels_that_no_ray_reaches_have_the_background():
     k1 = -0.9
     barrel = dataclasses.replace(CAMERA, parameters=CAMERA.parameters | {"k1": k1})
     ground = Rectangle((-90, -90, 0), (180, 0, 0), (0, 180, 0))
-    photo = render(Scene((ground,), (TEXTURE,)), barrel, [0, 0, 10.0], DOWN, Sensor(background=7))
+    photo = render(
+        Scene((ground,), (TEXTURE,)), barrel, [0, 0, 10.0], DOWN, Sensor(background=7)
+    )
     v, u = np.indices(photo.surface.shape)
     radius = np.hypot(u - 79.5, v - 59.5)
     end = F * 2 / 3 / np.sqrt(-3 * k1)

@@ -274,8 +274,7 @@ OWN: dict[str, Callable[[Path], None]] = {
     "ahead.toml": write_strips,
 }  # fmt: skip
 MADE_BY = {
-    "docs/calibrate.md": ["cameras.npz"],
-    "docs/reconstruct.md": ["surveyed"],
+    "docs/calibrate.md": ["cameras.npz"], "docs/reconstruct.md": ["surveyed"],
 }
 """Files that the page itself makes."""
 

@@ -342,7 +342,9 @@ def test_short_tables_with_a_stated_extrapolation(tmp_path):
     path = write(tmp_path, isd)
     with pytest.raises(InputError, match="outside the table"):
         read_csm(path)
-    (tmp_path / "scanner.toml").write_text('[scanner]\nsource = "isd.json"\nextrapolate = 2.5\n')
+    (tmp_path / "scanner.toml").write_text(
+        '[scanner]\nsource = "isd.json"\nextrapolate = 2.5\n'
+    )
     short = read_scanner(tmp_path / "scanner.toml")
     assert any("does not cover the whole image: extrapolated by" in w for w in short.warnings)
     # straight on: 9 m/s²·t²/2, for at most two seconds

@@ -69,9 +69,9 @@ def by_hand(isd, t):
         np.reshape(isd["instrument_pointing"]["constant_rotation"], (3, 3))
     )
     merged = np.array(sorted({*body[0], *pointing[0]}))
-    product = Rotation.concatenate(
-        [turned(*body, at) * (fixed * turned(*pointing, at)).inv() for at in merged]
-    )
+    product = Rotation.concatenate([
+        turned(*body, at) * (fixed * turned(*pointing, at)).inv() for at in merged
+    ])
     even = np.linspace(merged[0], merged[-1], len(merged))
     q = np.array([turned(merged, product, at).as_quat() for at in even])
     q *= np.where(q @ q[0] < 0, -1, 1)[:, None]

@@ -103,9 +103,7 @@ def test_an_image_by_the_handbook(tmp_path):
 REFUSED = {
     "no number": ("<LINE_PERIOD>0", "<LINE_PERIOD>x0", ["LINE_PERIOD", "'x0"]),
     "missing": (
-        "<SCENE_CENTER_LINE>300</SCENE_CENTER_LINE>",
-        "",
-        ["SCENE_CENTER_LINE is missing"],
+        "<SCENE_CENTER_LINE>300</SCENE_CENTER_LINE>", "", ["SCENE_CENTER_LINE is missing"],
     ),
     "look angles": (f"<NCOLS>{PIXELS}", "<NCOLS>401", ["400 Look_Angles", "401"]),
     "time": ("<TIME>2008-03-04T12:29", "<TIME>yesterday", ["Point 1, TIME", "yesterday"]),

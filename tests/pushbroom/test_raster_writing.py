@@ -79,17 +79,9 @@ def test_a_raster_of_errors_on_a_full_disk(tmp_path):
 
 def test_a_source_that_cannot_be_read_is_named_itself(tmp_path, monkeypatch):
     source = tmp_path / "source.tif"
-    with rasterio.open(
-        source,
-        "w",
-        driver="GTiff",
-        width=4,
-        height=4,
-        count=1,
-        dtype="uint8",
-        compress="deflate",
-        transform=rasterio.transform.Affine(1, 0, 5, 0, -1, 5),
-    ) as raster:
+    with rasterio.open(source, "w", driver="GTiff", width=4, height=4, count=1, dtype="uint8",
+                       compress="deflate",
+                       transform=rasterio.transform.Affine(1, 0, 5, 0, -1, 5)) as raster:
         raster.write(np.arange(16, dtype=np.uint8).reshape(1, 4, 4))
         window = raster.block_window(1, 0, 0)
     content = source.read_bytes()

@@ -97,22 +97,18 @@ def elsewhere(axis, shift):
     return table._replace(**{axis: moved})
 
 
-@pytest.mark.parametrize(
-    "table, options, words",
-    [
-        (control(BIAS), {"model": "afine"}, ["'afine'"]),
-        (RpcTable(*(c[:2] for c in control(BIAS))), {"model": "affine"}, ["2 control points", "3"]),
-        (one_point_twice(control(BIAS)), {"model": "affine"}, ["one line", "shift"]),
-        (control(BIAS), {"sigma": 0.0}, ["row 1", "positive"]),
-        (control(BIAS)._replace(height=np.r_[np.zeros(11), np.inf]), {}, ["row 12", "height"]),
-        (elsewhere("latitude", 0.01), {}, ["row 4", "latitude", "domain", "-23.521 to -23.279"]),
-        (elsewhere("longitude", -0.01), {}, ["row 4", "longitude"]),
-        (elsewhere("height", 1500), {}, ["row 4", "height", "-260 to 1060 m", "ellipsoid"]),
-        (elsewhere("line", 99999), {}, ["row 4", "line", "-300.6 to 6301.6", "measurement"]),
-        (elsewhere("sample", -5000), {}, ["row 4", "sample"]),
-    ],
-    ids=["model", "few", "on a line", "sigma", "inf", "north", "east", "up", "line", "sample"],
-)
+@pytest.mark.parametrize("table, options, words", [
+    (control(BIAS), {"model": "afine"}, ["'afine'"]),
+    (RpcTable(*(c[:2] for c in control(BIAS))), {"model": "affine"}, ["2 control points", "3"]),
+    (one_point_twice(control(BIAS)), {"model": "affine"}, ["one line", "shift"]),
+    (control(BIAS), {"sigma": 0.0}, ["row 1", "positive"]),
+    (control(BIAS)._replace(height=np.r_[np.zeros(11), np.inf]), {}, ["row 12", "height"]),
+    (elsewhere("latitude", 0.01), {}, ["row 4", "latitude", "domain", "-23.521 to -23.279"]),
+    (elsewhere("longitude", -0.01), {}, ["row 4", "longitude"]),
+    (elsewhere("height", 1500), {}, ["row 4", "height", "-260 to 1060 m", "ellipsoid"]),
+    (elsewhere("line", 99999), {}, ["row 4", "line", "-300.6 to 6301.6", "measurement"]),
+    (elsewhere("sample", -5000), {}, ["row 4", "sample"]),
+], ids=["model", "few", "on a line", "sigma", "inf", "north", "east", "up", "line", "sample"])
 def test_what_is_refused(table, options, words):
     with pytest.raises(InputError) as refused:
         fit_bias(RPC, table, **options)

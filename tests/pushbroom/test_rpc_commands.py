@@ -86,7 +86,9 @@ def test_a_bias_is_removed(tmp_path, run):
     write_rpc(tmp_path / "a.txt", RPC)
     true = table_of(RPC, (3, 3, 2))
     rng = np.random.default_rng(0)
-    measured = true._replace(line=true.line + 4 + 0.1 * rng.normal(size=18), sample=true.sample - 9)
+    measured = true._replace(
+        line=true.line + 4 + 0.1 * rng.normal(size=18), sample=true.sample - 9
+    )
     control = write_table(tmp_path / "control.csv", measured)
     status, out, err = run(
         "compensate", tmp_path / "a.txt", "--control", control, "--out", tmp_path / "b.txt",

@@ -54,6 +54,7 @@ def layers_of_air(step=200.0, top=50e3):
     return [(top, 1.0), *zip(borders[1:], 1 + means)]
 
 
+
 def spin(t):
     """Earth-fixed to inertial."""
     return Rotation.from_euler("z", (EARTH_RATE * t)[:, None])

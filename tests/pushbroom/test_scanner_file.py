@@ -56,7 +56,7 @@ def test_inertial_tables(tmp_path, frame):
 
 def test_an_orbit_instead_of_a_table(tmp_path):
     circle = (
-        "span = [-6, 11]\ncircle = { height = 505000.0, inclination = 97.4, "
+        'span = [-6, 11]\ncircle = { height = 505000.0, inclination = 97.4, '
         f"node = {float(np.degrees(1.9))!r}, argument = {float(np.degrees(0.1))!r} }}\n"
     )
     text = TEXT.replace('table = "positions.csv"\n', circle)
@@ -161,10 +161,9 @@ def test_there_and_back_by_the_commands(tmp_path, monkeypatch, capsys):
     (tmp_path / "places.csv").write_text("id,line,pixel\na,10.25,7\nb,599,399.4\n")
     places = ("--points", tmp_path / "places.csv")
     ground = tmp_path / "ground.csv"
-    assert (
-        run(monkeypatch, capsys, "locate", scanner, *places, "--height", 200, "--csv", ground)[0]
-        == 0
-    )
+    assert run(monkeypatch, capsys, "locate", scanner, *places, "--height", 200, "--csv", ground)[
+        0
+    ] == 0
     rows = list(csv.DictReader(io.StringIO(ground.read_text())))
     assert [row["id"] for row in rows] == ["a", "b"]
     assert all(abs(float(row["height"]) - 200) < 1e-6 for row in rows)
@@ -248,7 +247,9 @@ def test_terrain_rasters(tmp_path, monkeypatch, capsys):
     turned = extent._replace(west=extent.west + 360, east=extent.east + 360)
     whole, cut = (read_terrain(path, el.WGS84, part) for part in (None, turned))
     assert cut.heights.size < 0.9 * whole.heights.size
-    np.testing.assert_allclose(*(locate(file.image, t, *PLACES) for t in (whole, cut)), atol=1e-6)
+    np.testing.assert_allclose(
+        *(locate(file.image, t, *PLACES) for t in (whole, cut)), atol=1e-6
+    )
     bare = write_raster(tmp_path / "bare.tif", slope, None, (0.01, 0, 0, 0, -0.01, 0))
     with pytest.raises(InputError, match="no coordinate system"):
         read_terrain(bare, el.WGS84)

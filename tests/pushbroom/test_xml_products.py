@@ -290,11 +290,8 @@ def test_early_products_of_pleiades(tmp_path, root):
 
 def test_the_unit_of_the_period_of_few_lines_is_that_of_the_product(tmp_path):
     """START to END says nothing of it where there is one line."""
-    text = dimap(
-        change=lambda t: t.replace(f"<NROWS>{LINES}<", "<NROWS>1<").replace(
-            f"<END>{stamp(PERIOD * (LINES - 1))}", f"<END>{stamp(0)}"
-        )
-    )
+    text = dimap(change=lambda t: t.replace(f"<NROWS>{LINES}<", "<NROWS>1<")
+                 .replace(f"<END>{stamp(PERIOD * (LINES - 1))}", f"<END>{stamp(0)}"))
     (tmp_path / "DIM.XML").write_text(text, encoding="latin-1")
     assert float(read_scanner(tmp_path / "DIM.XML").image.times.period) == pytest.approx(PERIOD)
 

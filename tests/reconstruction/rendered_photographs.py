@@ -55,10 +55,9 @@ def corner(number, k):
 
 def scene(seed, markers=False):
     roof = Rectangle((-1.2, -1.0, 1.4), (2.0, 0, 0.4), (0, 2.0, 0))
-    shapes, textures = (
-        [HeightField(hills, (-9, -9, 9, 9)), roof],
-        [Texture(0.012, seed=seed, side=512)] * 2,
-    )
+    shapes, textures = [HeightField(hills, (-9, -9, 9, 9)), roof], [
+        Texture(0.012, seed=seed, side=512)
+    ] * 2
     if markers:
         shapes.append(Rectangle(PLATE, (2 * PITCH, 0, 0), (0, 2 * PITCH, 0)))
         textures.append(Markers(0.012))

@@ -16,9 +16,7 @@ from jaxbundle.tiepoints.verification import Pair
 def network():
     camera = jaxbundle.Camera("c", "brown", {"c": 100.0})
     return jaxbundle.simulate(
-        jaxbundle.ring_of_stations(6, 6.0, 5.0),
-        jaxbundle.grid_of_targets(4, 4, 0.6),
-        camera,
+        jaxbundle.ring_of_stations(6, 6.0, 5.0), jaxbundle.grid_of_targets(4, 4, 0.6), camera,
         noise=0.001,
     )
 

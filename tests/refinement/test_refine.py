@@ -103,12 +103,10 @@ def test_the_refined_image_sees_the_points_where_they_are(with_jitter, refined):
     X, observations = with_jitter
     image = refined.image("A")
     v = np.array([row["v"] for row in refined.image_points()])
-    g = np.array(
-        [
-            misclosure(image, x, image.times.time(line), pixel, WGS84)
-            for x, (line, pixel) in zip(X[:6], observations.xy[:6])
-        ]
-    )
+    g = np.array([
+        misclosure(image, x, image.times.time(line), pixel, WGS84)
+        for x, (line, pixel) in zip(X[:6], observations.xy[:6])
+    ])
     scale = refined.inspection.solution.problem.data.measured["scanner points 1"].scale[:6]
     assert np.allclose(np.einsum("nij,nj->ni", scale, g), v[:6], atol=2e-3)
 
@@ -117,7 +115,7 @@ def test_the_refined_image_sees_the_points_where_they_are(with_jitter, refined):
 def test_the_residual_of_what_is_located_is_zero():
     switch = Corrections(True, True, True)
     image = satellite(switch)
-    (form,) = pad_forms([make_form(image, WGS84, FREEDOM)])
+    form, = pad_forms([make_form(image, WGS84, FREEDOM)])
     p = 1e-4 * np.random.default_rng(3).normal(size=sum(form.sizes))
     places, heights = np.array([[120.3, 600.2]]), np.array([350.0])
     X = ground(image, form, p, heights, places)

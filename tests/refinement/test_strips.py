@@ -70,7 +70,9 @@ def found(strips):
     images, points, observations, X = strips
     wrong = points.X.copy()
     wrong[2, 1] += 3.0
-    return refine(images, dataclasses.replace(points, X=wrong), observations, snooping="baarda")
+    return refine(
+        images, dataclasses.replace(points, X=wrong), observations, snooping="baarda"
+    )
 
 
 @pytest.mark.further

@@ -189,11 +189,8 @@ def test_together_is_better_than_each_alone(case, equations):
     for of_scanner in (True, False):
         keep = np.where(rays, control_only & (first == of_scanner), True)
         keep[-3:] = False
-        own = [
-            k
-            for k in range(m)
-            if result.names[k].owner.startswith(("image", "sensor")) == of_scanner
-        ]
+        own = [k for k in range(m)
+               if result.names[k].owner.startswith(("image", "sensor")) == of_scanner]
         A = J[np.ix_(keep, own)]
         alone = np.sqrt(np.diagonal(np.linalg.inv(A.T @ A)))
         assert (together[own] <= alone * (1 + 1e-4)).all()

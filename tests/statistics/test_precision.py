@@ -1,6 +1,7 @@
 """`precision` against the dense inverse of networks built anew, and its derivatives against their
 differences."""
 
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
