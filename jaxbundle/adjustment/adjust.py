@@ -41,7 +41,6 @@ from jaxbundle.adjustment.orient import orient, orient_again, screen
 from jaxbundle.adjustment.problem import NetworkProblem, make_problem
 from jaxbundle.adjustment.quality.blunder_names import name_suspect
 from jaxbundle.adjustment.quality.correlated_errors import DEFAULTS as CORRELATIONS
-from jaxbundle.adjustment.quality.correlated_errors import CorrelationSettings, correlated_errors
 from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.adjustment.quality.misfit import doubt_of_robust
 from jaxbundle.adjustment.readjust import (
@@ -152,7 +151,8 @@ def adjust(  # noqa: PLR0913 - the options of an adjustment
       is 1; the factors are `Adjustment.sigma_factors`.
     - `correlated`: look for errors that image points share (a field on the sensor, interior
       orientations that move between photographs, errors along tracks), and state the σ under them
-      beside the classical ones (`Adjustment.error_model`). The estimates do not change.
+      beside the classical ones (`Adjustment.error_model`); of eight photographs or more, compare
+      halves of them (`Adjustment.replication`). The estimates do not change.
     - `progress(stage, done, total)`: called for every evaluation, with vᵀPv and the damping in
       the stage; up to 200 000 observations at the end of the iterations (`jaxbundle.show_progress`
       shows bars).
@@ -225,23 +225,9 @@ def adjust(  # noqa: PLR0913 - the options of an adjustment
     if misfit and not also and not name_conventions(problem, minimum, found.inspection):
         if mirrored := mirror(sigma0):
             result = result.with_changes(findings=(mirrored,))
-    return with_error_model(result) if correlated and result.converged else result
-
-
-def with_error_model(
-    result: Adjustment, settings: CorrelationSettings = CORRELATIONS
-) -> Adjustment:
-    """The same estimates with the σ of errors that image points share; unchanged, with a finding,
-    where the network cannot show any."""
-    why = f"no camera has {settings.min_images} photographs, and no point two rays"
-    try:
-        model = correlated_errors(result.cofactors.solution, result.problem, settings)
-    except NotSolvedError as error:
-        model, why = None, str(error)
-    if model is None:
-        line = f"correlated errors were not looked for: {why}"
-        return result.with_changes(findings=(*result.findings, line))
-    return result.with_changes(error_model=model)
+    if not correlated:
+        return result
+    return result.with_changes(correlations=CORRELATIONS).with_correlated_errors()
 
 
 def _compare_with_start(given: Network, result: Adjustment) -> tuple[str, ...]:

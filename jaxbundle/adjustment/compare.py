@@ -83,7 +83,9 @@ class AdjustmentComparison(TableMethods):
       `held_by`, the points it was found on;
     - `tests`: of all coordinates together ("points"), and of the parameters of each camera;
     - `shared`: image points that both have measured alike; if there are any nothing is tested;
-    - `significance`: of all rows together (Šidák).
+    - `significance`: of all rows together (Šidák);
+    - `modelled`: which of "a" and "b" have an error model: their σ are those under correlated
+      errors.
     """
 
     kind: np.ndarray
@@ -102,6 +104,7 @@ class AdjustmentComparison(TableMethods):
     tests: dict[str, Congruency]
     shared: int
     significance: float
+    modelled: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.id)
@@ -140,6 +143,7 @@ class AdjustmentComparison(TableMethods):
             },
             "shared": self.shared,
             "significance": self.significance,
+            "modelled": list(self.modelled),
         }
 
     def __repr__(self) -> str:
@@ -159,6 +163,8 @@ class AdjustmentComparison(TableMethods):
                 f"a was moved by a similarity found on {count(len(self.held_by), 'point')}"
                 f": scale {np.exp(self.similarity[6]):.8g}"
             )
+        if self.modelled:
+            lines.append(f"σ under correlated errors of {' and '.join(self.modelled)}")
         if self.shared:
             lines.append(
                 f"{count(self.shared, 'image point')} of both are the same measurements: "
@@ -409,7 +415,9 @@ class _FramedAdjustment:
     ) -> tuple[np.ndarray, np.ndarray]:
         """The unknowns and their covariance."""
         chosen = self.choose_rows(rows, angles)
-        return np.asarray(_call(chosen, self.result.values)), self.result.covariance_of(chosen)
+        return np.asarray(_call(chosen, self.result.values)), self.result.modelled_covariance_of(
+            chosen
+        )
 
 
 @compile_once
@@ -431,7 +439,7 @@ def _compare(
     place = {id: k for k, id in enumerate(b.problem.network.images.id)}
     near = b.image_values[[place[id] for id in rows.images], 3:].reshape(-1, 3)
     found = []
-    for part in _portions(rows):
+    for part in _portions(rows, _most_together(a, b)):
         angles = near if part.images else np.zeros((0, 3))
         found.append((one.estimate(part, angles), other.estimate(part, angles)))
     x_a, x_b = (np.concatenate([pair[side][0] for pair in found]) for side in (0, 1))
@@ -467,6 +475,7 @@ def _compare(
         tests=tests,
         shared=shared,
         significance=significance,
+        modelled=tuple(n for n, r in (("a", a), ("b", b)) if r.error_model is not None),
     )
 
 
@@ -492,11 +501,17 @@ def _test_together(
     return {name: test for name, test in tests.items() if test is not None}
 
 
-def _portions(rows: _CommonRows, most_together: int = 500) -> list[_CommonRows]:
-    """The rows whose covariance is formed together: cameras and images with points.
+def _most_together(a: Adjustment, b: Adjustment) -> int:
+    """Points whose covariance is formed together. That of 500, of 1500 coordinates, has 18 MB and
+    grows with the square of their number; under an error model the effects of all observations on
+    them are formed, of 1 GB at most."""
+    observations = [r.counts.observations for r in (a, b) if r.error_model is not None]
+    return min(500, max(2**27 // (3 * max(observations, default=1)), 10))
 
-    `most_together`: points. The covariance of their 1500 coordinates is 18 MB and grows with the
-    square of their number; points of several portions have no common test."""
+
+def _portions(rows: _CommonRows, most_together: int) -> list[_CommonRows]:
+    """The rows whose covariance is formed together: cameras and images with points; points of
+    several portions have no common test."""
     step = most_together
     parts = [rows.points[k : k + step] for k in range(0, len(rows.points), step)] or [[]]
     return [

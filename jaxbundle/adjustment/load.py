@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from jaxbundle.adjustment.problem import NetworkProblem, make_problem
+from jaxbundle.adjustment.quality.correlated_errors import error_components
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.adjustment.storage import CLASSES, FORMAT, State, Stored, with_own_models
 from jaxbundle.arguments import path as given_path
@@ -19,6 +20,7 @@ from jaxbundle.io.results.stored_tree import read_tree
 from jaxbundle.leastsquares import problem as engine
 from jaxbundle.leastsquares.declarations import ObservationSet, Table
 from jaxbundle.leastsquares.iterations.solver import History, Minimum
+from jaxbundle.leastsquares.quality.error_components import ErrorModel
 from jaxbundle.network.columns import list_some
 from jaxbundle.system.file_content import naming_file
 
@@ -115,7 +117,22 @@ def _restore(found: Stored, problem: NetworkProblem) -> Adjustment:
     minimum = Minimum(values, jax.device_put(termination), jax.device_put(iterations), history)
     result = Adjustment(problem.network, problem, minimum, check=found.check, **found.notes)
     result.weights, result.robust_scale = found.image_weights, found.robust_scale
+    model = _restore_error_model(found, result)
+    halves = found.replication and dataclasses.replace(found.replication, model=model)
+    result.keep(model, halves)
     return result
+
+
+def _restore_error_model(found: Stored, result: Adjustment) -> ErrorModel | None:
+    stored = found.error_model
+    if stored is None or result.correlations is None:
+        return None
+    solution = result.cofactors.solution
+    components = tuple(error_components(solution, result.problem, result.correlations))
+    if tuple(component.name for component in components) != stored.names:
+        raise ValueError
+    sizes = stored.theta, stored.theta_sigma, stored.score
+    return ErrorModel(solution, components, *sizes, stored.own)
 
 
 def _tree(like: Any, leaves: Sequence[np.ndarray]) -> Any:

@@ -20,6 +20,9 @@ from jaxbundle import plotting, report
 from jaxbundle.adjustment import result_tables
 from jaxbundle.adjustment.problem import Counts, NetworkProblem, coordinates
 from jaxbundle.adjustment.quality.check_points import CheckPoints, intersect_check_points
+from jaxbundle.adjustment.quality.control_prediction import ControlPrediction, predict_control
+from jaxbundle.adjustment.quality.correlated_errors import DEFAULTS as CORRELATIONS
+from jaxbundle.adjustment.quality.correlated_errors import CorrelationSettings, correlated_errors
 from jaxbundle.adjustment.quality.distortion_reach import (
     Reach,
     distortion_reach,
@@ -28,6 +31,12 @@ from jaxbundle.adjustment.quality.distortion_reach import (
 from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.adjustment.quality.misfit import doubt_of_fit, doubt_of_unit
 from jaxbundle.adjustment.quality.points_at_any_distance import FarPoints, find_far_points
+from jaxbundle.adjustment.quality.replication import (
+    Difference,
+    Replication,
+    compare_halves,
+    random_halves,
+)
 from jaxbundle.adjustment.quality.variance_components import groups
 from jaxbundle.adjustment.quality.weakness import Weakness, weakness
 from jaxbundle.adjustment.storage import network_fingerprint, store
@@ -74,6 +83,10 @@ if TYPE_CHECKING:
     from mpl_toolkits.mplot3d import Axes3D
 
 
+MAX_SPLITS = 3
+"""Random halves that are tried for the replication of a result."""
+
+
 @print_anywhere
 class Adjustment:
     """An adjusted network. It prints as a summary; `report()` is the full report.
@@ -98,6 +111,9 @@ class Adjustment:
       `robust_scale`: of the residuals, a posteriori (MAD), in a priori σ; `suspects`: image points
       whose residuals exceed the critical value.
     - `doubts`: the warnings about a priori σ, σ0 and blunders
+    - `error_model`: of errors that image points share, if it was requested (`correlations`, its
+      settings) and the network can show any, else None; `replication`: two halves of the network
+      compared, if requested (`halves_by`), else None
     - `fingerprint`: of the adjusted network; `save` writes the result into a file
     """
 
@@ -123,7 +139,8 @@ class Adjustment:
         doubts: tuple[str, ...] = (),
         weakness: Weakness | None = None,
         findings: tuple[str, ...] = (),
-        error_model: ErrorModel | None = None,
+        correlations: CorrelationSettings | None = None,
+        halves_by: str = "",
     ):
         self.network = network
         self.problem = problem
@@ -142,7 +159,8 @@ class Adjustment:
         self.suspects = suspects
         self.given_doubts = doubts
         self.findings = findings
-        self.error_model = error_model
+        self.correlations = correlations
+        self.halves_by = halves_by
         self._weakness = weakness
         self._inspection = inspection
         self.check = check
@@ -154,10 +172,12 @@ class Adjustment:
         *,
         sigma_factors: Mapping[str, float] | None = None,
         findings: tuple[str, ...] | None = None,
-        error_model: ErrorModel | None = None,
+        correlations: CorrelationSettings | None = None,
+        halves_by: str | None = None,
     ) -> "Adjustment":
-        """The same result with other factors of σ, other findings, or a model of correlated errors;
-        what follows from none of them is not computed again."""
+        """The same result with other factors of σ or findings, or with errors that image points
+        share (`correlations`) and halves by photographs, points or runs; what follows from none of
+        them is not computed again."""
         changed = copy.copy(self)
         for name in ("verdict", "doubts", "variance_components", "check_points", "fingerprint"):
             changed.__dict__.pop(name, None)
@@ -165,11 +185,24 @@ class Adjustment:
             changed.sigma_factors = dict(sigma_factors)
         if findings is not None:
             changed.findings = findings
-        if error_model is not None:
-            changed.error_model = error_model
-            for name in ("cameras", "images", "points"):
+        if correlations is not None:
+            changed.correlations = correlations
+            for name in ("cameras", "images", "points", "_modelled", "replication"):
                 changed.__dict__.pop(name, None)
+        if halves_by is not None:
+            changed.halves_by = halves_by
+            changed.__dict__.pop("replication", None)
         return changed
+
+    def with_correlated_errors(
+        self, halves_by: str = "photographs", settings: CorrelationSettings = CORRELATIONS
+    ) -> "Adjustment":
+        """The same result with an error model and one split into halves, as `reconstruct` and
+        `calibrate` state them; unchanged without a result, and with fewer photographs than
+        `settings.min_images`. Both are computed when they are needed."""
+        if not self.converged or len(self.problem.network.images) < settings.min_images:
+            return self
+        return self.with_changes(correlations=settings, halves_by=halves_by)
 
     @property
     def converged(self) -> bool:
@@ -376,6 +409,15 @@ class Adjustment:
             return None
         return intersect_check_points(self.inspection, *self.check, self.sigma_factors)
 
+    @functools.cached_property
+    def control_prediction(self) -> ControlPrediction | None:
+        """Every control point with σ, and every image measurement of control, predicted from all
+        other observations; None without control with σ, or without a factor for cofactors."""
+        self._require_solved()
+        if self.problem.reduction not in FACTORS:
+            return None
+        return predict_control(self.inspection, self.sigma0)
+
     # --- unknowns ---------------------------------------------------------------------------
 
     @functools.cached_property
@@ -412,6 +454,66 @@ class Adjustment:
         Q = Q * free[:, :, None] * free[:, None, :]
         return self.sigma0**2 * A @ Q @ A.transpose(0, 2, 1)
 
+    # --- correlated errors ------------------------------------------------------------------
+
+    @functools.cached_property
+    def _modelled(self) -> tuple[ErrorModel | None, str]:
+        """The error model; why there is none although it was requested."""
+        if self.correlations is None or not self.converged:
+            return None, ""
+        why = f"no camera has {self.correlations.min_images} photographs, and no point two rays"
+        try:
+            found = self.cofactors.solution
+            return correlated_errors(found, self.problem, self.correlations), why
+        except NotSolvedError as error:
+            return None, str(error)
+
+    def keep(self, model: ErrorModel | None, halves: Replication | None) -> None:
+        """Take over an error model and halves that were computed before (`load_adjustment`);
+        None: they are computed when they are needed."""
+        if model is not None:
+            self.__dict__["_modelled"] = model, ""
+        if halves is not None:
+            self.__dict__["replication"] = halves
+
+    @property
+    def error_model(self) -> ErrorModel | None:
+        """Errors that image points share; None if they were not requested, or cannot be found."""
+        return self._modelled[0]
+
+    @property
+    def why_no_error_model(self) -> str:
+        """Why a requested error model cannot be found; empty if it was."""
+        model, why = self._modelled
+        return why if model is None else ""
+
+    @functools.cached_property
+    def replication(self) -> Replication | None:
+        """One split of the network into halves, adjusted and compared; None if not requested."""
+        if not self.halves_by or not self.converged:
+            return None
+        # of held cameras alone there is nothing to compare
+        cameras = range(len(self.problem.network.cameras))
+        if not any(len(self.problem.free_parameters(c)[1]) for c in cameras):
+            return None
+        failed = []
+        # a random half may have all rolled photographs, or none, and not determine the camera
+        for second in random_halves(self.problem.network, self.halves_by, MAX_SPLITS, 0):
+            try:
+                split = self.compare_halves(second)
+            except NotSolvedError as error:
+                failed.append(str(error))
+            else:
+                return Replication(self.halves_by, (split,), (), self.error_model)
+        return Replication(self.halves_by, (), tuple(failed[:1]), self.error_model)
+
+    def compare_halves(self, second: Bool[np.ndarray, " rays"]) -> Difference:
+        """The interior orientations of two halves of the network, each adjusted alone; `second`:
+        the image points of the second one.
+
+        **Raises:** `NotSolvedError` if a half has too few photographs, or no solution."""
+        return compare_halves(self.cofactors.solution, self.problem, second, self.error_model)
+
     @property
     def correlated_image_covariance(self) -> Float[np.ndarray, "images 6 6"] | None:
         """`image_covariance` under the error model; None without one."""
@@ -431,6 +533,12 @@ class Adjustment:
         C = self.problem.cofactors_of_coordinates(self.values["point"], C)
         return self._where_known(np.asarray(C))
 
+    def modelled_camera_covariance(self, camera: str) -> tuple[list[str], Float[np.ndarray, "n n"]]:
+        """`camera_covariance` under the error model, or the classical one without."""
+        names, C = self.camera_covariance(camera)
+        modelled = self.correlated_camera_covariance(camera)
+        return names, C if modelled is None else modelled
+
     def correlated_camera_covariance(self, camera: str) -> Float[np.ndarray, "n n"] | None:
         """`camera_covariance` under the error model, of the same parameters; None without one."""
         if self.error_model is None:
@@ -441,19 +549,30 @@ class Adjustment:
 
     @property
     def sigma_ratio(self) -> float:
-        """The median of σ under the error model over classical σ, of the interior and exterior
-        orientations; 1 without a model."""
+        """The median of σ under the error model over classical σ, of the interior orientations or
+        of the exterior ones, whichever is larger: control determines only the latter. 1 without a
+        model."""
         if self.error_model is None:
             return 1.0
-        pairs = [(self.image_covariance, present(self.correlated_image_covariance))]
-        for camera in self.problem.network.cameras:
-            other = present(self.correlated_camera_covariance(camera.id))
-            pairs.append((self.camera_covariance(camera.id)[1][None], other[None]))
-        ratios = []
-        for classical, correlated in pairs:
-            a, b = (np.diagonal(C, axis1=1, axis2=2).ravel() for C in (classical, correlated))
-            ratios.append(np.sqrt(b[a > 0] / a[a > 0]))
-        return float(np.median(np.concatenate(ratios)))
+        cameras = [camera.id for camera in self.problem.network.cameras]
+        interior = [
+            (
+                self.camera_covariance(c)[1][None],
+                present(self.correlated_camera_covariance(c))[None],
+            )
+            for c in cameras
+        ]
+        exterior = [(self.image_covariance, present(self.correlated_image_covariance))]
+        medians = []
+        for pairs in (interior, exterior):
+            variances = [
+                [np.diagonal(C, axis1=1, axis2=2).ravel() for C in classical_and_correlated]
+                for classical_and_correlated in pairs
+            ]
+            ratios = np.concatenate([np.sqrt(b[a > 0] / a[a > 0]) for a, b in variances])
+            if len(ratios):
+                medians.append(float(np.median(ratios)))
+        return max(medians, default=1.0)
 
     @functools.cached_property
     def point_values(self) -> Float[np.ndarray, "points 3"]:
@@ -537,6 +656,15 @@ class Adjustment:
         self._require_solved()
         return self.sigma0**2 * self.inspection.propagate(function)
 
+    def modelled_covariance_of(
+        self, function: Callable[[Values], jax.Array]
+    ) -> Float[np.ndarray, "n n"]:
+        """`covariance_of` under the error model, or the classical one without."""
+        if self.error_model is None:
+            return self.covariance_of(function)
+        slopes = self.cofactors.solution.slopes(function)
+        return self.error_model.propagate_rows({t: np.asarray(x) for t, x in slopes.items()})
+
     # --- tables -----------------------------------------------------------------------------
 
     @property
@@ -587,9 +715,11 @@ class Adjustment:
         return result_tables.residuals(self)
 
     def table(self, name: str) -> dict[str, np.ndarray]:
-        """A table by name: images, points, residuals, cameras (one row per parameter), checks or
-        far_points."""
+        """A table by name: images, points, residuals, cameras (one row per parameter), checks,
+        far_points, or of predicted control, control and control_measurements."""
         made = {
+            "control": result_tables.control,
+            "control_measurements": result_tables.control_measurements,
             "cameras": result_tables.parameters,
             "checks": result_tables.checks,
             "far_points": result_tables.far_points,
@@ -597,7 +727,7 @@ class Adjustment:
         if name in made:
             return made[name](self)
         if name not in ("images", "points", "residuals"):
-            known = "cameras, images, points, residuals, checks, far_points"
+            known = ", ".join(("images", "points", "residuals", *made))
             raise KeyError(f"tables are {known}; not {name!r}")
         return getattr(self, name)
 

@@ -60,7 +60,7 @@ def cameras(adjustment: "Adjustment") -> dict[str, dict]:
             "free": free,
             "tied": [list(group) for group in given.tie],
             "correlations": correlation_matrix(Q),
-        }
+        } | ({} if C is None else {"correlations_correlated": correlation_matrix(C)})
     return tables
 
 
@@ -129,7 +129,7 @@ def units(adjustment: "Adjustment", columns: Sequence[str], name: str) -> dict[s
     length, angle = adjustment.network.object_unit, adjustment.network.angle_unit
     known = dict.fromkeys((*"XYZ", *EXTERIOR[:3], "distance", "nearer", "farther"), length)
     known |= dict.fromkeys((*EXTERIOR[3:], "su"), angle)
-    known["rms"] = adjustment.image_unit
+    known |= dict.fromkeys(("rms", "x", "y"), adjustment.image_unit)
     of = lambda column: known.get(column) or known.get(column[1:] if column[:1] in "sd" else "")
     return {column: unit for column in columns if (unit := of(column))}
 
@@ -248,6 +248,31 @@ def checks(adjustment: "Adjustment") -> dict[str, np.ndarray]:
     table |= {f"d{axis}": found.difference[:, i] for i, axis in enumerate("XYZ")}
     table |= {f"s{axis}": sigma[:, i] for i, axis in enumerate("XYZ")}
     return table | {"rays": found.rays}
+
+
+def control(adjustment: "Adjustment") -> dict[str, np.ndarray]:
+    """Control points predicted from all other observations, if any: columns id, dX, dY, dZ
+    (predicted − given), sX, sY, sZ, probability (of a larger error by chance)."""
+    found = adjustment.control_prediction
+    if found is None:
+        return {}
+    table = {"id": np.array(found.id, dtype=object)}
+    table |= {f"d{axis}": found.error[:, i] for i, axis in enumerate("XYZ")}
+    table |= {f"s{axis}": found.sigma[:, i] for i, axis in enumerate("XYZ")}
+    return table | {"probability": found.probability}
+
+
+def control_measurements(adjustment: "Adjustment") -> dict[str, np.ndarray]:
+    """Image measurements of control predicted from all other observations, if any: columns image,
+    point, dx, dy (predicted − measured, image unit), sx, sy, probability."""
+    found = adjustment.control_prediction
+    if found is None or not found.measurement:
+        return {}
+    image, point = zip(*found.measurement)
+    table = {"image": np.array(image, dtype=object), "point": np.array(point, dtype=object)}
+    table |= {f"d{axis}": found.image_error[:, i] for i, axis in enumerate("xy")}
+    table |= {f"s{axis}": found.image_sigma[:, i] for i, axis in enumerate("xy")}
+    return table | {"probability": found.image_probability}
 
 
 TESTED = ("residual", "gain", "redundancy", "w", "hat")

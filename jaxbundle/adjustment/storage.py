@@ -14,8 +14,11 @@ import jax
 import numpy as np
 
 from jaxbundle.adjustment.problem import NetworkProblem
+from jaxbundle.adjustment.quality.correlated_errors import CorrelationSettings
+from jaxbundle.adjustment.quality.replication import Difference, Replication
 from jaxbundle.cameras import CameraModel, get_model, is_own
 from jaxbundle.io.results.stored_tree import fingerprint, write_tree
+from jaxbundle.leastsquares.quality.error_components import ErrorSettings
 from jaxbundle.leastsquares.quality.names import Name
 from jaxbundle.network.blunders import Removed, Suspect
 from jaxbundle.network.kinds import KINDS
@@ -64,10 +67,23 @@ class State:
 
 
 @dataclasses.dataclass(frozen=True)
+class StoredErrorModel:
+    """The estimated sizes of an `ErrorModel`, and the covariance blocks that its components give;
+    the components themselves follow from the network, by their `names`."""
+
+    names: tuple[str, ...]
+    theta: np.ndarray
+    theta_sigma: np.ndarray
+    score: np.ndarray
+    own: tuple[dict[str, np.ndarray], ...]
+
+
+@dataclasses.dataclass(frozen=True)
 class Stored:
     """A saved adjustment; `check`: check points and their image points; `own_models`: names of
     camera models that only an object describes; `notes`: arguments of the `Adjustment`;
-    `image_weights`, `robust_scale`: of robust estimation."""
+    `image_weights`, `robust_scale`: of robust estimation; `error_model` of correlated errors and
+    `replication` (without its model), if they were requested."""
 
     format: str
     version: str
@@ -80,9 +96,23 @@ class Stored:
     notes: dict[str, Any]
     image_weights: np.ndarray | None
     robust_scale: float | None
+    error_model: StoredErrorModel | None = None
+    replication: Replication | None = None
 
 
-CLASSES = (*NETWORK, Stored, State, Removed, Suspect, Name)
+CLASSES = (
+    *NETWORK,
+    Stored,
+    State,
+    Removed,
+    Suspect,
+    Name,
+    CorrelationSettings,
+    ErrorSettings,
+    StoredErrorModel,
+    Replication,
+    Difference,
+)
 
 
 def network_fingerprint(network: Network) -> str:
@@ -127,6 +157,8 @@ def store(adjustment: Any, path: str | Path) -> None:
         "robust",
         "suspects",
         "findings",
+        "correlations",
+        "halves_by",
     )
     notes = {name: getattr(adjustment, name) for name in named}
     found = Stored(
@@ -141,8 +173,18 @@ def store(adjustment: Any, path: str | Path) -> None:
         notes | {"doubts": adjustment.given_doubts},
         adjustment.weights,
         adjustment.robust_scale,
+        _error_model(adjustment),
+        adjustment.replication and dataclasses.replace(adjustment.replication, model=None),
     )
     write_tree(path, found, CLASSES)
+
+
+def _error_model(adjustment: Any) -> StoredErrorModel | None:
+    model = adjustment.error_model
+    if model is None:
+        return None
+    names = tuple(component.name for component in model.components)
+    return StoredErrorModel(names, model.theta, model.theta_sigma, model.score, model.own)
 
 
 def _state(problem: NetworkProblem, minimum: Any) -> State:

@@ -26,7 +26,7 @@ from jaxtyping import Array, Float
 
 from jaxbundle.adjustment.adjust import adjust, check_options
 from jaxbundle.adjustment.result import Adjustment
-from jaxbundle.arguments import number, positive, show, text, vector
+from jaxbundle.arguments import number, positive, show, text, truth, vector
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.result import Calibration
 from jaxbundle.calibration.start import CalibrationStart, start_values
@@ -60,6 +60,7 @@ def calibrate(  # noqa: PLR0913 keyword arguments of a public function
     robust: str | None = None,
     snooping: str | None = "pope",
     cross_validation: bool = True,
+    correlated: bool = True,
     camera: str = "cam",
     object_unit: str = "m",
     progress: Progress | None = None,
@@ -82,6 +83,8 @@ def calibrate(  # noqa: PLR0913 keyword arguments of a public function
       removed; `snooping`: the test for removal, None: no removal. Both, and further `options`
       (`significance`, `max_iterations`, …), are those of `jaxbundle.adjust`.
     - `cross_validation`: False: do not calibrate from halves of the photographs.
+    - `correlated`: state σ under errors that image points share, and compare halves by views, of
+      eight views or more (`Adjustment.error_model`, `Adjustment.replication`).
     - `camera`: its name. `progress(stage, done, total)`: photographs searched.
 
     **Returns:** a `Calibration`; check `converged` first.
@@ -139,6 +142,8 @@ def calibrate(  # noqa: PLR0913 keyword arguments of a public function
             )
             result = adjust(network, **options)
         start = dataclasses.replace(start, views=centred)
+    if truth("correlated", correlated):
+        result = result.with_correlated_errors("views")
     return Calibration(start.views, result, cross_validation)
 
 

@@ -155,7 +155,7 @@ def _fill(
     network = adjusted_network(calibration.adjustment)
     fill_project(network, folder / ADJUSTED)
     remark = _write_foreign(network, folder, name)
-    text = camera_text(calibration.camera, calibration.sigma, *remark)
+    text = camera_text(calibration.camera, calibration.stated_sigma, *remark)
     write_text(folder / f"{name}.toml", text)
     if plots:
         save_plots(calibration, folder, progress)

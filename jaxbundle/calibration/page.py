@@ -219,7 +219,7 @@ def _rig(rig: "RigCalibration", unit: str) -> Section:
 def _table_of_cameras(found: "Calibrations") -> Listing:
     """One row per parameter of every separately calibrated camera."""
     rows = [
-        (name, one.camera.model, parameter, value, one.sigma.get(parameter))
+        (name, one.camera.model, parameter, value, one.stated_sigma.get(parameter))
         for name, one in found.cameras.items()
         if one.converged
         for parameter, value in one.parameters.items()

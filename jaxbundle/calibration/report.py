@@ -74,7 +74,7 @@ def photograph_facts(views: BoardViews) -> list[tuple[str, str]]:
 
 def _camera(calibration: "Calibration") -> list[str]:
     lines = heading(f"Camera ({calibration.adjustment.network.cameras[0].model})")
-    free = calibration.sigma
+    free = calibration.stated_sigma
     rows = []
     # parameters held at zero are not part of the camera, to a reader
     for name, value in calibration.parameters.items():

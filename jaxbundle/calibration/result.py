@@ -22,9 +22,10 @@ from jaxbundle.display import print_anywhere
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.measure.views import BoardViews
 from jaxbundle.network.tables import Camera
+from jaxbundle.report.correlated import stated_sigma_of
 from jaxbundle.results import TableMethods
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray
+from jaxbundle.types import AnyArray, present
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,7 +40,7 @@ class Calibration(TableMethods):
     - `views`: the measurements, and the failed photographs with reasons;
     - `adjustment`: the `Adjustment` of the network;
     - `camera`: the camera with its adjusted parameters, held; `parameters` and `sigma` by name
-      (in the unit of the model, a posteriori);
+      (in the unit of the model, a posteriori), and `stated_sigma`, which are shown;
     - `rms`: √(Σ(vx² + vy²)/points) in pixels, as OpenCV defines it;
     - `bias`, `mapping_error`, `coverage`, `advice`, `cross_validation`: accuracy, and advice on
       further photographs; `validated`: whether the last is requested.
@@ -71,6 +72,13 @@ class Calibration(TableMethods):
         """σ of the free parameters by name."""
         names, C = self.adjustment.camera_covariance(self.name)
         return dict(zip(names, np.sqrt(np.diagonal(C)).tolist()))
+
+    @functools.cached_property
+    def stated_sigma(self) -> dict[str, float]:
+        """σ of the free parameters by name, under errors that image points share where these are
+        known and their σ are larger."""
+        found = self.adjustment.cameras[self.name]["parameters"]
+        return {name: present(stated_sigma_of(found[name])) for name in self.sigma}
 
     @property
     def camera(self) -> Camera:
@@ -278,10 +286,14 @@ class Calibration(TableMethods):
     def __str__(self) -> str:
         if not self.converged:
             return f"Calibration of {self.name}: not solved ({self.adjustment.termination})"
-        shown = ", ".join(f"{n} {self.parameters[n]:.6g} ± {s:.2g}" for n, s in self.sigma.items())
+        shown = ", ".join(
+            f"{n} {self.parameters[n]:.6g} ± {s:.2g}" for n, s in self.stated_sigma.items()
+        )
+        halves = self.adjustment.replication
         return (
             f"Calibration of {self.name}: {len(self.views)} photographs, "
             f"{len(self.views.failed)} failed, RMS {self.rms:.3f} px\n{shown}"
+            + ("" if halves is None else f"\n{halves.sentence}")
         )
 
 

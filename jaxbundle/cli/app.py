@@ -141,6 +141,13 @@ Control = Annotated[
     Path | None,
     typer.Option(help="table id,X,Y,Z[,sX,sY,sZ] that replaces the control of the input"),
 ]
+Correlated = Annotated[
+    bool,
+    typer.Option(
+        help="of eight photographs or more: σ under errors that image points share, and halves of "
+        "the photographs compared"
+    ),
+]
 Check = Annotated[
     list[str] | None,
     typer.Option(

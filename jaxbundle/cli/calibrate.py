@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from jaxbundle.choices import BOARDS, DICTIONARIES, ESTIMATORS, TESTS
-from jaxbundle.cli.app import Force, Html, Quiet, app, choice, model_choice
+from jaxbundle.cli.app import Correlated, Force, Html, Quiet, app, choice, model_choice
 from jaxbundle.cli.habits import is_in_file
 from jaxbundle.errors import InputError, NotSolvedError
 
@@ -77,6 +77,7 @@ def calibrate(  # noqa: PLR0913 - the options of the command
     cross_validation: Annotated[
         bool, typer.Option(help="calibrate from each half of the photographs: 4 adjustments")
     ] = True,
+    correlated: Correlated = True,
     unit: Annotated[str, typer.Option(help="unit of the board, a label")] = "m",
     json: Annotated[str, typer.Option(help="write the result as JSON; - prints only JSON")] = "",
     out: Annotated[
@@ -154,6 +155,7 @@ def calibrate(  # noqa: PLR0913 - the options of the command
                 "--snooping": snooping,
                 "--significance": significance,
                 "--robust": robust,
+                "--no-correlated": True if not correlated else None,
             },
         )
     with counting(quiet or json == "-") as bar:
@@ -172,6 +174,7 @@ def calibrate(  # noqa: PLR0913 - the options of the command
             snooping=test,
             significance=significance,
             robust=robust,
+            correlated=correlated,
             object_unit=unit,
         )
         choice = None

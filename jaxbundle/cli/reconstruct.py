@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from jaxbundle.choices import CODED_TARGETS, FEATURES, MATCHED_PAIRS
-from jaxbundle.cli.app import Check, Force, Html, Quiet, app, choice
+from jaxbundle.cli.app import Check, Correlated, Force, Html, Quiet, app, choice
 from jaxbundle.errors import InputError
 from jaxbundle.system.interrupts import advise
 
@@ -45,6 +45,7 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
     square_pixels: Annotated[
         bool, typer.Option(help="observe fy/fx as 1; otherwise both focal lengths are unknown")
     ] = True,
+    correlated: Correlated = True,
     json: Annotated[str, typer.Option(help="write the result as JSON; - prints only JSON")] = "",
     html: Html = "",
     brief: Annotated[
@@ -95,6 +96,7 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
             pairs=pairs,
             points=points,
             square_pixels=square_pixels,
+            correlated=correlated,
             store=store,
             progress=tell,
         )
@@ -109,6 +111,7 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
             "--pairs": pairs,
             "--points": points,
             "--no-square-pixels": True if not square_pixels else None,
+            "--no-correlated": True if not correlated else None,
         },
     )
     with staging(quiet or json == "-") as show:

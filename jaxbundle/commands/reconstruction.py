@@ -5,6 +5,7 @@ from dataclasses import replace
 from math import inf
 from pathlib import Path
 
+from jaxbundle.arguments import truth
 from jaxbundle.commands.cameras import CameraSource, open_camera
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.control import select_checks
@@ -33,6 +34,7 @@ def reconstruct(  # noqa: PLR0913 (public: the options of the command, all but o
     pairs: str | None = None,
     points: int | None = None,
     square_pixels: bool = True,
+    correlated: bool = True,
     settings: ReconstructionSettings = DEFAULT,
     store: str | Path | None = None,
     progress: Progress = lambda *_: None,
@@ -53,6 +55,8 @@ def reconstruct(  # noqa: PLR0913 (public: the options of the command, all but o
     - `features`: `"sift"`, `"akaze"` or `"orb"`; `pairs`: which photographs are matched; `points`:
       desired tie points per photograph. They replace those of `settings`.
     - `square_pixels`: observe fy/fx as 1; otherwise both focal lengths are unknown.
+    - `correlated`: state σ under errors that image points share, and compare halves by photographs,
+      of eight photographs or more (`Adjustment.error_model`, `Adjustment.replication`).
     - `store`: folder of features and matches, for a repeated run.
     - `progress(stage, done, total)`.
 
@@ -71,6 +75,8 @@ def reconstruct(  # noqa: PLR0913 (public: the options of the command, all but o
     if not square_pixels:
         # an infinite σ is no prior
         settings = replace(settings, aspect_sigma=inf)
+    if not truth("correlated", correlated):
+        settings = replace(settings, correlated=False)
     known = open_camera(camera) if camera is not None else None
     measured = open_control(control, control_sigma, check)
     bars = read_distances(distances) if isinstance(distances, str | Path) else distances

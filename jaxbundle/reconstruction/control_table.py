@@ -15,10 +15,24 @@ its measurements."""
 
 
 @dataclasses.dataclass(frozen=True)
+class ControlMeasurement:
+    """A measurement of a control or check point: its photograph; whether it was used; its distance
+    from where everything else predicts it, and the σ of a coordinate of this, pixels; None: not
+    predicted."""
+
+    image: str
+    used: bool
+    distance: float | None
+    sigma: float | None
+
+
+@dataclasses.dataclass(frozen=True)
 class ControlPoint:
     """A control or check point: `role` as given, whether it was `used`; rays that were used; given
     coordinates and their σ (NaN: exact, infinite: not controlled); adjusted minus given; RMS image
-    residual, pixels; `verdict` in words. Lengths in the object unit, NaN: not there."""
+    residual, pixels; `verdict` in words; `prediction` of it from everything else, predicted minus
+    given, and its σ; `measurements`: every image measurement. Lengths in the object unit, NaN: not
+    there."""
 
     id: str
     role: str
@@ -29,6 +43,17 @@ class ControlPoint:
     residual: Float[np.ndarray, "3"]
     image_residual: float
     verdict: str
+    prediction: Float[np.ndarray, "3"]
+    prediction_sigma: Float[np.ndarray, "3"]
+    measurements: tuple["ControlMeasurement", ...]
+
+    @property
+    def wrong_measurements(self) -> list[str]:
+        """The photographs whose measurement of it contradicts the others."""
+        # the verdict decides: measurements of a point that takes no part are not wrong by that
+        if "wrong measurement" not in self.verdict:
+            return []
+        return [one.image for one in self.measurements if f"{one.image} is a wrong" in self.verdict]
 
     def cells(self, places: int) -> tuple[str, ...]:
         """The row of the table as text, in the order of `HEADER`; decimal `places` of lengths."""
@@ -56,6 +81,8 @@ class ControlPoint:
             "residual": axes(self.residual),
             "image_residual": self.image_residual if np.isfinite(self.image_residual) else None,
             "verdict": self.verdict,
+            "prediction": {"error": axes(self.prediction), "sigma": axes(self.prediction_sigma)},
+            "measurements": [dataclasses.asdict(one) for one in self.measurements],
         }
 
 

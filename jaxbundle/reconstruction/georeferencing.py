@@ -16,7 +16,9 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from jaxbundle.adjustment.quality.control_prediction import predict_measurements
 from jaxbundle.adjustment.result import Adjustment
+from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Points
@@ -28,12 +30,18 @@ from jaxbundle.reconstruction.control_choice import (
     choose_control,
     without_unknown_heights,
 )
-from jaxbundle.reconstruction.control_table import ControlPoint, ControlTable, describe_sigma
+from jaxbundle.reconstruction.control_table import (
+    ControlMeasurement,
+    ControlPoint,
+    ControlTable,
+    describe_sigma,
+)
 from jaxbundle.reconstruction.controlled_network import network_with_control
 from jaxbundle.reconstruction.oriented_block import (
     MIN_CONTROL,
     ControlSettings,
     FrameData,
+    MeasuredPoint,
     OrientedBlock,
 )
 from jaxbundle.types import present
@@ -102,6 +110,7 @@ def _tabulate(
     checks, points = result.check_points, result.problem.network.points.id
     compared = {} if checks is None else {id: k for k, id in enumerate(checks.id)}
     snooped = [removed.name for removed in result.removed]
+    predicted, rays = _predict(result, control, choice), _predict_rays(result, control)
     for k, id in enumerate(control.id):
         measured = dataclasses.replace(final.measure(id), good=choice.points[id].good)
         X, residual = np.full(3, np.nan), np.full(3, np.nan)
@@ -111,7 +120,8 @@ def _tabulate(
             X = final.X[final.of_id[id]]
         if np.isfinite(X).all():
             residual = np.where(np.isinf(choice.sigma[k]), np.nan, X - control.position[k])
-        off = final.misses(measured, X)[measured.good]
+        away = final.misses(measured, X)
+        off = away[measured.good]
         used = "held exactly" if control.role[k] == "fixed" else "used"
         verdict = used if choice.used[k] else "left out"
         verdict = "check" if control.role[k] == "check" else verdict
@@ -132,4 +142,75 @@ def _tabulate(
             residual,
             float(np.sqrt((off**2).mean())) if len(off) else np.nan,
             ": ".join([verdict, "; ".join(reasons)]) if reasons else verdict,
+            *predicted.get(id, (np.full(3, np.nan), np.full(3, np.nan))),
+            tuple(_measurements(final, id, measured, X, away, rays)),
         )
+
+
+def _predict(
+    result: Adjustment, control: Points, choice: ControlChoice
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Error and σ of the prediction of every point from everything else; of points that take no
+    part in the result, their difference from it."""
+    given = {id: (X, s) for id, X, s in zip(control.id, control.position, choice.sigma)}
+    found = {}
+    for table in (result.points, result.table("checks")):
+        for k, id in enumerate(table.get("id", ())):
+            if id in given:
+                X, sigma = given[id]
+                position, own = (
+                    np.array([table[f"{kind}{axis}"][k] for axis in "XYZ"]) for kind in ("", "s")
+                )
+                free = np.isinf(sigma)
+                spread = np.hypot(own, np.where(np.isfinite(sigma), sigma, 0.0))
+                found[id] = tuple(np.where(free, np.nan, x) for x in (position - X, spread))
+    used = result.control_prediction
+    if used is not None:
+        found |= {id: (e, s) for id, e, s in zip(used.id, used.error, used.sigma)}
+    # exact coordinates take part and are not predicted
+    fixed = {id for id, role in zip(result.points["id"], result.points["role"]) if role == "fixed"}
+    return {id: both for id, both in found.items() if id not in fixed}
+
+
+def _predict_rays(result: Adjustment, control: Points) -> dict[tuple[str, str], tuple]:
+    """Distance and σ of the prediction of the image measurements that take part, pixels."""
+    problem = result.problem
+    named = np.isin(np.array(problem.network.points.id, object), control.id)
+    rays = np.flatnonzero(named[problem.point])
+    names, error, sigma, _ = predict_measurements(result.inspection, result.sigma0, rays)
+    scale = dict(zip(problem.network.images.id, _pixels(result)))
+    return {
+        (image, point): (
+            float(np.hypot(*e)) / scale[image],
+            float(np.sqrt((s**2).mean())) / scale[image],
+        )
+        for (image, point), e, s in zip(names, error, sigma)
+    }
+
+
+def _pixels(result: Adjustment) -> np.ndarray:
+    """The size of a pixel in the image unit, by image."""
+    network = result.problem.network
+    sizes = [
+        1.0 if get_model(c.model).unit == "px" or c.pixel_size is None else float(c.pixel_size[0])
+        for c in network.cameras
+    ]
+    return np.array(sizes)[network.images.camera]
+
+
+def _measurements(
+    final: OrientedBlock,
+    id: str,
+    measured: MeasuredPoint,
+    X: np.ndarray,
+    away: np.ndarray,
+    rays: dict[tuple[str, str], tuple],
+) -> Iterator[ControlMeasurement]:
+    """Every measurement of a point: those that take part as all others predict them, the others
+    against the place of the point."""
+    for n in range(len(measured.rows)):
+        image = final.name_of(measured, n)
+        distance, sigma = rays.get((image, id), (away[n], measured.sigma[n]))
+        finite = lambda x: float(x) if np.isfinite(x) else None
+        used = bool(measured.good[n]) and (image, id) in rays
+        yield ControlMeasurement(image, used, finite(distance), finite(sigma))

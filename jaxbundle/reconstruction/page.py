@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from jaxbundle.network.columns import count
+from jaxbundle.network.columns import count, list_some
 from jaxbundle.reconstruction.adjusting import DOUBTFUL_MISFIT, WRONG_MISFIT
 from jaxbundle.reconstruction.control_table import HEADER
 from jaxbundle.reconstruction.result import ReconstructedPart, Reconstruction
@@ -149,13 +149,14 @@ def _judge_control(part: ReconstructedPart) -> list[Finding]:
     )
     if left:
         words += f"; left out: {', '.join(left)}"
-    # the verdicts of the table, which name photograph and point, are its only source
-    wrong = sum("wrong measurement" in p.verdict for p in part.control.points)
+    wrong = [f"{clean(p.id)} in {clean(m)}" for p in control.points for m in p.wrong_measurements]
     if wrong:
-        words += f"; {count(wrong, 'point')} with a wrong measurement"
+        words += f"; wrong measurements: {', '.join(wrong)}"
     held = any(p.verdict.startswith("held exactly") for p in used)
-    said = [f"{len(left)} of {count(len(given), 'control point')} left out"] if left else []
-    said += [f"{count(wrong, 'control point')} with a wrong measurement"] if wrong else []
+    said = [f"control left out: {list_some(left, 3, clean)}"] if left else []
+    if wrong:
+        name = "wrong measurement" if len(wrong) == 1 else "wrong measurements"
+        said.append(f"{name}: {list_some(wrong, 3, str)}")
     said += ["control held exactly"] if held else []
     state = DOUBTFUL if said else GOOD
     findings = [Finding("Control", state, words, ", ".join(said))]

@@ -427,15 +427,18 @@ class _ReconstructionRun:
                 no_control = str(error)
                 self._warn(f"{name}: control is not used: {error}", np.inf)
             self._begin("")
+        result = weighted.adjustment
+        if settings.correlated:
+            result = result.with_correlated_errors()
         exif = {photograph.name: photograph.exif for photograph in self.photographs}
         # without control and positions the frame is an arbitrary one
         absolute = control is not None or self.further.positions is not None
-        block = describe_block(weighted.adjustment, exif, self.system if absolute else "")
+        block = describe_block(result, exif, self.system if absolute else "")
         template = measured.is_template
         tracks, colours = measured.track[template].tolist(), measured.colour[template].tolist()
         colour_of = {track_name(track): tuple(colour) for track, colour in zip(tracks, colours)}
         part = ReconstructedPart(
-            name, weighted.adjustment, colour_of, weighted.factors, block, control, no_control
+            name, result, colour_of, weighted.factors, block, control, no_control
         )
         if part.misfit >= DOUBTFUL_MISFIT:
             self._warn(f"{name}: {misfit_in_words(part)}", part.misfit)

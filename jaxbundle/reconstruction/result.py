@@ -13,6 +13,7 @@ from jaxbundle.network.columns import count
 from jaxbundle.reconstruction.adjusting import WRONG_MISFIT
 from jaxbundle.reconstruction.block import BlockFacts
 from jaxbundle.reconstruction.control_table import ControlTable
+from jaxbundle.report.correlated import first_facts, stated_sigma_of
 from jaxbundle.report.head import count_points
 from jaxbundle.results import TableMethods
 
@@ -69,6 +70,9 @@ class Reconstruction(TableMethods):
                     "sigma0": part.adjustment.sigma0,
                     "sigma_factors": dict(part.factors),
                     "removed": len(part.adjustment.removed),
+                    "replication": None
+                    if part.adjustment.replication is None
+                    else part.adjustment.replication.brief(),
                     "global_test_passed": part.adjustment.global_test()["passed"],
                     "block": part.block.as_dict(),
                     "control": None if part.control is None else part.control.as_dict(),
@@ -112,6 +116,11 @@ class Reconstruction(TableMethods):
             for part in self.parts
             for said in (*part.adjustment.weakness.lines, *part.adjustment.doubts)
         ]
+        lines += [
+            f"{part.name}: {name}: {words}"
+            for part in self.parts
+            for name, words in first_facts(part.adjustment)
+        ]
         for part in self.parts:
             if part.control is not None:
                 lines.append(part.control.sigma)
@@ -132,7 +141,7 @@ def principal_distances(result: Adjustment) -> dict[str, dict]:
 def distances_found(result: Adjustment) -> str:
     """The free principal distances, with their σ."""
     return "".join(
-        f", principal distance {c['value']:.2f} ± {c['sigma']:.2f} px ({id})"
+        f", principal distance {c['value']:.2f} ± {stated_sigma_of(c):.2f} px ({id})"
         for id, c in principal_distances(result).items()
         if c["free"] and c["sigma"]
     )

@@ -42,6 +42,9 @@ class ReconstructionSettings:
     """σ with which fy/fx of an unknown camera is observed as 1, infinite: not at all. Sensors have
     square pixels: for two reflex cameras, in 39 photographs of a panel of surveyed targets, fy/fx
     is 1 − 8e-5 and 1 − 5e-5 (± 3e-6)."""
+    correlated: bool = True
+    """State σ under errors that image points share, and compare halves by photographs, of parts of
+    eight photographs or more."""
     contradictory_share: float = 0.3
     """Share of pairs that contradict others in triplets above which a warning calls the result
     doubtful. In the set `building`, which is right, 23 of 66 do."""

@@ -75,6 +75,7 @@ def text(
     lines += unknowns.far_points(adjustment, max_rows)
     lines += unknowns.further(adjustment, max_rows)
     lines += observations.check_points(adjustment, max_rows)
+    lines += observations.predicted_control(adjustment, max_rows)
     lines += observations.distances(adjustment, max_rows)
     lines += observations.residuals(adjustment, residual_limit, test)
     lines += observations.redundancy(adjustment)

@@ -1,13 +1,20 @@
-"""Correlated errors in a report: their components, and the σ under them."""
+"""Correlated errors in a report: their components, the σ under them, and the replication.
 
-from typing import TYPE_CHECKING
+Where an error model is known, the σ shown with a value is the larger of the classical one and that
+under the model; both stand in the section of this module.
+"""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.report.layout import clean, heading, paragraph, significant, table
 from jaxbundle.types import present
 
 if TYPE_CHECKING:
+    from jaxbundle.adjustment.quality.replication import Difference
     from jaxbundle.adjustment.result import Adjustment
 
 TITLE = "Correlated errors"
@@ -17,6 +24,53 @@ LEGEND = (
     "exceed those of independent errors, in σ. The estimates are those of least squares; only "
     "their σ change."
 )
+
+
+REPLICATION_LEGEND = (
+    "Differences of the interior orientations of two halves that share no image point. d² is their "
+    "square over its covariance; the mean of d²/n is 1 where σ are right. Halves by photographs of "
+    "one camera share the remainder of its lens model, halves by points all that belongs to "
+    "photographs: they cannot show these errors."
+)
+DIFFERENCE_HEADER = ("parameter", "difference", "σ", "in σ", "σ correlated", "in it")
+NOTABLE_RATIO = 1.3
+"""σ under correlated errors over classical ones from which the difference is a finding: five in a
+hundred exceed 1.96 classical σ where the model is right, thirteen at this ratio."""
+COMPONENT_HEADER = ("component", "size", "σ", "unit", "score")
+SIGMA_HEADER = ("unknown", "σ classical", "σ correlated", "ratio")
+
+
+def stated_sigma(found: Mapping[str, np.ndarray], name: str) -> Float[np.ndarray, " rows"]:
+    """The σ of a column of a table of images or points: the larger of the classical one and, where
+    it is known, that under correlated errors."""
+    return np.fmax(found[f"s{name}"], found.get(f"s{name}_correlated", found[f"s{name}"]))
+
+
+def stated_sigma_of(parameter: Mapping[str, Any]) -> float | None:
+    """The same of a camera parameter; None where it is held."""
+    known = (parameter["sigma"], parameter.get("sigma_correlated"))
+    return max((sigma for sigma in known if sigma is not None), default=None)
+
+
+def has_shared_errors(adjustment: "Adjustment") -> bool:
+    """Whether σ under correlated errors are notably larger than classical ones."""
+    return adjustment.sigma_ratio > NOTABLE_RATIO
+
+
+def first_facts(adjustment: "Adjustment") -> list[tuple[str, str]]:
+    """Replication and ratio of σ, for the first lines of a result."""
+    rows = []
+    if adjustment.replication is not None:
+        rows.append(("Replication", adjustment.replication.sentence))
+    if adjustment.error_model is not None:
+        rows.append(
+            (
+                "σ shown",
+                f"under correlated errors {significant(adjustment.sigma_ratio, 3)} times the "
+                "classical ones (median of the orientations); the larger of both is shown",
+            )
+        )
+    return rows
 
 
 def component_rows(adjustment: "Adjustment") -> list[tuple[str, str, str, str, str]]:
@@ -70,23 +124,58 @@ def _row(name: str, classical: float, correlated: float) -> tuple[str, str, str,
     return name, significant(classical, 3), significant(correlated, 3), significant(ratio, 3)
 
 
-def correlated_lines(adjustment: "Adjustment") -> list[str]:
-    """The section of a report; nothing without an error model."""
-    if adjustment.error_model is None:
-        return []
-    header = ("component", "size", "σ", "unit", "score")
-    lines = [*heading(TITLE), *table(header, component_rows(adjustment), "lrrlr"), ""]
-    lines += paragraph(LEGEND)
+def difference_rows(split: "Difference") -> list[tuple[str, ...]]:
+    """A split as text, a row a parameter (`DIFFERENCE_HEADER`)."""
+    return [
+        (
+            f"{camera} {name}",
+            significant(d, 3),
+            significant(s, 2),
+            f"{d / s:.1f}",
+            significant(m, 2),
+            f"{d / m:.1f}",
+        )
+        for (camera, name), d, s, m in zip(
+            split.names, split.difference, split.sigma, split.sigma_correlated
+        )
+    ]
+
+
+def not_looked_for(adjustment: "Adjustment") -> str:
+    """Which components a model lacks, in a sentence; empty if none."""
     found = " ".join(size.name for size in present(adjustment.error_model).sizes)
     if "by photograph" not in found:
-        lines += paragraph(
+        return (
             "Errors of photographs and a field on the sensor were not looked for: they need eight "
             "photographs of a camera."
         )
-    elif "field on the sensor" not in found:
-        lines += paragraph(
+    if "field on the sensor" not in found:
+        return (
             "A field on the sensor was not looked for: it needs four image points for each of its "
             "splines."
         )
-    header = ("unknown", "σ classical", "σ correlated", "ratio")
-    return [*lines, "", *table(header, sigma_rows(adjustment), "lrrr")]
+    return ""
+
+
+def correlated_lines(adjustment: "Adjustment") -> list[str]:
+    """The section of a report; nothing if no error model was requested."""
+    if why := adjustment.why_no_error_model:
+        return [*heading(TITLE), *paragraph(f"Not looked for: {why}.")]
+    if adjustment.error_model is None:
+        return []
+    lines = [*heading(TITLE), *table(COMPONENT_HEADER, component_rows(adjustment), "lrrlr"), ""]
+    lines += paragraph(LEGEND)
+    if words := not_looked_for(adjustment):
+        lines += paragraph(words)
+    lines += ["", *table(SIGMA_HEADER, sigma_rows(adjustment), "lrrr")]
+    return [*lines, *_replication_lines(adjustment)]
+
+
+def _replication_lines(adjustment: "Adjustment") -> list[str]:
+    found = adjustment.replication
+    if found is None:
+        return []
+    lines = [*heading("Replication"), *paragraph(f"{found.sentence}.")]
+    for split in found.splits:
+        lines += ["", *table(DIFFERENCE_HEADER, difference_rows(split), "lrrrrr")]
+    return [*lines, "", *paragraph(REPLICATION_LEGEND)]

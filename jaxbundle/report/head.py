@@ -14,6 +14,7 @@ from jaxbundle.leastsquares.quality.global_test import describe_test
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.datum_words import open_directions_in_words
 from jaxbundle.network.tables import ESTIMATED, ROLES, STATED, UNIT
+from jaxbundle.report import correlated
 from jaxbundle.report.layout import (
     WIDTH,
     clean,
@@ -59,6 +60,10 @@ ADVICE = {
     "plane, or outside the range of the distortion.",
 }
 
+LARGER_SIGMA = (
+    "Those of cameras, images and points are the larger ones of the classical standard deviations "
+    "and those under correlated errors: see Correlated errors for both."
+)
 ADVICE_FOR = {
     "camera": "Free fewer camera parameters, or give them a prior σ; c needs depth or convergent "
     "images, x0 and y0 need images rolled about their axis.",
@@ -91,6 +96,7 @@ def first_facts(
     if adjustment.converged:
         _, words, findings = verdict or adjustment.verdict
         rows = [("Verdict", words), *((f.about, f.words) for f in findings if f.lowers)]
+        rows += correlated.first_facts(adjustment)
     rows += [("Attention", clean(text)) for text in adjustment.findings]
     if words := left_out_in_words(adjustment):
         rows.append(("Left out", f"{words}: see Notes, and left_out in the JSON"))
@@ -306,7 +312,8 @@ def chi_squared(adjustment: "Adjustment", level: float = 0.05) -> str:
     """The global test in words."""
     found = adjustment.global_test(level)
     failed = found["passed"] is False and found["vtpv"] > found["high"]
-    words = describe_test(found, unit_of_weight(adjustment), level)
+    shared = correlated.has_shared_errors(adjustment)
+    words = describe_test(found, unit_of_weight(adjustment), level, shared)
     return f"{words}, see Warnings" if failed and adjustment.doubts else words
 
 
@@ -316,6 +323,8 @@ def variance_factor(adjustment: "Adjustment") -> list[str]:
         "All standard deviations below are a posteriori, σ0 × those from the a priori weights, "
         "unless called a priori."
     )
+    if adjustment.error_model is not None:
+        text += f" {LARGER_SIGMA}"
     if adjustment.sigma_factors:
         text += (
             "  The a priori σ of the groups of observations are the estimated ones:  "

@@ -6,7 +6,7 @@ is requested.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -287,6 +287,57 @@ def check_points(adjustment: "Adjustment", most: int) -> list[str]:
     if total > most:
         lines.append(f"{total - most} more rows are in checks.csv; the summary is of all {total}.")
     return lines
+
+
+CONTROL_HEADER = ("point", "dX", "dY", "dZ", "σX", "σY", "σZ", "p %")
+MEASUREMENT_HEADER = ("image", "point", "dx", "dy", "σx", "σy", "p %")
+PREDICTION_LEGEND = (
+    "Each point, and each measurement, as all other observations predict it: predicted − given, "
+    "with the σ of a good one, and the probability of a larger difference by chance. Where there "
+    "are no check points, these differences take their place; – is not predicted."
+)
+
+
+def predicted_rows(
+    found: Mapping[str, np.ndarray], names: Sequence[str], axes: str
+) -> list[tuple[str, ...]]:
+    """Predicted control points or measurements as text, the least probable first."""
+    spread = np.concatenate([found[f"s{axis}"] for axis in axes])
+    places = column_decimals(spread)
+    order = np.argsort(np.nan_to_num(found["probability"], nan=1.0), kind="stable")
+    return [
+        (
+            *(str(found[name][i]) for name in names),
+            *(fixed(float(found[f"{kind}{axis}"][i]), places) for kind in "ds" for axis in axes),
+            significant(100 * float(found["probability"][i]), 2),
+        )
+        for i in order
+    ]
+
+
+def predicted_control(adjustment: "Adjustment", most: int) -> list[str]:
+    """Control points predicted from all other observations, and their image measurements."""
+    points, rays = (adjustment.table(name) for name in ("control", "control_measurements"))
+    if not points:
+        return []
+    unit = clean(adjustment.network.object_unit)
+    rows = predicted_rows(points, ("id",), "XYZ")
+    lines = [*heading(f"Control predicted from all other observations, in {unit}")]
+    lines += table(CONTROL_HEADER, rows[:most], "lrrrrrrr")
+    if rays:
+        listed = predicted_rows(rays, ("image", "point"), "xy")
+        shown = min(most, MEASUREMENTS_SHOWN)
+        lines += ["", f"Image measurements of control, in {adjustment.image_unit}"]
+        lines += table(MEASUREMENT_HEADER, listed[:shown], "llrrrrr")
+        if len(listed) > shown:
+            lines.append(f"{len(listed) - shown} more, less improbable, are in the JSON.")
+    return [*lines, "", *paragraph(PREDICTION_LEGEND)]
+
+
+ROWS_OF_PAGE = 200
+"""Predicted control points or measurements on a page, as in a report."""
+MEASUREMENTS_SHOWN = 40
+"""Image measurements of control in a report, the least probable first: half a page."""
 
 
 def distances(adjustment: "Adjustment", most: int) -> list[str]:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxbundle.network.columns import count, list_some
+from jaxbundle.report.correlated import first_facts, stated_sigma, stated_sigma_of
 from jaxbundle.report.head import (
     chi_squared,
     count_points,
@@ -57,7 +58,7 @@ def summary(adjustment: "Adjustment") -> list[tuple[str, str]]:
     if words := left_out_in_words(adjustment):
         rows.insert(1, ("Left out", words))
     if adjustment.converged:
-        rows.insert(1, ("Verdict", adjustment.verdict.words))
+        rows[1:1] = [("Verdict", adjustment.verdict.words), *first_facts(adjustment)]
     if not adjustment.converged:
         if adjustment.undetermined:
             rows.append(("Not determined", list_some(adjustment.undetermined, 8, clean)))
@@ -91,7 +92,7 @@ def _cameras(adjustment: "Adjustment") -> Iterator[tuple[str, str]]:
             f"{name} {value}" + ("" if sigma == MISSING else f" ± {sigma}")
             for name, found in entry["parameters"].items()
             if found["free"]
-            for value, sigma in [estimate(found["value"], found["sigma"])]
+            for value, sigma in [estimate(found["value"], stated_sigma_of(found))]
         ]
         if len(parts) > max_parameters:
             more = len(parts) - max_parameters // 2
@@ -109,7 +110,7 @@ def _points(adjustment: "Adjustment") -> str:
     share = 0.95
     parts = []
     for axis in "XYZ":
-        sigma = adjustment.points[f"s{axis}"]
+        sigma = stated_sigma(adjustment.points, axis)
         sigma = sigma[np.isfinite(sigma) & (sigma > 0) & adjustment.located]
         if len(sigma):
             middle, most = np.quantile(sigma, (0.5, share))

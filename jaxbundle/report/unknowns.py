@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from jaxbundle.cameras import CameraModel, get_model
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import EXTERIOR
+from jaxbundle.report.correlated import stated_sigma, stated_sigma_of
 from jaxbundle.report.equations import equations
 from jaxbundle.report.layout import (
     WITHOUT_SIGMA,
@@ -64,7 +65,7 @@ def _one_camera(entry: Mapping[str, Any], model: CameraModel) -> list[str]:
         if not found["free"]:
             held.append(f"{name} {significant(found['value'], WITHOUT_SIGMA)}")
             continue
-        value, sigma = estimate(found["value"], found["sigma"])
+        value, sigma = estimate(found["value"], stated_sigma_of(found))
         t, total = found["t"], found["total_correlation"]
         mark = "–" if np.isnan(t) else "no" if t < critical_t else "yes"
         rows.append((name, value, sigma, significant(t, 3), mark, fixed(100 * total, 1)))
@@ -115,7 +116,7 @@ def _many_cameras(adjustment: "Adjustment") -> list[str]:
         rows = []
         for camera, entry in chosen.items():
             cells = [
-                estimate(entry["parameters"][p]["value"], entry["parameters"][p]["sigma"])
+                estimate(entry["parameters"][p]["value"], stated_sigma_of(entry["parameters"][p]))
                 for p in names
             ]
             rows += [(camera, *(a for a, _ in cells)), ("   σ", *(b for _, b in cells))]
@@ -149,13 +150,14 @@ def images(adjustment: "Adjustment", most: int) -> list[str]:
     """Exterior orientation, two lines an image: values, and σ under them."""
     found = adjustment.images
     unit, angle = adjustment.image_unit, adjustment.network.angle_unit
-    places = [coordinate_decimals(found[f"s{name}"]) for name in EXTERIOR]
+    spread = {name: stated_sigma(found, name) for name in EXTERIOR}
+    places = [coordinate_decimals(spread[name]) for name in EXTERIOR]
     scale, rms_unit = (1e3, "µm") if unit == "mm" else (1.0, unit)
     rms_places = column_decimals(scale * found["rms"])
     rows = []
     for i in range(min(len(found["id"]), most)):
         values = [fixed(found[name][i], d) for name, d in zip(EXTERIOR, places)]
-        sigma = [_sigma(found[f"s{name}"][i], d) for name, d in zip(EXTERIOR, places)]
+        sigma = [_sigma(spread[name][i], d) for name, d in zip(EXTERIOR, places)]
         rms = fixed(scale * found["rms"][i], rms_places)
         rows += [(found["id"][i], *values, str(found["rays"][i]), rms), ("   σ", *sigma, "", "")]
     header = ("image", "X0", "Y0", "Z0", "ω", "φ", "κ", "rays", f"RMS v {rms_unit}")
@@ -209,7 +211,7 @@ SUMMARY = (
 
 def _precision(adjustment: "Adjustment", accuracy_unit: float | None) -> list[str]:
     found, unit = adjustment.points, clean(adjustment.network.object_unit)
-    sigma = np.stack([found[f"s{axis}"] for axis in "XYZ"], 1)
+    sigma = np.stack([stated_sigma(found, axis) for axis in "XYZ"], 1)
     free = adjustment.problem.table("point").free > 0
     free = free & np.isfinite(sigma) & (sigma > 0)
     # points at infinity have no coordinates whose σ could be counted
@@ -260,13 +262,14 @@ def _list_of_points(adjustment: "Adjustment", most: int) -> list[str]:
     found = adjustment.points
     total = len(found["id"])
     shown = np.arange(min(total, most))
-    places = [coordinate_decimals(found[f"s{axis}"]) for axis in "XYZ"]
+    spread = {axis: stated_sigma(found, axis) for axis in "XYZ"}
+    places = [coordinate_decimals(spread[axis]) for axis in "XYZ"]
     rows = [
         (
             found["id"][i],
             ROLE_WORDS[found["role"][i]],
             *(fixed(found[axis][i], d) for axis, d in zip("XYZ", places)),
-            *(_sigma(found[f"s{axis}"][i], d) for axis, d in zip("XYZ", places)),
+            *(_sigma(spread[axis][i], d) for axis, d in zip("XYZ", places)),
             str(found["rays"][i]),
         )
         for i in shown

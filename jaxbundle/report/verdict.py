@@ -14,8 +14,9 @@ from jaxtyping import Bool, Float
 
 from jaxbundle.leastsquares.quality.distributions import level_of_one
 from jaxbundle.leastsquares.quality.global_test import contradicts
-from jaxbundle.network.columns import count
+from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import ESTIMATED
+from jaxbundle.report.correlated import has_shared_errors
 from jaxbundle.report.head import chi_squared, open_datum
 from jaxbundle.report.layout import clean, significant
 from jaxbundle.report.observations import count_weak, critical_value
@@ -147,20 +148,28 @@ def _tested(
 
 
 def _correlated(adjustment: "Adjustment") -> list[Finding]:
-    """σ that shared errors make larger; 1.3: five in a hundred exceed 1.96 classical σ where the
-    model is right, thirteen at this ratio."""
-    if adjustment.error_model is None:
-        return []
-    ratio, largest = adjustment.sigma_ratio, adjustment.error_model.sizes[1:]
-    named = max(largest, key=lambda size: size.score, default=None)
-    words = f"σ under correlated errors are {significant(ratio, 2)} times the classical ones"
-    if named is not None and named.size > 0:
-        words += f"; most of all a {named.name}"
-    if ratio > 1.3:
-        return [
-            Finding("Correlated errors", NOTED, words, f"σ {significant(ratio, 2)} times larger")
-        ]
-    return [Finding("Correlated errors", GOOD, words)]
+    """σ that shared errors make larger, and halves of the network that contradict each other."""
+    found = []
+    if adjustment.error_model is not None:
+        ratio, components = adjustment.sigma_ratio, adjustment.error_model.sizes[1:]
+        named = max(components, key=lambda size: size.score, default=None)
+        words = f"σ under correlated errors are {significant(ratio, 2)} times the classical ones"
+        if named is not None and named.size > 0:
+            words += f"; most of all a {named.name}"
+        state = NOTED if has_shared_errors(adjustment) else GOOD
+        brief = f"σ {significant(ratio, 2)} times larger under correlated errors"
+        found.append(Finding("Correlated errors", state, words, brief))
+    elif why := adjustment.why_no_error_model:
+        brief = "no look at correlated errors"
+        found.append(Finding("Correlated errors", NOTED, f"not looked for: {why}", brief))
+    if (halves := adjustment.replication) is not None:
+        if not halves.splits:
+            state, brief = NOTED, "halves not compared"
+        else:
+            state = DOUBTFUL if halves.probability < LEVEL else GOOD
+            brief = f"halves by {halves.by} contradict each other"
+        found.append(Finding("Replication", state, halves.sentence, brief))
+    return found
 
 
 def _control(adjustment: "Adjustment") -> Finding:
@@ -172,13 +181,30 @@ def _control(adjustment: "Adjustment") -> Finding:
     largest, limit, words = _tested(adjustment, adjustment.residuals["kind"] == "control")
     if np.isnan(largest):
         return _held_control(adjustment, parts)
-    words = f"{parts}; largest |τ| {words}"
+    words = f"{parts}; largest |τ| {words}{name_contradicted(adjustment)}"
     if largest > limit:
         return Finding("Control", BAD, words, "control contradicted")
     if vague := adjustment.weakness.georeference:
         brief = vague.partition(",")[0]
         return Finding("Control", NOTED, f"{words}; {vague}", brief)
     return Finding("Control", GOOD, words)
+
+
+def name_contradicted(adjustment: "Adjustment") -> str:
+    """Control points and image measurements of control that all other observations contradict, in
+    words; empty without."""
+    found = adjustment.control_prediction
+    if found is None:
+        return ""
+    points = found.contradicted(level_of_one(LEVEL, len(found.id)))
+    rays = found.wrong_measurements(level_of_one(LEVEL, len(found.measurement)))
+    said = []
+    if points:
+        said.append(f"contradicted by all others: {list_some(points, 5, clean)}")
+    if rays:
+        names = (f"{point} in {image}" for image, point in rays)
+        said.append(f"measurements contradicted by all others: {list_some(names, 5, clean)}")
+    return "".join(f"; {words}" for words in said)
 
 
 def _free_network(adjustment: "Adjustment") -> Finding:

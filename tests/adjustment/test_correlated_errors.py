@@ -4,17 +4,30 @@ import dataclasses
 import json
 
 import numpy as np
+import page_reader
 import pytest
 
 import jaxbundle
+from jaxbundle.adjustment.problem import make_problem
 from jaxbundle.adjustment.quality.correlated_errors import splines, wendland
+from jaxbundle.adjustment.quality.replication import compared_parameters
+from jaxbundle.leastsquares.quality import error_components
+from jaxbundle.network.sightings import keep_images
 from jaxbundle.planning import grid_of_targets, ring_of_stations
+from jaxbundle.report.page import compose
 
 IMAGES, SIGMA = 12, 0.2
 CAMERA = jaxbundle.Camera(
     "cam", "opencv", {"fx": 1500.0, "fy": 1500.0, "cx": 999.5, "cy": 749.5, "k1": -0.05},
     free=("fx", "fy", "cx", "cy", "k1", "k2"), image_size=(2000, 1500),
 )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def shaken(clean):
+    """Adjusted with errors of photographs, the error model and halves by photographs."""
+    found = jaxbundle.adjust(disturbed(clean, 5, affine=0.4), correlated=True)
+    return found.with_changes(halves_by="photographs")
 
 
 @pytest.fixture(scope="module")
@@ -85,16 +98,110 @@ def test_a_field_on_the_sensor_is_found(clean):
     assert len(result.to_pandas("cameras")["sigma_correlated"])
 
 
-def test_halves_show_what_classical_sigma_lack(clean):
+def test_halves_show_what_classical_sigma_lack(clean, shaken):
     plain = jaxbundle.replicate(clean, by="photographs", repeat=3)
     assert 0.2 < plain.ratio < 2.2 and abs(plain.ratio_correlated / plain.ratio - 1) < 0.3
-    shaken = jaxbundle.replicate(
-        jaxbundle.adjust(disturbed(clean, 5, affine=0.4)), by="photographs", repeat=3
-    )
-    assert shaken.ratio > 4 and 0.3 < shaken.ratio_correlated < 2.2
-    assert len(shaken.table()["parameter"]) == 3 * len(CAMERA.free)
+    found = jaxbundle.replicate(shaken, by="photographs", repeat=3)
+    assert found.ratio > 4 and 0.3 < found.ratio_correlated < 2.2
+    assert len(found.table()["parameter"]) == 3 * len(CAMERA.free)
+    assert found.splits[0].d2 == pytest.approx(shaken.replication.d2)
     by_points = jaxbundle.replicate(clean, by="points")
     assert by_points.dof == len(CAMERA.free)
+
+
+def test_a_half_is_that_of_its_image_points_alone(shaken):
+    """A network of every other photograph, adjusted from its own start values."""
+    network = shaken.network
+    second = network.observations.image % 4 < 2  # both rolled and not
+    found = shaken.compare_halves(second)
+    halves = [keep_images(network, np.arange(IMAGES) % 4 // 2 == 1 - k) for k in (0, 1)]
+    alone = [jaxbundle.adjust(half) for half in halves]
+    values = [[one.camera_parameters("cam")[name] for _, name in found.names] for one in alone]
+    sigma = np.sqrt(np.diag(found.classical))
+    np.testing.assert_allclose(found.difference / sigma, np.subtract(*values) / sigma, atol=0.1)
+    # independent halves: the sum of both covariances, with the σ0 of the whole
+    Q = sum(one.camera_cofactor("cam")[1] for one in alone)
+    np.testing.assert_allclose(sigma, shaken.sigma0 * np.sqrt(np.diag(Q)), rtol=0.03)
+
+
+def test_report_and_page_show_components_sigma_and_halves(shaken):
+    """The σ shown first is the larger one; halves are in the first lines."""
+    html = "".join(compose(shaken))
+    shown = "".join(t for texts in page_reader.Page(html).texts.values() for t in texts)
+    text = shaken.report()
+    d2 = f"{shaken.replication.ratio:.2f}"
+    assert d2 in text.partition("Counts")[0] and d2 in str(shaken)
+    assert "σ0" in str(shaken) and "Correlated errors" in text and "Replication" in text
+    for size in shaken.error_model.sizes:
+        assert size.name in shown
+    assert d2 in shown and shaken.replication.sentence in shown
+    f = shaken.cameras["cam"]["parameters"]["fx"]
+    assert f["sigma_correlated"] > 1.5 * f["sigma"]
+    for column, name in (("sigma", "sigma_correlated"), ("classical", "sigma")):
+        assert page_reader.column(html, "cameras", column)[0] == pytest.approx(f[name], rel=1e-5)
+    about = [finding.about for finding in shaken.verdict.findings if finding.state != "met"]
+    assert "Correlated errors" in about
+
+
+def test_chi_squared_confirms_no_sigma_where_errors_are_shared(shaken):
+    network = shaken.network
+    stated = dataclasses.replace(
+        network.observations,
+        sigma=network.observations.sigma * shaken.sigma0, sigma_origin="stated",
+    )  # fmt: skip
+    found = jaxbundle.adjust(network.replace(observations=stated), correlated=True)
+    assert found.global_test()["passed"]
+    words = " ".join(found.report().split())
+    assert "confirmed" not in words and "does not show errors that observations share" in words
+
+
+def test_a_saved_result_keeps_error_model_and_halves(shaken, tmp_path, monkeypatch):
+    shaken.save(tmp_path / "a.npz")
+    again = jaxbundle.load_adjustment(tmp_path / "a.npz")
+    monkeypatch.setattr(error_components, "fit_error_model", None)  # nothing is estimated again
+    assert again.report() == shaken.report()
+    told = [json.dumps(one.to_dict()) for one in (shaken, again)]
+    assert told[0] == told[1] and json.loads(told[0])["replication"]["by"] == "photographs"
+    name = ("camera", "cam", "fx")
+    function = lambda values: values["camera"][0, :2]
+    modelled = [one.modelled_covariance_of(function) for one in (shaken, again)]
+    np.testing.assert_allclose(*modelled, rtol=1e-9)
+    f = shaken.cameras["cam"]["parameters"]["fx"]
+    assert np.sqrt(modelled[0][0, 0]) == pytest.approx(f["sigma_correlated"], rel=0.1)
+    assert np.sqrt(shaken.covariance(name)[0, 0]) == pytest.approx(f["sigma"])
+
+
+def test_comparisons_use_sigma_under_correlated_errors(clean, shaken, tmp_path):
+    """Of two sessions with errors of photographs, which classical σ call different."""
+    other = jaxbundle.adjust(disturbed(clean, 6, affine=0.4), correlated=True)
+    plain = [jaxbundle.adjust(one.network) for one in (shaken, other)]
+    with_model, without = jaxbundle.compare(shaken, other), jaxbundle.compare(*plain)
+    camera = with_model.kind == "camera"
+    C = [one.modelled_camera_covariance("cam")[1] for one in (shaken, other)]
+    np.testing.assert_allclose(with_model.sigma[camera] ** 2, np.diag(sum(C)), rtol=0.1)
+    assert with_model.modelled == ("a", "b") and not without.modelled
+    assert with_model.tests["camera cam"].f < without.tests["camera cam"].f / 3
+    files = []
+    for number, one in enumerate((shaken, other)):
+        files.append(tmp_path / f"{number}.json")
+        files[-1].write_text(json.dumps(one.to_dict(brief=True)))
+    found = jaxbundle.stability(files)
+    np.testing.assert_allclose(found.sigma[0] ** 2, np.diag(C[0]), rtol=1e-9)
+    d = np.subtract(
+        *[[one.camera_parameters("cam")[n] for n in found.names] for one in (shaken, other)]
+    )
+    assert found.all_parameters.chi2 == pytest.approx(square(d, sum(C)), rel=1e-6)
+
+
+def test_only_free_parameters_are_compared(clean):
+    """Held parameters between free ones: columns of unknowns are not those of values."""
+    free = ("fx", "fy", "k2", "p2")
+    held = clean.replace(cameras=(dataclasses.replace(CAMERA, free=free),))
+    problem = make_problem(held)
+    both = [np.arange(len(problem.image)) % 2 == k for k in (0, 1)]
+    names = compared_parameters(problem, both)
+    assert [name for _, name, _ in names] == list(free)
+    assert [k for *_, (_, _, k) in names] == [0, 1, 2, 3]
 
 
 def test_what_cannot_be_replicated_is_said(clean):

@@ -5,6 +5,8 @@ import warnings
 import numpy as np
 import pytest
 
+from jaxbundle.adjustment.quality.correlated_errors import CorrelationSettings
+from jaxbundle.calibration import calibrate
 from jaxbundle.calibration.page import compose_calibration
 from jaxbundle.calibration.result import Calibration
 
@@ -28,3 +30,27 @@ def test_what_has_no_logarithm_is_not_drawn(calibration, monkeypatch, middle, co
     assert (EXACT in text) == (not drawn)
     for name in ("middle of the image", "worst corner"):
         assert (f"</svg>{name}</span>" in text) == (name in drawn)
+
+
+def test_views_are_compared_in_halves_without_being_asked(calibration):
+    """Twelve views of a rendered board: its first lines have the factor, its σ are the larger."""
+    halves = calibration.adjustment.replication
+    assert halves.by == "views" and halves.dof == len(calibration.sigma)
+    # nine parameters, errors of rendering and corners alone: χ² of 9 is below 27.9 with 99.9 %
+    assert halves.d2_correlated < 27.9
+    assert halves.sentence in str(calibration)
+    told = calibration.to_dict(brief=True)
+    assert told["replication"]["d2"] == pytest.approx(halves.d2)
+    for name, sigma in calibration.stated_sigma.items():
+        entry = told["cameras"][calibration.name]["parameters"][name]
+        assert sigma == max(entry["sigma"], entry["sigma_correlated"])
+    page = "".join(compose_calibration(calibration))
+    assert halves.sentence in page.partition("<nav>")[0] and "affine by photograph" in page
+
+
+def test_halves_are_not_made_of_few_views_or_if_turned_off(calibration):
+    plain = calibrate(calibration.views, correlated=False).adjustment
+    assert plain.replication is None and plain.error_model is None
+    assert "Replication" not in plain.report() and "replication" not in plain.to_dict(brief=True)
+    more_than_there_are = CorrelationSettings(min_images=13)
+    assert plain.with_correlated_errors("views", more_than_there_are) is plain

@@ -98,6 +98,31 @@ def test_a_wrong_name_and_a_bad_point_are_named(spoilt):
     assert np.linalg.norm(points["gcp06"].residual[:2] + [2.9, -2.6]) < 3 * SIGMA
 
 
+def test_every_point_and_every_measurement_is_predicted(spoilt):
+    """Good ones within 3 σ of it, or hardly beyond; the wrong ones far."""
+    image, result, points, _ = spoilt
+    for id, point in points.items():
+        t = np.abs(point.prediction / point.prediction_sigma)
+        assert len(point.measurements) > 1
+        if id == "gcp06":
+            # its difference from the result, with both σ
+            assert t[:2].max() > 3.5
+        else:
+            assert t.max() < 3.5 and (point.prediction_sigma > 0).all()
+        for one in point.measurements:
+            wrong = (id, one.image) == ("gcp04", image)
+            # 27 measurements and more, of two coordinates: 4.5 σ by chance with 1e-4
+            assert (one.distance > 20 * one.sigma) if wrong else one.distance < 4.5 * one.sigma
+    assert points["gcp04"].wrong_measurements == [image]
+    # of used points it is the deletion residual, which a coordinate with σ enlarges
+    used = [p for p in points.values() if p.used]
+    larger = [np.abs(p.prediction) > np.abs(p.residual) * (1 - 1e-6) for p in used]
+    assert np.mean(larger) > 0.9
+    told = points["gcp06"].numbers()
+    json.dumps(told, allow_nan=False)
+    assert told["prediction"]["sigma"]["X"] > 0
+
+
 @pytest.mark.further
 def test_stated_sigma_is_not_refused(drone, handheld):
     named, _ = swapped(drone.named, "gcp04", "gcp00")

@@ -51,3 +51,26 @@ def test_pixels_are_released_only_if_both_halves_of_the_photographs_agree(
     found = run._check_ratios(oriented, weighted, None, "first")
     assert found == ((("network", ["cam"]), "again") if confirmed else (weighted, "first"))
     assert ("are not square" in run.notes[-1]) == confirmed
+
+
+@pytest.mark.parametrize("correlated", [True, False])
+def test_parts_state_errors_that_image_points_share_unless_turned_off(run, monkeypatch, correlated):
+    examined = SimpleNamespace()
+    adjusted = SimpleNamespace(with_correlated_errors=lambda: examined)
+    weighted = SimpleNamespace(adjustment=adjusted, factors={}, unused_points=0)
+    none = np.zeros(0, int)
+    measured = SimpleNamespace(is_template=none > 0, track=none, colour=np.zeros((0, 3), int))
+    oriented = SimpleNamespace(images={})
+    for photograph in run.photographs:
+        photograph.exif = None
+    for name in ("tie_network", "refuse_folded", "describe_block"):
+        monkeypatch.setattr(reconstruct, name, lambda *_: None)
+    monkeypatch.setattr(reconstruct, "refuse_superimposed", lambda *_: [])
+    for name, found in {
+        "_measure": measured, "_adjust_first": (oriented, weighted, ""),
+        "_check_ratios": (weighted, ""), "_compare_with_files": [],
+    }.items():  # fmt: skip
+        monkeypatch.setattr(run, name, lambda *_, found=found: found)
+    run.settings = ReconstructionSettings(correlated=correlated)
+    part, _ = run._make_part([], [], [], "part 1")
+    assert part.adjustment is (examined if correlated else adjusted)

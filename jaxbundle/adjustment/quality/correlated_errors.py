@@ -18,10 +18,11 @@ import dataclasses
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.leastsquares.quality.error_components import (
+    OTHERS,
     ErrorComponent,
     ErrorModel,
     ErrorSettings,
@@ -157,7 +158,20 @@ def error_components(
         ]
     if (track := _along_tracks(found, problem, rays, settings.reach)) is not None:
         components.append(track)
+    others = np.setdiff1d(np.arange(rays.number), np.concatenate([rays.row, rays.row + 1]))
+    others = others[_have_weight(found)[others]]
+    if components and len(others):
+        # control, priors, positions: their σ are not those of image points
+        shape = (rays.number, len(others))
+        one = sp.csr_matrix((np.ones(len(others)), (others, np.arange(len(others)))), shape=shape)
+        components.append(ErrorComponent(OTHERS, "σ", one))
     return components
+
+
+def _have_weight(found: Solution) -> Bool[np.ndarray, " rows"]:
+    """Which rows of all observations take part."""
+    problem = found.problem
+    return np.concatenate([problem.weights(o.name).ravel() > 0 for o in problem.observations])
 
 
 def correlated_errors(

@@ -19,7 +19,8 @@ from jaxbundle.network.tables import Camera
 from jaxbundle.system.file_content import parse_json
 
 Calibrated = tuple[Camera, tuple[list[str], Float[np.ndarray, "k k"]]]
-"""A camera, the names of its free parameters, their covariance."""
+"""A camera, the names of its free parameters, their covariance: under correlated errors where the
+result has it."""
 
 
 def is_result(path: Path) -> bool:
@@ -69,8 +70,10 @@ def _calibrate(
     row |= {name: sizes[name] for name in ("image_size", "pixel_size") if sizes.get(name)}
     (camera,) = make_cameras([row], f"{path}, ")
     free = [name for name, p in parameters.items() if p["free"]]
-    sigma = np.array([float(parameters[name]["sigma"]) for name in free])
-    known = entry["correlations"]
+    # both or none: σ and correlations of one covariance
+    kind = "_correlated" if "correlations_correlated" in entry else ""
+    sigma = np.array([float(parameters[name][f"sigma{kind}"]) for name in free])
+    known = entry[f"correlations{kind}"]
     # The JSON has one row for a group of tied parameters: they are fully correlated, ρ = 1.
     listed = {name: _find_tied(name, parameters, known) for name in free}
     correlation = lambda a, b: 1.0 if a == b else float(known[a][b])

@@ -25,6 +25,10 @@ if TYPE_CHECKING:
     from jaxbundle.report.verdict import Verdict
 
 
+CORRELATIONS = ("correlations", "correlations_correlated")
+"""Of the parameters of a camera: classical, and under correlated errors where these are known."""
+
+
 def result_dict(adjustment: "Adjustment", brief: bool = False) -> dict:
     """The result as plain dicts and numbers; `brief` leaves points and residuals out."""
     counts = adjustment.counts
@@ -79,9 +83,13 @@ def result_dict(adjustment: "Adjustment", brief: bool = False) -> dict:
         ],
     }
     head |= {"check_points": _checks(adjustment)}
+    if adjustment.control_prediction is not None:
+        head |= {"control_prediction": _predicted(adjustment)}
     if adjustment.error_model is not None:
         head |= {"error_components": [size._asdict() for size in adjustment.error_model.sizes]}
         head |= {"sigma_ratio": adjustment.sigma_ratio}
+    if adjustment.replication is not None:
+        head |= {"replication": adjustment.replication.brief()}
     if brief:
         return head
     return head | {
@@ -155,8 +163,8 @@ def verdict_dict(verdict: "Verdict") -> dict:
 
 
 def _camera(table: dict, given: "Camera") -> dict:
-    free, C = table["free"], table["correlations"]
-    correlations = {
+    free = table["free"]
+    by_name = lambda C: {
         a: {b: float(C[i, j]) for j, b in enumerate(free) if j != i} for i, a in enumerate(free)
     }
     return {
@@ -164,7 +172,7 @@ def _camera(table: dict, given: "Camera") -> dict:
         "image_size": given.image_size and list(given.image_size),
         "pixel_size": given.pixel_size and list(given.pixel_size),
         "parameters": table["parameters"],
-        "correlations": correlations,
+        **{name: by_name(table[name]) for name in CORRELATIONS if name in table},
     }
 
 
@@ -239,6 +247,22 @@ def _far_points(adjustment: "Adjustment") -> dict:
 def _residuals(table: Mapping[str, np.ndarray]) -> Iterator[dict]:
     for row in table_rows(table):
         yield dict(zip(table, row))
+
+
+def _predicted(adjustment: "Adjustment") -> dict:
+    points, rays = (adjustment.table(name) for name in ("control", "control_measurements"))
+    error = lambda row, axes: (
+        {a: {"error": row[f"d{a}"], "sigma": row[f"s{a}"]} for a in axes}
+        | {"probability": row["probability"]}
+    )
+    row_dicts = lambda table: (dict(zip(table, row)) for row in table_rows(table))
+    return {
+        "points": {row["id"]: error(row, "XYZ") for row in row_dicts(points)},
+        "measurements": [
+            {"image": row["image"], "point": row["point"]} | error(row, "xy")
+            for row in row_dicts(rays)
+        ],
+    }
 
 
 def _checks(adjustment: "Adjustment") -> dict:

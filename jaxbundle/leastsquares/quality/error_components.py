@@ -16,7 +16,8 @@ expectations (MINQUE: Rao 1971; Koch 1999, section 3.6)
 
 Roots of many columns are replaced by random combinations of them, F·Ξ/√R with E ΞΞᵀ = R·1, on one
 side of a trace (Hutchinson 1990). V_k that fit the residuals no better than the independent part
-get the size zero.
+get the size zero. Observations that are said to have their own σ (`OTHERS`: control, priors beside
+image points) are independent errors of the size σ0, whatever that of the others is.
 
 Estimating the effects as unknowns with priors gives honest σ too, and estimates that are not nearer
 to each other in halves of real networks; so does whitening. Covariances clustered by image or point
@@ -31,7 +32,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxbundle.leastsquares.datum.conditions import (
     of_groups,
@@ -40,12 +41,20 @@ from jaxbundle.leastsquares.datum.conditions import (
     zeros_of_tables,
 )
 from jaxbundle.leastsquares.equations.elimination import NormalFactor, solve
+from jaxbundle.leastsquares.equations.linearise import differentiate
 from jaxbundle.leastsquares.equations.normal import Tangent, zero_tangent
 from jaxbundle.leastsquares.indexing.plan import Plan
-from jaxbundle.leastsquares.indexing.rows import Data, Declared, Values, restore_order
-from jaxbundle.leastsquares.quality.derivatives import LinearisedSolution
+from jaxbundle.leastsquares.indexing.rows import (
+    Data,
+    Declared,
+    Values,
+    lay_out_data,
+    prepare,
+    restore_order,
+)
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.system.programs import compile_once
+from jaxbundle.types import present
 
 AT_ONCE = 16
 """Columns a call: half and double take the same time a column, and the last call is filled up."""
@@ -59,6 +68,11 @@ class ErrorComponent(NamedTuple):
     name: str
     unit: str
     root: Any
+
+
+OTHERS = "other observations"
+"""The name of a component whose size is not estimated: independent errors of some rows, σ0 times
+their a priori σ; its θ is added to that of all independent errors."""
 
 
 class ErrorSize(NamedTuple):
@@ -107,9 +121,11 @@ class ErrorModel:
     def sizes(self) -> tuple[ErrorSize, ...]:
         """√θ of the independent part, as a factor of the a priori σ, and of all components."""
         names = [("independent errors", "σ"), *((c.name, c.unit) for c in self.components)]
+        names = [one for one in names if one[0] != OTHERS]
         # σ of √θ: σ_θ/(2√θ); not more than the size that one σ of θ would have, as at zero
-        root, most = np.sqrt(self.theta), np.sqrt(self.theta_sigma)
-        sigma = np.minimum(self.theta_sigma, 2 * root * most) / np.where(root > 0, 2 * root, 1.0)
+        theta, spread = self.theta[: len(names)], self.theta_sigma[: len(names)]
+        root, most = np.sqrt(theta), np.sqrt(spread)
+        sigma = np.minimum(spread, 2 * root * most) / np.where(root > 0, 2 * root, 1.0)
         sigma = np.where(root > 0, sigma, most)
         return tuple(
             ErrorSize(name, unit, float(s), float(d), float(z))
@@ -119,16 +135,19 @@ class ErrorModel:
     def covariance(self, table: str) -> Float[np.ndarray, "rows width width"]:
         """The covariance blocks of all rows of a table."""
         blocks = self.theta[0] * np.asarray(self.found.cofactor(table))
-        return blocks + sum(t * own[table] for t, own in zip(self.theta[1:], self.own) if t > 0)
+        return blocks + sum(t * own[table] for t, own in zip(self.theta[1:], self.own) if t != 0)
 
     def propagate_rows(
         self, rows: Mapping[str, Float[np.ndarray, "n rows width"]]
     ) -> Float[np.ndarray, "n n"]:
         """The covariance of linear functions of the changes of tables (`Solution.slopes`)."""
-        D = effects(self.found, rows)
+        return self.of_effects(effects(self.found, rows))
+
+    def of_effects(self, D: Float[np.ndarray, "n rows"]) -> Float[np.ndarray, "n n"]:
+        """The covariance D·Σ·Dᵀ of linear functions D of the errors, in units of their σ."""
         C = self.theta[0] * D @ D.T
         for theta, component in zip(self.theta[1:], self.components):
-            if theta > 0:
+            if theta != 0:
                 B = np.asarray(component.root.T @ D.T)
                 C = C + theta * B.T @ B
         return C
@@ -137,7 +156,7 @@ class ErrorModel:
 def fit_error_model(
     found: Solution, components: Sequence[ErrorComponent], settings: ErrorSettings = DEFAULTS
 ) -> ErrorModel:
-    """The sizes of components from the residuals of a solution."""
+    """The sizes of components from the residuals of a solution; `OTHERS` comes last."""
     rng = np.random.default_rng(settings.seed)
     F, number = [component.root.tocsr() for component in components], len(components) + 1
     v = stack_rows(found, found.residuals)
@@ -157,9 +176,23 @@ def fit_error_model(
         T[k, 0] = T[0, k]
         own.append(blocks)
     T[1:, 1:] = (T[1:, 1:] + T[1:, 1:].T) / 2
+    given = np.zeros(len(v), bool)
+    if components and components[-1].name == OTHERS:
+        # V_0 without the given rows, whose part of the forms is known
+        given[F[-1].nonzero()[0]] = True
+        F = F[:-1]
+        part = np.eye(number)
+        part[-1, 0] = -1
+        T, q = part.T @ T @ part, part.T @ q
+        T, q = T[:-1, :-1], q[:-1] - found.sigma0**2 * T[:-1, -1]
     theta = _nonnegative(T, q)
     score = _scores(T, q)
-    sigma = np.sqrt(np.diag(_covariance_of_sizes(found, F, theta, T, settings, rng)))
+    independent = np.where(given, found.sigma0**2, theta[0])
+    covariance = _covariance_of_sizes(found, F, theta, independent, given, T, rng)
+    sigma = np.sqrt(np.diag(covariance))
+    if given.any():
+        more = found.sigma0**2 - theta[0], 0.0, 0.0
+        theta, sigma, score = (np.append(x, y) for x, y in zip((theta, sigma, score), more))
     return ErrorModel(found, tuple(components), theta, sigma, score, tuple(own))
 
 
@@ -210,17 +243,19 @@ def _covariance_of_sizes(
     found: Solution,
     F: Sequence[Any],
     theta: Float[np.ndarray, " k"],
+    independent: Float[np.ndarray, " rows"],
+    given: Bool[np.ndarray, " rows"],
     T: Float[np.ndarray, "k k"],
-    settings: ErrorSettings,
     rng: np.random.Generator,
     draws: int = AT_ONCE,
 ) -> Float[np.ndarray, "k k"]:
     """T⁻¹·cov(q)·T⁻¹ of normal errors of the fitted Σ: cov(q)_ij = 2·tr(V_i·MΣM·V_j·MΣM), by
-    residuals drawn from it."""
-    rows = F[0].shape[0] if F else len(stack_rows(found, found.residuals))
-    times = [lambda e: e, *(lambda e, f=f: np.asarray((f @ (f.T @ e.T)).T) for f in F)]
-    sigma = lambda e: sum(t * V(e) for t, V in zip(theta, times) if t > 0)
-    errors = np.sqrt(theta[0]) * rng.standard_normal((draws, rows))
+    residuals drawn from it; `independent`: variances of the rows, of which some are `given`."""
+    of_components = [lambda e, f=f: np.asarray((f @ (f.T @ e.T)).T) for f in F]
+    times = [lambda e: e * ~given, *of_components]
+    parts = list(zip(theta[1:], of_components))
+    sigma = lambda e: independent * e + sum(t * V(e) for t, V in parts if t > 0)
+    errors = np.sqrt(independent) * rng.standard_normal((draws, len(given)))
     for t, f in zip(theta[1:], F):
         if t > 0:
             errors += np.sqrt(t) * np.asarray((f @ rng.standard_normal((f.shape[1], draws))).T)
@@ -251,44 +286,45 @@ def remove_fit(
 ) -> tuple[Float[np.ndarray, "k rows"], dict[str, Float[np.ndarray, "k rows width"]]]:
     """What errors of the observations (units of their σ) leave in the residuals, M·e, and how they
     change the tables, N⁻¹Aᵀe in the datum of the problem."""
-    k = len(errors)
-    wide = np.zeros((-(-k // AT_ONCE) * AT_ONCE, errors.shape[1]))
-    wide[:k] = errors
-    remaining, changes = [], []
-    for first in range(0, len(wide), AT_ONCE):
-        given = _unstack(found, wide[first : first + AT_ONCE])
-        left, changed = _remove_fit(*found.arguments, found.factor, given)
-        remaining.append(_stack(found, left))
-        changes.append(
-            {t.name: np.asarray(changed[t.name])[:, : t.rows] for t in found.problem.tables}
-        )
-    tables = {name: np.concatenate([x[name] for x in changes])[:k] for name in changes[0]}
-    return np.concatenate(remaining)[:k], tables
+    return _solve_columns(found, len(errors), errors, {})
 
 
 def effects(
     found: Solution, rows: Mapping[str, Float[np.ndarray, "f rows width"]]
 ) -> Float[np.ndarray, "f rows"]:
-    """The change of linear functions of the changes of tables by one σ of every observation."""
+    """The change of linear functions of the changes of tables by one σ of every observation,
+    D = R·N⁻¹Aᵀ, of the rows R of the functions."""
     number = len(next(iter(rows.values())))
-    size = found.problem.sizes
-    wide = {
-        t: np.pad(
-            np.asarray(x),
-            ((0, -number % AT_ONCE), (0, size["table", t] - x.shape[1]), (0, 0)),
-        )
-        for t, x in rows.items()
-    }
-    parts = [
-        _stack(
-            found,
-            _effects(
-                *found.arguments, found.factor, {t: x[k : k + AT_ONCE] for t, x in wide.items()}
-            ),
-        )
-        for k in range(0, number, AT_ONCE)
-    ]
-    return np.concatenate(parts)[:number]
+    size = sum(np.asarray(found.residuals[o.name]).size for o in found.problem.observations)
+    # without errors the residuals are −A·N⁻¹Rᵀ
+    return -_solve_columns(found, number, np.zeros((0, size)), rows)[0]
+
+
+def _solve_columns(
+    found: Solution,
+    number: int,
+    errors: Float[np.ndarray, "k rows"],
+    rows: Mapping[str, Float[np.ndarray, "f rows width"]],
+) -> tuple[Float[np.ndarray, "n rows"], dict[str, Float[np.ndarray, "n rows width"]]]:
+    """x = N⁻¹(Aᵀe + Rᵀ) by table and e − A·x, of a number of errors or of rows of functions."""
+    remaining, changes = [], []
+    tables = [(t.name, t.rows, found.problem.sizes["table", t.name]) for t in found.problem.tables]
+    none = {t.name: np.zeros((0, t.rows, t.space.width)) for t in found.problem.tables}
+    for first in range(0, number, AT_ONCE):
+        # the last call is filled up, and tables to the sizes of the plan
+        some = lambda x, first=first: _fill(np.asarray(x)[first : first + AT_ONCE], AT_ONCE)
+        given = {t: _fill(some(rows.get(t, none[t])), size, 1) for t, _, size in tables}
+        left, changed = _solve(*found.arguments, found.factor, _unstack(found, some(errors)), given)
+        remaining.append(_stack(found, left))
+        changes.append({t: np.asarray(changed[t])[:, :length] for t, length, _ in tables})
+    by_table = {t: np.concatenate([x[t] for x in changes])[:number] for t, *_ in tables}
+    return np.concatenate(remaining)[:number], by_table
+
+
+def _fill(x: np.ndarray, length: int, axis: int = 0) -> np.ndarray:
+    """The array with zeros behind it, up to a length of an axis."""
+    room = [(0, length - n if k == axis else 0) for k, n in enumerate(x.shape)]
+    return np.pad(x, room)
 
 
 def _unstack(
@@ -311,52 +347,50 @@ def _stack(found: Solution, by_set: Mapping[str, Array]) -> Float[np.ndarray, "k
 
 
 @compile_once
-def _remove_fit(
+def _solve(
     declared: Declared,
     plan: Plan,
     values: Values,
     data: Data,
     factor: NormalFactor,
     errors: dict[str, Float[Array, "k n r"]],
+    rows: dict[str, Float[Array, "k rows width"]],
 ) -> tuple[dict[str, Float[Array, "k n r"]], dict[str, Float[Array, "k rows width"]]]:
-    forward, backward = _jacobian(declared, plan, values, data, factor)
+    """`_solve_columns` of some columns: one program for errors and for functions."""
+    forward, backward = _jacobian(declared, plan, values, data)
 
-    def remove_one(e: dict[str, Float[Array, "n r"]]) -> tuple[Any, Any]:
+    def solve_one(given: Any) -> tuple[Any, Any]:
+        e, row = given
         (right,) = backward(e)
-        x = s_transform(declared, plan, values, solve(factor, right))
+        of_row = s_transform_transposed(declared, plan, values, of_groups(plan, row))
+        x = solve(factor, jax.tree.map(jnp.add, right, of_row))
         left = jax.tree.map(jnp.subtract, e, forward(x))
-        return left, _to_tables(declared, plan, values, x)
+        return left, _to_tables(declared, plan, values, s_transform(declared, plan, values, x))
 
-    return jax.lax.map(remove_one, errors)
-
-
-@compile_once
-def _effects(
-    declared: Declared,
-    plan: Plan,
-    values: Values,
-    data: Data,
-    factor: NormalFactor,
-    rows: dict[str, Float[Array, "f rows width"]],
-) -> dict[str, Float[Array, "f n r"]]:
-    forward, _ = _jacobian(declared, plan, values, data, factor)
-
-    def effect_of_one(row: dict[str, Float[Array, "rows width"]]) -> dict[str, Float[Array, "n r"]]:
-        given = zeros_of_tables(declared, values) | row
-        right = s_transform_transposed(declared, plan, values, of_groups(plan, given))
-        return forward(solve(factor, right))
-
-    return jax.lax.map(effect_of_one, rows)
+    return jax.lax.map(solve_one, (errors, rows))
 
 
-def _jacobian(
-    declared: Declared, plan: Plan, values: Values, data: Data, factor: NormalFactor
-) -> tuple[Any, Any]:
-    """A and Aᵀ, from changes of the groups to residuals by set in the given order."""
-    at, still = LinearisedSolution(declared, plan, values, data, factor, {}), zero_tangent(plan)
-    rows = lambda change: restore_order(plan, at.residuals(change, data))
-    _, forward = jax.linearize(rows, still)
-    return forward, jax.linear_transpose(forward, still)
+def _jacobian(declared: Declared, plan: Plan, values: Values, data: Data) -> tuple[Any, Any]:
+    """A and Aᵀ, from changes of the groups to residuals by set in the given order, as products with
+    the blocks of A: a tenth of the time of the derivative of the residuals along a change."""
+    laid, prepared = lay_out_data(plan, data), prepare(declared, values)
+    numbers = range(len(plan.parts))
+    blocks = [differentiate(declared, plan, k, prepared, laid) for k in numbers]
+
+    def forward(change: Tangent) -> dict[str, Float[Array, "n r"]]:
+        found = []
+        for part, (r, touches, E) in zip(plan.parts, blocks):
+            rows = jnp.zeros_like(r)
+            for touch, J in zip(part.touches, touches):
+                x = change[touch.group][touch.row, touch.start : touch.stop]
+                rows = rows + (J * x[:, None, None, :]).sum(-1)
+            if E is not None:
+                x = change[present(plan.eliminated)][part.eliminated]
+                rows = rows + (E * x[:, :, None, :]).sum(-1)
+            found.append(rows)
+        return restore_order(plan, found)
+
+    return forward, jax.linear_transpose(forward, zero_tangent(plan))
 
 
 def _to_tables(

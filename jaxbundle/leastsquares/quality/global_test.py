@@ -46,9 +46,11 @@ def chi_squared_test(
     return {"vtpv": vtpv, "low": low, "high": high, "passed": passed, "sigma_origin": origin}
 
 
-def describe_test(found: dict, unit: str, significance: float = LEVEL) -> str:
+def describe_test(
+    found: dict, unit: str, significance: float = LEVEL, shared_errors: bool = False
+) -> str:
     """The conclusion of a `chi_squared_test`, or why there is none; `unit`: of weight, such as
-    "1 mm"."""
+    "1 mm"; `shared_errors`: whether an error model found errors that residuals hardly show."""
     if found["low"] is None:
         return "no redundancy: σ0 and standard deviations cannot be estimated"
     if found["sigma_origin"] == ESTIMATED:
@@ -60,6 +62,8 @@ def describe_test(found: dict, unit: str, significance: float = LEVEL) -> str:
         f"{'' if found['passed'] else 'not '}passed: vᵀPv {vtpv}, "
         f"{100 * (1 - significance):g} % interval {low} to {high}; "
     )
+    if found["passed"] and shared_errors:
+        return f"{said}it does not show errors that observations share"
     if found["passed"]:
         return f"{said}the a priori σ are confirmed"
     if found["vtpv"] < found["low"]:

@@ -51,7 +51,8 @@ class Reliability(eqx.Module):
     """By set of observations, [n, r], 0 for residuals without weight: `residual`, v/σ; `standard`,
     nᵀu (v/σ if uncorrelated); `gain`, σ·√Pᵢᵢ ≥ 1 (1 if uncorrelated), by which the other residuals
     of its row sharpen it; the redundancy number; Baarda's w (NaN if uncontrolled); `hat`, h; and
-    `own`, its part due to the eliminated row of the observation alone."""
+    `own`, its part due to the eliminated row of the observation alone. `joint` [n, 1], of two
+    uncorrelated residuals: B between them, which deletes both together; else [n, 0]."""
 
     residual: Mapping[str, Float[AnyArray, "n r"]]
     standard: Mapping[str, Float[AnyArray, "n r"]]
@@ -60,6 +61,7 @@ class Reliability(eqx.Module):
     w: Mapping[str, Float[AnyArray, "n r"]]
     hat: Mapping[str, Float[AnyArray, "n r"]]
     own: Mapping[str, Float[AnyArray, "n r"]]
+    joint: Mapping[str, Float[AnyArray, "n c"]]
 
 
 @compile_once
@@ -83,10 +85,11 @@ def reliability(
 def _uncorrelated(
     weight: Float[AnyArray, "n r"],
     v: Float[Array, "n r"],
-    hat: Float[Array, "n r"],
-    own: Float[Array, "n r"],
+    hat: Float[Array, "n rc"],
+    own: Float[Array, "n rc"],
 ) -> dict[str, Float[AnyArray, "n r"]]:
-    used = weight > 0
+    used, r = weight > 0, v.shape[-1]
+    hat, joint, own = hat[:, :r], hat[:, r:], own[:, :r]
     return {
         "residual": v,
         "standard": v,
@@ -95,6 +98,7 @@ def _uncorrelated(
         "w": _test(v, hat, used),
         "hat": hat,
         "own": own,
+        "joint": joint,
     }
 
 
@@ -121,6 +125,7 @@ def _correlated(
         "w": _test(standard, h, used),
         "hat": h,
         "own": along(own),
+        "joint": jnp.zeros((len(u), 0)),
     }
 
 
@@ -146,8 +151,9 @@ def hat_blocks(
     declared: Declared, plan: Plan, values: Values, laid: ChunkedData, Q: Cofactors
 ) -> Iterable[tuple[Array, ...]]:
     """Of every part, from the blocks of Q that each observation touches: whitened residuals
-    [chunks, length, r], B, and its part E·V⁻¹·Eᵀ of the eliminated row alone; of B the diagonal,
-    or for correlated observations all of it, [chunks, length, r, r]."""
+    [chunks, length, r], B, and its part E·V⁻¹·Eᵀ of the eliminated row alone; of B the diagonal
+    and, of two residuals, the element between them, [chunks, length, r or 3], or for correlated
+    observations all of it, [chunks, length, r, r]."""
     prepared = prepare(declared, values)
     found = []
     for number in range(len(plan.parts)):
@@ -167,8 +173,10 @@ def _hat_of_chunk(
 ) -> tuple[Array, Array, Array]:
     """`hat_blocks` of one chunk, [length, …]."""
     block = lambda a, b: jnp.einsum("lic,ljc->lij", a, b)
-    form = block if correlated else lambda a, b: jnp.sum(a * b, -1)
-    hat = own = jnp.zeros((*r.shape, r.shape[-1]) if correlated else r.shape)
+    form = block if correlated else _diagonal_and_joint
+    rows = r.shape[-1]
+    inner = (rows, rows) if correlated else (rows + (rows == 2),)
+    hat = own = jnp.zeros((*r.shape[:-1], *inner))
     if touches:
         J = jnp.concatenate(touches, -1)
         # h = J·Q·Jᵀ from the blocks of Q that the observation touches, 9 × 9 and 3 × 3: kept,
@@ -181,10 +189,21 @@ def _hat_of_chunk(
         hat = hat + form(E @ present(Q.eliminated)[part.eliminated], E)
         for touch, J in zip(part.touches, touches):
             coupled = Q.coupled[touch.group]
-            rows = coupled.reshape(-1, *coupled.shape[2:])[touch.incidence]
-            cross = form(E @ rows[..., touch.start : touch.stop], J)
+            of_row = coupled.reshape(-1, *coupled.shape[2:])[touch.incidence]
+            cross = form(E @ of_row[..., touch.start : touch.stop], J)
             hat = hat + cross + (cross.mT if correlated else cross)
     return r, hat, own
+
+
+def _diagonal_and_joint(
+    a: Float[Array, "length r w"], b: Float[Array, "length r w"]
+) -> Float[Array, "length rc"]:
+    """The diagonal of a·bᵀ; of two rows also the element between them of its symmetric part."""
+    diagonal = jnp.sum(a * b, -1)
+    if a.shape[1] != 2:
+        return diagonal
+    between = jnp.sum(a[:, 0] * b[:, 1] + a[:, 1] * b[:, 0], -1, keepdims=True) / 2
+    return jnp.concatenate([diagonal, between], -1)
 
 
 def _kept_cofactors(part: ObservationPart, Q: Cofactors) -> Float[Array, "n n"]:

@@ -114,4 +114,5 @@ def _whole(adjustment: "Adjustment") -> list[str]:
         "<h3>Counts</h3>\n",
         grid(("", "", ""), head.count_rows(adjustment), "words"),
         paragraph(SIGMA_NOTE),
+        paragraph(head.LARGER_SIGMA) if adjustment.error_model is not None else "",
     ]

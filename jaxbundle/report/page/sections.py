@@ -9,13 +9,13 @@ from jaxbundle.cameras import get_model
 from jaxbundle.plotting.cameras import curve_reach
 from jaxbundle.plotting.distortion import distortion_profile
 from jaxbundle.plotting.style import micrometres
-from jaxbundle.report import head
+from jaxbundle.report import correlated, head, observations
 from jaxbundle.report.equations import equations
-from jaxbundle.report.layout import fixed, significant
+from jaxbundle.report.layout import clean, fixed, significant
 from jaxbundle.report.observations import count_by_class
 from jaxbundle.report.page.charts import Curve, draw_curves, draw_histogram
 from jaxbundle.report.page.document import Section
-from jaxbundle.report.page.markup import figure, grid, items, paragraph
+from jaxbundle.report.page.markup import figure, grid, items, paragraph, text
 from jaxbundle.report.unknowns import validity
 
 if TYPE_CHECKING:
@@ -28,6 +28,8 @@ def collect(adjustment: "Adjustment") -> Iterator[Section]:
     yield photographs()
     yield from cameras(adjustment)
     yield residuals(adjustment)
+    yield from predicted_control(adjustment)
+    yield from correlated_errors(adjustment)
     yield convergence(adjustment)
 
 
@@ -163,6 +165,54 @@ def show_residuals(test: np.ndarray, symbol: str = "τ = w/σ0", more: str = "")
         f"Normalised residuals of {counted.sum()} controlled observations; outer classes are open",
     )
     return Section("residuals", "Normalised residuals", drawing + more, "Residuals")
+
+
+def predicted_control(adjustment: "Adjustment") -> Iterator[Section]:
+    """Control points and their image measurements as all other observations predict them."""
+    points, rays = (adjustment.table(name) for name in ("control", "control_measurements"))
+    if not points:
+        return
+    rows = observations.predicted_rows(points, ("id",), "XYZ")
+    parts = [
+        paragraph(observations.PREDICTION_LEGEND),
+        grid(observations.CONTROL_HEADER, rows[: observations.ROWS_OF_PAGE]),
+    ]
+    if rays:
+        listed = observations.predicted_rows(rays, ("image", "point"), "xy")
+        parts += [
+            f"<h3>Image measurements of control, in {text(adjustment.image_unit)}</h3>\n",
+            grid(observations.MEASUREMENT_HEADER, listed[: observations.ROWS_OF_PAGE]),
+        ]
+    unit = clean(adjustment.network.object_unit)
+    title = f"Control predicted from all other observations, in {unit}"
+    yield Section("predicted", title, "".join(parts), "Predicted control")
+
+
+def correlated_errors(adjustment: "Adjustment") -> Iterator[Section]:
+    """Components of errors that image points share, σ under them, and the replication; nothing if
+    they were not requested."""
+    if why := adjustment.why_no_error_model:
+        parts = [paragraph(f"Not looked for: {why}.")]
+    elif adjustment.error_model is not None:
+        parts = [
+            grid(correlated.COMPONENT_HEADER, correlated.component_rows(adjustment)),
+            paragraph(correlated.LEGEND),
+        ]
+        if words := correlated.not_looked_for(adjustment):
+            parts.append(paragraph(words))
+        parts += [
+            "<h3>Standard deviations</h3>\n",
+            grid(correlated.SIGMA_HEADER, correlated.sigma_rows(adjustment)),
+        ]
+    else:
+        parts = []
+    if (halves := adjustment.replication) is not None:
+        parts += ["<h3>Replication</h3>\n", paragraph(f"{halves.sentence}.")]
+        for split in halves.splits:
+            parts.append(grid(correlated.DIFFERENCE_HEADER, correlated.difference_rows(split)))
+        parts.append(paragraph(correlated.REPLICATION_LEGEND))
+    if parts:
+        yield Section("correlated", correlated.TITLE, "".join(parts), "Correlated errors")
 
 
 def convergence(adjustment: "Adjustment") -> Section:

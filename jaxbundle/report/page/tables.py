@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.network.tables import EXTERIOR
+from jaxbundle.report.correlated import stated_sigma, stated_sigma_of
 from jaxbundle.report.layout import clean, coordinate_decimals
 from jaxbundle.report.page.columns import Column, estimates, numbers
 from jaxbundle.report.page.document import Listing
@@ -46,12 +47,20 @@ def collect_tables(adjustment: "Adjustment") -> dict[str, Listing]:
 def cameras(adjustment: "Adjustment") -> Columns:
     """One row per parameter."""
     found = adjustment.table("cameras")
+    parameters = [
+        entry for camera in adjustment.cameras.values() for entry in camera["parameters"].values()
+    ]
+    sigma = numbers(stated_sigma_of(entry) for entry in parameters)
+    classical = {}
+    if "sigma_correlated" in found:
+        classical["classical"] = Column(numbers(found["sigma"]), "σ classical")
     return {
         "camera": Column(found["camera"], "camera"),
         "model": Column(found["model"], "model"),
         "parameter": Column(found["parameter"], "parameter"),
-        "value": estimates(numbers(found["value"]), numbers(found["sigma"]), "value"),
-        "sigma": Column(numbers(found["sigma"]), "σ"),
+        "value": estimates(numbers(found["value"]), sigma, "value"),
+        "sigma": Column(sigma, "σ"),
+        **classical,
         "free": Column(found["free"].astype(bool), "free"),
         "t": Column(numbers(found["t"]), "t = |value|/σ"),
         "total": Column(100 * numbers(found["total_correlation"]), "total correlation %", 1),
@@ -64,12 +73,13 @@ def images(adjustment: "Adjustment") -> Columns:
     unit, angle = clean(given.object_unit), given.angle_unit
     units = dict(zip(EXTERIOR, [unit] * 3 + [angle] * 3))
     label = lambda name: f"{ANGLES.get(name, name)} [{units[name]}]"
-    places = {name: coordinate_decimals(found[f"s{name}"]) for name in EXTERIOR}
+    sigma = {name: stated_sigma(found, name) for name in EXTERIOR}
+    places = {name: coordinate_decimals(sigma[name]) for name in EXTERIOR}
     ids = np.array([camera.id for camera in given.cameras], dtype=object)
     return (
         {"id": Column(found["id"], "image"), "camera": Column(ids[given.images.camera], "camera")}
         | {name: Column(found[name], label(name), places[name], True) for name in EXTERIOR}
-        | {f"s{name}": Column(found[f"s{name}"], f"σ {label(name)}") for name in EXTERIOR}
+        | {f"s{name}": Column(sigma[name], f"σ {label(name)}") for name in EXTERIOR}
         | {
             "rays": Column(found["rays"], "rays"),
             "rms": Column(found["rms"], f"RMS v [{adjustment.image_unit}]"),
@@ -81,11 +91,12 @@ def images(adjustment: "Adjustment") -> Columns:
 def points(adjustment: "Adjustment") -> Columns:
     """Coordinates with σ; the covariance, and whether a point is near enough to be drawn."""
     found, unit = adjustment.points, clean(adjustment.network.object_unit)
-    places = {axis: coordinate_decimals(found[f"s{axis}"]) for axis in "XYZ"}
+    sigma = {axis: stated_sigma(found, axis) for axis in "XYZ"}
+    places = {axis: coordinate_decimals(sigma[axis]) for axis in "XYZ"}
     return (
         {"id": Column(found["id"], "point"), "role": Column(found["role"], "role")}
         | {a: Column(found[a], f"{a} [{unit}]", places[a], True) for a in "XYZ"}
-        | {f"s{a}": Column(found[f"s{a}"], f"σ{a} [{unit}]") for a in "XYZ"}
+        | {f"s{a}": Column(sigma[a], f"σ{a} [{unit}]") for a in "XYZ"}
         | {
             "rays": Column(found["rays"], "rays"),
             "rms": Column(found["rms"], f"RMS v [{adjustment.image_unit}]"),

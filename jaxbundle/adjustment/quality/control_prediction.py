@@ -1,0 +1,150 @@
+"""Control predicted from everything else: what a check of every control point, and of every image
+measurement of one, would give, without adjusting again.
+
+Of observations g of an adjustment (the coordinates of a control point, or both coordinates of an
+image point), in units of their σ, with their residuals v_g and hat matrix H_gg = A_g·N⁻¹·A_gᵀ, the
+error of their prediction from all others, and its cofactors, are
+
+    e_g = (1 − H_gg)⁻¹·v_g,        Q_e = (1 − H_gg)⁻¹
+
+(deletion residuals; Cook and Weisberg 1982, section 2.2), predicted minus given. Q_e contains the
+observation itself: σ of e is that with which a good one varies. A direction that the others leave
+open, such as the distance of a point of one ray, is not predicted.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxbundle.adjustment.problem import NetworkProblem
+from jaxbundle.adjustment.quality.inspection import Inspection
+from jaxbundle.leastsquares.quality.distributions import f_tail
+from jaxbundle.leastsquares.quality.reliability import MIN_REDUNDANCY
+
+OPEN_PART = 0.01
+"""An axis with a larger part of an open direction, of length 1, is not predicted: 1 % of an error
+as large as the network is seen in the axis."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ControlPrediction:
+    """Of control points, by `id`: `error` (predicted minus given, object unit), its `sigma`, a
+    posteriori, and the `probability` of a larger one by chance; of the image points of control and
+    fixed points, by (photograph, point) in `measurement`: the same in the image unit. NaN where the
+    other observations predict nothing."""
+
+    id: tuple[str, ...]
+    error: Float[np.ndarray, "points 3"]
+    sigma: Float[np.ndarray, "points 3"]
+    probability: Float[np.ndarray, " points"]
+    measurement: tuple[tuple[str, str], ...]
+    image_error: Float[np.ndarray, "rays 2"]
+    image_sigma: Float[np.ndarray, "rays 2"]
+    image_probability: Float[np.ndarray, " rays"]
+
+    def contradicted(self, level: float) -> tuple[str, ...]:
+        """The control points whose prediction is less probable than this."""
+        return tuple(id for id, p in zip(self.id, self.probability) if p < level)
+
+    def wrong_measurements(self, level: float) -> tuple[tuple[str, str], ...]:
+        """The image measurements whose prediction is less probable than this."""
+        return tuple(m for m, p in zip(self.measurement, self.image_probability) if p < level)
+
+
+def predict_control(
+    inspection: Inspection, sigma0: float, max_measurements: int = 5000
+) -> ControlPrediction | None:
+    """The predictions of all control points with σ, and of the measurements of control; None
+    without control with σ.
+
+    `max_measurements`: more are not control of a block, but a board or a resection, whose residuals
+    are shown anyway."""
+    problem = inspection.problem
+    if not any(o.name == "control" for o in problem.observations):
+        return None
+    ids, points = _predict_points(inspection, sigma0, problem.counts.redundancy)
+    rays = np.flatnonzero(problem.network.points.has_role("control", "fixed")[problem.point])
+    rays = rays if len(rays) <= max_measurements else rays[:0]
+    return ControlPrediction(ids, *points, *predict_measurements(inspection, sigma0, rays))
+
+
+Prediction = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Errors [n, k], their σ [n, k], probabilities [n]."""
+
+
+def _predict_points(
+    inspection: Inspection, sigma0: float, freedom: int
+) -> tuple[tuple[str, ...], Prediction]:
+    problem, ids = inspection.problem, inspection.problem.network.points.id
+    (rows,) = problem.observations_of("control").rows
+    weight = problem.weights("control")
+    # A is the unit matrix: H is the block of cofactors in units of σ
+    H = weight[:, :, None] * inspection.point_cofactors[rows] * weight[:, None, :]
+    v = inspection.residuals["control"]
+    found = [_delete(v[k], H[k], weight[k], sigma0, freedom) for k in range(len(rows))]
+    return tuple(ids[row] for row in rows), _collect(found, 3)
+
+
+def predict_measurements(
+    inspection: Inspection, sigma0: float, rays: Int[np.ndarray, " n"]
+) -> tuple[tuple[tuple[str, str], ...], np.ndarray, np.ndarray, np.ndarray]:
+    """(photograph, point) of image points, by row of the network, that take part; the error of
+    their prediction from all other observations [n, 2], its σ [n, 2] and probability [n]."""
+    problem, freedom = inspection.problem, inspection.problem.counts.redundancy
+    rays = rays[problem.used[rays]]
+    tested, weight = inspection.reliability, problem.image_weights
+    v, h, joint = (
+        np.asarray(problem.image_points(x)) for x in (tested.residual, tested.hat, tested.joint)
+    )
+    found = []
+    for k in rays.tolist():
+        H = np.diag(h[k]) + joint[k] * (1 - np.eye(2))
+        found.append(_delete(v[k], H, weight[k], sigma0, freedom))
+    return (_names(problem, rays), *_collect(found, 2))
+
+
+def _names(problem: NetworkProblem, rays: np.ndarray) -> tuple[tuple[str, str], ...]:
+    images, points = problem.network.images.id, problem.network.points.id
+    return tuple(
+        (images[i], points[p])
+        for i, p in zip(problem.image[rays].tolist(), problem.point[rays].tolist())
+    )
+
+
+def _delete(
+    v: Float[np.ndarray, " k"],
+    H: Float[np.ndarray, "k k"],
+    weight: Float[np.ndarray, " k"],
+    sigma0: float,
+    freedom: int,
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"], float]:
+    """Error and σ of the prediction of one group of observations, and the probability of a larger
+    T = eᵀ·Q_e⁻¹·e/σ0²; `weight`: 1/σ, 0 of what is no observation."""
+    used = np.flatnonzero(weight > 0)
+    error, sigma = np.full((2, len(v)), np.nan)
+    remains, directions = np.linalg.eigh(np.eye(len(used)) - H[np.ix_(used, used)])
+    seen = remains > MIN_REDUNDANCY
+    if not seen.any():
+        return error, sigma, np.nan
+    known = (np.abs(directions[:, ~seen]) < OPEN_PART).all(1)
+    E = directions[:, seen]
+    along = E.T @ v[used] / remains[seen]
+    cofactor = (E**2 / remains[seen]).sum(1)
+    unit = 1 / weight[used]
+    error[used[known]] = (unit * (E @ along))[known]
+    sigma[used[known]] = (sigma0 * unit * np.sqrt(cofactor))[known]
+    T, k = float((along**2 * remains[seen]).sum()) / sigma0**2, int(seen.sum())
+    # σ0 contains the residuals of the group: it is the larger, the worse the group is
+    rest = freedom - k
+    if rest <= 0 or not known.any():
+        return error, sigma, np.nan
+    others = max((freedom - T) / rest, 1e-12)
+    return error, sigma, f_tail(T / k / others, k, rest)
+
+
+def _collect(found: list, width: int) -> Prediction:
+    if not found:
+        return np.zeros((0, width)), np.zeros((0, width)), np.zeros(0)
+    error, sigma, probability = zip(*found)
+    return np.array(error), np.array(sigma), np.array(probability)
