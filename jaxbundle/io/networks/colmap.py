@@ -6,7 +6,12 @@ from pathlib import Path
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.colmap_binary import binary_files, read_binary_cameras, read_binary_model
 from jaxbundle.io.networks.colmap_model import from_network, numbers_of, to_network
-from jaxbundle.io.networks.colmap_rigs import read_frames, rigs_of_frames
+from jaxbundle.io.networks.colmap_rigs import (
+    read_frames,
+    rig_files,
+    rigs_and_frames,
+    rigs_of_frames,
+)
 from jaxbundle.io.networks.colmap_text import (
     camera_lines,
     read_text_cameras,
@@ -15,6 +20,7 @@ from jaxbundle.io.networks.colmap_text import (
 )
 from jaxbundle.io.text.csv_tables import write_bytes
 from jaxbundle.io.writing.folders import replace_folder
+from jaxbundle.network.kinds import Rigs
 from jaxbundle.network.tables import Camera, Network
 
 PARTS = ("cameras", "images", "points3D")
@@ -102,7 +108,13 @@ def fill_colmap(network: Network, folder: Path, text: bool | None = None) -> tup
     model, lost = from_network(network)
     if text is None:
         text = not any(character.isspace() for image in model.images for character in image.name)
-    files = text_files(model) if text else binary_files(model)
+    rigs, frames = [], []
+    if any(isinstance(kind, Rigs) for kind in network.further):
+        rigs, frames, more = rigs_and_frames(
+            network, [*model.cameras], [image.id for image in model.images]
+        )
+        lost = (*(what for what in lost if what != Rigs.TABLE), *more)
+    files = (text_files(model) if text else binary_files(model)) | rig_files(rigs, frames, text)
     folder.mkdir(exist_ok=True)
     for name, content in files.items():
         write_bytes(folder / name, content)

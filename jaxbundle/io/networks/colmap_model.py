@@ -3,7 +3,7 @@
 A pose is x_camera = R·X + t with x right, y down, z forward (`geometry.pose_conventions`); image
 points count from the corner of the first pixel, ½ more than here. Image points without an
 object point are left out. Rigs and frames (COLMAP 3.12 and later) are in `colmap_rigs`; every image
-has its full pose in `images`, and without them COLMAP creates trivial ones.
+has its full pose in `images`.
 """
 
 import dataclasses
