@@ -122,7 +122,7 @@ def test_a_reconstruction(tmp_path):
 def test_there_and_back(tmp_path):
     net = network("opencv", ("a.jpg", "b.jpg", "c.jpg"))
     made = convert_to(net, tmp_path / "opensfm")
-    assert made.lost == ()
+    assert made.lost == ("pixel sizes of cameras (1)",)
     back = read_network(tmp_path / "opensfm")
     assert_same(net, back)
     (camera,) = read_cameras(tmp_path / "opensfm" / "camera_models.json")

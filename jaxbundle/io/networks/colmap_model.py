@@ -23,7 +23,7 @@ from jaxbundle.io.networks.assemble import (
     image_columns,
 )
 from jaxbundle.io.networks.colmap_models import to_colmap
-from jaxbundle.io.networks.losses import describe_losses, need_values
+from jaxbundle.io.networks.losses import changed, losing, need_values
 from jaxbundle.io.networks.poses import matrices_of, matrices_of_quaternions, quaternions_of
 from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.reprojection import point_errors
@@ -153,8 +153,8 @@ def _observations(path: Path, model: ColmapModel) -> tuple[Columns, tuple[str, .
     return Columns(columns, source), warnings if repeated else ()
 
 
-def from_network(network: Network) -> tuple[ColmapModel, tuple[str, ...]]:
-    """The sparse model of a network, and messages about what it does not keep.
+def from_network(network: Network) -> ColmapModel:
+    """The sparse model of a network.
 
     **Raises:** `InputError` for a camera without a model in COLMAP, and for missing coordinates.
     """
@@ -184,9 +184,6 @@ def from_network(network: Network) -> tuple[ColmapModel, tuple[str, ...]]:
                 f"image {images.id[i]!r}",
             )
         )
-    lost = describe_losses(network)
-    if list(point_numbers.astype(str)) != list(points.id):
-        lost = (*lost, "names of points, which are numbered from 1")
     return ColmapModel(
         cameras,
         made,
@@ -194,7 +191,7 @@ def from_network(network: Network) -> tuple[ColmapModel, tuple[str, ...]]:
         points.position,
         points.source,
         np.nan_to_num(point_errors(network)[0], nan=-1.0),  # COLMAP's error not yet computed
-    ), lost
+    )
 
 
 def numbers_of(ids: Sequence[str]) -> list[int]:
@@ -211,3 +208,18 @@ def tracks(model: ColmapModel) -> dict[int, list[tuple[int, int]]]:
         for k, point in enumerate(image.point.tolist()):
             rays[point].append((image.id, k))
     return rays
+
+
+def _renumbered(ids: Sequence[str]) -> int:
+    return changed(ids, numbers_of(ids))
+
+
+COLMAP_LOSSES = losing(
+    "pixel sizes of cameras",
+    keeping=("rigs",),
+    partly={
+        "names of cameras": lambda n: _renumbered([camera.id for camera in n.cameras]),
+        "names of points": lambda n: _renumbered(n.points.id),
+    },
+)
+"""What it loses; names of cameras and points are numbers from 1."""

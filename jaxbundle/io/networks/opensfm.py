@@ -54,6 +54,7 @@ from jaxbundle.io.networks.losses import (
     GREY,
     check_others_zero,
     describe_losses,
+    losing,
     need_values,
     one_focal_length,
     size_of,
@@ -491,8 +492,18 @@ def fill_opensfm(network: Network, folder: Path) -> tuple[str, ...]:
     write_text(folder / RECONSTRUCTION, json.dumps([scene], indent=1) + "\n")
     write_text(folder / MODELS, json.dumps(cameras, indent=1) + "\n")
     write_text(folder / TRACKS, _track_lines(network, [c.image_size or (1, 1) for c in used]))
-    rest = tuple(kind for kind in network.further if not any(kind is m for m in measured))
-    return describe_losses(network.replace(further=rest))
+    return describe_losses(network, OPENSFM_LOSSES)
+
+
+OPENSFM_LOSSES = losing(
+    "pixel sizes of cameras",
+    partly={
+        Antennas.TABLE: lambda n: sum(
+            len(k.image) for k in n.further if isinstance(k, Antennas) and k.settings
+        )
+    },
+)
+"""What it loses; antennas with a lever arm or drifts are no projection centres."""
 
 
 def _track_lines(network: Network, sizes: Sequence[tuple[int, int]]) -> Iterable[str]:
