@@ -26,6 +26,7 @@ from jaxbundle.io.networks.colmap_model import COLMAP_LOSSES, numbers_of
 from jaxbundle.io.networks.colmap_models import COLMAP_MODELS
 from jaxbundle.io.networks.column_map import is_column_map, read_column_map
 from jaxbundle.io.networks.control import read_control, select_checks, with_control
+from jaxbundle.io.networks.csm_frame import is_csm_frame, read_csm_frame
 from jaxbundle.io.networks.jaicov import JAICOV_LOSSES, is_jaicov, read_jaicov, write_jaicov
 from jaxbundle.io.networks.kalibr import KALIBR_LOSSES, is_kalibr, read_kalibr, write_kalibr
 from jaxbundle.io.networks.kalibr import OFFERED_MODELS as KALIBR_MODELS
@@ -247,6 +248,7 @@ FORMATS: dict[str, Format] = {
     "ros-stereo": Format(is_ros_stereo, read_ros_stereo, NETWORK_FILES["ros-stereo"]),
     "rig": Format(is_rig_result, read_rig_result, NETWORK_FILES["rig"]),
     "rig-line": Format(is_rig_line, read_rig_line, NETWORK_FILES["rig-line"]),
+    "csm-frame": Format(is_csm_frame, read_csm_frame, NETWORK_FILES["csm-frame"]),
     "nvm": Format(
         is_nvm,
         read_nvm,

@@ -260,6 +260,7 @@ HOLDS: dict[str, set[str]] = {
                   "σ of control points"},
     "bingo": {"prior σ of camera parameters", "roles of points", "image sizes of cameras",
               "pixel sizes of cameras"},
+    "csm-frame": {"image sizes of cameras", "pixel sizes of cameras"},
     "nvm": {"pixel sizes of cameras", "σ of image points"},
     "alicevision": {"image sizes of cameras", "pixel sizes of cameras"},
     "orb-slam": {"image sizes of cameras", "rigs"},
@@ -274,7 +275,7 @@ HOLDS: dict[str, set[str]] = {
 }  # fmt: skip
 """What the inputs may have, beside `ALWAYS` and what an output of the same name keeps."""
 MOUNTED = {"orb-slam", "vins", "euroc", "rig", "rig-line", "kalibr", "opencv-stereo", "ros-stereo"}
-WITHOUT_POINTS = MOUNTED | {"transforms", "micmac", "mrcal"}
+WITHOUT_POINTS = MOUNTED | {"transforms", "micmac", "mrcal", "csm-frame"}
 
 
 def holds(kind: str) -> set[str]:

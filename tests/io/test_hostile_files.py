@@ -181,7 +181,8 @@ def read(kind: str, folder: Path):
 KINDS = ("colmap", "colmap-text", "bal", "bundler", "project", "photo-list", "opencv", "json",
          "photomodeler", "bingo", "metashape", "openmvg", "opensfm", "transforms", "kalibr",
          "mrcal", "micmac", "jaicov", "column-map", "camera-stack", "result", "opencv-stereo",
-         "ros-stereo", "rig", "nvm", "colmap-rigs", "vins", *FURTHER_SAMPLES)  # fmt: skip
+         "ros-stereo", "rig", "nvm", "csm-frame", "colmap-rigs", "vins",
+         *FURTHER_SAMPLES)  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -38,6 +38,9 @@ from jaxbundle.pushbroom.ancillary import DEFAULTS, check_times
 from jaxbundle.pushbroom.image import check_size, make_image
 from jaxbundle.pushbroom.scanner import LineTimes
 
+FRAME_MODEL = "USGS_ASTRO_FRAME_SENSOR_MODEL"
+"""The model of frame cameras (`io.networks.csm_frame`)."""
+
 
 def read_csm(
     path: str | Path, interpolation: str = "usgscsm", extrapolate: float | None = None
@@ -85,6 +88,11 @@ def read_csm(
 def _read_support_data(path: Path) -> tuple[JsonFields, int]:
     """The fields of an ISD, also of a state, and the degree of its interpolation."""
     text = read_text(path)
+    if FRAME_MODEL in text:
+        raise InputError(
+            f"{path}: of a frame camera, {FRAME_MODEL}; a line scanner is expected (`jaxbundle "
+            "convert` reads it as a photograph)"
+        )
     name, brace, _ = text.partition("{")
     name = name.strip()
     # a state has the name of its model before the braces
@@ -104,14 +112,14 @@ def _read_support_data(path: Path) -> tuple[JsonFields, int]:
             f"{path}: JSON of another kind, without image_lines and line_scan_rate; expected an "
             "ISD or a model state of a line scanner"
         )
-    _refuse_map(isd)
+    refuse_map(isd)
     model = isd.get("name_model", MODEL)
     if model != MODEL:
         raise InputError(f"{path}: name_model is {show(model)}; {MODEL} is expected")
     return isd, order
 
 
-def _refuse_map(isd: JsonFields) -> None:
+def refuse_map(isd: JsonFields) -> None:
     """Refuse an image whose rows are not the lines of the scanner: ALE states the projection and
     GDAL's transformation (x₀, dx, 0, y₀, 0, dy) of the file, empty and the identity for a raw one.
     """
