@@ -246,7 +246,7 @@ def test_what_is_refused_by_name(name, tmp_path):
 
 def test_scanners_send_it_here_and_states_are_no_support_data(tmp_path):
     path = write(tmp_path, support_data())
-    with pytest.raises(InputError, match="frame camera.*as a photograph"):
+    with pytest.raises(InputError, match="FRAME_SENSOR_MODEL.*as a photograph"):
         read_scanner(path)
     path.write_text("USGS_ASTRO_FRAME_SENSOR_MODEL\n" + path.read_text())
     with pytest.raises(InputError, match="a model state of a frame camera; give the support data"):

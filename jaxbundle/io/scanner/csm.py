@@ -88,11 +88,6 @@ def read_csm(
 def _read_support_data(path: Path) -> tuple[JsonFields, int]:
     """The fields of an ISD, also of a state, and the degree of its interpolation."""
     text = read_text(path)
-    if FRAME_MODEL in text:
-        raise InputError(
-            f"{path}: of a frame camera, {FRAME_MODEL}; a line scanner is expected (`jaxbundle "
-            "convert` reads it as a photograph)"
-        )
     name, brace, _ = text.partition("{")
     name = name.strip()
     # a state has the name of its model before the braces
@@ -115,7 +110,8 @@ def _read_support_data(path: Path) -> tuple[JsonFields, int]:
     refuse_map(isd)
     model = isd.get("name_model", MODEL)
     if model != MODEL:
-        raise InputError(f"{path}: name_model is {show(model)}; {MODEL} is expected")
+        hint = " (`jaxbundle convert` reads it as a photograph)" if model == FRAME_MODEL else ""
+        raise InputError(f"{path}: name_model is {show(model)}{hint}; {MODEL} is expected")
     return isd, order
 
 
