@@ -28,6 +28,7 @@ from jaxbundle.geometry.ellipsoid import WGS84, earth_fixed
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.io.text.json_fields import JsonFields, read_object
 from jaxbundle.io.text.known_keys import Keys, UnknownKeys
+from jaxbundle.network.columns import count
 from jaxbundle.network.tables import Camera, Points, Source
 from jaxbundle.types import present
 
@@ -90,11 +91,14 @@ def read_ground_control(
     told = list(unknown.messages())
     keep = [k for k, id in enumerate(ids) if id in seen]
     points = None
-    if keep:
-        if not reference.is_file():
-            raise InputError(
-                f"{file}: latitudes and longitudes need {reference.name}, which is not beside it"
-            )
+    if keep and not reference.is_file():
+        told.append(
+            f"{file.name}: left out {count(len(keep), 'control point')}: latitudes and longitudes "
+            f"need {reference.name}, which is not beside it"
+        )
+        lost = {ids[k] for k in keep}
+        rays = [ray for ray in rays if ray[1] not in lost]
+    elif keep:
         sigma = np.tile([HORIZONTAL_SIGMA, HORIZONTAL_SIGMA, VERTICAL_SIGMA], (len(keep), 1))
         local = _topocentric(_origin(reference), np.array(places)[keep])
         names = tuple(ids[k] for k in keep)
