@@ -441,8 +441,10 @@ def test_alicevision_writes_empty_lists_as_texts(tmp_path):
         (tmp_path / f"{key}.sfm").write_text(json.dumps(document | {key: ""}))
     for point in document["structure"]:
         point["observations"] = ""
+    document["views"][0]["path"] = ""
     path.write_text(json.dumps(document))
-    assert len(read_network(path).observations) == 0
+    net = read_network(path)
+    assert len(net.observations) == 0 and net.images.id[0] == document["views"][0]["viewId"]
     assert np.isnan(read_network(tmp_path / "poses.sfm").images.position).all()
     assert len(read_network(tmp_path / "structure.sfm").points) == 0
 

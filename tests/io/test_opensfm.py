@@ -225,7 +225,6 @@ def test_ground_control_points(tmp_path):
     assert np.isin(net.observations.point, index).sum() == 12 and net.datum == "control"
     for change, message in [
         (lambda: rows[0].update(id="gcp1"), "points.1.: the point 'gcp1' occurs twice"),
-        (lambda: rows[0].update(id="3"), "'3' is also a point of"),
         (lambda: rows[0]["position"].update(offset=1), "unknown key 'offset'"),
         (lambda: rows[0]["position"].pop("latitude"), "position: latitude is missing"),
     ]:
@@ -235,6 +234,9 @@ def test_ground_control_points(tmp_path):
         with pytest.raises(InputError, match=f"ground_control_points.json.*{message}"):
             read_network(tmp_path)
         rows[:] = before
+    # tracks and control points are numbered apart
+    file.write_text(json.dumps({"points": [{**rows[0], "id": "3"}, *rows[1:]]}))
+    assert "control 3" in read_network(tmp_path).points.id
     file.write_text(json.dumps({"points": rows}))
     (tmp_path / "reference_lla.json").unlink()
     net = read_network(tmp_path)

@@ -226,6 +226,7 @@ def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         used = {id: cameras[shot.text("camera")] for id, shot in shots.items()}
         control = read_ground_control(file.parent / CONTROL, file.parent / REFERENCE, used)
         told += control.messages
+        control = control.renamed({*names})
         names, at, rays = _add_control(file, control, names, at, rays)
     if (file.parent / REFERENCE).is_file():
         told.append(_reference(file.parent / REFERENCE))
@@ -257,12 +258,8 @@ def _add_control(
     at: Float[np.ndarray, "n 3"],
     rays: Columns | None,
 ) -> tuple[list[str], Float[np.ndarray, "m 3"], Columns]:
-    """Points and image points with those of ground control.
-
-    **Raises:** `InputError` for a control point called as a tie point."""
+    """Points and image points with those of ground control."""
     added = [*(control.points.id if control.points else ()), *control.unknown]
-    if twice := next((id for id in added if id in {*names}), None):
-        raise InputError(f"{file.parent / CONTROL}: {twice!r} is also a point of {file.name}")
     columns: dict[str, list] = {}
     for k, name in enumerate(("image", "point", "x", "y")):
         tracked = () if rays is None else rays.values[name]

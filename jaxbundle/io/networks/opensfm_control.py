@@ -15,7 +15,8 @@ Source: OpenSfM documentation, "Ground control points"; its config.py, gcp_horiz
 gcp_vertical_sd; its geo.py, topocentric coordinates.
 """
 
-from collections.abc import Mapping
+import dataclasses
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -50,6 +51,16 @@ class GroundControl(NamedTuple):
     rays: list[tuple[str, str, float, float]]
     unknown: list[str]
     messages: tuple[str, ...]
+
+    def renamed(self, taken: Collection[str]) -> "GroundControl":
+        """With names of their own: tracks and control are numbered apart, and may be equal."""
+        own = [*(self.points.id if self.points else ()), *self.unknown]
+        new = {id: f"control {id}" if id in taken else id for id in own}
+        points = self.points and dataclasses.replace(
+            self.points, id=tuple(new[id] for id in self.points.id)
+        )
+        rays = [(image, new[point], x, y) for image, point, x, y in self.rays]
+        return GroundControl(points, rays, [new[id] for id in self.unknown], self.messages)
 
 
 def read_ground_control(
