@@ -25,7 +25,7 @@ from jaxbundle.io.networks.assemble import (
 from jaxbundle.io.networks.colmap_models import to_colmap
 from jaxbundle.io.networks.losses import changed, losing, need_values
 from jaxbundle.io.networks.poses import matrices_of, matrices_of_quaternions, quaternions_of
-from jaxbundle.network.columns import Columns, count, list_some
+from jaxbundle.network.columns import Columns, RepeatedIds, count, list_some
 from jaxbundle.network.reprojection import point_errors
 from jaxbundle.network.tables import Camera, Network, Source
 
@@ -126,31 +126,41 @@ def _observations(path: Path, model: ColmapModel) -> tuple[Columns, tuple[str, .
     """The table of image points; the first if an image has several of one object point."""
     index, point, xy = [], [], []
     repeated = []
-    known = np.sort(model.point_ids)
-    for image in model.images:
+    for number, image in enumerate(model.images):
         used = np.flatnonzero(image.point != NO_POINT)
-        unknown = used[~np.isin(image.point[used], known)]
-        if len(unknown):
-            raise InputError(
-                f"{image.place}: image {image.name!r}, image point {unknown[0]}: the object point "
-                f"{image.point[unknown[0]]} is not in points3D"
-            )
         # A track may return to an image; a network has one image point of a point in an image.
         _, first = np.unique(image.point[used], return_index=True)
         if len(first) < len(used):
             repeated += [image.name] * (len(used) - len(first))
             used = used[np.sort(first)]
-        index += [image.name] * len(used)
+        index.append(np.full(len(used), number))
         point.append(image.point[used])
         xy.append(image.xy[used])
+    _check_points(model)
     xy = np.concatenate(xy) - PIXEL_CENTRE
     warnings = (
         f"left out {count(len(repeated), 'image point')} of object points that have another in "
         f"the same image: {list_some(dict.fromkeys(repeated))}",
     )
-    columns = {"image": index, "point": np.concatenate(point), "x": xy[:, 0], "y": xy[:, 1]}
+    names = RepeatedIds([image.name for image in model.images], np.concatenate(index))
+    columns = {"image": names, "point": np.concatenate(point), "x": xy[:, 0], "y": xy[:, 1]}
     source = Source(str(path), np.arange(1, len(xy) + 1), "image point")
     return Columns(columns, source), warnings if repeated else ()
+
+
+def _check_points(model: ColmapModel) -> None:
+    """Refuse image points of object points that are not there."""
+    named = np.concatenate([image.point for image in model.images])
+    if np.isin(named, np.append(model.point_ids, NO_POINT)).all():
+        return
+    for image in model.images:
+        unknown = ~np.isin(image.point, np.append(model.point_ids, NO_POINT))
+        if unknown.any():
+            k = int(unknown.argmax())
+            raise InputError(
+                f"{image.place}: image {image.name!r}, image point {k}: the object point "
+                f"{image.point[k]} is not in points3D"
+            )
 
 
 def from_network(network: Network) -> ColmapModel:
