@@ -212,7 +212,8 @@ def test_either_of_two_rays(network):
     assert result_dict(found, brief=True)["removed"][0]["name"] == removed.name
 
 
-@pytest.mark.parametrize("role", [pytest.param("control", marks=pytest.mark.further), "tie"])
+@pytest.mark.further
+@pytest.mark.parametrize("role", ["control", "tie"])
 def test_points_without_good_rays_and_other_observations(network, role):
     """A height alone does not locate a point without rays; a distance to it keeps it."""
     rays, points = network.observations, network.points

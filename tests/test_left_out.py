@@ -167,6 +167,7 @@ def test_a_repeated_frame_is_named_with_the_one_it_repeats(twins):
     assert any("'5' repeats '4'" in line for line in result.warnings)
 
 
+@pytest.mark.further
 def test_an_image_of_two_points_and_one_of_a_line_are_left_out_by_name():
     """An image of few points ended in an error, one of a line in a singular network."""
     row = ("1", "2", "3", "4", "5")
@@ -199,6 +200,7 @@ def video(seed):
                     disturb=(0.02, 0.002, 0.5), datum="inner")  # fmt: skip
 
 
+@pytest.mark.further
 def test_points_near_the_focus_of_expansion_cost_no_iterations():
     """They cost 50 to 90, or made the network singular."""
     result = jaxbundle.adjust(video(seed=0))
@@ -227,6 +229,7 @@ def good_start():
     return jaxbundle.adjust(fisheye((0.01, 0.001)))
 
 
+@pytest.mark.further
 def test_image_points_beyond_the_side_of_a_fisheye_give_start_values(good_start):
     """From 81° on they had no start values, and their points were seen in 0 placed images."""
     given = fisheye((0.01, 0.001))
@@ -248,6 +251,7 @@ def test_what_poor_start_values_exclude_comes_back(good_start):
     assert "contradict the start values" not in " ".join(result.warnings)
 
 
+@pytest.mark.further
 def test_what_stays_out_contradicts_the_adjusted_orientation(good_start):
     given = fisheye((0.9, 0.15))
     rays, wrong = given.observations, [40, 200]

@@ -217,6 +217,7 @@ def test_a_page_says_which_ellipsoids_it_draws(convergent4, monkeypatch):
     pyplot.close(ax.figure)
 
 
+@pytest.mark.further
 def test_the_explorer_draws_the_expected_ellipsoids_and_says_so(convergent4):
     view = NetworkView(convergent4)
     text = page_file(view, {}, live=True).content.decode()

@@ -25,7 +25,7 @@ from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.plotting import files, quality
 from jaxbundle.plotting.distortion import distortion_at
 from jaxbundle.plotting.style import extent, round_number
-from jaxbundle.plotting.views import Ellipses, camera_pyramids, error_ellipses
+from jaxbundle.plotting.views import Ellipses, camera_pyramids, error_ellipses, principal_sections
 
 matplotlib.use("Agg")
 
@@ -285,6 +285,19 @@ def test_error_ellipses_lean_as_the_covariance(convergent4):
     np.testing.assert_allclose(2 * moment, expected, rtol=1e-6, atol=1e-14)
 
 
+def test_sections_of_error_ellipsoids_lie_on_them_in_planes_of_two_axes(convergent4):
+    number = len(convergent4.points["id"])
+    sections = principal_sections(convergent4, Ellipses(np.arange(number), 0, 3.0))
+    away = sections.reshape(3, number, -1, 3) - convergent4.point_values[:, None]
+    covariance = convergent4.point_covariance
+    distance = np.einsum("spci,pij,spcj->spc", away, np.linalg.inv(covariance), away)
+    np.testing.assert_allclose(distance, 9.0, rtol=1e-6)
+    for p, (_, axes) in enumerate(zip(*np.linalg.eigh(covariance))):
+        along = np.abs(away[:, p] @ axes).max(1)
+        absent = along < 1e-9 * along.max(0)
+        np.testing.assert_array_equal(absent, np.eye(3, dtype=bool)[::-1])
+
+
 def test_pyramids_are_the_corners_of_the_images(convergent4):
     size = 0.1
     pyramids = camera_pyramids(convergent4, size)
@@ -373,6 +386,7 @@ def test_save_figures(convergent4, tmp_path, monkeypatch):
         assert content.startswith(b"\x89PNG") and b"IEND" in content[-12:]
 
 
+@pytest.mark.further
 def test_files_have_safe_names_of_their_own(convergent4, tmp_path, monkeypatch):
     network = convergent4.problem.network
     images = dataclasses.replace(network.images, id=("../a/b", "A?B", "$x_1$\n", "図"))

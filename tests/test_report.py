@@ -302,6 +302,7 @@ def test_without_redundancy_there_is_no_sigma(convergent4):
     assert_plain(str(changed))
 
 
+@pytest.mark.further
 def test_an_exact_fit_has_no_sigma(convergent4, tmp_path):
     """vᵀPv = 0: σ are 0, t infinite, τ unknown, correlations as ever; nothing divides by zero."""
     changed = again(convergent4)

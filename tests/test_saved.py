@@ -55,6 +55,7 @@ def test_a_loaded_adjustment_has_all_that_the_saved_one_has(network, tmp_path, o
     assert (again.fingerprint, again.warnings) == (result.fingerprint, result.warnings)
 
 
+@pytest.mark.further
 def test_check_points_are_intersected_after_loading(tmp_path):
     given = jaxbundle.read_network("examples/resection63/project.toml")
     role = np.array(given.points.role, dtype=object)
@@ -67,6 +68,7 @@ def test_check_points_are_intersected_after_loading(tmp_path):
         assert found.difference == pytest.approx(result.check_points.difference)
 
 
+@pytest.mark.further
 def test_observations_of_ones_own_are_asked_for(network, tmp_path):
     kind = Kind("height", lambda X, given: X[2:] - given, of=("point",))
     ids = np.array(network.points.id[:3], dtype=object)
@@ -152,6 +154,7 @@ def test_differences_vary_with_their_sigma(epochs):
     assert sum(one.differs.sum() for one in found) <= 2
 
 
+@pytest.mark.further
 def test_a_point_that_moved_is_found_and_told(epochs):
     stations = jaxbundle.ring_of_stations(6, radius=10.0, height=6.0, roll_every=2)
     targets = jaxbundle.cloud_of_targets(12, (6.0, 6.0, 2.0), seed=3)

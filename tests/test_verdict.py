@@ -231,6 +231,7 @@ def test_a_unit_of_weight_beside_control_with_sigma_is_no_good_result():
     assert any("1 mm was assumed beside the σ of other observations" in w for w in result.warnings)
 
 
+@pytest.mark.further
 def test_a_prior_beside_fixed_points_needs_a_stated_sigma_too():
     """Three fixed points give the datum: every prior is weighted against the image coordinates."""
     given = network(control=(), datum="control")

@@ -116,6 +116,7 @@ def test_blunders_do_not_make_good_geometry_weak():
     assert result.weakness.unknowns == () and "poorly determined" not in said(result)
 
 
+@pytest.mark.further
 def test_exchanged_control_points_do_not_make_good_geometry_weak():
     six = CONTROL | {"control": (0, 4, 10, 12, 20, 24)}
     result = jaxbundle.adjust(exchanged(network(RING, **six), "11", "13"))
@@ -123,6 +124,7 @@ def test_exchanged_control_points_do_not_make_good_geometry_weak():
     assert result.converged and result.sigma0 > 30 and "poorly determined" not in said(result)
 
 
+@pytest.mark.further
 def test_images_from_one_place_are_named_where_there_is_no_solution():
     result = jaxbundle.adjust(network(ONE_PLACE))
     assert not result.converged

@@ -22,7 +22,7 @@ import numpy as np
 from jaxbundle.arguments import integer
 from jaxbundle.batches.camera import LIMIT, SOLVED, STATUS
 from jaxbundle.batches.photographs import NOT_SEARCHED
-from jaxbundle.batches.work import WHERE_GIVEN, BatchSettings, Tell, Work, plan_works
+from jaxbundle.batches.work import WHERE_GIVEN, BatchSettings, ShareDone, Work, plan_works
 from jaxbundle.errors import InputError
 from jaxbundle.io.results.json_lines import JsonLines
 from jaxbundle.io.writing.locks import hold_lock
@@ -179,7 +179,7 @@ def _tell(progress: Progress, done: int, number: int, total: int, part: float) -
     progress(STAGE, done + int(part * number), total)
 
 
-def _rows(work: Work, chosen: Sequence[int], tell: Tell) -> list[dict]:
+def _rows(work: Work, chosen: Sequence[int], tell: ShareDone) -> list[dict]:
     # Before the computation, so that later changes are detected.
     data = [work.data(i) for i in chosen]
     return [

@@ -47,7 +47,8 @@ longer than a camera of a batch; not critical."""
 SIGMA_IMAGE = "sigma_image"
 WHERE_GIVEN = ("snooping", "significance", "pixel_size", "set", "sigma_image", *SECTIONS)
 """Settings present only in lines computed with them."""
-Tell = Callable[[float], None]
+ShareDone = Callable[[float], None]
+"""Called with the share of the work that is done, 0 to 1."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +63,7 @@ class Work:
     keys: tuple[str, ...]
     settings: dict
     data: Callable[[int], str]
-    solve: Callable[[Sequence[int], Tell], Iterable[dict]]
+    solve: Callable[[Sequence[int], ShareDone], Iterable[dict]]
     made_of: str = "the measurements"
     is_network: bool = False
     portion: int = sys.maxsize
@@ -195,7 +196,7 @@ def _stack(stack: CameraStack, name: str, settings: BatchSettings) -> Work:
     brief, of_rigs = settings.brief, settings.as_rigs()
     keys = tuple(f"{name}#{camera}" for camera in stack.ids)
 
-    def cameras(chosen: Sequence[int], _: Tell) -> list[dict]:
+    def cameras(chosen: Sequence[int], _: ShareDone) -> list[dict]:
         batch = calibrate_batch(
             **stack.arguments(np.asarray(chosen)),
             model=settings.model,
@@ -204,7 +205,7 @@ def _stack(stack: CameraStack, name: str, settings: BatchSettings) -> Work:
         )
         return [batch.row(i, brief) for i in range(len(chosen))]
 
-    def rigs(chosen: Sequence[int], tell: Tell) -> list[dict]:
+    def rigs(chosen: Sequence[int], tell: ShareDone) -> list[dict]:
         return [shorten(row, brief) for row, _ in solve_rigs(stack.rigs(chosen), of_rigs, tell)]
 
     if settings.are_plain() and not stack.of_rigs:
@@ -216,7 +217,7 @@ def _detect(found: PhotographFolders, keys: tuple[str, ...], settings: BatchSett
     brief, of_rigs = settings.brief, settings.as_rigs()
     options = {"model": settings.model, "free": settings.free, **settings.adjusting}
 
-    def solve(chosen: Sequence[int], tell: Tell) -> list[dict]:
+    def solve(chosen: Sequence[int], tell: ShareDone) -> list[dict]:
         measured = found.measure(chosen, tell)
         rows = {
             i: {"status": "bad input", "error": why}
@@ -244,7 +245,7 @@ def _detect(found: PhotographFolders, keys: tuple[str, ...], settings: BatchSett
 def _photographed_rigs(found: RigFolders, keys: tuple[str, ...], settings: BatchSettings) -> Work:
     of_rigs = settings.as_rigs()
 
-    def solve(chosen: Sequence[int], tell: Tell) -> list[dict]:
+    def solve(chosen: Sequence[int], tell: ShareDone) -> list[dict]:
         measured = found.measure(chosen, tell)
         rows = {
             i: {"status": "bad input", "error": why}

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxbundle.arguments import one_of
 from jaxbundle.choices import RESAMPLINGS, Resampling
-from jaxbundle.commands.scanner_inputs import Tell, ignore, open_scanner, surface_of
+from jaxbundle.commands.scanner_inputs import Message, ignore, open_scanner, surface_of
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.io.rasters.correction import map_of, write_corrected
@@ -68,7 +68,7 @@ def correct(  # noqa: PLR0913 (public: the options of the command, all but three
     truth: str | Path | None = None,
     error_map: str | Path | None = None,
     progress: Progress = lambda *_: None,
-    tell: Tell = ignore,
+    tell: Message = ignore,
 ) -> CorrectedImage:
     """Correct an image of a scanner file to a map, in blocks.
 
@@ -150,7 +150,7 @@ def _check_target(option: str, path: Path, image: Path) -> None:
         raise InputError(f"{option} {path} is the image itself; give another name")
 
 
-def _open_truth(path: Path, file: ScannerInput, tell: Tell) -> PushbroomImage:
+def _open_truth(path: Path, file: ScannerInput, tell: Message) -> PushbroomImage:
     """The true image, which must match the scanner file."""
     truth = open_scanner(path, tell)
     if truth.earth != file.earth:

@@ -19,7 +19,7 @@ from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.rpc import Rpc
 from jaxbundle.pushbroom.surfaces import Ground, GroundSurface, Height, Plane
 
-Tell = Callable[[str], object]
+Message = Callable[[str], object]
 """Called with a warning, a line of text."""
 OFF_IMAGE = "off the image"
 CARTESIAN, GEOGRAPHIC = ("X", "Y", "Z"), ("longitude", "latitude", "height")
@@ -66,7 +66,7 @@ def surface_of(
     return Height(level=height, earth=earth)
 
 
-def open_scanner(path: str | Path, tell: Tell = ignore) -> ScannerInput:
+def open_scanner(path: str | Path, tell: Message = ignore) -> ScannerInput:
     """A scanner file; `tell` receives its warnings.
 
     **Raises:** `InputError`."""
@@ -122,7 +122,7 @@ def places(
 
 
 def off_image(
-    image: PushbroomImage, line: np.ndarray, pixel: np.ndarray, source: Source, tell: Tell
+    image: PushbroomImage, line: np.ndarray, pixel: np.ndarray, source: Source, tell: Message
 ) -> np.ndarray:
     """Which positions are outside the image; reported, and refused if all are.
 
@@ -147,7 +147,7 @@ def off_image(
     return off
 
 
-def with_points(table: Columns, tell: Tell) -> Columns:
+def with_points(table: Columns, tell: Message) -> Columns:
     """The rows that have a point: `locate` leaves the others empty, with a status."""
     if "status" not in table.values:
         return table

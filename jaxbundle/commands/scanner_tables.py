@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxbundle.commands.scanner_inputs import (
     OFF_IMAGE,
-    Tell,
+    Message,
     ignore,
     off_image,
     open_scanner,
@@ -78,7 +78,7 @@ def locate(
     height: float | None = None,
     dem: str | Path | None = None,
     geoid: str | Path | None = None,
-    tell: Tell = ignore,
+    tell: Message = ignore,
 ) -> ScannerTable:
     """Locate image positions of a scanner file on the ground; (0, 0) is the centre of the first
     pixel. Of arrays: `locate_points`.
@@ -134,7 +134,7 @@ def locate(
     return ScannerTable(columns, {"scanner": file.name})
 
 
-def project(scanner: str | Path, points: str | Path, *, tell: Tell = ignore) -> ScannerTable:
+def project(scanner: str | Path, points: str | Path, *, tell: Message = ignore) -> ScannerTable:
     """Project ground points into the image of a scanner file: a row for every line that sees one.
     Of arrays: `project_points`.
 
@@ -204,7 +204,7 @@ def accuracy(  # noqa: PLR0913 (public: the options of the command, all but one 
     height: float | None = None,
     dem: str | Path | None = None,
     geoid: str | Path | None = None,
-    tell: Tell = ignore,
+    tell: Message = ignore,
 ) -> ScannerTable:
     """Ground RMS and CE90 for given σ of the ancillary data, or errors against a known truth; of
     about a thousand irregular positions, so that none of them falls in step with the records.

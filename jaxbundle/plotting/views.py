@@ -126,7 +126,11 @@ def _legend_below(ax: "Axes") -> None:
 
 
 def network_perspective(adjustment: "Adjustment", ax: "Axes3D | None" = None) -> "Axes3D":
-    """The network in perspective: cameras as pyramids of their image corners, points by role.
+    """The network in perspective: cameras as pyramids of their image corners, points by role, error
+    ellipsoids by their three principal sections.
+
+    The ellipsoids are 1σ (a posteriori) and exaggerated; legend and title state the factor, and of
+    which points they are drawn (`choose_ellipses`).
 
     **Returns:** matplotlib 3D `Axes`, in the object unit.
     """
@@ -151,6 +155,17 @@ def network_perspective(adjustment: "Adjustment", ax: "Axes3D | None" = None) ->
                 depthshade=False,
                 **_lighter(role, len(points["id"])),
             )
+    ellipses = choose_ellipses(adjustment, size, widest=0.1)  # none is hidden by its own point
+    if ellipses.total:
+        sections = principal_sections(adjustment, ellipses)
+        drawn = Line3DCollection(
+            list(sections),
+            colors=BLUE,
+            linewidths=0.6,
+            alpha=0.6 if len(ellipses.rows) == ellipses.total else 0.3,
+            label=f"error ellipsoids (1σ, {PROBABILITY[3]}) {ellipses.exaggeration}",
+        )
+        view.add_collection3d(drawn)
     everything = np.concatenate([points["xyz"], pyramids.reshape(-1, 3)])
     low, high = _inside(everything)
     for name, a, b in zip("xyz", low, high):
@@ -161,7 +176,12 @@ def network_perspective(adjustment: "Adjustment", ax: "Axes3D | None" = None) ->
     for name in "xyz":
         view.locator_params(axis=name, nbins=5)
         label_coordinates(view, name, unit)
-    title(view, f"{adjustment.network.name}: perspective")
+    selection = ellipses.selection
+    title(
+        view,
+        f"{adjustment.network.name}: perspective",
+        selection and f"error ellipsoids {selection}",
+    )
     legend(view, frameon=False, loc="upper right")
     return view
 
@@ -181,7 +201,6 @@ def camera_pyramids(adjustment: "Adjustment", size: float) -> np.ndarray:
     models = [get_model(given.model) for given in network.cameras]
     frames = np.array([np.stack(image_frame(adjustment, c.id)[:2]) for c in network.cameras])
     corners = np.zeros((len(models), 4, 3))
-    interior = np.asarray(adjustment.problem.interior_orientation(values))
     interior = np.asarray(adjustment.problem.interior_orientation(values))
     for model in dict.fromkeys(models):
         chosen = [c for c, other in enumerate(models) if other == model]
@@ -281,9 +300,10 @@ class Ellipses(NamedTuple):
         )
 
 
-def choose_ellipses(adjustment: "Adjustment", size: float) -> Ellipses:
+def choose_ellipses(adjustment: "Adjustment", size: float, widest: float = 0.03) -> Ellipses:
     """The error ellipses of points for a network of this size: at most `LARGEST_ELLIPSES` +
-    `SAMPLED_ELLIPSES`, in a visible and comparable size."""
+    `SAMPLED_ELLIPSES`, in a visible and comparable size: of half the median distance of neighbours,
+    but at most `widest` of the network's size."""
     covariance = adjustment.point_covariance[:, :2, :2]
     large = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
     there = np.flatnonzero(adjustment.located & np.isfinite(large) & (large > 0))
@@ -292,7 +312,7 @@ def choose_ellipses(adjustment: "Adjustment", size: float) -> Ellipses:
     rows = there[thin_out(adjustment.point_values[there], large[there])]
     neighbour = _neighbour(adjustment.point_values[rows, :2])
     # an ellipse is visible, and two neighbours hardly touch
-    reach = np.clip(0.45 * neighbour, 0.012 * size, 0.03 * size)
+    reach = np.clip(0.45 * neighbour, 0.012 * size, widest * size)
     return Ellipses(rows, len(there), round_number(reach / np.median(large[rows])))
 
 
@@ -317,12 +337,36 @@ def thin_out(
 
 def error_ellipses(adjustment: "Adjustment", ellipses: Ellipses, corners: int = 49) -> np.ndarray:
     """Closed polygons [drawn, corners, 2] of ellipses of X and Y."""
-    covariance = adjustment.point_covariance[ellipses.rows, :2, :2]
+    half_axes = _half_axes(adjustment, ellipses, 2)
+    offsets = half_axes @ _circle(corners)
+    return adjustment.point_values[ellipses.rows, None, :2] + offsets.transpose(0, 2, 1)
+
+
+def principal_sections(
+    adjustment: "Adjustment", ellipses: Ellipses, corners: int = 33
+) -> np.ndarray:
+    """Closed polygons [3·drawn, corners, 3]: the sections of error ellipsoids by the planes of two
+    of their axes."""
+    half_axes = _half_axes(adjustment, ellipses, 3)
+    offsets = np.stack(
+        [half_axes[:, :, pair] @ _circle(corners) for pair in ([0, 1], [0, 2], [1, 2])]
+    )
+    sections = adjustment.point_values[ellipses.rows, None] + offsets.transpose(0, 1, 3, 2)
+    return sections.reshape(-1, corners, 3)
+
+
+def _half_axes(
+    adjustment: "Adjustment", ellipses: Ellipses, dimensions: int
+) -> Float[np.ndarray, "drawn d d"]:
+    """The exaggerated half-axes of the first coordinates' ellipses, as columns."""
+    covariance = adjustment.point_covariance[ellipses.rows, :dimensions, :dimensions]
     square, direction = np.linalg.eigh(0.5 * (covariance + covariance.transpose(0, 2, 1)))
+    return ellipses.factor * direction * np.sqrt(np.clip(square, 0, None))[:, None, :]
+
+
+def _circle(corners: int) -> Float[np.ndarray, "2 corners"]:
     t = np.linspace(0, 2 * np.pi, corners)
-    circle = np.stack([np.cos(t), np.sin(t)])
-    shape = ellipses.factor * direction * np.sqrt(np.clip(square, 0, None))[:, None, :]
-    return adjustment.point_values[ellipses.rows, None, :2] + (shape @ circle).transpose(0, 2, 1)
+    return np.stack([np.cos(t), np.sin(t)])
 
 
 def _draw_ellipses(adjustment: "Adjustment", ax: "Axes", size: float) -> tuple[np.ndarray, str]:

@@ -253,6 +253,7 @@ def test_views_parallel_to_the_board_determine_no_focal_length(three, solved):
     assert not solved.undetermined.any()
 
 
+@pytest.mark.further
 def test_a_principal_point_is_weak_too(three):
     """With given fx and fy, bad measurements of slightly tilted views leave it unknown."""
     p = three[1][0]
@@ -264,6 +265,7 @@ def test_a_principal_point_is_weak_too(three):
     assert (found.sigma[0, :2] > p[:2] / 50).all() and not np.isnan(found.rms[0])
 
 
+@pytest.mark.further
 def test_without_redundancy_there_is_no_sigma(three):
     """2 views of 4 points: 16 coordinates for 4 + 12 unknowns."""
     corners = [0, 7, 32, 39]
@@ -336,6 +338,7 @@ def test_progress_is_told_and_portions_keep_the_order(three, solved):
         same(found, solved, camera, camera % 3)
 
 
+@pytest.mark.further
 def test_the_way_of_accelerators_gives_the_same(three, solved, monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     found = jaxbundle.calibrate_batch(BOARD, three[0], SIZE)
@@ -343,6 +346,7 @@ def test_the_way_of_accelerators_gives_the_same(three, solved, monkeypatch):
         same(found, solved, camera, camera, rtol=1e-6)
 
 
+@pytest.mark.further
 def test_a_solid_object_with_some_parameters_held():
     rng = np.random.default_rng(5)
     X = rng.uniform(-0.12, 0.12, (40, 3)) + BOARD.mean(0)
@@ -358,6 +362,7 @@ def test_a_solid_object_with_some_parameters_held():
     assert_allclose(found.sigma0, NOISE, rtol=0.1)
 
 
+@pytest.mark.further
 def test_a_fisheye_from_given_start_values():
     model = cameras.get_model("kannala-brandt")
     p = np.array([400.0, 402.0, 642.0, 470.0, 0.02, -0.004, 0.001, 0.0])

@@ -198,6 +198,7 @@ def test_the_datum_holds_exactly_after_convergence(name):
         assert (weight == expected[:, None]).all()
 
 
+@pytest.mark.further
 def test_moving_to_the_datum_changes_no_residual():
     problem = make("one fixed point")
     system, start = problem, problem.data.start

@@ -98,6 +98,7 @@ def test_without_snooping_they_are_misfits(rigs):
     assert not any("χ²" in said for said in found.adjustments[0].warnings)
 
 
+@pytest.mark.further
 def test_arrays_of_rigs_in_a_file(rigs, tmp_path):
     """Killed and restarted: the same lines; other settings are refused."""
     path, file = tmp_path / "rigs.npz", tmp_path / "rigs.jsonl"

@@ -63,6 +63,7 @@ def test_cells_are_the_dense_model_with_a_pose_each(clean):
     assert clean.bias.tests["cells"].F == pytest.approx(F, rel=1e-6)
 
 
+@pytest.mark.further
 def test_a_missing_k2_is_of_the_camera():
     """Another camera to compile than that of the other tests."""
     for seed in range(2):

@@ -208,6 +208,7 @@ def test_gross_errors_count_little():
     assert abs(spoilt.parameters["fx"] - TRUTH["fx"]) > abs(found.parameters["fx"] - TRUTH["fx"])
 
 
+@pytest.mark.further
 def test_a_view_in_the_wrong_order_is_left_out():
     views = simulated()
     xy = views.xy.copy()

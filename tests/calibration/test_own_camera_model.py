@@ -72,6 +72,7 @@ def unified(p, r, s, q):
     return cx + f * r / N, cy - f * s / N
 
 
+@pytest.mark.further
 def test_start_values_of_any_formula():
     """Nothing of the formula is known but its images: a fit to those of `opencv`, or of
     `kannala-brandt`."""

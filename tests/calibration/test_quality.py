@@ -230,6 +230,7 @@ def test_maps_that_cannot_be(sample):
         uncertainty_map(adjustment, "cam", 0.0)
 
 
+@pytest.mark.further
 def test_two_halves_agree_unless_the_camera_changed(calibration):
     found = calibration.cross_validation
     assert 0.1 < found.test < 3

@@ -329,6 +329,7 @@ def test_points_of_the_object_are_exact_weighted_or_free():
     assert not declare_rig(rig)[0][-1].free.any() and len(declare_rig(rig)[1]) == 1
 
 
+@pytest.mark.further
 def test_a_bent_board_is_estimated_with_the_rig():
     """Scale comes from the board on the whole; σ0 and the shape come out right."""
     nominal = taken.BOARD.points

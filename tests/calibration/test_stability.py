@@ -76,6 +76,7 @@ def test_a_slope_with_temperature():
     assert found.to_dict()["parameters"]["fx"]["slope"] == found.slope[0]
 
 
+@pytest.mark.further
 def test_scatter_about_a_slope():
     """Seven epochs on a line with scatter: the line's τ is the scatter alone, the slope's σ and its
     probability are correct if there is no trend."""

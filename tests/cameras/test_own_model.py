@@ -86,6 +86,7 @@ def test_second_derivatives(case):
     test_models.test_second_derivatives_of_all_parameters(case)
 
 
+@pytest.mark.further
 def test_brown_said_again_is_brown():
     again = CameraModel("again", brown.PARAMETERS, correct=brown.correct, never_free=("r0",))
     case = CASES[0]

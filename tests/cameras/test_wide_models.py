@@ -141,6 +141,7 @@ def test_the_spline_beside_mrcal():
     assert_allclose(theirs, case.grid(), atol=1e-7)
 
 
+@pytest.mark.further
 def test_a_point_sees_sixteen_knots():
     case = CASE["spline-6x5-160"]
     ray = jnp.asarray(DIRECTIONS[1])

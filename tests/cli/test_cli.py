@@ -204,6 +204,7 @@ def test_not_converged_says_so(command, tmp_path):
     assert "sigma0" not in result and "cameras" not in result
 
 
+@pytest.mark.further
 @pytest.mark.slow
 def test_orient_writes_a_project_with_start_values(command, project, tmp_path):
     images = (project / "images.csv").read_text().splitlines()
@@ -250,6 +251,7 @@ def test_processes_that_cannot_be_joined(command, options, said):
     assert not done.out
 
 
+@pytest.mark.further
 def test_a_cluster_that_is_none_ends_the_process():
     done = run("adjust", EXAMPLE / "project.toml", "--quiet", "--cluster")
     assert done.returncode == 2 and not done.stdout

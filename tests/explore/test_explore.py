@@ -441,6 +441,7 @@ def rms_of_cells(errors):
     return np.sqrt(np.mean((errors**2).sum(1).reshape(7, 6, -1), axis=2))
 
 
+@pytest.mark.further
 def test_errors_between_the_records_are_not_missed():
     """Attitude records every 100 lines, on which regular lines can fall. The RMS of all 4000 lines
     is 0.143 m (0.144 in the published study)."""
@@ -456,6 +457,7 @@ def test_errors_between_the_records_are_not_missed():
     assert np.min(found["errors"]) > 0.02  # no part of the image is without error
 
 
+@pytest.mark.further
 def test_errors_on_the_ground_are_those_of_the_library(scanner, flight):
     """Those of linear interpolation, which the spline does not leave; and of an error of roll, as
     an offset of the attitude."""
@@ -477,6 +479,7 @@ def test_errors_on_the_ground_are_those_of_the_library(scanner, flight):
     assert "CE90" in found["parts"]["accuracy"] and "<svg" in found["parts"]["ground"]
 
 
+@pytest.mark.further
 def test_the_flight_file_holds_what_was_chosen(scanner, tmp_path):
     given = {"attitude_interpolation": "spline", "roll": 0.05, "yaw": -0.02}
     file = scanner.export(FLIGHT_FILE, given)

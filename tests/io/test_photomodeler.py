@@ -280,6 +280,7 @@ def test_cut_off(tmp_path, share):
             read(tmp_path, part)
 
 
+@pytest.mark.further
 def test_points_it_does_not_list_are_found_from_its_orientations(tmp_path):
     from jaxbundle import orient
 

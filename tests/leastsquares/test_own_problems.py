@@ -78,6 +78,7 @@ def test_blunders_of_a_trilateration_are_removed(trilateration):
     assert {s.row for s in robust.suspects} == {7, 40}
 
 
+@pytest.mark.further
 def test_a_row_that_loses_its_only_view_is_excluded():
     """Of three views of a point, the wrong one is the only one with its height."""
     random = np.random.default_rng(3)
@@ -136,6 +137,7 @@ def test_what_nothing_determines_is_named(trilateration):
         result.residuals("distance")
 
 
+@pytest.mark.further
 def test_hand_eye_calibration_of_a_robot():
     """A = gripper in the base (known), X = camera in the gripper, Z = base in the board: the camera
     has measured poses B of the board with M_B = M_X·M_A·M_Zᵀ and the like for the centre."""

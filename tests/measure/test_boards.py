@@ -76,7 +76,9 @@ def test_every_point_is_found_and_numbered(board, seed):
     assert np.abs(error).max() < 0.3
 
 
-@pytest.mark.parametrize("board", [CHESS, CIRCLES], ids=lambda b: b.kind)
+@pytest.mark.parametrize(
+    "board", [CHESS, pytest.param(CIRCLES, marks=pytest.mark.further)], ids=lambda b: b.kind
+)
 def test_large_photographs_are_searched_in_small(board):
     """A photograph five times as large: found in a copy, measured in itself."""
     picture, true = taken(board, 20, 15, 10, 0.5)
@@ -176,6 +178,7 @@ def test_circles_of_another_number():
     assert other_sizes(picture, dataclasses.replace(CIRCLES, columns=7, rows=5)) == CIRCLES
 
 
+@pytest.mark.further
 def test_a_part_of_the_board_is_said_to_be_one():
     """Of a board of 9 × 6 the block of 5 × 5 is found in some photographs, and no 8 × 6 in most."""
     views = measure_boards([EXAMPLE / f"photo_{i:02d}.jpg" for i in range(1, 5)], Board(5, 5, 0.03))
@@ -215,6 +218,7 @@ def test_no_board_is_seen_in_a_landscape():
         assert other_sizes(read_photograph(path), Board(7, 5, 0.03)).grid == (6, 9)
 
 
+@pytest.mark.further
 def test_photographs_without_a_board_get_no_size_of_one(tmp_path, command):
     """A batch of landscapes: that there is no board, and nothing to try instead."""
     photos = tmp_path / "landscapes"
@@ -245,6 +249,7 @@ def test_a_board_in_a_fisheye_is_one():
     assert not is_chessboard(cv2, np.full_like(grey, 100), xy)
 
 
+@pytest.mark.further
 def test_markers_of_another_dictionary_are_named():
     """The board drawn has DICT_4X4_50; the dictionaries are tried, the smallest that fits named."""
     picture, _ = taken(CHARUCO, *POSES[2])

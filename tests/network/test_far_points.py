@@ -148,6 +148,7 @@ def _distances_of(inspection):
     return distances
 
 
+@pytest.mark.further
 def test_sigma_of_direction_and_inverse_distance_are_those_of_a_sample(moderate):
     found = moderate[1]
     far = find_far_points(found, 1.0)

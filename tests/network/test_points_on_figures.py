@@ -127,6 +127,7 @@ def test_known_shapes_start_where_their_points_are(simulated):
         np.testing.assert_allclose(x, BOARD, atol=1e-9)
 
 
+@pytest.mark.further
 def test_jacobians(result):
     check_jacobians(result.problem, result.values)
 
@@ -141,6 +142,7 @@ def test_sigma_is_that_of_a_sample(simulated, result):
         assert (np.abs(ratio - 1) < 4 / np.sqrt(2 * len(values))).all(), (name, ratio)
 
 
+@pytest.mark.further
 def test_exact_conditions_hold(simulated):
     """What is exact is the limit of a small σ: points lie on their figures to 1e-7 of the extent.
     (A circle has two conditions a point, a sphere one; boards three.)"""
@@ -162,6 +164,7 @@ def test_exact_conditions_hold(simulated):
         np.testing.assert_allclose(between(board), between(BOARD), atol=1e-6)
 
 
+@pytest.mark.further
 def test_a_plane_through_collinear_points_is_named(simulated):
     """The points of the line as a plane: its turn about them is open."""
     line = [r["point"] for r in tables(SIGMA)["figures"] if r["type"] == "line"]

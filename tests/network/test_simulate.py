@@ -258,6 +258,7 @@ def adjusted():
     return made.truth, result
 
 
+@pytest.mark.further
 def test_the_adjustment_finds_the_true_camera(adjusted):
     _, result = adjusted
     assert abs(result.sigma0 - 1) < 4 / np.sqrt(2 * result.redundancy)

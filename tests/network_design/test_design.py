@@ -119,6 +119,7 @@ def test_aims_are_those_of_dense_algebra(plain, oracle):
     assert worst < measure(Aim("worst"), blocks) < 10 ** (1 / 24) * worst
 
 
+@pytest.mark.further
 def test_the_smallest_redundancy_number(plain, oracle):
     problem = jaxbundle.make_problem(plain)
     assert smallest_redundancy(problem) == pytest.approx(oracle[1].min(), rel=1e-5)
@@ -221,6 +222,7 @@ def refused(network, message, aim="mean", **options):
         jaxbundle.design(network, aim, **options)
 
 
+@pytest.mark.further
 def test_what_cannot_be_designed_is_refused(network, site):
     camera = network.cameras[0]
     conditions = jaxbundle.Conditions
@@ -274,6 +276,7 @@ def test_priors_in_tables_are_information_as_in_columns(network):
         ))  # fmt: skip
 
 
+@pytest.mark.further
 def test_an_aim_that_the_datum_decides_is_refused(network, site):
     refused(network, "depends on the datum", Aim("mean", (("point", "3", "Z"),)))
     refused(network.replace(datum="minimal"), "inner constraints")

@@ -257,6 +257,7 @@ def test_bad_data_is_found_before():
         orient(network.replace(observations=rays))
 
 
+@pytest.mark.further
 def test_control_seen_once_gives_the_frame():
     """Of the four control points of this network two are in one image each; far away, and in
     millimetres."""
@@ -347,6 +348,7 @@ def test_blunders_that_leave_least_squares_no_solution(with_control):
     assert any("that contradict the adjusted" in warning for warning in result.notes)
 
 
+@pytest.mark.further
 def test_a_plane_without_control():
     """With an image that cannot be placed: the result is that without it."""
     network = close_up(jaxbundle.grid_of_targets(9, 9, 0.6))

@@ -55,6 +55,7 @@ def test_propagation_against_drawing(name):
     assert (np.abs(found.covariance - exact.covariance) / scale).max() < 4 * np.sqrt(2 / draws)
 
 
+@pytest.mark.further
 def test_white_noise_is_averaged_between_the_rows():
     """Halfway between two rows, interpolation on the shortest way leaves σ/√2."""
     at_row, between = 60.0, 67.5  # rows every 0.1 s are 15 lines apart

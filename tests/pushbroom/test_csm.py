@@ -300,7 +300,7 @@ def test_velocities_that_contradict_their_positions_are_said(tmp_path, factor, u
     np.testing.assert_allclose(track, known, rtol=0, atol=limit)
 
 
-@pytest.mark.parametrize("rows", [1, 2])
+@pytest.mark.parametrize("rows", [1, pytest.param(2, marks=pytest.mark.further)])
 def test_lines_in_reverse_order(tmp_path, rows):
     """With a negative period, in one row or two, line l is the line `LINES` − 1 − l of the same
     scanner read forwards."""
@@ -331,6 +331,7 @@ def test_lines_in_reverse_order(tmp_path, rows):
         read_csm(write(tmp_path, isd))
 
 
+@pytest.mark.further
 def test_short_tables_with_a_stated_extrapolation(tmp_path):
     """Positions that end a second before the last line, in a file and as `source`."""
     isd = support_data(older=True)

@@ -89,6 +89,7 @@ def by_hand(isd, t):
     return lagrange(rows, np.array(P)), Rotation.from_quat(lagrange(even, q))
 
 
+@pytest.mark.further
 def test_times_are_merged_and_orders_fall(tmp_path):
     """Body and pointing at other times, the image from the first to the last step of both."""
     isd = support_data()
@@ -274,6 +275,7 @@ def test_states_of_other_models_are_refused(tmp_path):
         read_csm(path)
 
 
+@pytest.mark.further
 def test_an_image_of_one_line(tmp_path):
     whole = read_csm(write(tmp_path, support_data(older=True)))
     one = read_csm(write(tmp_path, support_data(older=True) | {"image_lines": 1}))

@@ -102,6 +102,7 @@ def test_second_derivatives_of_the_way_back():
     assert float(along(0.0)[1]) == pytest.approx(float(numeric), rel=1e-3)
 
 
+@pytest.mark.further
 def test_a_line_of_sight_on_surfaces():
     """Points on a height and on sloping terrain project back to their origin."""
     line, sample, _ = r.project_points(RPC, *PLACES)

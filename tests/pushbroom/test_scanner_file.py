@@ -220,6 +220,7 @@ def write_raster(path, heights, crs, transform):
     return path
 
 
+@pytest.mark.further
 def test_terrain_rasters(tmp_path, monkeypatch, capsys):
     """Heights of a plane over longitude and latitude; the same in UTM; a model elsewhere."""
     scanner = write_scanner(tmp_path)
@@ -262,6 +263,7 @@ def test_terrain_rasters(tmp_path, monkeypatch, capsys):
     assert abs(np.degrees(terrain.origin[1]) - 49.65) < 0.01
 
 
+@pytest.mark.further
 def test_ground_behind_a_place_without_height(tmp_path, monkeypatch, capsys):
     """Flat land seen obliquely over a sea without height, and a high mountain elsewhere."""
     mounting = TEXT[TEXT.index("[mounting]") :]

@@ -41,6 +41,7 @@ def test_without_points_of_three_rays_the_first_attempt_counts(monkeypatch, firs
     assert len(attempts) == 2
 
 
+@pytest.mark.further
 def test_only_rays_that_meet_are_counted():
     """At the oriented photographs, not those to the start value of a point whose rays are wrong."""
     camera = Camera("cam", "brown", {"c": 24.0}, free=("c",))

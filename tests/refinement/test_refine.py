@@ -97,6 +97,7 @@ def test_blunders_are_found_and_nothing_else(with_jitter):
     assert len(to_json(found)["removed"]) == 3
 
 
+@pytest.mark.further
 def test_the_refined_image_sees_the_points_where_they_are(with_jitter, refined):
     """The image as written, slerp and all, against the adjusted residuals."""
     X, observations = with_jitter
@@ -110,6 +111,7 @@ def test_the_refined_image_sees_the_points_where_they_are(with_jitter, refined):
     assert np.allclose(np.einsum("nij,nj->ni", scale, g), v[:6], atol=2e-3)
 
 
+@pytest.mark.further
 def test_the_residual_of_what_is_located_is_zero():
     switch = Corrections(True, True, True)
     image = satellite(switch)
@@ -138,6 +140,7 @@ def test_check_points_and_their_sigma(refined):
     assert len(to_json(refined)["check_points"]) == COUNT
 
 
+@pytest.mark.further
 def test_what_flat_ground_does_not_determine_is_named():
     rng = np.random.default_rng(2)
     places, heights = spread(rng, relief=0.0)
@@ -153,6 +156,7 @@ def test_what_flat_ground_does_not_determine_is_named():
         assert any(all(word in warning for word in pair) for warning in found.warnings), said
 
 
+@pytest.mark.further
 def test_the_same_twice_is_refused_by_name():
     """Mounting and attitude bias of one image turn it alike."""
     rng = np.random.default_rng(2)

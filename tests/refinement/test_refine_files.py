@@ -220,6 +220,7 @@ def test_a_line_outside_the_tables_is_told_with_its_time(folder):
         refine(*file[:4])
 
 
+@pytest.mark.further
 def test_nothing_free_and_nothing_measured(folder):
     (folder / "refine.toml").write_text(TEXT.split("[unknowns]")[0] + "[unknowns]\n")
     file = read_refinement(folder / "refine.toml")

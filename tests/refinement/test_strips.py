@@ -105,6 +105,7 @@ def test_control_coordinates_with_sigma_are_tested_too(strips, found):
     assert "Y of control point P2" in report(found)
 
 
+@pytest.mark.further
 def test_a_tie_point_seen_from_one_place_is_refused(strips):
     images, points, observations, X = strips
     both = [images[0], dataclasses.replace(images[0], id="again")]

@@ -173,6 +173,7 @@ def test_the_same_as_a_dense_solution(case, equations):
     assert (np.abs(alone[m:] - y[m:]) > 0.2 * sigma[m:]).sum() > 6
 
 
+@pytest.mark.further
 def test_together_is_better_than_each_alone(case, equations):
     """σ of every unknown against those of its own rays and control points, which is all that a
     single image has of points seen once."""
