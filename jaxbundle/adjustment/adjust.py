@@ -100,7 +100,7 @@ class RoundSettings:
 ROUNDS = RoundSettings()
 
 
-def adjust(
+def adjust(  # noqa: PLR0913 - the options of an adjustment
     network: Network | str | Path,
     *,
     format: str | None = None,
@@ -483,7 +483,7 @@ def _tell(
     progress(stage, int(step), total)
 
 
-def check_options(
+def check_options(  # noqa: PLR0913 - the options of an adjustment
     *,
     method: str = "levenberg-marquardt",
     reduction: str | None = None,

@@ -103,7 +103,7 @@ class Adjustment:
 
     # Statistics are computed on first use and kept: most callers read a few, and the covariances of
     # a large block take longer than its adjustment.
-    def __init__(
+    def __init__(  # noqa: PLR0913 - all that a result holds
         self,
         network: Network,
         problem: NetworkProblem,

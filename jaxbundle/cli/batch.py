@@ -6,7 +6,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -15,6 +15,9 @@ from jaxbundle.choices import BOARDS, DICTIONARIES
 from jaxbundle.cli.app import Html, Quiet, app, choice, model_choice
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.system.interrupts import advise
+
+if TYPE_CHECKING:
+    from jaxbundle.network.columns import Columns
 
 STATUSES_WITH_REASON = ("bad input", "not solved", "failed")
 """Statuses of networks whose lines have an `error`."""
@@ -130,7 +133,7 @@ def batch(  # noqa: PLR0913 - the options of the command
     from jaxbundle.cli.processes import join_for_one_task
     from jaxbundle.cli.progress import counting
     from jaxbundle.commands.batch_run import BatchRun
-    from jaxbundle.io.text.csv_tables import read_csv, write_text
+    from jaxbundle.io.text.csv_tables import write_text
     from jaxbundle.network.columns import count
 
     if not board and (square or marker is not None):
@@ -142,12 +145,7 @@ def batch(  # noqa: PLR0913 - the options of the command
     given = [*inputs, json_lines, *filter(None, (html, against and str(against)))]
     check_outputs(table, summary, given, force)
     asked = _made_of_lines({"--html": html, "--table": table, "--summary": summary}, json_lines)
-    columns = None if against is None else read_csv(against)
-    if columns is not None:
-        if not asked:
-            raise InputError("--against: give --html, --table or --summary as well")
-        # read once before the run, for its errors
-        read_against(columns, columns.ids("id") if "id" in columns.values else (), str(against))
+    columns = None if against is None else _read_against(against, bool(asked))
     if not all(is_camera_stack(one) or known and is_photograph_folder(one) for one in inputs):
         # Cameras already use the cores by threads; devices gain nothing.
         jaxbundle.use_cores()
@@ -300,6 +298,18 @@ def _reason(row: dict) -> str:
     key, error = row["key"], row["error"]
     named = key.rpartition("/")[2] in error.partition(":")[0]
     return error if named else f"{key}: {error}"
+
+
+def _read_against(path: Path, asked: bool) -> "Columns":
+    """The table of `--against`, read whole before the run, for its errors."""
+    from jaxbundle.batches.population import read_against
+    from jaxbundle.io.text.csv_tables import read_csv
+
+    table = read_csv(path)
+    if not asked:
+        raise InputError("--against: give --html, --table or --summary as well")
+    read_against(table, table.ids("id") if "id" in table.values else (), str(path))
+    return table
 
 
 def _part(text: str) -> tuple[int, int]:

@@ -11,7 +11,7 @@ from jaxbundle.cli.app import Control, Force, Format, Input, Quiet, Settings, ap
 
 
 @app.command(example="out/board/network --by views --repeat 4", once=True)
-def replicate(
+def replicate(  # noqa: PLR0913 - the options of the command
     input: Input,
     by: Annotated[str, choice(REPLICATION, "what the halves do not share")] = "photographs",
     repeat: Annotated[int, typer.Option(min=1, help="random halves; runs have one")] = 1,

@@ -51,7 +51,7 @@ class CloudResult(TableMethods):
         return "\n".join(lines)
 
 
-def cloud(
+def cloud(  # noqa: PLR0913 - the options of the command
     cloud: Cloud | str | Path,
     *,
     cube: float | None = None,

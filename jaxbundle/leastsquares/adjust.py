@@ -201,7 +201,7 @@ class Result:
         return "\n".join(lines)
 
 
-def adjust(
+def adjust(  # noqa: PLR0913 - the options of an adjustment
     tables: Sequence[Table],
     observations: Sequence[ObservationSet],
     *,

@@ -77,7 +77,7 @@ OBSERVATION_SIGMAS = ("sx", "sy")
 DISTANCE_COLUMNS = ("from", "to", "value", "sigma")
 
 
-def make_network(
+def make_network(  # noqa: PLR0913 - the tables of a network
     cameras: Any,
     images: Any,
     points: Any,
