@@ -25,7 +25,7 @@ NO_NUMBERS = (bool, np.bool_, complex, np.complexfloating, type(np.ma.masked))
 real parts."""
 
 
-class RepeatedIds(Sequence[str]):
+class RepeatedIds:
     """A column of millions of ids of which few differ: `labels[codes]`."""
 
     def __init__(self, labels: Sequence[Any], codes: Int[np.ndarray, " rows"]):
@@ -34,7 +34,7 @@ class RepeatedIds(Sequence[str]):
     def __len__(self) -> int:
         return len(self.codes)
 
-    def __getitem__(self, row):
+    def __getitem__(self, row: int) -> Any:
         return self.labels[self.codes[row]]
 
     def __iter__(self) -> Iterator[Any]:

@@ -67,7 +67,9 @@ def rows_of_points(model: ColmapModel) -> Iterator[tuple[int, np.ndarray, float]
     return zip(model.point_ids.tolist(), model.points, model.errors.tolist())
 
 
-def check_unique(ids: Sequence[int], place: Callable[[int], object], thing: str) -> None:
+def check_unique(
+    ids: Sequence[int] | Int[np.ndarray, " rows"], place: Callable[[int], object], thing: str
+) -> None:
     """Refuse repeated numbers; `place(k)` names the position of the k-th."""
     values, first, counts = np.unique(np.asarray(ids), return_index=True, return_counts=True)
     for value in values[counts > 1][:1]:
