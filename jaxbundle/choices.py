@@ -54,6 +54,7 @@ NETWORK_FILES = {
     "ros-stereo": "a folder with two camera_info files of ROS, or ost.txt with two cameras",
     "rig": "result.json of jaxbundle calibrate --rig",
     "rig-line": "a line of jaxbundle batch: FILE.jsonl#KEY",
+    "csm-frame": "an ISD (.json) of a frame camera, USGS_ASTRO_FRAME_SENSOR_MODEL",
     "nvm": "an .nvm file of VisualSFM",
     "alicevision": "an .sfm or .json of AliceVision",
 }

@@ -1,6 +1,8 @@
 """`jaxbundle convert`: convert between formats."""
 
+import dataclasses
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -43,11 +45,19 @@ def convert(  # noqa: PLR0913 - the options of the command
     """Write any input in another format: project, COLMAP, BAL, Bundler, OpenCV, PLY, DXF, CSV."""
     from jaxbundle.cli.camera_inputs import pair
     from jaxbundle.io.exchange import convert as convert_file
+    from jaxbundle.io.exchange import describe_lost
 
     overrides = tuple(set or ())
     size = pair("--image-size", image_size)
     if size is not None and not all(number.is_integer() for number in size):
         raise InputError(f"--image-size {image_size}: whole numbers of pixels are expected")
+    told: list[str] = []
+
+    def tell(lost: Sequence[str]) -> None:
+        told.extend(lost)
+        for line in () if quiet else describe_lost(lost):
+            print(f"warning: {line}", file=sys.stderr, flush=True)
+
     done = convert_file(
         input,
         output,
@@ -61,8 +71,11 @@ def convert(  # noqa: PLR0913 - the options of the command
         pixel_size=pair("--pixel-size", pixel_size),
         force=force,
         control=control,
+        tell=tell,
     )
     if not quiet:
+        # only what the writer has found beside
+        done = dataclasses.replace(done, lost=tuple(what for what in done.lost if what not in told))
         print(str(done).split("\n", 1)[0])
         for line in str(done).splitlines()[1:]:
             print(line, file=sys.stderr if line.startswith("warning") else sys.stdout)

@@ -1,12 +1,13 @@
 """Conversion of any input to any output: reading, camera models, writing, and the differences.
 
 A network becomes a network, or points and cameras in a drawing or table, or one of its cameras a
-camera file; a camera file becomes a camera file. Nothing is written before all checks.
+camera file; a camera file becomes a camera file. Nothing is written before all checks, and before
+it is told what will be lost.
 """
 
 import dataclasses
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from jaxbundle.arguments import path as given_path
@@ -17,15 +18,18 @@ from jaxbundle.io.cameras.camera_files import choose_camera, is_camera_file, rea
 from jaxbundle.io.cameras.nearest_camera import fit_messages
 from jaxbundle.io.formats import (
     CAMERA_KINDS,
+    FORMATS,
     TARGETS,
     check_own_models,
     has_model,
     read_network,
+    recognise_format,
     recognise_target,
 )
 from jaxbundle.io.networks.assemble import network_of_cameras
 from jaxbundle.io.networks.bundler import LIST
 from jaxbundle.io.networks.jaicov import COMPANION_SUFFIXES
+from jaxbundle.io.networks.losses import describe_losses, losing
 from jaxbundle.io.networks.project import FILE_NAME
 from jaxbundle.io.results.coordinates import images_path
 from jaxbundle.io.writing.folders import check_folder, replace_folder
@@ -34,6 +38,11 @@ from jaxbundle.network.conversion import convert_cameras, convert_one
 from jaxbundle.network.image_bounds import outside_warnings
 from jaxbundle.network.rules import check_camera
 from jaxbundle.network.tables import Camera, Network
+
+FILES_OF_CAMERAS = losing(
+    "orientations of images", "points", keeping=("prior σ of camera parameters",)
+)
+"""What a file of cameras loses of a network; its kind says what of the cameras."""
 
 
 @print_anywhere
@@ -57,9 +66,14 @@ class Converted:
         lines += [f"camera {id!r} → {cost}" for id, cost in costs[:shown]]
         if len(costs) > shown:
             lines.append(f"and {len(costs) - shown} more cameras, with smaller differences")
-        lines += [f"not kept: {'; '.join(self.lost)}"] if self.lost else []
+        lines += describe_lost(self.lost)
         lines += [f"warning: {warning}" for warning in self.warnings]
         return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
+
+
+def describe_lost(lost: Sequence[str]) -> list[str]:
+    """The line about what is not kept; none if nothing is lost."""
+    return [f"not kept: {'; '.join(lost)}"] if lost else []
 
 
 def convert(  # noqa: PLR0913, as the options of the command
@@ -77,6 +91,7 @@ def convert(  # noqa: PLR0913, as the options of the command
     force: bool = False,
     control: str | Path | None = None,
     models: Sequence[CameraModel] = (),
+    tell: Callable[[Sequence[str]], None] = lambda lost: None,
 ) -> Converted:
     """Write an input in another format.
 
@@ -92,6 +107,7 @@ def convert(  # noqa: PLR0913, as the options of the command
     - `image_size` (pixels), `pixel_size` (mm): of all cameras that have none.
     - `force`: replace existing files, the output and those written beside it. Otherwise only a
       folder written by `convert` is replaced.
+    - `tell`: called with what the output will not keep, before it is written.
 
     **Raises:** `InputError`; nothing is written then.
     """
@@ -107,8 +123,8 @@ def convert(  # noqa: PLR0913, as the options of the command
         cameras = _add_sizes(read_cameras(input, models), image_size, pixel_size)
         if kind in TARGETS and TARGETS[kind].alone:
             network = network_of_cameras(cameras, str(input)).warn(*fit_messages(cameras))
-            return _convert_network(network, output, kind, model, measured, force)
-        made = _convert_cameras(input, cameras, output, kind, model, camera)
+            return _convert_network(network, output, kind, model, measured, force, (), tell)
+        made = _convert_cameras(input, cameras, output, kind, model, camera, tell)
         return dataclasses.replace(
             made, warnings=(*fit_messages(cameras), *outside_warnings(cameras))
         )
@@ -120,6 +136,7 @@ def convert(  # noqa: PLR0913, as the options of the command
         models=models,
         image_size=image_size,
     )
+    unread = FORMATS[format or str(recognise_format(input))].unread
     network = network.replace(cameras=_add_sizes(network.cameras, image_size, pixel_size))
     network = network.warn(*outside_warnings(network.cameras, network))
     _keep_input(input, network, output, kind, control)
@@ -130,17 +147,18 @@ def convert(  # noqa: PLR0913, as the options of the command
             # the fit over the measurements needs the network; then there is nothing to convert
             network, costs = convert_cameras(network, model, measured=True)
             model = None
-        made = _convert_cameras(input, network.cameras, output, kind, model, camera)
+        made = _convert_cameras(
+            input, network.cameras, output, kind, model, camera, tell, network, unread
+        )
         return dataclasses.replace(
             made,
             conversions=made.conversions if costs is None else costs,
-            lost=("images and points",),
             warnings=network.warnings,
             notes=network.notes,
         )
     if camera is not None:
         raise InputError(f"--camera {camera}: {kind} holds all cameras; omit it")
-    return _convert_network(network, output, kind, model, measured, force)
+    return _convert_network(network, output, kind, model, measured, force, unread, tell)
 
 
 def _convert_network(
@@ -150,9 +168,13 @@ def _convert_network(
     model: str | CameraModel | None,
     measured: bool,
     force: bool,
+    unread: Sequence[str],
+    tell: Callable[[Sequence[str]], None],
 ) -> Converted:
     network, costs = _with_model(network, kind, model, measured)
     folder, files = _folder(output, kind), TARGETS[kind].files
+    told = (*describe_losses(network, TARGETS[kind].losses), *unread)
+    tell(told)
     if folder is None:
         lost = TARGETS[kind].write(network, output)
     else:
@@ -160,7 +182,9 @@ def _convert_network(
             lost = TARGETS[kind].write(network, new)
     parts = tuple(path for path in _parts(network, output, kind) if path.exists())
     parts = () if parts == (output,) else parts
-    return Converted(kind, output, costs, tuple(lost), network.warnings, network.notes, parts)
+    # a writer may meet more than the format loses by itself
+    lost = (*told, *(what for what in lost if what not in told))
+    return Converted(kind, output, costs, lost, network.warnings, network.notes, parts)
 
 
 def _parts(network: Network, output: Path, kind: str) -> tuple[Path, ...]:
@@ -312,7 +336,11 @@ def _convert_cameras(
     kind: str,
     model: str | CameraModel | None,
     id: str | None,
+    tell: Callable[[Sequence[str]], None],
+    network: Network | None = None,
+    unread: Sequence[str] = (),
 ) -> Converted:
+    """Write cameras; `network`: where they are from, which is lost."""
     if kind not in CAMERA_KINDS:
         raise InputError(
             f"{input}: contains only cameras; they can be written as "
@@ -332,5 +360,12 @@ def _convert_cameras(
                 _refuse_inexact(cameras, camera.id, kind, costs[camera.id])
             camera = converted
         made.append(camera)
+    if network is None:
+        lost = describe_losses(network_of_cameras(made, str(input)), written.losses)
+    else:
+        losses = {**FILES_OF_CAMERAS, **written.losses}
+        lost = describe_losses(network.replace(cameras=tuple(made)), losses)
+    lost = (*lost, *unread)
+    tell(lost)
     written.write(made, output)
-    return Converted(kind, output, costs, (), ())
+    return Converted(kind, output, costs, lost, ())

@@ -17,32 +17,41 @@ from jaxbundle.io.cameras.opencv_file import SUFFIXES as OPENCV_SUFFIXES
 from jaxbundle.io.cameras.opencv_file import YAML
 from jaxbundle.io.cameras.opencv_writing import write_opencv, write_ros
 from jaxbundle.io.networks.alicevision import is_alicevision, read_alicevision
-from jaxbundle.io.networks.bal import OPENERS, is_bal, read_bal, write_bal
+from jaxbundle.io.networks.bal import BAL_LOSSES, OPENERS, is_bal, read_bal, write_bal
 from jaxbundle.io.networks.bingo import is_bingo, read_bingo
-from jaxbundle.io.networks.bundler import is_bundler, read_bundler, write_bundler
+from jaxbundle.io.networks.bundler import BUNDLER_LOSSES, is_bundler, read_bundler, write_bundler
 from jaxbundle.io.networks.colmap import FILES as COLMAP_FILES
 from jaxbundle.io.networks.colmap import fill_colmap, is_colmap, read_colmap, write_colmap_cameras
+from jaxbundle.io.networks.colmap_model import COLMAP_LOSSES, numbers_of
 from jaxbundle.io.networks.colmap_models import COLMAP_MODELS
 from jaxbundle.io.networks.column_map import is_column_map, read_column_map
 from jaxbundle.io.networks.control import read_control, select_checks, with_control
-from jaxbundle.io.networks.jaicov import is_jaicov, read_jaicov, write_jaicov
+from jaxbundle.io.networks.csm_frame import is_csm_frame, read_csm_frame
+from jaxbundle.io.networks.jaicov import JAICOV_LOSSES, is_jaicov, read_jaicov, write_jaicov
+from jaxbundle.io.networks.kalibr import KALIBR_LOSSES, is_kalibr, read_kalibr, write_kalibr
 from jaxbundle.io.networks.kalibr import OFFERED_MODELS as KALIBR_MODELS
-from jaxbundle.io.networks.kalibr import is_kalibr, read_kalibr, write_kalibr
-from jaxbundle.io.networks.losses import PIXEL_MODELS
+from jaxbundle.io.networks.losses import PIXEL_MODELS, QUANTITIES, Losses, changed
 from jaxbundle.io.networks.metashape import is_metashape, read_metashape
 from jaxbundle.io.networks.micmac import FILES as MICMAC_FILES
-from jaxbundle.io.networks.micmac import fill_micmac, is_micmac, read_micmac
+from jaxbundle.io.networks.micmac import MICMAC_LOSSES, fill_micmac, is_micmac, read_micmac
 from jaxbundle.io.networks.micmac_camera import MODELS as MICMAC_MODELS
 from jaxbundle.io.networks.micmac_camera import write_autocal
 from jaxbundle.io.networks.mounted_files import is_euroc, is_vins, read_euroc, read_vins
 from jaxbundle.io.networks.mrcal import FILES as MRCAL_FILES
+from jaxbundle.io.networks.mrcal import (
+    MRCAL_LOSSES,
+    fill_mrcal,
+    is_mrcal,
+    read_mrcal,
+    write_cameramodel,
+)
 from jaxbundle.io.networks.mrcal import OFFERED_MODELS as MRCAL_MODELS
-from jaxbundle.io.networks.mrcal import fill_mrcal, is_mrcal, read_mrcal, write_cameramodel
 from jaxbundle.io.networks.nvm import is_nvm, read_nvm
 from jaxbundle.io.networks.opencv_rigs import is_opencv_rig, read_opencv_rig
-from jaxbundle.io.networks.openmvg import is_openmvg, read_openmvg, write_openmvg
+from jaxbundle.io.networks.openmvg import OPENMVG_LOSSES, is_openmvg, read_openmvg, write_openmvg
 from jaxbundle.io.networks.opensfm import FILES as OPENSFM_FILES
 from jaxbundle.io.networks.opensfm import (
+    OPENSFM_LOSSES,
     fill_opensfm,
     is_opensfm,
     read_opensfm,
@@ -63,6 +72,7 @@ from jaxbundle.io.networks.rig_result import (
 from jaxbundle.io.networks.settings import choose_datum
 from jaxbundle.io.networks.stereo import (
     ROS_FILES,
+    STEREO_LOSSES,
     fill_ros_stereo,
     is_ros_stereo,
     opencv_stereo_files,
@@ -70,10 +80,15 @@ from jaxbundle.io.networks.stereo import (
     ros_stereo_folders,
     write_opencv_stereo,
 )
-from jaxbundle.io.networks.transforms import is_transforms, read_transforms, write_transforms
-from jaxbundle.io.results.coordinates import write_coordinates
-from jaxbundle.io.results.dxf import write_dxf
-from jaxbundle.io.results.ply import write_ply
+from jaxbundle.io.networks.transforms import (
+    TRANSFORMS_LOSSES,
+    is_transforms,
+    read_transforms,
+    write_transforms,
+)
+from jaxbundle.io.results.coordinates import COORDINATES_LOSSES, write_coordinates
+from jaxbundle.io.results.dxf import DXF_LOSSES, write_dxf
+from jaxbundle.io.results.ply import PLY_LOSSES, write_ply
 from jaxbundle.network.columns import count, did_you_mean, list_some
 from jaxbundle.network.rules import check_unique, model_of
 from jaxbundle.network.tables import Camera, Network, Source
@@ -85,7 +100,7 @@ class Format:
     """A kind of input: how it is recognised, how it is read, and a description;
     `adjusted` if its control points have adjusted coordinates and a posteriori σ; `names_models`
     if cameras name their models, and `read` takes own ones; `takes_image_size`: `read` takes the
-    image size of cameras that have none and need it."""
+    image size of cameras that have none and need it; `unread`: what of such files is not read."""
 
     recognises: Callable[[Path], bool]
     read: Callable[..., Network]
@@ -93,13 +108,15 @@ class Format:
     adjusted: bool = False
     names_models: bool = False
     takes_image_size: bool = False
+    unread: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
 class OutputFormat:
     """A kind of output: how its names are recognised, its writer, and its camera models.
 
-    `write` returns messages about what is not kept; no `models`: all, a name with * is a family.
+    `write` returns messages about what is not kept: `losses`, and what only the writer sees; no
+    `models`: all, a name with * is a family.
     `files`: names of the files in a folder; none: a file is written. `alone`: cameras
     without images can be written. `parts`: the files or folders that are written of a network, if
     there may be several.
@@ -111,6 +128,7 @@ class OutputFormat:
     models: tuple[str, ...] = ()
     files: tuple[str, ...] = ()
     alone: bool = False
+    losses: Losses = dataclasses.field(default_factory=dict)
     parts: Callable[[Network, Path], tuple[Path, ...]] | None = None
 
 
@@ -125,6 +143,18 @@ class CameraTarget:
     models: tuple[str, ...] = ()
     one: bool = False
     broad: bool = False
+    losses: Losses = dataclasses.field(default_factory=dict)
+
+
+def _cameras_losing(names: Callable[[Sequence[str]], Sequence[object]] | None = None) -> Losses:
+    """The losses of a file of cameras; `names`: those that they get."""
+    lost = ("pixel sizes of cameras", "prior σ of camera parameters")
+    renamed: Losses = {}
+    if names is not None:
+        renamed = {
+            "names of cameras": lambda n: changed(ids := [c.id for c in n.cameras], names(ids))
+        }
+    return renamed | {name: QUANTITIES[name] for name in lost}
 
 
 def _is_project(path: Path) -> bool:
@@ -156,18 +186,43 @@ FORMATS: dict[str, Format] = {
     "column-map": Format(
         is_column_map, read_column_map, NETWORK_FILES["column-map"], names_models=True
     ),
-    "colmap": Format(is_colmap, read_colmap, NETWORK_FILES["colmap"]),
-    "bingo": Format(is_bingo, read_bingo, NETWORK_FILES["bingo"]),
+    "colmap": Format(
+        is_colmap,
+        read_colmap,
+        NETWORK_FILES["colmap"],
+        unread=("colours, which are not read",),
+    ),
+    "bingo": Format(
+        is_bingo,
+        read_bingo,
+        NETWORK_FILES["bingo"],
+        unread=("orientations, distortion, which are not read",),
+    ),
     "metashape": Format(is_metashape, read_metashape, NETWORK_FILES["metashape"]),
     "photomodeler": Format(
         is_photomodeler,
         read_photomodeler,
         NETWORK_FILES["photomodeler"],
         adjusted=True,
+        unread=("covariances, which are not read",),
     ),
-    "bundler": Format(is_bundler, read_bundler, NETWORK_FILES["bundler"]),
-    "openmvg": Format(is_openmvg, read_openmvg, NETWORK_FILES["openmvg"]),
-    "opensfm": Format(is_opensfm, read_opensfm, NETWORK_FILES["opensfm"]),
+    "bundler": Format(
+        is_bundler,
+        read_bundler,
+        NETWORK_FILES["bundler"],
+        unread=("colours, which are not read",),
+    ),
+    "openmvg": Format(
+        is_openmvg,
+        read_openmvg,
+        NETWORK_FILES["openmvg"],
+    ),
+    "opensfm": Format(
+        is_opensfm,
+        read_opensfm,
+        NETWORK_FILES["opensfm"],
+        unread=("colours, which are not read",),
+    ),
     "transforms": Format(
         is_transforms,
         read_transforms,
@@ -193,8 +248,19 @@ FORMATS: dict[str, Format] = {
     "ros-stereo": Format(is_ros_stereo, read_ros_stereo, NETWORK_FILES["ros-stereo"]),
     "rig": Format(is_rig_result, read_rig_result, NETWORK_FILES["rig"]),
     "rig-line": Format(is_rig_line, read_rig_line, NETWORK_FILES["rig-line"]),
-    "nvm": Format(is_nvm, read_nvm, NETWORK_FILES["nvm"]),
-    "alicevision": Format(is_alicevision, read_alicevision, NETWORK_FILES["alicevision"]),
+    "csm-frame": Format(is_csm_frame, read_csm_frame, NETWORK_FILES["csm-frame"]),
+    "nvm": Format(
+        is_nvm,
+        read_nvm,
+        NETWORK_FILES["nvm"],
+        unread=("colours, which are not read",),
+    ),
+    "alicevision": Format(
+        is_alicevision,
+        read_alicevision,
+        NETWORK_FILES["alicevision"],
+        unread=("colours, which are not read",),
+    ),
 }
 
 
@@ -229,12 +295,37 @@ def _first(write: Callable[[Camera, Path], None]) -> Callable[[Sequence[Camera],
 
 # The order is that of recognition; "project" takes any folder and stands last.
 TARGETS: dict[str, OutputFormat] = {
-    "ply": OutputFormat(_ends(".ply"), write_ply, "NAME.ply"),
-    "dxf": OutputFormat(_ends(".dxf"), write_dxf, "NAME.dxf"),
-    "csv": OutputFormat(_ends(".csv"), write_coordinates, "NAME.csv"),
-    "bundler": OutputFormat(_ends(".out"), write_bundler, "NAME.out", ("snavely",)),
+    "ply": OutputFormat(
+        _ends(".ply"),
+        write_ply,
+        "NAME.ply",
+        losses=PLY_LOSSES,
+    ),
+    "dxf": OutputFormat(
+        _ends(".dxf"),
+        write_dxf,
+        "NAME.dxf",
+        losses=DXF_LOSSES,
+    ),
+    "csv": OutputFormat(
+        _ends(".csv"),
+        write_coordinates,
+        "NAME.csv",
+        losses=COORDINATES_LOSSES,
+    ),
+    "bundler": OutputFormat(
+        _ends(".out"),
+        write_bundler,
+        "NAME.out",
+        ("snavely",),
+        losses=BUNDLER_LOSSES,
+    ),
     "bal": OutputFormat(
-        _ends(".txt", ".bal", *OPENERS), write_bal, "NAME.txt, .bal, .gz, .bz2", ("snavely",)
+        _ends(".txt", ".bal", *OPENERS),
+        write_bal,
+        "NAME.txt, .bal, .gz, .bz2",
+        ("snavely",),
+        losses=BAL_LOSSES,
     ),
     "colmap": OutputFormat(
         _folder_of("colmap", "sparse"),
@@ -242,6 +333,7 @@ TARGETS: dict[str, OutputFormat] = {
         "a folder with colmap or sparse in its name",
         COLMAP_MODELS,
         COLMAP_FILES,
+        losses=COLMAP_LOSSES,
     ),
     "colmap-text": OutputFormat(
         lambda _: False,  # a folder is named as for "colmap": only --to asks for text
@@ -249,12 +341,14 @@ TARGETS: dict[str, OutputFormat] = {
         "by --to only",
         COLMAP_MODELS,
         COLMAP_FILES,
+        losses=COLMAP_LOSSES,
     ),
     "openmvg": OutputFormat(
         _file_of("sfm_data", ".json"),
         write_openmvg,
         "NAME.json with sfm_data in its name",
         PIXEL_MODELS,
+        losses=OPENMVG_LOSSES,
     ),
     "opensfm": OutputFormat(
         _folder_of("opensfm"),
@@ -262,6 +356,7 @@ TARGETS: dict[str, OutputFormat] = {
         "a folder with opensfm in its name",
         PIXEL_MODELS,
         OPENSFM_FILES,
+        losses=OPENSFM_LOSSES,
     ),
     "transforms": OutputFormat(
         _file_of("transforms", ".json"),
@@ -269,6 +364,7 @@ TARGETS: dict[str, OutputFormat] = {
         "NAME.json with transforms in its name",
         PIXEL_MODELS,
         alone=True,
+        losses=TRANSFORMS_LOSSES,
     ),
     "kalibr": OutputFormat(
         _file_of("camchain", *YAML),
@@ -276,6 +372,7 @@ TARGETS: dict[str, OutputFormat] = {
         "NAME.yaml with camchain in its name",
         KALIBR_MODELS,
         alone=True,
+        losses=KALIBR_LOSSES,
     ),
     "micmac": OutputFormat(
         lambda path: path.name.startswith("Ori-"),
@@ -283,8 +380,15 @@ TARGETS: dict[str, OutputFormat] = {
         "a folder Ori-NAME",
         MICMAC_MODELS,
         MICMAC_FILES,
+        losses=MICMAC_LOSSES,
     ),
-    "jaicov": OutputFormat(_ends(".phc"), write_jaicov, "NAME.phc", ("brown-projected",)),
+    "jaicov": OutputFormat(
+        _ends(".phc"),
+        write_jaicov,
+        "NAME.phc",
+        ("brown-projected",),
+        losses=JAICOV_LOSSES,
+    ),
     "mrcal": OutputFormat(
         _folder_of("mrcal"),
         fill_mrcal,
@@ -292,12 +396,14 @@ TARGETS: dict[str, OutputFormat] = {
         MRCAL_MODELS,
         MRCAL_FILES,
         alone=True,
+        losses=MRCAL_LOSSES,
     ),
     "opencv-stereo": OutputFormat(
         _file_of("stereo", *OPENCV_SUFFIXES),
         write_opencv_stereo,
         "NAME.yaml, .yml, .json with stereo in its name",
         PIXEL_MODELS,
+        losses=STEREO_LOSSES,
         parts=opencv_stereo_files,
     ),
     "ros-stereo": OutputFormat(
@@ -306,6 +412,7 @@ TARGETS: dict[str, OutputFormat] = {
         "a folder with camera_info in its name",
         PIXEL_MODELS,
         ROS_FILES,
+        losses=STEREO_LOSSES,
         parts=ros_stereo_folders,
     ),
     "project": OutputFormat(
@@ -317,10 +424,18 @@ TARGETS: dict[str, OutputFormat] = {
 }
 CAMERA_KINDS: dict[str, CameraTarget] = {
     "colmap-cameras": CameraTarget(
-        _is_named("cameras.txt"), write_colmap_cameras, "cameras.txt", COLMAP_MODELS
+        _is_named("cameras.txt"),
+        write_colmap_cameras,
+        "cameras.txt",
+        COLMAP_MODELS,
+        losses=_cameras_losing(numbers_of),
     ),
     "opensfm-cameras": CameraTarget(
-        _is_named("camera_models.json"), write_opensfm_cameras, "camera_models.json", PIXEL_MODELS
+        _is_named("camera_models.json"),
+        write_opensfm_cameras,
+        "camera_models.json",
+        PIXEL_MODELS,
+        losses=_cameras_losing(),
     ),
     "ros": CameraTarget(
         _file_of("camera_info", *YAML),
@@ -328,6 +443,7 @@ CAMERA_KINDS: dict[str, CameraTarget] = {
         "NAME.yaml with camera_info in its name",
         PIXEL_MODELS,
         one=True,
+        losses=_cameras_losing(lambda ids: [None] * len(ids)),
     ),
     "cameramodel": CameraTarget(
         _ends(".cameramodel"),
@@ -335,6 +451,7 @@ CAMERA_KINDS: dict[str, CameraTarget] = {
         "NAME.cameramodel",
         MRCAL_MODELS,
         one=True,
+        losses=_cameras_losing(lambda ids: [None] * len(ids)),
     ),
     "autocal": CameraTarget(
         _file_of("autocal", ".xml"),
@@ -342,6 +459,7 @@ CAMERA_KINDS: dict[str, CameraTarget] = {
         "NAME.xml with autocal in its name",
         MICMAC_MODELS,
         one=True,
+        losses=_cameras_losing(lambda ids: [None] * len(ids)),
     ),
     "opencv": CameraTarget(
         _ends(*YAML, ".json"),
@@ -349,6 +467,7 @@ CAMERA_KINDS: dict[str, CameraTarget] = {
         "NAME.yaml, .yml, .json",
         PIXEL_MODELS,
         one=True,
+        losses=_cameras_losing(lambda ids: [None] * len(ids)),
         broad=True,
     ),
     "cameras": CameraTarget(_ends(".toml"), write_cameras, "NAME.toml", broad=True),

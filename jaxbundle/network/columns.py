@@ -6,7 +6,7 @@ Data frames, dicts of columns, lists of dicts, and text from file readers all pa
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from operator import index
 from typing import Any, SupportsIndex
 
@@ -23,6 +23,22 @@ from jaxbundle.types import Column
 NO_NUMBERS = (bool, np.bool_, complex, np.complexfloating, type(np.ma.masked))
 """Types that Python or NumPy would convert silently: Booleans to 0 and 1, complex numbers to their
 real parts."""
+
+
+class RepeatedIds:
+    """A column of millions of ids of which few differ: `labels[codes]`."""
+
+    def __init__(self, labels: Sequence[Any], codes: Int[np.ndarray, " rows"]):
+        self.labels, self.codes = labels, codes
+
+    def __len__(self) -> int:
+        return len(self.codes)
+
+    def __getitem__(self, row: int) -> Any:
+        return self.labels[self.codes[row]]
+
+    def __iter__(self) -> Iterator[Any]:
+        return map(self.labels.__getitem__, self.codes.tolist())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,10 +136,21 @@ class Columns:
     ) -> Int[np.ndarray, " rows"]:
         """A column of ids as indices into another table (`thing`s in `where`)."""
         # Millions of rows: looked up at once, and searched for the unknown id only if there is one.
-        ids = self.ids(name)
+        values = self.column(name)
         try:
+            if isinstance(values, np.ndarray) and values.dtype.kind in "iu":
+                different, codes = np.unique(values, return_inverse=True)
+                values = RepeatedIds([*map(str, different.tolist())], codes)
+            if isinstance(values, RepeatedIds):
+                found = [of.get(label, -1) for label in map(_id, values.labels)]
+                indices = np.array(found, np.int64)[values.codes]
+                if indices.size and indices.min() < 0:
+                    raise KeyError
+                return indices
+            ids = self.ids(name)
             return np.fromiter(map(of.__getitem__, ids), np.int64, len(ids))
         except KeyError:
+            ids = self.ids(name)
             row = next(row for row, id in enumerate(ids) if id not in of)
             raise InputError(
                 f"{self.source(row)}: {name} {ids[row]!r} is unknown: no such {thing} in {where}"

@@ -88,31 +88,36 @@ def make_cloud(
     **Raises:** `InputError` naming the point: a coordinate that is not finite, a negative or
     infinite σ, a number of rays that is none."""
     n = len(X)
-    bad = ~(np.abs(X) < max_coordinate).all(axis=1)
-    if bad.any():
+    # the extremes of millions of points first: NaN compares as false
+    if n and not (X.max() < max_coordinate and X.min() > -max_coordinate):
+        bad = ~(np.abs(X) < max_coordinate).all(axis=1)
         where = source(int(bad.argmax()))
         raise InputError(
             f"{where}: coordinates {', '.join(f'{x:g}' for x in X[bad.argmax()])}: {bad.sum()} of "
             f"{n} points have coordinates that are not finite, or too large"
         )
-    read = lambda name, missing: np.asarray(columns.get(name, np.full(n, missing)), float)
+    columns = {name: np.asarray(values, float) for name, values in columns.items()}
     for name, limit, what in (
         *((name, max_coordinate, "a positive number, or nothing,") for name in SIGMAS),
         ("rays", np.iinfo(np.int32).max, "a number of images"),
     ):
-        values = read(name, np.nan)
+        if name not in columns:
+            continue
+        values = columns[name]
         if values.shape != (n,):
             raise InputError(f"{source.name}: {name} has {values.shape[1:]} values a point; one is")
         if (bad := (values < 0) | (values > limit)).any():
             row = int(bad.argmax())
             raise InputError(f"{source(row)}: {name} is {values[row]:g}; {what} is expected")
-    covariance = np.zeros((n, 3, 3))
-    for k, name in enumerate(SIGMAS):
-        covariance[:, k, k] = read(name, np.nan) ** 2
-    rays = np.nan_to_num(read("rays", 0)).astype(int)
-    return Cloud(
-        X, covariance, rays, np.zeros(n, int), np.full((n, 2), np.nan), ("",), colour, system
-    )
+    # what the file does not have is one value for all points, without memory of its own
+    same = lambda value, shape, kind=float: np.broadcast_to(np.array(value, kind), shape)
+    covariance = same(np.diag(np.full(3, np.nan)), (n, 3, 3))
+    if columns.keys() & {*SIGMAS}:
+        covariance = np.zeros((n, 3, 3))
+        for k, name in enumerate(SIGMAS):
+            covariance[:, k, k] = columns.get(name, np.full(n, np.nan)) ** 2
+    rays = np.nan_to_num(columns["rays"]).astype(int) if "rays" in columns else same(0, n, int)
+    return Cloud(X, covariance, rays, same(0, n, int), same(np.nan, (n, 2)), ("",), colour, system)
 
 
 def report_of(

@@ -210,14 +210,20 @@ def _read_las(path: Path) -> Cloud:
     with foreign_parser(path, EXPECTED):
         las = laspy.read(path)
         names = {*las.point_format.dimension_names}
-        X = np.stack([np.asarray(a, float) for a in (las.x, las.y, las.z)], 1)
+        # as laspy's las.x, without the arrays between
+        X = np.empty((len(las.points), 3))
+        for k, raw in enumerate((las.X, las.Y, las.Z)):
+            np.multiply(raw, las.header.scales[k], out=X[:, k])
+            X[:, k] += las.header.offsets[k]
         rgb = [np.asarray(las[name]) for name in COLOURS if name in names]
         columns = {name: np.asarray(las[name]) for name in (*SIGMAS, "rays") if name in names}
         crs = las.header.parse_crs() if len(X) else None
         system = None if crs is None else (crs.to_string() if crs.to_epsg() else crs.to_wkt())
     colour = None
     if len(rgb) == len(COLOURS):
-        colour = (np.stack(rgb, 1) // 257).astype(np.uint8)
+        colour = np.empty((len(X), 3), np.uint8)
+        for k, values in enumerate(rgb):
+            colour[:, k] = values // 257
     return make_cloud(Source(str(path), None, "point"), X, columns, colour, system)
 
 

@@ -267,6 +267,12 @@ def _openmvg() -> str:
     return json.dumps({**document, "@": 0})
 
 
+def _isd() -> str:
+    from test_csm_frame import support_data
+
+    return json.dumps({"@": 0, **support_data()})
+
+
 def _mrcal() -> str:
     from test_mrcal import model
 
@@ -295,6 +301,7 @@ SAMPLES: dict[str, tuple[str, str, object]] = {
     "kalibr-camera": ("camchain.yaml", YAML, KALIBR.replace("@cam0", "cam0").replace("@@", "@")),
     "transforms": ("transforms.json", JSON, TRANSFORMS),
     "alicevision": ("scene.sfm", JSON, ALICEVISION),
+    "csm-frame": ("isd.json", JSON, _isd),
     "metashape": ("cameras.xml", XML, _metashape),
     "metashape-lens": ("calibration.xml", XML, LENS),
     "autocal": ("AutoCal_x.xml", XML, AUTOCAL),

@@ -184,7 +184,17 @@ def _(folder):
         kept.keep("content", Board(4, 3, 1.0), ((640, 480), np.arange(24.0).reshape(12, 2)))
 
 
-@reader("json lines", lambda f: JsonLines(f / "results.jsonl").append([{"key": "one more"}]))
+def _continued(folder: Path):
+    """A file that is continued is complete afterwards."""
+    file = folder / "results.jsonl"
+    lines = JsonLines(file)
+    lines.append([{"key": "one more", "status": "weak"}])
+    whole = file.read_bytes().removesuffix(b"\n").split(b"\n")
+    assert {json.loads(line)["key"] for line in whole} == {*lines.heads}
+    assert JsonLines(file).heads.keys() == lines.heads.keys()
+
+
+@reader("json lines", _continued)
 def _(folder):
     JsonLines(folder / "results.jsonl").append(
         {"key": f"a.npz#{i}", "status": "converged", "settings": {"free": ["fx"]}, "data": "f" * 16}

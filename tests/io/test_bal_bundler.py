@@ -32,7 +32,7 @@ def shared(net):
 @pytest.mark.parametrize("name", ["p.txt", "p.txt.gz", "p.txt.bz2"])
 def test_bal_round_trip(tmp_path, name):
     lost = write_bal(case(), tmp_path / name)
-    assert lost == ("that images share a camera",)
+    assert lost == ("that images share a camera (2)",)
     assert_same(shared(case()), read_bal(tmp_path / name))
 
 
@@ -53,7 +53,7 @@ def test_bal_has_the_published_formula(tmp_path):
 @pytest.mark.parametrize("names", [NUMBERED, ("a.jpg", "b.jpg", "c.jpg")])
 def test_bundler_round_trip(tmp_path, names):
     path = tmp_path / "bundle.out"
-    assert write_bundler(case(names), path) == ("that images share a camera",)
+    assert write_bundler(case(names), path) == ("that images share a camera (2)",)
     assert is_bundler(path) and (tmp_path / "list.txt").exists() == (names != NUMBERED)
     after = read_bundler(path)
     assert_same(shared(case(names)), after)

@@ -47,7 +47,7 @@ def test_pyramids_look_where_the_camera_looks():
 
 def test_ply(tmp_path):
     path = tmp_path / "net.ply"
-    assert "1 points without coordinates" in write_ply(case(), path)
+    assert "points (1)" in write_ply(case(), path)
     data = path.read_bytes()
     head, body = data.split(b"end_header\n", 1)
     lines = head.decode().splitlines()

@@ -243,10 +243,10 @@ def test_camodocal(tmp_path):
     v = 1410 * (y * radial - 2 * 0.002 * x * y + 0.001 * (r2 + 2 * y * y)) + 358
     assert camera.id == "cam"
     assert_allclose(image(camera, X, Y, Z), [u, v], atol=1e-9)
-    path.write_text(path.read_text().replace("MEI", "SCARAMUZZA"))
-    with pytest.raises(InputError, match="model_type is SCARAMUZZA, a camera of camodocal"):
+    path.write_text(path.read_text().replace("MEI", "POLYFISHEYE"))
+    with pytest.raises(InputError, match="model_type is POLYFISHEYE, a camera of camodocal"):
         read_cameras(path)
-    path.write_text(path.read_text().replace("SCARAMUZZA", "MEI").replace("   xi: 1.9", ""))
+    path.write_text(path.read_text().replace("POLYFISHEYE", "MEI").replace("   xi: 1.9", ""))
     with pytest.raises(InputError, match="mirror_parameters.xi is missing"):
         read_cameras(path)
 
@@ -423,3 +423,87 @@ def test_an_angle_and_a_size(command, tmp_path):
     told = command("convert", file, tmp_path / "out.csv", "--image-size", "800,800")
     assert told.status == 0 and (tmp_path / "out.csv").is_file()
     assert command("camera", file, "--image-size", "800,800").status == 0
+
+
+def test_xml_under_the_name_of_yaml(tmp_path):
+    """OpenCV recognises its files by their content, whatever their names."""
+    path = write_sample(tmp_path, "opencv-xml")
+    path = path.rename(tmp_path / "camera.yaml")
+    (camera,) = read_cameras(path)
+    assert camera.model == "opencv" and camera.parameters["fx"] == 657.3
+
+
+def test_alicevision_writes_empty_lists_as_texts(tmp_path):
+    """The property tree of Boost, by which AliceVision writes, has no empty list."""
+    path = write_sample(tmp_path, "alicevision")
+    document = json.loads(path.read_text())
+    for key in ("poses", "structure"):
+        (tmp_path / f"{key}.sfm").write_text(json.dumps(document | {key: ""}))
+    for point in document["structure"]:
+        point["observations"] = ""
+    document["views"][0]["path"] = ""
+    path.write_text(json.dumps(document))
+    net = read_network(path)
+    assert len(net.observations) == 0 and net.images.id[0] == document["views"][0]["viewId"]
+    assert np.isnan(read_network(tmp_path / "poses.sfm").images.position).all()
+    assert len(read_network(tmp_path / "structure.sfm").points) == 0
+
+
+def test_settings_of_vins_that_do_not_concern_its_cameras(tmp_path):
+    path = write_sample(tmp_path, "vins")
+    path.write_text(path.read_text() + "publish_rectify: 0\nis_fisheye: 1\n")
+    assert not read_network(path).warnings
+
+
+def test_orb_slam_names_its_setup_as_type(tmp_path):
+    path = write_sample(tmp_path, "orb-slam-pair")
+    text = path.read_text()
+    line = next(line for line in text.splitlines() if line.startswith("Camera.type"))
+    path.write_text(text.replace(line, 'Camera.type: "Stereo"\nCamera.model: "Pinhole"'))
+    assert [camera.model for camera in read_network(path).cameras] == ["opencv", "opencv"]
+
+
+PAL = """%YAML:1.0
+---
+model_type: scaramuzza
+camera_name: pal
+image_width: 1280
+image_height: 720
+poly_parameters:
+   p0: -246.0
+   p1: 0.0
+   p2: 2.0e-03
+   p3: -3.0e-06
+   p4: 6.0e-09
+inv_poly_parameters:
+   p0: 378.0
+   p1: 248.0
+affine_parameters:
+   ac: 0.999
+   ad: 0.001
+   ae: -0.002
+   cx: 641.5
+   cy: 355.25
+"""
+
+
+def test_scaramuzza_of_camodocal(tmp_path):
+    """The ray of a pixel: x = A⁻¹·(p − c), (x, y, −Σ pᵢ·ρⁱ), forward +z."""
+    path = tmp_path / "pal.yaml"
+    path.write_text(PAL)
+    (camera,) = read_cameras(path)
+    assert (camera.id, camera.model, camera.image_size) == ("pal", "scaramuzza", (1280, 720))
+    A = np.array([[0.999, 0.001], [-0.002, 1.0]])
+    uv = np.array([[641.5, 355.25], [700.0, 300.0], [400.0, 500.0], [900.0, 100.0]])
+    x = (uv - [641.5, 355.25]) @ np.linalg.inv(A).T
+    rho = np.hypot(*x.T)
+    z = -(-246.0 + 2e-3 * rho**2 - 3e-6 * rho**3 + 6e-9 * rho**4)
+    model = get_model("scaramuzza")
+    found = images_of(model, all_parameters(camera), np.stack([x[:, 0], -x[:, 1], -z], 1))
+    np.testing.assert_allclose(found, uv, atol=1e-8)
+    path.write_text(PAL.replace("p1: 0.0", "p1: 0.5", 1))
+    with pytest.raises(InputError, match="pal.yaml: poly_parameters.p1 is 0.5"):
+        read_cameras(path)
+    path.write_text(PAL.replace("scaramuzza", "POLYFISHEYE"))
+    with pytest.raises(InputError, match="model_type is POLYFISHEYE, a camera of camodocal"):
+        read_cameras(path)

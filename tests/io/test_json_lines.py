@@ -6,7 +6,6 @@ import stat
 from pathlib import Path
 
 import pytest
-from garbling import often, read_or_refused, what_is_done
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.results.json_lines import JsonLines
@@ -105,29 +104,3 @@ def test_a_tail_of_zeros_is_cut(tmp_path):
     path = tmp_path / "results.jsonl"
     path.write_bytes(b'{"key": "a"}\n' + bytes(50))
     assert [*JsonLines(path).heads] == ["a"] and path.read_bytes() == b'{"key": "a"}\n'
-
-
-@pytest.fixture(scope="module")
-def valid(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("valid")
-    JsonLines(folder / "results.jsonl").append(
-        {"key": f"a.npz#{i}", "status": "converged", "settings": {"free": ["fx"]}, "data": "f" * 16}
-        for i in range(5)
-    )
-    return folder
-
-
-@often(200)
-@what_is_done
-def test_a_garbled_file_is_taken_up_or_refused(valid, **done):
-    """A file that is continued is complete afterwards, every key once."""
-
-    def read(folder):
-        file = folder / "results.jsonl"
-        lines = JsonLines(file)
-        lines.append([{"key": "one more", "status": "weak"}])
-        whole = file.read_bytes().removesuffix(b"\n").split(b"\n")
-        assert [json.loads(line)["key"] for line in whole] == [*lines.heads]
-        assert JsonLines(file).heads == lines.heads
-
-    read_or_refused(read, valid, **done)

@@ -144,7 +144,7 @@ def test_a_camera_file_becomes_a_chain(tmp_path):
     net = read(tmp_path, chain(("pinhole", "equi")))
     write_opencv(net.cameras[0], tmp_path / "left.yaml")
     made = convert(tmp_path / "left.yaml", tmp_path / "my-camchain.yaml")
-    assert made.kind == "kalibr" and made.lost == ("names of cameras",)
+    assert made.kind == "kalibr" and made.lost == ("names of cameras (1)", "names of images (1)")
     (back,) = read_network(tmp_path / "my-camchain.yaml").cameras
     assert all_parameters(back) == all_parameters(net.cameras[0])
     convert(tmp_path / "my-camchain.yaml", tmp_path / "camera_info.yaml")

@@ -131,7 +131,7 @@ def test_there_and_back(tmp_path):
         net.cameras[0], parameters=dict(net.cameras[0].parameters, fy=1000.0)
     )
     net = net.replace(cameras=(square,))
-    assert write_micmac(net, tmp_path / "Ori-Out") == ("image points", "points")
+    assert write_micmac(net, tmp_path / "Ori-Out") == ("pixel sizes of cameras (1)", "points (12)")
     back = read_network(tmp_path / "Ori-Out")
     assert_allclose(back.images.position, POSITION, atol=1e-12)
     assert_allclose([matrix(a) for a in back.images.angles], [*map(matrix, ANGLES)], atol=1e-12)

@@ -115,7 +115,7 @@ def test_a_folder_there_and_back(tmp_path):
     net = network("opencv", ("a", "b", "c"))
     folder = tmp_path / "mrcal"
     lost = write_mrcal(net, folder)
-    assert lost == ("that images share a camera", "image points", "points")
+    assert {"that images share a camera (2)", "points (12)"} <= {*lost}
     back = read_network(folder)
     assert back.images.id == ("a", "b", "c") and len(back.cameras) == 3
     assert_allclose(back.images.position, POSITION, atol=1e-12)

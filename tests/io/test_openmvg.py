@@ -111,7 +111,7 @@ def test_there_and_back(tmp_path):
         write_openmvg(net, tmp_path / "sfm_data.json")
     square = dataclasses.replace(camera, id="0", parameters=dict(camera.parameters, fy=1000.0))
     net = net.replace(cameras=(square,))
-    assert write_openmvg(net, tmp_path / "sfm_data.json") == ()
+    assert write_openmvg(net, tmp_path / "sfm_data.json") == ("pixel sizes of cameras (1)",)
     back = read_openmvg(tmp_path / "sfm_data.json")
     assert_same(net, back)
     made = convert(tmp_path / "sfm_data.json", tmp_path / "again_sfm_data.json")

@@ -9,8 +9,8 @@ import pytest
 from jaxbundle.errors import InputError
 from jaxbundle.network import Camera
 from jaxbundle.network.build import make_cameras, make_further, make_network
-from jaxbundle.network.columns import did_you_mean
-from jaxbundle.network.tables import EXTERIOR
+from jaxbundle.network.columns import Columns, RepeatedIds, did_you_mean
+from jaxbundle.network.tables import EXTERIOR, Source
 from jaxbundle.network.units import to_image_unit
 
 CAMERAS = [{"id": "a", "c": 50.0, "free": "c, x0", "sigma": {"c": 0.1}}]
@@ -245,3 +245,19 @@ def test_unknown_images_of_priors_are_named_with_their_row():
     (priors,) = make_further({"exterior_priors": rows}, 1.0)
     with pytest.raises(InputError, match="exterior_priors, row 2: .*'elsewhere'"):
         priors.check(given)
+
+
+def test_ids_that_repeat_are_looked_up_once():
+    """Columns of millions of rows: few labels and their codes, or whole numbers."""
+    codes = np.array([2, 0, 0, 1])
+    repeated = RepeatedIds(["a ", "b", "c"], codes)
+    assert list(repeated) == ["c", "a ", "a ", "b"] and len(repeated) == 4 and repeated[3] == "b"
+    table = Columns({"image": repeated, "point": np.array([7, 9, 7, 8])}, Source("t"))
+    of = {"a": 0, "b": 1, "c": 2}
+    assert table.indices("image", "image", of, "images").tolist() == [2, 0, 0, 1]
+    points = {"7": 0, "8": 1, "9": 2}
+    assert table.indices("point", "point", points, "points").tolist() == [0, 2, 0, 1]
+    with pytest.raises(InputError, match="t, row 4: image 'b' is unknown"):
+        table.indices("image", "image", {"a": 0, "c": 2}, "images")
+    with pytest.raises(InputError, match="t, row 2: point '9' is unknown"):
+        table.indices("point", "point", {"7": 0, "8": 1}, "points")

@@ -6,7 +6,6 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from garbling import often, read_or_refused, what_is_done
 from rpc_scenes import made_up
 from scanner_files import write_scanner
 from test_csm import support_data
@@ -80,10 +79,3 @@ def valid(tmp_path_factory):
 @pytest.mark.parametrize("kind", READ)
 def test_a_valid_input_is_read(kind, valid):
     assert READ[kind](valid(kind)) is not None
-
-
-@pytest.mark.parametrize("kind", READ)
-@often(100)
-@what_is_done
-def test_a_garbled_input_is_read_or_refused(kind, valid, **done):
-    read_or_refused(READ[kind], valid(kind), **done)

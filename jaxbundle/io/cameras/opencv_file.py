@@ -31,6 +31,7 @@ are not part of our models: if they are not 0 the nearest is fitted, which needs
 Source: OpenCV 4 documentation, XML/YAML/JSON file storages; ROS wiki, camera_calibration_parsers.
 """
 
+import codecs
 import re
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -101,7 +102,7 @@ def is_opencv(path: Path) -> bool:
 def find_cameras(path: Path) -> list[tuple[str, Mapping[str, Any]]]:
     """The names and entries of the cameras in a YAML, JSON or XML file, without any complaint."""
     head = beginning(path, 1_000_000) if path.suffix.lower() in READ_SUFFIXES else b""
-    if path.suffix.lower() == ".xml" and FILE_STORAGE not in head:
+    if _is_xml(head) and FILE_STORAGE not in head:
         return []
     # every spelling of a camera has one of these
     if not re.search(rb"(?i)[km]\b|intrinsic|matri|mat\b|mtx|fx\b|focal_?length", head):
@@ -118,10 +119,14 @@ def find_cameras(path: Path) -> list[tuple[str, Mapping[str, Any]]]:
         return [("", {})] if re.search(rb"(?i)\bcamera_?matrix\b", head) else []
 
 
+def _is_xml(head: bytes) -> bool:
+    return head.removeprefix(codecs.BOM_UTF8).lstrip().startswith(b"<")
+
+
 def read_document(path: Path) -> Any:
-    """The document of a YAML, JSON or XML file of OpenCV."""
+    """The document of a YAML, JSON or XML file; OpenCV recognises them by their content."""
     text = read_text(path)
-    if path.suffix.lower() == ".xml":
+    if path.suffix.lower() == ".xml" or _is_xml(text[:1000].encode()):
         return storage_entries(path)
     if path.suffix.lower() == ".json" or text.lstrip().startswith("{"):
         return parse_json(path, text)

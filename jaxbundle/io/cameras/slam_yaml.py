@@ -7,6 +7,7 @@
     KANNALA_BRANDT    projection_parameters k2 … k5, mu mv u0 v0: `kannala-brandt` with k1 … k4
     MEI               mirror_parameters xi, distortion_parameters k1 k2 p1 p2,
                       projection_parameters gamma1 gamma2 u0 v0: `mei`
+    SCARAMUZZA        poly_parameters p0 … p4, affine_parameters ac ad ae cx cy: `scaramuzza`
 
 VINS's settings stand in the same file, or, of VINS-Fusion, in one that names the cameras' files
 (`networks.vins`).
@@ -87,6 +88,9 @@ CAMODOCAL = {
         _same(DISTORTION, "k1 k2 p1 p2"),
     ),
 }
+SCARAMUZZA = "SCARAMUZZA"
+POLYNOMIAL, INVERSE, AFFINE = "poly_parameters", "inv_poly_parameters", "affine_parameters"
+AFFINE_KEYS = {"c": "ac", "d": "ad", "e": "ae", "cx": "cx", "cy": "cy"}
 SETTINGS_OF_VINS = Keys(
     (),
     {
@@ -99,7 +103,8 @@ SETTINGS_OF_VINS = Keys(
             ("max_*", "min_*", "freq", "F_threshold", "show_*", "equalize", "fisheye",
              "keyframe_parallax", "flow_back", "use_gpu*", "multiple_thread", "visual*", "save_*",
              "skip_*", "pub_*", "fast_relocalization", "loop_closure", "load_previous*",
-             "pose_graph*", "debug*", "queue*", "visualize*", "ransac*", "freq_*", "image_queue*"),
+             "pose_graph*", "publish_*", "is_fisheye", "debug*", "queue*", "visualize*", "ransac*",
+             "freq_*", "image_queue*"),
             "settings of its tracker and solver",
         ),
         **dict.fromkeys(
@@ -120,6 +125,7 @@ ORB_SLAM = {
     **dict.fromkeys(("kannalabrandt8", "kannalabrandt", "fisheye"), ("kannala-brandt", EQUI)),
 }
 """Our model and coefficients by `Camera.type`, without separators."""
+ARRANGEMENTS = ("monocular", "stereo", "rgbd", "rgb-d")
 PREFIXES = ("Camera", "Camera1")
 ORB_KEYS = Keys(
     (
@@ -185,10 +191,12 @@ def read_slam_yaml(path: str | Path) -> Camera:
 def camodocal_camera(path: Path, fields: JsonFields) -> Camera:
     """The camera of camodocal; its id is `camera_name`, or the name of the file."""
     kind = fields.text("model_type").upper()
+    if kind == SCARAMUZZA:
+        return _scaramuzza(path, fields)
     if kind not in CAMODOCAL:
         raise InputError(
             f"{path}: model_type is {kind}, a camera of camodocal; expected one of "
-            f"{', '.join(CAMODOCAL)}"
+            f"{', '.join((*CAMODOCAL, SCARAMUZZA))}"
         )
     lens, unknown = CAMODOCAL[kind], UnknownKeys()
     unknown.check(fields.document, CAMODOCAL_KEYS, path)
@@ -198,21 +206,50 @@ def camodocal_camera(path: Path, fields: JsonFields) -> Camera:
             unknown.check(fields.child(section).document, Keys(own), f"{path}, {section}")
     parameters = {name: fields.number(key) for name, key in lens.required.items()}
     parameters |= {name: fields.number(key, 0.0) for name, key in lens.optional.items()}
+    return _named_camera(path, fields, lens.model, parameters, unknown)
+
+
+def _named_camera(
+    path: Path,
+    fields: JsonFields,
+    model: str,
+    parameters: Mapping[str, float],
+    unknown: UnknownKeys,
+) -> Camera:
     name = fields.get("camera_name")
-    camera = Camera(
-        str(name) if name not in (None, "", "camera") else path.stem,
-        lens.model,
-        parameters,
-        image_size=_size(fields, *SIZE),
-    )
+    id = str(name) if name not in (None, "", "camera") else path.stem
+    camera = Camera(id, model, parameters, image_size=_size(fields, *SIZE))
     check_camera(camera, f"{path}, ")
     return with_messages(camera, *unknown.messages())
+
+
+def _scaramuzza(path: Path, fields: JsonFields) -> Camera:
+    """`scaramuzza`, whose polynomial has the other sign, the axis forward."""
+    unknown = UnknownKeys()
+    unknown.check(fields.document, CAMODOCAL_KEYS | Keys((POLYNOMIAL, INVERSE, AFFINE)), path)
+    a = [fields.number(f"{POLYNOMIAL}.p{i}") for i in range(5)]
+    unknown.check(
+        fields.child(POLYNOMIAL).document,
+        Keys(f"p{i}" for i in range(5)),
+        f"{path}, {POLYNOMIAL}",
+    )
+    unknown.check(fields.child(AFFINE).document, Keys(AFFINE_KEYS.values()), f"{path}, {AFFINE}")
+    if a[1]:
+        raise InputError(
+            f"{path}: {POLYNOMIAL}.p1 is {a[1]:g}; 0 is expected: rays have no cusp on the axis"
+        )
+    parameters = {f"a{i}": -a[i] for i in (0, 2, 3, 4)}
+    parameters |= {name: fields.number(f"{AFFINE}.{key}") for name, key in AFFINE_KEYS.items()}
+    return _named_camera(path, fields, "scaramuzza", parameters, unknown)
 
 
 def orb_cameras(path: Path, fields: JsonFields, unknown: UnknownKeys) -> list[Camera]:
     """One camera of ORB-SLAM or two."""
     document = fields.document
-    text = next((str(document[k]) for k in ("Camera.type", "Camera.model") if document.get(k)), "")
+    given = [str(document[k]) for k in ("Camera.type", "Camera.model") if document.get(k)]
+    # some files have the arrangement of the cameras as their type, and the lens as their model
+    lenses = [text for text in given if text.lower() not in ARRANGEMENTS]
+    text = next(iter(lenses or given), "")
     kind = re.sub(r"[\W_]+", "", text).lower() or "pinhole"
     if document.get("Camera.bFishEye") and ORB_SLAM.get(kind, ("",))[0] != "kannala-brandt":
         raise InputError(f"{path}: Camera.bFishEye of ORB-SLAM without Camera.type KannalaBrandt8")

@@ -139,14 +139,14 @@ def read_alicevision(path: str | Path, overrides: Sequence[str] = ()) -> Network
     tie, rays = _structure(file, unknown, views)
     seen = {view for view, *_ in rays}
     posed = {id for id, row in views.items() if row.text("poseId", "none") in poses}
-    left = [Path(views[id].text("path", id)).name for id in views if id not in posed | seen]
+    left = [Path(_path(views[id], id)).name for id in views if id not in posed | seen]
     views = {id: row for id, row in views.items() if id in posed | seen}
     if not views:
         raise InputError(
             f"{path}: a scene of AliceVision without poses and image points; expected the result "
             "of its structure from motion"
         )
-    labels = unique_labels([_name(row.text("path", id)) for id, row in views.items()], list(views))
+    labels = unique_labels([_name(_path(row, id)) for id, row in views.items()], list(views))
     names = dict(zip(views, labels))
     R, X0 = np.full((len(views), 3, 3), np.nan), np.full((len(views), 3), np.nan)
     for k, (id, row) in enumerate(views.items()):
@@ -242,6 +242,11 @@ def _camera(row: JsonFields, id: str, version: tuple[int, ...]) -> dict[str, Any
         **core,
         **dict(zip(names, values)),
     }
+
+
+def _path(view: JsonFields, id: str) -> str:
+    """The path of a photograph, or the number of its view."""
+    return str(view.get("path") or id)
 
 
 def _structure(

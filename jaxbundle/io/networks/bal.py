@@ -29,7 +29,7 @@ from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import bundler_pose, exterior_from_bundler
 from jaxbundle.io.networks.assemble import all_parameters, foreign_document
-from jaxbundle.io.networks.losses import describe_losses, need_values
+from jaxbundle.io.networks.losses import changed, describe_losses, losing, need_values
 from jaxbundle.io.networks.poses import (
     angles_of,
     matrices_of,
@@ -117,6 +117,19 @@ def read_bal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     ).replace(angle_unit=angle_unit)
 
 
+BAL_LOSSES = losing(
+    "that images share a camera",
+    "image sizes of cameras",
+    "pixel sizes of cameras",
+    partly={
+        "names of cameras": lambda n: changed([c.id for c in n.cameras], range(len(n.cameras))),
+        "names of images": lambda n: changed(n.images.id, range(len(n.images))),
+        "names of points": lambda n: changed(n.points.id, range(len(n.points))),
+    },
+)
+"""What it loses; names are numbers from 0."""
+
+
 def write_bal(network: Network, path: str | Path) -> tuple[str, ...]:
     """Write a network as a problem, compressed if the name ends in .gz or .bz2.
 
@@ -143,7 +156,7 @@ def write_bal(network: Network, path: str | Path) -> tuple[str, ...]:
         case ".bz2":
             text = bz2.compress(text)
     write_bytes(path, text)
-    return describe_losses(network, shared_cameras=True, names=True)
+    return describe_losses(network, BAL_LOSSES)
 
 
 def _first_words(file: BinaryIO) -> list[bytes]:

@@ -26,7 +26,14 @@ from jaxtyping import Float, Int
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import bundler_pose, exterior_from_bundler
 from jaxbundle.io.networks.assemble import all_parameters, assemble, foreign_document, image_columns
-from jaxbundle.io.networks.losses import GREY, are_numbered_from_0, describe_losses, need_values
+from jaxbundle.io.networks.losses import (
+    GREY,
+    are_numbered_from_0,
+    changed,
+    describe_losses,
+    losing,
+    need_values,
+)
 from jaxbundle.io.networks.poses import check_rotations, matrices_of
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.io.text.rows import TextRows, join_numbers
@@ -161,6 +168,18 @@ def _names(path: Path, number: int) -> list[str]:
     return [str(k) for k in range(number)]
 
 
+BUNDLER_LOSSES = losing(
+    "that images share a camera",
+    "image sizes of cameras",
+    "pixel sizes of cameras",
+    partly={
+        "names of cameras": lambda n: changed([c.id for c in n.cameras], range(len(n.cameras))),
+        "names of points": lambda n: changed(n.points.id, range(len(n.points))),
+    },
+)
+"""What it loses; cameras and points are numbered from 0."""
+
+
 def write_bundler(network: Network, path: str | Path) -> tuple[str, ...]:
     """Write `bundle.out` and, if the images have names, `list.txt` beside it.
 
@@ -196,7 +215,4 @@ def write_bundler(network: Network, path: str | Path) -> tuple[str, ...]:
     with replace_files(*content) as temporary:
         for place, text in zip(temporary, content.values()):
             place.write_bytes(("\n".join(text) + "\n").encode())
-    lost = describe_losses(network, shared_cameras=True)
-    if are_numbered_from_0(points.id):
-        return lost
-    return (*lost, "names of points, which are numbered from 0")
+    return describe_losses(network, BUNDLER_LOSSES)

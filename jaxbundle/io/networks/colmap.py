@@ -5,16 +5,23 @@ from pathlib import Path
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.colmap_binary import binary_files, read_binary_cameras, read_binary_model
-from jaxbundle.io.networks.colmap_model import from_network, numbers_of, to_network
-from jaxbundle.io.networks.colmap_rigs import read_frames, rigs_of_frames
+from jaxbundle.io.networks.colmap_model import COLMAP_LOSSES, from_network, numbers_of, to_network
+from jaxbundle.io.networks.colmap_rigs import (
+    read_frames,
+    rig_files,
+    rigs_and_frames,
+    rigs_of_frames,
+)
 from jaxbundle.io.networks.colmap_text import (
     camera_lines,
     read_text_cameras,
     read_text_model,
     text_files,
 )
+from jaxbundle.io.networks.losses import describe_losses
 from jaxbundle.io.text.csv_tables import write_bytes
 from jaxbundle.io.writing.folders import replace_folder
+from jaxbundle.network.kinds import Rigs
 from jaxbundle.network.tables import Camera, Network
 
 PARTS = ("cameras", "images", "points3D")
@@ -99,11 +106,16 @@ def write_colmap(
 def fill_colmap(network: Network, folder: Path, text: bool | None = None) -> tuple[str, ...]:
     """Write a sparse model into an existing folder or a new one; as `write_colmap`. `text`
     by default if possible, that is without blanks in image names."""
-    model, lost = from_network(network)
+    model, contradicted = from_network(network), []
     if text is None:
         text = not any(character.isspace() for image in model.images for character in image.name)
-    files = text_files(model) if text else binary_files(model)
+    rigs, frames = [], []
+    if any(isinstance(kind, Rigs) for kind in network.further):
+        rigs, frames, contradicted = rigs_and_frames(
+            network, [*model.cameras], [image.id for image in model.images]
+        )
+    files = (text_files(model) if text else binary_files(model)) | rig_files(rigs, frames, text)
     folder.mkdir(exist_ok=True)
     for name, content in files.items():
         write_bytes(folder / name, content)
-    return lost
+    return (*describe_losses(network, COLMAP_LOSSES), *contradicted)

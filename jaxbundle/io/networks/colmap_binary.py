@@ -36,6 +36,10 @@ from jaxbundle.network.tables import Camera, Source
 from jaxbundle.system.file_content import read_content
 
 POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<u8")])
+POINT = np.dtype(
+    [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("rays", "<u8")]
+)
+"""A point without its track."""
 NO_POINT_ID = np.uint64(2**64 - 1)
 
 
@@ -154,24 +158,44 @@ def _points(
     path: Path, images: set[int]
 ) -> tuple[Int[np.ndarray, " points"], Float[np.ndarray, "points 3"], Source]:
     """Numbers and coordinates of the points; as of the text form."""
-    file, ids, positions = BinaryFile(path), [], []
-    known = np.array(sorted(images), "<u4")
-    for k in range(file.count("points", 51)):  # without a track
-        file.what = f"point {k + 1}"
-        (id,) = file.take("Q")
-        if id >= 2**63:
-            raise file.error(f"its number {id} is impossible")
-        ids.append(id)
-        positions.append(file.numbers(3, "coordinates"))
-        file.take("3Bd")
-        track = np.frombuffer(file.raw(8 * file.count("rays", 8)), "<u4")[::2]
-        unknown = track[~np.isin(track, known)]
-        if len(unknown):
-            raise file.error(f"the image {unknown[0]} of the track is not in images")
+    file = BinaryFile(path)
+    number = file.count("points", POINT.itemsize)
+    count_of, places = struct.Struct("<Q").unpack_from, []
+    # the length of a track tells where the next point is
+    for k in range(number):
+        places.append(file.position)
+        end = file.position + POINT.itemsize
+        if end > len(file.data) or end + 8 * count_of(file.data, end - 8)[0] > len(file.data):
+            file.what = f"point {k + 1}"
+            file.raw(POINT.itemsize - 8)
+            file.count("rays", 8)
+        file.position = end + 8 * count_of(file.data, end - 8)[0]
     file.end()
+    starts = np.array(places, np.int64)
+    data = np.frombuffer(file.data, np.uint8)
+    points = data[starts[:, None] + np.arange(POINT.itemsize)].reshape(-1).view(POINT)
+    rays = points["rays"].astype(np.int64)
+    # of each ray the image, behind its point
+    of_ray = np.repeat(np.arange(number), rays)
+    nth = np.arange(len(of_ray)) - np.repeat(np.cumsum(rays) - rays, rays)
+    at = starts[of_ray] + POINT.itemsize + 8 * nth
+    track = data[at[:, None] + np.arange(4)].reshape(-1).view("<u4")
+
+    if (impossible := points["id"] >= 2**63).any():
+        file.what = f"point {impossible.argmax() + 1}"
+        raise file.error(f"its number {points['id'][impossible][0]} is impossible")
+    if (infinite := ~np.isfinite(points["xyz"])).any():
+        file.what = f"point {infinite.any(1).argmax() + 1}"
+        raise file.error(f"coordinates: {points['xyz'][infinite][0]} is not a finite number")
+    unknown = ~np.isin(track, np.array(sorted(images), "<u4"))
+    if unknown.any():
+        ray = int(unknown.argmax())
+        file.what = f"point {of_ray[ray] + 1}"
+        raise file.error(f"the image {track[ray]} of the track is not in images")
     source = Source(str(path), None, "point")
+    ids = points["id"].astype(np.int64)
     check_unique(ids, source, "point")
-    return np.array(ids, np.int64), np.array(positions, float).reshape(-1, 3), source
+    return ids, points["xyz"].astype(float), source
 
 
 def binary_files(model: ColmapModel) -> dict[str, bytes]:

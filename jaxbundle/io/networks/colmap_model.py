@@ -3,7 +3,7 @@
 A pose is x_camera = R·X + t with x right, y down, z forward (`geometry.pose_conventions`); image
 points count from the corner of the first pixel, ½ more than here. Image points without an
 object point are left out. Rigs and frames (COLMAP 3.12 and later) are in `colmap_rigs`; every image
-has its full pose in `images`, and without them COLMAP creates trivial ones.
+has its full pose in `images`.
 """
 
 import dataclasses
@@ -23,9 +23,9 @@ from jaxbundle.io.networks.assemble import (
     image_columns,
 )
 from jaxbundle.io.networks.colmap_models import to_colmap
-from jaxbundle.io.networks.losses import describe_losses, need_values
+from jaxbundle.io.networks.losses import changed, losing, need_values
 from jaxbundle.io.networks.poses import matrices_of, matrices_of_quaternions, quaternions_of
-from jaxbundle.network.columns import Columns, count, list_some
+from jaxbundle.network.columns import Columns, RepeatedIds, count, list_some
 from jaxbundle.network.reprojection import point_errors
 from jaxbundle.network.tables import Camera, Network, Source
 
@@ -67,7 +67,9 @@ def rows_of_points(model: ColmapModel) -> Iterator[tuple[int, np.ndarray, float]
     return zip(model.point_ids.tolist(), model.points, model.errors.tolist())
 
 
-def check_unique(ids: Sequence[int], place: Callable[[int], object], thing: str) -> None:
+def check_unique(
+    ids: Sequence[int] | Int[np.ndarray, " rows"], place: Callable[[int], object], thing: str
+) -> None:
     """Refuse repeated numbers; `place(k)` names the position of the k-th."""
     values, first, counts = np.unique(np.asarray(ids), return_index=True, return_counts=True)
     for value in values[counts > 1][:1]:
@@ -126,35 +128,45 @@ def _observations(path: Path, model: ColmapModel) -> tuple[Columns, tuple[str, .
     """The table of image points; the first if an image has several of one object point."""
     index, point, xy = [], [], []
     repeated = []
-    known = np.sort(model.point_ids)
-    for image in model.images:
+    for number, image in enumerate(model.images):
         used = np.flatnonzero(image.point != NO_POINT)
-        unknown = used[~np.isin(image.point[used], known)]
-        if len(unknown):
-            raise InputError(
-                f"{image.place}: image {image.name!r}, image point {unknown[0]}: the object point "
-                f"{image.point[unknown[0]]} is not in points3D"
-            )
         # A track may return to an image; a network has one image point of a point in an image.
         _, first = np.unique(image.point[used], return_index=True)
         if len(first) < len(used):
             repeated += [image.name] * (len(used) - len(first))
             used = used[np.sort(first)]
-        index += [image.name] * len(used)
+        index.append(np.full(len(used), number))
         point.append(image.point[used])
         xy.append(image.xy[used])
+    _check_points(model)
     xy = np.concatenate(xy) - PIXEL_CENTRE
     warnings = (
         f"left out {count(len(repeated), 'image point')} of object points that have another in "
         f"the same image: {list_some(dict.fromkeys(repeated))}",
     )
-    columns = {"image": index, "point": np.concatenate(point), "x": xy[:, 0], "y": xy[:, 1]}
+    names = RepeatedIds([image.name for image in model.images], np.concatenate(index))
+    columns = {"image": names, "point": np.concatenate(point), "x": xy[:, 0], "y": xy[:, 1]}
     source = Source(str(path), np.arange(1, len(xy) + 1), "image point")
     return Columns(columns, source), warnings if repeated else ()
 
 
-def from_network(network: Network) -> tuple[ColmapModel, tuple[str, ...]]:
-    """The sparse model of a network, and messages about what it does not keep.
+def _check_points(model: ColmapModel) -> None:
+    """Refuse image points of object points that are not there."""
+    named = np.concatenate([image.point for image in model.images])
+    if np.isin(named, np.append(model.point_ids, NO_POINT)).all():
+        return
+    for image in model.images:
+        unknown = ~np.isin(image.point, np.append(model.point_ids, NO_POINT))
+        if unknown.any():
+            k = int(unknown.argmax())
+            raise InputError(
+                f"{image.place}: image {image.name!r}, image point {k}: the object point "
+                f"{image.point[k]} is not in points3D"
+            )
+
+
+def from_network(network: Network) -> ColmapModel:
+    """The sparse model of a network.
 
     **Raises:** `InputError` for a camera without a model in COLMAP, and for missing coordinates.
     """
@@ -184,9 +196,6 @@ def from_network(network: Network) -> tuple[ColmapModel, tuple[str, ...]]:
                 f"image {images.id[i]!r}",
             )
         )
-    lost = describe_losses(network)
-    if list(point_numbers.astype(str)) != list(points.id):
-        lost = (*lost, "names of points, which are numbered from 1")
     return ColmapModel(
         cameras,
         made,
@@ -194,7 +203,7 @@ def from_network(network: Network) -> tuple[ColmapModel, tuple[str, ...]]:
         points.position,
         points.source,
         np.nan_to_num(point_errors(network)[0], nan=-1.0),  # COLMAP's error not yet computed
-    ), lost
+    )
 
 
 def numbers_of(ids: Sequence[str]) -> list[int]:
@@ -211,3 +220,18 @@ def tracks(model: ColmapModel) -> dict[int, list[tuple[int, int]]]:
         for k, point in enumerate(image.point.tolist()):
             rays[point].append((image.id, k))
     return rays
+
+
+def _renumbered(ids: Sequence[str]) -> int:
+    return changed(ids, numbers_of(ids))
+
+
+COLMAP_LOSSES = losing(
+    "pixel sizes of cameras",
+    keeping=("rigs",),
+    partly={
+        "names of cameras": lambda n: _renumbered([camera.id for camera in n.cameras]),
+        "names of points": lambda n: _renumbered(n.points.id),
+    },
+)
+"""What it loses; names of cameras and points are numbers from 1."""

@@ -10,24 +10,39 @@
     frames.bin    count u64;  id u32, rig u32, 7 f64, count u32,  type i32, sensor u32, data u64
 
 A frame of several images is an epoch of a rig (table `rigs`): its cameras have one mounting. The
-poses of images are in `images` and are those of frame and sensor together. A sensor is a camera
-(CAMERA, 0), or an IMU, which has no images.
+poses of images are in `images` and are those of frame and sensor together; COLMAP itself takes the
+latter. A sensor is a camera (CAMERA, 0), or an IMU, which has no images. For COLMAP every camera is
+in one rig and every image in one frame; they are written if the network has rigs, because without
+the files COLMAP makes a rig of every camera and a frame of every image.
+
+    x_sensor = R·x_rig + t        x_rig = R·X + t        x_rig: the frame of the reference sensor
 
 Source: COLMAP documentation, "Output Format"; src/colmap/scene/reconstruction_io_binary.cc.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+import struct
+from collections.abc import Container, Iterator, Mapping, Sequence
+from itertools import count as count_from
 from pathlib import Path
 from typing import NamedTuple
 
-from jaxbundle.errors import InputError
-from jaxbundle.io.networks.colmap_binary import BinaryFile
-from jaxbundle.io.text.rows import TextRow, TextRows
-from jaxbundle.network.columns import Columns
-from jaxbundle.network.kinds import Rigs
-from jaxbundle.network.tables import Source
+import numpy as np
+from jaxtyping import Float
 
-CAMERA_TYPES = ("CAMERA", 0)
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.pose_conventions import cv_pose
+from jaxbundle.io.networks.colmap_binary import BinaryFile
+from jaxbundle.io.networks.colmap_model import numbers_of
+from jaxbundle.io.networks.poses import matrices_of, quaternions_of
+from jaxbundle.io.text.rows import TextRow, TextRows, join_numbers
+from jaxbundle.network.columns import Columns, count
+from jaxbundle.network.kinds import Rigs
+from jaxbundle.network.kinds.rigs import MountedCameras
+from jaxbundle.network.tables import Network, Source
+
+CAMERA, CAMERA_NUMBER = CAMERA_TYPES = ("CAMERA", 0)
+Pose = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]
+"""R and t."""
 POSE = ("QW", "QX", "QY", "QZ", "TX", "TY", "TZ")
 
 
@@ -170,3 +185,188 @@ def _binary_frames(path: Path) -> list[Frame]:
         images = tuple(image for kind, _, image in data if kind in CAMERA_TYPES)
         frames.append(Frame(id, rig, images, f"{path}, frame {k + 1}"))
     return frames
+
+
+class SensorPose(NamedTuple):
+    """A pose as COLMAP has it: quaternion (w, x, y, z) and shift."""
+
+    q: Float[np.ndarray, "4"]
+    t: Float[np.ndarray, "3"]
+
+
+class WrittenRig(NamedTuple):
+    """A rig of a file: the numbers of its reference camera and of the others, with their poses."""
+
+    id: int
+    reference: int
+    others: dict[int, SensorPose]
+
+
+class WrittenFrame(NamedTuple):
+    """A frame of a file: its pose, and the number of the image of each camera."""
+
+    id: int
+    rig: int
+    pose: SensorPose
+    images: dict[int, int]
+
+
+def rigs_and_frames(
+    network: Network, cameras: Sequence[int], images: Sequence[int]
+) -> tuple[list[WrittenRig], list[WrittenFrame], list[str]]:
+    """The rigs and frames of a network with images mounted together, and what they do not keep.
+
+    **Arguments:** `cameras`, `images`: the numbers that the rows of the tables have in the files.
+
+    A camera stays in the first of its rigs. Where the orientations of images contradict the
+    mounting of their camera (before an adjustment, or with a σ of the mounting), COLMAP has those
+    of one epoch.
+    """
+    R, t = cv_pose(matrices_of(network.images.angles), network.images.position)
+    # names are kept if they are numbers
+    named = {
+        name: rig
+        for kind in network.further
+        if isinstance(kind, Rigs)
+        for name, rig in kind.mounted(network).items()
+    }
+    names = [(name, epoch) for name, rig in named.items() for epoch in rig.epochs]
+    rig_ids = dict(zip(named, numbers_of([*named])))
+    epochs = [epoch for _, epoch in names]
+    plain = len({*epochs}) == len(epochs)
+    frame_ids = dict(zip(names, numbers_of(epochs) if plain else range(1, len(names) + 1)))
+    new_rig = count_from(1 + max(rig_ids.values(), default=0))
+    new_frame = count_from(1 + max(frame_ids.values(), default=0))
+
+    rigs: list[WrittenRig] = []
+    frames: list[WrittenFrame] = []
+    made_R, made_t = R.copy(), t.copy()
+    free = {*range(len(network.cameras))}  # cameras, images without a rig, a frame
+    left = {*range(len(network.images))}
+
+    def add_frame(id: int, rig: int, sensors: Mapping[int, Pose], epoch: Mapping[int, int]) -> None:
+        camera, image = next(((c, i) for c, i in epoch.items() if c == next(iter(sensors))),
+                             next(iter(epoch.items())))  # fmt: skip
+        Rs, ts = sensors[camera]
+        R_frame, t_frame = Rs.T @ R[image], Rs.T @ (t[image] - ts)
+        for c, i in epoch.items():
+            made_R[i], made_t[i] = sensors[c][0] @ R_frame, sensors[c][0] @ t_frame + sensors[c][1]
+        left.difference_update(epoch.values())
+        numbers = {cameras[c]: images[i] for c, i in epoch.items()}
+        frames.append(WrittenFrame(id, rig, _written(R_frame, t_frame), numbers))
+
+    parted = 0
+    for name, rig in named.items():
+        sensors = _sensors(rig, free)
+        if len(sensors) < 2:
+            parted += sum(map(len, rig.epochs.values()))
+            continue
+        free -= sensors.keys()
+        _, *others = sensors
+        rigs.append(
+            WrittenRig(
+                rig_ids[name],
+                cameras[rig.reference],
+                {cameras[c]: _written(*sensors[c]) for c in others},
+            )
+        )
+        for epoch, of_camera in rig.epochs.items():
+            mine = {c: i for c, i in of_camera.items() if c in sensors}
+            parted += len(of_camera) - len(mine)
+            if mine:
+                add_frame(frame_ids[name, epoch], rig_ids[name], sensors, mine)
+        for i in sorted(left):
+            if (c := int(network.images.camera[i])) in sensors:
+                add_frame(next(new_frame), rig_ids[name], sensors, {c: i})
+    for c in sorted(free):
+        rigs.append(WrittenRig(next(new_rig), cameras[c], {}))
+        alone = {c: (np.eye(3), np.zeros(3))}
+        for i in np.flatnonzero(network.images.camera == c).tolist():
+            if i in left:
+                add_frame(next(new_frame), rigs[-1].id, alone, {c: i})
+    lost = [f"the rig of {count(parted, 'image')}"] if parted else []
+    if [*map(str, rig_ids.values())] != [*named] or [*map(str, frame_ids.values())] != epochs:
+        lost.append("names of rigs and epochs, which are numbered")
+    return rigs, frames, lost + _changed(R, t, made_R, made_t)
+
+
+def _sensors(rig: MountedCameras, free: Container[int]) -> dict[int, Pose]:
+    """The poses of cameras that are in no other rig, in COLMAP's frames, the reference first; none
+    without it."""
+    if rig.reference not in free:
+        return {}
+    flip = np.diag([1.0, -1.0, -1.0])  # from our camera frame to that of COLMAP
+    return {
+        c: (flip @ mounting.rotation @ flip, -flip @ mounting.rotation @ mounting.position)
+        for c, mounting in rig.mountings.items()
+        if mounting is not None and c in free
+    }
+
+
+def _written(R: np.ndarray, t: np.ndarray) -> SensorPose:
+    return SensorPose(quaternions_of(R[None])[0], t)
+
+
+def _changed(R: np.ndarray, t: np.ndarray, made_R: np.ndarray, made_t: np.ndarray) -> list[str]:
+    """The largest change of orientations, if it is more than rounding."""
+    D = R @ made_R.transpose(0, 2, 1)
+    axis = np.stack([D[:, 1, 2] - D[:, 2, 1], D[:, 2, 0] - D[:, 0, 2], D[:, 0, 1] - D[:, 1, 0]])
+    turn = np.arctan2(np.linalg.norm(axis, axis=0), np.trace(D, axis1=1, axis2=2) - 1).max()
+    shift = np.linalg.norm(made_t - t, axis=1).max()
+    # products of three matrices in double precision, and coordinates of 1e6
+    if turn <= 1e-9 and shift <= 1e-9 * max(abs(t).max(), 1.0):
+        return []
+    return [
+        "orientations that contradict the mountings of their rig, one a camera: up to "
+        f"{shift:.3g} and {np.degrees(turn):.3g}°"
+    ]
+
+
+def rig_files(
+    rigs: Sequence[WrittenRig], frames: Sequence[WrittenFrame], text: bool
+) -> dict[str, bytes]:
+    """The files of rigs and frames by name; none without rigs."""
+    if not rigs:
+        return {}
+    return (_text_files if text else _binary_files)(rigs, frames)
+
+
+def _text_files(rigs: Sequence[WrittenRig], frames: Sequence[WrittenFrame]) -> dict[str, bytes]:
+    rig_lines = [
+        "# RIG_ID, NUM_SENSORS, REF_SENSOR_TYPE, REF_SENSOR_ID, SENSORS[] as (SENSOR_TYPE, "
+        "SENSOR_ID, HAS_POSE, [QW, QX, QY, QZ, TX, TY, TZ])"
+    ]
+    for rig in rigs:
+        others = (f" {CAMERA} {c} 1 {join_numbers((*q, *t))}" for c, (q, t) in rig.others.items())
+        head = f"{rig.id} {1 + len(rig.others)} {CAMERA} {rig.reference}"
+        rig_lines.append(head + "".join(others))
+    frame_lines = [
+        "# FRAME_ID, RIG_ID, QW, QX, QY, QZ, TX, TY, TZ, NUM_DATA_IDS, DATA_IDS[] as "
+        "(SENSOR_TYPE, SENSOR_ID, DATA_ID)"
+    ]
+    for frame in frames:
+        data = " ".join(f"{CAMERA} {camera} {image}" for camera, image in frame.images.items())
+        pose = join_numbers((*frame.pose.q, *frame.pose.t))
+        frame_lines.append(f"{frame.id} {frame.rig} {pose} {len(frame.images)} {data}")
+    lines = {"rigs.txt": rig_lines, "frames.txt": frame_lines}
+    return {name: ("\n".join(some) + "\n").encode() for name, some in lines.items()}
+
+
+def _binary_files(rigs: Sequence[WrittenRig], frames: Sequence[WrittenFrame]) -> dict[str, bytes]:
+    of_rigs = [struct.pack("<Q", len(rigs))]
+    for rig in rigs:
+        head = (rig.id, 1 + len(rig.others), CAMERA_NUMBER, rig.reference)
+        of_rigs.append(struct.pack("<IIiI", *head))
+        of_rigs += [
+            struct.pack("<iIB7d", CAMERA_NUMBER, camera, 1, *q, *t)
+            for camera, (q, t) in rig.others.items()
+        ]
+    of_frames = [struct.pack("<Q", len(frames))]
+    for frame in frames:
+        numbers = (*frame.pose.q, *frame.pose.t, len(frame.images))
+        of_frames.append(struct.pack("<II7dI", frame.id, frame.rig, *numbers))
+        of_frames += [
+            struct.pack("<iIQ", CAMERA_NUMBER, camera, image)
+            for camera, image in frame.images.items()
+        ]
+    return {"rigs.bin": b"".join(of_rigs), "frames.bin": b"".join(of_frames)}

@@ -8,7 +8,7 @@
 Source: COLMAP documentation, "Output Format".
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -102,8 +102,11 @@ def _points(
 ) -> tuple[Int[np.ndarray, " points"], Float[np.ndarray, "points 3"], Source]:
     """Numbers and coordinates of the points, and their lines; tracks are only checked, since the
     image points name their object points."""
+    rows = TextRows(path, "#")
+    if (found := _plain_points(path, rows.lines, images)) is not None:
+        return found
     ids, positions, lines = [], [], []
-    for row in TextRows(path, "#"):
+    for row in rows:
         ids.append(row.integer(0, "POINT3D_ID"))
         positions.append(row.numbers(("X", "Y", "Z", "R", "G", "B", "ERROR"), 1, more=True)[:3])
         lines.append(row.number)
@@ -115,6 +118,32 @@ def _points(
     source = Source(str(path), np.array(lines, np.int64), "line")
     check_unique(ids, source, "point")
     return np.array(ids, np.int64), np.array(positions, float).reshape(-1, 3), source
+
+
+def _plain_points(
+    path: Path, lines: Sequence[tuple[int, str]], images: set[int]
+) -> tuple[Int[np.ndarray, " points"], Float[np.ndarray, "points 3"], Source] | None:
+    """The same at once; None if something is unusual, and read line by line."""
+    known = {str(id) for id in images}
+    ids: list[str] = []
+    numbers: list[str] = []
+    for _, text in lines:
+        words = text.split()
+        if len(words) < 8 or len(words) % 2 or "_" in text or not known.issuperset(words[8::2]):
+            return None
+        ids.append(words[0])
+        numbers += words[1:8]
+    try:
+        values = np.fromiter(map(float, numbers), float, len(numbers)).reshape(-1, 7)
+        points = np.fromiter(map(int, ids), np.int64, len(ids))
+    except (ValueError, OverflowError):
+        return None
+    unique = len(np.unique(points)) == len(points)
+    if not (np.isfinite(values).all() and unique and (points >= 0).all()):
+        return None
+    # the line of every point
+    source = Source(str(path), np.array([number for number, _ in lines], np.int64), "line")
+    return points, values[:, :3].copy(), source
 
 
 def text_files(model: ColmapModel) -> dict[str, bytes]:

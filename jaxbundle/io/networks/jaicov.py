@@ -27,7 +27,7 @@ from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.assemble import all_parameters, assemble, foreign_document, image_columns
-from jaxbundle.io.networks.losses import describe_losses, need_values, size_of
+from jaxbundle.io.networks.losses import changed, describe_losses, losing, need_values, size_of
 from jaxbundle.io.networks.poses import matrices_of
 from jaxbundle.io.text.rows import TextRow, TextRows, join_numbers
 from jaxbundle.io.writing.replacing import replace_files
@@ -278,17 +278,27 @@ def write_jaicov(network: Network, path: str | Path) -> tuple[str, ...]:
     with replace_files(*content) as temporary:
         for place, lines in zip(temporary, content.values()):
             place.write_bytes("".join(f"{line}\n" for line in lines).encode())
-    lost = [
-        what for what in describe_losses(network) if what not in ("distances", "σ of image points")
-    ]
-    renamed = image_ids != list(images.id) or camera_ids != [c.id for c in network.cameras]
-    return (*lost, *(("names of images and cameras, which are numbered",) if renamed else ()))
+    return describe_losses(network, JAICOV_LOSSES)
 
 
 def _numbers(ids: Sequence[str]) -> list[str]:
     # 18 digits fit in 64 bits
     plain = all(id.isascii() and id.isdigit() and len(id) < 19 for id in ids)
     return list(ids) if plain else [str(k) for k in range(1, len(ids) + 1)]
+
+
+JAICOV_LOSSES = losing(
+    keeping=("distances", "σ of image points", "datum points"),
+    partly={
+        "names of cameras": lambda n: _renumbered([camera.id for camera in n.cameras]),
+        "names of images": lambda n: _renumbered(n.images.id),
+    },
+)
+"""What it loses; names of cameras and images are numbers."""
+
+
+def _renumbered(ids: Sequence[str]) -> int:
+    return changed(ids, _numbers(ids))
 
 
 def _interior(id: str, camera: Camera) -> list[str]:

@@ -28,7 +28,7 @@ Source: Kalibr's wiki, "yaml formats", "Supported models".
 
 import dataclasses
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +39,15 @@ from jaxbundle.cameras.convert import convert_camera
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import cv_pose
 from jaxbundle.io.networks.assemble import all_parameters, rig_network
-from jaxbundle.io.networks.losses import describe_losses, need_values, size_of
+from jaxbundle.io.networks.losses import (
+    QUANTITIES,
+    Losses,
+    changed,
+    describe_losses,
+    losing,
+    need_values,
+    size_of,
+)
 from jaxbundle.io.networks.poses import check_rotations, matrices_of
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.json_fields import JsonFields
@@ -232,8 +240,9 @@ def write_kalibr(network: Network, path: str | Path) -> tuple[str, ...]:
 
     **Raises:** `InputError` for a camera without a model in Kalibr, or without image size.
     """
-    mountings, lost = mountings_of(network)
-    lines = []
+    mountings, lines, lost = mountings_of(network), [], []
+    if mountings is None and len(network.cameras) > 1:
+        lost.append("mountings of the cameras")
     for k, original in enumerate(network.cameras):
         camera, said = _fit(original)
         lost += said
@@ -244,10 +253,7 @@ def write_kalibr(network: Network, path: str | Path) -> tuple[str, ...]:
                 *(f"  - [{join_numbers(row, ', ')}]" for row in mountings[k - 1]),
             ]
     write_text(Path(path), "\n".join(lines) + "\n")
-    lost += [what for what in describe_losses(network, rays=True) if what != Rigs.TABLE]
-    lost += ["points"] if len(network.points) else []
-    own = any(camera.id != f"cam{k}" for k, camera in enumerate(network.cameras))
-    return (*lost, *(["names of cameras"] if own else []))
+    return (*describe_losses(network, KALIBR_LOSSES), *lost)
 
 
 def _fit(camera: Camera) -> tuple[Camera, list[str]]:
@@ -307,15 +313,15 @@ def _camera_lines(camera: Camera, k: int) -> list[str]:
 
 def mountings_of(
     network: Network,
-) -> tuple[Float[np.ndarray, "pairs 4 4"] | None, list[str]]:
+) -> Float[np.ndarray, "pairs 4 4"] | None:
     """T from the frame of each camera (x right, y down, z forward) to that of the next
-    [cameras − 1, 4, 4]; else None, and what is lost.
+    [cameras − 1, 4, 4]; None for a single camera, and without an image of every camera.
 
         x' = R'·X + t',  x = R·X + t   ⇒   x' = (R'·Rᵀ)·x + t' − (R'·Rᵀ)·t
     """
     images, number = network.images, len(network.cameras)
     if number == 1:
-        return None, ["orientations"] if len(images) > 1 else []
+        return None
     moments: dict[object, list[int]] = {}
     for rigs in (kind for kind in network.further if isinstance(kind, Rigs)):
         row = {id: i for i, id in enumerate(images.id)}
@@ -330,7 +336,7 @@ def mountings_of(
         if len({*images.camera[rows].tolist()}) == number == len(rows)
     ]
     if not whole or not np.isfinite(images.position[whole[0]]).all():
-        return None, ["mountings of the cameras"]
+        return None
     # only the orientations that are written must be there
     need_values(network.replace(images=images.take(np.array(whole[0]))), points=False)
     rows = np.array(whole[0])[np.argsort(images.camera[whole[0]])]
@@ -338,4 +344,35 @@ def mountings_of(
     T = np.tile(np.eye(4), (number - 1, 1, 1))
     T[:, :3, :3] = R[1:] @ R[:-1].transpose(0, 2, 1)
     T[:, :3, 3] = t[1:] - np.einsum("nij,nj->ni", T[:, :3, :3], t[:-1])
-    return T, ["orientations"] if len(images) > number else []
+    return T
+
+
+def _lost_orientations(network: Network) -> int:
+    """Images beyond one of each camera, all without mountings; the frame is that of the first."""
+    if len(network.cameras) > 1 and mountings_of(network) is None:
+        return QUANTITIES["orientations of images"](network)
+    return len(network.images) - len(network.cameras)
+
+
+def mounted_losses(names: Callable[[Network], Sequence[str]] | None = None) -> Losses:
+    """The losses of a format of cameras and their mountings, whose images have the names of the
+    cameras; `names`: other ones that cameras are given."""
+    written = names or (lambda n: [camera.id for camera in n.cameras])
+    return losing(
+        "pixel sizes of cameras",
+        "points",
+        partly={
+            "orientations of images": _lost_orientations,
+            "rigs": lambda n: QUANTITIES["rigs"](n) if mountings_of(n) is None else 0,
+            "names of images": lambda n: len({*n.images.id} - {*written(n)}),
+            **(
+                {"names of cameras": lambda n: changed([c.id for c in n.cameras], written(n))}
+                if names
+                else {}
+            ),
+        },
+    )
+
+
+KALIBR_LOSSES = mounted_losses(lambda network: [f"cam{k}" for k in range(len(network.cameras))])
+"""What it loses."""

@@ -1,12 +1,19 @@
-"""What a writer requires of a network, and what its format cannot hold."""
+"""What a writer requires of a network, and what its format cannot hold.
 
-from collections.abc import Sequence
+A format declares what it loses (`losing`): names of `QUANTITIES`, each with a count of what a
+network has of it. The command tells this before it writes, the table of conversions in the
+documentation is made of it, and a test compares it with what is read back.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 
 import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.assemble import all_parameters
-from jaxbundle.network.tables import Camera, Network
+from jaxbundle.network.kinds import KINDS
+from jaxbundle.network.tables import UNIT, Camera, Network
 
 PIXEL_MODELS = ("opencv", "kannala-brandt")
 """Camera models common to formats of computer vision."""
@@ -39,32 +46,117 @@ def need_values(network: Network, model: str = "", format: str = "", points: boo
             )
 
 
-def describe_losses(
-    network: Network, shared_cameras: bool = False, names: bool = False, rays: bool = False
-) -> tuple[str, ...]:
-    """Messages about parts of a network that formats of computer vision cannot hold.
+Count = Callable[[Network], int]
+"""How many of something a network has."""
+Losses = Mapping[str, Count]
+"""What a format cannot hold, by name."""
 
-    **Arguments:** `shared_cameras` whether every image gets its own camera; `names` whether
-    ids become numbers; `rays` whether image points are lost.
-    """
-    images, points = network.images, network.points
-    lost = {
-        "roles and σ of control, fixed and check points": not points.has_role("tie").all(),
-        "prior σ of exterior orientations": not np.isnan(images.sigma).all(),
-        "σ of image points": len(np.unique(network.observations.sigma)) > 1,
-        "distances": len(network.distances) > 0,
-        **{kind.TABLE: True for kind in network.further},
-        "that images share a camera": shared_cameras and len(network.cameras) < len(images),
-        "names of images and points, which are numbered from 0": names
-        and not are_numbered_from_0(images.id, points.id),
-        "image points": rays and len(network.observations) > 0,
+
+def _rows_of(table: str) -> Count:
+    def count(network: Network) -> int:
+        kinds = [kind for kind in network.further if kind.TABLE == table]
+        return sum(len(next(iter(kind.columns(1.0).values()))) for kind in kinds)
+
+    return count
+
+
+def _sharing(network: Network) -> int:
+    """Images beyond the first of each camera."""
+    return len(network.images) - len(np.unique(network.images.camera))
+
+
+def _stated_sigmas(network: Network) -> int:
+    """Image points with a σ other than 1, which is that of a format without σ."""
+    rays = network.observations
+    units = rays.sigma_origin == UNIT or not len(rays)
+    # 1e-12: the conversion between pixels and millimetres rounds 1 to a few eps (2e-16)
+    return 0 if units else int((abs(rays.sigma - 1) > 1e-12).any(axis=1).sum())
+
+
+QUANTITIES: Losses = MappingProxyType(
+    {
+        "interior orientations": lambda n: len(n.cameras),
+        "names of cameras": lambda n: len(n.cameras),
+        "that images share a camera": _sharing,
+        "image sizes of cameras": lambda n: sum(c.image_size is not None for c in n.cameras),
+        "pixel sizes of cameras": lambda n: sum(c.pixel_size is not None for c in n.cameras),
+        "prior σ of camera parameters": lambda n: sum(len(c.sigma) for c in n.cameras),
+        "orientations of images": lambda n: int(np.isfinite(n.images.position).all(1).sum()),
+        "names of images": lambda n: len(n.images),
+        "prior σ of orientations": lambda n: int(np.isfinite(n.images.sigma).any(1).sum()),
+        "points": lambda n: len(n.points),
+        "names of points": lambda n: len(n.points),
+        "roles of points": lambda n: int((~n.points.has_role("tie")).sum()),
+        "σ of control points": lambda n: int((~np.isnan(n.points.sigma)).any(1).sum()),
+        "datum points": lambda n: len(n.datum_points),
+        "image points": lambda n: len(n.observations),
+        "σ of image points": _stated_sigmas,
+        "distances": lambda n: len(n.distances),
+        **{table: _rows_of(table) for table in KINDS},
     }
-    return tuple(what for what, there in lost.items() if there)
+)
+"""What a network may have, and how many. Settings of the adjustment (free and tied parameters,
+datum, units, σ of further kinds) are of a project alone."""
+PARTS = {
+    "interior orientations": {
+        "image sizes of cameras",
+        "pixel sizes of cameras",
+        "that images share a camera",
+        "prior σ of camera parameters",
+    },
+    "points": {
+        "names of points",
+        "roles of points",
+        "σ of control points",
+        "datum points",
+        "image points",
+        "σ of image points",
+    },
+    "image points": {"σ of image points"},
+}
+"""What is lost together with something, and is not told beside it."""
+STATISTICS = (
+    "prior σ of camera parameters",
+    "prior σ of orientations",
+    "roles of points",
+    "σ of control points",
+    "datum points",
+    "σ of image points",
+    "distances",
+    *KINDS,
+)
+"""What formats of computer vision do not have."""
 
 
-def are_numbered_from_0(*ids: Sequence[str]) -> bool:
-    """Whether the names of each table are 0, 1, 2, …, as a format counts them."""
-    return all(list(names) == [str(k) for k in range(len(names))] for names in ids)
+def losing(
+    *names: str, keeping: Sequence[str] = (), partly: Mapping[str, Count] = MappingProxyType({})
+) -> Losses:
+    """The losses of a format: `STATISTICS` and the names, without those it keeps; `partly`: counts
+    of what is lost only in part."""
+    lost = ({*STATISTICS} - {*keeping}) | {*names, *partly}
+    unknown = {*names, *partly, *keeping} - QUANTITIES.keys()
+    if unknown:
+        raise ValueError(f"unknown quantities: {', '.join(sorted(unknown))}")
+    hidden = {part for name in lost if name not in partly for part in PARTS.get(name, ())}
+    return MappingProxyType(
+        {name: partly.get(name, QUANTITIES[name]) for name in QUANTITIES if name in lost - hidden}
+    )
+
+
+def describe_losses(network: Network, losses: Losses) -> tuple[str, ...]:
+    """What of a network a format cannot hold, each with its number."""
+    numbers = {name: count(network) for name, count in losses.items()}
+    return tuple(f"{name} ({number})" for name, number in numbers.items() if number)
+
+
+def changed(names: Sequence[str], written: Sequence[object]) -> int:
+    """How many names are written as something else."""
+    return sum(name != str(new) for name, new in zip(names, written, strict=True))
+
+
+def are_numbered_from_0(ids: Sequence[str]) -> bool:
+    """Whether the names are 0, 1, 2, …, as a format counts them."""
+    return changed(ids, range(len(ids))) == 0
 
 
 def check_others_zero(camera: Camera, format: str, coefficients: Sequence[str]) -> dict[str, float]:

@@ -28,7 +28,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import flip_rows
 from jaxbundle.io.cameras.nearest_camera import fit_messages
 from jaxbundle.io.networks.assemble import assemble, entry_of, foreign_document, image_columns
-from jaxbundle.io.networks.losses import describe_losses, need_values
+from jaxbundle.io.networks.losses import describe_losses, losing, need_values
 from jaxbundle.io.networks.micmac_camera import C2M, M2C, calibration, calibration_lines, document
 from jaxbundle.io.networks.poses import check_rotations, matrices_of
 from jaxbundle.io.text.csv_tables import write_text
@@ -176,7 +176,11 @@ def fill_micmac(network: Network, folder: Path) -> tuple[str, ...]:
         camera = network.cameras[images.camera[k]].id
         lines = _orientation(f"{CALIBRATION}{camera}.xml", C2W[k], images.position[k])
         write_text(folder / f"{ORIENTATION}{id}.xml", document(lines))
-    return (*describe_losses(network, rays=True), *(("points",) if len(network.points) else ()))
+    return describe_losses(network, MICMAC_LOSSES)
+
+
+MICMAC_LOSSES = losing("pixel sizes of cameras", "points")
+"""What it loses."""
 
 
 def _orientation(file: str, C2W: Float[np.ndarray, "3 3"], X0: Float[np.ndarray, "3"]) -> list[str]:

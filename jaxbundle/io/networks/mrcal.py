@@ -49,7 +49,7 @@ from jaxbundle.io.networks.assemble import (
     foreign_document,
     image_columns,
 )
-from jaxbundle.io.networks.losses import describe_losses, need_values, size_of
+from jaxbundle.io.networks.losses import describe_losses, losing, need_values, size_of
 from jaxbundle.io.networks.poses import (
     matrices_of,
     matrices_of_rotation_vectors,
@@ -257,8 +257,19 @@ def fill_mrcal(network: Network, folder: Path) -> tuple[str, ...]:
     folder.mkdir(exist_ok=True)
     for name, text in zip(names, texts):
         write_text(folder / f"{name}{SUFFIX}", text)
-    lost = describe_losses(network, shared_cameras=True, rays=True)
-    return (*lost, *(("points",) if len(network.points) else ()))
+    return describe_losses(network, MRCAL_LOSSES)
+
+
+MRCAL_LOSSES = losing(
+    "that images share a camera",
+    "pixel sizes of cameras",
+    "points",
+    partly={
+        "names of cameras": lambda n: len({c.id for c in n.cameras} - {*n.images.id}),
+        "names of images": lambda n: sum("/" in id for id in n.images.id),
+    },
+)
+"""What it loses; every image is a file with a camera."""
 
 
 def write_cameramodel(camera: Camera, path: str | Path) -> None:

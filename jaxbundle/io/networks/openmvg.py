@@ -48,8 +48,10 @@ from jaxbundle.io.networks.assemble import (
 )
 from jaxbundle.io.networks.control import with_control
 from jaxbundle.io.networks.losses import (
+    changed,
     check_others_zero,
     describe_losses,
+    losing,
     need_values,
     one_focal_length,
     size_of,
@@ -387,9 +389,18 @@ def write_openmvg(network: Network, path: str | Path) -> tuple[str, ...]:
         "control_points": tables[1],
     }
     write_text(Path(path), json.dumps(scene, indent=1) + "\n")
-    lost = [what for what in describe_losses(network) if not what.startswith("roles")]
-    lost += ["σ of control points, check points"] if held.any() or "check" in points.role else []
-    return (*lost, *(("names of points",) if list(map(str, numbers)) != list(points.id) else ()))
+    return describe_losses(network, OPENMVG_LOSSES)
+
+
+OPENMVG_LOSSES = losing(
+    "pixel sizes of cameras",
+    partly={
+        "names of cameras": lambda n: changed([c.id for c in n.cameras], range(len(n.cameras))),
+        "roles of points": lambda n: int(n.points.has_role("fixed", "check").sum()),
+        "names of points": lambda n: changed(n.points.id, _numbers(n.points.id)),
+    },
+)
+"""What it loses; fixed points become control points."""
 
 
 def _view_entries(network: Network) -> list[dict[str, Any]]:

@@ -54,6 +54,7 @@ from jaxbundle.io.networks.losses import (
     GREY,
     check_others_zero,
     describe_losses,
+    losing,
     need_values,
     one_focal_length,
     size_of,
@@ -225,6 +226,7 @@ def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         used = {id: cameras[shot.text("camera")] for id, shot in shots.items()}
         control = read_ground_control(file.parent / CONTROL, file.parent / REFERENCE, used)
         told += control.messages
+        control = control.renamed({*names})
         names, at, rays = _add_control(file, control, names, at, rays)
     if (file.parent / REFERENCE).is_file():
         told.append(_reference(file.parent / REFERENCE))
@@ -256,12 +258,8 @@ def _add_control(
     at: Float[np.ndarray, "n 3"],
     rays: Columns | None,
 ) -> tuple[list[str], Float[np.ndarray, "m 3"], Columns]:
-    """Points and image points with those of ground control.
-
-    **Raises:** `InputError` for a control point called as a tie point."""
+    """Points and image points with those of ground control."""
     added = [*(control.points.id if control.points else ()), *control.unknown]
-    if twice := next((id for id in added if id in {*names}), None):
-        raise InputError(f"{file.parent / CONTROL}: {twice!r} is also a point of {file.name}")
     columns: dict[str, list] = {}
     for k, name in enumerate(("image", "point", "x", "y")):
         tracked = () if rays is None else rays.values[name]
@@ -491,8 +489,18 @@ def fill_opensfm(network: Network, folder: Path) -> tuple[str, ...]:
     write_text(folder / RECONSTRUCTION, json.dumps([scene], indent=1) + "\n")
     write_text(folder / MODELS, json.dumps(cameras, indent=1) + "\n")
     write_text(folder / TRACKS, _track_lines(network, [c.image_size or (1, 1) for c in used]))
-    rest = tuple(kind for kind in network.further if not any(kind is m for m in measured))
-    return describe_losses(network.replace(further=rest))
+    return describe_losses(network, OPENSFM_LOSSES)
+
+
+OPENSFM_LOSSES = losing(
+    "pixel sizes of cameras",
+    partly={
+        Antennas.TABLE: lambda n: sum(
+            len(k.image) for k in n.further if isinstance(k, Antennas) and k.settings
+        )
+    },
+)
+"""What it loses; antennas with a lever arm or drifts are no projection centres."""
 
 
 def _track_lines(network: Network, sizes: Sequence[tuple[int, int]]) -> Iterable[str]:

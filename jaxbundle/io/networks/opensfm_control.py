@@ -15,7 +15,8 @@ Source: OpenSfM documentation, "Ground control points"; its config.py, gcp_horiz
 gcp_vertical_sd; its geo.py, topocentric coordinates.
 """
 
-from collections.abc import Mapping
+import dataclasses
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,6 +29,7 @@ from jaxbundle.geometry.ellipsoid import WGS84, earth_fixed
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.io.text.json_fields import JsonFields, read_object
 from jaxbundle.io.text.known_keys import Keys, UnknownKeys
+from jaxbundle.network.columns import count
 from jaxbundle.network.tables import Camera, Points, Source
 from jaxbundle.types import present
 
@@ -49,6 +51,16 @@ class GroundControl(NamedTuple):
     rays: list[tuple[str, str, float, float]]
     unknown: list[str]
     messages: tuple[str, ...]
+
+    def renamed(self, taken: Collection[str]) -> "GroundControl":
+        """With names of their own: tracks and control are numbered apart, and may be equal."""
+        own = [*(self.points.id if self.points else ()), *self.unknown]
+        new = {id: f"control {id}" if id in taken else id for id in own}
+        points = self.points and dataclasses.replace(
+            self.points, id=tuple(new[id] for id in self.points.id)
+        )
+        rays = [(image, new[point], x, y) for image, point, x, y in self.rays]
+        return GroundControl(points, rays, [new[id] for id in self.unknown], self.messages)
 
 
 def read_ground_control(
@@ -90,11 +102,14 @@ def read_ground_control(
     told = list(unknown.messages())
     keep = [k for k, id in enumerate(ids) if id in seen]
     points = None
-    if keep:
-        if not reference.is_file():
-            raise InputError(
-                f"{file}: latitudes and longitudes need {reference.name}, which is not beside it"
-            )
+    if keep and not reference.is_file():
+        told.append(
+            f"{file.name}: left out {count(len(keep), 'control point')}: latitudes and longitudes "
+            f"need {reference.name}, which is not beside it"
+        )
+        lost = {ids[k] for k in keep}
+        rays = [ray for ray in rays if ray[1] not in lost]
+    elif keep:
         sigma = np.tile([HORIZONTAL_SIGMA, HORIZONTAL_SIGMA, VERTICAL_SIGMA], (len(keep), 1))
         local = _topocentric(_origin(reference), np.array(places)[keep])
         names = tuple(ids[k] for k in keep)

@@ -36,11 +36,10 @@ from jaxbundle.io.cameras.opencv_file import YAML, matrix_in, read_entries, read
 from jaxbundle.io.cameras.opencv_writing import file_text, opencv_entries, ros_text
 from jaxbundle.io.cameras.ros_ini import is_ros_ini_pair, read_ros_sections
 from jaxbundle.io.networks.assemble import all_parameters, rig_network
-from jaxbundle.io.networks.kalibr import mountings_of
+from jaxbundle.io.networks.kalibr import mounted_losses, mountings_of
 from jaxbundle.io.networks.losses import describe_losses, size_of
 from jaxbundle.io.networks.poses import check_rotations
 from jaxbundle.io.text.csv_tables import write_texts
-from jaxbundle.network.kinds import Rigs
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.system.file_content import beginning
 
@@ -137,31 +136,33 @@ def _file_names(cameras: Sequence[Camera]) -> list[str]:
     return names
 
 
-def _pairs(network: Network, what: str) -> tuple[list[StereoPair], list[str]]:
-    """Every camera with the first, and what is lost.
+def _pairs(network: Network, what: str) -> list[StereoPair]:
+    """Every camera with the first.
 
     **Raises:** `InputError` for a single camera, and for cameras without mountings."""
     cameras = network.cameras
     if len(cameras) < 2:
         raise InputError(f"{what} holds two cameras, got {len(cameras)}")
-    mountings, lost = mountings_of(network)
+    mountings = mountings_of(network)
     if mountings is None:
         raise InputError(
             f"{what} holds the mounting of two cameras; a rig, or one image of each, is expected"
         )
-    lost += [what for what in describe_losses(network, rays=True) if what != Rigs.TABLE]
-    lost += ["points"] if len(network.points) else []
     names, T, pairs = _file_names(cameras), np.eye(4), []
     for camera, name, step in zip(cameras[1:], names[1:], mountings):
         T = step @ T  # from the first camera to this one
         own = f"{names[0]}_{name}" if len(cameras) > 2 else ""
         pairs.append(StereoPair((cameras[0], camera), T[:3, :3], T[:3, 3], own))
-    return pairs, lost
+    return pairs
+
+
+STEREO_LOSSES = mounted_losses()
+"""What both formats lose."""
 
 
 def opencv_stereo_files(network: Network, path: Path) -> tuple[Path, ...]:
     """The file of each pair of a rig; of two cameras the path itself."""
-    pairs, _ = _pairs(network, "a stereo file of OpenCV")
+    pairs = _pairs(network, "a stereo file of OpenCV")
     return tuple(_file_of(pair, path) for pair in pairs)
 
 
@@ -178,8 +179,8 @@ def write_opencv_stereo(network: Network, path: str | Path) -> tuple[str, ...]:
     **Raises:** `InputError` for a network of one camera, or without a mounting.
     """
     path = Path(path)
-    pairs, lost = _pairs(network, "a stereo file of OpenCV")
-    texts = []
+    pairs = _pairs(network, "a stereo file of OpenCV")
+    texts, lost = [], []
     for pair in pairs:
         entries = _stereo_entries(pair)
         try:
@@ -191,7 +192,7 @@ def write_opencv_stereo(network: Network, path: str | Path) -> tuple[str, ...]:
             entries |= {"Q": (4, 4, rectified.Q.ravel())}
         texts.append(file_text(entries, path.suffix.lower() == ".json"))
     write_texts([_file_of(pair, path) for pair in pairs], texts)
-    return tuple(lost)
+    return (*describe_losses(network, STEREO_LOSSES), *lost)
 
 
 def _stereo_entries(pair: StereoPair) -> dict[str, Any]:
@@ -211,7 +212,7 @@ def _stereo_entries(pair: StereoPair) -> dict[str, Any]:
 
 def ros_stereo_folders(network: Network, folder: Path) -> tuple[Path, ...]:
     """The folder of each pair of a rig; of two cameras the folder itself."""
-    pairs, _ = _pairs(network, "a pair of ROS")
+    pairs = _pairs(network, "a pair of ROS")
     return tuple(folder / pair.name for pair in pairs)
 
 
@@ -221,7 +222,7 @@ def fill_ros_stereo(network: Network, folder: Path) -> tuple[str, ...]:
 
     **Returns, raises:** as `write_opencv_stereo`; `InputError` if no pair can be rectified.
     """
-    pairs, lost = _pairs(network, "a pair of ROS")
+    pairs = _pairs(network, "a pair of ROS")
     texts, refused = {}, []
     for pair in pairs:
         try:
@@ -237,7 +238,7 @@ def fill_ros_stereo(network: Network, folder: Path) -> tuple[str, ...]:
     for file in texts:
         file.parent.mkdir(parents=True, exist_ok=True)
     write_texts([*texts], [*texts.values()])
-    return (*lost, *refused)
+    return (*describe_losses(network, STEREO_LOSSES), *refused)
 
 
 def is_ros_stereo(path: Path) -> bool:

@@ -36,7 +36,13 @@ from jaxbundle.io.networks.assemble import (
     foreign_document,
     image_columns,
 )
-from jaxbundle.io.networks.losses import check_others_zero, describe_losses, need_values, size_of
+from jaxbundle.io.networks.losses import (
+    check_others_zero,
+    describe_losses,
+    losing,
+    need_values,
+    size_of,
+)
 from jaxbundle.io.networks.poses import check_rotations, matrices_of
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.json_fields import JsonFields, read_object
@@ -235,7 +241,11 @@ def write_transforms(network: Network, path: str | Path) -> tuple[str, ...]:
     ]
     document = (fields[0] if single else {}) | {"frames": frames}
     write_text(Path(path), json.dumps(document, indent=1) + "\n")
-    return (*describe_losses(network, rays=True), *(("points",) if len(network.points) else ()))
+    return describe_losses(network, TRANSFORMS_LOSSES)
+
+
+TRANSFORMS_LOSSES = losing("names of cameras", "pixel sizes of cameras", "points")
+"""What it loses."""
 
 
 def _fields(camera: Camera) -> dict[str, Any]:

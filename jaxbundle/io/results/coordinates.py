@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxbundle.io.networks.losses import describe_losses, losing
 from jaxbundle.io.text.csv_tables import write_csv
 from jaxbundle.io.writing.replacing import replace_files
 from jaxbundle.network.build import IMAGE_COLUMNS, POINT_COLUMNS, POINT_SIGMAS
@@ -51,7 +52,15 @@ def write_coordinates(network: Network, path: str | Path) -> tuple[str, ...]:
             ),
         )
         write_csv(of_points, header, ((id, role, *_cells(row)) for id, role, row in rows))
-    return ("interior orientations", "image points")
+    return describe_losses(network, COORDINATES_LOSSES)
+
+
+COORDINATES_LOSSES = losing(
+    "interior orientations",
+    "image points",
+    keeping=("roles of points", "σ of control points"),
+)
+"""What it loses; `NAME_images.csv` names the cameras."""
 
 
 def _cells(numbers: Iterable[float]) -> Iterator[str]:

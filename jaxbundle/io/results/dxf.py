@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.networks.losses import need_values
+from jaxbundle.io.networks.losses import describe_losses, losing, need_values
 from jaxbundle.io.results.pyramids import pyramids
 from jaxbundle.io.text.csv_tables import write_text
 from jaxbundle.network.tables import ROLES, Network
@@ -59,8 +59,17 @@ def write_dxf(network: Network, path: str | Path) -> tuple[str, ...]:
     text = io.StringIO()
     drawing.write(text)
     write_text(Path(path), text.getvalue())
-    lost = ("cameras but for their pyramids", "image points")
-    return lost if known.all() else (*lost, f"{(~known).sum()} points without coordinates")
+    return describe_losses(network, DXF_LOSSES)
+
+
+DXF_LOSSES = losing(
+    "interior orientations",
+    "names of cameras",
+    "image points",
+    keeping=("roles of points",),
+    partly={"points": lambda n: int((~np.isfinite(n.points.position)).any(1).sum())},
+)
+"""What it loses; roles of points are layers."""
 
 
 def _write_name(

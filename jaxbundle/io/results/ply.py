@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxbundle.io.networks.losses import need_values
+from jaxbundle.io.networks.losses import describe_losses, losing, need_values
 from jaxbundle.io.results.pyramids import pyramids
 from jaxbundle.io.text.csv_tables import write_bytes
 from jaxbundle.network.reprojection import point_errors
@@ -67,5 +67,15 @@ def write_ply(
         "end_header\n",
     ]
     write_bytes(Path(path), "\n".join(head).encode() + vertices.tobytes() + edges.tobytes())
-    lost = ("names", "cameras but for their pyramids", "image points")
-    return lost if known.all() else (*lost, f"{(~known).sum()} points without coordinates")
+    return describe_losses(network, PLY_LOSSES)
+
+
+PLY_LOSSES = losing(
+    "interior orientations",
+    "names of cameras",
+    "names of images",
+    "names of points",
+    "image points",
+    partly={"points": lambda n: int((~np.isfinite(n.points.position)).any(1).sum())},
+)
+"""What it loses; roles of points are colours, which nothing reads."""

@@ -38,6 +38,9 @@ from jaxbundle.pushbroom.ancillary import DEFAULTS, check_times
 from jaxbundle.pushbroom.image import check_size, make_image
 from jaxbundle.pushbroom.scanner import LineTimes
 
+FRAME_MODEL = "USGS_ASTRO_FRAME_SENSOR_MODEL"
+"""The model of frame cameras (`io.networks.csm_frame`)."""
+
 
 def read_csm(
     path: str | Path, interpolation: str = "usgscsm", extrapolate: float | None = None
@@ -104,14 +107,15 @@ def _read_support_data(path: Path) -> tuple[JsonFields, int]:
             f"{path}: JSON of another kind, without image_lines and line_scan_rate; expected an "
             "ISD or a model state of a line scanner"
         )
-    _refuse_map(isd)
+    refuse_map(isd)
     model = isd.get("name_model", MODEL)
     if model != MODEL:
-        raise InputError(f"{path}: name_model is {show(model)}; {MODEL} is expected")
+        hint = " (`jaxbundle convert` reads it as a photograph)" if model == FRAME_MODEL else ""
+        raise InputError(f"{path}: name_model is {show(model)}{hint}; {MODEL} is expected")
     return isd, order
 
 
-def _refuse_map(isd: JsonFields) -> None:
+def refuse_map(isd: JsonFields) -> None:
     """Refuse an image whose rows are not the lines of the scanner: ALE states the projection and
     GDAL's transformation (x₀, dx, 0, y₀, 0, dy) of the file, empty and the identity for a raw one.
     """

@@ -98,6 +98,35 @@ def states_of(
     return _resample(isd, lines, interpolation, settings)
 
 
+def pose_at_centre(isd: JsonFields) -> tuple[Float[np.ndarray, "3"], Rotation, tuple[str, ...]]:
+    """The pose of a photograph: projection centre, the rotation from the camera into the frame of
+    the body, and warnings. Of tables with several rows the state at the centre time; a single row
+    is taken as it is.
+
+    **Raises:** `InputError` naming file and field.
+    """
+    if "sensor_position" in isd.document and "instrument_position" not in isd.document:
+        P = isd.array("sensor_position.positions", (1, 3)) * unit_of(isd, "sensor_position", "m")
+        R, lengths = _rotations(
+            isd, "sensor_orientation", isd.array("sensor_orientation.quaternions", (1, 4))
+        )
+        return P[0], R[0], lengths
+    body_times, body, body_lengths = _turns(isd, "body_rotation")
+    times, pointing, lengths = _turns(isd, "instrument_pointing")
+    position_times = _times(isd, "instrument_position")
+    centre = lambda t: t if len(t) == 1 else np.zeros(1)
+    if len(position_times) == 1:
+        scale = unit_of(isd, "instrument_position", "km")
+        inertial, said = scale * isd.array("instrument_position.positions", (1, 3)), ()
+    else:
+        at, said = _positions(isd, position_times)
+        inertial = at(np.zeros(1))
+    X0 = body(centre(position_times)).apply(inertial)[0]
+    when = centre(times)
+    R = (body(when) * pointing(when).inv())[0]
+    return X0, R, (*body_lengths, *lengths, *said)
+
+
 def trajectory_of(states: States, turn: Rotation, interpolation: str, order: int) -> Trajectory:
     """The tables, the camera turned by `turn`."""
     q = np.roll((states.R * turn).as_quat(), 1, axis=1)
@@ -249,7 +278,8 @@ def _turns(isd: JsonFields, key: str) -> tuple[Float[np.ndarray, " n"], Turns, t
         )
     constant = Rotation.from_matrix(fixed)
     if len(t) == 1:
-        rate = isd.array(f"{key}.angular_velocities", (1, 3), np.zeros((1, 3)))[0]
+        given = isd.get(f"{key}.angular_velocities") is not None  # null where they are unknown
+        rate = isd.array(f"{key}.angular_velocities", (1, 3))[0] if given else np.zeros(3)
         turned = lambda times: constant * Rotation.from_rotvec(np.outer(times - t[0], rate)) * R[0]
         return t, turned, lengths
     return t, lambda times: constant * slerp(t, R, times), lengths

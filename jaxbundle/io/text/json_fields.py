@@ -91,6 +91,8 @@ class JsonFields:
     def rows(self, key: str) -> list["JsonFields"]:
         """The objects in a list, counted from 0 in messages; none if it is missing."""
         value = self.get(key, [])
+        # the property trees of Boost write an empty list as an empty text
+        value = [] if value == "" else value
         if not isinstance(value, list):
             raise InputError(f"{self.path}: {key} is {show(value)}; a list is expected")
         return [_object(f"{self.path}, {key}[{k}]", row) for k, row in enumerate(value)]

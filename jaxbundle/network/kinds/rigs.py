@@ -14,11 +14,11 @@ reference, several images are tied to the first by both mountings; a single one 
 import dataclasses
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jaxbundle.arguments import positive
 from jaxbundle.errors import InputError
@@ -64,6 +64,27 @@ def mounting_misclosure(
 MOUNTED = Kind(
     "mountings", mounting_misclosure, ("image", "image", MOUNTING, MOUNTING), AXES, invariant=True
 )
+
+
+class Mounting(NamedTuple):
+    """A camera in the frame of the reference camera: place of its centre, and rotation from there
+    to its own frame."""
+
+    position: Float[np.ndarray, "3"]
+    rotation: Float[np.ndarray, "3 3"]
+
+
+class MountedCameras(NamedTuple):
+    """The cameras of a rig as the orientations of its images have them.
+
+    `reference`: index of the camera that the mountings refer to; `mountings`: by index of the
+    camera, the reference first, None for one that no epoch connects with it; `epochs`: by name,
+    index of the camera → index of the image.
+    """
+
+    reference: int
+    mountings: dict[int, Mounting | None]
+    epochs: dict[str, dict[int, int]]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -116,26 +137,25 @@ class Rigs(Further):
 
     def declare(self, network: Network, origin: Float[np.ndarray, "3"]) -> Contribution:
         images, radians = network.images, ANGLE_UNITS[network.angle_unit]
-        row = {id: i for i, id in enumerate(images.id)}
-        M = np.array([np.asarray(matrix_from_omega_phi_kappa(a)) for a in images.angles])
         labels, places, turns, held, pairs = [], [], [], [], []
-        for rig in dict.fromkeys(self.rig):
-            epochs = self._epochs(rig, row, images.camera)
-            reference = self._reference(epochs, network)
+        for rig, (reference, mountings, all_epochs) in self.mounted(network).items():
+            if len(mountings) < 2:
+                continue
             first = len(labels)
             # The reference first; its mounting is the identity and held, so that all others are
             # relative to it.
-            cameras = sorted({c for epoch in epochs for c in epoch}, key=lambda c: c != reference)
-            at = {c: first + k for k, c in enumerate(cameras)}
-            for c in cameras:
-                t, R = _mounting(epochs, reference, c, images.position, M)
+            at = {c: first + k for k, c in enumerate(mountings)}
+            for c, mounting in mountings.items():
+                # a camera that nothing connects with the reference starts in its place
+                t, R = mounting or Mounting(np.zeros(3), np.eye(3))
                 labels.append(f"{network.cameras[c].id} of {rig}")
                 places.append(t)
                 turns.append(np.asarray(quaternion_from_matrix(R)))
                 held.append(c == reference)
-            for epoch in epochs:
-                one = reference if reference in epoch else min(epoch)
-                pairs += [(epoch[one], i, at[one], at[c]) for c, i in epoch.items() if c != one]
+            for epoch in all_epochs.values():
+                if len(epoch) > 1:
+                    one = reference if reference in epoch else min(epoch)
+                    pairs += [(epoch[one], i, at[one], at[c]) for c, i in epoch.items() if c != one]
         if not pairs:
             raise InputError(f"{self.source.name}: no epoch has images of two cameras")
         free = ~np.array(held)[:, None] * np.ones(6, bool)
@@ -164,15 +184,22 @@ class Rigs(Further):
         seen = MOUNTED(tuple(np.array(pairs).T), np.zeros((len(pairs), 6)), sigma=sigma)
         return Contribution((mounting,), (seen,), ((MOUNTING, _move_mounting),))
 
-    def _epochs(
-        self, rig: str, row: Mapping[str, int], camera: Int[np.ndarray, " images"]
-    ) -> list[dict[int, int]]:
-        """By epoch, camera → image."""
-        epochs: dict[str, dict[int, int]] = {}
-        for name, epoch, id in zip(self.rig, self.epoch, self.image):
-            if name == rig:
-                epochs.setdefault(epoch, {})[int(camera[row[id]])] = row[id]
-        return [epoch for epoch in epochs.values() if len(epoch) > 1]
+    def mounted(self, network: Network) -> dict[str, MountedCameras]:
+        """The rigs by name, with the mountings that the orientations of the images give."""
+        images = network.images
+        row = {id: i for i, id in enumerate(images.id)}
+        M = np.array([np.asarray(matrix_from_omega_phi_kappa(a)) for a in images.angles])
+        rigs: dict[str, dict[str, dict[int, int]]] = {}
+        for rig, epoch, id in zip(self.rig, self.epoch, self.image):
+            of_epoch = rigs.setdefault(rig, {}).setdefault(epoch, {})
+            of_epoch[int(images.camera[row[id]])] = row[id]
+        made = {}
+        for rig, epochs in rigs.items():
+            together = [epoch for epoch in epochs.values() if len(epoch) > 1]
+            reference = self._reference(together or [*epochs.values()], network)
+            mountings = _mountings(together, reference, images.position, M)
+            made[rig] = MountedCameras(reference, mountings, epochs)
+        return made
 
     def _reference(self, epochs: Sequence[Mapping[int, int]], network: Network) -> int:
         ids = [camera.id for camera in network.cameras]
@@ -185,29 +212,49 @@ class Rigs(Further):
         return max(sorted(cameras), key=cameras.__getitem__, default=0)
 
 
-def _mounting(
+def _mountings(
     epochs: Sequence[Mapping[int, int]],
     reference: int,
-    camera: int,
     position: Float[np.ndarray, "images 3"],
     M: Float[np.ndarray, "images 3 3"],
-) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Start values: those of the epoch with the median position."""
+) -> dict[int, Mounting | None]:
+    """The mountings of the cameras; one that has no epoch with the reference by way of another."""
+    cameras = sorted({c for epoch in epochs for c in epoch}, key=lambda c: c != reference)
+    found: dict[int, Mounting | None] = dict.fromkeys(cameras)
+    found[reference] = Mounting(np.zeros(3), np.eye(3))
+    to_visit = [reference]
+    for known in to_visit:
+        base = found[known]
+        assert base is not None
+        for c in cameras:
+            if found[c] is None and (step := _between(epochs, known, c, position, M)):
+                # x_c = R·(M_known·(X − X_known) − t), and M_known = R_known·M_reference
+                place = base.position + base.rotation.T @ step.position
+                found[c] = Mounting(place, step.rotation @ base.rotation)
+                to_visit.append(c)
+    return found
+
+
+def _between(
+    epochs: Sequence[Mapping[int, int]],
+    one: int,
+    other: int,
+    position: Float[np.ndarray, "images 3"],
+    M: Float[np.ndarray, "images 3 3"],
+) -> Mounting | None:
+    """A camera in the frame of another, at the epoch with the median position; None without an
+    epoch of both."""
     found = [
-        (
-            M[e[reference]] @ (position[e[camera]] - position[e[reference]]),
-            M[e[camera]] @ M[e[reference]].T,
-        )
+        Mounting(M[e[one]] @ (position[e[other]] - position[e[one]]), M[e[other]] @ M[e[one]].T)
         for e in epochs
-        if reference in e and camera in e
+        if one in e and other in e
     ]
-    if camera == reference or not found:
-        return np.zeros(3), np.eye(3)
+    if not found:
+        return None
     # Of a whole epoch, not a mean of all: position and rotation of one epoch belong together, and a
     # mean of rotations from poor start values is none of them.
     t = np.array([t for t, _ in found])
-    k = np.linalg.norm(t - np.median(t, axis=0), axis=1).argmin()
-    return found[k]
+    return found[np.linalg.norm(t - np.median(t, axis=0), axis=1).argmin()]
 
 
 def _move_mounting(motion: Float[Array, "7"], value: PoseValue) -> PoseValue:

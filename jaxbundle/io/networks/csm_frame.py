@@ -1,0 +1,288 @@
+"""Frame cameras of the Community Sensor Model: support data (ISD) as ALE writes them.
+
+A file is one photograph: its camera, its projection centre and its attitude in the frame of the
+body. The fields have the meaning of usgscsm:
+
+    sample = u + ½, line = v + ½                      (½, ½): centre of the first pixel
+    detector = (line, sample)·summing + starting_detector
+    (x, y) = A⁻¹·(detector − detector_center − a₀)    focal plane, mm; a₀ | A: focal2pixel
+    (x', y') = (x, y) without distortion
+    X = X0 + λ·R·(x', y', f)                          R from the camera into the frame of the body
+
+With the x and y axis of our camera along the samples and against the lines, `radial` is `usgs`
+(xi = x − x·(k0 + k1·r² + k2·r⁴): K_i = −k_i), `dawnfc` (x = x'·(1 + k·r'²), mm) and `radtan`
+(OpenCV's coefficients, of x'/f) are `opencv`; `cahvor` with its centre of distortion on the axis
+is `radial`. With another centre, and for `transverse`, cubic polynomials of (x', y'), the nearest
+camera is fitted and the difference reported. A mirror image (samples × lines against the view) has
+no camera here.
+
+Source: usgscsm, UsgsAstroFrameSensorModel.cpp and Distortion.cpp; ALE's formatters.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.cameras.nearest_camera import Foreign, Formula, fit_camera, fit_messages
+from jaxbundle.io.networks.assemble import assemble, entry_of, foreign_document, image_columns
+from jaxbundle.io.scanner.csm import FRAME_MODEL as MODEL
+from jaxbundle.io.scanner.csm import refuse_map
+from jaxbundle.io.scanner.csm_trajectory import pose_at_centre
+from jaxbundle.io.text.csv_tables import read_text
+from jaxbundle.io.text.json_fields import JsonFields, read_object
+from jaxbundle.io.text.known_keys import Keys, UnknownKeys
+from jaxbundle.network.columns import show
+from jaxbundle.network.tables import Camera, Network, Source
+from jaxbundle.system.file_content import beginning
+from jaxbundle.types import Scalar
+
+KEYS = Keys(
+    (
+        *("name_model", "name_sensor", "image_lines", "image_samples", "center_ephemeris_time"),
+        *("body_rotation", "instrument_pointing", "instrument_position", "sensor_position"),
+        *("sensor_orientation", "detector_sample_summing", "detector_line_summing"),
+        *("focal_length_model", "detector_center", "focal2pixel_lines", "focal2pixel_samples"),
+        *("optical_distortion", "starting_detector_line", "starting_detector_sample"),
+        *("projection", "geotransform", "jitter"),
+    ),
+    {
+        **dict.fromkeys(
+            ("isis_camera_version", "name_platform", "image_identifier", "naif_keywords",
+             "interpolation_method", "number_of_*", "dt_ephemeris", "t0_ephemeris", "dt_quaternion",
+             "t0_quaternion", "b_summing", "exposure_duration", "starting_ephemeris_time"),
+            "names and sources; times of one photograph",
+        ),
+        **dict.fromkeys(
+            ("radii", "reference_height", "sun_position", "velocity*", "sensor_velocity"),
+            "the body, the sun and the motion, which the photograph does not need",
+        ),
+    },
+)  # fmt: skip
+
+
+def is_csm_frame(path: Path) -> bool:
+    """Whether a JSON file names the model of frame cameras."""
+    return path.suffix.lower() == ".json" and MODEL.encode() in beginning(path, 100_000)
+
+
+def read_csm_frame(path: str | Path, overrides: Sequence[str] = ()) -> Network:
+    """The photograph of an ISD, with the name of the file; lengths in metres, in the frame of the
+    body. Nothing can be adjusted.
+
+    **Raises:** `InputError` naming file and field: missing, not a number, a distortion without a
+    camera here; for model states, maps, crops and mirror images.
+    """
+    path = Path(path)
+    text = read_text(path)
+    if not text.lstrip().startswith("{"):
+        raise InputError(f"{path}: a model state of a frame camera; give the support data (ISD)")
+    isd = JsonFields(path, read_object(path, text, "an ISD"))
+    if isd.get("name_model") != MODEL:
+        raise InputError(
+            f"{path}: name_model is {show(isd.get('name_model'))}; {MODEL} is expected: give the "
+            "support data (ISD) of a frame camera, no model state"
+        )
+    unknown = UnknownKeys()
+    unknown.check(isd.document, KEYS, path)
+    refuse_map(isd)
+    if isd.get("jitter") is not None:
+        raise InputError(f"{path}: jitter, of a rolling shutter, is not supported")
+    plane = _focal_plane(isd)
+    id = str(isd.get("name_sensor") or path.stem)
+    camera = _camera(id, isd, plane)
+    X0, R, warnings = pose_at_centre(isd)
+    # from the body into our frame, of which the plane has the axes in the frame of the ISD
+    M = plane.axes @ R.as_matrix().T
+    images = image_columns(
+        Source(str(path), None, "photograph"), [path.stem], [id], M[None], X0[None]
+    )
+    document = foreign_document(path.stem, [entry_of(camera)], object_unit="m")
+    told = (*warnings, *fit_messages([camera]), *unknown.messages())
+    return assemble(path, document, overrides, images, warnings=told)
+
+
+class FocalPlane(NamedTuple):
+    """The focal plane of an ISD.
+
+    `to_mm`: of a pixel along samples and along lines [2, 2], in columns; `centre`: (u, v) of
+    x = y = 0; `axes`: x, y, z of our camera in the frame of the ISD, in rows; `focal_length`: |f|.
+    """
+
+    to_mm: Float[np.ndarray, "2 2"]
+    centre: Float[np.ndarray, "2"]
+    axes: Float[np.ndarray, "3 3"]
+    size: tuple[int, int]
+    focal_length: float
+
+    @property
+    def pixel_size(self) -> tuple[float, float]:
+        """Width and height, mm."""
+        w, h = np.linalg.norm(self.to_mm, axis=0)
+        return float(w), float(h)
+
+
+def _focal_plane(isd: JsonFields) -> FocalPlane:
+    f = isd.number("focal_length_model.focal_length")
+    size = (isd.integer("image_samples", least=1), isd.integer("image_lines", least=1))
+    along_line, along_sample = (isd.array(f"focal2pixel_{k}", (3,)) for k in ("lines", "samples"))
+    names = ("detector_sample_summing", "detector_line_summing")
+    summing = np.array([isd.number(name, 1.0) for name in names])
+    if f == 0 or not (summing > 0).all():
+        raise InputError(
+            f"{isd.path}: focal_length is {f:g}, {names[0]} and {names[1]} are {summing[0]:g} and "
+            f"{summing[1]:g}; expected a focal length in mm, and summing above 0"
+        )
+    A = np.stack([along_sample[1:], along_line[1:]])
+    # parallel but for the rounding of numbers of 12 digits
+    if abs(np.linalg.det(A)) < 1e-12 * np.abs(A).max() ** 2 or not A.any():
+        raise InputError(f"{isd.path}: focal2pixel_lines and focal2pixel_samples are dependent")
+    to_mm = np.linalg.inv(A) * summing
+    start = np.array([isd.number(f"starting_detector_{k}", 0.0) for k in ("sample", "line")])
+    middle = np.array([isd.number(f"detector_center.{k}") for k in ("sample", "line")])
+    first = np.array([along_sample[0], along_line[0]])
+    centre = (middle + first - start) / summing - 0.5
+    if np.linalg.det(to_mm) * np.sign(f) < 0:
+        raise InputError(
+            f"{isd.path}: focal2pixel_lines and focal2pixel_samples make a mirror image, which no "
+            "camera here has; mirror the image, and negate the coefficients of its lines"
+        )
+    across = to_mm[:, 0] / np.linalg.norm(to_mm[:, 0])
+    # y against the lines; of a plane with skew, at right angles to the samples
+    up = np.array([across[1], -across[0]]) * np.sign(f)
+    axes = np.array([[*across, 0.0], [*up, 0.0], [0.0, 0.0, -np.sign(f)]])
+    return FocalPlane(to_mm, centre, axes, size, abs(f))
+
+
+def _camera(id: str, isd: JsonFields, plane: FocalPlane) -> Camera:
+    kinds = isd.get("optical_distortion", {"radial": {"coefficients": [0.0]}})
+    if not isinstance(kinds, dict) or len(kinds) != 1:
+        raise InputError(f"{isd.path}: optical_distortion {show(kinds)}; one kind is expected")
+    (kind,) = kinds
+    where = f"optical_distortion.{kind}"
+    numbers = lambda n: isd.array(f"{where}.coefficients", (n,))
+    # the images of the axes of the plane in ours: the rows of `axes` without the third
+    Q, f = plane.axes[:2, :2], plane.focal_length
+    skewed = abs(plane.to_mm[:, 0] @ plane.to_mm[:, 1]) > 1e-9 * np.prod(plane.pixel_size)
+    focal: Mapping[str, float] = dict(
+        fx=f / plane.pixel_size[0],
+        fy=f / plane.pixel_size[1],
+        cx=float(plane.centre[0]),
+        cy=float(plane.centre[1]),
+    )
+    match kind:
+        case "radial" | "cahvor":
+            k = np.r_[numbers(None), np.zeros(6)]
+            known = 5 if kind == "cahvor" else 3
+            if k[known:].any():
+                raise InputError(f"{isd.path}: {where}: at most {known} coefficients are known")
+            offset = k[3:5] if kind == "cahvor" else np.zeros(2)
+            if skewed or offset.any():
+                p = {"k": k[:3], "offset": offset}
+                return _fit(id, isd, plane, focal, image_of_radial, p, f"has the distortion {kind}")
+            return _corrected(id, plane, k[:3]) if k.any() else _opencv(id, plane, focal)
+        case "dawnfc" | "radtan":
+            # k1, k2, p1, p2, k3 of x/f; a decentring (p2, p1) turns with the axes
+            k1, k2, p1, p2, k3 = (
+                numbers(5) if kind == "radtan" else (numbers(1)[0] * f * f, 0, 0, 0, 0)
+            )
+            turned = Q @ [p2, p1] * np.sign(-plane.axes[2, 2])
+            own = {"k1": k1, "k2": k2, "k3": k3, "p1": -turned[1], "p2": turned[0]}
+            if skewed:
+                raise InputError(f"{isd.path}: {where} with skewed pixels is not supported")
+            return _opencv(id, plane, {**focal, **{name: float(v) for name, v in own.items()}})
+        case "transverse":
+            a, b = (isd.array(f"{where}.{axis}", (None,)) for axis in "xy")
+            p = {"a": np.r_[a, np.zeros(10)][:10], "b": np.r_[b, np.zeros(10)][:10]}
+            why = "has the distortion transverse"
+            return _fit(id, isd, plane, focal, image_of_transverse, p, why)
+    raise InputError(
+        f"{isd.path}: optical_distortion {show(kind)} of a frame camera is not supported; radial, "
+        "transverse, radtan, dawnfc or cahvor is expected"
+    )
+
+
+def _opencv(id: str, plane: FocalPlane, parameters: Mapping[str, float]) -> Camera:
+    return Camera(id, "opencv", parameters, image_size=plane.size, pixel_size=plane.pixel_size)
+
+
+def _corrected(id: str, plane: FocalPlane, k: Float[np.ndarray, "3"]) -> Camera:
+    """Exactly `radial`, the correction of the measured point; `brown` where it has no linear term.
+    """
+    (w, h), (pw, ph) = plane.size, plane.pixel_size
+    parameters = {
+        "c": plane.focal_length,
+        "x0": (plane.centre[0] - (w - 1) / 2) * pw,
+        "y0": -(plane.centre[1] - (h - 1) / 2) * ph,
+        **{f"K{i}": -value for i, value in enumerate(k)},
+    }
+    parameters = {name: float(value) for name, value in parameters.items()}
+    model = "usgs" if parameters["K0"] else "brown"
+    if model == "brown":
+        del parameters["K0"]
+    return Camera(id, model, parameters, image_size=plane.size, pixel_size=plane.pixel_size)
+
+
+def _fit(
+    id: str,
+    isd: JsonFields,
+    plane: FocalPlane,
+    start: Mapping[str, float],
+    formula: Formula,
+    p: Mapping[str, Float[np.ndarray, " n"]],
+    why: str,
+) -> Camera:
+    """The nearest camera: the pixels of rays by the formula of the ISD."""
+    own = {
+        "distortion": dict(p),
+        "f": plane.focal_length,
+        "axes": plane.axes[:2, :2],
+        "to_pixel": np.linalg.inv(plane.to_mm),
+        "centre": plane.centre,
+    }
+    foreign = Foreign(formula, own, start, plane.size, plane.pixel_size)
+    return fit_camera(id, foreign, str(isd.path), why)
+
+
+def radial(k: Mapping[str, Array], u: Float[Array, "2"]) -> Float[Array, "2"]:
+    """The point whose correction, about `offset`, is u: d + (1 − k0 − k1·r² − k2·r⁴)·… = u."""
+
+    def correct(d: Float[Array, "2"]) -> Float[Array, "2"]:
+        e = d - k["offset"]
+        r2 = e @ e
+        return k["offset"] + e * (1 - k["k"][0] - r2 * (k["k"][1] + r2 * k["k"][2]))
+
+    # Fixed-point iteration as of the scanners: a step gains some digits.
+    d = u
+    for _ in range(25):
+        d = d + u - correct(d)
+    return d
+
+
+def transverse(k: Mapping[str, Array], u: Float[Array, "2"]) -> Float[Array, "2"]:
+    """Cubic polynomials of the undistorted point."""
+    x, y = u
+    terms = jnp.stack(
+        [jnp.ones_like(x), x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3]
+    )
+    return jnp.stack([k["a"] @ terms, k["b"] @ terms])
+
+
+def image_of_radial(p: Mapping, X: Scalar, Y: Scalar, Z: Scalar) -> Float[Array, "2"]:
+    """The pixel of a ray (right, down, forward) by `radial`, or `cahvor`."""
+    return _image(radial, p, X, Y, Z)
+
+
+def image_of_transverse(p: Mapping, X: Scalar, Y: Scalar, Z: Scalar) -> Float[Array, "2"]:
+    """The pixel of a ray (right, down, forward) by `transverse`."""
+    return _image(transverse, p, X, Y, Z)
+
+
+def _image(distort: Callable, p: Mapping, X: Scalar, Y: Scalar, Z: Scalar) -> Float[Array, "2"]:
+    # our axes are x right, y up: a ray (X, Y) has −Y along the second
+    u = p["f"] / Z * (X * p["axes"][0] - Y * p["axes"][1])
+    return p["to_pixel"] @ distort(p["distortion"], u) + p["centre"]
