@@ -183,8 +183,14 @@ def _fit(
 ) -> dict[str, float]:
     """Parameters of a model fitted to the images of the computed camera, over the measured area;
     for a model with priors, all parameters with a prior, over the whole image if possible."""
-    if {*given} - {*model.principal_distance}:
-        model = dataclasses.replace(model, defaults=dict(model.defaults) | given)
+    conventions = dict(given)
+    if model.prior:
+        # Held, whatever it is; near the true one, so that knots without points, which stay at 0,
+        # are like their neighbours.
+        centre = {name: first.interior[name] for name in ("cx", "cy")}
+        conventions = {n: v for n, v in centre.items() if n in model.parameters} | conventions
+    if {*conventions} - {*model.principal_distance}:
+        model = dataclasses.replace(model, defaults=dict(model.defaults) | conventions)
     core = () if model.prior else model.principal_distance
     wanted = [n for n in model.parameters if n in (*core, *free) and n not in given]
     areas = [(xy.min(0), xy.max(0))]

@@ -211,7 +211,7 @@ def _opencv(id: str, plane: FocalPlane, parameters: Mapping[str, float]) -> Came
 
 
 def _corrected(id: str, plane: FocalPlane, k: Float[np.ndarray, "3"]) -> Camera:
-    """Exactly `radial`, the correction of the measured point; `brown` where it has no linear term."""
+    """Exactly `radial`, the correction of the measured point; `brown` without a linear term."""
     (w, h), (pw, ph) = plane.size, plane.pixel_size
     parameters = {
         "c": plane.focal_length,
