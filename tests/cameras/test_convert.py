@@ -188,3 +188,15 @@ def test_a_fit_stays_where_its_parameters_mean_something():
     for name, (low, high) in dict(target.ranges).items():
         assert low <= found.parameters[name] < high
     assert found.rms < 0.2
+
+
+def test_knots_without_points_stay_at_the_start():
+    """The corners of a grid of splines over 80°, of an image of 42°: within σ of their prior."""
+    source, target = get_model("opencv"), get_model("spline-8x6-80")
+    parameters = {"fx": 620.0, "fy": 620.0, "cx": 240.0, "cy": 180.0, "k1": -0.2, "k2": 0.1}
+    knots = [name for name in target.parameters if name.startswith("d")]
+    found = convert_camera(source, parameters, target, image_size=(480, 360), free=knots)
+    for i, j in ((0, 0), (0, 7), (5, 0), (5, 7), (2, 0), (2, 7)):
+        for axis in "xy":
+            name = f"d{axis}_{i}_{j}"
+            assert abs(found.parameters[name]) < dict(target.prior)[name], name
