@@ -18,8 +18,9 @@ from jaxbundle.network.tables import Network
 
 
 def use_prior_tables(network: Network) -> Network:
-    """The network with the priors of its tables `exterior_priors` and `camera_parameters` at its
-    own values."""
+    """The network with the priors of its cameras and of its tables `exterior_priors` and
+    `camera_parameters` at its own values."""
+    cameras = tuple(dataclasses.replace(camera, observed={}) for camera in network.cameras)
     further = []
     for rows in network.further:
         if isinstance(rows, ExteriorPriors):
@@ -28,7 +29,7 @@ def use_prior_tables(network: Network) -> Network:
             further.append(_observe_present_values(network, rows))
         else:
             further.append(rows)
-    return network.replace(further=tuple(further))
+    return network.replace(cameras=cameras, further=tuple(further))
 
 
 def _move_to_images(network: Network, given: ExteriorPriors) -> Network:

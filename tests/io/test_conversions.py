@@ -5,8 +5,11 @@ import csv
 import struct
 
 import conversions
+import ezdxf
 import numpy as np
+import plyfile
 import pytest
+import yaml
 from conversions import DRAWINGS, HOLDS, PAGE, full_network, holds, model_for, round_trip, write
 from test_hostile_files import KINDS, made, read
 
@@ -60,7 +63,6 @@ def test_ply_by_an_independent_reader(tmp_path):
 
 
 def test_ply_by_plyfile(tmp_path):
-    plyfile = pytest.importorskip("plyfile")
     net = full_network("brown")
     path, _ = write("ply", net, tmp_path)
     vertex = plyfile.PlyData.read(str(path))["vertex"]
@@ -69,7 +71,6 @@ def test_ply_by_plyfile(tmp_path):
 
 
 def test_dxf_by_ezdxf(tmp_path):
-    ezdxf = pytest.importorskip("ezdxf")
     net = full_network("brown")
     path, said = write("dxf", net, tmp_path)
     space = ezdxf.readfile(path).modelspace()
@@ -104,7 +105,6 @@ def test_csv_by_the_standard_library(tmp_path):
 
 def test_kalibr_and_ros_by_pyyaml(tmp_path):
     """T_cn_cnm1 from the orientations of the first moment, by scipy alone."""
-    yaml = pytest.importorskip("yaml")
     net = full_network("opencv")
     path, _ = write("kalibr", net, tmp_path)
     chain = yaml.safe_load(path.read_text())
