@@ -118,8 +118,8 @@ def check_camera(camera: Camera, where: str = "") -> None:
     for name, value in camera.observed.items():
         if name not in camera.sigma:
             raise InputError(
-                f"{where}observed is given for {name!r}, which has no sigma; add its sigma, or give "
-                f"the value as start value (sigma: {', '.join(camera.sigma) or 'none'})"
+                f"{where}observed is given for {name!r}, which has no sigma (sigma: "
+                f"{', '.join(camera.sigma) or 'none'}); add it, or give a start value"
             )
         if not math.isfinite(value):
             raise InputError(f"{where}observed value of {name} is {value}; it must be finite")
