@@ -136,7 +136,6 @@ def calibrate_batch(  # noqa: PLR0913 keyword arguments of a public function
         far = far_outside(batch.xy, batch.visible, batch.image_size, down)
         batch = dataclasses.replace(batch, visible=batch.visible & ~far)
     on_cpu = not on_accelerator()
-    portions = list(batch.portions(on_cpu))
     key = ProgramKey(camera_model, batch.free, batch.known, on_cpu)
 
     def run(portion: Portion) -> Rows:
@@ -146,10 +145,16 @@ def calibrate_batch(  # noqa: PLR0913 keyword arguments of a public function
             rows if snooping is None else _snoop(key, solve, portion, rows, snooping, significance)
         )
 
-    parts, done = [], 0
+    portions, parts, done = [], [], 0
     # threads, not processes: compiled code leaves Python alone, and the programs are shared
     with ThreadPoolExecutor(threads if on_cpu else 1) as pool:
-        for portion, solved in zip(portions, pool.map(run, portions)):
+        # the first are solved while the next are padded
+        solving = [
+            (portions.append(portion), pool.submit(run, portion))[1]
+            for portion in batch.portions(on_cpu)
+        ]
+        for portion, future in zip(portions, solving):
+            solved = future.result()
             parts.append(_without_padding(portion, batch.xy.shape[1:3], solved))
             done += len(portion.cameras)
             if progress is not None:
@@ -188,7 +193,7 @@ def _result(model: CameraModel, batch: Batch, rows: Rows) -> BatchCalibration:
     weak = np.full(len(batch), "", dtype=object)
     for i in np.flatnonzero(np.isin(ended, (LIMIT, SINGULAR))):
         points = batch.point if batch.point.ndim == 2 else batch.point[i]
-        weak[i] = weak_geometry(points, batch.xy[i], batch.visible[i])
+        weak[i] = weak_geometry(points, batch.xy[i].astype(float), batch.visible[i])
     # the last RMS of those at the limit: the residuals may fit perfectly where nothing is
     # determined
     rms = np.where(ended == LIMIT, rows["rms"], np.nan)
@@ -242,7 +247,7 @@ def _snoop(
     for _ in range(MAX_ROUNDS):
         used = np.stack([camera.used for camera in cameras]).astype(float)
         at = CameraUnknowns(rows["interior"], rows["quaternion"], rows["shift"])
-        tests = np.asarray(_tests_program(key, portion.seen, used, at, rows["views"]))
+        tests = np.asarray(_tests_program(key, _in_double(portion.seen), used, at, rows["views"]))
         tested = np.isin(rows["status"], TESTED) & np.isfinite(rows["sigma0"])
         failed += rows["status"] != CONVERGED
         # A camera without a solution goes on for 60 rounds, in each of which it loses at most a
@@ -296,9 +301,14 @@ def _tests_program(
 
 def _solve_portion(key: ProgramKey, max_steps: int, size: float, portion: Portion) -> Rows:
     """The rows of a `BatchCalibration`, with the status as its number."""
-    data = portion.seen, portion.interior, portion.axes, portion.middle
+    data = _in_double(portion.seen), portion.interior, portion.axes, portion.middle
     result = _portion_program(key, portion.flat, max_steps, size, *data)
     return jax.tree.map(np.array, result)
+
+
+def _in_double(seen: Sightings) -> Sightings:
+    """On the device, in double precision: one program for measurements in either."""
+    return jax.tree.map(lambda x: jnp.asarray(x).astype(float), seen)
 
 
 @partial(compile_once, static=(0, 1))

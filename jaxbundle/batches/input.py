@@ -162,22 +162,23 @@ class Batch:
             "visible", visible, "true or false [cameras, views, points]", truths=True
         )
         check_shapes(X, xy, size, visible)
-        X, xy = X.astype(float), xy.astype(float)
+        # single precision stays until a portion is on the device: half of the memory
+        xy = xy if xy.dtype in (np.float32, np.float64) else xy.astype(float)
         cameras = len(xy)
         free = free_parameters(model, free)
         interior, known = _interior(model, free, start, size, cameras)
         # NaN is a missing point; infinite numbers are a fault of the camera, and end in its status
         there = ~np.any(np.isnan(X), axis=-1)
-        visible = visible.astype(bool) & ~np.isnan(xy).any(-1) & there[..., None, :]
+        # x and y apart: numpy's `any` over an axis of two takes ten times as long
+        missing = np.isnan(xy[..., 0]) | np.isnan(xy[..., 1])
+        visible = visible.astype(bool) & ~missing & there[..., None, :]
         seen = np.any(visible, axis=1)
-        X = np.where(seen[..., None], X, 0.0)
-        xy = np.where(visible[..., None], xy, 0.0)
-        # finite, and so are sums of their squares
-        usable = lambda numbers: np.all(
-            np.abs(numbers) < LARGEST_NUMBER, axis=tuple(range(1, numbers.ndim))
-        )
-        finite = usable(X) & usable(xy) & usable(interior)
-        X[~finite], xy[~finite] = 0.0, 0.0
+        X = np.where(seen[..., None], X.astype(float), 0.0)
+        if not visible.all():
+            xy = np.where(visible[..., None], xy, 0.0)
+        finite = _usable(X) & _usable(xy) & _usable(interior)
+        if not finite.all():
+            X[~finite], xy = 0.0, np.where(finite[:, None, None, None], xy, 0.0)
         return cls(
             finite,
             *_principal_axes(X, seen),
@@ -233,15 +234,23 @@ class Batch:
         shape: tuple[int, int],
     ) -> Portion:
         def wide(rows: np.ndarray, *axes: int) -> np.ndarray:
+            if rows.shape[: len(axes)] == axes:
+                return rows
             missing = [n - old for n, old in zip(axes, rows.shape)]
             return np.pad(rows, [(0, n) for n in missing] + [(0, 0)] * (rows.ndim - len(axes)))
 
-        of_views = lambda rows: rows[cameras[:, None], views]
+        # Neighbours are not copied: of 10 000 cameras the new memory costs more than the numbers.
+        neighbours = cameras[-1] - cameras[0] == len(cameras) - 1
+        of = slice(cameras[0], cameras[-1] + 1) if neighbours else cameras
+        in_order = np.array_equal(views, np.broadcast_to(np.arange(views.shape[1]), views.shape))
+        of_views = lambda rows: (
+            rows[of, : views.shape[1]] if in_order else rows[cameras[:, None], views]
+        )
         visible = of_views(self.visible) & self.finite[cameras, None, None]
         seen = Sightings(
             point=wide(self.point[cameras], size, shape[1]),
             xy=wide(of_views(self.xy), size, *shape),
-            weight=wide(visible.astype(float), size, *shape),
+            weight=wide(visible.astype(np.float32), size, *shape),
         )
         # cameras that fill up the portion have the start values of the last one, and no points
         interior = np.pad(self.interior[cameras], [(0, size - len(cameras)), (0, 0)], mode="edge")
@@ -254,6 +263,13 @@ class Batch:
             wide(self.axes[cameras], size),
             wide(self.middle[cameras], size),
         )
+
+
+def _usable(numbers: Float[np.ndarray, "cameras *axes"]) -> Bool[np.ndarray, " cameras"]:
+    """Whether all numbers of a camera are finite, and so are sums of their squares."""
+    of_camera = tuple(range(1, numbers.ndim))
+    low, high = numbers.min(of_camera).astype(float), numbers.max(of_camera).astype(float)
+    return (low > -LARGEST_NUMBER) & (high < LARGEST_NUMBER)
 
 
 def any_model(name: str | CameraModel) -> CameraModel:
@@ -357,6 +373,9 @@ def _principal_axes(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Points [cameras, points, 3] about the mean of those seen, along their principal axes; the
     mean; the axes as rows [cameras, 3, 3]; is the object flat?"""
+    if len(X) > 1 and (seen == seen[0]).all() and (X == X[0]).all():
+        one = _principal_axes(X[:1], seen[:1])
+        return tuple(np.broadcast_to(x, (len(X), *x.shape[1:])) for x in one)
     number = np.maximum(seen.sum(1), 1)[:, None]
     middle = X.sum(1) / number
     centred = np.where(seen[..., None], X - middle[:, None], 0.0)

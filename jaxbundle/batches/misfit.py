@@ -134,8 +134,11 @@ def _beyond(
     xy: Float[np.ndarray, "*points 2"], size: Float[np.ndarray, "2"], down: bool, margin: float
 ) -> Bool[np.ndarray, "*points"]:
     """Which points are outside the image by more than `margin` times its size."""
-    low = _corner(size, down)
-    return np.any((xy < low - margin * size) | (xy > low + (1 + margin) * size), axis=-1)
+    low = _corner(size, down) - margin * size
+    high = low + (1 + 2 * margin) * size
+    # x and y apart: numpy's `any` over an axis of two takes ten times as long
+    x, y = xy[..., 0], xy[..., 1]
+    return (x < low[0]) | (x > high[0]) | (y < low[1]) | (y > high[1])
 
 
 def axes_remark(xy: Float[np.ndarray, "points 2"], size: Float[np.ndarray, "2"], down: bool) -> str:

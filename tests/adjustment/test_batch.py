@@ -338,6 +338,14 @@ def test_progress_is_told_and_portions_keep_the_order(three, solved):
         same(found, solved, camera, camera % 3)
 
 
+def test_single_precision_is_read_exactly(three):
+    """Every float32 number is a float64 number."""
+    single = three[0].astype(np.float32)
+    found = jaxbundle.calibrate_batch(BOARD, single, SIZE)
+    double = jaxbundle.calibrate_batch(BOARD, single.astype(float), SIZE)
+    np.testing.assert_array_equal(found.values, double.values)
+
+
 @pytest.mark.further
 def test_the_way_of_accelerators_gives_the_same(three, solved, monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")

@@ -25,7 +25,7 @@ from jaxbundle.leastsquares.datum.conditions import (
 from jaxbundle.leastsquares.declarations import Kind, Motions, Table
 from jaxbundle.leastsquares.equations.hessian import exact_equations
 from jaxbundle.leastsquares.equations.normal import Normal, zero_tangent
-from jaxbundle.leastsquares.indexing.rows import lay_out_data
+from jaxbundle.leastsquares.indexing.rows import _look_up_in_copies, lay_out_data, look_up
 from jaxbundle.leastsquares.iterations.retraction import retract
 from jaxbundle.leastsquares.iterations.solver import minimise
 from jaxbundle.leastsquares.problem import (
@@ -444,3 +444,15 @@ def test_data_of_another_shape_are_refused():
     short = dataclasses.replace(problem.data, measured=cut)
     with pytest.raises(InputError, match="shapes of problem.data"):
         solve(problem, short)
+
+
+@pytest.mark.parametrize("rows", [3, 40], ids=["copied", "more copies than observations"])
+def test_look_ups_of_accelerators_are_look_ups(rows):
+    """In value and in reverse mode, which sums over all observations of a row."""
+    random = np.random.default_rng(3)
+    at = jnp.array(random.integers(rows, size=(30, 8)), jnp.int32)
+    column, weight = jnp.array(random.normal(size=rows)), jnp.array(random.normal(size=at.shape))
+    value, transposed = jax.vjp(lambda x: _look_up_in_copies((x,), at)[0], column)
+    np.testing.assert_array_equal(value, look_up(column, at))
+    sums = np.array([weight[at == row].sum() for row in range(rows)])
+    np.testing.assert_allclose(transposed(weight)[0], sums, rtol=1e-14, atol=1e-14)
