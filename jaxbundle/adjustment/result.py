@@ -32,7 +32,7 @@ from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.adjustment.quality.misfit import doubt_of_fit, doubt_of_unit
 from jaxbundle.adjustment.quality.points_at_any_distance import FarPoints, find_far_points
 from jaxbundle.adjustment.quality.replication import (
-    Difference,
+    HalvesDifference,
     Replication,
     compare_halves,
     random_halves,
@@ -507,7 +507,7 @@ class Adjustment:
                 return Replication(self.halves_by, (split,), (), self.error_model)
         return Replication(self.halves_by, (), tuple(failed[:1]), self.error_model)
 
-    def compare_halves(self, second: Bool[np.ndarray, " rays"]) -> Difference:
+    def compare_halves(self, second: Bool[np.ndarray, " rays"]) -> HalvesDifference:
         """The interior orientations of two halves of the network, each adjusted alone; `second`:
         the image points of the second one.
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.adjustment.quality.correlated_errors import CorrelationSettings
-from jaxbundle.adjustment.quality.replication import Difference, Replication
+from jaxbundle.adjustment.quality.replication import HalvesDifference, Replication
 from jaxbundle.cameras import CameraModel, get_model, is_own
 from jaxbundle.io.results.stored_tree import fingerprint, write_tree
 from jaxbundle.leastsquares.quality.error_components import ErrorSettings
@@ -111,7 +111,7 @@ CLASSES = (
     ErrorSettings,
     StoredErrorModel,
     Replication,
-    Difference,
+    HalvesDifference,
 )
 
 

@@ -26,7 +26,7 @@ from jaxbundle.batches.calibrate_rigs import check_rigs, rigs_of_arrays
 from jaxbundle.batches.input import check_shapes, single_list
 from jaxbundle.batches.rigs import RigViews
 from jaxbundle.errors import InputError
-from jaxbundle.io.text.archives import Member, open_archive, read_member
+from jaxbundle.io.text.archives import ArchiveMember, open_archive, read_member
 from jaxbundle.io.text.stored_rows import StoredRows, find_stored_rows
 from jaxbundle.io.writing.fingerprints import of_arrays
 
@@ -147,7 +147,7 @@ def _names(path: str | Path, arrays: Mapping[str, np.ndarray], name: str) -> tup
     return tuple(map(str, texts.tolist()))
 
 
-def _rows(path: str | Path, archive: zipfile.ZipFile, name: str, member: Member) -> Any:
+def _rows(path: str | Path, archive: zipfile.ZipFile, name: str, member: ArchiveMember) -> Any:
     """An array, or on demand the rows of a large one with one row per camera."""
     by_camera = len(member.shape) in BY_CAMERA.get(name, ())
     # a stack may exceed the memory: rows are read from the file when needed

@@ -87,7 +87,7 @@ class Candidate:
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
-class Difference:
+class ModelDifference:
     """The image difference of a model from the best: the map, its lengths in pixels, and the RMS of
     the lengths over the σ of the difference."""
 
@@ -131,7 +131,7 @@ class ModelComparison(TableMethods):
         return float(d.mean()), float(d.std(ddof=1) / np.sqrt(len(d)))
 
     @cached_property
-    def differences(self) -> dict[str, Difference | None]:
+    def differences(self) -> dict[str, ModelDifference | None]:
         others = (one for one in self.candidates if one is not self.best)
         return {one.model: _difference(self.best, one) for one in others}
 
@@ -333,7 +333,7 @@ def _squares(adjustment: Adjustment, camera: Camera) -> Float[np.ndarray, " rays
     return np.square(residuals_in_pixels(adjustment, camera)[0]).sum(1)
 
 
-def _difference(best: Candidate, one: Candidate) -> Difference | None:
+def _difference(best: Candidate, one: Candidate) -> ModelDifference | None:
     camera = best.calibration.camera
     sizes = {"image_size": camera.image_size, "pixel_size": camera.pixel_size}
     mappings = best.model_and_parameters, one.model_and_parameters
@@ -348,7 +348,7 @@ def _difference(best: Candidate, one: Candidate) -> Difference | None:
     # lengths over the σ of a length: √ of the trace
     sigma = np.sqrt(np.trace(C, axis1=2, axis2=3))
     ratio = comparison.length / sigma
-    return Difference(
+    return ModelDifference(
         comparison,
         C,
         comparison.rms / size,

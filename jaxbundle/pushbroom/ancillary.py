@@ -136,7 +136,7 @@ def normalise_quaternions(
     return values / length[:, None], () if rounded.all() else (message,)
 
 
-class Contradiction(NamedTuple):
+class VelocityContradiction(NamedTuple):
     """Velocities that are not the rates of the positions: the row and what it shows, in words;
     `shift`: metres by which Hermite's interpolation is off between two rows, at most."""
 
@@ -150,7 +150,7 @@ def contradiction(
     velocities: Float[np.ndarray, "rows k"],
     source: Source = POSITIONS,
     tolerance: float = 0.02,
-) -> Contradiction | None:
+) -> VelocityContradiction | None:
     """What shows that velocities are not the rates of the positions; None if nothing does.
 
     The mean velocity between two rows is compared with the mean of theirs, which differ by h²/12
@@ -174,7 +174,7 @@ def contradiction(
     if not (bad := off > allowed).any():
         return None
     k = int(bad.argmax())
-    return Contradiction(
+    return VelocityContradiction(
         f"{source(k + 1)}: positions move by {speed[k]:.6g} m/s from the row before, velocities "
         f"say {np.linalg.norm(trapezoid[k]):.6g} m/s, {off[k]:.6g} m/s from that; expected metres "
         "a second in the frame of the positions",

@@ -14,7 +14,7 @@ from jaxbundle.report.layout import clean, heading, paragraph, significant, tabl
 from jaxbundle.types import present
 
 if TYPE_CHECKING:
-    from jaxbundle.adjustment.quality.replication import Difference
+    from jaxbundle.adjustment.quality.replication import HalvesDifference
     from jaxbundle.adjustment.result import Adjustment
 
 TITLE = "Correlated errors"
@@ -124,7 +124,7 @@ def _row(name: str, classical: float, correlated: float) -> tuple[str, str, str,
     return name, significant(classical, 3), significant(correlated, 3), significant(ratio, 3)
 
 
-def difference_rows(split: "Difference") -> list[tuple[str, ...]]:
+def difference_rows(split: "HalvesDifference") -> list[tuple[str, ...]]:
     """A split as text, a row a parameter (`DIFFERENCE_HEADER`)."""
     return [
         (

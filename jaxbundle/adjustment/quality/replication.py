@@ -53,7 +53,7 @@ equations, 1e-16."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Difference:
+class HalvesDifference:
     """Differences of the interior orientation of two halves, with their covariances: classical, of
     independent errors with the σ0 of the whole network, and of its error model (None without)."""
 
@@ -95,7 +95,7 @@ class Replication(TableMethods):
     reason."""
 
     by: str
-    splits: tuple[Difference, ...]
+    splits: tuple[HalvesDifference, ...]
     failed: tuple[str, ...]
     model: ErrorModel | None
 
@@ -225,7 +225,7 @@ def compare_halves(
     problem: NetworkProblem,
     second: Bool[np.ndarray, " rays"],
     model: ErrorModel | None,
-) -> Difference:
+) -> HalvesDifference:
     """The interior orientations of two halves of a solved network, each adjusted alone.
 
     **Arguments:** `second`: the image points of the second half; `model`: of the errors of the
@@ -254,7 +254,7 @@ def compare_halves(
     correlated = None if model is None else model.of_effects(between)
     found = tuple((camera, name) for camera, name, _ in names)
     difference = -between @ stack_rows(whole, whole.residuals)
-    return Difference(found, difference, whole.sigma0**2 * white, correlated)
+    return HalvesDifference(found, difference, whole.sigma0**2 * white, correlated)
 
 
 def compared_parameters(

@@ -46,7 +46,7 @@ Pose = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]
 POSE = ("QW", "QX", "QY", "QZ", "TX", "TY", "TZ")
 
 
-class Frame(NamedTuple):
+class ColmapFrame(NamedTuple):
     """A moment of a rig, and the numbers of its images; `place` for messages."""
 
     id: int
@@ -55,7 +55,7 @@ class Frame(NamedTuple):
     place: str
 
 
-def read_frames(folder: Path, suffix: str) -> list[Frame]:
+def read_frames(folder: Path, suffix: str) -> list[ColmapFrame]:
     """The frames of a model.
 
     **Raises:** `InputError` naming file and line, or entry; for a frame of an unknown rig."""
@@ -69,7 +69,7 @@ def read_frames(folder: Path, suffix: str) -> list[Frame]:
 
 
 def rigs_of_frames(
-    path: Path, frames: Sequence[Frame], names: Mapping[int, str]
+    path: Path, frames: Sequence[ColmapFrame], names: Mapping[int, str]
 ) -> tuple[Rigs, ...]:
     """The table of the frames with several images; nothing if no frame has several.
 
@@ -136,7 +136,7 @@ def _text_rigs(path: Path) -> set[int]:
     return rigs
 
 
-def _text_frames(path: Path) -> list[Frame]:
+def _text_frames(path: Path) -> list[ColmapFrame]:
     frames = []
     for row in TextRows(path, "#"):
         words = _Words(row)
@@ -150,7 +150,7 @@ def _text_frames(path: Path) -> list[Frame]:
             if kind in CAMERA_TYPES:
                 images.append(data)
         words.end()
-        frames.append(Frame(id, rig, tuple(images), f"{path}, line {row.number}"))
+        frames.append(ColmapFrame(id, rig, tuple(images), f"{path}, line {row.number}"))
     return frames
 
 
@@ -175,7 +175,7 @@ def _binary_rigs(path: Path) -> set[int]:
     return rigs
 
 
-def _binary_frames(path: Path) -> list[Frame]:
+def _binary_frames(path: Path) -> list[ColmapFrame]:
     frames = []
     for file, k in _entries(path, "frames", 68):
         id, rig = file.take("II")
@@ -183,7 +183,7 @@ def _binary_frames(path: Path) -> list[Frame]:
         (count,) = file.take("I")
         data = (file.take("iIQ") for _ in range(count))
         images = tuple(image for kind, _, image in data if kind in CAMERA_TYPES)
-        frames.append(Frame(id, rig, images, f"{path}, frame {k + 1}"))
+        frames.append(ColmapFrame(id, rig, images, f"{path}, frame {k + 1}"))
     return frames
 
 

@@ -75,7 +75,7 @@ RECTIFIED = Keys((), {
 })  # fmt: skip
 
 
-class Pose(NamedTuple):
+class CameraFromRig(NamedTuple):
     """x = R·X + t."""
 
     R: Float[np.ndarray, "3 3"]
@@ -162,7 +162,7 @@ def read_opencv_rig(path: str | Path, overrides: Sequence[str] = ()) -> Network:
 
 def _read_pair(
     path: Path, document: Mapping[str, Any], pair: tuple[str, str], unknown: UnknownKeys
-) -> tuple[list[Camera], list[Pose]]:
+) -> tuple[list[Camera], list[CameraFromRig]]:
     """Two cameras whose entries are told apart by their names."""
     own: list[dict[str, Any]] = [{}, {}]
     rest: dict[str, Any] = {}
@@ -186,12 +186,12 @@ def _read_pair(
             found[str(_of_side(name, value, side))] = (name, value)
         id = found.pop("camera_name", ("", side if len(side) > 1 else ("left", "right")[k]))[1]
         cameras.append(camera_of(path, found, str(id)))
-    return cameras, [Pose(np.eye(3), np.zeros(3)), pose or Pose(*UNKNOWN)]
+    return cameras, [CameraFromRig(np.eye(3), np.zeros(3)), pose or CameraFromRig(*UNKNOWN)]
 
 
 def _read_nested(
     path: Path, document: Any, unknown: UnknownKeys
-) -> tuple[list[Camera], list[Pose]]:
+) -> tuple[list[Camera], list[CameraFromRig]]:
     """Cameras that are objects of their own."""
     inside = list(cameras_within(document))
     if len(inside) < 2:
@@ -212,13 +212,13 @@ def _read_nested(
         left = {key: value for key, value in document.items() if key not in names}
         shared = _take_pose(path, left) if len(inside) == 2 and not any(poses) else None
         if shared is not None:
-            poses = [Pose(np.eye(3), np.zeros(3)), shared]
+            poses = [CameraFromRig(np.eye(3), np.zeros(3)), shared]
         around = {fold(key): key for key, value in left.items() if not _holds(value, inside)}
         unknown.check((around[key] for key in RECTIFIED.unknown(around)), Keys(POSES), path)
     # with the first as reference, which many files leave out
     if any(poses[1:]) and poses[0] is None:
-        poses[0] = Pose(np.eye(3), np.zeros(3))
-    return cameras, [pose or Pose(*UNKNOWN) for pose in poses]
+        poses[0] = CameraFromRig(np.eye(3), np.zeros(3))
+    return cameras, [pose or CameraFromRig(*UNKNOWN) for pose in poses]
 
 
 def _holds(value: Any, inside: Sequence[tuple[str, Any]]) -> bool:
@@ -231,7 +231,7 @@ def _holds(value: Any, inside: Sequence[tuple[str, Any]]) -> bool:
     )
 
 
-def _take_pose(where: object, entries: dict[str, Any]) -> Pose | None:
+def _take_pose(where: object, entries: dict[str, Any]) -> CameraFromRig | None:
     """The pose among entries, which are removed; None without one.
 
     **Raises:** `InputError` for half a pose, and what is no rotation."""
@@ -268,4 +268,4 @@ def _take_pose(where: object, entries: dict[str, Any]) -> Pose | None:
     else:
         return None
     check_rotations(R, f"{where}: {name}")
-    return Pose(R, t)
+    return CameraFromRig(R, t)

@@ -24,7 +24,7 @@ METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """What `numpy.savez` and `numpy.savez_compressed` write."""
 
 
-class Member(NamedTuple):
+class ArchiveMember(NamedTuple):
     """An array of an archive by its header; `begin`: its first byte in the unpacked member."""
 
     info: zipfile.ZipInfo
@@ -47,7 +47,7 @@ def largest_unpacked_size(size: int, ratio: int = 200, harmless: int = 2**20) ->
 @contextmanager
 def open_archive(
     path: str | Path, expected: str, names: Sequence[str] | None = None
-) -> Iterator[tuple[zipfile.ZipFile, dict[str, Member]]]:
+) -> Iterator[tuple[zipfile.ZipFile, dict[str, ArchiveMember]]]:
     """An archive and its arrays by name, those of `names` if given.
 
     **Raises:** `InputError`: it cannot be read, an array has another length than its header
@@ -95,7 +95,7 @@ def read_arrays(
 
 
 def read_member(
-    path: str | Path, expected: str, archive: zipfile.ZipFile, name: str, member: Member
+    path: str | Path, expected: str, archive: zipfile.ZipFile, name: str, member: ArchiveMember
 ) -> np.ndarray:
     """An array of an archive, whose checksum is tested.
 
@@ -116,7 +116,7 @@ def read_member(
 
 def _member(
     path: Path, expected: str, archive: zipfile.ZipFile, name: str, info: zipfile.ZipInfo
-) -> Member:
+) -> ArchiveMember:
     where = f"{path}, array {name!r}"
     with foreign_parser(where, expected), archive.open(info) as stream:
         version = np.lib.format.read_magic(stream)
@@ -133,4 +133,4 @@ def _member(
             f"{where}: damaged: its header states {shape} of {dtype}, its size is "
             f"{info.file_size - begin} bytes"
         )
-    return Member(info, tuple(map(int, shape)), dtype, bool(by_columns), begin)
+    return ArchiveMember(info, tuple(map(int, shape)), dtype, bool(by_columns), begin)

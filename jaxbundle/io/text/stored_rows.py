@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Int
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.text.archives import Member
+from jaxbundle.io.text.archives import ArchiveMember
 from jaxbundle.system.foreign_parsers import foreign_parser
 
 LOCAL_HEADER = struct.Struct("<4s22xHH")
@@ -69,7 +69,7 @@ def find_stored_rows(
     expected: str,
     archive: zipfile.ZipFile,
     name: str,
-    member: Member,
+    member: ArchiveMember,
     smallest: int = 2**20,
 ) -> StoredRows | None:
     """The rows of an array of an open archive, if they can be read singly and the array is large

@@ -66,7 +66,7 @@ MOUNTED = Kind(
 )
 
 
-class Mounting(NamedTuple):
+class MountedPose(NamedTuple):
     """A camera in the frame of the reference camera: place of its centre, and rotation from there
     to its own frame."""
 
@@ -83,7 +83,7 @@ class MountedCameras(NamedTuple):
     """
 
     reference: int
-    mountings: dict[int, Mounting | None]
+    mountings: dict[int, MountedPose | None]
     epochs: dict[str, dict[int, int]]
 
 
@@ -147,7 +147,7 @@ class Rigs(Further):
             at = {c: first + k for k, c in enumerate(mountings)}
             for c, mounting in mountings.items():
                 # a camera that nothing connects with the reference starts in its place
-                t, R = mounting or Mounting(np.zeros(3), np.eye(3))
+                t, R = mounting or MountedPose(np.zeros(3), np.eye(3))
                 labels.append(f"{network.cameras[c].id} of {rig}")
                 places.append(t)
                 turns.append(np.asarray(quaternion_from_matrix(R)))
@@ -217,11 +217,11 @@ def _mountings(
     reference: int,
     position: Float[np.ndarray, "images 3"],
     M: Float[np.ndarray, "images 3 3"],
-) -> dict[int, Mounting | None]:
+) -> dict[int, MountedPose | None]:
     """The mountings of the cameras; one that has no epoch with the reference by way of another."""
     cameras = sorted({c for epoch in epochs for c in epoch}, key=lambda c: c != reference)
-    found: dict[int, Mounting | None] = dict.fromkeys(cameras)
-    found[reference] = Mounting(np.zeros(3), np.eye(3))
+    found: dict[int, MountedPose | None] = dict.fromkeys(cameras)
+    found[reference] = MountedPose(np.zeros(3), np.eye(3))
     to_visit = [reference]
     for known in to_visit:
         base = found[known]
@@ -230,7 +230,7 @@ def _mountings(
             if found[c] is None and (step := _between(epochs, known, c, position, M)):
                 # x_c = R·(M_known·(X − X_known) − t), and M_known = R_known·M_reference
                 place = base.position + base.rotation.T @ step.position
-                found[c] = Mounting(place, step.rotation @ base.rotation)
+                found[c] = MountedPose(place, step.rotation @ base.rotation)
                 to_visit.append(c)
     return found
 
@@ -241,11 +241,11 @@ def _between(
     other: int,
     position: Float[np.ndarray, "images 3"],
     M: Float[np.ndarray, "images 3 3"],
-) -> Mounting | None:
+) -> MountedPose | None:
     """A camera in the frame of another, at the epoch with the median position; None without an
     epoch of both."""
     found = [
-        Mounting(M[e[one]] @ (position[e[other]] - position[e[one]]), M[e[other]] @ M[e[one]].T)
+        MountedPose(M[e[one]] @ (position[e[other]] - position[e[one]]), M[e[other]] @ M[e[one]].T)
         for e in epochs
         if one in e and other in e
     ]
