@@ -135,6 +135,16 @@ def test_every_room_has_its_place():
     assert {layer_of(path) for path in FILES} == set(LAYERS)
 
 
+def test_a_class_name_stands_once():
+    """A reader who meets it knows what it is."""
+    places = {}
+    for path in FILES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ClassDef):
+                places.setdefault(node.name, []).append(path.relative_to(PACKAGE))
+    assert {name: where for name, where in places.items() if len(where) > 1} == {}
+
+
 def test_nothing_imports_in_a_circle(imported):
     """Neither at the top nor inside a function."""
     names = {path: ".".join(("jaxbundle", *path.relative_to(PACKAGE).with_suffix("").parts))

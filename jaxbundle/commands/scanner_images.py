@@ -9,7 +9,13 @@ import numpy as np
 
 from jaxbundle.arguments import one_of
 from jaxbundle.choices import RESAMPLINGS, Resampling
-from jaxbundle.commands.scanner_inputs import Message, ignore, open_scanner, surface_of
+from jaxbundle.commands.scanner_inputs import (
+    Message,
+    ignore,
+    open_image,
+    open_scanner,
+    surface_of,
+)
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.io.rasters.correction import map_of, write_corrected
@@ -18,6 +24,7 @@ from jaxbundle.io.rasters.maps import MapSystem, describe_distance
 from jaxbundle.io.rasters.scenes import read_scene, write_taken
 from jaxbundle.io.scanner.flight import read_flight
 from jaxbundle.io.scanner.refinement import RefineFile, read_refinement
+from jaxbundle.io.scanner.rpc_images import IMAGES, RpcInput
 from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.scanner.writing import names_of, write_scanner_image
 from jaxbundle.io.writing.fingerprints import files_read
@@ -25,6 +32,7 @@ from jaxbundle.io.writing.folders import check_folder, replace_folder
 from jaxbundle.pushbroom.flight import measured_image, true_image
 from jaxbundle.pushbroom.ground_to_image import make_search
 from jaxbundle.pushbroom.image import PushbroomImage
+from jaxbundle.pushbroom.rpc_image import RpcImage
 from jaxbundle.refinement import Refinement
 from jaxbundle.refinement import refine as refine_images
 from jaxbundle.types import Progress
@@ -55,7 +63,7 @@ class CorrectedImage:
 
 def correct(  # noqa: PLR0913 (public: the options of the command, all but three by name)
     scanner: str | Path,
-    image: str | Path,
+    image: str | Path | None,
     out: str | Path,
     *,
     crs: str | None = None,
@@ -74,8 +82,8 @@ def correct(  # noqa: PLR0913 (public: the options of the command, all but three
 
     **Arguments:**
 
-    - `scanner`: scanner file; `image`: a raster of all its lines and pixels; `out`: GeoTIFF to
-      write.
+    - `scanner`: scanner file, product file, or coefficients (RPC); `image`: a raster of all its
+      lines and pixels; or `scanner`: a raster with RPC, `image`: None; `out`: GeoTIFF to write.
     - `crs`: EPSG:… of the map, default longitude and latitude; `spacing`: pixel size in its unit,
       default that of the image.
     - `height`, `dem`, `geoid`: as of `locate`; `occlusion`: no data where terrain hides the ground.
@@ -91,7 +99,7 @@ def correct(  # noqa: PLR0913 (public: the options of the command, all but three
         raise InputError(f"--spacing {spacing:g}: a positive number is expected")
     if (truth is None) != (error_map is None):
         raise InputError("--truth and --error-map: give both, or none")
-    picture, target = Path(image), Path(out)
+    picture, target = _raster_of(scanner, image), Path(out)
     errors = None if error_map is None else Path(error_map)
     _check_target("--out", target, picture)
     if errors is not None:
@@ -101,14 +109,15 @@ def correct(  # noqa: PLR0913 (public: the options of the command, all but three
     # an ellipsoid hides nothing of itself where an image looks down
     if occlusion and dem is None:
         raise InputError("--occlusion: needs terrain; give --dem")
-    file = open_scanner(scanner, tell)
+    file = open_image(scanner, tell, picture)
     surface = surface_of(file.earth, height, dem, file.image, geoid)
     system = MapSystem(file.earth, crs)
     grid = map_of(file.image, surface, system, spacing, None if dem is None else Path(dem))
     if crs is not None and (place := system.degrees_of(grid)):
         if said := describe_distance(crs, *place):
             tell(said)
-    search = make_search(file.image, file.earth)
+    taken = file.image
+    search = None if isinstance(taken, RpcImage) else make_search(taken, file.earth)
     true = None if truth is None else _open_truth(Path(truth), file, tell)
     write_corrected(
         picture,
@@ -138,6 +147,15 @@ def correct(  # noqa: PLR0913 (public: the options of the command, all but three
     return CorrectedImage(target, grid.rows, grid.columns, grid.size, errors, rms)
 
 
+def _raster_of(scanner: str | Path, image: str | Path | None) -> Path:
+    """The raster; without one it is the scanner file itself, if that is a raster with RPC."""
+    if image is not None:
+        return Path(image)
+    if Path(scanner).suffix.lower() not in IMAGES:
+        raise InputError(f"{scanner}: give the image as well: a raster of all lines and pixels")
+    return Path(scanner)
+
+
 def _check_target(option: str, path: Path, image: Path) -> None:
     """Refuse output that cannot be written, before computing."""
     if not path.absolute().parent.is_dir():
@@ -150,7 +168,7 @@ def _check_target(option: str, path: Path, image: Path) -> None:
         raise InputError(f"{option} {path} is the image itself; give another name")
 
 
-def _open_truth(path: Path, file: ScannerInput, tell: Message) -> PushbroomImage:
+def _open_truth(path: Path, file: ScannerInput | RpcInput, tell: Message) -> PushbroomImage:
     """The true image, which must match the scanner file."""
     truth = open_scanner(path, tell)
     if truth.earth != file.earth:

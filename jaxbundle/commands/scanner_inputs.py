@@ -10,13 +10,15 @@ from jaxbundle.geometry.ellipsoid import Ellipsoid, earth_fixed
 from jaxbundle.io.rasters.extent import image_extent, rpc_extent
 from jaxbundle.io.rasters.geoid import add_geoid
 from jaxbundle.io.rasters.reading import read_terrain
-from jaxbundle.io.scanner.read import read_scanner
+from jaxbundle.io.scanner.read import EXPECTED_PRODUCTS, read_scanner
+from jaxbundle.io.scanner.rpc_images import RpcInput, has_rpc_only, read_rpc_image
 from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.text.csv_tables import read_csv
 from jaxbundle.network.columns import Columns, did_you_mean
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.rpc import Rpc
+from jaxbundle.pushbroom.rpc_image import RpcImage
 from jaxbundle.pushbroom.surfaces import Ground, GroundSurface, Height, Plane
 
 Message = Callable[[str], object]
@@ -36,7 +38,7 @@ def surface_of(
     earth: Ellipsoid | None,
     height: float | None,
     dem: str | Path | None,
-    image: PushbroomImage | Rpc | None = None,
+    image: PushbroomImage | RpcImage | Rpc | None = None,
     geoid: str | Path | None = None,
 ) -> GroundSurface:
     """The surface selected by the options; default: the ellipsoid (or Z = 0).
@@ -52,8 +54,8 @@ def surface_of(
             raise InputError("--height and --dem: give one of them")
         check_spheroid(earth)
         extent = None
-        if isinstance(image, Rpc):
-            extent = rpc_extent(image)
+        if isinstance(image, Rpc | RpcImage):
+            extent = rpc_extent(image if isinstance(image, Rpc) else image.rpc)
         elif image is not None and earth is not None:
             extent = image_extent(image, earth)
         terrain = read_terrain(dem, earth, extent, above_geoid=geoid is not None)
@@ -70,10 +72,31 @@ def open_scanner(path: str | Path, tell: Message = ignore) -> ScannerInput:
     """A scanner file; `tell` receives its warnings.
 
     **Raises:** `InputError`."""
-    file = read_scanner(Path(path))
+    path = Path(path)
+    if path.exists() and has_rpc_only(path):
+        raise InputError(
+            f"{path}: has rational polynomials (RPC) only, which info, locate, project, correct, "
+            f"surface and rpc take; here a rigorous model is needed: a scanner file, or "
+            f"{EXPECTED_PRODUCTS}"
+        )
+    file = read_scanner(path)
     for warning in file.warnings:
         tell(warning)
     return file
+
+
+def open_image(
+    path: str | Path, tell: Message = ignore, raster: str | Path | None = None
+) -> ScannerInput | RpcInput:
+    """A scanner file, or an image with rational polynomials; `tell` receives its warnings.
+
+    **Arguments:** `raster`: of the image, where the coefficients do not have it beside them.
+
+    **Raises:** `InputError`."""
+    path = Path(path)
+    if not path.exists() or not has_rpc_only(path):
+        return open_scanner(path, tell)
+    return read_rpc_image(path, None if raster is None else Path(raster))
 
 
 def check_spheroid(earth: Ellipsoid | None) -> None:
@@ -103,7 +126,7 @@ def geographic(table: Columns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def places(
-    image: PushbroomImage, points: str | Path | None, grid: tuple[int, int]
+    image: PushbroomImage | RpcImage, points: str | Path | None, grid: tuple[int, int]
 ) -> tuple[Sequence[str], np.ndarray, np.ndarray, Source]:
     """Ids, lines, pixels and their source: a table, or a grid over the image.
 
@@ -122,13 +145,20 @@ def places(
 
 
 def off_image(
-    image: PushbroomImage, line: np.ndarray, pixel: np.ndarray, source: Source, tell: Message
+    image: PushbroomImage | RpcImage,
+    line: np.ndarray,
+    pixel: np.ndarray,
+    source: Source,
+    tell: Message,
 ) -> np.ndarray:
-    """Which positions are outside the image; reported, and refused if all are.
+    """Which positions are outside the image; reported, and refused if all are. None, where only the
+    domain of its coefficients is known.
 
     **Raises:** `InputError`.
     """
     off = np.zeros(len(line), bool)
+    if isinstance(image, RpcImage) and not image.sized:
+        return off
     said = None
     for name, values, size in (("line", line, image.lines), ("pixel", pixel, image.pixels)):
         outside = ~((values >= -0.5) & (values <= size - 0.5))

@@ -7,12 +7,14 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Bool, Float
 
 from jaxbundle.commands.scanner_inputs import (
     OFF_IMAGE,
     Message,
     ignore,
     off_image,
+    open_image,
     open_scanner,
     places,
     points_of,
@@ -21,9 +23,10 @@ from jaxbundle.commands.scanner_inputs import (
 )
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
-from jaxbundle.geometry.ellipsoid import geodetic
+from jaxbundle.geometry.ellipsoid import WGS84, geodetic
 from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.io.text.csv_tables import read_csv
+from jaxbundle.network.columns import Columns
 from jaxbundle.pushbroom.error_propagation import (
     ground_errors,
     propagate_accuracy,
@@ -31,8 +34,13 @@ from jaxbundle.pushbroom.error_propagation import (
     spread_positions,
 )
 from jaxbundle.pushbroom.ground_to_image import ProjectionStatus, make_search, project_points
+from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.image_to_ground import locate_points
 from jaxbundle.pushbroom.noise import Noise
+from jaxbundle.pushbroom.rpc import RpcStatus
+from jaxbundle.pushbroom.rpc import project_points as rpc_project_points
+from jaxbundle.pushbroom.rpc_image import RpcImage, heights_in_words, locate_rpc_points
+from jaxbundle.pushbroom.surfaces import GroundSurface
 from jaxbundle.pushbroom.terrain import Terrain
 from jaxbundle.results import TableMethods
 from jaxbundle.types import Column
@@ -85,7 +93,8 @@ def locate(
 
     **Arguments:**
 
-    - `scanner`: scanner file, or product file.
+    - `scanner`: scanner file, product file, or an image with rational polynomials: its raster or
+      the file of the coefficients.
     - `points`: table line, pixel[, id]; without it a `grid` of lines × pixels over the image.
     - `height`: of the ground, metres above the ellipsoid (Z in a local frame), or `dem`: terrain
       raster, with `geoid`: geoid heights, where its heights are orthometric.
@@ -96,18 +105,23 @@ def locate(
 
     **Raises:** `InputError`, also if no position meets the surface.
     """
-    file = open_scanner(scanner, tell)
+    file = open_image(scanner, tell)
     surface = surface_of(file.earth, height, dem, file.image, geoid)
     ids, line, pixel, source = places(file.image, points, grid)
     off = off_image(file.image, line, pixel, source, tell)
-    find = jax.jit(locate_points)
-    X = np.array(find(file.image, surface, line, pixel))
+    X, extrapolated = _locate(file.image, surface, line, pixel)
     X[:, off] = np.nan
     missed = np.isnan(X).any(0) & ~off
     over = np.zeros_like(missed)
     if isinstance(surface, Terrain):
         strict = dataclasses.replace(surface, over_voids=False)
-        over = ~(missed | off) & np.isnan(np.array(find(file.image, strict, line, pixel))).any(0)
+        over = ~(missed | off) & np.isnan(_locate(file.image, strict, line, pixel)[0]).any(0)
+    extrapolated &= ~off
+    if extrapolated.any() and isinstance(file.image, RpcImage):
+        tell(
+            f"{source(int(extrapolated.argmax()))}: {_extrapolated(file.image)} "
+            f"({extrapolated.sum()} of {len(line)} points)"
+        )
     reason = "no terrain there" if dem else "misses the surface"
     if missed.any():
         row = int(missed.argmax())
@@ -129,25 +143,45 @@ def locate(
         longitude, latitude, h = (np.asarray(v) for v in jax.jit(geodetic)(file.earth, tuple(X)))
         columns |= {"longitude": np.degrees(longitude), "latitude": np.degrees(latitude)}
         columns |= {"height": h}
-    reasons = [OFF_IMAGE, reason, GAP_REASON]
-    columns["status"] = np.select([off, missed, over], reasons, "found").tolist()
+    reasons = [OFF_IMAGE, reason, GAP_REASON, RpcStatus.OUTSIDE.meaning]
+    columns["status"] = np.select([off, missed, over, extrapolated], reasons, "found").tolist()
     return ScannerTable(columns, {"scanner": file.name})
+
+
+def _locate(
+    image: PushbroomImage | RpcImage,
+    surface: GroundSurface,
+    line: Float[np.ndarray, " n"],
+    pixel: Float[np.ndarray, " n"],
+) -> tuple[Float[np.ndarray, "3 n"], Bool[np.ndarray, " n"]]:
+    """The points, and which of them polynomials extrapolate."""
+    if isinstance(image, RpcImage):
+        X, status = jax.jit(locate_rpc_points)(image, surface, line, pixel)
+        return np.array(X), np.asarray(status) == RpcStatus.OUTSIDE
+    return np.array(jax.jit(locate_points)(image, surface, line, pixel)), np.zeros(len(line), bool)
+
+
+def _extrapolated(image: RpcImage) -> str:
+    held = heights_in_words(image.rpc)
+    return f"{RpcStatus.OUTSIDE.meaning}; they hold for heights from {held} m"
 
 
 def project(scanner: str | Path, points: str | Path, *, tell: Message = ignore) -> ScannerTable:
     """Project ground points into the image of a scanner file: a row for every line that sees one.
     Of arrays: `project_points`.
 
-    **Arguments:** `points`: table X, Y, Z[, id] (m) or longitude, latitude, height[, id]
-    (degrees); `tell`: called with every warning.
+    **Arguments:** `scanner`: as of `locate`; `points`: table X, Y, Z[, id] (m) or longitude,
+    latitude, height[, id] (degrees); `tell`: called with every warning.
 
     **Returns:** columns id, line, pixel, count (of lines that see the point), status.
 
     **Raises:** `InputError`, also if no point is in the image.
     """
-    file = open_scanner(scanner, tell)
+    file = open_image(scanner, tell)
     table = with_points(read_csv(Path(points)), tell)
     X = points_of(table, file.earth)
+    if isinstance(file.image, RpcImage):
+        return ScannerTable(_project_rpc(file.image, table, X, tell), {"scanner": file.name})
     search = make_search(file.image, file.earth)
     found = project_points(file.image, search, X, most=MAX_IMAGES)
     line, pixel = np.asarray(found.line), np.asarray(found.pixel)
@@ -178,6 +212,44 @@ def project(scanner: str | Path, points: str | Path, *, tell: Message = ignore) 
         "status": [ProjectionStatus(int(status[p])).meaning for p in point],
     }
     return ScannerTable(columns, {"scanner": file.name})
+
+
+def _project_rpc(
+    image: RpcImage, table: Columns, X: Float[np.ndarray, "3 n"], tell: Message
+) -> dict[str, Column]:
+    """The columns of `project` for rational polynomials, a row for every point.
+
+    **Raises:** `InputError`, if no point is in the image."""
+    place = jax.jit(geodetic)(WGS84, tuple(X))
+    line, pixel, status = (np.array(v) for v in rpc_project_points(image.rpc, *place))
+    seen = (line >= -0.5) & (line <= image.lines - 0.5)
+    seen &= (pixel >= -0.5) & (pixel <= image.pixels - 0.5) & (status != RpcStatus.NOT_CONVERGED)
+    extrapolated = status != RpcStatus.INSIDE
+    if not image.sized:
+        seen = ~extrapolated
+    if not seen.any():
+        raise InputError(
+            f"{table.source(0)}: no point is in the image; this one is at line {line[0]:.6g}, "
+            f"pixel {pixel[0]:.6g} of {image.lines} × {image.pixels}: check coordinates, frame and "
+            "units"
+        )
+    for rows, words in (
+        (~seen, f"not in the image of {image.lines} × {image.pixels}"),
+        (seen & extrapolated, _extrapolated(image)),
+    ):
+        if rows.any():
+            tell(
+                f"{table.source(int(rows.argmax()))}: {words} ({rows.sum()} of {len(seen)} points)"
+            )
+    line[~seen], pixel[~seen] = np.nan, np.nan
+    words = [OFF_IMAGE, RpcStatus.OUTSIDE.meaning]
+    return {
+        "id": table.ids("id") if "id" in table.values else [str(k + 1) for k in range(len(seen))],
+        "line": line,
+        "pixel": pixel,
+        "count": seen.astype(int),
+        "status": np.select([~seen, extrapolated], words, ProjectionStatus.SEEN.meaning).tolist(),
+    }
 
 
 def check_draws(draws: int) -> None:

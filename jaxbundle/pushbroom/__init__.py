@@ -24,6 +24,10 @@ _HOME = {
         "refine",
         "simulate",
     ),
+    "jaxbundle.commands.scanner_info": (
+        "ScannerInfo",
+        "info",
+    ),
     "jaxbundle.commands.scanner_tables": (
         "ScannerTable",
         "accuracy",
@@ -90,6 +94,7 @@ _HOME = {
         "Rpc",
         "RpcStatus",
     ),
+    "jaxbundle.pushbroom.rpc_image": ("RpcImage",),
     "jaxbundle.pushbroom.rpc_bias": (
         "apply_bias",
         "fit_bias",

@@ -4,6 +4,8 @@ from jaxbundle.commands.scanner_images import CorrectedImage as CorrectedImage
 from jaxbundle.commands.scanner_images import correct as correct
 from jaxbundle.commands.scanner_images import refine as refine
 from jaxbundle.commands.scanner_images import simulate as simulate
+from jaxbundle.commands.scanner_info import ScannerInfo as ScannerInfo
+from jaxbundle.commands.scanner_info import info as info
 from jaxbundle.commands.scanner_tables import ScannerTable as ScannerTable
 from jaxbundle.commands.scanner_tables import accuracy as accuracy
 from jaxbundle.commands.scanner_tables import locate as locate
@@ -58,6 +60,7 @@ from jaxbundle.pushbroom.rpc_fit import RpcTable as RpcTable
 from jaxbundle.pushbroom.rpc_fit import check_rpc as check_rpc
 from jaxbundle.pushbroom.rpc_fit import fit_image as fit_image
 from jaxbundle.pushbroom.rpc_fit import fit_rpc as fit_rpc
+from jaxbundle.pushbroom.rpc_image import RpcImage as RpcImage
 from jaxbundle.pushbroom.scanner import AnglePolynomial as AnglePolynomial
 from jaxbundle.pushbroom.scanner import AngleTable as AngleTable
 from jaxbundle.pushbroom.scanner import FocalLine as FocalLine
@@ -96,8 +99,10 @@ __all__ = [
     "Rpc",
     "RpcCheck",
     "RpcFit",
+    "RpcImage",
     "RpcStatus",
     "RpcTable",
+    "ScannerInfo",
     "ScannerTable",
     "SearchSettings",
     "Terrain",
@@ -117,6 +122,7 @@ __all__ = [
     "fit_image",
     "fit_rpc",
     "ground_errors",
+    "info",
     "locate",
     "locate_lines",
     "locate_point",

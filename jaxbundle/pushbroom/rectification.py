@@ -5,6 +5,8 @@ every pixel on the ellipsoid and its vertical; the height, constant or from a te
 added. Every point is projected into the image, starting from the interpolated image position, or
 by a search if that does not converge, and the image is resampled there.
 
+An image by rational polynomials (`RpcImage`) needs neither start nor search.
+
 A point is hidden by other terrain if the ray of its image position ends before it:
 optionally the first intersection of every pixel's ray is computed, and points farther from it than
 half a map pixel are not shown.
@@ -25,11 +27,13 @@ from jaxbundle.pushbroom.ground_to_image import project_from, project_points
 from jaxbundle.pushbroom.image import LinePose, PushbroomImage
 from jaxbundle.pushbroom.image_to_ground import ground_point
 from jaxbundle.pushbroom.pieces import sample
+from jaxbundle.pushbroom.rpc import Rpc
+from jaxbundle.pushbroom.rpc_image import RpcImage, are_occluded_in_rpc, project_to_rpc
 from jaxbundle.pushbroom.search import ScannerGeometry, Search, scanner_of
 from jaxbundle.pushbroom.surfaces import GroundSurface, Height, Plane
 from jaxbundle.pushbroom.terrain import Terrain, bilinear
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray, Scalar
+from jaxbundle.types import AnyArray, Scalar, present
 
 BLOCK_SIZE = 256
 """Pixels of a block of the map along each side: a usual tile of GeoTIFF, in which maps are written,
@@ -74,16 +78,22 @@ def local_nodes(x: np.ndarray, y: np.ndarray) -> MapNodes:
 
 
 def block_places(
-    image: PushbroomImage,
-    search: Search,
+    image: PushbroomImage | RpcImage,
+    search: Search | None,
     surface: GroundSurface,
     nodes: MapNodes,
     occlusion: bool = False,
 ) -> Places | None:
     """Image positions of the pixels of a block; None if none of them is near the image.
 
-    With `occlusion` pixels hidden by other terrain have none.
+    With `occlusion` pixels hidden by other terrain have none. `search`: of a rigorous image.
     """
+    if isinstance(image, RpcImage):
+        occlusion = occlusion and isinstance(surface, Terrain)
+        places = _rpc_places(occlusion, image.rpc, surface, nodes)
+        found = _keep_inside(image, *map(np.asarray, places))
+        return found if np.isfinite(found.line).any() else None
+    search = present(search)
     # start values only: between the heights of terrain an image position moves by pixels
     level = np.asarray(_level(surface))
     raised = nodes.X + level * nodes.up
@@ -101,11 +111,33 @@ def block_places(
         # on a rough trajectory the interpolated start may not converge
         line, pixel = line.copy(), pixel.copy()
         line[lost], pixel[lost] = _search(image, search, ground[:, lost], starts[0].size)
+    if occlusion and isinstance(surface, Terrain):
+        hidden = np.asarray(_are_occluded(scanner, search, surface, line, pixel, ground))
+        line = np.where(hidden, np.nan, line)
+    return _keep_inside(image, line, pixel)
+
+
+def _keep_inside(
+    image: PushbroomImage | RpcImage,
+    line: Float[np.ndarray, "rows columns"],
+    pixel: Float[np.ndarray, "rows columns"],
+) -> Places:
+    """Positions outside the image become NaN."""
     inside = (line >= -0.5) & (line < image.lines - 0.5)
     inside &= (pixel >= -0.5) & (pixel < image.pixels - 0.5)
-    if occlusion and isinstance(surface, Terrain):
-        inside &= ~np.asarray(_are_occluded(scanner, search, surface, line, pixel, ground))
     return Places(np.where(inside, line, np.nan), np.where(inside, pixel, np.nan))
+
+
+@partial(compile_once, static=0)
+def _rpc_places(
+    occlusion: bool, rpc: Rpc, surface: GroundSurface, nodes: MapNodes
+) -> tuple[Array, Array]:
+    ground = _ground(surface, nodes)
+    line, pixel = project_to_rpc(rpc, surface, ground)
+    if occlusion:
+        hidden = are_occluded_in_rpc(rpc, surface, line, pixel, ground)
+        line = jnp.where(hidden, jnp.nan, line)
+    return line, pixel
 
 
 def _search(

@@ -18,7 +18,13 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, geodetic
 from jaxbundle.io.rasters.reading import check_pixels, check_raw, open_raster, read_pixels
 from jaxbundle.io.scanner.read import read_scanner
-from jaxbundle.io.scanner.rpc import RASTERS, read_rpc
+from jaxbundle.io.scanner.rpc import read_rpc
+from jaxbundle.io.scanner.rpc_images import (
+    COMPANION_ENDINGS,
+    IMAGES,
+    find_coefficients,
+    find_raster,
+)
 from jaxbundle.photographs.places import utm_system
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.image_to_ground import locate_point
@@ -38,9 +44,6 @@ from jaxbundle.system.file_content import missing
 if TYPE_CHECKING:
     import pyproj
 
-IMAGES = (*RASTERS, ".jp2", ".png", ".jpg")
-COMPANION_ENDINGS = ("_RPC.TXT", "_rpc.txt", "_RPC.txt", ".RPB", ".rpb", ".geom", ".xml", ".XML")
-ENDINGS = ("_rpc", "_RPC")
 Orientation = Rpc | tuple[PushbroomImage, Ellipsoid | None]
 """The polynomials; or the scanner's image, and its Earth, None in a local frame."""
 
@@ -196,11 +199,7 @@ def _orientation(path: Path, folder: Path | None) -> tuple[Orientation, Path]:
     if not path.is_file():
         raise missing(path, "a raster with RPC, or a scanner file")
     if path.suffix.lower() in IMAGES:
-        beside = [path.with_name(path.stem + end) for end in COMPANION_ENDINGS]
-        source = next((p for p in beside if p.is_file()), path)
-        if source is path and path.suffix.lower() not in RASTERS:
-            raise InputError(f"{path}: no coefficients beside it: {path.stem}_RPC.TXT is expected")
-        return read_rpc(source), path
+        return read_rpc(find_coefficients(path)), path
     scanner = path.suffix.lower() in (".json", ".dim", ".imd") or (path.suffix == ".toml")
     if path.suffix.lower() == ".xml":
         try:
@@ -214,16 +213,11 @@ def _orientation(path: Path, folder: Path | None) -> tuple[Orientation, Path]:
 
 
 def _raster_of(path: Path, folder: Path | None) -> Path:
-    stem = path.stem
-    for end in ENDINGS:
-        stem = stem.removesuffix(end)
-    places = [path.parent, *([folder] if folder else [])]
-    for place in places:
-        for suffix in (*IMAGES, *(s.upper() for s in IMAGES)):
-            if (place / (stem + suffix)).is_file():
-                return place / (stem + suffix)
-    where = f"beside it or in {folder}" if folder else "beside it; --photos names its folder"
-    raise InputError(f"{path}: no raster {stem}.tif {where}")
+    found = find_raster(path, *([folder] if folder else []))
+    if found is None:
+        where = f"beside it or in {folder}" if folder else "beside it; --photos names its folder"
+        raise InputError(f"{path}: no raster {path.stem}.tif {where}")
+    return found
 
 
 def _central_neighbourhood(orientation: Orientation) -> Neighbourhood:

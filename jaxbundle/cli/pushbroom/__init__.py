@@ -2,6 +2,7 @@
 
 from jaxbundle.cli.pushbroom import accuracy as accuracy
 from jaxbundle.cli.pushbroom import correct as correct
+from jaxbundle.cli.pushbroom import info as info
 from jaxbundle.cli.pushbroom import locate as locate
 from jaxbundle.cli.pushbroom import project as project
 from jaxbundle.cli.pushbroom import refine as refine

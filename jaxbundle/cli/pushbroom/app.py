@@ -15,6 +15,12 @@ app.add_typer(pushbroom, name="pushbroom")
 ScannerFile = Annotated[
     Path, typer.Argument(help="scanner file .toml, or product file (docs/pushbroom.md)")
 ]
+ImageFile = Annotated[
+    Path,
+    typer.Argument(
+        help="scanner file .toml, product file, or an image with RPC: raster or coefficients",
+    ),
+]
 Level = Annotated[
     float | None, typer.Option("--height", help="metres above the ellipsoid; Z in a local frame")
 ]

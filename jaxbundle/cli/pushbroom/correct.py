@@ -7,13 +7,19 @@ import typer
 
 from jaxbundle.choices import RESAMPLINGS
 from jaxbundle.cli.app import Quiet, choice
-from jaxbundle.cli.pushbroom.app import Dem, Geoid, Level, ScannerFile, pushbroom
+from jaxbundle.cli.pushbroom.app import Dem, Geoid, ImageFile, Level, pushbroom
 
 
 @pushbroom.command(example="out/flight/scanner.toml out/flight/image.tif --out out/map.tif")
 def correct(  # noqa: PLR0913 - the options of the command
-    scanner: ScannerFile,
-    image: Annotated[Path, typer.Argument(help="the image: a raster of all lines and pixels")],
+    scanner: ImageFile,
+    image: Annotated[
+        Path | None,
+        typer.Argument(
+            help="the image: a raster of all lines and pixels; omit it if SCANNER is it"
+        ),
+    ] = None,
+    *,
     out: Annotated[Path, typer.Option(help="GeoTIFF to write")],
     crs: Annotated[
         str | None, typer.Option(help="EPSG:… of the map; default: longitude, latitude")

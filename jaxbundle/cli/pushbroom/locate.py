@@ -5,12 +5,12 @@ from typing import Annotated
 
 import typer
 
-from jaxbundle.cli.pushbroom.app import Csv, Dem, Geoid, Json, Level, ScannerFile, pushbroom
+from jaxbundle.cli.pushbroom.app import Csv, Dem, Geoid, ImageFile, Json, Level, pushbroom
 
 
 @pushbroom.command(example="out/flight/scanner.toml --grid 3x3 --csv out/points.csv")
 def locate(
-    scanner: ScannerFile,
+    scanner: ImageFile,
     points: Annotated[Path | None, typer.Option(help="table line,pixel[,id]")] = None,
     grid: Annotated[
         str, typer.Option(help="LINESxPIXELS positions over the image, without --points")

@@ -5,12 +5,12 @@ from typing import Annotated
 
 import typer
 
-from jaxbundle.cli.pushbroom.app import Csv, Json, ScannerFile, pushbroom
+from jaxbundle.cli.pushbroom.app import Csv, ImageFile, Json, pushbroom
 
 
 @pushbroom.command(example="out/flight/scanner.toml --points out/points.csv")
 def project(
-    scanner: ScannerFile,
+    scanner: ImageFile,
     points: Annotated[
         Path, typer.Option(help="table X,Y,Z[,id] (m) or longitude,latitude,height[,id] (degrees)")
     ],

@@ -19,6 +19,7 @@ from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.image_to_ground import locate_lines
 from jaxbundle.pushbroom.rectification import BLOCK_SIZE, MapNodes, block_places
 from jaxbundle.pushbroom.resampling import resample
+from jaxbundle.pushbroom.rpc_image import RpcImage, locate_rpc_lines
 from jaxbundle.pushbroom.surfaces import GroundSurface
 from jaxbundle.pushbroom.terrain import Terrain
 from jaxbundle.system.programs import compile_once
@@ -32,10 +33,11 @@ Part = tuple[slice, slice]
 
 _resample = compile_once(resample, 3)
 _locate = compile_once(locate_lines, ())
+_locate_rpc = compile_once(locate_rpc_lines, ())
 
 
 def map_of(
-    image: PushbroomImage,
+    image: PushbroomImage | RpcImage,
     surface: GroundSurface,
     system: MapSystem,
     size: float | None,
@@ -56,7 +58,8 @@ def map_of(
     lines = np.linspace(-0.5, image.lines - 0.5, border)
     pixels = np.linspace(-0.5, image.pixels - 0.5, border)
     inner = np.clip(lines, 0, image.lines - 1)  # the tables may end at the outer lines' centres
-    X = np.asarray(_locate(image, surface, inner, pixels))
+    locate = _locate_rpc if isinstance(image, RpcImage) else _locate
+    X = np.asarray(locate(image, surface, inner, pixels))
     if not np.isfinite(X).any():
         raise InputError(
             f"{model or 'terrain'}: no height where the image looks; give a model that covers it"
@@ -80,8 +83,8 @@ def map_of(
 def write_corrected(
     source: str | Path,
     target: str | Path,
-    image: PushbroomImage,
-    search: Search,
+    image: PushbroomImage | RpcImage,
+    search: Search | None,
     surface: GroundSurface,
     system: MapSystem,
     grid: MapGrid,
@@ -98,10 +101,12 @@ def write_corrected(
     **Raises:** `InputError` if the raster does not have the size of the image, or cannot be read.
     """
     with open_raster(source) as bands:
-        check_raw(source, bands)
+        if not isinstance(image, RpcImage):
+            check_raw(source, bands)
         if (bands.height, bands.width) != (image.lines, image.pixels):
             raise InputError(
-                f"{source}: {bands.height} lines of {bands.width} pixels; the scanner file has "
+                f"{source}: {bands.height} lines of {bands.width} pixels; the "
+                f"{'image of the RPC' if isinstance(image, RpcImage) else 'scanner file'} has "
                 f"{image.lines} of {image.pixels}"
             )
         reading = threading.Lock()  # GDAL: one thread at a time in a data set
@@ -129,7 +134,7 @@ def _values(
     source: str | Path,
     bands: "DatasetReader",
     reading: threading.Lock,
-    image: PushbroomImage,
+    image: PushbroomImage | RpcImage,
     places: tuple[Float[AnyArray, "rows columns"], Float[AnyArray, "rows columns"]],
     resampling: Resampling,
 ) -> Float[np.ndarray, "bands rows columns"]:
@@ -153,7 +158,7 @@ def _values(
 def _parts(
     line: Float[np.ndarray, "rows columns"],
     pixel: Float[np.ndarray, "rows columns"],
-    image: PushbroomImage,
+    image: PushbroomImage | RpcImage,
     most: float,
     part: Part = (slice(0, BLOCK_SIZE), slice(0, BLOCK_SIZE)),
 ) -> Iterator[tuple[Part, Window]]:

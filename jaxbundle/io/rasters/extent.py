@@ -14,6 +14,7 @@ from jaxbundle.geometry.ellipsoid import Ellipsoid, geodetic
 from jaxbundle.pushbroom.image import PushbroomImage, pose_at
 from jaxbundle.pushbroom.image_to_ground import locate_lines
 from jaxbundle.pushbroom.rpc import Rpc
+from jaxbundle.pushbroom.rpc_image import REACH
 from jaxbundle.pushbroom.surfaces import Height
 from jaxbundle.system.programs import compile_once
 
@@ -60,12 +61,10 @@ def image_extent(image: PushbroomImage, earth: Ellipsoid, places: int = 17) -> E
 
 def rpc_extent(rpc: Rpc) -> Extent | None:
     """The validity domain of coefficients."""
-    # Normalised coordinates are in ±1 by definition; a fifth more for images that reach beyond, not
-    # critical: only more terrain is read.
-    ends = np.array([-1.0, 1.0])
+    ends = np.array([-REACH, REACH])
     return _around(
-        float(rpc.longitude_offset) + abs(float(rpc.longitude_scale)) * 1.2 * ends,
-        float(rpc.latitude_offset) + abs(float(rpc.latitude_scale)) * 1.2 * ends,
+        float(rpc.longitude_offset) + abs(float(rpc.longitude_scale)) * ends,
+        float(rpc.latitude_offset) + abs(float(rpc.latitude_scale)) * ends,
     )
 
 

@@ -51,6 +51,7 @@ def check_against_rpc(scanner: ScannerInput, path: Path, choose: bool = True) ->
         return _warn(scanner, f"not compared with its RPC: {error}")
     image = scanner.image
     usual = _compare(image, rpc, (image.corrections,))[0]
+    scanner = dataclasses.replace(scanner, agreement=usual)
     if _agree(usual, random_error):
         return scanner
     if not np.isfinite(usual.rms):
@@ -67,7 +68,8 @@ def check_against_rpc(scanner: ScannerInput, path: Path, choose: bool = True) ->
                 "scanner file sets others"
             )
             image = dataclasses.replace(image, corrections=chosen)
-            return _warn(dataclasses.replace(scanner, image=image), message)
+            chosen_one = dataclasses.replace(scanner, image=image, agreement=found[best])
+            return _warn(chosen_one, message)
     return _warn(
         scanner,
         f"{path}: the rigorous model, with {_names(image.corrections)}, and the RPC of {file.name} "

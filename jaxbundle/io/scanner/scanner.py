@@ -4,15 +4,18 @@ import dataclasses
 
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.pushbroom.image import PushbroomImage
+from jaxbundle.pushbroom.rpc_agreement import Agreement
 
 
 @dataclasses.dataclass(frozen=True)
 class ScannerInput:
     """The image, the ellipsoid of its Earth (None: a local frame), warnings of the reader;
-    `backwards`: whether its clock runs against time, so that no correction can be applied."""
+    `backwards`: whether its clock runs against time, so that no correction can be applied;
+    `agreement` with the RPC of the product, if it has any."""
 
     name: str
     image: PushbroomImage
     earth: Ellipsoid | None
     warnings: tuple[str, ...] = ()
     backwards: bool = False
+    agreement: Agreement | None = None

@@ -1,0 +1,107 @@
+"""Images with rational polynomials, given by their raster or by the file of the coefficients.
+
+| given | coefficients | size of the image |
+|---|---|---|
+| raster (`.tif`, `.ntf`, `.vrt`, …) | `NAME_RPC.TXT`, `NAME.RPB`, `NAME.geom`, `NAME.xml` beside it, else its tags | of the raster |
+| `_RPC.TXT`, `.RPB`, `.geom`, XML of DIMAP (`RPC_….XML`) or of DigitalGlobe without a rigorous model | the file | of a raster of the same name beside it, else as far as the coefficients hold |
+"""  # noqa: E501 a table
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid
+from jaxbundle.io.rasters.reading import check_raw, open_raster
+from jaxbundle.io.scanner.rpc import RASTERS, read_rpc
+from jaxbundle.io.text.xml_fields import read_xml
+from jaxbundle.pushbroom.rpc import Rpc
+from jaxbundle.pushbroom.rpc_image import RpcImage
+from jaxbundle.system.file_content import missing
+
+IMAGES = (*RASTERS, ".jp2", ".png", ".jpg")
+COEFFICIENTS = (".txt", ".rpb", ".geom")
+COMPANION_ENDINGS = ("_RPC.TXT", "_rpc.txt", "_RPC.txt", ".RPB", ".rpb", ".geom", ".xml", ".XML")
+ENDINGS = ("_rpc", "_RPC")
+
+
+@dataclasses.dataclass(frozen=True)
+class RpcInput:
+    """An image with rational polynomials as the scanner commands have it; see `ScannerInput`."""
+
+    name: str
+    image: RpcImage
+    earth: Ellipsoid = WGS84
+    warnings: tuple[str, ...] = ()
+
+
+def has_rpc_only(path: Path) -> bool:
+    """Whether a file is of rational polynomials, by its suffix or the root of its XML."""
+    suffix = path.suffix.lower()
+    if suffix != ".xml":
+        return suffix in (*IMAGES, *COEFFICIENTS)
+    root = read_xml(path)
+    has = lambda key: root.find(f".//{key}") is not None
+    rigorous = has("EPH") and has("ATT") if has("RPB") else has("Refined_Model")
+    return not rigorous and (has("RPB") or has("Rational_Function_Model"))
+
+
+def read_rpc_image(path: Path, raster: Path | None = None) -> RpcInput:
+    """The image of a raster or of a file of coefficients.
+
+    **Arguments:** `raster`: the image of the coefficients, where it has another name.
+
+    **Raises:** `InputError`, also for a raster that is a map.
+    """
+    source, beside = find_coefficients(path), raster or find_raster(path)
+    rpc = read_rpc(source)
+    if beside is None:
+        lines, pixels = _domain_size(rpc)
+        return RpcInput(path.stem, RpcImage(rpc, lines, pixels, sized=False))
+    with open_raster(beside) as bands:
+        # Tags belong to the pixels of their raster, also of a map or of a part; a file of
+        # coefficients to the whole image.
+        if source != beside and bands.crs is None:
+            check_raw(beside, bands)
+        return RpcInput(path.stem, RpcImage(rpc, bands.height, bands.width))
+
+
+def find_coefficients(path: Path) -> Path:
+    """The file of the coefficients of an image: beside its raster, or the given one.
+
+    **Raises:** `InputError`, if there is no such file, or nothing beside a raster that has no
+    tags.
+    """
+    if not path.is_file():
+        raise missing(path, "a raster with RPC, or a file of coefficients")
+    if path.suffix.lower() not in IMAGES:
+        return path
+    beside = (path.with_name(path.stem + end) for end in COMPANION_ENDINGS)
+    found = next((p for p in beside if p.is_file()), path)
+    if found is path and path.suffix.lower() not in RASTERS:
+        raise InputError(f"{path}: no coefficients beside it: {path.stem}_RPC.TXT is expected")
+    return found
+
+
+def find_raster(path: Path, *folders: Path) -> Path | None:
+    """The raster of a file of coefficients, or of a scanner file: of the same name beside it, or in
+    one of the folders; None if there is none."""
+    if path.suffix.lower() in IMAGES:
+        return path
+    stem = path.stem
+    for end in ENDINGS:
+        stem = stem.removesuffix(end)
+    names = [stem + suffix for suffix in (*IMAGES, *(s.upper() for s in IMAGES))]
+    places = (place / name for place in (path.parent, *folders) for name in names)
+    return next((p for p in places if p.is_file()), None)
+
+
+def _domain_size(rpc: Rpc) -> tuple[int, int]:
+    """Lines and pixels from (0, 0) to the ends of the domain."""
+    ends = (
+        float(rpc.line_offset) + abs(float(rpc.line_scale)),
+        float(rpc.sample_offset) + abs(float(rpc.sample_scale)),
+    )
+    lines, pixels = (max(int(np.ceil(end)) + 1, 2) for end in ends)
+    return lines, pixels
