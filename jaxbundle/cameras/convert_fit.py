@@ -109,7 +109,8 @@ def fit_parameters(
         least = lambda p: np.fmin(cost(p), np.inf)
         start = min((_order(model, values) for values in starts), key=least)
         if not np.isfinite(cost(start)):
-            raise ValueError("no start of the fit has an image of the whole area")
+            seen = [np.isfinite(_images(model, _order(model, v), rays)).all(1) for v in starts]
+            raise ValueError(_without_images(model, rays, max(seen, key=np.sum)))
 
         def complete(q: Float[np.ndarray, " free"]) -> Float[np.ndarray, " parameters"]:
             p = start.copy()
@@ -145,6 +146,20 @@ def fit_parameters(
         except np.linalg.LinAlgError as error:
             raise ValueError(f"the fit failed: {error}") from None
     return dict(zip(model.parameters, complete(found.x).tolist()))
+
+
+def _without_images(
+    model: CameraModel, rays: Float[np.ndarray, "points 3"], seen: Bool[np.ndarray, " points"]
+) -> str:
+    """What to say where a model has no image of some rays."""
+    axis = rays[np.hypot(rays[:, 0], rays[:, 1]).argmin()] * [0.0, 0.0, 1.0]
+    cosine = rays @ axis / (np.linalg.norm(rays, axis=1) * np.linalg.norm(axis))
+    angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    reach = f"up to {angle[seen].max():.1f}°" if seen.any() else "none"
+    return (
+        f"{model.name} has no image of the whole area: it has rays up to {angle.max():.1f}° from "
+        f"the axis, of which the model has images of {reach}; choose one with a larger field"
+    )
 
 
 def _bounds(

@@ -5,12 +5,12 @@ from documents import Process
 
 from jaxbundle.cameras.catalogue import MODELS as BUILT_IN
 
-MODELS = (*BUILT_IN, "radial-spline-6-45", "spline-8x6-80")
-"""The radial spline ends where the photographs do: nothing determines its values beyond."""
+MODELS = (*BUILT_IN, "radial-spline-6-54", "spline-8x6-80")
+"""From corner to corner the base camera has 52°, and so a radial spline must have more."""
 
-FREE = {"mei": "fx,fy,cx,cy,k1,k2"}
+FREE = {"mei": "fx,fy,cx,cy,k1,k2", "radial-spline-6-54": "fx,fy,cx,cy,s1,s2,s3"}
 """Where the photographs, of a lens of 42°, do not determine all that is free by default: xi is
-singular beside fx, fy, k1 and k2."""
+singular beside fx, fy, k1 and k2; the outer values of a spline are beyond all points."""
 
 COMMANDS = """
 jaxbundle convert base.toml MODEL.toml --model MODEL --pixel-size 0.01,0.01
