@@ -374,8 +374,10 @@ def _principal_axes(
     """Points [cameras, points, 3] about the mean of those seen, along their principal axes; the
     mean; the axes as rows [cameras, 3, 3]; is the object flat?"""
     if len(X) > 1 and (seen == seen[0]).all() and (X == X[0]).all():
-        one = _principal_axes(X[:1], seen[:1])
-        return tuple(np.broadcast_to(x, (len(X), *x.shape[1:])) for x in one)
+        a, b, c, d = (
+            np.broadcast_to(x, (len(X), *x.shape[1:])) for x in _principal_axes(X[:1], seen[:1])
+        )
+        return a, b, c, d
     number = np.maximum(seen.sum(1), 1)[:, None]
     middle = X.sum(1) / number
     centred = np.where(seen[..., None], X - middle[:, None], 0.0)

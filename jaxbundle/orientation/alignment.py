@@ -1,5 +1,6 @@
 """Transformation of models: to control and given positions, to each other, or to scale."""
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -64,8 +65,11 @@ def _by_rays(network: Network, sights: Sights, model: Model) -> Similarity | Non
 
 
 def to_scale(network: Network, model: Model) -> tuple[Model, str]:
-    """The model with the scale of the distances, if any, and its reference."""
+    """The model with the scale of the distances, or of the bases of rigs, if any, and its
+    reference."""
     scale = scale_of_distances(network, model)
+    if scale is None:
+        scale = _scale_of_other_lengths(network, model)
     if scale is None:
         return model, "in an arbitrary frame and scale"
     return model.transform(scale * np.eye(3), np.zeros(3)), "to scale, in an arbitrary frame"
@@ -79,6 +83,20 @@ def scale_of_distances(network: Network, model: Model) -> float | None:
         return None
     a, b = model.X[distances.points[there]].transpose(1, 0, 2)
     return float(np.median(distances.value[there] / np.linalg.norm(a - b, axis=1)))
+
+
+def _scale_of_other_lengths(network: Network, model: Model) -> float | None:
+    """The median of the given lengths of further kinds by those in the model."""
+    if not network.further or not model.placed.any():
+        return None
+    placed = np.flatnonzero(model.placed)
+    images = network.images.take(placed)
+    oriented = dataclasses.replace(
+        images, position=model.X0[placed], angles=many.angles(model.M[placed])
+    )
+    part = network.replace(images=oriented)
+    ratios = [ratio for one in network.further for ratio in one.among(part).scales(part)]
+    return float(np.median(ratios)) if ratios else None
 
 
 def join(sights: Sights, model: Model, part: Model) -> Model | None:

@@ -26,6 +26,7 @@ from jaxbundle.report.layout import (
     significant,
     table,
 )
+from jaxbundle.report.rig_scale import scale_of_rigs
 from jaxbundle.types import present
 
 if TYPE_CHECKING:
@@ -165,9 +166,11 @@ def datum(adjustment: "Adjustment") -> str:
             f"inner constraints on {count(int(weight.any(1).sum()), 'datum point')}, whose start "
             "values fix it (smallest sum of their variances)"
         )
+    scale = scale_of_rigs(adjustment)
     return (
-        f"{network.datum}; {open_ones}; {how}. Coordinates, exterior orientation and their σ "
-        "refer to this datum; residuals, σ0 and cameras do not depend on it."
+        f"{network.datum}; {open_ones}; {how}. {scale}{'. ' if scale else ''}Coordinates, exterior "
+        "orientation and their σ refer to this datum; residuals, σ0 and cameras do not depend on "
+        "it."
     )
 
 

@@ -120,6 +120,11 @@ class Further(abc.ABC):
         """The network with missing start values taken from these rows."""
         return network
 
+    def scales(self, network: Network) -> Sequence[float]:
+        """Given lengths by those of the network, whose scale is arbitrary; none if these rows have
+        no lengths."""
+        return ()
+
     @property
     def needs_scale(self) -> bool:
         """Whether a σ is a length that does not define the scale: the residuals shrink with the

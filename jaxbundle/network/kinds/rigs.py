@@ -7,7 +7,8 @@ the same at all epochs, exactly or within a σ (an unstable mounting):
 
 Columns: `rig`, `epoch`, `image`. The reference of a rig is the camera that most of its epochs have,
 or the one the section names: `reference = "left"`. Section: `sigma_position` (object unit) and
-`sigma_angle` (angle unit) of one epoch, exact if not given. At an epoch without an image of the
+`sigma_angle` (angle unit) of one epoch, exact if not given; `mounting` and `bases`: what is known
+of the mountings (`mountings`). At an epoch without an image of the
 reference, several images are tied to the first by both mountings; a single one stays free.
 """
 
@@ -26,15 +27,26 @@ from jaxbundle.geometry import quaternion_from_matrix
 from jaxbundle.geometry.rotations import matrix_from_omega_phi_kappa
 from jaxbundle.leastsquares.declarations import Kind, Table
 from jaxbundle.leastsquares.spaces import Pose, Posed, PoseValue
-from jaxbundle.network.columns import Columns
+from jaxbundle.network.columns import Columns, did_you_mean
 from jaxbundle.network.kinds.base import Contribution, Further, check_settings
 from jaxbundle.network.kinds.figures import EXACT_SIGMA, across_rays
+from jaxbundle.network.kinds.mountings import (
+    AXES,
+    BASES,
+    MOUNTING,
+    Base,
+    GivenMounting,
+    observe_mountings,
+    read_bases,
+    read_mountings,
+    turn_of,
+)
 from jaxbundle.network.rules import check_unique
 from jaxbundle.network.tables import Network
 from jaxbundle.network.units import ANGLE_UNITS
 
-SECTION, MOUNTING = "rig", "mounting"
-AXES = ("X", "Y", "Z", "turn x", "turn y", "turn z")
+SECTION = "rig"
+KEYS = ("reference", "sigma_position", "sigma_angle", "mounting", "bases")
 
 
 def mounting_misclosure(
@@ -55,9 +67,7 @@ def mounting_misclosure(
     apart = jnp.stack(other.centre) - jnp.stack(one.centre)
     t1, t2 = jnp.stack(mounting_of_one.centre), jnp.stack(mounting_of_other.centre)
     shift = base1 @ apart - (t2 - t1)
-    D = base2 @ base1.T
-    turn = 0.5 * jnp.stack([D[1, 2] - D[2, 1], D[2, 0] - D[0, 2], D[0, 1] - D[1, 0]])
-    return jnp.concatenate([shift, turn]) - given
+    return jnp.concatenate([shift, turn_of(base2 @ base1.T)]) - given
 
 
 # Invariant: residuals of a condition at the start scale with the network but define no scale.
@@ -100,10 +110,12 @@ class Rigs(Further):
     @classmethod
     def from_columns(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Rigs":
         table.check_names(("rig", "epoch", "image"))
-        check_settings(SECTION, settings, ("reference", "sigma_position", "sigma_angle"))
+        check_settings(SECTION, settings, KEYS)
         for name in ("sigma_position", "sigma_angle"):
             if name in settings:
                 positive(f"[{SECTION}]: {name}", settings[name])
+        read_mountings(SECTION, settings.get("mounting", {}), radians)
+        read_bases(SECTION, settings.get("bases", ()))
         return cls(
             rig=table.ids("rig"),
             epoch=table.ids("epoch"),
@@ -126,6 +138,7 @@ class Rigs(Further):
         super().check(network)
         check_unique(self.image, self.source, "image")
         images = network.images
+        mountings, bases = self.given(network)
         camera = {id: network.cameras[c].id for id, c in zip(images.id, images.camera)}
         seen: dict[tuple[str, ...], int] = {}
         for row, key in enumerate(zip(self.rig, self.epoch, map(camera.__getitem__, self.image))):
@@ -135,9 +148,26 @@ class Rigs(Further):
                     f"rig {key[0]!r}; the other is in {self.source(seen[key])}"
                 )
 
+        there = {camera[id] for id in self.image}
+        named = [(f"mounting.{name}", name) for name in mountings]
+        named += [("bases", name) for base in bases for name in base.cameras]
+        for key, name in named:
+            if name not in there:
+                raise InputError(
+                    f"[{SECTION}]: {key}: no rig has a camera {name!r}{did_you_mean(name, there)}"
+                )
+
+    def given(self, network: Network) -> tuple[dict[str, GivenMounting], tuple[Base, ...]]:
+        """The given mountings by camera, and the given bases."""
+        radians = ANGLE_UNITS[network.angle_unit]
+        mountings = read_mountings(SECTION, self.settings.get("mounting", {}), radians)
+        return mountings, read_bases(SECTION, self.settings.get("bases", ()))
+
     def declare(self, network: Network, origin: Float[np.ndarray, "3"]) -> Contribution:
         images, radians = network.images, ANGLE_UNITS[network.angle_unit]
-        labels, places, turns, held, pairs = [], [], [], [], []
+        given, bases = self.given(network)
+        labels, places, turns, free, pairs = [], [], [], [], []
+        observed, between = [], []
         for rig, (reference, mountings, all_epochs) in self.mounted(network).items():
             if len(mountings) < 2:
                 continue
@@ -146,24 +176,37 @@ class Rigs(Further):
             # relative to it.
             at = {c: first + k for k, c in enumerate(mountings)}
             for c, mounting in mountings.items():
-                # a camera that nothing connects with the reference starts in its place
-                t, R = mounting or MountedPose(np.zeros(3), np.eye(3))
-                labels.append(f"{network.cameras[c].id} of {rig}")
+                name = network.cameras[c].id
+                known = given.get(name, NOTHING_GIVEN)
+                if c == reference and name in given:
+                    raise InputError(
+                        f"[{SECTION}]: mounting.{name}: {name!r} is the reference camera of rig "
+                        f"{rig!r}, which the others are mounted to; give theirs, or name another "
+                        "reference"
+                    )
+                t, R = _start(mounting, known)
+                labels.append(f"{name} of {rig}")
                 places.append(t)
                 turns.append(np.asarray(quaternion_from_matrix(R)))
-                held.append(c == reference)
+                free.append(c != reference and ~np.repeat(known.held, 3))
+                observed.append((at[c], known))
+            ids = {network.cameras[c].id: at[c] for c in mountings}
+            between += [
+                (*(ids[name] for name in base.cameras), base)
+                for base in bases
+                if {*base.cameras} <= {*ids}
+            ]
             for epoch in all_epochs.values():
                 if len(epoch) > 1:
                     one = reference if reference in epoch else min(epoch)
                     pairs += [(epoch[one], i, at[one], at[c]) for c, i in epoch.items() if c != one]
         if not pairs:
             raise InputError(f"{self.source.name}: no epoch has images of two cameras")
-        free = ~np.array(held)[:, None] * np.ones(6, bool)
         mounting = Table(
             MOUNTING,
             PoseValue(np.array(places), np.array(turns)),
             Pose(),
-            free,
+            np.array([np.broadcast_to(row, 6) for row in free]),
             labels,
             AXES,
             "mounting of",
@@ -182,7 +225,35 @@ class Rigs(Further):
         angle = self.settings.get("sigma_angle", EXACT_SIGMA * across / depth / radians) * radians
         sigma = np.repeat([length, angle], 3) * np.ones((len(pairs), 1))
         seen = MOUNTED(tuple(np.array(pairs).T), np.zeros((len(pairs), 6)), sigma=sigma)
-        return Contribution((mounting,), (seen,), ((MOUNTING, _move_mounting),))
+        sets = [seen, *observe_mountings(*zip(*observed))]
+        if between:
+            one, other, base = zip(*between)
+            length, spread = (np.array([getattr(b, n) for b in base]) for n in ("length", "sigma"))
+            sets.append(BASES((np.array(one), np.array(other)), length, sigma=spread))
+        return Contribution((mounting,), sets, ((MOUNTING, _move_mounting),))
+
+    def scales(self, network: Network) -> list[float]:
+        """The given bases, by those of the orientations of the images."""
+        given, bases = self.given(network)
+        found = []
+        for rig in self.mounted(network).values():
+            at = {
+                network.cameras[c].id: mounting.position
+                for c, mounting in rig.mountings.items()
+                if mounting is not None
+            }
+            lengths = [
+                (known.length, np.linalg.norm(at[name]))
+                for name, known in given.items()
+                if name in at and known.length is not None
+            ]
+            lengths += [
+                (base.length, np.linalg.norm(at[base.cameras[0]] - at[base.cameras[1]]))
+                for base in bases
+                if {*base.cameras} <= {*at}
+            ]
+            found += [float(length / now) for length, now in lengths if now > 0]
+        return found
 
     def mounted(self, network: Network) -> dict[str, MountedCameras]:
         """The rigs by name, with the mountings that the orientations of the images give."""
@@ -210,6 +281,20 @@ class Rigs(Further):
         if named is not None and named not in ids:
             raise InputError(f"[{SECTION}]: reference is {named!r}, but there is no such camera")
         return max(sorted(cameras), key=cameras.__getitem__, default=0)
+
+
+NOTHING_GIVEN = GivenMounting(None, None, np.full(6, np.inf), None, (False, False))
+
+
+def _start(mounting: MountedPose | None, known: GivenMounting) -> MountedPose:
+    """The start value of a mounting: that of the orientations of the images, except for what is
+    held; of a camera that nothing connects with the reference what is given, or its place."""
+    t, R = mounting or MountedPose(np.zeros(3), np.eye(3))
+    if known.position is not None and (mounting is None or known.held[0]):
+        t = known.position
+    if known.angles is not None and (mounting is None or known.held[1]):
+        R = np.asarray(matrix_from_omega_phi_kappa(known.angles))
+    return MountedPose(t, R)
 
 
 def _mountings(

@@ -1,0 +1,216 @@
+"""Given mountings of the cameras of a rig: settings `mounting` and `bases` of the section `[rig]`.
+
+    [rig]
+    mounting.right = { position = [0.5, 0, 0], angles = [0, 0, 0], sigma_position = 1e-3 }
+    bases = [{ cameras = ["left", "right"], length = 0.5, sigma = 1e-4 }]
+
+A mounting is the camera in the frame of the reference camera of its rig: `position` of its
+projection centre (object unit), and `angles` ω, φ, κ of the rotation from there to its own frame.
+Each may be given alone. Without a σ it is held; `sigma_position` and `sigma_angle`, a number or one
+for each axis, weight it, along the axes of the reference camera and about those of the camera
+itself; `inf` says nothing of an axis, so that a common plane or parallel axes can be given. Instead
+of both, `covariance` is that of position and angles, [6, 6]. A base is the distance of the
+projection centres of two cameras. What is given holds for every rig that has the cameras.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbundle.arguments import positive, show
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.rotations import matrix_from_omega_phi_kappa
+from jaxbundle.leastsquares.declarations import Kind, ObservationSet
+from jaxbundle.leastsquares.spaces import Posed
+from jaxbundle.network.kinds.base import check_settings, numbers
+
+MOUNTING = "mounting"
+AXES = ("X", "Y", "Z", "turn x", "turn y", "turn z")
+KEYS = ("position", "angles", "sigma_position", "sigma_angle", "covariance")
+
+
+def turn_of(D: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    """The rotation vector of a small rotation, to second order."""
+    return 0.5 * jnp.stack([D[1, 2] - D[2, 1], D[2, 0] - D[0, 2], D[0, 1] - D[1, 0]])
+
+
+def given_mounting(mounting: Posed, given: Float[Array, "6"]) -> Float[Array, "6"]:
+    """Position and rotation of a mounting minus the given position and ω, φ, κ; the rotation as a
+    vector about the axes of the camera, which has no singular attitude."""
+    turn = turn_of(mounting.rotation.matrix() @ matrix_from_omega_phi_kappa(given[3:]).T)
+    return jnp.concatenate([jnp.stack(mounting.centre) - given[:3], turn])
+
+
+def given_base(one: Posed, other: Posed, length: Float[Array, ""]) -> Float[Array, ""]:
+    """The distance of two cameras of a rig minus the given one."""
+    return jnp.linalg.norm(jnp.stack(one.centre) - jnp.stack(other.centre)) - length
+
+
+GIVEN_MOUNTINGS = Kind("given mountings", given_mounting, (MOUNTING,), AXES, snooped="")
+BASES = Kind("bases", given_base, (MOUNTING, MOUNTING), ("length",), snooped="")
+
+
+class GivenMounting(NamedTuple):
+    """What is known of a mounting: position, and angles in radians, None where it is not given;
+    `sigma` of position and rotation vector, infinite where nothing is observed, or their
+    `covariance`; `held`: position, angles."""
+
+    position: Float[np.ndarray, "3"] | None
+    angles: Float[np.ndarray, "3"] | None
+    sigma: Float[np.ndarray, "6"]
+    covariance: Float[np.ndarray, "6 6"] | None
+    held: tuple[bool, bool]
+
+    @property
+    def length(self) -> float | None:
+        """The base to the reference camera; None if it is not determined."""
+        known = self.held[0] or np.isfinite(self.sigma[:3]).all()
+        length = 0.0 if self.position is None or not known else np.linalg.norm(self.position)
+        return float(length) if length > 0 else None
+
+
+class Base(NamedTuple):
+    """The distance of the projection centres of two cameras, with its σ; object unit."""
+
+    cameras: tuple[str, str]
+    length: float
+    sigma: float
+
+
+def read_mountings(section: str, given: Any, radians: float) -> dict[str, GivenMounting]:
+    """The given mountings by camera; `radians` per angle unit.
+
+    **Raises:** `InputError`."""
+    if not isinstance(given, Mapping):
+        raise InputError(
+            f"[{section}]: mounting is {show(given)}; for each camera what is known of its "
+            "mounting is expected, such as mounting.right = { position = [0.5, 0, 0] }"
+        )
+    return {
+        name: _read_mounting(f"{section}.mounting.{name}", one, radians)
+        for name, one in given.items()
+    }
+
+
+def _read_mounting(section: str, given: Any, radians: float) -> GivenMounting:
+    check_settings(section, given, KEYS)
+    unit = np.repeat([1.0, radians], 3)
+    position = numbers(section, "position", given["position"], 3) if "position" in given else None
+    angles = numbers(section, "angles", given["angles"], 3) * radians if "angles" in given else None
+    if position is None and angles is None:
+        raise InputError(f"[{section}]: give position, angles, or both")
+    if "covariance" in given:
+        if {"sigma_position", "sigma_angle"} & {*given}:
+            raise InputError(f"[{section}]: give covariance, or sigma_position and sigma_angle")
+        if angles is None or position is None:
+            raise InputError(f"[{section}]: covariance is of position and angles; give both")
+        C = _covariance(section, given["covariance"]) * np.outer(unit, unit)
+        C = _of_rotation_vector(C, angles)
+        return GivenMounting(position, angles, np.sqrt(np.diag(C)), C, (False, False))
+    sigma = np.full(6, np.inf)
+    held = []
+    for k, (name, value) in enumerate((("position", position), ("angle", angles))):
+        key = f"sigma_{name}"
+        if key in given and value is None:
+            raise InputError(f"[{section}]: {key} without {'position' if not k else 'angles'}")
+        held.append(value is not None and key not in given)
+        if key in given:
+            sigma[3 * k : 3 * k + 3] = _sigmas(section, key, given[key]) * unit[3 * k]
+    return GivenMounting(position, angles, sigma, None, (held[0], held[1]))
+
+
+def _sigmas(section: str, key: str, given: Any) -> Float[np.ndarray, "3"]:
+    """One σ for all axes, or three; inf: an axis of which nothing is known."""
+    try:
+        found = np.broadcast_to(np.asarray(given, float), 3)
+    except (TypeError, ValueError):
+        found = np.zeros(3)
+    # NaN is not positive either
+    if not (found > 0).all():
+        raise InputError(
+            f"[{section}]: {key} is {show(given)}; a positive number or three are expected (inf: "
+            "nothing is known of an axis)"
+        )
+    return found
+
+
+def _covariance(section: str, given: Any) -> Float[np.ndarray, "6 6"]:
+    try:
+        C = np.array(given, float)
+        # 1e-9: rounding of numbers printed with nine digits
+        scale = np.sqrt(np.outer(np.diag(C), np.diag(C)))
+        good = C.shape == (6, 6) and (np.abs(C - C.T) <= 1e-9 * scale).all()
+        good = good and np.isfinite(np.linalg.cholesky(C)).all()
+    except (TypeError, ValueError, np.linalg.LinAlgError):
+        good = False
+    if not good:
+        raise InputError(
+            f"[{section}]: covariance: six rows of six numbers are expected, symmetric and "
+            "positive definite: of position and ω, φ, κ"
+        )
+    return C
+
+
+def _of_rotation_vector(
+    C: Float[np.ndarray, "6 6"], angles: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "6 6"]:
+    """The covariance of position and rotation vector from that of position and ω, φ, κ."""
+    R = matrix_from_omega_phi_kappa(angles)
+    J = jax.jacfwd(lambda a: turn_of(matrix_from_omega_phi_kappa(a) @ R.T))(jnp.asarray(angles))
+    J = np.block([[np.eye(3), np.zeros((3, 3))], [np.zeros((3, 3)), np.asarray(J)]])
+    return J @ C @ J.T
+
+
+def read_bases(section: str, given: Any) -> tuple[Base, ...]:
+    """The given bases.
+
+    **Raises:** `InputError`."""
+    if not isinstance(given, Sequence) or isinstance(given, str):
+        raise InputError(
+            f"[{section}]: bases is {show(given)}; a list is expected, such as "
+            '[{ cameras = ["left", "right"], length = 0.5, sigma = 0.001 }]'
+        )
+    found = []
+    for k, one in enumerate(given, 1):
+        where = f"{section}.bases, {k}"
+        check_settings(where, one, ("cameras", "length", "sigma"))
+        cameras = one.get("cameras")
+        pair = isinstance(cameras, list | tuple) and len(cameras) == 2
+        if not pair or not all(isinstance(c, str) for c in cameras) or cameras[0] == cameras[1]:
+            raise InputError(f"[{where}]: cameras is {show(cameras)}; two names are expected")
+        length, sigma = (
+            positive(f"[{where}]: {key}", one.get(key, np.nan)) for key in ("length", "sigma")
+        )
+        found.append(Base((cameras[0], cameras[1]), length, sigma))
+    return tuple(found)
+
+
+def observe_mountings(rows: Sequence[int], given: Sequence[GivenMounting]) -> list[ObservationSet]:
+    """The observations of mountings (rows of the table) that have a σ: those whose axes are
+    independent, and those with a covariance."""
+    found = []
+    for name, correlated in (("given mountings", False), ("correlated mountings", True)):
+        chosen = [
+            (row, one)
+            for row, one in zip(rows, given)
+            if (one.covariance is not None) == correlated and np.isfinite(one.sigma).any()
+        ]
+        if not chosen:
+            continue
+        at, ones = zip(*chosen)
+        measured = np.stack([_as_measured(one) for one in ones])
+        spread: dict[str, Any] = {"sigma": np.stack([one.sigma for one in ones])}
+        if correlated:
+            spread = {"covariance": np.stack([one.covariance for one in ones])}
+        found.append(GIVEN_MOUNTINGS((np.array(at),), measured, name=name, **spread))
+    return found
+
+
+def _as_measured(one: GivenMounting) -> Float[np.ndarray, "6"]:
+    # what is not given has an infinite σ
+    parts = (np.zeros(3) if part is None else part for part in (one.position, one.angles))
+    return np.concatenate([*parts])
