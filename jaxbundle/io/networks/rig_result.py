@@ -51,10 +51,10 @@ def is_rig_result(path: Path) -> bool:
     """Whether a JSON file has the calibrations and the rig of `calibrate --rig`."""
     if path.suffix.lower() != ".json":
         return False
-    return (
-        re.match(rb'\s*\{\s*"converged"\s*:\s*\w+\s*,\s*"calibrations"\s*:', beginning(path, 1000))
-        is not None
-    )
+    if not re.match(rb'\s*\{\s*"converged"\s*:', beginning(path, 1000)):
+        return False
+    content = path.read_bytes()
+    return all(key in content for key in (b'"calibrations"', b'"mountings"'))
 
 
 def file_of_line(path: Path) -> Path:
