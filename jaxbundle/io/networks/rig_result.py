@@ -54,7 +54,7 @@ def is_rig_result(path: Path) -> bool:
     if not re.match(rb'\s*\{\s*"converged"\s*:', beginning(path, 1000)):
         return False
     content = path.read_bytes()
-    return all(key in content for key in (b'"calibrations"', b'"mountings"'))
+    return all(key in content for key in (b'"calibrations"', b'"rig"'))
 
 
 def file_of_line(path: Path) -> Path:
