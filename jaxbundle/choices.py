@@ -52,6 +52,7 @@ NETWORK_FILES = {
     "vins": "a .yaml of VINS-Fusion with cam0_calib and body_T_cam0",
     "euroc": "a folder of EuRoC with cam0/sensor.yaml",
     "ros-stereo": "a folder with two camera_info files of ROS, or ost.txt with two cameras",
+    "anipose": "a .toml of anipose, Pose2Sim, FreeMoCap: [cam_0] with matrix, rotation, …",
     "rig": "result.json of jaxbundle calibrate --rig",
     "rig-line": "a line of jaxbundle batch: FILE.jsonl#KEY",
     "csm-frame": "an ISD (.json) of a frame camera, USGS_ASTRO_FRAME_SENSOR_MODEL",
@@ -74,7 +75,8 @@ FORMATS = tuple(NETWORK_FILES)
 """Kinds of inputs that are networks."""
 TARGETS = (
     "ply", "dxf", "csv", "bundler", "bal", "colmap", "colmap-text", "openmvg", "opensfm",
-    "transforms", "kalibr", "micmac", "jaicov", "mrcal", "opencv-stereo", "ros-stereo", "project",
+    "transforms", "kalibr", "micmac", "jaicov", "mrcal", "opencv-stereo", "ros-stereo",
+    "anipose", "project",
 )  # fmt: skip
 CAMERA_FILES = (
     "colmap-cameras", "opensfm-cameras", "ros", "cameramodel", "autocal", "opencv", "cameras",

@@ -65,9 +65,10 @@ RIG_FILES: dict[str, tuple[str, tuple[str, ...]]] = {
     "mrcal": ("mrcal", MRCAL_FILES),
     "opencv-stereo": ("stereo.yaml", ()),
     "ros-stereo": ("camera_info", ROS_FILES),
+    "anipose": ("calibration.toml", ()),
 }
-"""Files and folders of a rig for other programs, by their format; the last two in pairs of
-cameras."""
+"""Files and folders of a rig for other programs, by their format; `opencv-stereo` and `ros-stereo`
+in pairs of cameras."""
 STEREO_PAIRS = "stereo_*.yaml"
 FOREIGN = ("opencv", "kannala-brandt")
 """Models that OpenCV and COLMAP have."""

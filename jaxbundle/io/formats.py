@@ -17,6 +17,12 @@ from jaxbundle.io.cameras.opencv_file import SUFFIXES as OPENCV_SUFFIXES
 from jaxbundle.io.cameras.opencv_file import YAML
 from jaxbundle.io.cameras.opencv_writing import write_opencv, write_ros
 from jaxbundle.io.networks.alicevision import is_alicevision, read_alicevision
+from jaxbundle.io.networks.anipose import (
+    ANIPOSE_LOSSES,
+    is_anipose,
+    read_anipose,
+    write_anipose,
+)
 from jaxbundle.io.networks.bal import BAL_LOSSES, OPENERS, is_bal, read_bal, write_bal
 from jaxbundle.io.networks.bingo import is_bingo, read_bingo
 from jaxbundle.io.networks.bundler import BUNDLER_LOSSES, is_bundler, read_bundler, write_bundler
@@ -159,7 +165,7 @@ def _cameras_losing(names: Callable[[Sequence[str]], Sequence[object]] | None = 
 
 def _is_project(path: Path) -> bool:
     if path.suffix.lower() == ".toml":
-        return not is_column_map(path)
+        return not (is_column_map(path) or is_anipose(path))
     return path.is_dir() and project_file(path).is_file()
 
 
@@ -246,6 +252,7 @@ FORMATS: dict[str, Format] = {
     "vins": Format(is_vins, read_vins, NETWORK_FILES["vins"]),
     "euroc": Format(is_euroc, read_euroc, NETWORK_FILES["euroc"]),
     "ros-stereo": Format(is_ros_stereo, read_ros_stereo, NETWORK_FILES["ros-stereo"]),
+    "anipose": Format(is_anipose, read_anipose, NETWORK_FILES["anipose"]),
     "rig": Format(is_rig_result, read_rig_result, NETWORK_FILES["rig"]),
     "rig-line": Format(is_rig_line, read_rig_line, NETWORK_FILES["rig-line"]),
     "csm-frame": Format(is_csm_frame, read_csm_frame, NETWORK_FILES["csm-frame"]),
@@ -414,6 +421,14 @@ TARGETS: dict[str, OutputFormat] = {
         ROS_FILES,
         losses=STEREO_LOSSES,
         parts=ros_stereo_folders,
+    ),
+    "anipose": OutputFormat(
+        _file_of("calibration", ".toml"),
+        write_anipose,
+        "NAME.toml with calibration in its name",
+        PIXEL_MODELS,
+        alone=True,
+        losses=ANIPOSE_LOSSES,
     ),
     "project": OutputFormat(
         lambda path: not path.suffix or path.is_dir() or path.name == FILE_NAME,

@@ -26,8 +26,8 @@ PAGE = Path(__file__).parents[2] / "docs" / "conversions.md"
 NAMES = {
     "bundler": "bundle.out", "bal": "problem.txt", "openmvg": "sfm_data.json",
     "transforms": "transforms.json", "kalibr": "camchain.yaml", "micmac": "Ori-A",
-    "jaicov": "project.phc", "opencv-stereo": "stereo.yaml", "ply": "n.ply", "dxf": "n.dxf",
-    "csv": "n.csv",
+    "anipose": "calibration.toml", "jaicov": "project.phc", "opencv-stereo": "stereo.yaml",
+    "ply": "n.ply", "dxf": "n.dxf", "csv": "n.csv",
 }  # fmt: skip
 DRAWINGS = ("ply", "dxf", "csv")
 """Outputs that are not read as networks."""
@@ -274,7 +274,8 @@ HOLDS: dict[str, set[str]] = {
     "micmac": {"pixel sizes of cameras"},
 }  # fmt: skip
 """What the inputs may have, beside `ALWAYS` and what an output of the same name keeps."""
-MOUNTED = {"orb-slam", "vins", "euroc", "rig", "rig-line", "kalibr", "opencv-stereo", "ros-stereo"}
+MOUNTED = {"anipose", "orb-slam", "vins", "euroc", "rig", "rig-line", "kalibr", "opencv-stereo",
+           "ros-stereo"}  # fmt: skip
 WITHOUT_POINTS = MOUNTED | {"transforms", "micmac", "mrcal", "csm-frame"}
 
 

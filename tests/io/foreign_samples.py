@@ -279,6 +279,29 @@ def _mrcal() -> str:
     return model("OPENCV8").replace("'lensmodel'", "@'lensmodel'", 1)
 
 
+ANIPOSE = """@[cam_0]
+@name = "left"
+size = [ 640, 480,]
+matrix = [ [ 500.0, 0.0, 320.0,], [ 0.0, 501.0, 240.0,], [ 0.0, 0.0, 1.0,],]
+distortions = [ -0.3, 0.1, 0.001, -0.0005, 0.02,]
+rotation = [ 0.0, 0.0, 0.0,]
+translation = [ 0.0, 0.0, 0.0,]
+
+[cam_1]
+@name = "right"
+size = [ 640, 480,]
+matrix = [ [ 510.0, 0.0, 321.0,], [ 0.0, 511.0, 239.0,], [ 0.0, 0.0, 1.0,],]
+distortions = [ 0.01, 0.002, -0.003, 0.001,]
+fisheye = true
+rotation = [ 0.02, -0.1, 0.01,]
+translation = [ -100.0, 2.0, 1.0,]
+
+[metadata]
+adjusted = false
+error = 0.4
+"""
+
+
 SAMPLES: dict[str, tuple[str, str, object]] = {
     "opencv": ("camera.yaml", YAML, OPENCV),
     "opencv-xml": ("camera.xml", XML, STORAGE),
@@ -299,6 +322,7 @@ SAMPLES: dict[str, tuple[str, str, object]] = {
     "euroc": ("sensor.yaml", YAML, EUROC),
     "kalibr": ("camchain.yaml", YAML, KALIBR.replace("@@", "").replace("\n  rost", "\n  rost")),
     "kalibr-camera": ("camchain.yaml", YAML, KALIBR.replace("@cam0", "cam0").replace("@@", "@")),
+    "anipose": ("calibration.toml", "{key} = 7\n", ANIPOSE),
     "transforms": ("transforms.json", JSON, TRANSFORMS),
     "alicevision": ("scene.sfm", JSON, ALICEVISION),
     "csm-frame": ("isd.json", JSON, _isd),

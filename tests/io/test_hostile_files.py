@@ -26,7 +26,7 @@ from jaxbundle.io.networks.stereo import fill_ros_stereo, write_opencv_stereo
 from jaxbundle.network.tables import Camera, Network
 
 FURTHER_SAMPLES = ("opencv-xml", "opencv-json", "opencv-nested", "ros-ini", "camodocal", "orb-slam",
-                   "orb-slam-pair", "euroc", "alicevision", "metashape-lens",
+                   "orb-slam-pair", "euroc", "anipose", "alicevision", "metashape-lens",
                    "autocal")  # fmt: skip
 EXAMPLE = Path(__file__).parents[2] / "examples" / "convergent4" / "convergent4.txt"
 

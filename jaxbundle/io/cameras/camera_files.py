@@ -15,6 +15,7 @@ from jaxbundle.io.cameras.metashape_lens import is_metashape_lens, read_metashap
 from jaxbundle.io.cameras.opencv_file import READ_SUFFIXES, is_opencv, read_opencv
 from jaxbundle.io.cameras.ros_ini import is_ros_ini, is_ros_ini_pair, read_ros_ini
 from jaxbundle.io.cameras.slam_yaml import is_slam_yaml, read_slam_yaml
+from jaxbundle.io.networks.anipose import is_anipose
 from jaxbundle.io.networks.colmap import read_colmap_cameras
 from jaxbundle.io.networks.column_map import is_column_map
 from jaxbundle.io.networks.micmac_camera import is_autocal, read_autocal
@@ -49,7 +50,9 @@ def _is_colmap_cameras(path: Path) -> bool:
 
 def _is_toml_cameras(path: Path) -> bool:
     # a project and a column map are TOML with cameras too, but hold a network
-    return _is_toml(path) and not is_column_map(path) and "project" not in read_toml(path)
+    if not _is_toml(path) or is_column_map(path) or is_anipose(path):
+        return False
+    return "project" not in read_toml(path)
 
 
 # In the order of recognition: OpenCV's habits, which many programs share, come last.
@@ -100,7 +103,7 @@ def read_cameras(path: str | Path, models: Sequence[CameraModel] = ()) -> tuple[
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file")
-    if _is_toml(path):
+    if _is_toml(path) and not is_anipose(path):
         return _read_toml_cameras(path, models)
     kind = next((kind for kind in CAMERA_FORMATS.values() if kind.recognises(path)), None)
     if kind is None and path.suffix.lower() in READ_SUFFIXES:
