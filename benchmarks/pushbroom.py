@@ -12,6 +12,7 @@ value; results are checked first, and a wrong answer ends with exit status 1, re
     terrain        first hit with a rough model       jacobian     ∂(X, Y, Z)/∂(3 angles, 3 shifts)
     raster         ground → image, near a known place search       ground → image, nothing known
     rpc_project    ground → image by RPC              rpc_locate   the way back, heights given
+    gdal_project   the same by GDAL (rasterio)        gdal_locate
 """
 
 import os
@@ -53,7 +54,7 @@ from jaxbundle.pushbroom.trajectory import Trajectory, orbital_frame  # noqa: E4
 LINES, PIXELS, PERIOD, ORBIT = 10_000, 8000, 1 / 1500, (5e5, np.radians(97.4), 0.3, 0.6)
 DEMANDS = {
     "ellipsoid": 50, "geodetic": 10, "terrain": 2, "jacobian": 3, "raster": 10, "search": 10,
-    "rpc_project": None, "rpc_locate": None,
+    "rpc_project": None, "rpc_locate": 8, "gdal_project": None, "gdal_locate": None,
 }  # fmt: skip
 U = jnp.arange(float(PIXELS))
 
@@ -150,7 +151,36 @@ def measure(rounds):
         "search": rate(lambda X: project_points(scan, search, X), [X] * 2, X.shape[1], rounds),
         "rpc_project": rate(lambda h: rpc_project(rpc, east, north, h), [h] * 8, len(h), rounds),
         "rpc_locate": rate(lambda h: rpc_locate(rpc, l, u, h), [h] * 8, len(h), rounds),
+        **gdal_rates(rpc, (l, u, h), (east, north), rounds, check),
     }, wrong  # fmt: skip
+
+
+def gdal_rates(rpc, place, ground, rounds, check):
+    """Of GDAL's transformer in two threads, checked against ours; its first pixel begins at 0."""
+    from rasterio.rpc import RPC
+    from rasterio.transform import RPCTransformer
+
+    names = {"line": "line", "sample": "samp", "longitude": "long", "latitude": "lat",
+             "height": "height"}  # fmt: skip
+    given = {}
+    for name, short in names.items():
+        given[f"{short}_off"] = float(getattr(rpc, f"{name}_offset"))
+        given[f"{short}_scale"] = float(getattr(rpc, f"{name}_scale"))
+    for field, key in (("line_numerator", "line_num_coeff"), ("line_denominator", "line_den_coeff"),
+                       ("sample_numerator", "samp_num_coeff"),
+                       ("sample_denominator", "samp_den_coeff")):  # fmt: skip
+        given[key] = np.asarray(getattr(rpc, field)).tolist()
+    (l, u, h), (east, north) = place, (np.degrees(np.asarray(v)) for v in ground)
+    # of its own for every thread: GDAL's is not shared
+    make = lambda: RPCTransformer(RPC(**given))
+    rows, columns = make().rowcol(east, north, zs=h, op=lambda x: x)
+    check("gdal_project", np.abs(np.stack([rows, columns]) - 0.5 - [l, u]).max(), 1e-3)
+    project = lambda _: make().rowcol(east, north, zs=h, op=lambda x: x)
+    locate = lambda _: make().xy(l, u, zs=h, offset="center")
+    return {
+        "gdal_project": rate(project, [0] * 8, len(h), rounds),
+        "gdal_locate": rate(locate, [0] * 8, len(h), rounds),
+    }
 
 
 def map_seconds():
