@@ -56,6 +56,10 @@ Minimise = Callable[..., tuple[NetworkProblem, Minimum]]
 problem as it ended."""
 
 
+MIN_POINTS = 3
+"""Of an image: fewer leave its pose open."""
+
+
 class Candidate(NamedTuple):
     """Another solution to start from, and the images that differ."""
 
@@ -163,23 +167,34 @@ class _State:
         own = np.bincount(self.rays.image, squares, images) / np.maximum(2 * number, 1)
         scale = np.maximum(self.scale, own)
         share = self.settings.min_turning_share / self.settings.safety
-        weak = (share * effect < self.settings.limit * scale) & self.free & (number >= 3)
+        weak = (share * effect < self.settings.limit * scale) & self.free & (number >= MIN_POINTS)
         if not weak.any():
             return
-        chosen = np.flatnonzero(weak)
-        refined, change = self._resect(turned, chosen)
-        here = _turns(self.scene, turned)[chosen]
-        apart = _turns(self.scene, refined)[chosen] > 0.01 * here
-        apart &= share_behind(refined, self.rays)[chosen] <= 0.5
-        # Points and cameras are held in these resections: free ones reduce the difference.
-        limit = self.settings.safety * self.settings.threshold * scale[chosen]
-        better = apart & (change < -self.settings.threshold * scale[chosen])
+        views = self._views(np.flatnonzero(weak))
+        refined, change = self._improve(turned, views)
+        # A wrong minimum need not be the turned one: where residuals contradict their σ, the best
+        # pose of the image is found in closed form as well.
+        degrees = np.maximum(2 * number, 1)
+        largest = [chi2_quantile(1 - self.settings.error_probability, n) for n in degrees]
+        doubted = [v for v in views if self.stated and own[v.image] > largest[v.image] / degrees[v.image]]
+        if doubted:
+            best, by_best = self._improve(self._resect(turned, doubted), doubted)
+            use = by_best < change
+            refined = _choose(use, best, refined)
+            change = np.where(use, by_best, change)
+        # A hundredth of the way is the present pose, found again.
+        apart = _turns(self.scene, refined) > 0.01 * _turns(self.scene, turned)
+        apart &= np.isfinite(change) & (share_behind(refined, self.rays) <= 0.5)
+        better = apart & (change < -self.settings.threshold * scale)
         if better.sum() > 1:
-            yield Candidate(TURNED, chosen[better], self._with_poses(refined, chosen[better]))
-        each = apart & (change < limit) & ~(better & (better.sum() > 1))
-        order = np.argsort(np.where(each, change, np.inf))[: each.sum()]
-        for k in chosen[order[: self.settings.max_images]]:
-            yield Candidate(TURNED, np.array([k]), self._with_poses(refined, np.array([k])))
+            yield Candidate(TURNED, np.flatnonzero(better), _choose(better, refined, self.scene))
+            apart &= ~better
+        # Points and cameras are held in these resections: free ones reduce the difference.
+        limit = self.settings.safety * self.settings.threshold * scale
+        each = np.flatnonzero(apart & (change < limit))
+        for k in each[np.argsort(change[each])][: self.settings.max_images]:
+            alone = np.arange(images) == k
+            yield Candidate(TURNED, np.array([k]), _choose(alone, refined, self.scene))
 
     def _reversed(self) -> Iterator[Candidate]:
         scene = reverse_depth(self.scene, self.rays, self.known)
@@ -273,48 +288,53 @@ class _State:
         cameras = adjusted_cameras(self.problem, self.first.adjusted)
         return sights(network.replace(cameras=tuple(cameras.values())))
 
-    def _resect(
-        self, turned: Scene, chosen: Int[np.ndarray, " n"]
-    ) -> tuple[Scene, Float[np.ndarray, " n"]]:
-        """Poses of the chosen images improved on the adjusted points, and by how much their Σ(v/σ)²
-        is above the present one."""
-        seen, problem, scene = self._sights, self.problem, self.scene
+    def _views(self, images: Int[np.ndarray, " n"]) -> list["_View"]:
+        """What images see, in cameras turned towards it."""
+        seen, problem = self._sights, self.problem
         place = np.full(len(problem.network.observations), -1)
-        place[np.flatnonzero(problem.used)] = np.arange(int(problem.used.sum()))
-        X0, M = turned.X0.copy(), turned.M.copy()
-        turns, xy, X, weights, rows = [], [], [], [], []
-        for k in chosen:
+        place[np.flatnonzero(problem.used)] = np.arange(len(self.rays.image))
+        views = []
+        for k in images:
             part = np.arange(*seen.rows_of(k).indices(len(seen.image)))
             part = part[place[seen.row[part]] >= 0]
-            R, plane = in_plane(seen.ray[part])
-            there = np.isfinite(plane).all(1)
-            part, plane = part[there], plane[there]
-            turns.append(R)
-            xy.append(plane)
-            X.append(scene.X[seen.point[part]])
-            weights.append(1 / self.rays.sigma[place[seen.row[part]]] ** 2)
-            rows.append(part)
-        enough = np.array([len(part) >= 3 for part in rows])
-        change = np.full(len(chosen), np.inf)
-        if not enough.any():
-            return turned, change
-        use = np.flatnonzero(enough)
-        starts = X0[chosen[use]], np.stack([turns[i] @ M[chosen[i]] for i in use])
-        pick = lambda parts: [parts[i] for i in use]
-        centre, rotation = many.refine(starts, pick(xy), pick(X), pick(weights))
-        for i, x, m in zip(use, centre, rotation):
-            k = chosen[i]
-            X0[k], M[k] = x, turns[i].T @ m
-            square = lambda x, m: (
-                weights[i] * ((_unit((X[i] - x) @ m.T) - seen.ray[rows[i]]) ** 2).sum(1)
-            ).sum()
-            change[i] = square(X0[k], M[k]) - square(scene.X0[k], scene.M[k])
-        return Scene(X0, M, scene.X), np.where(np.isfinite(change), change, np.inf)
+            R, xy = in_plane(seen.ray[part])
+            there = np.isfinite(xy).all(1)
+            part = part[there]
+            weight = 1 / self.rays.sigma[place[seen.row[part]]] ** 2
+            X = self.scene.X[seen.point[part]]
+            views.append(
+                _View(int(k), R, xy[there], X, seen.ray[part], weight, float(seen.tolerance[k]))
+            )
+        return [view for view in views if len(view.xy) >= MIN_POINTS]
 
-    def _with_poses(self, scene: Scene, images: Int[np.ndarray, " n"]) -> Scene:
-        X0, M = self.scene.X0.copy(), self.scene.M.copy()
-        X0[images], M[images] = scene.X0[images], scene.M[images]
-        return Scene(X0, M, self.scene.X)
+    def _improve(
+        self, start: Scene, views: list["_View"]
+    ) -> tuple[Scene, Float[np.ndarray, " images"]]:
+        """Poses of images improved on the adjusted points, and by how much their Σ(v/σ)² is then
+        above the present one; infinite without."""
+        X0, M, change = start.X0.copy(), start.M.copy(), np.full(len(start.X0), np.inf)
+        if not views:
+            return start, change
+        images = [view.image for view in views]
+        poses = X0[images], np.stack([view.R @ M[view.image] for view in views])
+        columns = zip(*((view.xy, view.X, view.weight) for view in views))
+        for view, x, m in zip(views, *many.refine(poses, *columns)):
+            k = view.image
+            X0[k], M[k] = x, view.R.T @ m
+            change[k] = view.square(X0[k], M[k]) - view.square(self.scene.X0[k], self.scene.M[k])
+        return Scene(X0, M, start.X), np.where(np.isfinite(change), change, np.inf)
+
+    def _resect(self, start: Scene, views: list["_View"]) -> Scene:
+        """The poses of images in closed form."""
+        tolerance = np.array([view.tolerance for view in views])
+        found = many.resect(
+            [view.xy for view in views], [view.X for view in views], tolerance
+        )
+        X0, M = start.X0.copy(), start.M.copy()
+        for view, x, m, share in zip(views, *found):
+            if share > 0:
+                X0[view.image], M[view.image] = x, view.R.T @ m
+        return Scene(X0, M, start.X)
 
     # --- adjustment -------------------------------------------------------------------------
 
@@ -405,6 +425,30 @@ class _State:
         return SecondMinimum(
             found.candidate.ambiguity, images, vtpv, other, E, ambiguous, taken, found.turn, found.shift
         )
+
+
+class _View(NamedTuple):
+    """What one image sees: x, y with c = 1 in the camera turned by R, the points, the rays in the
+    image's own frame, weights of directions, the tolerance of start values."""
+
+    image: int
+    R: Float[np.ndarray, "3 3"]
+    xy: Float[np.ndarray, "n 2"]
+    X: Float[np.ndarray, "n 3"]
+    ray: Float[np.ndarray, "n 3"]
+    weight: Float[np.ndarray, " n"]
+    tolerance: float
+
+    def square(self, X0: Float[np.ndarray, "3"], M: Float[np.ndarray, "3 3"]) -> float:
+        """Σ(v/σ)² of a pose."""
+        off = _unit((self.X - X0) @ M.T) - self.ray
+        return float((self.weight * (off**2).sum(1)).sum())
+
+
+def _choose(images: Bool[np.ndarray, " images"], one: Scene, other: Scene) -> Scene:
+    """The poses of `one` for some images, of `other` for the rest, with its points."""
+    X0 = np.where(images[:, None], one.X0, other.X0)
+    return Scene(X0, np.where(images[:, None, None], one.M, other.M), other.X)
 
 
 def _cost(minimum: Minimum) -> float:
