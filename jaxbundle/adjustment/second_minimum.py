@@ -7,6 +7,7 @@ the program of the first minimum from other start values.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -172,6 +173,13 @@ class _State:
             return
         views = self._views(np.flatnonzero(weak))
         refined, change = self._improve(turned, views)
+        # Near the end of its second minimum (see `min_turning_share`) an iteration may step over to
+        # the first one: then the closed form is the better start.
+        back = _turns(self.scene, refined) < 0.5 * _turns(self.scene, turned)
+        refined = _choose(back, turned, refined)
+        for view in views:
+            if back[view.image]:
+                change[view.image] = self._change(view, turned)
         # A wrong minimum need not be the turned one: where residuals contradict their σ, the best
         # pose of the image is found in closed form as well.
         degrees = np.maximum(2 * number, 1)
@@ -282,7 +290,7 @@ class _State:
         X = np.where(np.isfinite(model.X) & ~self.known[:, None], model.X, self.scene.X)
         return Scene(model.X0, model.M, X)
 
-    @property
+    @functools.cached_property
     def _sights(self) -> Sights:
         network = self.problem.network
         cameras = adjusted_cameras(self.problem, self.first.adjusted)
@@ -321,8 +329,13 @@ class _State:
         for view, x, m in zip(views, *many.refine(poses, *columns)):
             k = view.image
             X0[k], M[k] = x, view.R.T @ m
-            change[k] = view.square(X0[k], M[k]) - view.square(self.scene.X0[k], self.scene.M[k])
+            change[k] = self._change(view, Scene(X0, M, start.X))
         return Scene(X0, M, start.X), np.where(np.isfinite(change), change, np.inf)
+
+    def _change(self, view: "_View", other: Scene) -> float:
+        """By how much Σ(v/σ)² of an image is above the present one in another pose."""
+        k = view.image
+        return view.square(other.X0[k], other.M[k]) - view.square(self.scene.X0[k], self.scene.M[k])
 
     def _resect(self, start: Scene, views: list["_View"]) -> Scene:
         """The poses of images in closed form."""
