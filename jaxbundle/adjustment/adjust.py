@@ -451,7 +451,11 @@ class _AdjustmentState:
         """Take the best minimum and keep those that remain; those left before remain known."""
         if self.inspection is None or not can_have_second(self.problem):
             return
-        self.problem, self.minimum, found = look(self.inspection, self.minimum)
+        try:
+            self.problem, self.minimum, found = look(self.inspection, self.minimum)
+        except (InputError, NotSolvedError, np.linalg.LinAlgError):
+            # The result is as good as before the search.
+            return
         left = [one for one in self.said.get("second_minima", ()) if one.taken]
         same = lambda one, other: (one.ambiguity, one.images) == (other.ambiguity, other.images)
         left = [one for one in left if not any(same(one, other) for other in found)]

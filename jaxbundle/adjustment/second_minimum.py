@@ -29,13 +29,13 @@ from jaxbundle.adjustment.quality.second_minimum import (
     evidence,
 )
 from jaxbundle.adjustment.second_solutions import (
-    Rays,
     Scene,
     mirror,
     mirror_images,
     perspective_effect,
     rays_of,
     reverse_depth,
+    sample,
     scene_of,
     share_behind,
     turn_over,
@@ -121,12 +121,11 @@ def find_second_minima(
 class _State:
     """One minimum, and what is needed to look for others."""
 
-    def __init__(
-        self, first: Inspection, minimise: Minimise, settings: SecondMinimumSettings
-    ):
+    def __init__(self, first: Inspection, minimise: Minimise, settings: SecondMinimumSettings):
         self.first, self.problem, self.settings = first, first.problem, settings
         self.minimise = minimise
-        self.scene, self.rays = scene_of(first.adjusted), rays_of(first.problem)
+        self.scene, self.all_rays = scene_of(first.adjusted), rays_of(first.problem)
+        self.rays = sample(self.all_rays, len(self.scene.X0), many.SLOTS)
         self.free = np.asarray(self.problem.table("image").free).any(1)
         network, counts = self.problem.network, self.problem.counts
         self.known = network.points.has_role("control", "fixed")
@@ -151,9 +150,9 @@ class _State:
         plain = np.array([get_model(c.model).image == "perspective" for c in network.cameras])
         behind = (share_behind(self.scene, self.rays) > 0.5) & plain[network.images.camera]
         behind &= self.free
-        if behind.all():
+        if behind.all() and self.problem.lengths is None:
             yield Candidate(MIRRORED, np.flatnonzero(behind), mirror(self.scene, self.known))
-        elif behind.any():
+        elif behind.any() and not behind.all():
             scene = mirror_images(self.scene, self.rays, behind)
             yield Candidate(MIRRORED, np.flatnonzero(behind), scene)
 
@@ -162,10 +161,10 @@ class _State:
         images = len(self.scene.X0)
         turned = turn_over(self.scene, self.rays)
         effect = perspective_effect(self.scene, turned, self.rays)
-        number = np.bincount(self.rays.image, minlength=images)
+        number = np.bincount(self.all_rays.image, minlength=images)
         # An image in the wrong minimum has large residuals, however many others fit.
         squares = (self.first.image_residuals[self.problem.used] ** 2).sum(1)
-        own = np.bincount(self.rays.image, squares, images) / np.maximum(2 * number, 1)
+        own = np.bincount(self.all_rays.image, squares, images) / np.maximum(2 * number, 1)
         scale = np.maximum(self.scale, own)
         share = self.settings.min_turning_share / self.settings.safety
         weak = (share * effect < self.settings.limit * scale) & self.free & (number >= MIN_POINTS)
@@ -184,7 +183,9 @@ class _State:
         # pose of the image is found in closed form as well.
         degrees = np.maximum(2 * number, 1)
         largest = [chi2_quantile(1 - self.settings.error_probability, n) for n in degrees]
-        doubted = [v for v in views if self.stated and own[v.image] > largest[v.image] / degrees[v.image]]
+        doubted = [
+            v for v in views if self.stated and own[v.image] > largest[v.image] / degrees[v.image]
+        ]
         if doubted:
             best, by_best = self._improve(self._resect(turned, doubted), doubted)
             use = by_best < change
@@ -215,11 +216,11 @@ class _State:
         """Of an image and those that see most of its points, the orientations with the other plane,
         if the plane is possible in all of them."""
         images, points = len(self.scene.X0), len(self.scene.X)
-        number = np.bincount(self.rays.image, minlength=images)
-        first = int(np.argmax(number))
+        rays = self.all_rays
+        first = int(np.argmax(np.bincount(rays.image, minlength=images)))
         common = np.zeros(points, bool)
-        common[self.rays.point[self.rays.image == first]] = True
-        shared = np.bincount(self.rays.image, common[self.rays.point], images)
+        common[rays.point[rays.image == first]] = True
+        shared = np.bincount(rays.image, common[rays.point], images)
         shared[first] = 0
         partners = np.argsort(-shared, kind="stable")[: many.LANES]
         partners = partners[shared[partners] >= 6]
@@ -234,21 +235,29 @@ class _State:
         # The solution that is farther from the present one.
         turn = np.stack([_angles(M[:, k] @ relative.transpose(0, 2, 1)) for k in (0, 1)], 1)
         base = self.scene.M[first] @ (self.scene.X0[partners] - self.scene.X0[first]).T
-        across = np.stack([np.linalg.norm(b[:, k] - base.T / np.linalg.norm(base, axis=0)[:, None], axis=1) for k in (0, 1)], 1)
+        across = np.stack(
+            [
+                np.linalg.norm(b[:, k] - base.T / np.linalg.norm(base, axis=0)[:, None], axis=1)
+                for k in (0, 1)
+            ],
+            1,
+        )
         other = np.argmax(turn + across, axis=1)
         lane = np.arange(len(partners))
         if not possible[lane, other].all():
             return
         best = int(np.argmax(np.linalg.norm(base, axis=0)))
-        scene = self._grow(seen, first, int(partners[best]), M[best, other[best]], b[best, other[best]])
+        scene = self._grow(
+            seen, first, int(partners[best]), M[best, other[best]], b[best, other[best]]
+        )
         if scene is not None:
             yield Candidate(OTHER_PLANE, np.arange(images), scene)
 
     def _is_plane(self, first: int, partners: Int[np.ndarray, " n"]) -> bool:
         """Whether the points of an image are so near to a plane that the second orientation of a
         plane may fit: by the parallax of what is off it."""
-        rays, scene = self.rays, self.scene
-        seen = np.unique(rays.point[rays.image == first])
+        rays, scene = self.all_rays, self.scene
+        seen = self.rays.point[self.rays.image == first]
         X = scene.X[seen]
         o = X.mean(0)
         normal = np.linalg.svd(X - o)[2][2]
@@ -257,7 +266,9 @@ class _State:
             along = ((o - scene.X0[first]) @ normal) / (sight @ normal)
         flat = scene.X.copy()
         flat[seen] = scene.X0[first] + along[:, None] * sight
-        chosen = np.isin(rays.image, partners) & np.isin(rays.point, seen)
+        of_point, of_image = np.zeros(len(scene.X), bool), np.zeros(len(scene.X0), bool)
+        of_point[seen], of_image[partners] = True, True
+        chosen = of_image[rays.image] & of_point[rays.point]
         image, point = rays.image[chosen], rays.point[chosen]
         one, two = (_unit(X[point] - scene.X0[image]) for X in (scene.X, flat))
         effect = np.nansum((np.linalg.norm(one - two, axis=1) / rays.sigma[chosen]) ** 2)
@@ -278,7 +289,7 @@ class _State:
         model.place(second, b, M)
         grow(seen, model)
         intersect(seen, model, START_VALUE_DEMANDS)
-        used = np.unique(self.rays.point)
+        used = np.unique(self.all_rays.point)
         if not model.placed.all() or not model.known[used].all():
             return None
         held = self.known[used]
@@ -300,7 +311,7 @@ class _State:
         """What images see, in cameras turned towards it."""
         seen, problem = self._sights, self.problem
         place = np.full(len(problem.network.observations), -1)
-        place[np.flatnonzero(problem.used)] = np.arange(len(self.rays.image))
+        place[np.flatnonzero(problem.used)] = np.arange(len(self.all_rays.image))
         views = []
         for k in images:
             part = np.arange(*seen.rows_of(k).indices(len(seen.image)))
@@ -308,7 +319,7 @@ class _State:
             R, xy = in_plane(seen.ray[part])
             there = np.isfinite(xy).all(1)
             part = part[there]
-            weight = 1 / self.rays.sigma[place[seen.row[part]]] ** 2
+            weight = 1 / self.all_rays.sigma[place[seen.row[part]]] ** 2
             X = self.scene.X[seen.point[part]]
             views.append(
                 _View(int(k), R, xy[there], X, seen.ray[part], weight, float(seen.tolerance[k]))
@@ -340,9 +351,7 @@ class _State:
     def _resect(self, start: Scene, views: list["_View"]) -> Scene:
         """The poses of images in closed form."""
         tolerance = np.array([view.tolerance for view in views])
-        found = many.resect(
-            [view.xy for view in views], [view.X for view in views], tolerance
-        )
+        found = many.resect([view.xy for view in views], [view.X for view in views], tolerance)
         X0, M = start.X0.copy(), start.M.copy()
         for view, x, m, share in zip(views, *found):
             if share > 0:
@@ -379,13 +388,16 @@ class _State:
             return None
         there = scene_of(found.adjusted)
         # Never a solution with its points behind the cameras.
-        behind = [(share_behind(s, self.rays) > 0.5).sum() for s in (self.scene, there)]
-        if behind[1] > behind[0] or not self._differs(there):
+        if self._behind(there) > self._behind(self.scene) or not self._differs(there):
             return None
         images = candidate.images
         turn = float(_turns(self.scene, there)[images].max())
         shift = float(np.linalg.norm(there.X0 - self.scene.X0, axis=1)[images].max())
         return Found(candidate, problem, minimum, found, turn, shift)
+
+    def _behind(self, scene: Scene) -> int:
+        """Images with most of their points behind them."""
+        return int(np.sum(share_behind(scene, self.rays) > 0.5))
 
     def _values(self, scene: Scene) -> Values:
         values = dict(self.first.adjusted)
@@ -394,7 +406,10 @@ class _State:
         values["image"] = PoseValue(
             np.where(free, scene.X0, position), np.where(free, many.quaternions(scene.M), rotation)
         )
-        values["point"] = with_coordinates(values["point"], scene.X)
+        X = np.where(
+            np.asarray(self.problem.table("point").free).any(1)[:, None], scene.X, self.scene.X
+        )
+        values["point"] = with_coordinates(values["point"], X)
         return values
 
     def _differs(self, there: Scene) -> bool:
@@ -416,8 +431,8 @@ class _State:
         with more points in front of the cameras."""
         difference = found.inspection.vtpv - self.first.vtpv
         if found.candidate.ambiguity == MIRRORED:
-            behind = [(share_behind(s, self.rays) > 0.5).sum() for s in (self.scene, scene_of(found.inspection.adjusted))]
-            return behind[1] < behind[0] and difference < self.settings.threshold * self.scale
+            fewer = self._behind(scene_of(found.inspection.adjusted)) < self._behind(self.scene)
+            return fewer and difference < self.settings.threshold * self.scale
         return difference < -max(1e-9 * self.first.vtpv, self.rounding)
 
     def record(self, found: Found) -> SecondMinimum:
@@ -436,7 +451,15 @@ class _State:
         mirrored = found.candidate.ambiguity == MIRRORED
         ambiguous = E < self.settings.threshold and not mirrored
         return SecondMinimum(
-            found.candidate.ambiguity, images, vtpv, other, E, ambiguous, taken, found.turn, found.shift
+            found.candidate.ambiguity,
+            images,
+            vtpv,
+            other,
+            E,
+            ambiguous,
+            taken,
+            found.turn,
+            found.shift,
         )
 
 

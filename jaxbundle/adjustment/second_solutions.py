@@ -1,7 +1,7 @@
 """The second solutions that a network may have, in closed form from its first one.
 
-S(a) = 1 − 2·a·aᵀ reflects on the plane with the unit normal a. With a point c of the object, seen by
-an image with the centre X0 and the rotation M in the direction u = M·(c − X0)/|M·(c − X0)|:
+S(a) = 1 − 2·a·aᵀ reflects on the plane with the unit normal a. A point c of the object is seen by
+an image with the centre X0 and the rotation M in the direction u = M·(c − X0)/|M·(c − X0)|.
 
 **Turned over** (one image of a plane; Oberkampf, DeMenthon and Davis, 1996; Schweighofer and Pinz,
 2006). Under weak perspective the image of a plane with the normal m is the same after the normal is
@@ -14,14 +14,15 @@ whole object, reflected on a plane with any normal n through o: all choices diff
 
     X' = o + S(n)·(X − o),        (1) with n for m, and X0' about c'                         (2)
 
-**Mirrored** (all images). The collinearity equations do not see the sign of q, so that every network
-fits exactly as its mirror image behind its cameras; of a plane on which its control lies, control
-too: the images look away from their points, from below the floor.
+**Mirrored** (all images). The collinearity equations do not see the sign of q, so that every
+network fits exactly as its mirror image behind its cameras; mirrored on a plane on which its
+control lies, control fits too: the images look away from their points, from below the floor.
 
     X' = o + S(n)·(X − o),        X0' = o + S(n)·(X0 − o),        M' = −M·S(n)               (3)
 
 **The other plane** (two images or more of a plane): `orientation.planar`; of images that nearly
-coincide the normal of the plane and the direction of the base are exchanged (Longuet-Higgins, 1986).
+coincide the normal of the plane and the direction of the base are exchanged (Longuet-Higgins,
+1986).
 """
 
 from typing import NamedTuple
@@ -71,6 +72,22 @@ def rays_of(problem: NetworkProblem) -> Rays:
     return Rays(problem.image[used], problem.point[used], 1 / weight)
 
 
+def sample(rays: Rays, images: int, most: int) -> Rays:
+    """At most so many rays of every image, evenly, with the weight of all of them: sums over an
+    image stay about the same, in a time that does not grow with its points."""
+    order = np.argsort(rays.image, kind="stable")
+    number = np.bincount(rays.image, minlength=images)
+    first = np.cumsum(number) - number
+    place = np.arange(len(order)) - first[rays.image[order]]
+    total = number[rays.image[order]]
+    # Those at which place·most/total passes an integer.
+    chosen = (place * most) // total != ((place - 1) * most) // total
+    kept = order[chosen | (total <= most)]
+    weight = number / np.maximum(np.bincount(rays.image[kept], minlength=images), 1)
+    image = rays.image[kept]
+    return Rays(image, rays.point[kept], rays.sigma[kept] / np.sqrt(weight[image]))
+
+
 def turn_over(scene: Scene, rays: Rays) -> Scene:
     """Equation (1) for every image, the plane fitted to the points that it sees."""
     c, normal = _planes(scene, rays)
@@ -107,9 +124,7 @@ def mirror_images(scene: Scene, rays: Rays, images: Bool[np.ndarray, " images"])
     c, normal = _planes(scene, rays)
     X0 = scene.X0 - 2 * ((scene.X0 - c) * normal).sum(1, keepdims=True) * normal
     M, chosen = -scene.M @ _reflection(normal), images[:, None]
-    return Scene(
-        np.where(chosen, X0, scene.X0), np.where(chosen[:, None], M, scene.M), scene.X
-    )
+    return Scene(np.where(chosen, X0, scene.X0), np.where(chosen[:, None], M, scene.M), scene.X)
 
 
 def plane_of_known(
@@ -156,9 +171,7 @@ def _in_tangent_plane(scene: Scene, rays: Rays, images: int) -> np.ndarray:
     d = np.einsum(
         "nij,nj->ni", scene.M[rays.image], _unit(scene.X[rays.point] - scene.X0[rays.image])
     )
-    axis = np.zeros((images, 3))
-    np.add.at(axis, rays.image, np.nan_to_num(d))
-    axis = _unit(axis)
+    axis = _unit(np.stack([np.bincount(rays.image, x, images) for x in np.nan_to_num(d).T], 1))
     # Any rotation that takes the axis to −z, the same for neighbouring axes: the shortest one.
     a, b, c = np.nan_to_num(axis).T
     f = 1 / np.maximum(1 - c, 1e-9)
@@ -175,8 +188,9 @@ def _planes(
     """A point and the normal of the plane fitted to the points of every image."""
     c = _means(scene.X, rays, len(scene.X0))
     off = scene.X[rays.point] - c[rays.image]
-    scatter = np.zeros((len(scene.X0), 3, 3))
-    np.add.at(scatter, rays.image, off[:, :, None] * off[:, None, :])
+    columns = (off[:, :, None] * off[:, None, :]).reshape(-1, 9).T
+    scatter = np.stack([np.bincount(rays.image, x, len(scene.X0)) for x in columns], 1)
+    scatter = scatter.reshape(-1, 3, 3)
     return c, np.linalg.eigh(scatter)[1][:, :, 0]
 
 
@@ -204,8 +218,7 @@ def _reflect(
 
 def _means(X: Float[np.ndarray, "points 3"], rays: Rays, images: int) -> np.ndarray:
     """The mean of the points that every image sees."""
-    sums = np.zeros((images, 3))
-    np.add.at(sums, rays.image, X[rays.point])
+    sums = np.stack([np.bincount(rays.image, x, images) for x in X[rays.point].T], 1)
     return sums / np.maximum(np.bincount(rays.image, minlength=images), 1)[:, None]
 
 

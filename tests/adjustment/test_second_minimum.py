@@ -1,4 +1,4 @@
-"""Second minima: found, compared with dense adjustments from the other pose, taken, or left alone."""
+"""Second minima: compared with dense adjustments from the other pose, taken, or left alone."""
 
 import dataclasses
 import json
