@@ -219,16 +219,116 @@ def run_images(cases, seed):
     return counts, error, taken, float(np.median(spent))
 
 
+def draw_network(rng):
+    """Two to five images of 20 unknown points, flat or as deep as wide."""
+    images, n = int(rng.integers(2, 6)), 20
+    X = rng.uniform(-1, 1, (n, 3)) * [1, 1, np.exp(rng.uniform(np.log(0.1), 0))]
+    distance = np.exp(rng.uniform(np.log(20.0), np.log(3000.0)))
+    sigma = C / distance * np.exp(rng.uniform(np.log(1e-4), np.log(0.005)))
+    X0, M = zip(*(
+        looking_at(view, distance, rng.uniform(0, 2 * np.pi)) for view in views(rng, images, 5, 50)
+    ))  # fmt: skip
+    X0, M = np.stack(X0), np.stack(M)
+    xy = sigma * residuals(X0, M, X, 0.0, sigma).reshape(images, n, 2)
+    return Case(X, X0, M, xy + sigma * rng.normal(size=xy.shape), sigma)
+
+
+def reverse(case):
+    """The object reflected on the plane across the mean line of sight, and its images."""
+    n = case.X0.mean(0) / np.linalg.norm(case.X0.mean(0))
+    S, o = np.eye(3) - 2 * np.outer(n, n), case.X.mean(0)
+    X0, M = np.empty_like(case.X0), np.empty_like(case.M)
+    for k, (x, m) in enumerate(zip(case.X0, case.M)):
+        local = m @ (o - x)
+        u = local / np.linalg.norm(local)
+        M[k] = (np.eye(3) - 2 * np.outer(u, u)) @ m @ S
+        X0[k] = o - M[k].T @ local
+    return case._replace(X=o + (case.X - o) @ S, X0=X0, M=M)
+
+
+def dense(case, steps=60):
+    """vᵀPv of a free network by a dense Levenberg-Marquardt from its poses and points; None if it
+    did not settle."""
+    images, n = len(case.X0), len(case.X)
+    size = np.linalg.norm(case.X0[0])
+
+    def value(p):
+        turn = Rotation.from_rotvec(p[3 * images : 6 * images].reshape(-1, 3)).as_matrix()
+        X0 = case.X0 + size * p[: 3 * images].reshape(-1, 3)
+        X = case.X + p[6 * images :].reshape(n, 3)
+        return residuals(X0, turn @ case.M, X, case.xy, case.sigma).ravel()
+
+    p, h, damping = np.zeros(6 * images + 3 * n), 1e-6, 1e-4
+    r = value(p)
+    for _ in range(steps):
+        J = np.stack([(value(p + h * e) - value(p - h * e)) / (2 * h) for e in np.eye(len(p))], 1)
+        N, g, before = J.T @ J, J.T @ r, r @ r
+        for _ in range(20):
+            D = np.diag(np.diag(N)) + 1e-9 * np.eye(len(p))
+            step = np.linalg.solve(N + damping * D, -g)
+            trial = value(p + step)
+            if trial @ trial <= before:
+                break
+            damping *= 4
+        p, r, damping = p + step, trial, damping / 5
+        if abs(before - r @ r) < 1e-9 * (1 + before):
+            return r @ r
+    return None
+
+
+def run_networks(cases, seed):
+    """Counts of what became of networks, the largest error of a difference, further minima."""
+    rng = np.random.default_rng(seed)
+    counts, error, further = {}, 0.0, 0
+    for k in range(cases):
+        case = draw_network(rng)
+        other = reverse(case)
+        start = (case, other)[k % 2]
+        try:
+            result = jaxbundle.adjust(as_network(start, start.X0, start.M, known=False))
+            solved = result.converged
+        except jaxbundle.NotSolvedError:
+            solved = False
+        costs = [dense(case), dense(other)] if solved else [None]
+        if None in costs:
+            counts["not solved"] = counts.get("not solved", 0) + 1
+            continue
+        best, worst = sorted(costs)
+        r = 4 * len(case.X0) * 10 - 6 * len(case.X0) - 60 + 7
+        E = (worst - best) / max(1.0, best / r)
+        told = [one for one in result.second_minima if one.ambiguous]
+        right = [one for one in told if abs(one.difference - (worst - best)) < 1e-3 * (1 + worst)]
+        further += len(told) - len(right)
+        if result.vtpv > best + 1e-4 * (1 + best):
+            word = "worse minimum"
+        elif E < THRESHOLD:
+            word = "found" if right else "missed"
+        else:
+            word = "false alarm" if right else "none"
+        counts[word] = counts.get(word, 0) + 1
+        if right and word == "found":
+            error = max(error, abs(right[0].difference - (worst - best)))
+        if word not in ("none", "found"):
+            told = [(one.ambiguity, round(one.other_vtpv, 3)) for one in told]
+            print(f"  network {k}: {word}, E {E:.3g}, {len(case.X0)} images, minima {best:.4f}, "
+                  f"{worst:.4f}, result {result.vtpv:.4f}, {told}")  # fmt: skip
+    return counts, error, further
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cases", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--networks", type=int, default=200)
     given = parser.parse_args()
     jaxbundle.enable_x64()
     counts, error, taken, spent = run_images(given.cases, given.seed)
     print(f"{given.cases} images of known points: {counts}")
     print(f"largest error of a difference of vᵀPv {error:.2g}; better one taken {taken} times; "
           f"median {1000 * spent:.0f} ms")  # fmt: skip
+    counts, error, further = run_networks(given.networks, given.seed)
+    print(f"{given.networks} free networks of 2 to 5 images: {counts}")
+    print(f"largest error of a difference of vᵀPv {error:.2g}; {further} minima of other kinds")
 
 
 if __name__ == "__main__":

@@ -126,7 +126,8 @@ class _State:
         self.minimise = minimise
         self.scene, self.all_rays = scene_of(first.adjusted), rays_of(first.problem)
         self.rays = sample(self.all_rays, len(self.scene.X0), many.SLOTS)
-        self.free = np.asarray(self.problem.table("image").free).any(1)
+        free = lambda table: np.asarray(self.problem.table(table).free).max(1) > 0
+        self.free, self.free_points = free("image"), free("point")
         network, counts = self.problem.network, self.problem.counts
         self.known = network.points.has_role("control", "fixed")
         self.stated = network.observations.sigma_origin != UNIT
@@ -406,9 +407,7 @@ class _State:
         values["image"] = PoseValue(
             np.where(free, scene.X0, position), np.where(free, many.quaternions(scene.M), rotation)
         )
-        X = np.where(
-            np.asarray(self.problem.table("point").free).any(1)[:, None], scene.X, self.scene.X
-        )
+        X = np.where(self.free_points[:, None], scene.X, self.scene.X)
         values["point"] = with_coordinates(values["point"], X)
         return values
 
