@@ -21,6 +21,7 @@ from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.adjustment.quality.second_minimum import (
     MIRRORED,
     OTHER_PLANE,
+    OTHER_POSE,
     REVERSED,
     SECOND_MINIMUM,
     TURNED,
@@ -159,7 +160,7 @@ class _State:
 
     def _turned(self) -> Iterator[Candidate]:
         """Images alone, the points as they are."""
-        images = len(self.scene.X0)
+        settings, images = self.settings, len(self.scene.X0)
         turned = turn_over(self.scene, self.rays)
         effect = perspective_effect(self.scene, turned, self.rays)
         number = np.bincount(self.all_rays.image, minlength=images)
@@ -167,44 +168,55 @@ class _State:
         squares = (self.first.image_residuals[self.problem.used] ** 2).sum(1)
         own = np.bincount(self.all_rays.image, squares, images) / np.maximum(2 * number, 1)
         scale = np.maximum(self.scale, own)
-        share = self.settings.min_turning_share / self.settings.safety
-        weak = (share * effect < self.settings.limit * scale) & self.free & (number >= MIN_POINTS)
-        if not weak.any():
+        share = settings.min_turning_share / settings.safety
+        usable = self.free & (number >= MIN_POINTS)
+        weak = (share * effect < settings.limit * scale) & usable
+        doubted = self._doubted(own, number, weak) & usable
+        if not (weak | doubted).any():
             return
-        views = self._views(np.flatnonzero(weak))
-        refined, change = self._improve(turned, views)
+        views = self._views(np.flatnonzero(weak | doubted))
+        pose, change = self._improve(turned, views)
         # Near the end of its second minimum (see `min_turning_share`) an iteration may step over to
         # the first one: then the closed form is the better start.
-        back = _turns(self.scene, refined) < 0.5 * _turns(self.scene, turned)
-        refined = _choose(back, turned, refined)
+        back = _turns(self.scene, pose) < 0.5 * _turns(self.scene, turned)
+        pose = _choose(back, turned, pose)
         for view in views:
             if back[view.image]:
                 change[view.image] = self._change(view, turned)
-        # A wrong minimum need not be the turned one: where residuals contradict their σ, the best
-        # pose of the image is found in closed form as well.
-        degrees = np.maximum(2 * number, 1)
-        largest = [chi2_quantile(1 - self.settings.error_probability, n) for n in degrees]
-        doubted = [
-            v for v in views if self.stated and own[v.image] > largest[v.image] / degrees[v.image]
-        ]
-        if doubted:
-            best, by_best = self._improve(self._resect(turned, doubted), doubted)
-            use = by_best < change
-            refined = _choose(use, best, refined)
-            change = np.where(use, by_best, change)
+        # A wrong minimum need not be that of the object turned over.
+        views = [view for view in views if doubted[view.image]]
+        best, by_best = self._improve(self._resect(turned, views), views)
+        other = by_best < change
+        pose, change = _choose(other, best, pose), np.where(other, by_best, change)
         # A hundredth of the way is the present pose, found again.
-        apart = _turns(self.scene, refined) > 0.01 * _turns(self.scene, turned)
-        apart &= np.isfinite(change) & (share_behind(refined, self.rays) <= 0.5)
-        better = apart & (change < -self.settings.threshold * scale)
+        apart = _turns(self.scene, pose) > 0.01 * _turns(self.scene, turned)
+        apart &= np.isfinite(change) & (share_behind(pose, self.rays) <= 0.5)
+        better = apart & (change < -settings.threshold * scale)
         if better.sum() > 1:
-            yield Candidate(TURNED, np.flatnonzero(better), _choose(better, refined, self.scene))
+            name = OTHER_POSE if other[better].all() else TURNED
+            yield Candidate(name, np.flatnonzero(better), _choose(better, pose, self.scene))
             apart &= ~better
         # Points and cameras are held in these resections: free ones reduce the difference.
-        limit = self.settings.safety * self.settings.threshold * scale
-        each = np.flatnonzero(apart & (change < limit))
-        for k in each[np.argsort(change[each])][: self.settings.max_images]:
-            alone = np.arange(images) == k
-            yield Candidate(TURNED, np.array([k]), _choose(alone, refined, self.scene))
+        each = np.flatnonzero(apart & (change < settings.safety * settings.threshold * scale))
+        for k in each[np.argsort(change[each])][: settings.max_images]:
+            alone, name = np.arange(images) == k, OTHER_POSE if other[k] else TURNED
+            yield Candidate(name, np.array([k]), _choose(alone, pose, self.scene))
+
+    def _doubted(
+        self,
+        own: Float[np.ndarray, " images"],
+        number: Int[np.ndarray, " images"],
+        weak: Bool[np.ndarray, " images"],
+    ) -> Bool[np.ndarray, " images"]:
+        """The images whose pose is also found in closed form: those of weak perspective with
+        residuals that contradict their σ, and the few that fit worst of all, if badly; `own`: mean
+        squares of their residuals."""
+        alpha, degrees = self.settings.error_probability, np.maximum(2 * number, 1)
+        largest = np.array([chi2_quantile(1 - alpha, n) for n in degrees]) / degrees
+        contradicted = weak & (own > largest) & self.stated
+        worst = np.argsort(-own)[: self.settings.max_images]
+        bad = own > self.settings.max_misfit**2 * (1.0 if self.stated else self.scale)
+        return contradicted | (bad & np.isin(np.arange(len(own)), worst))
 
     def _reversed(self) -> Iterator[Candidate]:
         scene = reverse_depth(self.scene, self.rays, self.known)
@@ -351,6 +363,8 @@ class _State:
 
     def _resect(self, start: Scene, views: list["_View"]) -> Scene:
         """The poses of images in closed form."""
+        if not views:
+            return start
         tolerance = np.array([view.tolerance for view in views])
         found = many.resect([view.xy for view in views], [view.X for view in views], tolerance)
         X0, M = start.X0.copy(), start.M.copy()

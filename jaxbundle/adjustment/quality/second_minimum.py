@@ -24,6 +24,7 @@ from jaxbundle.leastsquares.quality.distributions import normal_quantile
 from jaxbundle.network.columns import list_some
 
 TURNED = "planar object turned over"
+OTHER_POSE = "another pose of the image"
 REVERSED = "depth reversed"
 MIRRORED = "mirrored behind the cameras"
 OTHER_PLANE = "two orientations of a plane"
@@ -33,7 +34,7 @@ OTHER_PLANE = "two orientations of a plane"
 class SecondMinimum:
     """Another minimum of an adjustment.
 
-    `ambiguity`: which one (`TURNED`, `REVERSED`, `MIRRORED`, `OTHER_PLANE`); `images`: that differ,
+    `ambiguity`: which one (one of the constants above); `images`: that differ,
     by id; `vtpv` of the result, `other_vtpv`; `evidence`: E of the module, for the result;
     `ambiguous`: it is below the threshold; `taken`: the iterations ended in the other one first,
     and the result was found from it; `turn`: radians, `shift`: object unit, the largest differences
@@ -95,10 +96,13 @@ class SecondMinimumSettings:
       0.4 remained, of three images and more at least 0.05. Larger: second minima of two images are
       missed; smaller: networks that have none are adjusted again for nothing.
     - `safety`: by which both are divided, for what these orders of the effect leave out.
+    - `max_misfit`: an image whose residuals exceed this many σ (RMS) is also resected in closed
+      form, whatever its perspective: a wrong pose, not a wrong σ (`likely_causes`, `max_sigma0`).
     - `evaluations_before_rejection`: from an analytic start value, which is right to the square of
       the effect of perspective, a second minimum that counts is nearly reached in three. What is
       then still above ten times the limit is rejected. Smaller: slowly converging ones are missed.
-    - `max_images`: of images alone, this many of the least evidence are adjusted again.
+    - `max_images`: of images alone, this many of the least evidence are adjusted again, and this
+      many of the worst resected in closed form.
     - `max_rounds`: of taking a better one.
     """
 
@@ -106,6 +110,7 @@ class SecondMinimumSettings:
     min_turning_share: float = 9 / 16
     min_reversed_share: float = 0.01
     safety: float = 4.0
+    max_misfit: float = 5.0
     evaluations_before_rejection: int = 6
     max_images: int = 8
     max_rounds: int = 3
