@@ -51,7 +51,7 @@ from jaxbundle.adjustment.readjust import (
     with_components,
 )
 from jaxbundle.adjustment.result import Adjustment
-from jaxbundle.adjustment.second_minimum import can_have_second, find_second_minima
+from jaxbundle.adjustment.second_minimum import can_have_second, find_second_minima, is_said
 from jaxbundle.arguments import at_least_zero, integer, one_of, show, truth
 from jaxbundle.choices import ESTIMATORS, METHODS, REDUCTIONS
 from jaxbundle.errors import InputError, NotSolvedError
@@ -457,8 +457,7 @@ class _AdjustmentState:
             # The result is as good as before the search.
             return
         left = [one for one in self.said.get("second_minima", ()) if one.taken]
-        same = lambda one, other: (one.ambiguity, one.images) == (other.ambiguity, other.images)
-        left = [one for one in left if not any(same(one, other) for other in found)]
+        left = [one for one in left if not is_said(one, found)]
         self.said["second_minima"] = (*found, *left)
 
     def adjustment(self, check: tuple[Points, Observations]) -> Adjustment:

@@ -8,7 +8,7 @@ the program of the first minimum from other start values.
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -48,6 +48,7 @@ from jaxbundle.leastsquares.iterations.solver import Minimum
 from jaxbundle.leastsquares.iterations.stopping import LIMIT
 from jaxbundle.leastsquares.quality.distributions import chi2_quantile
 from jaxbundle.leastsquares.spaces import PoseValue
+from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import UNIT
 from jaxbundle.orientation import many
 from jaxbundle.orientation.growth import START_VALUE_DEMANDS, Model, grow, intersect
@@ -108,15 +109,24 @@ def find_second_minima(
         problem, first = best.problem, best.inspection
         minimum = join_legs([minimum, best.minimum])
     taken = [state.record_left(*one) for one in left]
-    same = lambda one, other: (one.ambiguity, one.images) == (other.ambiguity, other.images)
-    known = lambda one, others: any(same(one, other) for other in others)
     said = [
-        dataclasses.replace(one, taken=known(one, taken))
+        dataclasses.replace(one, taken=is_said(one, taken))
         for one in map(state.record, found)
         if one.ambiguous
     ]
-    said += [one for one in taken if not known(one, said)]
+    said += [one for one in taken if not is_said(one, said)]
+    if len(state.untried) and said:
+        ids = [str(problem.network.images.id[k]) for k in np.sort(state.untried)]
+        words = f"the second minimum of {count(len(ids), 'further image')} was not adjusted"
+        network = problem.network.note(f"{words}: {list_some(ids, 5, str)}")
+        problem = dataclasses.replace(problem, network=network)
     return problem, minimum, tuple(sorted(said, key=lambda one: one.evidence))
+
+
+def is_said(one: SecondMinimum, others: Iterable[SecondMinimum]) -> bool:
+    """Whether all images of a second minimum are among those of others of its kind."""
+    images = {id for other in others if other.ambiguity == one.ambiguity for id in other.images}
+    return images.issuperset(one.images)
 
 
 class _State:
@@ -135,6 +145,7 @@ class _State:
         # vᵀPv of rounding: 1e-10 of the principal distance in all image coordinates.
         self.rounding = counts.observations * (1e-10 / noise_of_rays(network)) ** 2
         vtpv, r = first.vtpv, max(counts.redundancy, 1)
+        self.untried = np.zeros(0, int)
         self.scale = max(vtpv / r, 1.0 if self.stated else self.rounding)
 
     # --- candidates -------------------------------------------------------------------------
@@ -191,14 +202,17 @@ class _State:
         # A hundredth of the way is the present pose, found again.
         apart = _turns(self.scene, pose) > 0.01 * _turns(self.scene, turned)
         apart &= np.isfinite(change) & (share_behind(pose, self.rays) <= 0.5)
-        better = apart & (change < -settings.threshold * scale)
+        # All that fit better at once; alone only those that may also be ambiguous.
+        better = apart & (change < 0)
         if better.sum() > 1:
             name = OTHER_POSE if other[better].all() else TURNED
             yield Candidate(name, np.flatnonzero(better), _choose(better, pose, self.scene))
-            apart &= ~better
+            apart &= change > -settings.threshold * scale
         # Points and cameras are held in these resections: free ones reduce the difference.
         each = np.flatnonzero(apart & (change < settings.safety * settings.threshold * scale))
-        for k in each[np.argsort(change[each])][: settings.max_images]:
+        each = each[np.argsort(change[each])]
+        self.untried = each[settings.max_images :]
+        for k in each[: settings.max_images]:
             alone, name = np.arange(images) == k, OTHER_POSE if other[k] else TURNED
             yield Candidate(name, np.array([k]), _choose(alone, pose, self.scene))
 

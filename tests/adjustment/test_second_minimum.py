@@ -319,6 +319,51 @@ def test_a_free_network_from_afar_has_its_reversal():
     assert result.vtpv == pytest.approx(min(true, reversed_), rel=1e-6)
 
 
+def views_of_a_board(distance, sigma, turned=()):
+    """Twelve views, some of which start from the turned pose."""
+    rng = np.random.default_rng(5)
+    X0, M = poses(zip(rng.uniform(15, 55, 12), rng.uniform(0, 360, 12)), distance)
+    X0 *= rng.uniform(0.9, 1.2, (12, 1))
+    xy = image_points(X0, M, board()) + sigma * rng.normal(size=(12, 16, 2))
+    rays = Rays(np.repeat(np.arange(12), 16), np.tile(np.arange(16), 12), np.ones(192))
+    other = turn_over(Scene(X0, M, board()), rays)
+    rows = list(turned)
+    X0[rows], M[rows] = other.X0[rows], other.M[rows]
+    return network(board(), xy, sigma, X0, M)
+
+
+def test_views_of_a_calibration_are_turned_back():
+    camera = Camera("cam", "brown", {"c": C}, ("c", "K1"))
+    right, given = (
+        views_of_a_board(60.0, 1e-3, turned).replace(cameras=(camera,)) for turned in ((), (2, 7))
+    )
+    result = jaxbundle.adjust(given)
+    assert result.vtpv == pytest.approx(jaxbundle.adjust(right).vtpv, rel=1e-8)
+    (found,) = result.second_minima
+    assert found.images == ("i2", "i7") and found.taken and not found.ambiguous
+
+
+@pytest.mark.further
+def test_many_ambiguous_views_have_the_best_of_their_poses():
+    """Images that share nothing: every one in its better pose, from either start."""
+    results = [jaxbundle.adjust(views_of_a_board(400.0, 2e-3, rows)) for rows in ((), range(12))]
+
+    def vtpv_alone(k, rows):
+        given = views_of_a_board(400.0, 2e-3, rows)
+        rays = given.observations.take(given.observations.image == k)
+        alone = given.replace(
+            images=given.images.take(np.arange(12) == k),
+            observations=dataclasses.replace(rays, image=np.zeros(16, int)),
+        )
+        return jaxbundle.adjust(alone, second_minimum=False).vtpv
+
+    best = sum(min(vtpv_alone(k, rows) for rows in ((), (k,))) for k in range(12))
+    for result in results:
+        assert result.vtpv == pytest.approx(best, rel=1e-7)
+        assert len([one for one in result.second_minima if one.ambiguity == TURNED]) >= 8
+        assert any("further image" in note for note in result.notes)
+
+
 def test_two_images_of_a_plane_have_two_orientations():
     rng = np.random.default_rng(3)
     X = np.concatenate([rng.uniform(-2, 2, (20, 2)), np.zeros((20, 1))], 1)
