@@ -408,8 +408,13 @@ class _State:
         if int(minimum.termination) == LIMIT:
             if not _cost(minimum) - self.first.vtpv < 10 * limit:
                 return None
-            problem, rest = self.minimise(problem, minimum.values)
-            minimum = join_legs([minimum, rest])
+            legs = [minimum]
+            while int(legs[-1].termination) == LIMIT and len(legs) <= settings.max_legs:
+                problem, rest = self.minimise(problem, legs[-1].values)
+                legs.append(rest)
+                if not _cost(rest) - self.first.vtpv < limit:
+                    return None
+            minimum = join_legs(legs)
         if not _cost(minimum) - self.first.vtpv < limit:
             return None
         found = inspect_solution(problem, minimum)
@@ -440,17 +445,23 @@ class _State:
         return values
 
     def _differs(self, there: Scene) -> bool:
-        """Whether the pose of an image is significantly another one than the present: outside of
-        the ellipsoid of its covariance that holds all but the error probability."""
-        M, here = there.M @ self.scene.M.transpose(0, 2, 1), self.scene
-        change = np.concatenate([there.X0 - here.X0, _rotation_vectors(M)], 1)
-        Q = self.first.image_cofactors
+        """Whether the pose of an image, or a point, is significantly another one than the present:
+        outside of the ellipsoid of its covariance that holds all but the error probability."""
+        here, first = self.scene, self.first
+        turn = _rotation_vectors(there.M @ here.M.transpose(0, 2, 1))
+        poses = np.concatenate([there.X0 - here.X0, turn], 1)
+        if self._outside(poses, first.image_cofactors):
+            return True
+        located = self.free_points & ~self.problem.at_any_distance & ~self.problem.excluded
+        return self._outside((there.X - here.X)[located], first.point_cofactors[located])
+
+    def _outside(self, change: Float[np.ndarray, "n k"], Q: Float[np.ndarray, "n k k"]) -> bool:
         # Of unit size, whatever the units of coordinates and angles.
         size = np.sqrt(np.maximum(np.diagonal(Q, axis1=1, axis2=2), 0))
         inverse = np.where(size > 0, 1 / np.where(size > 0, size, 1), 0)
         change, Q = change * inverse, Q * inverse[:, :, None] * inverse[:, None, :]
         distance = np.einsum("ni,nij,nj->n", change, np.linalg.pinv(Q, 1e-12, True), change)
-        limit = chi2_quantile(1 - self.settings.error_probability, 6)
+        limit = chi2_quantile(1 - self.settings.error_probability, change.shape[1])
         return bool((distance > limit * self.scale).any())
 
     def is_better(self, found: Found) -> bool:

@@ -103,6 +103,8 @@ class SecondMinimumSettings:
       then still above ten times the limit is rejected. Smaller: slowly converging ones are missed.
     - `max_images`: of images alone, this many of the least evidence are adjusted again, and this
       many of the worst resected in closed form.
+    - `max_legs`: a second minimum of two images may lie in the valley of their bas-relief, along
+      which iterations are slow: they are repeated this many times, up to the limit of each.
     - `max_rounds`: of taking a better one.
     """
 
@@ -113,6 +115,7 @@ class SecondMinimumSettings:
     max_misfit: float = 5.0
     evaluations_before_rejection: int = 6
     max_images: int = 8
+    max_legs: int = 5
     max_rounds: int = 3
 
     @property
