@@ -6,7 +6,7 @@ Every case is one image of 4 to 25 known points of a plane, or up to a twentieth
 it, with random tilt, distance, and σ, from where the second solution cannot be told from the first
 to where perspective decides at once. Half of the adjustments start from the true pose, half from
 the second one. The truth about each case is found without the package: all minima that a dense
-Levenberg-Marquardt with derivatives by differences reaches from 51 poses. Networks of 3 to 5 images
+Levenberg-Marquardt with derivatives by differences reaches from 51 poses. Networks of 2 to 5 images
 with unknown points (a free network) follow; their truth is the reversed network, adjusted densely.
 
 Ambiguous: two minima whose poses differ beyond the ellipsoid of their covariance (99.9 %), with

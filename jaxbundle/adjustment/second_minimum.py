@@ -188,12 +188,13 @@ class _State:
         views = self._views(np.flatnonzero(weak | doubted))
         pose, change = self._improve(turned, views)
         # Near the end of its second minimum (see `min_turning_share`) an iteration may step over to
-        # the first one: then the closed form is the better start.
-        back = _turns(self.scene, pose) < 0.5 * _turns(self.scene, turned)
-        pose = _choose(back, turned, pose)
+        # the first one, or wander off: then the closed form is the better start.
+        closed = np.full(images, np.inf)
         for view in views:
-            if back[view.image]:
-                change[view.image] = self._change(view, turned)
+            closed[view.image] = self._change(view, turned)
+        back = _turns(self.scene, pose) < 0.5 * _turns(self.scene, turned)
+        back |= closed < change
+        pose, change = _choose(back, turned, pose), np.where(back, closed, change)
         # A wrong minimum need not be that of the object turned over.
         views = [view for view in views if doubted[view.image]]
         best, by_best = self._improve(self._resect(turned, views), views)
