@@ -181,7 +181,8 @@ class _State:
         scale = np.maximum(self.scale, own)
         share = settings.min_turning_share / settings.safety
         usable = self.free & (number >= MIN_POINTS)
-        weak = (share * effect < settings.limit * scale) & usable
+        weak = (share * effect < settings.limit * scale) | (number <= settings.few_points)
+        weak &= usable
         doubted = self._doubted(own, number, weak) & usable
         if not (weak | doubted).any():
             return
