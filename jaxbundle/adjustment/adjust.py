@@ -51,6 +51,7 @@ from jaxbundle.adjustment.readjust import (
     with_components,
 )
 from jaxbundle.adjustment.result import Adjustment
+from jaxbundle.adjustment.second_minimum import can_have_second, find_second_minima, is_said
 from jaxbundle.arguments import at_least_zero, integer, one_of, show, truth
 from jaxbundle.choices import ESTIMATORS, METHODS, REDUCTIONS
 from jaxbundle.errors import InputError, NotSolvedError
@@ -118,6 +119,7 @@ def adjust(  # noqa: PLR0913 - the options of an adjustment
     critical_t: float = 2.0,
     estimate_components: bool = False,
     correlated: bool = False,
+    second_minimum: bool = True,
     progress: Progress | None = None,
 ) -> Adjustment:
     """Adjust a network by least squares, with self-calibration of all free parameters.
@@ -153,6 +155,9 @@ def adjust(  # noqa: PLR0913 - the options of an adjustment
       orientations that move between photographs, errors along tracks), and state the σ under them
       beside the classical ones (`Adjustment.error_model`); of eight photographs or more, compare
       halves of them (`Adjustment.replication`). The estimates do not change.
+    - `second_minimum`: after convergence look for the second minima that networks of nearly plane
+      objects and of small perspective effect may have; take a better one, and report those that
+      cannot be separated from the result (`Adjustment.second_minima`; docs/statistics.md).
     - `progress(stage, done, total)`: called for every evaluation, with vᵀPv and the damping in
       the stage; up to 200 000 observations at the end of the iterations (`jaxbundle.show_progress`
       shows bars).
@@ -173,6 +178,7 @@ def adjust(  # noqa: PLR0913 - the options of an adjustment
         critical_t=critical_t,
         estimate_components=estimate_components,
         correlated=correlated,
+        second_minimum=second_minimum,
         progress=progress,
     )
     given = without_placeholders(
@@ -203,6 +209,10 @@ def adjust(  # noqa: PLR0913 - the options of an adjustment
     found = _AdjustmentState(
         problem.network, with_factor(problem), minimum, method, problem.reduction
     )
+    look = partial(find_second_minima, minimise=partial(minimise_with_infinity, **options))
+    # Before anything is excluded or downweighted because of residuals of the wrong minimum.
+    if second_minimum:
+        found.look_for_second_minima(look)
     if robust:
         found.weight_robustly(again, robust, significance)
     if found.inspection:
@@ -212,6 +222,8 @@ def adjust(  # noqa: PLR0913 - the options of an adjustment
             found.estimate_components(again)
         if eliminate:
             found.eliminate_parameters(again, critical_t)
+        if second_minimum and (robust or snooping or estimate_components or eliminate):
+            found.look_for_second_minima(look)
     result = found.adjustment(checked)
     sigma0 = sigma0_at_end(found.problem, found.minimum) if found.inspection else None
     if found.inspection:
@@ -435,6 +447,19 @@ class _AdjustmentState:
         )
         self.said["eliminated"] = tuple(names)
 
+    def look_for_second_minima(self, look: Callable) -> None:
+        """Take the best minimum and keep those that remain; those left before remain known."""
+        if self.inspection is None or not can_have_second(self.problem):
+            return
+        try:
+            self.problem, self.minimum, found = look(self.inspection, self.minimum)
+        except (InputError, NotSolvedError, np.linalg.LinAlgError):
+            # The result is as good as before the search.
+            return
+        left = [one for one in self.said.get("second_minima", ()) if one.taken]
+        left = [one for one in left if not is_said(one, found)]
+        self.said["second_minima"] = (*found, *left)
+
     def adjustment(self, check: tuple[Points, Observations]) -> Adjustment:
         """The result, or the reason why there is none."""
         problem, minimum, inspection = self.problem, self.minimum, self.inspection
@@ -481,6 +506,7 @@ def check_options(  # noqa: PLR0913 - the options of an adjustment
     critical_t: float = 2.0,
     estimate_components: bool = False,
     correlated: bool = False,
+    second_minimum: bool = True,
     progress: Progress | None = None,
 ) -> None:
     """Refuse invalid options of `adjust`.
@@ -497,6 +523,7 @@ def check_options(  # noqa: PLR0913 - the options of an adjustment
     at_least_zero("critical_t", critical_t)
     truth("estimate_components", estimate_components)
     truth("correlated", correlated)
+    truth("second_minimum", second_minimum)
     if progress is not None and not callable(progress):
         raise InputError(f"progress must be a function, but is {show(progress)}")
 

@@ -37,6 +37,7 @@ from jaxbundle.adjustment.quality.replication import (
     compare_halves,
     random_halves,
 )
+from jaxbundle.adjustment.quality.second_minimum import SecondMinimum
 from jaxbundle.adjustment.quality.variance_components import groups
 from jaxbundle.adjustment.quality.weakness import Weakness, weakness
 from jaxbundle.adjustment.storage import network_fingerprint, store
@@ -114,6 +115,8 @@ class Adjustment:
     - `error_model`: of errors that image points share, if it was requested (`correlations`, its
       settings) and the network can show any, else None; `replication`: two halves of the network
       compared, if requested (`halves_by`), else None
+    - `second_minima`: other minima (`adjustment.quality.second_minimum.SecondMinimum`) that cannot
+      be separated from the result, or that were left for a better one
     - `fingerprint`: of the adjusted network; `save` writes the result into a file
     """
 
@@ -141,6 +144,7 @@ class Adjustment:
         findings: tuple[str, ...] = (),
         correlations: CorrelationSettings | None = None,
         halves_by: str = "",
+        second_minima: tuple[SecondMinimum, ...] = (),
     ):
         self.network = network
         self.problem = problem
@@ -161,6 +165,7 @@ class Adjustment:
         self.findings = findings
         self.correlations = correlations
         self.halves_by = halves_by
+        self.second_minima = second_minima
         self._weakness = weakness
         self._inspection = inspection
         self.check = check

@@ -16,6 +16,7 @@ import numpy as np
 from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.adjustment.quality.correlated_errors import CorrelationSettings
 from jaxbundle.adjustment.quality.replication import HalvesDifference, Replication
+from jaxbundle.adjustment.quality.second_minimum import SecondMinimum
 from jaxbundle.cameras import CameraModel, get_model, is_own
 from jaxbundle.io.results.stored_tree import fingerprint, write_tree
 from jaxbundle.leastsquares.quality.error_components import ErrorSettings
@@ -112,6 +113,7 @@ CLASSES = (
     StoredErrorModel,
     Replication,
     HalvesDifference,
+    SecondMinimum,
 )
 
 
@@ -159,6 +161,7 @@ def store(adjustment: Any, path: str | Path) -> None:
         "findings",
         "correlations",
         "halves_by",
+        "second_minima",
     )
     notes = {name: getattr(adjustment, name) for name in named}
     found = Stored(

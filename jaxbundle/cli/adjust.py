@@ -63,6 +63,10 @@ def adjust(  # noqa: PLR0913 - the options of the command
         bool,
         typer.Option("--correlated", help="look for errors that image points share; σ under them"),
     ] = False,
+    second_minimum: Annotated[
+        bool,
+        typer.Option(help="look for second minima: plane objects turned over, depth reversed"),
+    ] = True,
     budget: Annotated[
         list[str] | None,
         typer.Option(
@@ -127,6 +131,7 @@ def adjust(  # noqa: PLR0913 - the options of the command
             eliminate,
             components,
             correlated,
+            second_minimum,
             budget,
             check,
         )
@@ -157,6 +162,7 @@ def adjust(  # noqa: PLR0913 - the options of the command
                 "--eliminate": eliminate,
                 "--components": components,
                 "--correlated": correlated,
+                "--no-second-minimum": not second_minimum,
                 "--budget": ", ".join(budget or ()),
             },
         )
@@ -173,6 +179,7 @@ def adjust(  # noqa: PLR0913 - the options of the command
                 eliminate=eliminate,
                 estimate_components=components,
                 correlated=correlated,
+                second_minimum=second_minimum,
                 progress=tell,
             )
     except NotSolvedError as error:

@@ -13,18 +13,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxbundle.geometry import (
     matrix_from_omega_phi_kappa,
     matrix_from_quaternion,
     omega_phi_kappa_from_matrix,
+    quaternion_from_matrix,
     rotation_vector_from_matrix,
     transform_point,
 )
 from jaxbundle.leastsquares.iterations.small import minimise
 from jaxbundle.orientation.absolute import absolute_orientation
 from jaxbundle.orientation.intersection import intersection, misclosure
+from jaxbundle.orientation.planar import planar_orientations
 from jaxbundle.orientation.pose import CameraPose
 from jaxbundle.orientation.resection import refine_resection
 from jaxbundle.orientation.robust import robust_relative_orientation, robust_resection
@@ -111,6 +113,22 @@ def orient_pairs(
     return M, b, part, angle
 
 
+def orient_planes(
+    xy1: Columns, xy2: Columns
+) -> tuple[
+    Float[np.ndarray, "pairs 2 3 3"],
+    Float[np.ndarray, "pairs 2 3"],
+    Float[np.ndarray, "pairs 2 3"],
+    Bool[np.ndarray, "pairs 2"],
+]:
+    """Both M, b and normals of pairs of images of planes, and whether each is possible."""
+    rows = [spread(len(a)) for a in xy1]
+    M, b, normal, possible = run_in_lanes(
+        _orient_plane, LANES, _gather_slots(xy1, rows), _gather_slots(xy2, rows), _weights(rows)
+    )
+    return M, b, normal, possible
+
+
 def intersect(
     X0: Float[np.ndarray, "n rays 3"],
     rays: Float[np.ndarray, "n rays 3"],
@@ -157,6 +175,11 @@ def similarity_by_rays(
 def matrices(angles: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
     """M of ω, φ, κ."""
     return run_in_lanes(_matrix, POINT_LANES, angles)[0]
+
+
+def quaternions(M: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 4"]:
+    """Unit quaternions of M."""
+    return run_in_lanes(_quaternion, POINT_LANES, M)[0]
 
 
 def matrices_of_quaternions(q: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:
@@ -301,8 +324,23 @@ def _matrix_of_quaternion(q: Float[Array, "4"]) -> tuple[Float[Array, "3 3"]]:
 
 @partial(compile_once, static=())
 @jax.vmap
+def _quaternion(M: Float[Array, "3 3"]) -> tuple[Float[Array, "4"]]:
+    return (quaternion_from_matrix(M),)
+
+
+@partial(compile_once, static=())
+@jax.vmap
 def _angles(M: Float[Array, "3 3"]) -> tuple[Float[Array, "3"]]:
     return (omega_phi_kappa_from_matrix(M),)
+
+
+@quick_jit
+@jax.vmap
+def _orient_plane(
+    xy1: Float[Array, "slots 2"], xy2: Float[Array, "slots 2"], weights: Float[Array, " slots"]
+) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
+    found = planar_orientations(xy1, xy2, weights)
+    return found.M, found.b, found.normal, found.possible & (found.status == int(Status.SOUND))
 
 
 def _gather_slots(

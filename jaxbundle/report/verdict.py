@@ -63,6 +63,7 @@ def judge(adjustment: "Adjustment") -> list[Finding]:
         _fit(adjustment),
         _control(adjustment),
         *_checks(adjustment),
+        *_second_minima(adjustment),
         describe_reliability(adjustment.residuals["r"]),
         *_correlated(adjustment),
         _blunders(adjustment),
@@ -170,6 +171,23 @@ def _correlated(adjustment: "Adjustment") -> list[Finding]:
             brief = f"halves by {halves.by} contradict each other"
         found.append(Finding("Replication", state, halves.sentence, brief))
     return found
+
+
+def _second_minima(adjustment: "Adjustment") -> list[Finding]:
+    """Solutions of which the observations choose none, and those left for a better one."""
+    found = adjustment.second_minima
+    if not found:
+        return []
+    unit, most = clean(adjustment.network.object_unit), 3
+    said = [clean(one.in_words(unit)) for one in found[:most]]
+    if len(found) > most:
+        said.append(f"and {len(found) - most} more: see second_minima in the JSON")
+    about, words = "Second minimum", "; ".join(said)
+    ambiguous = [one for one in found if one.ambiguous]
+    if ambiguous:
+        brief = f"a second solution fits as well ({ambiguous[0].ambiguity})"
+        return [Finding(about, DOUBTFUL, words, brief)]
+    return [Finding(about, NOTED, words, f"a better second solution taken ({found[0].ambiguity})")]
 
 
 def _control(adjustment: "Adjustment") -> Finding:

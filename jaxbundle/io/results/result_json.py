@@ -20,6 +20,7 @@ from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.types import present
 
 if TYPE_CHECKING:
+    from jaxbundle.adjustment.quality.second_minimum import SecondMinimum
     from jaxbundle.adjustment.result import Adjustment
     from jaxbundle.network.tables import Camera
     from jaxbundle.report.verdict import Verdict
@@ -82,6 +83,7 @@ def result_dict(adjustment: "Adjustment", brief: bool = False) -> dict:
             {"camera": name.id, "parameter": name.parameter} for name in adjustment.eliminated
         ],
     }
+    head |= {"second_minima": [_second_minimum(adjustment, s) for s in adjustment.second_minima]}
     head |= {"check_points": _checks(adjustment)}
     if adjustment.control_prediction is not None:
         head |= {"control_prediction": _predicted(adjustment)}
@@ -222,6 +224,22 @@ def _points(table: Mapping[str, np.ndarray]) -> Iterator[tuple[str, dict]]:
             point["id"],
             {"role": point["role"]} | estimates | {"rays": point["rays"], "rms": point["rms"]},
         )
+
+
+def _second_minimum(adjustment: "Adjustment", one: "SecondMinimum") -> dict:
+    return {
+        "ambiguity": one.ambiguity,
+        "images": list(one.images),
+        "vtpv": one.vtpv,
+        "other_vtpv": one.other_vtpv,
+        "difference": one.difference,
+        "evidence": one.evidence,
+        "probability": one.probability,
+        "ambiguous": one.ambiguous,
+        "taken": one.taken,
+        "turn": one.turn * adjustment.angle_scale,
+        "shift": one.shift,
+    }
 
 
 def _far_points(adjustment: "Adjustment") -> dict:

@@ -1,0 +1,576 @@
+"""After convergence: the second minima of a network, adjusted from their closed forms.
+
+The candidates (`second_solutions`) are few, and most are excluded before anything is adjusted: by
+the effect of perspective, which is of the order of the square of the image and known without any
+iteration, and of single images by a resection on the adjusted points. The others are adjusted by
+the program of the first minimum from other start values.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxbundle.adjustment.far_points import join_legs, noise_of_rays
+from jaxbundle.adjustment.minimum import adjusted_cameras, inspect_solution
+from jaxbundle.adjustment.problem import NetworkProblem, with_coordinates
+from jaxbundle.adjustment.quality.inspection import Inspection
+from jaxbundle.adjustment.quality.second_minimum import (
+    MIRRORED,
+    OTHER_PLANE,
+    OTHER_POSE,
+    REVERSED,
+    SECOND_MINIMUM,
+    TURNED,
+    SecondMinimum,
+    SecondMinimumSettings,
+    evidence,
+)
+from jaxbundle.adjustment.second_solutions import (
+    Scene,
+    mirror,
+    mirror_images,
+    perspective_effect,
+    rays_of,
+    reverse_depth,
+    sample,
+    scene_of,
+    share_behind,
+    turn_over,
+)
+from jaxbundle.cameras import get_model
+from jaxbundle.leastsquares.indexing.reduction import FACTORS
+from jaxbundle.leastsquares.indexing.rows import Values
+from jaxbundle.leastsquares.iterations.solver import Minimum
+from jaxbundle.leastsquares.iterations.stopping import LIMIT
+from jaxbundle.leastsquares.quality.distributions import chi2_quantile
+from jaxbundle.leastsquares.spaces import PoseValue
+from jaxbundle.network.columns import count, list_some
+from jaxbundle.network.tables import UNIT
+from jaxbundle.orientation import many
+from jaxbundle.orientation.growth import START_VALUE_DEMANDS, Model, grow, intersect
+from jaxbundle.orientation.sights import Sights, in_plane, sights
+
+Minimise = Callable[..., tuple[NetworkProblem, Minimum]]
+"""`minimise(problem, start)` iterates from given values, `max_steps` at most if given; returns the
+problem as it ended."""
+
+
+MIN_POINTS = 3
+"""Of an image: fewer leave its pose open."""
+
+
+class Candidate(NamedTuple):
+    """Another solution to start from, and the images that differ."""
+
+    ambiguity: str
+    images: Int[np.ndarray, " n"]
+    scene: Scene
+
+
+class Found(NamedTuple):
+    """A minimum that was adjusted from a candidate, and the largest differences of rotations
+    (radians) and projection centres."""
+
+    candidate: Candidate
+    problem: NetworkProblem
+    minimum: Minimum
+    inspection: Inspection
+    turn: float
+    shift: float
+
+
+def can_have_second(problem: NetworkProblem) -> bool:
+    """Whether second minima are looked for: not in systems without a factor, and not where other
+    tables (mountings of a rig, shifts of antennas) would have to change with the images."""
+    return problem.reduction in FACTORS and not problem.further_tables
+
+
+def find_second_minima(
+    first: Inspection,
+    minimum: Minimum,
+    minimise: Minimise,
+    settings: SecondMinimumSettings = SECOND_MINIMUM,
+) -> tuple[NetworkProblem, Minimum, tuple[SecondMinimum, ...]]:
+    """The best minimum of a solved problem, the given one unless another one fits better; and the
+    second minima that cannot be told from it, or that were left for it."""
+    left, problem = [], first.problem
+    for round in range(settings.max_rounds + 1):
+        state = _State(first, minimise, settings)
+        found = list(state.adjust_candidates())
+        better = [one for one in found if state.is_better(one)]
+        if not better or round == settings.max_rounds:
+            break
+        best = min(better, key=lambda one: one.inspection.vtpv)
+        left.append((best, first.vtpv))
+        problem, first = best.problem, best.inspection
+        minimum = join_legs([minimum, best.minimum])
+    taken = [state.record_left(*one) for one in left]
+    said = [
+        dataclasses.replace(one, taken=is_said(one, taken))
+        for one in map(state.record, found)
+        if one.ambiguous
+    ]
+    said += [one for one in taken if not is_said(one, said)]
+    if len(state.untried) and said:
+        ids = [str(problem.network.images.id[k]) for k in np.sort(state.untried)]
+        words = f"the second minimum of {count(len(ids), 'further image')} was not adjusted"
+        network = problem.network.note(f"{words}: {list_some(ids, 5, str)}")
+        problem = dataclasses.replace(problem, network=network)
+    return problem, minimum, tuple(sorted(said, key=lambda one: one.evidence))
+
+
+def is_said(one: SecondMinimum, others: Iterable[SecondMinimum]) -> bool:
+    """Whether all images of a second minimum are among those of others of its kind."""
+    images = {id for other in others if other.ambiguity == one.ambiguity for id in other.images}
+    return images.issuperset(one.images)
+
+
+class _State:
+    """One minimum, and what is needed to look for others."""
+
+    def __init__(self, first: Inspection, minimise: Minimise, settings: SecondMinimumSettings):
+        self.first, self.problem, self.settings = first, first.problem, settings
+        self.minimise = minimise
+        self.scene, self.all_rays = scene_of(first.adjusted), rays_of(first.problem)
+        self.rays = sample(self.all_rays, len(self.scene.X0), many.SLOTS)
+        free = lambda table: np.asarray(self.problem.table(table).free).max(1) > 0
+        self.free, self.free_points = free("image"), free("point")
+        network, counts = self.problem.network, self.problem.counts
+        self.known = network.points.has_role("control", "fixed")
+        self.stated = network.observations.sigma_origin != UNIT
+        # vᵀPv of rounding: 1e-10 of the principal distance in all image coordinates.
+        self.rounding = counts.observations * (1e-10 / noise_of_rays(network)) ** 2
+        vtpv, r = first.vtpv, max(counts.redundancy, 1)
+        self.untried = np.zeros(0, int)
+        self.scale = max(vtpv / r, 1.0 if self.stated else self.rounding)
+
+    # --- candidates -------------------------------------------------------------------------
+
+    def candidates(self) -> Iterator[Candidate]:
+        """What is worth an adjustment."""
+        yield from self._mirrored()
+        yield from self._turned()
+        if len(self.scene.X0) > 1 and self.problem.lengths is None and self.free.all():
+            yield from self._reversed()
+            yield from self._other_plane()
+
+    def _mirrored(self) -> Iterator[Candidate]:
+        network = self.problem.network
+        plain = np.array([get_model(c.model).image == "perspective" for c in network.cameras])
+        behind = (share_behind(self.scene, self.rays) > 0.5) & plain[network.images.camera]
+        behind &= self.free
+        if behind.all() and self.problem.lengths is None:
+            yield Candidate(MIRRORED, np.flatnonzero(behind), mirror(self.scene, self.known))
+        elif behind.any() and not behind.all():
+            scene = mirror_images(self.scene, self.rays, behind)
+            yield Candidate(MIRRORED, np.flatnonzero(behind), scene)
+
+    def _turned(self) -> Iterator[Candidate]:
+        """Images alone, the points as they are."""
+        settings, images = self.settings, len(self.scene.X0)
+        turned = turn_over(self.scene, self.rays)
+        effect = perspective_effect(self.scene, turned, self.rays)
+        number = np.bincount(self.all_rays.image, minlength=images)
+        # An image in the wrong minimum has large residuals, however many others fit.
+        squares = (self.first.image_residuals[self.problem.used] ** 2).sum(1)
+        own = np.bincount(self.all_rays.image, squares, images) / np.maximum(2 * number, 1)
+        scale = np.maximum(self.scale, own)
+        share = settings.min_turning_share / settings.safety
+        usable = self.free & (number >= MIN_POINTS)
+        weak = (share * effect < settings.limit * scale) | (number <= settings.few_points)
+        weak &= usable
+        doubted = self._doubted(own, number, weak) & usable
+        if not (weak | doubted).any():
+            return
+        views = self._views(np.flatnonzero(weak | doubted))
+        pose, change = self._improve(turned, views)
+        # Near the end of its second minimum (see `min_turning_share`) an iteration may step over to
+        # the first one, or wander off: then the closed form is the better start.
+        closed = np.full(images, np.inf)
+        for view in views:
+            closed[view.image] = self._change(view, turned)
+        back = _turns(self.scene, pose) < 0.5 * _turns(self.scene, turned)
+        back |= closed < change
+        pose, change = _choose(back, turned, pose), np.where(back, closed, change)
+        # A wrong minimum need not be that of the object turned over.
+        views = [view for view in views if doubted[view.image]]
+        best, by_best = self._improve(self._resect(turned, views), views)
+        other = by_best < change
+        pose, change = _choose(other, best, pose), np.where(other, by_best, change)
+        # A hundredth of the way is the present pose, found again.
+        apart = _turns(self.scene, pose) > 0.01 * _turns(self.scene, turned)
+        apart &= np.isfinite(change) & (share_behind(pose, self.rays) <= 0.5)
+        # All that fit better at once; alone only those that may also be ambiguous.
+        better = apart & (change < 0)
+        if better.sum() > 1:
+            name = OTHER_POSE if other[better].all() else TURNED
+            yield Candidate(name, np.flatnonzero(better), _choose(better, pose, self.scene))
+            apart &= change > -settings.threshold * scale
+        # Points and cameras are held in these resections: free ones reduce the difference.
+        each = np.flatnonzero(apart & (change < settings.safety * settings.threshold * scale))
+        each = each[np.argsort(change[each])]
+        self.untried = each[settings.max_images :]
+        for k in each[: settings.max_images]:
+            alone, name = np.arange(images) == k, OTHER_POSE if other[k] else TURNED
+            yield Candidate(name, np.array([k]), _choose(alone, pose, self.scene))
+
+    def _doubted(
+        self,
+        own: Float[np.ndarray, " images"],
+        number: Int[np.ndarray, " images"],
+        weak: Bool[np.ndarray, " images"],
+    ) -> Bool[np.ndarray, " images"]:
+        """The images whose pose is also found in closed form: those of weak perspective with
+        residuals that contradict their σ, and the few that fit worst of all, if badly; `own`: mean
+        squares of their residuals."""
+        alpha, degrees = self.settings.error_probability, np.maximum(2 * number, 1)
+        largest = np.array([chi2_quantile(1 - alpha, n) for n in degrees]) / degrees
+        contradicted = weak & (own > largest) & self.stated
+        worst = np.argsort(-own)[: self.settings.max_images]
+        bad = own > self.settings.max_misfit**2 * (1.0 if self.stated else self.scale)
+        return contradicted | (bad & np.isin(np.arange(len(own)), worst))
+
+    def _reversed(self) -> Iterator[Candidate]:
+        scene = reverse_depth(self.scene, self.rays, self.known)
+        effect = perspective_effect(self.scene, scene, self.rays).sum()
+        share = self.settings.min_reversed_share / self.settings.safety
+        if share * effect < self.settings.limit * self.scale:
+            yield Candidate(REVERSED, np.arange(len(scene.X0)), scene)
+
+    def _other_plane(self) -> Iterator[Candidate]:
+        """Of an image and those that see most of its points, the orientations with the other plane,
+        if the plane is possible in all of them."""
+        images, points = len(self.scene.X0), len(self.scene.X)
+        rays = self.all_rays
+        first = int(np.argmax(np.bincount(rays.image, minlength=images)))
+        common = np.zeros(points, bool)
+        common[rays.point[rays.image == first]] = True
+        shared = np.bincount(rays.image, common[rays.point], images)
+        shared[first] = 0
+        partners = np.argsort(-shared, kind="stable")[: many.LANES]
+        partners = partners[shared[partners] >= 6]
+        if not len(partners) or not self._is_plane(first, partners):
+            return
+        seen = self._sights
+        pairs = [_common_rays(seen, first, int(k)) for k in partners]
+        if any(len(xy1) < 6 for xy1, _ in pairs):
+            return
+        M, b, _, possible = many.orient_planes(*zip(*pairs))
+        relative = self.scene.M[partners] @ self.scene.M[first].T
+        # The solution that is farther from the present one.
+        turn = np.stack([_angles(M[:, k] @ relative.transpose(0, 2, 1)) for k in (0, 1)], 1)
+        base = self.scene.M[first] @ (self.scene.X0[partners] - self.scene.X0[first]).T
+        across = np.stack(
+            [
+                np.linalg.norm(b[:, k] - base.T / np.linalg.norm(base, axis=0)[:, None], axis=1)
+                for k in (0, 1)
+            ],
+            1,
+        )
+        other = np.argmax(turn + across, axis=1)
+        lane = np.arange(len(partners))
+        if not possible[lane, other].all():
+            return
+        best = int(np.argmax(np.linalg.norm(base, axis=0)))
+        scene = self._grow(
+            seen, first, int(partners[best]), M[best, other[best]], b[best, other[best]]
+        )
+        if scene is not None:
+            yield Candidate(OTHER_PLANE, np.arange(images), scene)
+
+    def _is_plane(self, first: int, partners: Int[np.ndarray, " n"]) -> bool:
+        """Whether the points of an image are so near to a plane that the second orientation of a
+        plane may fit: by the parallax of what is off it."""
+        rays, scene = self.all_rays, self.scene
+        seen = self.rays.point[self.rays.image == first]
+        X = scene.X[seen]
+        o = X.mean(0)
+        normal = np.linalg.svd(X - o)[2][2]
+        sight = X - scene.X0[first]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            along = ((o - scene.X0[first]) @ normal) / (sight @ normal)
+        flat = scene.X.copy()
+        flat[seen] = scene.X0[first] + along[:, None] * sight
+        of_point, of_image = np.zeros(len(scene.X), bool), np.zeros(len(scene.X0), bool)
+        of_point[seen], of_image[partners] = True, True
+        chosen = of_image[rays.image] & of_point[rays.point]
+        image, point = rays.image[chosen], rays.point[chosen]
+        one, two = (_unit(X[point] - scene.X0[image]) for X in (scene.X, flat))
+        effect = np.nansum((np.linalg.norm(one - two, axis=1) / rays.sigma[chosen]) ** 2)
+        share = self.settings.min_reversed_share / self.settings.safety
+        return bool(np.isfinite(along).all() and share * effect < self.settings.limit * self.scale)
+
+    def _grow(
+        self,
+        seen: Sights,
+        first: int,
+        second: int,
+        M: Float[np.ndarray, "3 3"],
+        b: Float[np.ndarray, "3"],
+    ) -> Scene | None:
+        """All images and points from a pair of images, in the present frame."""
+        model = Model.empty(seen)
+        model.place(first, np.zeros(3), np.eye(3))
+        model.place(second, b, M)
+        grow(seen, model)
+        intersect(seen, model, START_VALUE_DEMANDS)
+        used = np.unique(self.all_rays.point)
+        if not model.placed.all() or not model.known[used].all():
+            return None
+        held = self.known[used]
+        rows = used[held] if held.sum() >= 3 else used
+        moved = many.similarity(model.X[rows], self.scene.X[rows], np.ones(len(rows)))
+        if moved is None:
+            return None
+        model = model.transform(*moved)
+        X = np.where(np.isfinite(model.X) & ~self.known[:, None], model.X, self.scene.X)
+        return Scene(model.X0, model.M, X)
+
+    @functools.cached_property
+    def _sights(self) -> Sights:
+        network = self.problem.network
+        cameras = adjusted_cameras(self.problem, self.first.adjusted)
+        return sights(network.replace(cameras=tuple(cameras.values())))
+
+    def _views(self, images: Int[np.ndarray, " n"]) -> list["_View"]:
+        """What images see, in cameras turned towards it."""
+        seen, problem = self._sights, self.problem
+        place = np.full(len(problem.network.observations), -1)
+        place[np.flatnonzero(problem.used)] = np.arange(len(self.all_rays.image))
+        views = []
+        for k in images:
+            part = np.arange(*seen.rows_of(k).indices(len(seen.image)))
+            part = part[place[seen.row[part]] >= 0]
+            R, xy = in_plane(seen.ray[part])
+            there = np.isfinite(xy).all(1)
+            part = part[there]
+            weight = 1 / self.all_rays.sigma[place[seen.row[part]]] ** 2
+            X = self.scene.X[seen.point[part]]
+            views.append(
+                _View(int(k), R, xy[there], X, seen.ray[part], weight, float(seen.tolerance[k]))
+            )
+        return [view for view in views if len(view.xy) >= MIN_POINTS]
+
+    def _improve(
+        self, start: Scene, views: list["_View"]
+    ) -> tuple[Scene, Float[np.ndarray, " images"]]:
+        """Poses of images improved on the adjusted points, and by how much their Σ(v/σ)² is then
+        above the present one; infinite without."""
+        X0, M, change = start.X0.copy(), start.M.copy(), np.full(len(start.X0), np.inf)
+        if not views:
+            return start, change
+        images = [view.image for view in views]
+        poses = X0[images], np.stack([view.R @ M[view.image] for view in views])
+        columns = zip(*((view.xy, view.X, view.weight) for view in views))
+        for view, x, m in zip(views, *many.refine(poses, *columns)):
+            k = view.image
+            X0[k], M[k] = x, view.R.T @ m
+            change[k] = self._change(view, Scene(X0, M, start.X))
+        return Scene(X0, M, start.X), np.where(np.isfinite(change), change, np.inf)
+
+    def _change(self, view: "_View", other: Scene) -> float:
+        """By how much Σ(v/σ)² of an image is above the present one in another pose."""
+        k = view.image
+        return view.square(other.X0[k], other.M[k]) - view.square(self.scene.X0[k], self.scene.M[k])
+
+    def _resect(self, start: Scene, views: list["_View"]) -> Scene:
+        """The poses of images in closed form."""
+        if not views:
+            return start
+        tolerance = np.array([view.tolerance for view in views])
+        found = many.resect([view.xy for view in views], [view.X for view in views], tolerance)
+        X0, M = start.X0.copy(), start.M.copy()
+        for view, x, m, share in zip(views, *found):
+            if share > 0:
+                X0[view.image], M[view.image] = x, view.R.T @ m
+        return Scene(X0, M, start.X)
+
+    # --- adjustment -------------------------------------------------------------------------
+
+    def adjust_candidates(self) -> Iterator[Found]:
+        """The candidates that lead to another minimum, each minimum once, which is better or cannot
+        be told from the present one."""
+        seen: list[Found] = []
+        for candidate in self.candidates():
+            found = self._adjust(candidate)
+            if found is None or any(_are_same(found, other) for other in seen):
+                continue
+            seen.append(found)
+            yield found
+
+    def _adjust(self, candidate: Candidate) -> Found | None:
+        settings, limit = self.settings, self.settings.limit * self.scale
+        start = self._values(candidate.scene)
+        few = settings.evaluations_before_rejection
+        problem, minimum = self.minimise(self.problem, start, max_steps=few)
+        if int(minimum.termination) == LIMIT:
+            if not _cost(minimum) - self.first.vtpv < 10 * limit:
+                return None
+            legs = [minimum]
+            while int(legs[-1].termination) == LIMIT and len(legs) <= settings.max_legs:
+                problem, rest = self.minimise(problem, legs[-1].values)
+                legs.append(rest)
+                if not _cost(rest) - self.first.vtpv < limit:
+                    return None
+            minimum = join_legs(legs)
+        if not _cost(minimum) - self.first.vtpv < limit:
+            return None
+        found = inspect_solution(problem, minimum)
+        if found is None:
+            return None
+        there = scene_of(found.adjusted)
+        # Never a solution with its points behind the cameras.
+        if self._behind(there) > self._behind(self.scene) or not self._differs(there):
+            return None
+        images = candidate.images
+        turn = float(_turns(self.scene, there)[images].max())
+        shift = float(np.linalg.norm(there.X0 - self.scene.X0, axis=1)[images].max())
+        return Found(candidate, problem, minimum, found, turn, shift)
+
+    def _behind(self, scene: Scene) -> int:
+        """Images with most of their points behind them."""
+        return int(np.sum(share_behind(scene, self.rays) > 0.5))
+
+    def _values(self, scene: Scene) -> Values:
+        values = dict(self.first.adjusted)
+        free = self.free[:, None]
+        position, rotation = (np.asarray(part) for part in values["image"])
+        values["image"] = PoseValue(
+            np.where(free, scene.X0, position), np.where(free, many.quaternions(scene.M), rotation)
+        )
+        X = np.where(self.free_points[:, None], scene.X, self.scene.X)
+        values["point"] = with_coordinates(values["point"], X)
+        return values
+
+    def _differs(self, there: Scene) -> bool:
+        """Whether the pose of an image, or a point, is significantly another one than the present:
+        outside of the ellipsoid of its covariance that holds all but the error probability."""
+        here, first = self.scene, self.first
+        turn = _rotation_vectors(there.M @ here.M.transpose(0, 2, 1))
+        poses = np.concatenate([there.X0 - here.X0, turn], 1)
+        if self._outside(poses, first.image_cofactors):
+            return True
+        located = self.free_points & ~self.problem.at_any_distance & ~self.problem.excluded
+        return self._outside((there.X - here.X)[located], first.point_cofactors[located])
+
+    def _outside(self, change: Float[np.ndarray, "n k"], Q: Float[np.ndarray, "n k k"]) -> bool:
+        # Of unit size, whatever the units of coordinates and angles.
+        size = np.sqrt(np.maximum(np.diagonal(Q, axis1=1, axis2=2), 0))
+        inverse = np.where(size > 0, 1 / np.where(size > 0, size, 1), 0)
+        change, Q = change * inverse, Q * inverse[:, :, None] * inverse[:, None, :]
+        distance = np.einsum("ni,nij,nj->n", change, np.linalg.pinv(Q, 1e-12, True), change)
+        limit = chi2_quantile(1 - self.settings.error_probability, change.shape[1])
+        return bool((distance > limit * self.scale).any())
+
+    def is_better(self, found: Found) -> bool:
+        """Whether another minimum takes the place of the present one: it fits better, or as well
+        with more points in front of the cameras."""
+        difference = found.inspection.vtpv - self.first.vtpv
+        if found.candidate.ambiguity == MIRRORED:
+            fewer = self._behind(scene_of(found.inspection.adjusted)) < self._behind(self.scene)
+            return fewer and difference < self.settings.threshold * self.scale
+        return difference < -max(1e-9 * self.first.vtpv, self.rounding)
+
+    def record(self, found: Found) -> SecondMinimum:
+        """The other minimum as reported for the present one."""
+        return self._record(found, self.first.vtpv, found.inspection.vtpv, False)
+
+    def record_left(self, found: Found, other: float) -> SecondMinimum:
+        """A minimum that was left for the present one; `other`: its vᵀPv."""
+        return self._record(found, self.first.vtpv, other, True)
+
+    def _record(self, found: Found, vtpv: float, other: float, taken: bool) -> SecondMinimum:
+        counts = self.problem.counts
+        E = evidence(vtpv, other, counts.redundancy, self.stated, self.rounding)
+        ids = self.problem.network.images.id
+        images = tuple(str(ids[k]) for k in found.candidate.images)
+        mirrored = found.candidate.ambiguity == MIRRORED
+        ambiguous = E < self.settings.threshold and not mirrored
+        return SecondMinimum(
+            found.candidate.ambiguity,
+            images,
+            vtpv,
+            other,
+            E,
+            ambiguous,
+            taken,
+            found.turn,
+            found.shift,
+        )
+
+
+class _View(NamedTuple):
+    """What one image sees: x, y with c = 1 in the camera turned by R, the points, the rays in the
+    image's own frame, weights of directions, the tolerance of start values."""
+
+    image: int
+    R: Float[np.ndarray, "3 3"]
+    xy: Float[np.ndarray, "n 2"]
+    X: Float[np.ndarray, "n 3"]
+    ray: Float[np.ndarray, "n 3"]
+    weight: Float[np.ndarray, " n"]
+    tolerance: float
+
+    def square(self, X0: Float[np.ndarray, "3"], M: Float[np.ndarray, "3 3"]) -> float:
+        """Σ(v/σ)² of a pose."""
+        off = _unit((self.X - X0) @ M.T) - self.ray
+        return float((self.weight * (off**2).sum(1)).sum())
+
+
+def _choose(images: Bool[np.ndarray, " images"], one: Scene, other: Scene) -> Scene:
+    """The poses of `one` for some images, of `other` for the rest, with its points."""
+    X0 = np.where(images[:, None], one.X0, other.X0)
+    return Scene(X0, np.where(images[:, None, None], one.M, other.M), other.X)
+
+
+def _cost(minimum: Minimum) -> float:
+    """vᵀPv where iterations ended."""
+    steps = int(minimum.iterations)
+    cost = np.asarray(minimum.history.cost)[:steps]
+    accepted = np.asarray(minimum.history.accepted)[:steps]
+    return float(2 * cost[accepted][-1]) if accepted.any() else np.inf
+
+
+def _are_same(found: Found, other: Found) -> bool:
+    """Whether two candidates led to one minimum."""
+    one, two = (scene_of(f.inspection.adjusted) for f in (found, other))
+    vtpv = found.inspection.vtpv
+    near = abs(vtpv - other.inspection.vtpv) <= 1e-6 * max(vtpv, 1.0)
+    return bool(near and _turns(one, two).max() < 0.01 * min(found.turn, other.turn))
+
+
+def _turns(one: Scene, two: Scene) -> Float[np.ndarray, " images"]:
+    return _angles(one.M @ two.M.transpose(0, 2, 1))
+
+
+def _angles(M: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
+    return np.linalg.norm(_rotation_vectors(M), axis=1)
+
+
+def _rotation_vectors(M: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3"]:
+    """δθ of M = exp([δθ]×); of half a turn, which has no axis here, any axis."""
+    v = np.stack([M[:, 2, 1] - M[:, 1, 2], M[:, 0, 2] - M[:, 2, 0], M[:, 1, 0] - M[:, 0, 1]], 1) / 2
+    sine = np.linalg.norm(v, axis=1)
+    angle = np.arctan2(sine, (np.trace(M, axis1=1, axis2=2) - 1) / 2)
+    axis = np.where(sine[:, None] > 1e-12, v / np.maximum(sine, 1e-12)[:, None], [1.0, 0.0, 0.0])
+    return angle[:, None] * axis
+
+
+def _common_rays(
+    seen: Sights, first: int, second: int
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
+    """x, y with c = 1 of the points that two images have in common."""
+    one, two = (seen.rows_of(k) for k in (first, second))
+    _, a, b = np.intersect1d(seen.point[one], seen.point[two], return_indices=True)
+    rays = seen.ray[one][a], seen.ray[two][b]
+    front = (rays[0][:, 2] < -0.15) & (rays[1][:, 2] < -0.15)
+    xy = tuple(ray[front, :2] / -ray[front, 2:] for ray in rays)
+    return xy[0], xy[1]
+
+
+def _unit(v: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    return v / np.linalg.norm(v, axis=1, keepdims=True)

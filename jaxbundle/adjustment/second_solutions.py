@@ -1,0 +1,227 @@
+"""The second solutions that a network may have, in closed form from its first one.
+
+S(a) = 1 − 2·a·aᵀ reflects on the plane with the unit normal a. A point c of the object is seen by
+an image with the centre X0 and the rotation M in the direction u = M·(c − X0)/|M·(c − X0)|.
+
+**Turned over** (one image of a plane; Oberkampf, DeMenthon and Davis, 1996; Schweighofer and Pinz,
+2006). Under weak perspective the image of a plane with the normal m is the same after the normal is
+reflected about the line of sight:
+
+    M' = S(u)·M·S(m),        X0' = c − M'ᵀ·M·(c − X0)                                        (1)
+
+**Reversed in depth** (all images; Ullman, 1979; Koenderink and van Doorn, 1991). The same for the
+whole object, reflected on a plane with any normal n through o: all choices differ by a rotation:
+
+    X' = o + S(n)·(X − o),        (1) with n for m, and X0' about c'                         (2)
+
+**Mirrored** (all images). The collinearity equations do not see the sign of q, so that every
+network fits exactly as its mirror image behind its cameras; mirrored on a plane on which its
+control lies, control fits too: the images look away from their points, from below the floor.
+
+    X' = o + S(n)·(X − o),        X0' = o + S(n)·(X0 − o),        M' = −M·S(n)               (3)
+
+**The other plane** (two images or more of a plane): `orientation.planar`; of images that nearly
+coincide the normal of the plane and the direction of the base are exchanged (Longuet-Higgins,
+1986).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxbundle.adjustment.problem import NetworkProblem, coordinates
+from jaxbundle.cameras import get_model
+from jaxbundle.leastsquares.indexing.rows import Values
+from jaxbundle.orientation.many import matrices_of_quaternions
+
+
+class Scene(NamedTuple):
+    """Poses and points, relative to the origin of the problem."""
+
+    X0: Float[np.ndarray, "images 3"]
+    M: Float[np.ndarray, "images 3 3"]
+    X: Float[np.ndarray, "points 3"]
+
+
+class Rays(NamedTuple):
+    """The image points that take part: image, object point, a priori σ of the direction in
+    radians."""
+
+    image: Int[np.ndarray, " rays"]
+    point: Int[np.ndarray, " rays"]
+    sigma: Float[np.ndarray, " rays"]
+
+
+def scene_of(values: Values) -> Scene:
+    """The poses and points of values of a problem."""
+    position, rotation = (np.asarray(part) for part in values["image"])
+    return Scene(position, matrices_of_quaternions(rotation), np.asarray(coordinates(values)))
+
+
+def rays_of(problem: NetworkProblem) -> Rays:
+    """The image points that take part in an adjustment."""
+    used, network = problem.used, problem.network
+    c = [
+        min((abs(camera.parameters[n]) for n in names), default=1.0)
+        for camera in network.cameras
+        for names in [get_model(camera.model).principal_distance]
+    ]
+    # σ of the better coordinate: the effects that are compared with it shall not look small.
+    weight = problem.image_weights.max(1)[used] * np.array(c)[problem.camera[used]]
+    return Rays(problem.image[used], problem.point[used], 1 / weight)
+
+
+def sample(rays: Rays, images: int, most: int) -> Rays:
+    """At most so many rays of every image, evenly, with the weight of all of them: sums over an
+    image stay about the same, in a time that does not grow with its points."""
+    order = np.argsort(rays.image, kind="stable")
+    number = np.bincount(rays.image, minlength=images)
+    first = np.cumsum(number) - number
+    place = np.arange(len(order)) - first[rays.image[order]]
+    total = number[rays.image[order]]
+    # Those at which place·most/total passes an integer.
+    chosen = (place * most) // total != ((place - 1) * most) // total
+    kept = order[chosen | (total <= most)]
+    weight = number / np.maximum(np.bincount(rays.image[kept], minlength=images), 1)
+    image = rays.image[kept]
+    return Rays(image, rays.point[kept], rays.sigma[kept] / np.sqrt(weight[image]))
+
+
+def turn_over(scene: Scene, rays: Rays) -> Scene:
+    """Equation (1) for every image, the plane fitted to the points that it sees."""
+    c, normal = _planes(scene, rays)
+    return Scene(*_reflect_poses(scene, normal, c, c), scene.X)
+
+
+def reverse_depth(
+    scene: Scene, rays: Rays, known: Bool[np.ndarray, " points"] | None = None
+) -> Scene:
+    """Equation (2); the `known` points stay. The plane is theirs if they have one, otherwise it is
+    across the mean line of sight, so that the images stay about where they are."""
+    known = np.zeros(len(scene.X), bool) if known is None else known
+    normal, o = plane_of_known(scene, known)
+    c = _means(scene.X, rays, len(scene.X0))
+    if normal is None:
+        sight = np.nan_to_num(_unit(c - scene.X0)).sum(0)
+        normal, o = _unit(sight), o if known.any() else scene.X[np.unique(rays.point)].mean(0)
+    X = np.where(known[:, None], scene.X, _reflect(scene.X, normal, o))
+    there = _means(X, rays, len(scene.X0))
+    return Scene(*_reflect_poses(scene, np.tile(normal, (len(c), 1)), c, there), X)
+
+
+def mirror(scene: Scene, known: Bool[np.ndarray, " points"]) -> Scene:
+    """Equation (3) on the plane of the `known` points, or without one on any."""
+    normal, o = plane_of_known(scene, known)
+    normal = np.array([0.0, 0.0, 1.0]) if normal is None else normal
+    X = np.where(known[:, None], scene.X, _reflect(scene.X, normal, o))
+    return Scene(_reflect(scene.X0, normal, o), -scene.M @ _reflection(normal), X)
+
+
+def mirror_images(scene: Scene, rays: Rays, images: Bool[np.ndarray, " images"]) -> Scene:
+    """Equation (3) for some images only, each on the plane fitted to the points that it sees, which
+    stay."""
+    c, normal = _planes(scene, rays)
+    X0 = scene.X0 - 2 * ((scene.X0 - c) * normal).sum(1, keepdims=True) * normal
+    M, chosen = -scene.M @ _reflection(normal), images[:, None]
+    return Scene(np.where(chosen, X0, scene.X0), np.where(chosen[:, None], M, scene.M), scene.X)
+
+
+def plane_of_known(
+    scene: Scene, known: Bool[np.ndarray, " points"]
+) -> tuple[Float[np.ndarray, "3"] | None, Float[np.ndarray, "3"]]:
+    """Normal and a point of the plane of the known points; no normal of fewer than three."""
+    X = scene.X[known]
+    if not len(X):
+        return None, np.zeros(3)
+    o = X.mean(0)
+    return (np.linalg.svd(X - o)[2][2] if len(X) >= 3 else None), o
+
+
+def share_behind(scene: Scene, rays: Rays) -> Float[np.ndarray, " images"]:
+    """The share of the points of every image that are behind it (q > 0)."""
+    q = np.einsum("ni,ni->n", scene.M[rays.image, 2], scene.X[rays.point] - scene.X0[rays.image])
+    number = np.bincount(rays.image, minlength=len(scene.X0))
+    return np.bincount(rays.image, q > 0, len(scene.X0)) / np.maximum(number, 1)
+
+
+def perspective_effect(scene: Scene, other: Scene, rays: Rays) -> Float[np.ndarray, " images"]:
+    """Σ(δ/σ)² of every image, δ: what distinguishes another solution beside shift, scale and roll.
+
+    The directions of both solutions to their points are compared in the plane across the mean line
+    of sight, after the similarity that fits them best: what is left is the effect of perspective,
+    which no pose of the second solution can hide but by turning back to the first one."""
+    images = len(scene.X0)
+    z, w = (_in_tangent_plane(s, rays, images) for s in (scene, other))
+    p = 1 / rays.sigma**2
+    total = lambda value: np.bincount(rays.image, value, images)
+    complex_total = lambda value: total(value.real) + 1j * total(value.imag)
+    number = np.where(total(p) > 0, total(p), 1.0)
+    z = z - (complex_total(p * z) / number)[rays.image]
+    w = w - (complex_total(p * w) / number)[rays.image]
+    # w ≈ b·z, b a complex number: scale and roll.
+    square = total(p * abs(z) ** 2)
+    b = complex_total(p * w * z.conj()) / np.where(square > 0, square, 1.0)
+    return total(p * abs(w - b[rays.image] * z) ** 2)
+
+
+def _in_tangent_plane(scene: Scene, rays: Rays, images: int) -> np.ndarray:
+    """Directions to the points as complex numbers x + iy, c = 1, in a camera turned towards the
+    mean of them; those at its side are cut off at 80°."""
+    d = np.einsum(
+        "nij,nj->ni", scene.M[rays.image], _unit(scene.X[rays.point] - scene.X0[rays.image])
+    )
+    axis = _unit(np.stack([np.bincount(rays.image, x, images) for x in np.nan_to_num(d).T], 1))
+    # Any rotation that takes the axis to −z, the same for neighbouring axes: the shortest one.
+    a, b, c = np.nan_to_num(axis).T
+    f = 1 / np.maximum(1 - c, 1e-9)
+    first = np.stack([1 - a * a * f, -a * b * f, a], 1)
+    second = np.stack([-a * b * f, 1 - b * b * f, b], 1)
+    along = np.maximum((axis[rays.image] * d).sum(1), np.cos(np.deg2rad(80)))
+    x, y = ((basis[rays.image] * d).sum(1) / along for basis in (first, second))
+    return np.nan_to_num(x) + 1j * np.nan_to_num(y)
+
+
+def _planes(
+    scene: Scene, rays: Rays
+) -> tuple[Float[np.ndarray, "images 3"], Float[np.ndarray, "images 3"]]:
+    """A point and the normal of the plane fitted to the points of every image."""
+    c = _means(scene.X, rays, len(scene.X0))
+    off = scene.X[rays.point] - c[rays.image]
+    columns = (off[:, :, None] * off[:, None, :]).reshape(-1, 9).T
+    scatter = np.stack([np.bincount(rays.image, x, len(scene.X0)) for x in columns], 1)
+    scatter = scatter.reshape(-1, 3, 3)
+    return c, np.linalg.eigh(scatter)[1][:, :, 0]
+
+
+def _reflect_poses(
+    scene: Scene,
+    normal: Float[np.ndarray, "images 3"],
+    c: Float[np.ndarray, "images 3"],
+    there: Float[np.ndarray, "images 3"],
+) -> tuple[Float[np.ndarray, "images 3"], Float[np.ndarray, "images 3 3"]]:
+    """Equation (1) with the centres `there` of the points afterwards."""
+    local = np.einsum("nij,nj->ni", scene.M, c - scene.X0)
+    M = _reflection(_unit(local)) @ scene.M @ _reflection(normal)
+    return there - np.einsum("nji,nj->ni", M, local), M
+
+
+def _reflection(a: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
+    return np.eye(3) - 2 * a[..., :, None] * a[..., None, :]
+
+
+def _reflect(
+    X: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "3"], o: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "n 3"]:
+    return o + (X - o) @ _reflection(normal)
+
+
+def _means(X: Float[np.ndarray, "points 3"], rays: Rays, images: int) -> np.ndarray:
+    """The mean of the points that every image sees."""
+    sums = np.stack([np.bincount(rays.image, x, images) for x in X[rays.point].T], 1)
+    return sums / np.maximum(np.bincount(rays.image, minlength=images), 1)[:, None]
+
+
+def _unit(v: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return v / np.linalg.norm(v, axis=-1, keepdims=True)
