@@ -30,7 +30,7 @@ from jaxbundle.adjustment.quality.second_minimum import (
     evidence,
 )
 from jaxbundle.adjustment.second_solutions import (
-    Scene,
+    NetworkScene,
     mirror,
     mirror_images,
     perspective_effect,
@@ -63,19 +63,19 @@ MIN_POINTS = 3
 """Of an image: fewer leave its pose open."""
 
 
-class Candidate(NamedTuple):
+class OtherSolution(NamedTuple):
     """Another solution to start from, and the images that differ."""
 
     ambiguity: str
     images: Int[np.ndarray, " n"]
-    scene: Scene
+    scene: NetworkScene
 
 
 class Found(NamedTuple):
     """A minimum that was adjusted from a candidate, and the largest differences of rotations
     (radians) and projection centres."""
 
-    candidate: Candidate
+    candidate: OtherSolution
     problem: NetworkProblem
     minimum: Minimum
     inspection: Inspection
@@ -150,7 +150,7 @@ class _State:
 
     # --- candidates -------------------------------------------------------------------------
 
-    def candidates(self) -> Iterator[Candidate]:
+    def candidates(self) -> Iterator[OtherSolution]:
         """What is worth an adjustment."""
         yield from self._mirrored()
         yield from self._turned()
@@ -158,18 +158,18 @@ class _State:
             yield from self._reversed()
             yield from self._other_plane()
 
-    def _mirrored(self) -> Iterator[Candidate]:
+    def _mirrored(self) -> Iterator[OtherSolution]:
         network = self.problem.network
         plain = np.array([get_model(c.model).image == "perspective" for c in network.cameras])
         behind = (share_behind(self.scene, self.rays) > 0.5) & plain[network.images.camera]
         behind &= self.free
         if behind.all() and self.problem.lengths is None:
-            yield Candidate(MIRRORED, np.flatnonzero(behind), mirror(self.scene, self.known))
+            yield OtherSolution(MIRRORED, np.flatnonzero(behind), mirror(self.scene, self.known))
         elif behind.any() and not behind.all():
             scene = mirror_images(self.scene, self.rays, behind)
-            yield Candidate(MIRRORED, np.flatnonzero(behind), scene)
+            yield OtherSolution(MIRRORED, np.flatnonzero(behind), scene)
 
-    def _turned(self) -> Iterator[Candidate]:
+    def _turned(self) -> Iterator[OtherSolution]:
         """Images alone, the points as they are."""
         settings, images = self.settings, len(self.scene.X0)
         turned = turn_over(self.scene, self.rays)
@@ -208,7 +208,7 @@ class _State:
         better = apart & (change < 0)
         if better.sum() > 1:
             name = OTHER_POSE if other[better].all() else TURNED
-            yield Candidate(name, np.flatnonzero(better), _choose(better, pose, self.scene))
+            yield OtherSolution(name, np.flatnonzero(better), _choose(better, pose, self.scene))
             apart &= change > -settings.threshold * scale
         # Points and cameras are held in these resections: free ones reduce the difference.
         each = np.flatnonzero(apart & (change < settings.safety * settings.threshold * scale))
@@ -216,7 +216,7 @@ class _State:
         self.untried = each[settings.max_images :]
         for k in each[: settings.max_images]:
             alone, name = np.arange(images) == k, OTHER_POSE if other[k] else TURNED
-            yield Candidate(name, np.array([k]), _choose(alone, pose, self.scene))
+            yield OtherSolution(name, np.array([k]), _choose(alone, pose, self.scene))
 
     def _doubted(
         self,
@@ -234,14 +234,14 @@ class _State:
         bad = own > self.settings.max_misfit**2 * (1.0 if self.stated else self.scale)
         return contradicted | (bad & np.isin(np.arange(len(own)), worst))
 
-    def _reversed(self) -> Iterator[Candidate]:
+    def _reversed(self) -> Iterator[OtherSolution]:
         scene = reverse_depth(self.scene, self.rays, self.known)
         effect = perspective_effect(self.scene, scene, self.rays).sum()
         share = self.settings.min_reversed_share / self.settings.safety
         if share * effect < self.settings.limit * self.scale:
-            yield Candidate(REVERSED, np.arange(len(scene.X0)), scene)
+            yield OtherSolution(REVERSED, np.arange(len(scene.X0)), scene)
 
-    def _other_plane(self) -> Iterator[Candidate]:
+    def _other_plane(self) -> Iterator[OtherSolution]:
         """Of an image and those that see most of its points, the orientations with the other plane,
         if the plane is possible in all of them."""
         images, points = len(self.scene.X0), len(self.scene.X)
@@ -280,7 +280,7 @@ class _State:
             seen, first, int(partners[best]), M[best, other[best]], b[best, other[best]]
         )
         if scene is not None:
-            yield Candidate(OTHER_PLANE, np.arange(images), scene)
+            yield OtherSolution(OTHER_PLANE, np.arange(images), scene)
 
     def _is_plane(self, first: int, partners: Int[np.ndarray, " n"]) -> bool:
         """Whether the points of an image are so near to a plane that the second orientation of a
@@ -311,7 +311,7 @@ class _State:
         second: int,
         M: Float[np.ndarray, "3 3"],
         b: Float[np.ndarray, "3"],
-    ) -> Scene | None:
+    ) -> NetworkScene | None:
         """All images and points from a pair of images, in the present frame."""
         model = Model.empty(seen)
         model.place(first, np.zeros(3), np.eye(3))
@@ -328,7 +328,7 @@ class _State:
             return None
         model = model.transform(*moved)
         X = np.where(np.isfinite(model.X) & ~self.known[:, None], model.X, self.scene.X)
-        return Scene(model.X0, model.M, X)
+        return NetworkScene(model.X0, model.M, X)
 
     @functools.cached_property
     def _sights(self) -> Sights:
@@ -356,8 +356,8 @@ class _State:
         return [view for view in views if len(view.xy) >= MIN_POINTS]
 
     def _improve(
-        self, start: Scene, views: list["_View"]
-    ) -> tuple[Scene, Float[np.ndarray, " images"]]:
+        self, start: NetworkScene, views: list["_View"]
+    ) -> tuple[NetworkScene, Float[np.ndarray, " images"]]:
         """Poses of images improved on the adjusted points, and by how much their Σ(v/σ)² is then
         above the present one; infinite without."""
         X0, M, change = start.X0.copy(), start.M.copy(), np.full(len(start.X0), np.inf)
@@ -369,15 +369,15 @@ class _State:
         for view, x, m in zip(views, *many.refine(poses, *columns)):
             k = view.image
             X0[k], M[k] = x, view.R.T @ m
-            change[k] = self._change(view, Scene(X0, M, start.X))
-        return Scene(X0, M, start.X), np.where(np.isfinite(change), change, np.inf)
+            change[k] = self._change(view, NetworkScene(X0, M, start.X))
+        return NetworkScene(X0, M, start.X), np.where(np.isfinite(change), change, np.inf)
 
-    def _change(self, view: "_View", other: Scene) -> float:
+    def _change(self, view: "_View", other: NetworkScene) -> float:
         """By how much Σ(v/σ)² of an image is above the present one in another pose."""
         k = view.image
         return view.square(other.X0[k], other.M[k]) - view.square(self.scene.X0[k], self.scene.M[k])
 
-    def _resect(self, start: Scene, views: list["_View"]) -> Scene:
+    def _resect(self, start: NetworkScene, views: list["_View"]) -> NetworkScene:
         """The poses of images in closed form."""
         if not views:
             return start
@@ -387,7 +387,7 @@ class _State:
         for view, x, m, share in zip(views, *found):
             if share > 0:
                 X0[view.image], M[view.image] = x, view.R.T @ m
-        return Scene(X0, M, start.X)
+        return NetworkScene(X0, M, start.X)
 
     # --- adjustment -------------------------------------------------------------------------
 
@@ -402,7 +402,7 @@ class _State:
             seen.append(found)
             yield found
 
-    def _adjust(self, candidate: Candidate) -> Found | None:
+    def _adjust(self, candidate: OtherSolution) -> Found | None:
         settings, limit = self.settings, self.settings.limit * self.scale
         start = self._values(candidate.scene)
         few = settings.evaluations_before_rejection
@@ -431,11 +431,11 @@ class _State:
         shift = float(np.linalg.norm(there.X0 - self.scene.X0, axis=1)[images].max())
         return Found(candidate, problem, minimum, found, turn, shift)
 
-    def _behind(self, scene: Scene) -> int:
+    def _behind(self, scene: NetworkScene) -> int:
         """Images with most of their points behind them."""
         return int(np.sum(share_behind(scene, self.rays) > 0.5))
 
-    def _values(self, scene: Scene) -> Values:
+    def _values(self, scene: NetworkScene) -> Values:
         values = dict(self.first.adjusted)
         free = self.free[:, None]
         position, rotation = (np.asarray(part) for part in values["image"])
@@ -446,7 +446,7 @@ class _State:
         values["point"] = with_coordinates(values["point"], X)
         return values
 
-    def _differs(self, there: Scene) -> bool:
+    def _differs(self, there: NetworkScene) -> bool:
         """Whether the pose of an image, or a point, is significantly another one than the present:
         outside of the ellipsoid of its covariance that holds all but the error probability."""
         here, first = self.scene, self.first
@@ -521,10 +521,12 @@ class _View(NamedTuple):
         return float((self.weight * (off**2).sum(1)).sum())
 
 
-def _choose(images: Bool[np.ndarray, " images"], one: Scene, other: Scene) -> Scene:
+def _choose(
+    images: Bool[np.ndarray, " images"], one: NetworkScene, other: NetworkScene
+) -> NetworkScene:
     """The poses of `one` for some images, of `other` for the rest, with its points."""
     X0 = np.where(images[:, None], one.X0, other.X0)
-    return Scene(X0, np.where(images[:, None, None], one.M, other.M), other.X)
+    return NetworkScene(X0, np.where(images[:, None, None], one.M, other.M), other.X)
 
 
 def _cost(minimum: Minimum) -> float:
@@ -543,7 +545,7 @@ def _are_same(found: Found, other: Found) -> bool:
     return bool(near and _turns(one, two).max() < 0.01 * min(found.turn, other.turn))
 
 
-def _turns(one: Scene, two: Scene) -> Float[np.ndarray, " images"]:
+def _turns(one: NetworkScene, two: NetworkScene) -> Float[np.ndarray, " images"]:
     return _angles(one.M @ two.M.transpose(0, 2, 1))
 
 

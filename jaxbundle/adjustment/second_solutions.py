@@ -36,7 +36,7 @@ from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.orientation.many import matrices_of_quaternions
 
 
-class Scene(NamedTuple):
+class NetworkScene(NamedTuple):
     """Poses and points, relative to the origin of the problem."""
 
     X0: Float[np.ndarray, "images 3"]
@@ -44,7 +44,7 @@ class Scene(NamedTuple):
     X: Float[np.ndarray, "points 3"]
 
 
-class Rays(NamedTuple):
+class ImageRays(NamedTuple):
     """The image points that take part: image, object point, a priori σ of the direction in
     radians."""
 
@@ -53,13 +53,15 @@ class Rays(NamedTuple):
     sigma: Float[np.ndarray, " rays"]
 
 
-def scene_of(values: Values) -> Scene:
+def scene_of(values: Values) -> NetworkScene:
     """The poses and points of values of a problem."""
     position, rotation = (np.asarray(part) for part in values["image"])
-    return Scene(position, matrices_of_quaternions(rotation), np.asarray(coordinates(values)))
+    return NetworkScene(
+        position, matrices_of_quaternions(rotation), np.asarray(coordinates(values))
+    )
 
 
-def rays_of(problem: NetworkProblem) -> Rays:
+def rays_of(problem: NetworkProblem) -> ImageRays:
     """The image points that take part in an adjustment."""
     used, network = problem.used, problem.network
     c = [
@@ -69,10 +71,10 @@ def rays_of(problem: NetworkProblem) -> Rays:
     ]
     # σ of the better coordinate: the effects that are compared with it shall not look small.
     weight = problem.image_weights.max(1)[used] * np.array(c)[problem.camera[used]]
-    return Rays(problem.image[used], problem.point[used], 1 / weight)
+    return ImageRays(problem.image[used], problem.point[used], 1 / weight)
 
 
-def sample(rays: Rays, images: int, most: int) -> Rays:
+def sample(rays: ImageRays, images: int, most: int) -> ImageRays:
     """At most so many rays of every image, evenly, with the weight of all of them: sums over an
     image stay about the same, in a time that does not grow with its points."""
     order = np.argsort(rays.image, kind="stable")
@@ -85,18 +87,18 @@ def sample(rays: Rays, images: int, most: int) -> Rays:
     kept = order[chosen | (total <= most)]
     weight = number / np.maximum(np.bincount(rays.image[kept], minlength=images), 1)
     image = rays.image[kept]
-    return Rays(image, rays.point[kept], rays.sigma[kept] / np.sqrt(weight[image]))
+    return ImageRays(image, rays.point[kept], rays.sigma[kept] / np.sqrt(weight[image]))
 
 
-def turn_over(scene: Scene, rays: Rays) -> Scene:
+def turn_over(scene: NetworkScene, rays: ImageRays) -> NetworkScene:
     """Equation (1) for every image, the plane fitted to the points that it sees."""
     c, normal = _planes(scene, rays)
-    return Scene(*_reflect_poses(scene, normal, c, c), scene.X)
+    return NetworkScene(*_reflect_poses(scene, normal, c, c), scene.X)
 
 
 def reverse_depth(
-    scene: Scene, rays: Rays, known: Bool[np.ndarray, " points"] | None = None
-) -> Scene:
+    scene: NetworkScene, rays: ImageRays, known: Bool[np.ndarray, " points"] | None = None
+) -> NetworkScene:
     """Equation (2); the `known` points stay. The plane is theirs if they have one, otherwise it is
     across the mean line of sight, so that the images stay about where they are."""
     known = np.zeros(len(scene.X), bool) if known is None else known
@@ -107,28 +109,32 @@ def reverse_depth(
         normal, o = _unit(sight), o if known.any() else scene.X[np.unique(rays.point)].mean(0)
     X = np.where(known[:, None], scene.X, _reflect(scene.X, normal, o))
     there = _means(X, rays, len(scene.X0))
-    return Scene(*_reflect_poses(scene, np.tile(normal, (len(c), 1)), c, there), X)
+    return NetworkScene(*_reflect_poses(scene, np.tile(normal, (len(c), 1)), c, there), X)
 
 
-def mirror(scene: Scene, known: Bool[np.ndarray, " points"]) -> Scene:
+def mirror(scene: NetworkScene, known: Bool[np.ndarray, " points"]) -> NetworkScene:
     """Equation (3) on the plane of the `known` points, or without one on any."""
     normal, o = plane_of_known(scene, known)
     normal = np.array([0.0, 0.0, 1.0]) if normal is None else normal
     X = np.where(known[:, None], scene.X, _reflect(scene.X, normal, o))
-    return Scene(_reflect(scene.X0, normal, o), -scene.M @ _reflection(normal), X)
+    return NetworkScene(_reflect(scene.X0, normal, o), -scene.M @ _reflection(normal), X)
 
 
-def mirror_images(scene: Scene, rays: Rays, images: Bool[np.ndarray, " images"]) -> Scene:
+def mirror_images(
+    scene: NetworkScene, rays: ImageRays, images: Bool[np.ndarray, " images"]
+) -> NetworkScene:
     """Equation (3) for some images only, each on the plane fitted to the points that it sees, which
     stay."""
     c, normal = _planes(scene, rays)
     X0 = scene.X0 - 2 * ((scene.X0 - c) * normal).sum(1, keepdims=True) * normal
     M, chosen = -scene.M @ _reflection(normal), images[:, None]
-    return Scene(np.where(chosen, X0, scene.X0), np.where(chosen[:, None], M, scene.M), scene.X)
+    return NetworkScene(
+        np.where(chosen, X0, scene.X0), np.where(chosen[:, None], M, scene.M), scene.X
+    )
 
 
 def plane_of_known(
-    scene: Scene, known: Bool[np.ndarray, " points"]
+    scene: NetworkScene, known: Bool[np.ndarray, " points"]
 ) -> tuple[Float[np.ndarray, "3"] | None, Float[np.ndarray, "3"]]:
     """Normal and a point of the plane of the known points; no normal of fewer than three."""
     X = scene.X[known]
@@ -138,14 +144,16 @@ def plane_of_known(
     return (np.linalg.svd(X - o)[2][2] if len(X) >= 3 else None), o
 
 
-def share_behind(scene: Scene, rays: Rays) -> Float[np.ndarray, " images"]:
+def share_behind(scene: NetworkScene, rays: ImageRays) -> Float[np.ndarray, " images"]:
     """The share of the points of every image that are behind it (q > 0)."""
     q = np.einsum("ni,ni->n", scene.M[rays.image, 2], scene.X[rays.point] - scene.X0[rays.image])
     number = np.bincount(rays.image, minlength=len(scene.X0))
     return np.bincount(rays.image, q > 0, len(scene.X0)) / np.maximum(number, 1)
 
 
-def perspective_effect(scene: Scene, other: Scene, rays: Rays) -> Float[np.ndarray, " images"]:
+def perspective_effect(
+    scene: NetworkScene, other: NetworkScene, rays: ImageRays
+) -> Float[np.ndarray, " images"]:
     """Σ(δ/σ)² of every image, δ: what distinguishes another solution beside shift, scale and roll.
 
     The directions of both solutions to their points are compared in the plane across the mean line
@@ -165,7 +173,7 @@ def perspective_effect(scene: Scene, other: Scene, rays: Rays) -> Float[np.ndarr
     return total(p * abs(w - b[rays.image] * z) ** 2)
 
 
-def _in_tangent_plane(scene: Scene, rays: Rays, images: int) -> np.ndarray:
+def _in_tangent_plane(scene: NetworkScene, rays: ImageRays, images: int) -> np.ndarray:
     """Directions to the points as complex numbers x + iy, c = 1, in a camera turned towards the
     mean of them; those at its side are cut off at 80°."""
     d = np.einsum(
@@ -183,7 +191,7 @@ def _in_tangent_plane(scene: Scene, rays: Rays, images: int) -> np.ndarray:
 
 
 def _planes(
-    scene: Scene, rays: Rays
+    scene: NetworkScene, rays: ImageRays
 ) -> tuple[Float[np.ndarray, "images 3"], Float[np.ndarray, "images 3"]]:
     """A point and the normal of the plane fitted to the points of every image."""
     c = _means(scene.X, rays, len(scene.X0))
@@ -195,7 +203,7 @@ def _planes(
 
 
 def _reflect_poses(
-    scene: Scene,
+    scene: NetworkScene,
     normal: Float[np.ndarray, "images 3"],
     c: Float[np.ndarray, "images 3"],
     there: Float[np.ndarray, "images 3"],
@@ -216,7 +224,7 @@ def _reflect(
     return o + (X - o) @ _reflection(normal)
 
 
-def _means(X: Float[np.ndarray, "points 3"], rays: Rays, images: int) -> np.ndarray:
+def _means(X: Float[np.ndarray, "points 3"], rays: ImageRays, images: int) -> np.ndarray:
     """The mean of the points that every image sees."""
     sums = np.stack([np.bincount(rays.image, x, images) for x in X[rays.point].T], 1)
     return sums / np.maximum(np.bincount(rays.image, minlength=images), 1)[:, None]

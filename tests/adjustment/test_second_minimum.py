@@ -18,8 +18,8 @@ from jaxbundle.adjustment.quality.second_minimum import (
     evidence,
 )
 from jaxbundle.adjustment.second_solutions import (
-    Rays,
-    Scene,
+    ImageRays,
+    NetworkScene,
     mirror,
     perspective_effect,
     reverse_depth,
@@ -138,11 +138,11 @@ def test_the_second_solutions_are_those_of_parallel_projection():
     rng = np.random.default_rng(1)
     X = rng.normal(size=(12, 3))
     flat = X * [1, 1, 0]
-    rays = Rays(np.repeat(np.arange(3), 12), np.tile(np.arange(12), 3), np.full(36, 1e-3))
+    rays = ImageRays(np.repeat(np.arange(3), 12), np.tile(np.arange(12), 3), np.full(36, 1e-3))
     for distance, error in ((1e3, 1e-5), (1e5, 1e-9)):
         X0, M = poses([(30, 10), (50, 200), (20, 90)], distance)
         for given, solve in ((flat, turn_over), (X, reverse_depth)):
-            scene = Scene(X0, M, given)
+            scene = NetworkScene(X0, M, given)
             other = solve(scene, rays)
             # (x/c)·(z/distance): second order in the size of the object over the distance
             off = image_points(other.X0, other.M, other.X) - image_points(X0, M, given)
@@ -156,7 +156,7 @@ def test_the_mirrored_network_fits_exactly_from_below():
     X = np.random.default_rng(2).normal(size=(10, 3)) * [1, 1, 0.3]
     known = np.arange(10) < 4
     X[known, 2] = 0.0
-    other = mirror(Scene(X0, M, X), known)
+    other = mirror(NetworkScene(X0, M, X), known)
     np.testing.assert_allclose(other.X, X * [1, 1, -1], atol=1e-12)
     np.testing.assert_allclose(other.X0, X0 * [1, 1, -1], atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(other.M), 1)
@@ -288,7 +288,7 @@ def test_cameras_under_the_floor_come_up():
     xy = image_points(X0, M, X) + 1e-3 * rng.normal(size=(3, 24, 2))
     role = ["fixed"] * 16 + ["tie"] * 8
     right = jaxbundle.adjust(network(X, xy, 1e-3, X0, M, role))
-    below = mirror(Scene(X0, M, X), np.arange(24) < 16)
+    below = mirror(NetworkScene(X0, M, X), np.arange(24) < 16)
     given = network(below.X, xy, 1e-3, below.X0, below.M, role)
     wrong = jaxbundle.adjust(given, second_minimum=False)
     assert (wrong.images["Z0"] < 0).all()
@@ -310,8 +310,8 @@ def test_a_free_network_from_afar_has_its_reversal():
     given = network(X, xy, sigma, X0, M, "tie")
     result = jaxbundle.adjust(given)
     (found,) = (one for one in result.second_minima if one.ambiguity == REVERSED)
-    rays = Rays(np.repeat(np.arange(5), 20), np.tile(np.arange(20), 5), np.full(100, 1e-3))
-    other = reverse_depth(Scene(X0, M, X), rays)
+    rays = ImageRays(np.repeat(np.arange(5), 20), np.tile(np.arange(20), 5), np.full(100, 1e-3))
+    other = reverse_depth(NetworkScene(X0, M, X), rays)
     turned = given.replace(points=dataclasses.replace(given.points, position=other.X))
     true = dense_vtpv(given, X0, M, free_points=True)
     reversed_ = dense_vtpv(turned, other.X0, other.M, free_points=True)
@@ -325,8 +325,8 @@ def views_of_a_board(distance, sigma, turned=()):
     X0, M = poses(zip(rng.uniform(15, 55, 12), rng.uniform(0, 360, 12)), distance)
     X0 *= rng.uniform(0.9, 1.2, (12, 1))
     xy = image_points(X0, M, board()) + sigma * rng.normal(size=(12, 16, 2))
-    rays = Rays(np.repeat(np.arange(12), 16), np.tile(np.arange(16), 12), np.ones(192))
-    other = turn_over(Scene(X0, M, board()), rays)
+    rays = ImageRays(np.repeat(np.arange(12), 16), np.tile(np.arange(16), 12), np.ones(192))
+    other = turn_over(NetworkScene(X0, M, board()), rays)
     rows = list(turned)
     X0[rows], M[rows] = other.X0[rows], other.M[rows]
     return network(board(), xy, sigma, X0, M)
