@@ -121,8 +121,8 @@ def line(problem):
     # Weights change by a hundredth, other numbers by a thousandth of their size.
     of = lambda x, part: part * random.normal(size=np.shape(x)) * np.abs(x)
     along = jax.tree.map(lambda x: of(x, 1e-3), base)
-    other = tuple((m, of(w, 1e-2)) for (m, _), (_, w) in zip(along.other, base.other))
-    along = dataclasses.replace(along, other=other)
+    weight = {name: of(w, 1e-2) for name, w in base.weight.items()}
+    along = dataclasses.replace(along, weight=weight)
     values = jax.tree.leaves(jaxbundle.solve(problem))
     scale = np.concatenate([np.full(np.size(x), np.abs(x).max() + 1e-3) for x in values])
     return Line(problem, base, along, scale)
