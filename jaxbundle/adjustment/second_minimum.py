@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from jaxbundle.adjustment.far_points import join_legs, noise_of_rays
 from jaxbundle.adjustment.minimum import adjusted_cameras, inspect_solution
@@ -21,25 +21,28 @@ from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.adjustment.quality.second_minimum import (
     MIRRORED,
     OTHER_PLANE,
-    OTHER_POSE,
     REVERSED,
     SECOND_MINIMUM,
-    TURNED,
     SecondMinimum,
     SecondMinimumSettings,
     evidence,
 )
+from jaxbundle.adjustment.second_poses import SecondPoses
 from jaxbundle.adjustment.second_solutions import (
     NetworkScene,
+    OtherSolution,
+    angles,
     mirror,
     mirror_images,
     perspective_effect,
     rays_of,
     reverse_depth,
+    rotation_vectors,
     sample,
     scene_of,
     share_behind,
-    turn_over,
+    turns,
+    unit,
 )
 from jaxbundle.cameras import get_model
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
@@ -52,23 +55,11 @@ from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import UNIT
 from jaxbundle.orientation import many
 from jaxbundle.orientation.growth import START_VALUE_DEMANDS, Model, grow, intersect
-from jaxbundle.orientation.sights import Sights, in_plane, sights
+from jaxbundle.orientation.sights import Sights, sights
 
 Minimise = Callable[..., tuple[NetworkProblem, Minimum]]
 """`minimise(problem, start)` iterates from given values, `max_steps` at most if given; returns the
 problem as it ended."""
-
-
-MIN_POINTS = 3
-"""Of an image: fewer leave its pose open."""
-
-
-class OtherSolution(NamedTuple):
-    """Another solution to start from, and the images that differ."""
-
-    ambiguity: str
-    images: Int[np.ndarray, " n"]
-    scene: NetworkScene
 
 
 class Found(NamedTuple):
@@ -145,15 +136,31 @@ class _State:
         # vᵀPv of rounding: 1e-10 of the principal distance in all image coordinates.
         self.rounding = counts.observations * (1e-10 / noise_of_rays(network)) ** 2
         vtpv, r = first.vtpv, max(counts.redundancy, 1)
-        self.untried = np.zeros(0, int)
         self.scale = max(vtpv / r, 1.0 if self.stated else self.rounding)
+        self._poses = SecondPoses(
+            problem=self.problem,
+            scene=self.scene,
+            rays=self.rays,
+            all_rays=self.all_rays,
+            squares=(first.image_residuals[self.problem.used] ** 2).sum(1),
+            free=self.free,
+            scale=self.scale,
+            stated=self.stated,
+            settings=settings,
+            sights=lambda: self._sights,
+        )
+
+    @property
+    def untried(self) -> Int[np.ndarray, " n"]:
+        """Images whose second pose was not adjusted, since they are too many."""
+        return self._poses.untried
 
     # --- candidates -------------------------------------------------------------------------
 
     def candidates(self) -> Iterator[OtherSolution]:
         """What is worth an adjustment."""
         yield from self._mirrored()
-        yield from self._turned()
+        yield from self._poses.candidates()
         if len(self.scene.X0) > 1 and self.problem.lengths is None and self.free.all():
             yield from self._reversed()
             yield from self._other_plane()
@@ -168,71 +175,6 @@ class _State:
         elif behind.any() and not behind.all():
             scene = mirror_images(self.scene, self.rays, behind)
             yield OtherSolution(MIRRORED, np.flatnonzero(behind), scene)
-
-    def _turned(self) -> Iterator[OtherSolution]:
-        """Images alone, the points as they are."""
-        settings, images = self.settings, len(self.scene.X0)
-        turned = turn_over(self.scene, self.rays)
-        effect = perspective_effect(self.scene, turned, self.rays)
-        number = np.bincount(self.all_rays.image, minlength=images)
-        # An image in the wrong minimum has large residuals, however many others fit.
-        squares = (self.first.image_residuals[self.problem.used] ** 2).sum(1)
-        own = np.bincount(self.all_rays.image, squares, images) / np.maximum(2 * number, 1)
-        scale = np.maximum(self.scale, own)
-        share = settings.min_turning_share / settings.safety
-        usable = self.free & (number >= MIN_POINTS)
-        weak = (share * effect < settings.limit * scale) | (number <= settings.few_points)
-        weak &= usable
-        doubted = self._doubted(own, number, weak) & usable
-        if not (weak | doubted).any():
-            return
-        views = self._views(np.flatnonzero(weak | doubted))
-        pose, change = self._improve(turned, views)
-        # Near the end of its second minimum (see `min_turning_share`) an iteration may step over to
-        # the first one, or wander off: then the closed form is the better start.
-        closed = np.full(images, np.inf)
-        for view in views:
-            closed[view.image] = self._change(view, turned)
-        back = _turns(self.scene, pose) < 0.5 * _turns(self.scene, turned)
-        back |= closed < change
-        pose, change = _choose(back, turned, pose), np.where(back, closed, change)
-        # A wrong minimum need not be that of the object turned over.
-        views = [view for view in views if doubted[view.image]]
-        best, by_best = self._improve(self._resect(turned, views), views)
-        other = by_best < change
-        pose, change = _choose(other, best, pose), np.where(other, by_best, change)
-        # A hundredth of the way is the present pose, found again.
-        apart = _turns(self.scene, pose) > 0.01 * _turns(self.scene, turned)
-        apart &= np.isfinite(change) & (share_behind(pose, self.rays) <= 0.5)
-        # All that fit better at once; alone only those that may also be ambiguous.
-        better = apart & (change < 0)
-        if better.sum() > 1:
-            name = OTHER_POSE if other[better].all() else TURNED
-            yield OtherSolution(name, np.flatnonzero(better), _choose(better, pose, self.scene))
-            apart &= change > -settings.threshold * scale
-        # Points and cameras are held in these resections: free ones reduce the difference.
-        each = np.flatnonzero(apart & (change < settings.safety * settings.threshold * scale))
-        each = each[np.argsort(change[each])]
-        self.untried = each[settings.max_images :]
-        for k in each[: settings.max_images]:
-            alone, name = np.arange(images) == k, OTHER_POSE if other[k] else TURNED
-            yield OtherSolution(name, np.array([k]), _choose(alone, pose, self.scene))
-
-    def _doubted(
-        self,
-        own: Float[np.ndarray, " images"],
-        number: Int[np.ndarray, " images"],
-        weak: Bool[np.ndarray, " images"],
-    ) -> Bool[np.ndarray, " images"]:
-        """The images whose pose is also found in closed form: those of weak perspective with
-        residuals that contradict their σ, and the few that fit worst of all, if badly; `own`: mean
-        squares of their residuals."""
-        alpha, degrees = self.settings.error_probability, np.maximum(2 * number, 1)
-        largest = np.array([chi2_quantile(1 - alpha, n) for n in degrees]) / degrees
-        contradicted = weak & (own > largest) & self.stated
-        worst = np.argsort(-own)[: self.settings.max_images]
-        bad = own > self.settings.max_misfit**2 * (1.0 if self.stated else self.scale)
-        return contradicted | (bad & np.isin(np.arange(len(own)), worst))
 
     def _reversed(self) -> Iterator[OtherSolution]:
         scene = reverse_depth(self.scene, self.rays, self.known)
@@ -262,7 +204,7 @@ class _State:
         M, b, _, possible = many.orient_planes(*zip(*pairs))
         relative = self.scene.M[partners] @ self.scene.M[first].T
         # The solution that is farther from the present one.
-        turn = np.stack([_angles(M[:, k] @ relative.transpose(0, 2, 1)) for k in (0, 1)], 1)
+        turn = np.stack([angles(M[:, k] @ relative.transpose(0, 2, 1)) for k in (0, 1)], 1)
         base = self.scene.M[first] @ (self.scene.X0[partners] - self.scene.X0[first]).T
         across = np.stack(
             [
@@ -299,7 +241,7 @@ class _State:
         of_point[seen], of_image[partners] = True, True
         chosen = of_image[rays.image] & of_point[rays.point]
         image, point = rays.image[chosen], rays.point[chosen]
-        one, two = (_unit(X[point] - scene.X0[image]) for X in (scene.X, flat))
+        one, two = (unit(X[point] - scene.X0[image]) for X in (scene.X, flat))
         effect = np.nansum((np.linalg.norm(one - two, axis=1) / rays.sigma[chosen]) ** 2)
         share = self.settings.min_reversed_share / self.settings.safety
         return bool(np.isfinite(along).all() and share * effect < self.settings.limit * self.scale)
@@ -335,59 +277,6 @@ class _State:
         network = self.problem.network
         cameras = adjusted_cameras(self.problem, self.first.adjusted)
         return sights(network.replace(cameras=tuple(cameras.values())))
-
-    def _views(self, images: Int[np.ndarray, " n"]) -> list["_View"]:
-        """What images see, in cameras turned towards it."""
-        seen, problem = self._sights, self.problem
-        place = np.full(len(problem.network.observations), -1)
-        place[np.flatnonzero(problem.used)] = np.arange(len(self.all_rays.image))
-        views = []
-        for k in images:
-            part = np.arange(*seen.rows_of(k).indices(len(seen.image)))
-            part = part[place[seen.row[part]] >= 0]
-            R, xy = in_plane(seen.ray[part])
-            there = np.isfinite(xy).all(1)
-            part = part[there]
-            weight = 1 / self.all_rays.sigma[place[seen.row[part]]] ** 2
-            X = self.scene.X[seen.point[part]]
-            views.append(
-                _View(int(k), R, xy[there], X, seen.ray[part], weight, float(seen.tolerance[k]))
-            )
-        return [view for view in views if len(view.xy) >= MIN_POINTS]
-
-    def _improve(
-        self, start: NetworkScene, views: list["_View"]
-    ) -> tuple[NetworkScene, Float[np.ndarray, " images"]]:
-        """Poses of images improved on the adjusted points, and by how much their Σ(v/σ)² is then
-        above the present one; infinite without."""
-        X0, M, change = start.X0.copy(), start.M.copy(), np.full(len(start.X0), np.inf)
-        if not views:
-            return start, change
-        images = [view.image for view in views]
-        poses = X0[images], np.stack([view.R @ M[view.image] for view in views])
-        columns = zip(*((view.xy, view.X, view.weight) for view in views))
-        for view, x, m in zip(views, *many.refine(poses, *columns)):
-            k = view.image
-            X0[k], M[k] = x, view.R.T @ m
-            change[k] = self._change(view, NetworkScene(X0, M, start.X))
-        return NetworkScene(X0, M, start.X), np.where(np.isfinite(change), change, np.inf)
-
-    def _change(self, view: "_View", other: NetworkScene) -> float:
-        """By how much Σ(v/σ)² of an image is above the present one in another pose."""
-        k = view.image
-        return view.square(other.X0[k], other.M[k]) - view.square(self.scene.X0[k], self.scene.M[k])
-
-    def _resect(self, start: NetworkScene, views: list["_View"]) -> NetworkScene:
-        """The poses of images in closed form."""
-        if not views:
-            return start
-        tolerance = np.array([view.tolerance for view in views])
-        found = many.resect([view.xy for view in views], [view.X for view in views], tolerance)
-        X0, M = start.X0.copy(), start.M.copy()
-        for view, x, m, share in zip(views, *found):
-            if share > 0:
-                X0[view.image], M[view.image] = x, view.R.T @ m
-        return NetworkScene(X0, M, start.X)
 
     # --- adjustment -------------------------------------------------------------------------
 
@@ -427,7 +316,7 @@ class _State:
         if self._behind(there) > self._behind(self.scene) or not self._differs(there):
             return None
         images = candidate.images
-        turn = float(_turns(self.scene, there)[images].max())
+        turn = float(turns(self.scene, there)[images].max())
         shift = float(np.linalg.norm(there.X0 - self.scene.X0, axis=1)[images].max())
         return Found(candidate, problem, minimum, found, turn, shift)
 
@@ -450,7 +339,7 @@ class _State:
         """Whether the pose of an image, or a point, is significantly another one than the present:
         outside of the ellipsoid of its covariance that holds all but the error probability."""
         here, first = self.scene, self.first
-        turn = _rotation_vectors(there.M @ here.M.transpose(0, 2, 1))
+        turn = rotation_vectors(there.M @ here.M.transpose(0, 2, 1))
         poses = np.concatenate([there.X0 - here.X0, turn], 1)
         if self._outside(poses, first.image_cofactors):
             return True
@@ -503,32 +392,6 @@ class _State:
         )
 
 
-class _View(NamedTuple):
-    """What one image sees: x, y with c = 1 in the camera turned by R, the points, the rays in the
-    image's own frame, weights of directions, the tolerance of start values."""
-
-    image: int
-    R: Float[np.ndarray, "3 3"]
-    xy: Float[np.ndarray, "n 2"]
-    X: Float[np.ndarray, "n 3"]
-    ray: Float[np.ndarray, "n 3"]
-    weight: Float[np.ndarray, " n"]
-    tolerance: float
-
-    def square(self, X0: Float[np.ndarray, "3"], M: Float[np.ndarray, "3 3"]) -> float:
-        """Σ(v/σ)² of a pose."""
-        off = _unit((self.X - X0) @ M.T) - self.ray
-        return float((self.weight * (off**2).sum(1)).sum())
-
-
-def _choose(
-    images: Bool[np.ndarray, " images"], one: NetworkScene, other: NetworkScene
-) -> NetworkScene:
-    """The poses of `one` for some images, of `other` for the rest, with its points."""
-    X0 = np.where(images[:, None], one.X0, other.X0)
-    return NetworkScene(X0, np.where(images[:, None, None], one.M, other.M), other.X)
-
-
 def _cost(minimum: Minimum) -> float:
     """vᵀPv where iterations ended."""
     steps = int(minimum.iterations)
@@ -542,24 +405,7 @@ def _are_same(found: Found, other: Found) -> bool:
     one, two = (scene_of(f.inspection.adjusted) for f in (found, other))
     vtpv = found.inspection.vtpv
     near = abs(vtpv - other.inspection.vtpv) <= 1e-6 * max(vtpv, 1.0)
-    return bool(near and _turns(one, two).max() < 0.01 * min(found.turn, other.turn))
-
-
-def _turns(one: NetworkScene, two: NetworkScene) -> Float[np.ndarray, " images"]:
-    return _angles(one.M @ two.M.transpose(0, 2, 1))
-
-
-def _angles(M: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
-    return np.linalg.norm(_rotation_vectors(M), axis=1)
-
-
-def _rotation_vectors(M: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3"]:
-    """δθ of M = exp([δθ]×); of half a turn, which has no axis here, any axis."""
-    v = np.stack([M[:, 2, 1] - M[:, 1, 2], M[:, 0, 2] - M[:, 2, 0], M[:, 1, 0] - M[:, 0, 1]], 1) / 2
-    sine = np.linalg.norm(v, axis=1)
-    angle = np.arctan2(sine, (np.trace(M, axis1=1, axis2=2) - 1) / 2)
-    axis = np.where(sine[:, None] > 1e-12, v / np.maximum(sine, 1e-12)[:, None], [1.0, 0.0, 0.0])
-    return angle[:, None] * axis
+    return bool(near and turns(one, two).max() < 0.01 * min(found.turn, other.turn))
 
 
 def _common_rays(
@@ -572,7 +418,3 @@ def _common_rays(
     front = (rays[0][:, 2] < -0.15) & (rays[1][:, 2] < -0.15)
     xy = tuple(ray[front, :2] / -ray[front, 2:] for ray in rays)
     return xy[0], xy[1]
-
-
-def _unit(v: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    return v / np.linalg.norm(v, axis=1, keepdims=True)

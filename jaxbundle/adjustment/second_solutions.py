@@ -53,6 +53,14 @@ class ImageRays(NamedTuple):
     sigma: Float[np.ndarray, " rays"]
 
 
+class OtherSolution(NamedTuple):
+    """Another solution to start from, and the images that differ."""
+
+    ambiguity: str
+    images: Int[np.ndarray, " n"]
+    scene: NetworkScene
+
+
 def scene_of(values: Values) -> NetworkScene:
     """The poses and points of values of a problem."""
     position, rotation = (np.asarray(part) for part in values["image"])
@@ -105,8 +113,8 @@ def reverse_depth(
     normal, o = plane_of_known(scene, known)
     c = _means(scene.X, rays, len(scene.X0))
     if normal is None:
-        sight = np.nan_to_num(_unit(c - scene.X0)).sum(0)
-        normal, o = _unit(sight), o if known.any() else scene.X[np.unique(rays.point)].mean(0)
+        sight = np.nan_to_num(unit(c - scene.X0)).sum(0)
+        normal, o = unit(sight), o if known.any() else scene.X[np.unique(rays.point)].mean(0)
     X = np.where(known[:, None], scene.X, _reflect(scene.X, normal, o))
     there = _means(X, rays, len(scene.X0))
     return NetworkScene(*_reflect_poses(scene, np.tile(normal, (len(c), 1)), c, there), X)
@@ -177,9 +185,9 @@ def _in_tangent_plane(scene: NetworkScene, rays: ImageRays, images: int) -> np.n
     """Directions to the points as complex numbers x + iy, c = 1, in a camera turned towards the
     mean of them; those at its side are cut off at 80°."""
     d = np.einsum(
-        "nij,nj->ni", scene.M[rays.image], _unit(scene.X[rays.point] - scene.X0[rays.image])
+        "nij,nj->ni", scene.M[rays.image], unit(scene.X[rays.point] - scene.X0[rays.image])
     )
-    axis = _unit(np.stack([np.bincount(rays.image, x, images) for x in np.nan_to_num(d).T], 1))
+    axis = unit(np.stack([np.bincount(rays.image, x, images) for x in np.nan_to_num(d).T], 1))
     # Any rotation that takes the axis to −z, the same for neighbouring axes: the shortest one.
     a, b, c = np.nan_to_num(axis).T
     f = 1 / np.maximum(1 - c, 1e-9)
@@ -210,7 +218,7 @@ def _reflect_poses(
 ) -> tuple[Float[np.ndarray, "images 3"], Float[np.ndarray, "images 3 3"]]:
     """Equation (1) with the centres `there` of the points afterwards."""
     local = np.einsum("nij,nj->ni", scene.M, c - scene.X0)
-    M = _reflection(_unit(local)) @ scene.M @ _reflection(normal)
+    M = _reflection(unit(local)) @ scene.M @ _reflection(normal)
     return there - np.einsum("nji,nj->ni", M, local), M
 
 
@@ -230,6 +238,25 @@ def _means(X: Float[np.ndarray, "points 3"], rays: ImageRays, images: int) -> np
     return sums / np.maximum(np.bincount(rays.image, minlength=images), 1)[:, None]
 
 
-def _unit(v: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+def unit(v: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     with np.errstate(invalid="ignore", divide="ignore"):
         return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def turns(one: NetworkScene, two: NetworkScene) -> Float[np.ndarray, " images"]:
+    """The angle between both rotations of every image, radians."""
+    return angles(one.M @ two.M.transpose(0, 2, 1))
+
+
+def angles(M: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
+    """The angles of rotations, radians."""
+    return np.linalg.norm(rotation_vectors(M), axis=1)
+
+
+def rotation_vectors(M: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3"]:
+    """δθ of M = exp([δθ]×); of half a turn, which has no axis here, any axis."""
+    v = np.stack([M[:, 2, 1] - M[:, 1, 2], M[:, 0, 2] - M[:, 2, 0], M[:, 1, 0] - M[:, 0, 1]], 1) / 2
+    sine = np.linalg.norm(v, axis=1)
+    angle = np.arctan2(sine, (np.trace(M, axis1=1, axis2=2) - 1) / 2)
+    axis = np.where(sine[:, None] > 1e-12, v / np.maximum(sine, 1e-12)[:, None], [1.0, 0.0, 0.0])
+    return angle[:, None] * axis

@@ -15,6 +15,7 @@ from jaxbundle.commands.scanner_inputs import (
     open_image,
     open_scanner,
     surface_of,
+    surface_under,
 )
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
@@ -110,7 +111,7 @@ def correct(  # noqa: PLR0913 (public: the options of the command, all but three
     if occlusion and dem is None:
         raise InputError("--occlusion: needs terrain; give --dem")
     file = open_image(scanner, tell, picture)
-    surface = surface_of(file.earth, height, dem, file.image, geoid)
+    surface = surface_under(file.image, file.earth, height, dem, geoid, tell)
     system = MapSystem(file.earth, crs)
     grid = map_of(file.image, surface, system, spacing, None if dem is None else Path(dem))
     if crs is not None and (place := system.degrees_of(grid)):

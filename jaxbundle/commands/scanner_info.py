@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.commands.scanner_inputs import Message, ignore, open_image, surface_of
+from jaxbundle.commands.scanner_inputs import Message, ignore, open_image, surface_under
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.geometry.ellipsoid import Ellipsoid, geodetic, normal
 from jaxbundle.io.results.result_json import without_nan
@@ -69,8 +69,11 @@ class ScannerInfo(TableMethods):
         for row in rows_of(self.table()):
             # degrees to a millimetre, metres likewise
             places = {"longitude": 8, "latitude": 8, "line": 0, "pixel": 0}
+            # + 0.0: of −0 made by rounding
             cells = (
-                "" if row[name] is None else f"{row[name]:.{places.get(name, 3)}f}"
+                ""
+                if row[name] is None
+                else f"{round(row[name], places.get(name, 3)) + 0.0:.{places.get(name, 3)}f}"
                 for name in names
             )
             lines.append(f"{row['corner']:26}" + "".join(f"{cell:>14}" for cell in cells))
@@ -84,23 +87,21 @@ def info(
     ground sampling, direction of view, footprint, corrections, and how well a rigorous model agrees
     with the RPC of its product.
 
-    **Arguments:** `height`: of the ground, metres above the ellipsoid (Z in a local frame);
-    default: 0, of polynomials the middle of the heights for which they hold.
+    **Arguments:** `height`: of the ground, metres above the ellipsoid (Z in a local frame), as of
+    `locate`.
 
     **Raises:** `InputError`.
     """
     file = open_image(scanner, tell)
     image = file.image
-    if isinstance(image, RpcImage) and height is None:
-        height = float(image.rpc.height_offset)
-    surface = surface_of(file.earth, height, None)
+    surface = surface_under(image, file.earth, height, None, None, tell)
     kind = "rational polynomials" if isinstance(image, RpcImage) else "rigorous"
     figures: dict[str, Any] = {
         "scanner": file.name,
         "model": kind,
         "lines": image.lines,
         "pixels": image.pixels,
-        "height": height or 0.0,
+        "height": float(getattr(surface, "level", 0.0)),
     }
     # the middle, the next line, the next pixel; the corners
     line, pixel = (image.lines - 1) / 2, (image.pixels - 1) / 2

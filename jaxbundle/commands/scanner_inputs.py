@@ -10,7 +10,7 @@ from jaxbundle.geometry.ellipsoid import Ellipsoid, earth_fixed
 from jaxbundle.io.rasters.extent import image_extent, rpc_extent
 from jaxbundle.io.rasters.geoid import add_geoid
 from jaxbundle.io.rasters.reading import read_terrain
-from jaxbundle.io.scanner.read import EXPECTED_PRODUCTS, read_scanner
+from jaxbundle.io.scanner.read import EXPECTED_PRODUCTS, PRODUCTS, read_scanner
 from jaxbundle.io.scanner.rpc_images import RpcInput, has_rpc_only, read_rpc_image
 from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.text.csv_tables import read_csv
@@ -18,8 +18,9 @@ from jaxbundle.network.columns import Columns, did_you_mean
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.rpc import Rpc
-from jaxbundle.pushbroom.rpc_image import RpcImage
+from jaxbundle.pushbroom.rpc_image import RpcImage, heights_in_words, heights_of
 from jaxbundle.pushbroom.surfaces import Ground, GroundSurface, Height, Plane
+from jaxbundle.pushbroom.terrain import Terrain
 
 Message = Callable[[str], object]
 """Called with a warning, a line of text."""
@@ -73,7 +74,7 @@ def open_scanner(path: str | Path, tell: Message = ignore) -> ScannerInput:
 
     **Raises:** `InputError`."""
     path = Path(path)
-    if path.exists() and has_rpc_only(path):
+    if path.is_file() and has_rpc_only(path):
         raise InputError(
             f"{path}: has rational polynomials (RPC) only, which info, locate, project, correct, "
             f"surface and rpc take; here a rigorous model is needed: a scanner file, or "
@@ -94,9 +95,45 @@ def open_image(
 
     **Raises:** `InputError`."""
     path = Path(path)
-    if not path.exists() or not has_rpc_only(path):
-        return open_scanner(path, tell)
-    return read_rpc_image(path, None if raster is None else Path(raster))
+    if path.is_file() and has_rpc_only(path):
+        found = read_rpc_image(path, None if raster is None else Path(raster))
+        for warning in found.warnings:
+            tell(warning)
+        return found
+    if path.exists() and path.suffix.lower() not in (".toml", *PRODUCTS):
+        raise InputError(
+            f"{path}: expected a scanner file (.toml), {EXPECTED_PRODUCTS}; or an image with RPC: "
+            "its raster, or _RPC.TXT, .RPB, .geom, RPC_….XML"
+        )
+    return open_scanner(path, tell)
+
+
+def surface_under(
+    image: PushbroomImage | RpcImage,
+    earth: Ellipsoid | None,
+    height: float | None,
+    dem: str | Path | None,
+    geoid: str | Path | None,
+    tell: Message,
+) -> GroundSurface:
+    """`surface_of` for an image: without height and terrain the ellipsoid, or, where polynomials do
+    not hold there, the middle of their heights; `tell` receives that, and a surface for which they
+    do not hold."""
+    if not isinstance(image, RpcImage):
+        return surface_of(earth, height, dem, image, geoid)
+    low, high = heights_of(image.rpc)
+    held = f"the RPC holds for heights from {heights_in_words(image.rpc)} m"
+    if height is None and dem is None and not low <= 0 <= high:
+        height = (low + high) / 2
+        tell(f"{held}, not for 0: the ground is taken at {height:.6g} m; give --height or --dem")
+    surface = surface_of(earth, height, dem, image, geoid)
+    at = [height or 0.0]
+    if isinstance(surface, Terrain):
+        at = [float(surface.lowest), float(surface.highest)]
+    if min(at) < low or max(at) > high:
+        words = " to ".join(f"{h:.6g}" for h in at)
+        tell(f"{held}; the ground is at {words} m, where it is extrapolated")
+    return surface
 
 
 def check_spheroid(earth: Ellipsoid | None) -> None:

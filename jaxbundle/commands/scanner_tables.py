@@ -19,6 +19,7 @@ from jaxbundle.commands.scanner_inputs import (
     places,
     points_of,
     surface_of,
+    surface_under,
     with_points,
 )
 from jaxbundle.display import print_in_one_screen
@@ -96,8 +97,9 @@ def locate(
     - `scanner`: scanner file, product file, or an image with rational polynomials: its raster or
       the file of the coefficients.
     - `points`: table line, pixel[, id]; without it a `grid` of lines × pixels over the image.
-    - `height`: of the ground, metres above the ellipsoid (Z in a local frame), or `dem`: terrain
-      raster, with `geoid`: geoid heights, where its heights are orthometric.
+    - `height`: of the ground, metres above the ellipsoid (Z in a local frame), default 0, or, where
+      polynomials do not hold for 0, the middle of their heights; or `dem`: terrain raster,
+      with `geoid`: geoid heights, where its heights are orthometric.
     - `tell`: called with every warning.
 
     **Returns:** columns line, pixel, X, Y, Z, on the Earth longitude, latitude (degrees), height,
@@ -106,7 +108,7 @@ def locate(
     **Raises:** `InputError`, also if no position meets the surface.
     """
     file = open_image(scanner, tell)
-    surface = surface_of(file.earth, height, dem, file.image, geoid)
+    surface = surface_under(file.image, file.earth, height, dem, geoid, tell)
     ids, line, pixel, source = places(file.image, points, grid)
     off = off_image(file.image, line, pixel, source, tell)
     X, extrapolated = _locate(file.image, surface, line, pixel)
@@ -233,8 +235,9 @@ def _project_rpc(
             f"pixel {pixel[0]:.6g} of {image.lines} × {image.pixels}: check coordinates, frame and "
             "units"
         )
+    outside = f"not in the image of {image.lines} × {image.pixels}"
     for rows, words in (
-        (~seen, f"not in the image of {image.lines} × {image.pixels}"),
+        (~seen, outside if image.sized else RpcStatus.OUTSIDE.meaning),
         (seen & extrapolated, _extrapolated(image)),
     ):
         if rows.any():
@@ -242,7 +245,7 @@ def _project_rpc(
                 f"{table.source(int(rows.argmax()))}: {words} ({rows.sum()} of {len(seen)} points)"
             )
     line[~seen], pixel[~seen] = np.nan, np.nan
-    words = [OFF_IMAGE, RpcStatus.OUTSIDE.meaning]
+    words = [OFF_IMAGE if image.sized else RpcStatus.OUTSIDE.meaning, RpcStatus.OUTSIDE.meaning]
     return {
         "id": table.ids("id") if "id" in table.values else [str(k + 1) for k in range(len(seen))],
         "line": line,

@@ -33,11 +33,16 @@ class RpcImage(eqx.Module):
     sized: bool = eqx.field(static=True, default=True)
 
 
-def heights_in_words(rpc: Rpc) -> str:
-    """The heights between which the polynomials hold, to a millimetre."""
+def heights_of(rpc: Rpc) -> tuple[float, float]:
+    """The heights between which the polynomials hold, metres, to a millimetre."""
     middle, half = float(rpc.height_offset), abs(float(rpc.height_scale))
-    low, high = (round(h, 3) + 0.0 for h in (middle - half, middle + half))
-    return f"{low:.10g} to {high:.10g}"
+    # + 0.0: of −0 made by rounding
+    return round(middle - half, 3) + 0.0, round(middle + half, 3) + 0.0
+
+
+def heights_in_words(rpc: Rpc) -> str:
+    """The same, for messages."""
+    return " to ".join(f"{h:.10g}" for h in heights_of(rpc))
 
 
 def locate_rpc_lines(

@@ -5,6 +5,7 @@ import csv
 import struct
 
 import conversions
+import cv2
 import ezdxf
 import numpy as np
 import plyfile
@@ -129,7 +130,6 @@ def test_kalibr_and_ros_by_pyyaml(tmp_path):
 
 @pytest.mark.parametrize("suffix", ["yaml", "json"])
 def test_stereo_by_opencv(tmp_path, suffix):
-    cv2 = pytest.importorskip("cv2")
     net = full_network("opencv")
     path = tmp_path / f"stereo.{suffix}"
     TARGETS["opencv-stereo"].write(net, path)

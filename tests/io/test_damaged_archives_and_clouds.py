@@ -5,6 +5,7 @@ import sqlite3
 import struct
 import zipfile
 
+import laspy
 import numpy as np
 import pytest
 
@@ -83,7 +84,6 @@ def test_coordinates_that_are_not_finite(tmp_path, value):
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
 @pytest.mark.parametrize("offset, what", [(EVLR_COUNT, "extended records"), (RECORDS, "records")])
 def test_counts_of_las_records_beyond_the_file(tmp_path, suffix, offset, what):
-    pytest.importorskip("laspy")
     path = tmp_path / f"c{suffix}"
     write_cloud(some_points(), path)
     assert len(read_cloud(path)) == 5
@@ -94,7 +94,6 @@ def test_counts_of_las_records_beyond_the_file(tmp_path, suffix, offset, what):
 
 
 def test_the_count_of_laz_chunks_beyond_the_file(tmp_path):
-    pytest.importorskip("laspy")
     path = tmp_path / "c.laz"
     write_cloud(some_points(), path)
     content = bytearray(path.read_bytes())
@@ -115,7 +114,6 @@ def damage(path, offset, form, *values):
 @pytest.mark.parametrize("length", [10, 100, 226, 300, 374, 375, 500])
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
 def test_a_las_file_cut_in_its_header_is_no_cloud_of_no_points(tmp_path, suffix, length):
-    pytest.importorskip("laspy")
     path = tmp_path / f"c{suffix}"
     write_cloud(some_points(), path)
     path.write_bytes(path.read_bytes()[:length])
@@ -133,7 +131,6 @@ LAS_FIELDS = {
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
 @pytest.mark.parametrize("case", LAS_FIELDS)
 def test_fields_of_the_header_of_las(tmp_path, suffix, case):
-    pytest.importorskip("laspy")
     path = tmp_path / f"c{suffix}"
     write_cloud(some_points(), path)
     damage(path, *LAS_FIELDS[case])
@@ -142,7 +139,6 @@ def test_fields_of_the_header_of_las(tmp_path, suffix, case):
 
 def test_chunks_of_laz_larger_than_the_memory(tmp_path):
     """lazrs would allocate 175 GB and abort the process."""
-    laspy = pytest.importorskip("laspy")
     path = tmp_path / "c.laz"
     write_cloud(some_points(), path)
     begin = path.read_bytes().index(b"laszip encoded") - 2 + 54
@@ -170,7 +166,6 @@ def test_values_that_no_point_has(tmp_path, suffix, column, value):
             f"ply\nformat ascii 1.0\nelement vertex 4\n{fields}end_header\n{text}\n"
         )
     else:
-        laspy = pytest.importorskip("laspy")
         if column in "XYZ":
             return  # whole numbers
         header = laspy.LasHeader(point_format=7, version="1.4")
@@ -198,7 +193,6 @@ def test_a_dsm_of_points_of_no_sigma():
 
 
 def test_a_vector_where_las_has_a_number(tmp_path):
-    laspy = pytest.importorskip("laspy")
     header = laspy.LasHeader(point_format=7, version="1.4")
     header.add_extra_dim(laspy.ExtraBytesParams("sX", "3f4"))
     las = laspy.LasData(header)
@@ -208,7 +202,6 @@ def test_a_vector_where_las_has_a_number(tmp_path):
 
 
 def test_an_unknown_coordinate_system_of_las(tmp_path):
-    laspy = pytest.importorskip("laspy")
     header = laspy.LasHeader(point_format=3, version="1.2")
     keys = laspy.vlrs.known.GeoKeyDirectoryVlr()
     keys.parse_record_data(struct.pack("<8H", 1, 1, 0, 1, 3072, 0, 1, 9999))

@@ -8,6 +8,7 @@ import sys
 import jax
 import numpy as np
 import pytest
+import rasterio
 from rpc_scenes import made_up, places, smooth_image
 
 from jaxbundle import pushbroom
@@ -25,7 +26,6 @@ from jaxbundle.pushbroom.rpc_image import RpcImage
 from jaxbundle.pushbroom.surfaces import Height
 from jaxbundle.pushbroom.terrain import make_terrain
 
-rasterio = pytest.importorskip("rasterio")
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
 LINES, PIXELS = 600, 400
@@ -111,7 +111,8 @@ def test_what_is_off_the_image_or_the_domain_is_said(folder, tmp_path):
     ).table()
     assert list(found["status"]) == [rpc.RpcStatus.OUTSIDE.meaning, "off the image"]
     assert np.isnan(found["X"][1]) and np.isfinite(found["X"][0])
-    assert "off the image, which has 600" in told[0] and "heights from 0 to 2000 m" in told[1]
+    assert "heights from 0 to 2000 m; the ground is at 9000 m" in told[0]
+    assert "off the image, which has 600" in told[1] and "heights from 0 to 2000 m" in told[2]
     ground = pushbroom.locate(folder / "image.tif", grid=(2, 2), height=0.0).table()
     names = ("longitude", "latitude", "height")
     rows = np.c_[[ground[name] for name in names]].T
@@ -203,6 +204,28 @@ def test_commands_as_processes(folder, tmp_path):
     done = run("accuracy", folder / "image.tif", "--attitude-white", "0.01")
     assert done.returncode == 2 and "Traceback" not in done.stderr
     assert "rational polynomials" in done.stderr and "rigorous" in done.stderr
+
+
+def test_the_ground_is_where_the_polynomials_hold(tmp_path, scene):
+    """Without a height: 0, or the middle of their heights, which is said; by all commands alike."""
+    image, _ = scene
+    high = fit_image(image, WGS84, (1000.0, 3000.0))[0].rpc
+    write_picture(tmp_path / "high.tif")
+    write_rpc(tmp_path / "high.tif", high)
+    told = []
+    found = pushbroom.locate(tmp_path / "high.tif", grid=(2, 2), tell=told.append).table()
+    np.testing.assert_allclose(found["height"], 2000.0, atol=1e-6)
+    assert pushbroom.info(tmp_path / "high.tif", tell=told.append).figures["height"] == 2000.0
+    pushbroom.correct(tmp_path / "high.tif", None, tmp_path / "map.tif", tell=told.append)
+    assert len(told) == 3 and all("1000 to 3000 m, not for 0" in line for line in told)
+
+
+def test_coefficients_of_the_whole_image_beside_a_tile_are_said(scene, tmp_path):
+    write_picture(tmp_path / "tile.tif", LINES // 2)
+    write_rpc(tmp_path / "tile_RPC.TXT", scene[1])
+    told = []
+    pushbroom.info(tmp_path / "tile.tif", tell=told.append)
+    assert len(told) == 1 and "is it a tile" in told[0] and "300 of 400" in told[0]
 
 
 def test_a_raster_without_coefficients_is_refused(tmp_path):

@@ -64,7 +64,9 @@ def read_rpc_image(path: Path, raster: Path | None = None) -> RpcInput:
         # coefficients to the whole image.
         if source != beside and bands.crs is None:
             check_raw(beside, bands)
-        return RpcInput(path.stem, RpcImage(rpc, bands.height, bands.width))
+        size = bands.height, bands.width
+    said = () if source == beside else _other_size(source, beside, rpc, size)
+    return RpcInput(path.stem, RpcImage(rpc, *size), warnings=said)
 
 
 def find_coefficients(path: Path) -> Path:
@@ -95,6 +97,18 @@ def find_raster(path: Path, *folders: Path) -> Path | None:
     names = [stem + suffix for suffix in (*IMAGES, *(s.upper() for s in IMAGES))]
     places = (place / name for place in (path.parent, *folders) for name in names)
     return next((p for p in places if p.is_file()), None)
+
+
+def _other_size(source: Path, raster: Path, rpc: Rpc, size: tuple[int, int]) -> tuple[str, ...]:
+    """Whether coefficients may belong to another raster, such as the whole image of a tile."""
+    held = _domain_size(rpc)
+    # Vendors' domains end within a tenth of the image; a tile is half of it or less.
+    if all(abs(a - b) <= 0.25 * b for a, b in zip(held, size)):
+        return ()
+    return (
+        f"{source} holds for {held[0]} lines of {held[1]} pixels, {raster} has {size[0]} of "
+        f"{size[1]}: is it a tile or a part of a larger image? Coefficients refer to the whole",
+    )
 
 
 def _domain_size(rpc: Rpc) -> tuple[int, int]:
