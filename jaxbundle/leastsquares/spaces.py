@@ -310,6 +310,25 @@ class Frame(WithoutChart):
     def hold(self, value: PoseValue, given: PoseValue, free: Float[Array, " width"]) -> PoseValue:
         return hold_by_retraction(self, value, given, free)
 
+    def representative(self, value: PoseValue, given: PoseValue) -> PoseValue:
+        """Of all frames of the same figure the one nearest to `given`: its position is that of
+        `given` projected onto the figure, its rotation that of `given` turned as little as the
+        figure asks for. Iterations leave these to their path, which has no derivative."""
+        M = matrix_from_quaternion(value.rotation)
+        along_itself = jnp.array([k not in self.columns for k in range(3)])
+        away = jnp.where(along_itself, M @ (given.position - value.position), 0.0)
+        position = value.position + M.T @ away
+        axes = [k for k in range(3) if 3 + k not in self.columns]
+        if len(axes) == 3:
+            return PoseValue(position, given.rotation)
+        if len(axes) == 1:  # about which the trace of the rotation from `given` is the largest
+            (k,), (i, j) = axes, ((axes[0] + 1) % 3, (axes[0] + 2) % 3)
+            A = M @ matrix_from_quaternion(given.rotation).T
+            turn = jnp.arctan2(A[i, j] - A[j, i], A[i, i] + A[j, j])
+            rotation = retract_quaternion(value.rotation, jnp.zeros(3).at[k].set(turn))
+            return PoseValue(position, rotation)
+        return PoseValue(position, value.rotation)
+
 
 @dataclasses.dataclass(frozen=True)
 class Direction(WithoutChart):

@@ -50,3 +50,38 @@ def test_a_change_leads_there_and_the_difference_back(name):
     there = space.retract(value, jnp.asarray(change))
     np.testing.assert_allclose(space.difference(there, value), change, atol=1e-9)
     np.testing.assert_allclose(space.difference(value, value), 0.0, atol=1e-12)
+
+
+FIGURES = {
+    "plane": (2, 3, 4),
+    "axis": (0, 1, 3, 4),
+    "circle": (0, 1, 2, 3, 4),
+    "sphere": (0, 1, 2),
+    "body": (0, 1, 2, 3, 4, 5),
+}
+
+
+@pytest.mark.parametrize("columns", FIGURES.values(), ids=FIGURES)
+def test_the_representative_of_a_figure_does_not_depend_on_the_way_to_it(columns):
+    """A frame moved in itself has the same representative; it is the same figure, and nearest to
+    the given frame: that of the given figure, moved in itself, is the given frame."""
+    space, value = Frame(columns), pose()
+    given = Frame().retract(value, jnp.asarray(0.3 * random.normal(size=6)))
+    nearest = space.representative(value, given)
+
+    def moved_in_itself(frame):
+        step = 0.5 * random.normal(size=6)
+        step[list(columns)] = 0.0
+        return Frame().retract(frame, jnp.asarray(step))
+
+    for found, right in (
+        (space.representative(moved_in_itself(value), given), nearest),
+        (space.representative(moved_in_itself(given), given), given),
+    ):
+        np.testing.assert_allclose(found.position, right.position, atol=1e-14)
+        q, p = found.rotation, right.rotation
+        np.testing.assert_allclose(abs(q @ p), 1.0, atol=1e-14)
+    own = {3, 4, 5} - set(columns)
+    gauge = Frame().difference(nearest, value)
+    if own in ({5}, set()):  # rotations about several axes do not add up
+        np.testing.assert_allclose(gauge[jnp.array(columns)], 0.0, atol=1e-13)

@@ -1,6 +1,8 @@
 """Every kind of observation of a network under jit, vmap, jvp, grad and hessian, and in float32."""
 
 import dataclasses
+from functools import partial
+from itertools import chain
 
 import jax
 import jax.numpy as jnp
@@ -8,12 +10,22 @@ import numpy as np
 import pytest
 
 import jaxbundle
+from jaxbundle.leastsquares.equations.normal import zero_tangent
+from jaxbundle.leastsquares.indexing.rows import fill_places, lay_out_data, residuals
+from jaxbundle.leastsquares.iterations.retraction import retract
+from jaxbundle.leastsquares.problem import complete_data
 from jaxbundle.network.build import make_further
 from jaxbundle.network.kinds import KINDS
 from jaxbundle.network.tables import EXTERIOR
 
 EPOCHS, SIGMA = 4, 0.002
-pytestmark = pytest.mark.further  # minutes of compiling for twenty kinds at once
+pytestmark = pytest.mark.further  # minutes of compiling
+# In three problems: of all kinds in one, XLA compiles the derivatives in minutes and 6 GB.
+TABLES_OF = {
+    "navigation": ("antennas", "antenna", "attitudes", "attitude", "exterior_priors"),
+    "rigs": ("rigs", "rig", "camera_parameters", "ties", "velocities", "rolling_shutter"),
+    "object": ("differences", "angles", "figures", "shapes", "edges"),
+}
 AXIS = np.array([-1.0, 0.0, 1.0])
 GRID = np.stack(np.meshgrid(AXIS, AXIS, AXIS, indexing="ij"), -1).reshape(-1, 3)
 
@@ -58,7 +70,7 @@ def rows(images):
 
 
 @pytest.fixture(scope="module")
-def problem():
+def network_and_truth():
     """Two cameras in a rig at four epochs, with control, distances and priors."""
     ring = jaxbundle.ring_of_stations(EPOCHS, radius=6.0, height=2.0, roll_every=2)
     camera = lambda id: jaxbundle.Camera(
@@ -72,29 +84,37 @@ def problem():
         disturb=(0.01, 0.002, 0.01), datum="control", control=[0, 8, 20, 26], control_sigma=0.005,
         distances=((1, 5), (5, 7)), distance_sigma=0.002,
     )  # fmt: skip
-    network, truth = made.network, made.truth
-    images = list(network.images.id)
-    given = network.replace(
-        further=tuple(make_further(rows(images), 1.0)),
-        images=dataclasses.replace(
-            network.images, sigma=np.tile([0.02] * 3 + [0.002] * 3, (len(images), 1))
-        ),
-    )
-    given = jaxbundle.simulate_further(given, truth, seed=3)
-    seen = given.observations
-    edges = [
+    sigma = np.tile([0.02] * 3 + [0.002] * 3, (2 * EPOCHS, 1))
+    images = dataclasses.replace(made.network.images, sigma=sigma)
+    return made.network.replace(images=images), made.truth
+
+
+@pytest.fixture(scope="module", params=TABLES_OF)
+def problem(request, network_and_truth):
+    network, truth = network_and_truth
+    images, seen = list(network.images.id), network.observations
+    tables = rows(images)
+    tables["edges"] = [
         {"line": str(line), "image": images[i], "sigma": 0.01,
          "x": float(seen.xy[k, 0]), "y": float(seen.xy[k, 1])}
         for line, points in enumerate([(0, 1, 2), (6, 7, 8)])
         for k, (i, p) in enumerate(zip(seen.image, seen.point)) if p in points
     ]  # fmt: skip
-    given = given.replace(further=(*given.further, *make_further({"edges": edges}, 1.0)))
+    of_this = {name: tables[name] for name in TABLES_OF[request.param]}
+    edges = make_further({"edges": of_this.pop("edges")}, 1.0) if "edges" in of_this else ()
+    given = network.replace(further=tuple(make_further(of_this, 1.0)))
+    given = jaxbundle.simulate_further(given, truth, seed=3)
+    given = given.replace(further=(*given.further, *edges))
     return jaxbundle.make_problem(jaxbundle.check_network(given))
 
 
-def test_every_kind_is_there(problem):
-    assert {type(one).TABLE for one in problem.network.further} == KINDS.keys()
-    assert any(np.ndim(weight) == 3 for weight in problem.data.weight.values()), "no covariance"
+def test_every_kind_is_there():
+    assert KINDS.keys() <= set(chain(*TABLES_OF.values()))
+
+
+def test_antennas_have_a_covariance(problem):
+    if "antennas" in {type(one).TABLE for one in problem.network.further}:
+        assert any(np.ndim(weight) == 3 for weight in problem.data.weight.values())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,26 +149,57 @@ def line(problem):
 
 
 def test_jit_vmap_and_derivatives(line):
-    """Values, first derivatives (forward and reverse) and second ones along one direction of all
-    data, in one program for five steps: each as by differences of the one before, and the values as
-    those of a single call."""
+    """Values and first derivatives, forward and reverse, along one direction of all data, in one
+    program for five steps: each as by differences, and the values as those of a single call."""
     towards = np.random.default_rng(6).normal(size=len(line.scale))
-    along = lambda t: towards @ line(t)
 
+    def along(t, base, change):
+        data = jax.tree.map(lambda x, d: x + t * d, base, change)
+        values = jax.tree.leaves(jaxbundle.solve(line.problem, data))
+        return towards @ (jnp.concatenate([jnp.ravel(x) for x in values]) / line.scale)
+
+    # Data as arguments: of constants XLA computes what it can while compiling, for minutes.
     @jax.jit
-    @jax.vmap
-    def evaluate(t):
-        value, forward = jax.jvp(along, (t,), (1.0,))
-        return value, forward, jax.grad(along)(t), jax.hessian(along)(t)
+    @partial(jax.vmap, in_axes=(0, None, None))
+    def evaluate(t, *data):
+        value, reverse = jax.value_and_grad(along)(t, *data)
+        return value, reverse, jax.jvp(lambda t: along(t, *data), (t,), (1.0,))[1]
 
     h = 0.1
-    value, forward, first, second = evaluate(h * jnp.arange(-2.0, 3.0))
+    value, reverse, forward = evaluate(h * jnp.arange(-2.0, 3.0), line.base, line.along)
     assert np.ptp(value) > 1e-4
-    np.testing.assert_allclose(value[4], along(2 * h), rtol=1e-9)
-    slope = lambda f: (8 * (f[3] - f[1]) - (f[4] - f[0])) / (12 * h)
-    np.testing.assert_allclose(forward, first, rtol=1e-8)
-    np.testing.assert_allclose(first[2], slope(value), rtol=1e-6)
-    np.testing.assert_allclose(second[2], slope(first), rtol=1e-5)
+    np.testing.assert_allclose(value[4], along(2 * h, line.base, line.along), rtol=1e-9)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-8)
+    np.testing.assert_allclose(reverse[2], slope(value, h), rtol=1e-6)
+
+
+def slope(f, h):
+    return (8 * (f[3] - f[1]) - (f[4] - f[0])) / (12 * h)
+
+
+def test_residuals_have_the_derivatives_of_a_hessian(line):
+    """The second derivatives of the solution need the third ones of all residuals (those of the
+    engine: tests/leastsquares/test_derivatives.py; all kinds in one program: 20 minutes)."""
+    problem, data = line.problem, complete_data(line.problem, None)
+    random, tangent = np.random.default_rng(8), zero_tangent(problem.plan)
+    group = lambda name, x: 1e-2 * random.normal(size=x.shape) * problem.plan.groups[name].free
+    change = {name: group(name, x) for name, x in tangent.items()}
+    plan, laid = fill_places(problem.plan, lay_out_data(problem.plan, data))
+
+    def seen(t):
+        moved = {name: t * d for name, d in change.items()}
+        moved = retract(problem.declared, plan, data.start, moved)
+        return jnp.concatenate([v.ravel() for v in residuals(problem.declared, plan, moved, laid)])
+
+    derivative = lambda f: lambda t: jax.jvp(f, (t,), (1.0,))[1]
+    second = derivative(derivative(seen))
+    h = 0.05
+    seconds, thirds = jax.jit(jax.vmap(lambda t: jax.jvp(second, (t,), (1.0,))))(
+        h * jnp.arange(-2.0, 3.0)
+    )
+    third, scale = thirds[2], np.abs(seconds[2]).max()
+    assert np.all(np.isfinite(thirds)) and np.ptp(third) > 1e-6 * scale
+    np.testing.assert_allclose(third, slope(seconds, h), atol=1e-5 * np.abs(third).max())
 
 
 def test_single_precision_is_taken_as_the_numbers_it_holds(line):

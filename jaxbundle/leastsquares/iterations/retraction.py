@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxbundle.leastsquares.equations.normal import AnyTangent, Rows, Tangent
 from jaxbundle.leastsquares.indexing.plan import Plan
 from jaxbundle.leastsquares.indexing.rows import Declared, Values
+from jaxbundle.leastsquares.spaces import Frame
 
 
 def retract(declared: Declared, plan: Plan, values: Values, change: Tangent) -> Values:
@@ -30,3 +31,11 @@ def changes_of_tables(plan: Plan, values: Values, change: AnyTangent) -> dict[st
             known = found.get(member.table)
             found[member.table] = part if known is None else known + part
     return found
+
+
+def representatives(declared: Declared, values: Values, start: Values) -> Values:
+    """The tables with what does not change them (a plane moved in itself) as near to `start` as
+    possible: a function of the figures and `start` alone, not of the way of the iterations."""
+    frames = {n: space for n, space in declared.named_spaces if isinstance(space, Frame)}
+    nearest = {n: jax.vmap(s.representative)(values[n], start[n]) for n, s in frames.items()}
+    return values | nearest

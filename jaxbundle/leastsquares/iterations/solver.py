@@ -36,6 +36,7 @@ from jaxbundle.leastsquares.indexing.rows import (
     lay_out_data,
     residuals,
 )
+from jaxbundle.leastsquares.iterations.retraction import representatives
 from jaxbundle.leastsquares.iterations.search import (
     Info,
     MarquardtDescent,
@@ -294,7 +295,8 @@ def minimise(solver: LeastSquares, data: Data, start: Values) -> Minimum[Values]
         fn, solver, start, laid, max_steps=None, adjoint=NoAdjoint(), throw=False
     )
     stats = solution.stats
-    return Minimum(solution.value, stats["termination"], stats["iterations"], stats["history"])
+    values = representatives(solver.declared, solution.value, start)
+    return Minimum(values, stats["termination"], stats["iterations"], stats["history"])
 
 
 find = compile_once(minimise)

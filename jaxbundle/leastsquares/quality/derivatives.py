@@ -44,7 +44,7 @@ from jaxbundle.leastsquares.indexing.rows import (
     lay_out_data,
     residuals,
 )
-from jaxbundle.leastsquares.iterations.retraction import retract
+from jaxbundle.leastsquares.iterations.retraction import representatives, retract
 from jaxbundle.leastsquares.iterations.solver import find, half_square
 from jaxbundle.leastsquares.iterations.stopping import converged
 from jaxbundle.leastsquares.problem import Problem, complete_data, make_solver, without_filling
@@ -149,9 +149,10 @@ def attach_derivatives(
     step = jax.tree.map(jnp.negative, elimination.solve(at.factor, gradient))
     if sensitivity == "gauss-newton":
         change = datum.s_transform(declared, plan, values, step)
-        return at.move(_propagate(change, at, data), data)
+        return representatives(declared, at.move(_propagate(change, at, data), data), data.start)
     change = implicit_root(gradient_after, _solve_structured, step, at, data)
-    return datum.attach_motion(declared, plan, at.move(change, data), data.start)
+    moved = datum.attach_motion(declared, plan, at.move(change, data), data.start)
+    return representatives(declared, moved, data.start)
 
 
 def linearise(
