@@ -10,6 +10,9 @@ Walther 2008, section 15.3). The iterations that found the root are never differ
 factorisation of A.
 """
 
+# The functions of this module are defined by their derivative rules.
+# ruff: noqa: ARG001
+
 from collections.abc import Callable
 from typing import Any
 

@@ -126,9 +126,9 @@ def influence(given: Adjustment | NetworkProblem, of: Any = CAMERAS) -> Influenc
 
 
 COLUMNS = {
-    "kind": lambda kind, image, point, axes: np.full(len(image) * len(axes), kind, object),
-    "image": lambda kind, image, point, axes: np.repeat(image, len(axes)),
-    "point": lambda kind, image, point, axes: np.repeat(point, len(axes)),
-    "axis": lambda kind, image, point, axes: np.tile(np.array(axes, object), len(image)),
+    "kind": lambda kind, image, _point, axes: np.full(len(image) * len(axes), kind, object),
+    "image": lambda _kind, image, _point, axes: np.repeat(image, len(axes)),
+    "point": lambda _kind, _image, point, axes: np.repeat(point, len(axes)),
+    "axis": lambda _kind, image, _point, axes: np.tile(np.array(axes, object), len(image)),
 }
 """The columns that identify a measurement."""

@@ -89,7 +89,7 @@ def equivalent_35mm(
 
     **Raises:** `ValueError` for another definition.
     """
-    lengths = {"diagonal": np.hypot, "width": lambda w, h: w, "height": lambda w, h: h}
+    lengths = {"diagonal": np.hypot, "width": lambda w, _h: w, "height": lambda _w, h: h}
     if by not in lengths:
         raise ValueError(f"the equivalent is by diagonal, width or height, not by {by!r}")
     return float(lengths[by](*SMALL_FORMAT) / lengths[by](*np.divide(size, c)))

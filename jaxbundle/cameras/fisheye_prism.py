@@ -74,7 +74,7 @@ def _fisheye(
     coefficients: Callable[[Parameters], Parameters],
 ) -> CameraModel:
     """A model of the angle; `coefficients`: those of its radial polynomial, of p."""
-    undistort = implicit_inverse(distort, lambda p, X, Y: (X, Y), 12)
+    undistort = implicit_inverse(distort, lambda _p, X, Y: (X, Y), 12)
     one = (1.0, 1.0)
 
     def project(p: Parameters, r: Scalar, s: Scalar, q: Scalar) -> Pair:

@@ -40,7 +40,7 @@ def distort(p: Parameters, x: Scalar, y: Scalar) -> Pair:
     return xd, yd
 
 
-_undistort = implicit_inverse(distort, lambda p, X, Y: (X, Y), 10)
+_undistort = implicit_inverse(distort, lambda _p, X, Y: (X, Y), 10)
 
 
 def project(p: Parameters, r: Scalar, s: Scalar, q: Scalar) -> Pair:

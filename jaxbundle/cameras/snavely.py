@@ -28,6 +28,6 @@ SNAVELY = CameraModel(
     distort=distort,
     unit="px",
     axes="up",
-    start=lambda p, X, Y: (X, Y),
+    start=lambda _p, X, Y: (X, Y),
     iterations=8,
 )

@@ -14,6 +14,7 @@ from jaxbundle.cli.app import (
     Format,
     Html,
     Input,
+    Json,
     Quiet,
     Settings,
     app,
@@ -26,7 +27,7 @@ from jaxbundle.errors import InputError, NotSolvedError
 @app.command(example="examples/convergent4/project.toml --out out/convergent4", once=True)
 def adjust(  # noqa: PLR0913 - the options of the command
     input: Input,
-    json: Annotated[str, typer.Option(help="write the result as JSON; - prints only JSON")] = "",
+    json: Json = "",
     out: Annotated[
         Path | None, typer.Option(help="folder for report, page, JSON, tables, plots")
     ] = None,

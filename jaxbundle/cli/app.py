@@ -157,6 +157,7 @@ Check = Annotated[
 ]
 Force = Annotated[bool, typer.Option("--force", help="replace foreign files in --out")]
 Html = Annotated[str, typer.Option(help="write the result as one HTML page")]
+Json = Annotated[str, typer.Option(help="write the result as JSON; - prints only JSON")]
 
 
 def choice(

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from jaxbundle.choices import BOARDS, DICTIONARIES, ESTIMATORS, TESTS
-from jaxbundle.cli.app import Correlated, Force, Html, Quiet, app, choice, model_choice
+from jaxbundle.cli.app import Correlated, Force, Html, Json, Quiet, app, choice, model_choice
 from jaxbundle.cli.habits import is_in_file
 from jaxbundle.errors import InputError, NotSolvedError
 
@@ -79,7 +79,7 @@ def calibrate(  # noqa: PLR0913 - the options of the command
     ] = True,
     correlated: Correlated = True,
     unit: Annotated[str, typer.Option(help="unit of the board, a label")] = "m",
-    json: Annotated[str, typer.Option(help="write the result as JSON; - prints only JSON")] = "",
+    json: Json = "",
     out: Annotated[
         Path | None, typer.Option(help="folder for report, page, JSON, cameras, network, plots")
     ] = None,

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from jaxbundle.cli.app import app
+from jaxbundle.cli.app import Json, app
 from jaxbundle.errors import InputError
 
 
@@ -25,13 +25,18 @@ def camera(
     plot: Annotated[
         Path | None, typer.Option(help="PNG file for the curves of all cameras")
     ] = None,
+    json: Json = "",
 ) -> None:
     """Print field of view, 35 mm equivalent, and distortion by radius."""
     import jaxbundle
     from jaxbundle.cli.camera_inputs import calibration_given, pair, write_png
+    from jaxbundle.cli.outputs import check_json_target
     from jaxbundle.commands.cameras import CameraDescription
-    from jaxbundle.io.text.csv_tables import table_rows, write_csv
+    from jaxbundle.io.results.result_json import json_text
+    from jaxbundle.io.text.csv_tables import table_rows, write_csv, write_text
+    from jaxbundle.system.terminals import write_json
 
+    check_json_target(json, (file.partition("#")[0] for file in files))
     smooth = 200  # points of a curve that looks smooth
     sizes = {
         "image_size": pair("--image-size", image_size),
@@ -41,10 +46,14 @@ def camera(
     for file in files:
         calibration_given(file, sizes["image_size"])  # its warnings
         described = jaxbundle.camera(file, step=step, about_origin=about_origin, **sizes)
-        print(described.report())
+        if json != "-":
+            print(described.report())
         # two files may have cameras of one name
         id = described.camera.id
         found[id if id not in found else f"{id} ({file})"] = described
+    if json:
+        text = json_text({"cameras": [one.to_dict() for one in found.values()]})
+        write_json(text) if json == "-" else write_text(Path(json), text)
     if plot is not None:
         units = {one.unit for one in found.values()}
         if len(units) > 1:

@@ -1,5 +1,6 @@
 """`jaxbundle cloud`: filter, thin, convert and compare point clouds."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -7,9 +8,8 @@ from typing import Annotated
 import typer
 
 from jaxbundle.choices import CLOUD_FILES, CUBE_POINTS
-from jaxbundle.cli.app import app, choice
+from jaxbundle.cli.app import Json, app, choice
 from jaxbundle.errors import InputError
-from jaxbundle.system.terminals import write_json
 
 
 @app.command(example="out/surface/cloud.csv --cube 0.05 --out out/thinned.las")
@@ -33,20 +33,22 @@ def cloud(  # noqa: PLR0913 - the options of the command
         Path | None, typer.Option(help="points X,Y,Z (.csv) whose heights are compared")
     ] = None,
     plane: Annotated[bool, typer.Option("--plane", help="RMS to the best plane")] = False,
-    json: Annotated[str, typer.Option(help="figures as JSON; - for standard output")] = "",
+    json: Json = "",
+    force: Annotated[
+        bool, typer.Option("--force", help="replace files that are not clouds")
+    ] = False,
 ) -> None:
     """Filter, thin, convert and compare point clouds; accuracy and DSM."""
     import jaxbundle
-    from jaxbundle.cli.outputs import check_json
-    from jaxbundle.io.results.result_json import json_text
-    from jaxbundle.io.text.csv_tables import write_text
+    from jaxbundle.cli.outputs import check_writable, print_result
     from jaxbundle.surfaces.dsm import write_dsm
     from jaxbundle.surfaces.point_files import write_cloud
 
-    check_json(json)
     if (dsm is None) != (size is None):
         raise InputError("--dsm and --size: give both")
-    _check_targets([file] if against is None else [file, against], out, dsm)
+    inputs = [given for given in (file, against, check) if given is not None]
+    check_writable(json, None, "cloud", (), inputs, force)
+    _check_targets(inputs, out, dsm, force)
     found = jaxbundle.cloud(
         file,
         cube=cube,
@@ -64,19 +66,31 @@ def cloud(  # noqa: PLR0913 - the options of the command
         write_dsm(found.dsm, dsm, dsm.with_name(f"{dsm.stem}_sigma{dsm.suffix}"))
     if out is not None:
         write_cloud(found.cloud, out)
-    text = json_text(found.to_dict())
-    if json == "-":
-        write_json(text)
-        return
-    if json:
-        write_text(Path(json), text)
-    print(found.report())
+    print_result(found, json)
 
 
-def _check_targets(inputs: Sequence[Path], out: Path | None, dsm: Path | None) -> None:
-    """Refuse a cloud of another format, and files that would replace an input."""
+CONTENT = {
+    ".csv": re.compile(rb"\s*X,Y,Z"),
+    ".ply": re.compile(rb"ply\s"),
+    ".las": re.compile(rb"LASF"),
+    ".laz": re.compile(rb"LASF"),
+}
+"""The beginning of a cloud, by its suffix."""
+TIFF = re.compile(rb"II[*+]\0|MM\0[*+]")
+
+
+def _check_targets(inputs: Sequence[Path], out: Path | None, dsm: Path | None, force: bool) -> None:
+    """Refuse a cloud of another format, and files that would replace an input, or something else
+    than a cloud or a DSM."""
+    from jaxbundle.cli.outputs import FORCE_ADVICE, check_content, check_file
+
     if out is not None and out.suffix.lower() not in CLOUD_FILES:
         raise InputError(f"--out {out}: one of {', '.join(CLOUD_FILES)} is expected")
-    for option, path in (("--out", out), ("--dsm", dsm)):
-        if path is not None and path.resolve() in [given.resolve() for given in inputs]:
-            raise InputError(f"{option} {path} is part of the input and would be overwritten")
+    targets = [("--dsm", dsm, TIFF, "a TIFF")]
+    if out is not None:
+        targets.append(("--out", out, CONTENT[out.suffix.lower()], "a cloud"))
+    for option, path, content, noun in targets:
+        if path is not None:
+            check_file(option, str(path), None, inputs)
+            if not force:
+                check_content(option, str(path), content, noun, FORCE_ADVICE)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from jaxbundle.cli.app import app
+from jaxbundle.cli.app import Json, app
 from jaxbundle.errors import InputError
 
 PAIR = "examples/video_cameras/cameras.toml#1-indoor examples/video_cameras/cameras.toml#1-outdoor"
@@ -31,14 +31,17 @@ def compare(
     pixel_size: Annotated[str, typer.Option(help="W,H in mm, if missing in A")] = "",
     csv: Annotated[Path | None, typer.Option(help="file for the table of rings")] = None,
     plot: Annotated[Path | None, typer.Option(help="PNG file for the map")] = None,
+    json: Json = "",
 ) -> None:
     """Compare two calibrations: parameters, and image differences. Of two saved adjustments, all
     common unknowns, with a test of each difference."""
     import jaxbundle
     from jaxbundle.cli.camera_inputs import calibration_given, pair, write_png
+    from jaxbundle.cli.outputs import check_json_target, print_result
     from jaxbundle.commands.comparison import CalibrationComparison, is_saved_adjustment
     from jaxbundle.io.text.csv_tables import table_rows, write_csv
 
+    check_json_target(json, (one.partition("#")[0] for one in (a, b)))
     if is_saved_adjustment(a) or is_saved_adjustment(b):
         if plot is not None:
             raise InputError("--plot: of calibrations only; --csv writes the table")
@@ -55,7 +58,7 @@ def compare(
             image_size=pair("--image-size", image_size),
             pixel_size=pair("--pixel-size", pixel_size),
         )
-    print(found)
+    print_result(found, json)
     if csv is not None:
         table = found.table()
         write_csv(csv, list(table), table_rows(table))

@@ -8,7 +8,7 @@ import typer
 
 import jaxbundle
 from jaxbundle.choices import AIMS, DESIGNED, ORDERS
-from jaxbundle.cli.app import Force, Quiet, app, choice
+from jaxbundle.cli.app import Force, Json, Quiet, app, choice
 from jaxbundle.cli.habits import is_in_file
 
 BOX_FORM = "Xmin,Ymin,Zmin,Xmax,Ymax,Zmax"
@@ -65,7 +65,7 @@ def design(  # noqa: PLR0913 - the options of the command
     out: Annotated[
         Path | None, typer.Option(help="folder: designed project, report, JSON, figures")
     ] = None,
-    json: Annotated[str, typer.Option(help="write the result as JSON; - prints only JSON")] = "",
+    json: Json = "",
     plots: Annotated[bool, typer.Option(help="write figures to --out")] = True,
     force: Force = False,
     quiet: Quiet = False,

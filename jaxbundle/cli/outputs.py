@@ -25,7 +25,7 @@ from jaxbundle.io.networks.orientation_covariance import write_orientation_covar
 from jaxbundle.io.networks.project import ADJUSTED, fill_project
 from jaxbundle.io.networks.project import FILES as NETWORK_FILES
 from jaxbundle.io.results.budget_json import budget_dict
-from jaxbundle.io.results.result_json import result_text, unsolved_text
+from jaxbundle.io.results.result_json import json_text, result_text, unsolved_text
 from jaxbundle.io.results.result_project import readjustable_network
 from jaxbundle.io.text.csv_tables import table_rows, write_bytes, write_csv, write_text
 from jaxbundle.io.writing.folders import check_folder, replace_folder
@@ -37,6 +37,7 @@ from jaxbundle.plotting.style import need_matplotlib
 from jaxbundle.report.page import UNKNOWN, Origin, compose, compose_failure
 from jaxbundle.report.page.budget import describe_budget
 from jaxbundle.report.verdict import Verdict
+from jaxbundle.results import ReportedResult
 from jaxbundle.system.terminals import write_json
 from jaxbundle.types import Progress
 
@@ -98,7 +99,7 @@ def check_page(
         raise InputError("--html -: a page cannot be written to standard output; give a file")
     check_file("--html", html, out, inputs)
     if not force:
-        _check_content("--html", html, HTML, "HTML", FORCE_ADVICE)
+        check_content("--html", html, HTML, "HTML", FORCE_ADVICE)
 
 
 def check_file(option: str, file: str, out: Path | None, inputs: Iterable[str | Path]) -> None:
@@ -121,14 +122,32 @@ def check_file(option: str, file: str, out: Path | None, inputs: Iterable[str | 
         raise InputError(f"{path} is part of the input and would be overwritten; give another")
 
 
+def check_json_target(json: str, inputs: Iterable[str | Path]) -> None:
+    """Refuse a file of --json that cannot be written, is not JSON, or would replace an input."""
+    check_file("--json", json, None, inputs)
+    check_json(json)
+
+
+def print_result(result: ReportedResult, json: str, quiet: bool = False) -> None:
+    """Print the report of a result, or write its JSON (`-`: instead of the report). `quiet`: no
+    report beside a file."""
+    if json == "-":
+        write_json(json_text(result.to_dict()))
+        return
+    if json:
+        write_text(Path(json), json_text(result.to_dict()))
+    if not (quiet and json):
+        print(result.report())
+
+
 def check_json(json: str, way: str = "", option: str = "--json") -> None:
     """Refuse to replace a file that is not JSON, unless it is empty: it was probably named by
     mistake. `way`: an alternative to another name, for the message.
     """
-    _check_content(option, json, JSON, "JSON", way)
+    check_content(option, json, JSON, "JSON", way)
 
 
-def _check_content(option: str, file: str, like: re.Pattern[bytes], noun: str, way: str) -> None:
+def check_content(option: str, file: str, like: re.Pattern[bytes], noun: str, way: str) -> None:
     """Refuse to replace a file that is not empty and does not begin like the new one."""
     path = Path(file)
     if file in ("", "-") or not path.is_file():
@@ -160,7 +179,7 @@ def check_targets(
         raise InputError("--save -: give the name of a file")
     check_file("--save", save, None, inputs)
     if not force:
-        _check_content("--save", save, SAVED_ADJUSTMENT, "a saved adjustment", FORCE_ADVICE)
+        check_content("--save", save, SAVED_ADJUSTMENT, "a saved adjustment", FORCE_ADVICE)
 
 
 def name_inside(file: str, out: Path | None) -> str | None:

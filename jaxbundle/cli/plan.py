@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from jaxbundle.cli.app import Force, app
+from jaxbundle.cli.app import Force, Json, app
 from jaxbundle.errors import InputError
 
 
@@ -30,16 +30,16 @@ def plan(  # noqa: PLR0913 - the options of the command
         bool, typer.Option(help="σ from the covariance of a simulated block")
     ] = True,
     out: Annotated[Path | None, typer.Option(help="folder for the block as a project")] = None,
+    json: Json = "",
     force: Force = False,
 ) -> None:
     """Plan a block of vertical photographs: strips, photographs, expected precision."""
     import jaxbundle
+    from jaxbundle.cli.outputs import check_writable, print_result
     from jaxbundle.io import write_project
     from jaxbundle.io.networks.project import FILES
-    from jaxbundle.io.writing.folders import check_folder
 
-    if out is not None:
-        check_folder(out, "plan", FILES, force=force)
+    check_writable(json, out, "plan", FILES, (), force)
     if sum(value is not None for value in (height, scale, ground_pixel)) != 1:
         raise InputError("give one of --height, --scale, --ground-pixel (with --pixel)")
     found = jaxbundle.plan(
@@ -60,8 +60,8 @@ def plan(  # noqa: PLR0913 - the options of the command
     written = None
     if out is not None:
         written = write_project(found.network, out, force=force, by="plan")
-    print(found.report())
-    if written is not None:
+    print_result(found, json)
+    if written is not None and json != "-":
         print(f"{'written':22}{written}")
 
 

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from jaxbundle.choices import CODED_TARGETS, FEATURES, MATCHED_PAIRS
-from jaxbundle.cli.app import Check, Correlated, Force, Html, Quiet, app, choice
+from jaxbundle.cli.app import Check, Correlated, Force, Html, Json, Quiet, app, choice
 from jaxbundle.errors import InputError
 from jaxbundle.system.interrupts import advise
 
@@ -46,7 +46,7 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
         bool, typer.Option(help="observe fy/fx as 1; otherwise both focal lengths are unknown")
     ] = True,
     correlated: Correlated = True,
-    json: Annotated[str, typer.Option(help="write the result as JSON; - prints only JSON")] = "",
+    json: Json = "",
     html: Html = "",
     brief: Annotated[
         bool, typer.Option("--brief", help="omit points and residuals from the JSON")

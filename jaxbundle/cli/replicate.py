@@ -1,13 +1,12 @@
 """`jaxbundle replicate`: a network in two halves, each adjusted alone."""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 import jaxbundle
 from jaxbundle.choices import REPLICATION, TESTS
-from jaxbundle.cli.app import Control, Force, Format, Input, Quiet, Settings, app, choice
+from jaxbundle.cli.app import Control, Force, Format, Input, Json, Quiet, Settings, app, choice
 
 
 @app.command(example="out/board/network --by views --repeat 4", once=True)
@@ -16,7 +15,7 @@ def replicate(  # noqa: PLR0913 - the options of the command
     by: Annotated[str, choice(REPLICATION, "what the halves do not share")] = "photographs",
     repeat: Annotated[int, typer.Option(min=1, help="random halves; runs have one")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="of the random halves")] = 0,
-    json: Annotated[str, typer.Option(help="write the result as JSON; - prints only JSON")] = "",
+    json: Json = "",
     force: Force = False,
     set: Settings = None,
     format: Format = None,
@@ -30,11 +29,8 @@ def replicate(  # noqa: PLR0913 - the options of the command
     where σ are right; stated are that of independent errors, and that of errors which image points
     share.
     """
-    from jaxbundle.cli.outputs import check_writable
+    from jaxbundle.cli.outputs import check_writable, print_result
     from jaxbundle.cli.progress import staging
-    from jaxbundle.io.results.result_json import json_text
-    from jaxbundle.io.text.csv_tables import write_text
-    from jaxbundle.system.terminals import write_json
 
     jaxbundle.use_cores()
     check_writable(json, None, "replicate", (), [input], force)
@@ -50,11 +46,4 @@ def replicate(  # noqa: PLR0913 - the options of the command
             snooping=snooping,
             progress=show,
         )
-    text = json_text(found.to_dict())
-    if json == "-":
-        write_json(text)
-        return
-    if json:
-        write_text(Path(json), text)
-    if not (quiet and json):
-        print(found.report())
+    print_result(found, json, quiet)

@@ -1,11 +1,10 @@
 """`jaxbundle stability`: calibrations of one camera at several epochs."""
 
-from json import dumps
 from typing import Annotated
 
 import typer
 
-from jaxbundle.cli.app import app
+from jaxbundle.cli.app import Json, app
 
 
 @app.command(example="spring.json summer.json autumn.json --at 8,24,13")
@@ -16,24 +15,15 @@ def stability(
     at: Annotated[
         str, typer.Option(help="a,b,c: a number or date per epoch, such as temperature, for slopes")
     ] = "",
-    json: Annotated[str, typer.Option(help="write the result as JSON; - prints only JSON")] = "",
+    json: Json = "",
 ) -> None:
     """Test whether calibrations of one camera differ significantly."""
-    from pathlib import Path
-
     import jaxbundle
     from jaxbundle.cli.camera_inputs import calibration_given
-    from jaxbundle.io.text.csv_tables import write_text
-    from jaxbundle.system.terminals import write_json
+    from jaxbundle.cli.outputs import check_json_target, print_result
 
+    check_json_target(json, (file.partition("#")[0] for file in files))
     for file in files:
         calibration_given(file)  # its warnings
     words = [word.strip() for word in at.split(",")] if at else None
-    found = jaxbundle.stability(files, at=words)
-    text = dumps(found.to_dict(), indent=1) + "\n"
-    if json == "-":
-        write_json(text)
-        return
-    if json:
-        write_text(Path(json), text)
-    print(found.report())
+    print_result(jaxbundle.stability(files, at=words), json)

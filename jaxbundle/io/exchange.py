@@ -91,7 +91,7 @@ def convert(  # noqa: PLR0913, as the options of the command
     force: bool = False,
     control: str | Path | None = None,
     models: Sequence[CameraModel] = (),
-    tell: Callable[[Sequence[str]], None] = lambda lost: None,
+    tell: Callable[[Sequence[str]], None] = lambda _lost: None,
 ) -> Converted:
     """Write an input in another format.
 

@@ -164,7 +164,7 @@ def _check_images(network: Network) -> None:
         images,
         np.isinf(values),
         "image",
-        lambda row, k: f"{EXTERIOR[k]} is infinite; a number is expected",
+        lambda _row, k: f"{EXTERIOR[k]} is infinite; a number is expected",
     )
     hint = "are these degrees?" if unit == "rad" else f"is {unit!r} right?"
     _refuse(
@@ -190,7 +190,7 @@ def _check_images(network: Network) -> None:
         images,
         ~np.isnan(sigma) & np.isnan(values),
         "image",
-        lambda row, k: f"{EXTERIOR[k]} has a σ but no value; give the value, or leave the σ empty",
+        lambda _row, k: f"{EXTERIOR[k]} has a σ but no value; give the value, or leave the σ empty",
     )
     # A rotation changes by a vector δθ in the camera frame: no column of it is one angle.
     held = (sigma[:, 3:] == 0).sum(1, keepdims=True)
@@ -198,7 +198,7 @@ def _check_images(network: Network) -> None:
         images,
         (held > 0) & (held < 3),
         "image",
-        lambda row, k: (
+        lambda _row, _k: (
             "omega, phi, kappa can be held fixed only all three together; give the "
             "one to be held a small σ instead"
         ),
@@ -213,13 +213,13 @@ def _check_points(network: Network) -> Network:
         points,
         ~points.has_role(*ROLES)[:, None],
         "point",
-        lambda row, k: f"role must be one of {', '.join(ROLES)}, not {points.role[row]!r}",
+        lambda row, _k: f"role must be one of {', '.join(ROLES)}, not {points.role[row]!r}",
     )
     _refuse(
         points,
         np.isinf(points.position),
         "point",
-        lambda row, k: f"{AXES[k]} is infinite; a number is expected",
+        lambda _row, k: f"{AXES[k]} is infinite; a number is expected",
     )
     _refuse(
         points,
@@ -242,7 +242,7 @@ def _check_points(network: Network) -> Network:
         points,
         (control & ~none)[:, None] & np.isnan(sigma),
         "control point",
-        lambda row, k: (
+        lambda _row, k: (
             f"σ of {AXES[k]} is missing while another axis has one; give all three, "
             'or write "free" for an axis that is not controlled'
         ),
@@ -369,7 +369,7 @@ def _refuse_missing(
         table,
         missing,
         thing,
-        lambda row, k: (
+        lambda _row, k: (
             f"{names[k]} has no start value{also}; give start values, or find them with "
             "jaxbundle.orient"
         ),

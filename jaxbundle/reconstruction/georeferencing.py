@@ -143,7 +143,7 @@ def _tabulate(
             float(np.sqrt((off**2).mean())) if len(off) else np.nan,
             ": ".join([verdict, "; ".join(reasons)]) if reasons else verdict,
             *predicted.get(id, (np.full(3, np.nan), np.full(3, np.nan))),
-            tuple(_measurements(final, id, measured, X, away, rays)),
+            tuple(_measurements(final, id, measured, away, rays)),
         )
 
 
@@ -202,7 +202,6 @@ def _measurements(
     final: OrientedBlock,
     id: str,
     measured: MeasuredPoint,
-    X: np.ndarray,
     away: np.ndarray,
     rays: dict[tuple[str, str], tuple],
 ) -> Iterator[ControlMeasurement]:

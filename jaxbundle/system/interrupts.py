@@ -86,7 +86,7 @@ def set_status(status: int) -> None:
     _status = status
 
 
-def _handle(number: int, frame: object) -> None:
+def _handle(number: int, _frame: object) -> None:
     if _temporaries is None:  # Then nothing is.
         _say_and_exit(number)
     if not _temporaries.defer(lambda: _end(number)):

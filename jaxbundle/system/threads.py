@@ -12,7 +12,7 @@ def map_in_threads(
     function: Callable[[Any], Any],
     items: Iterable[Any],
     at_once: int,
-    advance: Callable[[int], object] = lambda done: None,
+    advance: Callable[[int], object] = lambda _done: None,
 ) -> list[Any]:
     """The results of all items, in their order. An item that finds too little memory beside others
     is tried again alone, after them. `advance(done)`: called after each."""

@@ -157,3 +157,33 @@ def test_a_wrong_call_leads_to_the_help(command, given, said, help):
     run = command(*given.split())
     assert run.status == 2 and run.err.startswith(f"jaxbundle: {said}")
     assert run.err.endswith(f" {help}--help.\n") and run.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("arguments", [
+    PLAN, ("camera", f"{CAMERAS}#1-indoor", f"{CAMERAS}#2-indoor"),
+    ("compare", f"{CAMERAS}#1-indoor", f"{CAMERAS}#2-indoor"), ("cloud", "cloud.csv"),
+], ids=lambda arguments: arguments[0])  # fmt: skip
+def test_json_goes_to_a_file_beside_the_report_or_alone(command, tmp_path, arguments):
+    """And never over a file that is not JSON."""
+    (tmp_path / "cloud.csv").write_text("X,Y,Z\n0,0,0\n1,0,0\n0,1,0\n1,1,0\n")
+    arguments = [tmp_path / word if word == "cloud.csv" else word for word in arguments]
+    report, alone = command(*arguments), command(*arguments, "--json", "-")
+    beside = command(*arguments, "--json", tmp_path / "result.json")
+    assert (alone.status, beside.out) == (0, report.out)
+    assert json.loads((tmp_path / "result.json").read_text()) == json.loads(alone.out)
+    (tmp_path / "notes").write_text("a word")
+    refused = command(*arguments, "--json", tmp_path / "notes")
+    assert refused.status == 2 and "is not JSON" in refused.err and refused.out == ""
+    assert (tmp_path / "notes").read_text() == "a word"
+
+
+def test_a_cloud_replaces_clouds_only(command, tmp_path):
+    cloud, other = tmp_path / "cloud.csv", tmp_path / "other.csv"
+    cloud.write_text("X,Y,Z\n0,0,0\n1,0,0\n0,1,0\n1,1,0\n")
+    other.write_text("name,price\n")
+    refused = command("cloud", cloud, "--out", other)
+    assert refused.status == 2 and "is not a cloud" in refused.err
+    assert other.read_text() == "name,price\n"
+    for options in (["--force"], []):
+        assert command("cloud", cloud, "--out", other, *options).status == 0
+        assert other.read_text().startswith("X,Y,Z")

@@ -156,7 +156,7 @@ def error_components(
             ErrorComponent(f"{what}{name}", "image", sp.hstack(parts).tocsr())
             for what, parts in roots
         ]
-    if (track := _along_tracks(found, problem, rays, settings.reach)) is not None:
+    if (track := _along_tracks(found, rays, settings.reach)) is not None:
         components.append(track)
     others = np.setdiff1d(np.arange(rays.number), np.concatenate([rays.row, rays.row + 1]))
     others = others[_have_weight(found)[others]]
@@ -225,9 +225,7 @@ def wendland(distance: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     return np.clip(1 - distance, 0, None) ** 4 * (4 * distance + 1)
 
 
-def _along_tracks(
-    found: Solution, problem: NetworkProblem, rays: ImageRows, reach: float
-) -> ErrorComponent | None:
+def _along_tracks(found: Solution, rays: ImageRows, reach: float) -> ErrorComponent | None:
     """The correlation of the images of a point by the distance of their stations, in units of their
     a priori σ."""
     import scipy.sparse as sp

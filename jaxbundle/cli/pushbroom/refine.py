@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from jaxbundle.cli.app import Force, Html
+from jaxbundle.cli.app import Force, Html, Json
 from jaxbundle.cli.pushbroom.app import pushbroom
 
 PHOTOGRAPHS = "photographs"
@@ -21,7 +21,7 @@ def refine(
     ] = None,
     html: Html = "",
     force: Force = False,
-    json: Annotated[str, typer.Option(help="write the result as JSON; - prints only JSON")] = "",
+    json: Json = "",
 ) -> None:
     """Refine attitude, position and optics of scanner images with control and tie points."""
     from jaxbundle import pushbroom as line_scanners

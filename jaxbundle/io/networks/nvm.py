@@ -120,7 +120,7 @@ def _network(path: Path, model: _Model, overrides: Sequence[str], told: Sequence
         | {"free": ["c", "K1"]}
         for name, f, r in zip(names, c.tolist(), p[:, 8].tolist())
     ]
-    position, rays = _points(path, model, len(names))
+    position, rays = _points(model, len(names))
     kept = {}
     for k, (image, point, *_) in enumerate(rays[:, :2].astype(np.int64).tolist()):
         kept.setdefault((image, point), k)
@@ -150,7 +150,7 @@ def _network(path: Path, model: _Model, overrides: Sequence[str], told: Sequence
     )  # fmt: skip
 
 
-def _points(path: Path, model: _Model, images: int) -> tuple[np.ndarray, np.ndarray]:
+def _points(model: _Model, images: int) -> tuple[np.ndarray, np.ndarray]:
     """Coordinates, and image, point, x, y, line of all rays."""
     position, rays = [], [np.zeros((0, 5))]
     for k, row in enumerate(model.points):

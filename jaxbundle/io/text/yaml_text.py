@@ -163,17 +163,17 @@ def _loader() -> Any:
             node = self.get_node() if self.check_node() else None
             return None if node is None else self.construct_document(node)
 
-    def whole(loader: Any, node: Any) -> int:
+    def whole(_loader: Any, node: Any) -> int:
         digits = node.value.lstrip("+-0")
         if len(digits) > len(str(LARGEST_INTEGER)):
             raise yaml.MarkedYAMLError(problem=TOO_LARGE, problem_mark=node.start_mark)
         return int(node.value)
 
-    def real(loader: Any, node: Any) -> float:
+    def real(_loader: Any, node: Any) -> float:
         text = node.value.lower()
         return float(text.replace(".", "") if text.endswith(("inf", "nan")) else text)
 
-    def content(loader: Any, suffix: str, node: Any) -> Any:
+    def content(loader: Any, _suffix: str, node: Any) -> Any:
         """What is under an unknown tag."""
         if isinstance(node, yaml.MappingNode):
             return loader.construct_mapping(node, deep=True)

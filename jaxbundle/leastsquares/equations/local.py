@@ -124,9 +124,9 @@ class _Columns:
     kind: Kind
 
     def __call__(
-        self, blocks: tuple[Block, ...], measured: PyTree[Scalar], weight: Weight
+        self, blocks: tuple[Block, ...], measured: PyTree[Scalar], _weight: Weight
     ) -> tuple:
-        assert self.kind.local is not None  # `weight` is passed to all functions of observations
+        assert self.kind.local is not None  # the weight is passed to all functions of observations
         return self.kind.local.columns(*blocks, measured)
 
 

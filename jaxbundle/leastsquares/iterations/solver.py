@@ -6,7 +6,7 @@ formed once per accepted point; a rejected step costs a factorisation and the re
 """
 
 # Arguments that the interfaces of optimistix prescribe:
-# ruff: noqa: ARG002
+# ruff: noqa: ARG002, ARG005
 
 import dataclasses
 from collections.abc import Callable, Iterable

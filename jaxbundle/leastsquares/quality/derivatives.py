@@ -202,7 +202,7 @@ def _solve_structured(times: Callable, at: LinearisedSolution, b: Tangent) -> Ta
 
 
 @eqx.filter_custom_jvp
-def _propagate(change: Tangent, at: LinearisedSolution, data: Data) -> Tangent:
+def _propagate(change: Tangent, at: LinearisedSolution, data: Data) -> Tangent:  # noqa: ARG001
     """`change` with the derivative of error propagation, which cannot be differentiated again."""
     return change
 
