@@ -27,7 +27,7 @@ import numpy as np
 from photograph_sets import Shot, arc, camera, write
 
 import jaxbundle
-from jaxbundle.orientation import many
+from jaxbundle.orientation import batched
 from jaxbundle.planning.rendering import Rendered, Scene, Sensor, camera_rays
 from jaxbundle.planning.shapes import HeightField, Rectangle
 from jaxbundle.planning.stations import stations_looking_at
@@ -209,7 +209,7 @@ def taken(seed: int, mirrors: dict[int, float]) -> Callable[[Rendered, Shot], np
 
 def _shots(prefix, stages, X0, at, width, focal, roll, exif=True):
     X0, lens = np.asarray(X0, float), camera(width, focal)
-    M = many.matrices(stations_looking_at(X0, np.asarray(at, float), roll=roll).angles)
+    M = batched.matrices(stations_looking_at(X0, np.asarray(at, float), roll=roll).angles)
     told = ("Pocket", WRONG * focal) if exif else None
     return [
         Shot(f"{prefix}{k:02d}.jpg", Scene(tuple(s.shapes), tuple(s.textures)), lens, X0[k], M[k],

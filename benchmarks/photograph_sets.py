@@ -28,7 +28,7 @@ import machine
 import numpy as np
 
 import jaxbundle
-from jaxbundle.orientation import many
+from jaxbundle.orientation import batched
 from jaxbundle.planning.rendering import Rendered, Scene, Sensor, render
 from jaxbundle.planning.shapes import HeightField, Rectangle
 from jaxbundle.planning.stations import stations_looking_at
@@ -73,7 +73,7 @@ def shots(
     scenes = scenes if isinstance(scenes, list) else [scenes] * n
     gain = np.ones(n) if gain is None else gain
     placed = stations_looking_at(X0, np.asarray(at, float), roll=roll)
-    M, lens = many.matrices(placed.angles), camera(width, focal)
+    M, lens = batched.matrices(placed.angles), camera(width, focal)
     return [
         Shot(f"{prefix}{k:02d}.jpg", scenes[k], lens, X0[k], M[k],
              Sensor(gain[k], noise=2.0, seed=k, fine=1, background=215.0), **stored)

@@ -27,9 +27,9 @@ from jaxbundle.pushbroom.rpc_fit import fit_image
 from jaxbundle.pushbroom.scanner import FocalLine
 from jaxbundle.pushbroom.surfaces import Ground
 from jaxbundle.surfaces.dsm import make_dsm
-from jaxbundle.surfaces.ground import RpcView, neighbourhood
 from jaxbundle.surfaces.reconstruct import ground_bounds, reconstruct_surface
 from jaxbundle.surfaces.relative import align_all
+from jaxbundle.surfaces.scanner_views import RpcView, neighbourhood
 
 GSD, ORBIT, SPEED = 0.5, 650e3, 6.9e3
 PITCHES = -0.22, 0.22

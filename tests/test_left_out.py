@@ -10,8 +10,8 @@ import jaxbundle
 from jaxbundle import Camera, grid_of_targets, ring_of_stations, simulate
 from jaxbundle.io.results.result_json import result_dict
 from jaxbundle.orientation.determined import have_one_line, see_a_line
-from jaxbundle.orientation.growth import Model
-from jaxbundle.orientation.sights import Sights, in_plane, sights
+from jaxbundle.orientation.incremental import Model
+from jaxbundle.orientation.rays import Sights, in_plane, sights
 from jaxbundle.planning.stations import Stations
 from jaxbundle.report.page.adjustment import compose
 

@@ -66,15 +66,15 @@ from jaxbundle.leastsquares.quality.snooping import check_test
 from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.network.check import check_network
 from jaxbundle.network.columns import count, list_some
-from jaxbundle.network.sightings import split_check_points
 from jaxbundle.network.tables import Network, Observations, Points
+from jaxbundle.network.undetermined import split_check_points
 from jaxbundle.network.unit_mistakes import (
     name_pixels,
     name_unit_of_positions,
 )
 from jaxbundle.orientation.conventions import name_image_extent
-from jaxbundle.orientation.exchanges import CONTRADICTORY_CONTROL
 from jaxbundle.orientation.network import Oriented, lacks_start_values, without_placeholders
+from jaxbundle.orientation.swapped_control import CONTRADICTORY_CONTROL
 from jaxbundle.types import AnyArray, Progress, present
 
 UNNAMED = ("a combination of unknowns that spreads over many of them",)

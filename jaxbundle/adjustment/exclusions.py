@@ -25,11 +25,11 @@ from jaxbundle.adjustment.problem import NetworkProblem, coordinates, with_coord
 from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network.columns import list_some
-from jaxbundle.network.sightings import equations_of, keep_images, keep_points, leave_out
 from jaxbundle.network.tables import LeftOut, Network
-from jaxbundle.orientation import many
+from jaxbundle.network.undetermined import equations_of, keep_images, keep_points, leave_out
+from jaxbundle.orientation import batched
 from jaxbundle.orientation.determined import have_one_line, see_a_line
-from jaxbundle.orientation.growth import (
+from jaxbundle.orientation.incremental import (
     START_VALUE_DEMANDS,
     Demands,
     Model,
@@ -40,7 +40,7 @@ from jaxbundle.orientation.growth import (
     place_far_points,
 )
 from jaxbundle.orientation.missing import explain_missing, note_missing
-from jaxbundle.orientation.sights import Sights, sights
+from jaxbundle.orientation.rays import Sights, sights
 from jaxbundle.types import AnyArray
 
 COMES_BACK = Demands(START_VALUE_DEMANDS.angle, 1.0)
@@ -225,7 +225,7 @@ def _adjusted_model(
         )
     )
     position, rotation = map(np.asarray, values["image"])
-    M = many.matrices_of_quaternions(rotation)
+    M = batched.matrices_of_quaternions(rotation)
     model.place(images, position + problem.origin, M)
     X = np.asarray(coordinates(values)) + problem.origin
     model.X[points], model.known[points] = X, np.isfinite(X).all(1)
@@ -295,7 +295,7 @@ def _with_start_values(network: Network, model: Model) -> Network:
     position, angles = images.position.copy(), images.angles.copy()
     position[lacking] = model.X0[lacking]
     if lacking.any():
-        angles[lacking] = many.angles(model.M[lacking])
+        angles[lacking] = batched.angles(model.M[lacking])
     found = model.known & ~np.isfinite(points.position).all(1)
     X = np.where(found[:, None], model.X, points.position)
     return network.replace(

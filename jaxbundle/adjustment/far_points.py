@@ -26,8 +26,8 @@ from jaxbundle.leastsquares.problem import with_data, with_factor, with_free
 from jaxbundle.leastsquares.solution import Solution, find_minimum
 from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network.tables import Network
-from jaxbundle.orientation.many import matrices_of_quaternions
-from jaxbundle.orientation.sights import sights
+from jaxbundle.orientation.batched import matrices_of_quaternions
+from jaxbundle.orientation.rays import sights
 from jaxbundle.types import present
 
 

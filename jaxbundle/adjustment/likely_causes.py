@@ -22,8 +22,8 @@ from jaxbundle.network.unit_mistakes import (
 )
 from jaxbundle.orientation.angle_units import name_angle_unit
 from jaxbundle.orientation.conventions import name_image_convention, name_image_extent
-from jaxbundle.orientation.exchanges import CONTRADICTORY_CONTROL, name_contradiction
 from jaxbundle.orientation.one_place import name_one_place
+from jaxbundle.orientation.swapped_control import CONTRADICTORY_CONTROL, name_contradiction
 
 
 @dataclasses.dataclass(frozen=True)

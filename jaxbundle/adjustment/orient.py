@@ -14,12 +14,12 @@ from jaxbundle.float64 import require_x64
 from jaxbundle.io.formats import as_network
 from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.network.check import check_network
-from jaxbundle.network.sightings import keep_images, keep_points
 from jaxbundle.network.tables import Camera, Distances, Network
-from jaxbundle.orientation import many
-from jaxbundle.orientation.growth import Model, misclosures
+from jaxbundle.network.undetermined import keep_images, keep_points
+from jaxbundle.orientation import batched
+from jaxbundle.orientation.incremental import Model, misclosures
 from jaxbundle.orientation.network import Oriented, find_start_values
-from jaxbundle.orientation.sights import TOLERANCE, Sights
+from jaxbundle.orientation.rays import TOLERANCE, Sights
 
 
 def orient(
@@ -97,7 +97,7 @@ def _adjust(network: Network, sights: Sights, model: Model) -> None:
     index = {id: k for k, id in enumerate(network.points.id)}
     points = np.array([index[id] for id in problem.network.points.id])
     model.X0[images] = X0 + problem.origin
-    model.M[images] = many.matrices_of_quaternions(rotation)
+    model.M[images] = batched.matrices_of_quaternions(rotation)
     model.X[points] = X + problem.origin
 
 
@@ -107,7 +107,7 @@ def _part(
     """The oriented images and the points in `use`, without priors, with control held."""
     images, points = network.images, network.points
     angles = np.full((len(images), 3), np.nan)
-    angles[model.placed] = many.angles(model.M[model.placed])
+    angles[model.placed] = batched.angles(model.M[model.placed])
     held = model.control & use
     roles = tuple("fixed" if h else "tie" for h in held)
     cameras = tuple(dataclasses.replace(c, free=(), sigma={}, observed={}) for c in network.cameras)

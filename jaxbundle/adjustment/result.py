@@ -37,7 +37,7 @@ from jaxbundle.adjustment.quality.replication import (
     compare_halves,
     random_halves,
 )
-from jaxbundle.adjustment.quality.second_minimum import SecondMinimum
+from jaxbundle.adjustment.quality.two_minima import SecondMinimum
 from jaxbundle.adjustment.quality.variance_components import groups
 from jaxbundle.adjustment.quality.weakness import Weakness, weakness
 from jaxbundle.adjustment.storage import network_fingerprint, store
@@ -74,7 +74,7 @@ from jaxbundle.network.declare import LEAST_IMAGES
 from jaxbundle.network.tables import ESTIMATED, UNIT, Network, Observations, Points, units_of
 from jaxbundle.network.unit_mistakes import name_pixels
 from jaxbundle.network.units import ANGLE_UNITS
-from jaxbundle.orientation.exchanges import CONTRADICTORY_CONTROL
+from jaxbundle.orientation.swapped_control import CONTRADICTORY_CONTROL
 from jaxbundle.results import data_frame, finite
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, present

@@ -18,7 +18,7 @@ from jaxbundle.adjustment.far_points import join_legs, noise_of_rays
 from jaxbundle.adjustment.minimum import adjusted_cameras, inspect_solution
 from jaxbundle.adjustment.problem import NetworkProblem, with_coordinates
 from jaxbundle.adjustment.quality.inspection import Inspection
-from jaxbundle.adjustment.quality.second_minimum import (
+from jaxbundle.adjustment.quality.two_minima import (
     MIRRORED,
     OTHER_PLANE,
     REVERSED,
@@ -53,9 +53,9 @@ from jaxbundle.leastsquares.quality.distributions import chi2_quantile
 from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import UNIT
-from jaxbundle.orientation import many
-from jaxbundle.orientation.growth import START_VALUE_DEMANDS, Model, grow, intersect
-from jaxbundle.orientation.sights import Sights, sights
+from jaxbundle.orientation import batched
+from jaxbundle.orientation.incremental import START_VALUE_DEMANDS, Model, grow, intersect
+from jaxbundle.orientation.rays import Sights, sights
 
 Minimise = Callable[..., tuple[NetworkProblem, Minimum]]
 """`minimise(problem, start)` iterates from given values, `max_steps` at most if given; returns the
@@ -127,7 +127,7 @@ class _State:
         self.first, self.problem, self.settings = first, first.problem, settings
         self.minimise = minimise
         self.scene, self.all_rays = scene_of(first.adjusted), rays_of(first.problem)
-        self.rays = sample(self.all_rays, len(self.scene.X0), many.SLOTS)
+        self.rays = sample(self.all_rays, len(self.scene.X0), batched.SLOTS)
         free = lambda table: np.asarray(self.problem.table(table).free).max(1) > 0
         self.free, self.free_points = free("image"), free("point")
         network, counts = self.problem.network, self.problem.counts
@@ -193,7 +193,7 @@ class _State:
         common[rays.point[rays.image == first]] = True
         shared = np.bincount(rays.image, common[rays.point], images)
         shared[first] = 0
-        partners = np.argsort(-shared, kind="stable")[: many.LANES]
+        partners = np.argsort(-shared, kind="stable")[: batched.LANES]
         partners = partners[shared[partners] >= 6]
         if not len(partners) or not self._is_plane(first, partners):
             return
@@ -201,7 +201,7 @@ class _State:
         pairs = [_common_rays(seen, first, int(k)) for k in partners]
         if any(len(xy1) < 6 for xy1, _ in pairs):
             return
-        M, b, _, possible = many.orient_planes(*zip(*pairs))
+        M, b, _, possible = batched.orient_planes(*zip(*pairs))
         relative = self.scene.M[partners] @ self.scene.M[first].T
         # The solution that is farther from the present one.
         turn = np.stack([angles(M[:, k] @ relative.transpose(0, 2, 1)) for k in (0, 1)], 1)
@@ -265,7 +265,7 @@ class _State:
             return None
         held = self.known[used]
         rows = used[held] if held.sum() >= 3 else used
-        moved = many.similarity(model.X[rows], self.scene.X[rows], np.ones(len(rows)))
+        moved = batched.similarity(model.X[rows], self.scene.X[rows], np.ones(len(rows)))
         if moved is None:
             return None
         model = model.transform(*moved)
@@ -329,7 +329,8 @@ class _State:
         free = self.free[:, None]
         position, rotation = (np.asarray(part) for part in values["image"])
         values["image"] = PoseValue(
-            np.where(free, scene.X0, position), np.where(free, many.quaternions(scene.M), rotation)
+            np.where(free, scene.X0, position),
+            np.where(free, batched.quaternions(scene.M), rotation),
         )
         X = np.where(self.free_points[:, None], scene.X, self.scene.X)
         values["point"] = with_coordinates(values["point"], X)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbundle.adjustment.problem import NetworkProblem
-from jaxbundle.adjustment.quality.second_minimum import (
+from jaxbundle.adjustment.quality.two_minima import (
     OTHER_POSE,
     TURNED,
     SecondMinimumSettings,
@@ -29,8 +29,8 @@ from jaxbundle.adjustment.second_solutions import (
     unit,
 )
 from jaxbundle.leastsquares.quality.distributions import chi2_quantile
-from jaxbundle.orientation import many
-from jaxbundle.orientation.sights import Sights, in_plane
+from jaxbundle.orientation import batched
+from jaxbundle.orientation.rays import Sights, in_plane
 
 MIN_POINTS = 3
 """Of an image: fewer leave its pose open."""
@@ -153,7 +153,7 @@ class SecondPoses:
         images = [view.image for view in views]
         poses = X0[images], np.stack([view.R @ M[view.image] for view in views])
         columns = zip(*((view.xy, view.X, view.weight) for view in views))
-        for view, x, m in zip(views, *many.refine(poses, *columns)):
+        for view, x, m in zip(views, *batched.refine(poses, *columns)):
             k = view.image
             X0[k], M[k] = x, view.R.T @ m
             change[k] = self._change(view, NetworkScene(X0, M, start.X))
@@ -169,7 +169,7 @@ class SecondPoses:
         if not views:
             return start
         tolerance = np.array([view.tolerance for view in views])
-        found = many.resect([view.xy for view in views], [view.X for view in views], tolerance)
+        found = batched.resect([view.xy for view in views], [view.X for view in views], tolerance)
         X0, M = start.X0.copy(), start.M.copy()
         for view, x, m, share in zip(views, *found):
             if share > 0:

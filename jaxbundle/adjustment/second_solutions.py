@@ -33,7 +33,7 @@ from jaxtyping import Bool, Float, Int
 from jaxbundle.adjustment.problem import NetworkProblem, coordinates
 from jaxbundle.cameras import get_model
 from jaxbundle.leastsquares.indexing.rows import Values
-from jaxbundle.orientation.many import matrices_of_quaternions
+from jaxbundle.orientation.batched import matrices_of_quaternions
 
 
 class NetworkScene(NamedTuple):

@@ -20,7 +20,7 @@ from jaxbundle.cli.app import (
     app,
     choice,
 )
-from jaxbundle.cli.habits import is_in_file
+from jaxbundle.cli.common_options import is_in_file
 from jaxbundle.errors import InputError, NotSolvedError
 
 

@@ -16,8 +16,8 @@ from typer.core import TyperCommand, TyperGroup
 
 import jaxbundle
 from jaxbundle.choices import CAMERA_MODELS, FORMATS, MODEL_FAMILIES
-from jaxbundle.cli.habits import Quiet as Quiet
-from jaxbundle.cli.habits import add_habits
+from jaxbundle.cli.common_options import Quiet as Quiet
+from jaxbundle.cli.common_options import add_habits
 from jaxbundle.cli.small_inputs import is_small
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.system.configuration import leave

@@ -9,7 +9,7 @@ import typer
 
 from jaxbundle.choices import BOARDS, DICTIONARIES, ESTIMATORS, TESTS
 from jaxbundle.cli.app import Correlated, Force, Html, Json, Quiet, app, choice, model_choice
-from jaxbundle.cli.habits import is_in_file
+from jaxbundle.cli.common_options import is_in_file
 from jaxbundle.errors import InputError, NotSolvedError
 
 

@@ -9,7 +9,7 @@ import typer
 import jaxbundle
 from jaxbundle.choices import AIMS, DESIGNED, ORDERS
 from jaxbundle.cli.app import Force, Json, Quiet, app, choice
-from jaxbundle.cli.habits import is_in_file
+from jaxbundle.cli.common_options import is_in_file
 
 BOX_FORM = "Xmin,Ymin,Zmin,Xmax,Ymax,Zmax"
 

@@ -7,7 +7,7 @@ import typer
 
 import jaxbundle
 from jaxbundle.cli.app import Control, Force, Format, Input, Quiet, Settings, app
-from jaxbundle.cli.habits import is_in_file
+from jaxbundle.cli.common_options import is_in_file
 
 
 @app.command(example="examples/convergent4/project.toml --out out/oriented", once=True)

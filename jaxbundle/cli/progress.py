@@ -15,7 +15,7 @@ from rich.progress import (
     TimeElapsedColumn,
 )
 
-from jaxbundle.cli.habits import verbose
+from jaxbundle.cli.common_options import verbose
 from jaxbundle.cli.verbose import Stages, say
 from jaxbundle.system.progress import show_progress
 

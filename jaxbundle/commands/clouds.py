@@ -12,9 +12,9 @@ from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.results import TableMethods
 from jaxbundle.surfaces.accuracy import accuracy_of, at_check_points, to_plane
 from jaxbundle.surfaces.cloud import Cloud
+from jaxbundle.surfaces.cloud_filters import drop_isolated, drop_weak, thin
 from jaxbundle.surfaces.compare import compare
 from jaxbundle.surfaces.dsm import Dsm, make_dsm
-from jaxbundle.surfaces.filtering import drop_isolated, drop_weak, thin
 from jaxbundle.surfaces.point_files import read_cloud
 
 

@@ -17,8 +17,8 @@ from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.network.tables import Camera, Network
-from jaxbundle.planning.planned_block import planned_network
-from jaxbundle.planning.vertical_photographs import BlockDesign, design_block, relief_displacement
+from jaxbundle.planning.block_design import BlockDesign, design_block, relief_displacement
+from jaxbundle.planning.block_network import planned_network
 from jaxbundle.results import TableMethods
 
 MAX_PHOTOGRAPHS = 2000

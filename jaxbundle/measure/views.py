@@ -23,7 +23,7 @@ from jaxbundle.measure.corners import (
     memory_of_search,
     other_sizes,
 )
-from jaxbundle.photographs.at_once import photographs_at_once
+from jaxbundle.photographs.concurrent import photographs_at_once
 from jaxbundle.photographs.folders import list_photographs
 from jaxbundle.photographs.formats import SUFFIXES
 from jaxbundle.photographs.opencv import need_opencv

@@ -1,6 +1,6 @@
 """Checks of a network before the adjustment; errors are reported with their location.
 
-`check_network` checks every value of every table, then (`jaxbundle.network.sightings`)
+`check_network` checks every value of every table, then (`jaxbundle.network.undetermined`)
 determinability: rays per point, points per image, connected parts, redundancy.
 """
 
@@ -24,14 +24,6 @@ from jaxbundle.network.rules import (
     check_models,
     check_unique,
 )
-from jaxbundle.network.sightings import (
-    check_parts,
-    check_redundancy,
-    leave_out_undetermined,
-    with_roles,
-    without_distances,
-)
-from jaxbundle.network.sightings import split_check_points as split_check_points
 from jaxbundle.network.single_strip import check_single_strip
 from jaxbundle.network.tables import (
     EXTERIOR,
@@ -43,6 +35,14 @@ from jaxbundle.network.tables import (
     Source,
     require_network,
 )
+from jaxbundle.network.undetermined import (
+    check_parts,
+    check_redundancy,
+    leave_out_undetermined,
+    with_roles,
+    without_distances,
+)
+from jaxbundle.network.undetermined import split_check_points as split_check_points
 from jaxbundle.network.unit_mistakes import check_units
 from jaxbundle.network.units import ANGLE_UNITS
 

@@ -27,8 +27,8 @@ from jaxbundle.io.text.csv_tables import read_toml
 from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network.columns import did_you_mean
-from jaxbundle.network.sightings import keep_images, split_check_points
 from jaxbundle.network.tables import Images, Network, units_of
+from jaxbundle.network.undetermined import keep_images, split_check_points
 from jaxbundle.network_design.aims import Aim, aim_of
 from jaxbundle.network_design.conditions import Conditions
 from jaxbundle.network_design.feasible import (

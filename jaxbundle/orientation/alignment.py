@@ -7,11 +7,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbundle.network.tables import Network
-from jaxbundle.orientation import many
-from jaxbundle.orientation.growth import Model, are_controlled
+from jaxbundle.orientation import batched
+from jaxbundle.orientation.incremental import Model, are_controlled
+from jaxbundle.orientation.rays import Sights
 from jaxbundle.orientation.robust import OUTLIER_LIMIT
 from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
-from jaxbundle.orientation.sights import Sights
 from jaxbundle.types import Index
 
 Similarity = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]
@@ -57,7 +57,7 @@ def _by_rays(network: Network, sights: Sights, model: Model) -> Similarity | Non
         return None
     # From the control points to the model, not back: the misclosures are then angles at the
     # projection centres of the model, and the inverse is exact.
-    A, t, off = many.similarity_by_rays(points.position[point], model.X0[image], rays, *start)
+    A, t, off = batched.similarity_by_rays(points.position[point], model.X0[image], rays, *start)
     if not np.median(off) < np.median(sights.tolerance[image]):
         return None
     back = np.linalg.inv(A)
@@ -92,7 +92,7 @@ def _scale_of_other_lengths(network: Network, model: Model) -> float | None:
     placed = np.flatnonzero(model.placed)
     images = network.images.take(placed)
     oriented = dataclasses.replace(
-        images, position=model.X0[placed], angles=many.angles(model.M[placed])
+        images, position=model.X0[placed], angles=batched.angles(model.M[placed])
     )
     part = network.replace(images=oriented)
     ratios = [ratio for one in network.further for ratio in one.among(part).scales(part)]
@@ -177,7 +177,7 @@ def similarity(
     good = np.ones(len(source), bool)
     # The first round uses all points, the second those near its result; a third settles which.
     for _ in range(3):
-        found = many.similarity(source, target, good.astype(float)) if good.sum() >= 3 else None
+        found = batched.similarity(source, target, good.astype(float)) if good.sum() >= 3 else None
         # Of fewer than six points an outlier draws the seven unknowns so far that it does not show.
         if found is None or len(source) < 6:
             return found
@@ -206,7 +206,7 @@ def similarity_of_most(
         triples = [rng.choice(n, 3, replace=False) for _ in range(number)]
     best, least = None, np.inf
     for triple in triples:
-        found = many.similarity(source, target, np.isin(np.arange(n), triple).astype(float))
+        found = batched.similarity(source, target, np.isin(np.arange(n), triple).astype(float))
         if found is not None:
             off = np.linalg.norm(source @ found[0].T + found[1] - target, axis=1)
             # Not the median: the three points of the triple fit nearly exactly, and would make half
@@ -216,4 +216,4 @@ def similarity_of_most(
     if best is None:
         return None
     limit = max(OUTLIER_LIMIT * 1.4826 * least, np.sort(best)[2])
-    return many.similarity(source, target, (best <= limit).astype(float))
+    return batched.similarity(source, target, (best <= limit).astype(float))

@@ -8,10 +8,10 @@ import numpy as np
 
 from jaxbundle.network.tables import Network
 from jaxbundle.network.units import ANGLE_UNITS
-from jaxbundle.orientation import many
-from jaxbundle.orientation.growth import Model, misclosures
+from jaxbundle.orientation import batched
+from jaxbundle.orientation.incremental import Model, misclosures
+from jaxbundle.orientation.rays import sights
 from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
-from jaxbundle.orientation.sights import sights
 
 
 def name_angle_unit(network: Network, settings: StartValueSettings = DEFAULTS) -> str:
@@ -28,7 +28,7 @@ def name_angle_unit(network: Network, settings: StartValueSettings = DEFAULTS) -
     missed = {}
     for unit, factor in ANGLE_UNITS.items():
         model = Model.empty(seen)
-        M = many.matrices(images.angles[there] * factor / given)
+        M = batched.matrices(images.angles[there] * factor / given)
         model.place(there, images.position[there], M)
         model.X[known] = network.points.position[known]
         off = misclosures(seen, model)[rows] / seen.tolerance[seen.image[rows]]

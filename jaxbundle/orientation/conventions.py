@@ -16,10 +16,10 @@ from jaxtyping import Bool, Float
 
 from jaxbundle.cameras import get_model
 from jaxbundle.network.tables import Camera, Network
-from jaxbundle.orientation import many
-from jaxbundle.orientation.growth import Model, misclosures
+from jaxbundle.orientation import batched
+from jaxbundle.orientation.incremental import Model, misclosures
+from jaxbundle.orientation.rays import sights
 from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
-from jaxbundle.orientation.sights import sights
 
 IDENTITY = (1, 0, 0, 1)
 """The symmetry of the expected convention: a 2 × 2 matrix, row by row."""
@@ -62,7 +62,7 @@ def name_image_convention(network: Network, settings: StartValueSettings = DEFAU
         return ""
     # The median of 2000 is known to 3 % of its spread (1.25/√n): more than enough to recognise a
     # factor of ten, of up to sixteen conventions.
-    rows = rows[many.spread(len(rows), 2000)]
+    rows = rows[batched.spread(len(rows), 2000)]
     some = network.replace(observations=rays.take(rows))
     centres, halves = (np.array(v) for v in zip(*(image_frame(c) for c in network.cameras)))
     camera = images.camera[some.observations.image]
@@ -119,7 +119,7 @@ def _misclosure(
     if 2 * len(seen.row) < len(network.observations):
         return np.inf
     model = Model.empty(seen)
-    model.place(placed, images.position[placed], many.matrices(images.angles[placed]))
+    model.place(placed, images.position[placed], batched.matrices(images.angles[placed]))
     model.X[known] = network.points.position[known]
     return float(np.median(misclosures(seen, model) / seen.tolerance[seen.image]))
 

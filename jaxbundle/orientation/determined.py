@@ -26,8 +26,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbundle.leastsquares.quality.distributions import chi2_quantile
-from jaxbundle.orientation.growth import Model
-from jaxbundle.orientation.sights import Sights
+from jaxbundle.orientation.incremental import Model
+from jaxbundle.orientation.rays import Sights
 
 
 def have_one_line(

@@ -7,11 +7,11 @@ from jaxtyping import Bool
 
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import LeftOut, Network
-from jaxbundle.orientation.growth import (
+from jaxbundle.orientation.incremental import (
     Model,
 )
+from jaxbundle.orientation.rays import Sights
 from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
-from jaxbundle.orientation.sights import Sights
 
 
 def note_missing(network: Network, thing: str, reasons: Mapping[str, str], what: str) -> Network:

@@ -1,7 +1,7 @@
 """The start values of a whole network.
 
 1. Images with given exterior orientation and control points are known: images that see enough
-   of them are resected, points intersected, more images resected, … (`growth`).
+   of them are resected, points intersected, more images resected, … (`incremental`).
 2. If no image can be resected, given coordinates of tie points count as known.
 3. If this fails too, or images are left, a model starts from two of them: among the pairs with many
    common points one with good intersection angles, oriented relatively (five points). It grows;
@@ -26,14 +26,13 @@ from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.network.check import check_tables
 from jaxbundle.network.columns import count, list_some
-from jaxbundle.network.sightings import keep_images, keep_points, leave_out
 from jaxbundle.network.tables import Network
+from jaxbundle.network.undetermined import keep_images, keep_points, leave_out
 from jaxbundle.network.unit_mistakes import name_pixels
-from jaxbundle.orientation import many
+from jaxbundle.orientation import batched
 from jaxbundle.orientation.alignment import describe_mirror, join, move_to_given_frame, to_scale
 from jaxbundle.orientation.conventions import name_image_extent
-from jaxbundle.orientation.exchanges import name_contradiction, name_suspects
-from jaxbundle.orientation.growth import (
+from jaxbundle.orientation.incremental import (
     Improve,
     Model,
     are_controlled,
@@ -44,9 +43,10 @@ from jaxbundle.orientation.growth import (
     place_far_points,
 )
 from jaxbundle.orientation.missing import explain_missing, note_missing
+from jaxbundle.orientation.rays import TOLERANCE, Sights, sights
 from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
-from jaxbundle.orientation.sights import TOLERANCE, Sights, sights
 from jaxbundle.orientation.start_pairs import all_pairs, good_pairs
+from jaxbundle.orientation.swapped_control import name_contradiction, name_suspects
 from jaxbundle.results import TableMethods
 
 CONTRADICTION = "that contradict the start values"
@@ -302,7 +302,7 @@ def _start_from_given(network: Network, seen: Sights, settings: StartValueSettin
     model, images = Model.empty(seen), network.images
     there = _have_poses(network)
     if there.any():
-        model.place(there, images.position[there], many.matrices(images.angles[there]))
+        model.place(there, images.position[there], batched.matrices(images.angles[there]))
     return _with_control(network, model, settings)
 
 
@@ -361,7 +361,7 @@ def _result(
     lacking &= model.placed
     position[lacking] = model.X0[lacking]
     if lacking.any():
-        angles[lacking] = many.angles(model.M[lacking])
+        angles[lacking] = batched.angles(model.M[lacking])
     X = np.where(
         (model.known & ~np.isfinite(points.position).all(1))[:, None], model.X, points.position
     )

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Network
-from jaxbundle.orientation.sights import Sights, sights
+from jaxbundle.orientation.rays import Sights, sights
 
 MAX_SIGMA_RATIO = 3.0
 """Misclosures up to this number of σ are explained by the measurements. Medians of points are

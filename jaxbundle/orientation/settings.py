@@ -12,7 +12,7 @@ import dataclasses
 @dataclasses.dataclass(frozen=True)
 class StartValueSettings:
     """How images and points are oriented one after the other. Angles in radians; "tolerance": of
-    start values, see `sights`.
+    start values, see `rays`.
 
     Images:
 
@@ -35,8 +35,8 @@ class StartValueSettings:
 
     - `min_common_points`: from 6: five have up to ten solutions, a sixth chooses. Half and double
       are as good here.
-    - `max_pairs`: that are oriented relatively, in lanes of `many.LANES`. Half: 21 more right image
-      points are left out; double is no better.
+    - `max_pairs`: that are oriented relatively, in lanes of `batched.LANES`. Half: 21 more right
+      image points are left out; double is no better.
     - `max_seeds`: of these, tried until one is sufficient. Half is as good here, double no better.
     - `good_angle`: an angle of intersection beyond which a wider one is no better. Half and double
       are as good here.

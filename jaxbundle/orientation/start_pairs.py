@@ -6,12 +6,12 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxbundle.orientation import many
-from jaxbundle.orientation.growth import (
+from jaxbundle.orientation import batched
+from jaxbundle.orientation.incremental import (
     RESECTION_DEMANDS,
 )
+from jaxbundle.orientation.rays import Sights, in_plane
 from jaxbundle.orientation.settings import StartValueSettings
-from jaxbundle.orientation.sights import Sights, in_plane
 from jaxbundle.types import Index
 
 
@@ -42,7 +42,7 @@ def good_pairs(
         return
     R, Q, xy, other_xy = zip(*turned)
     tolerance = seen.tolerance[pairs].mean(1)
-    M, b, part, angle = many.orient_pairs(xy, other_xy, tolerance)
+    M, b, part, angle = batched.orient_pairs(xy, other_xy, tolerance)
     # 1/σ of the depth of a pair: with the root of the number of points and with the angle. Beyond
     # `good_angle` images differ so much that many points are seen in one only.
     worth = np.sqrt(common) * part * np.minimum(angle, settings.good_angle)
@@ -71,7 +71,7 @@ def _pairs_in_common(
     # one still has 0.33 of the points of the next (20 % of the format beside 60 %).
     enough = order[number[order] >= 0.3 * number.max(initial=0)]
     half = settings.max_pairs // 2
-    spread = many.spread(len(enough), settings.max_pairs - half)
+    spread = batched.spread(len(enough), settings.max_pairs - half)
     chosen = np.unique(np.concatenate([order[:half], enough[spread]]))
     return pairs[chosen], number[chosen]
 

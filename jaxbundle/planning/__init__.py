@@ -24,8 +24,8 @@ _HOME = {
         "ring_of_stations",
         "stations_looking_at",
     ),
-    "jaxbundle.planning.planned_block": ("planned_network",),
-    "jaxbundle.planning.vertical_photographs": (
+    "jaxbundle.planning.block_network": ("planned_network",),
+    "jaxbundle.planning.block_design": (
         "BlockDesign",
         "design_block",
         "relief_displacement",

@@ -34,8 +34,8 @@ from jaxbundle.pushbroom.image import LinePose, PushbroomImage, pose_at
 from jaxbundle.pushbroom.newton import first_of, gather, refine, replace_chosen
 from jaxbundle.pushbroom.passages import find_passages
 from jaxbundle.pushbroom.pieces import make_pieces, sample, sample_times
+from jaxbundle.pushbroom.prepared import ScannerGeometry, Search, scanner_of
 from jaxbundle.pushbroom.scanner import Pair
-from jaxbundle.pushbroom.search import ScannerGeometry, Search, scanner_of
 from jaxbundle.pushbroom.search_settings import DEFAULTS, SearchSettings
 from jaxbundle.system.devices import batch_size
 from jaxbundle.system.programs import compile_once

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from jaxbundle.geometry.vectors import Triple, Vector, difference
 from jaxbundle.pushbroom.pieces import motion
 from jaxbundle.pushbroom.polynomial import value, value_and_rate
-from jaxbundle.pushbroom.search import ScannerGeometry, Search
+from jaxbundle.pushbroom.prepared import ScannerGeometry, Search
 from jaxbundle.system.devices import batch_size
 from jaxbundle.types import AnyArray, Scalar
 

@@ -16,7 +16,7 @@ from jaxbundle.geometry.ellipsoid import normal
 from jaxbundle.geometry.vectors import Vector, difference, dot
 from jaxbundle.pushbroom.detector_line import slope_ahead
 from jaxbundle.pushbroom.pieces import sample
-from jaxbundle.pushbroom.search import ScannerGeometry, Search
+from jaxbundle.pushbroom.prepared import ScannerGeometry, Search
 
 # start times [most, n]; their number, and whether the point is ahead of the last line, behind the
 # first, never above the horizon [n]

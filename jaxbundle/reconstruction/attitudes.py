@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from jaxbundle.network.build import make_further
 from jaxbundle.network.tables import Network
-from jaxbundle.orientation import many
+from jaxbundle.orientation import batched
 from jaxbundle.photographs.xmp import CameraAttitude, rotation_of
 
 MIN_ATTITUDES = 3
@@ -53,7 +53,7 @@ def with_attitudes(
     if known.sum() < MIN_ATTITUDES:
         return network, ""
     M, sigma = attitudes.M[rows[known]], attitudes.sigma[rows[known]]
-    oriented = np.asarray(many.matrices(network.images.angles[known]))
+    oriented = np.asarray(batched.matrices(network.images.angles[known]))
     # the angle of M·M'ᵀ: 2·cos α + 1 = tr(M·M'ᵀ)
     cosine = (np.einsum("nij,nij->n", M, oriented) - 1) / 2
     off = np.arccos(np.clip(cosine, -1, 1))
@@ -65,7 +65,7 @@ def with_attitudes(
             "from those of the photographs and their positions: not used"
         )
     # one σ about all axes: the largest that the file states
-    angles = np.asarray(many.angles(M))
+    angles = np.asarray(batched.angles(M))
     columns = {"image": [network.images.id[k] for k in np.flatnonzero(known)]}
     columns |= {axis: angles[:, k] for k, axis in enumerate(("omega", "phi", "kappa"))}
     columns |= {f"s{axis}": sigma for axis in ("omega", "phi", "kappa")}

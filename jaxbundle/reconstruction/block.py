@@ -11,8 +11,8 @@ from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.network.kinds import Antennas
 from jaxbundle.network.tables import Camera
 from jaxbundle.network.units import from_image_unit
-from jaxbundle.orientation import many
-from jaxbundle.orientation.sights import ideal_points
+from jaxbundle.orientation import batched
+from jaxbundle.orientation.rays import ideal_points
 from jaxbundle.photographs.exif import Exif
 from jaxbundle.report.layout import significant
 from jaxbundle.system.clock import in_words, now
@@ -165,7 +165,7 @@ def describe_block(result: Adjustment, exif: Mapping[str, Exif], system: str) ->
 
     **Arguments:** `exif` by photograph; `system` of the coordinates, empty: arbitrary."""
     network, values = result.problem.network, result.image_values
-    X0, M = values[:, :3], np.asarray(many.matrices(values[:, 3:]))
+    X0, M = values[:, :3], np.asarray(batched.matrices(values[:, 3:]))
     used = result.problem.used
     image, point = result.problem.image[used], result.problem.point[used]
     X = result.point_values

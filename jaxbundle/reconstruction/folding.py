@@ -18,10 +18,10 @@ from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.network.columns import count
 from jaxbundle.network.tables import Camera, Network
-from jaxbundle.orientation import many
+from jaxbundle.orientation import batched
 from jaxbundle.reconstruction.adjusting import WeightedAdjustment
-from jaxbundle.tiepoints.search import ideal_features, present_size
 from jaxbundle.tiepoints.track_measurement import Measurements
+from jaxbundle.tiepoints.verified_pairs import ideal_features, present_size
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,7 +125,7 @@ def count_shared_points(
     """The points of every photograph (rows) that should also be in every other one (columns), and
     those of them that are measured there."""
     network, values = result.network, result.image_values
-    X0, M = values[:, :3], np.asarray(many.matrices(values[:, 3:]))
+    X0, M = values[:, :3], np.asarray(batched.matrices(values[:, 3:]))
     X = np.asarray(result.point_values)
     used = result.problem.used
     known = np.all(np.isfinite(X), axis=1)

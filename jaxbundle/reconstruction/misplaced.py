@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from jaxbundle.network.tables import Network
-from jaxbundle.orientation import many
+from jaxbundle.orientation import batched
 from jaxbundle.tiepoints.verification import Pair, rotation_angle
 
 
@@ -67,7 +67,7 @@ def _compare(
     row = {id: k for k, id in enumerate(network.images.id)}
     if not row:
         return {}
-    X0, M = network.images.position, np.asarray(many.matrices(network.images.angles))
+    X0, M = network.images.position, np.asarray(batched.matrices(network.images.angles))
     contradicted = {}
     for ids, pair in pairs.items():
         if ids[0] in row and ids[1] in row:

@@ -13,7 +13,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import read_csv
 from jaxbundle.measure.coded_targets import NamedPoints, find_coded_targets, memory_of_targets
 from jaxbundle.network.columns import list_some
-from jaxbundle.photographs.at_once import photographs_at_once
+from jaxbundle.photographs.concurrent import photographs_at_once
 from jaxbundle.photographs.reading import image_errors, read_photograph
 from jaxbundle.reconstruction.control import Control
 from jaxbundle.reconstruction.photographs import Photograph

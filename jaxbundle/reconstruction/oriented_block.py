@@ -18,10 +18,10 @@ from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.any_distance import derivative
 from jaxbundle.network.tables import Network, Points
 from jaxbundle.network.units import from_image_unit
-from jaxbundle.orientation import many
+from jaxbundle.orientation import batched
 from jaxbundle.orientation.alignment import similarity_of_most
 from jaxbundle.orientation.control_consistency import Discrepancies
-from jaxbundle.orientation.sights import ideal_points
+from jaxbundle.orientation.rays import ideal_points
 from jaxbundle.reconstruction.named import NamedMeasurements
 
 MIN_CONTROL = 3
@@ -94,7 +94,7 @@ class OrientedBlock:
         self.network: Network = result.problem.network
         values = result.image_values
         self.X0, self.angles = values[:, :3], values[:, 3:]
-        self.M = np.asarray(many.matrices(self.angles))
+        self.M = np.asarray(batched.matrices(self.angles))
         self.X, self.A = result.point_values, np.eye(3)
         self.cameras = tuple(
             dataclasses.replace(c, parameters=result.camera_parameters(c.id))
@@ -180,7 +180,7 @@ class OrientedBlock:
         usable = np.flatnonzero(np.isfinite(point.rays).all(1))
         best = np.zeros(len(point.rows), bool)
         closest = np.inf
-        tried = usable[many.spread(len(usable), self.settings.paired_rays)]
+        tried = usable[batched.spread(len(usable), self.settings.paired_rays)]
         for i in tried:
             for j in tried[tried > i]:
                 pair = np.isin(np.arange(len(point.rows)), [i, j])
@@ -229,7 +229,7 @@ class OrientedBlock:
         A, t = similarity
         R = A / np.cbrt(np.linalg.det(A))
         self.X0, self.X, self.M = self.X0 @ A.T + t, self.X @ A.T + t, self.M @ R.T
-        self.angles, self.A = np.asarray(many.angles(self.M)), A
+        self.angles, self.A = np.asarray(batched.angles(self.M)), A
 
     @property
     def ground_sample_distance(self) -> float:

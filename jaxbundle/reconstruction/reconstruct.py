@@ -18,11 +18,11 @@ from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.float64 import require_x64
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import Camera, Network
-from jaxbundle.orientation import many
+from jaxbundle.orientation import batched
 from jaxbundle.orientation.network import Oriented
-from jaxbundle.photographs.at_once import photographs_at_once
+from jaxbundle.photographs.concurrent import photographs_at_once
 from jaxbundle.photographs.reading import read_photograph
-from jaxbundle.reconstruction import aspect_ratio
+from jaxbundle.reconstruction import square_pixels
 from jaxbundle.reconstruction.adjusting import DOUBTFUL_MISFIT, WeightedAdjustment, adjust_weighted
 from jaxbundle.reconstruction.attitudes import map_attitudes, with_attitudes
 from jaxbundle.reconstruction.block import describe_block
@@ -56,18 +56,18 @@ from jaxbundle.tiepoints.camera_starts import start_cameras
 from jaxbundle.tiepoints.duplicates import find_duplicates
 from jaxbundle.tiepoints.features import Features, memory_of_features
 from jaxbundle.tiepoints.matching import FeatureMatches
-from jaxbundle.tiepoints.search import (
+from jaxbundle.tiepoints.still import without_marks
+from jaxbundle.tiepoints.store import Store
+from jaxbundle.tiepoints.track_measurement import Measurements, measure_tracks
+from jaxbundle.tiepoints.tracks import choose_tracks, make_tracks
+from jaxbundle.tiepoints.verification import Pair
+from jaxbundle.tiepoints.verified_pairs import (
     detect,
     match,
     prepare,
     verify,
     without_contradicted,
 )
-from jaxbundle.tiepoints.still import without_marks
-from jaxbundle.tiepoints.store import Store
-from jaxbundle.tiepoints.track_measurement import Measurements, measure_tracks
-from jaxbundle.tiepoints.tracks import choose_tracks, make_tracks
-from jaxbundle.tiepoints.verification import Pair
 from jaxbundle.types import Progress
 
 DEFAULT = ReconstructionSettings()
@@ -159,7 +159,7 @@ class _ReconstructionRun:
         with ThreadPoolExecutor(1) as ahead:
             # compiled during the search and matching of features, and the verification of pairs
             windows = lambda: track_measurement.prepare(self.settings.track_matching)
-            programs = (prepare, windows, many.prepare) if can_run_two_programs() else ()
+            programs = (prepare, windows, batched.prepare) if can_run_two_programs() else ()
             prepared = [ahead.submit(program) for program in programs]
             features, matches = self._match()
             for first in prepared[:1]:
@@ -458,7 +458,7 @@ class _ReconstructionRun:
             # towards it: a contradiction is larger than it looks, and the test is cautious
             sigma = np.hypot(file.sigma, adjusted["sigma"])
             off = abs(adjusted["value"] - file.value)
-            if off > aspect_ratio.CRITICAL_DEVIATION * sigma:
+            if off > square_pixels.CRITICAL_DEVIATION * sigma:
                 said.append(
                     f"camera {id}: principal distance {adjusted['value']:.0f} px contradicts the "
                     f"{file.value:.0f} ± {file.sigma:.0f} px of the files ({file.source}): the "
@@ -506,11 +506,11 @@ class _ReconstructionRun:
     ) -> tuple[WeightedAdjustment, str]:
         """The adjustment with square pixels, unless halves of the photographs agree that they are
         not."""
-        contradicted = aspect_ratio.contradicted_ratios(weighted.adjustment)
+        contradicted = square_pixels.contradicted_ratios(weighted.adjustment)
         if not contradicted:
             return weighted, note
         self._begin("ratio of the focal lengths")
-        halves = aspect_ratio.replicated_ratios(weighted.adjustment)
+        halves = square_pixels.replicated_ratios(weighted.adjustment)
         released = {}
         for id, ratio in contradicted.items():
             both = halves.get(id)
@@ -519,7 +519,7 @@ class _ReconstructionRun:
                 said += "halves of them none: "
             else:
                 said += f"halves of them {' and '.join(map(_ratio_in_words, both))}: "
-            if both is not None and aspect_ratio.is_replicated(*both):
+            if both is not None and square_pixels.is_replicated(*both):
                 released[id] = ratio
                 self.notes.append(f"{said}the pixels are not square")
             else:
@@ -530,7 +530,7 @@ class _ReconstructionRun:
         if not released:
             return weighted, note
         # from the start values: the result's gross errors were judged with square pixels
-        network = aspect_ratio.release(oriented.network, released)
+        network = square_pixels.release(oriented.network, released)
         return self._adjust(dataclasses.replace(oriented, network=network), measured)
 
     def _adjust(self, oriented: Oriented, measured: Measurements) -> tuple[WeightedAdjustment, str]:
@@ -542,7 +542,7 @@ class _ReconstructionRun:
         return weighted, note
 
 
-def _ratio_in_words(ratio: aspect_ratio.Ratio) -> str:
+def _ratio_in_words(ratio: square_pixels.Ratio) -> str:
     return f"{1 + ratio.deviation:.5f} ± {ratio.sigma:.5f}"
 
 

@@ -18,13 +18,13 @@ from jaxtyping import Bool
 from jaxbundle.adjustment.orient import orient
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.errors import NotSolvedError
-from jaxbundle.network.sightings import keep_images, keep_points
 from jaxbundle.network.tables import Camera, Network
+from jaxbundle.network.undetermined import keep_images, keep_points
 from jaxbundle.orientation.network import Oriented
-from jaxbundle.orientation.sights import TOLERANCE
+from jaxbundle.orientation.rays import TOLERANCE
 from jaxbundle.reconstruction.misplaced import MisplacedSettings, NamedPairs, find_misplaced
 from jaxbundle.reconstruction.network import observed_parameters, with_observed
-from jaxbundle.tiepoints.search import present_size
+from jaxbundle.tiepoints.verified_pairs import present_size
 
 
 @dataclasses.dataclass(frozen=True)

@@ -4,8 +4,8 @@ At the given coordinates, a check point is projected: its residuals in lines and
 
     σ_v² = σ0²·(1/p + A·Q·Aᵀ).
 
-On the ground, the rays of two or more images give the point (`leastsquares/checks.py`); one scanner
-image gives it at its given height, east and north only.
+On the ground, the rays of two or more images give the point (`leastsquares/excluded_rows.py`); one
+scanner image gives it at its given height, east and north only.
 """
 
 import dataclasses
@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbundle.display import print_in_one_screen
-from jaxbundle.leastsquares.checks import determine
+from jaxbundle.leastsquares.excluded_rows import determine
 from jaxbundle.leastsquares.indexing.plan import Plan
 from jaxbundle.leastsquares.indexing.rows import (
     Data,

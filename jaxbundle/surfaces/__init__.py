@@ -18,12 +18,12 @@ _HOME = {
         "write_dsm",
     ),
     "jaxbundle.surfaces.inputs": ("read_views",),
-    "jaxbundle.surfaces.ground": (
+    "jaxbundle.surfaces.scanner_views": (
         "RpcView",
         "ScannerView",
     ),
     "jaxbundle.surfaces.bounds": ("Bounds",),
-    "jaxbundle.surfaces.filtering": (
+    "jaxbundle.surfaces.cloud_filters": (
         "drop_isolated",
         "drop_weak",
         "thin",

@@ -6,11 +6,11 @@ from jaxbundle.surfaces.dsm import Dsm as Dsm
 from jaxbundle.surfaces.dsm import DsmSettings as DsmSettings
 from jaxbundle.surfaces.dsm import make_dsm as make_dsm
 from jaxbundle.surfaces.dsm import write_dsm as write_dsm
-from jaxbundle.surfaces.filtering import drop_isolated as drop_isolated
-from jaxbundle.surfaces.filtering import drop_weak as drop_weak
-from jaxbundle.surfaces.filtering import thin as thin
-from jaxbundle.surfaces.ground import RpcView as RpcView
-from jaxbundle.surfaces.ground import ScannerView as ScannerView
+from jaxbundle.surfaces.cloud_filters import drop_isolated as drop_isolated
+from jaxbundle.surfaces.cloud_filters import drop_weak as drop_weak
+from jaxbundle.surfaces.cloud_filters import thin as thin
+from jaxbundle.surfaces.scanner_views import RpcView as RpcView
+from jaxbundle.surfaces.scanner_views import ScannerView as ScannerView
 from jaxbundle.surfaces.inputs import read_views as read_views
 from jaxbundle.surfaces.reconstruct import SurfaceResult as SurfaceResult
 from jaxbundle.surfaces.reconstruct import SurfaceSettings as SurfaceSettings

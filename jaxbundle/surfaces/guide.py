@@ -16,8 +16,8 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from jaxbundle.surfaces.correlation import Pyramid, combine, correlate, find_peaks
+from jaxbundle.surfaces.cost_aggregation import aggregate
 from jaxbundle.surfaces.segments import Segments, Windows, segments, visible_range, windows
-from jaxbundle.surfaces.semiglobal import aggregate
 from jaxbundle.surfaces.views import OrientedImage, Places
 
 ImagePyramids = tuple[Pyramid, Sequence[Pyramid]]

@@ -14,7 +14,6 @@ from jaxbundle.surfaces.correlation import Pyramid, make_pyramid
 from jaxbundle.surfaces.dense import DenseSettings
 from jaxbundle.surfaces.dense_cloud import dense_cloud
 from jaxbundle.surfaces.dense_ground import dense_ground_cloud
-from jaxbundle.surfaces.ground import RpcView
 from jaxbundle.surfaces.guide import (
     Guide,
     GuideSettings,
@@ -26,6 +25,7 @@ from jaxbundle.surfaces.interest import interest_points, sample_percentiles, to_
 from jaxbundle.surfaces.matching import MatchingSettings, match_points
 from jaxbundle.surfaces.orientation import is_uncertain
 from jaxbundle.surfaces.pairs import choose_partners
+from jaxbundle.surfaces.scanner_views import RpcView
 from jaxbundle.surfaces.segments import segments, visible_range
 from jaxbundle.surfaces.views import FrameView, OrientedImage, Places
 from jaxbundle.types import Progress

@@ -16,9 +16,9 @@ from jaxtyping import Float
 from jaxbundle.measure.least_squares_matching import MatchingStatus
 from jaxbundle.surfaces.bounds import Bounds
 from jaxbundle.surfaces.correlation import Pyramid, make_pyramid
-from jaxbundle.surfaces.ground import GroundView
 from jaxbundle.surfaces.guide import GuideSettings, ImagePyramids, search
 from jaxbundle.surfaces.interest import interest_points
+from jaxbundle.surfaces.scanner_views import GroundView
 from jaxbundle.surfaces.segments import positions, visible_range, windows
 from jaxbundle.surfaces.subpixel_matching import refine
 from jaxbundle.surfaces.views import Places

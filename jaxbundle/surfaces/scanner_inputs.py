@@ -31,7 +31,7 @@ from jaxbundle.pushbroom.image_to_ground import locate_point
 from jaxbundle.pushbroom.rpc import Rpc
 from jaxbundle.pushbroom.surfaces import Ground
 from jaxbundle.surfaces.cloud import Cloud
-from jaxbundle.surfaces.ground import (
+from jaxbundle.surfaces.scanner_views import (
     GroundView,
     Neighbourhood,
     RpcView,

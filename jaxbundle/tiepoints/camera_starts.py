@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.network.tables import Camera
-from jaxbundle.orientation import many
+from jaxbundle.orientation import batched
 from jaxbundle.tiepoints.closure import (
     ClosureSettings,
     Interior,
@@ -23,8 +23,8 @@ from jaxbundle.tiepoints.closure import (
 from jaxbundle.tiepoints.coplanarity import CoplanaritySettings, estimate_interior
 from jaxbundle.tiepoints.features import Features
 from jaxbundle.tiepoints.matching import FeatureMatches
-from jaxbundle.tiepoints.search import ideal_features, present_size, verify
 from jaxbundle.tiepoints.verification import SLOTS, Pair, VerificationSettings
+from jaxbundle.tiepoints.verified_pairs import ideal_features, present_size, verify
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,7 +140,7 @@ def _close(
         pairs = verify(with_interior(x), camera_of, features, matches, quiet, verification)
         # only the matches that refine a rotation in every evaluation of the search
         pairs = [
-            dataclasses.replace(pair, matches=pair.matches[many.spread(len(pair), SLOTS)])
+            dataclasses.replace(pair, matches=pair.matches[batched.spread(len(pair), SLOTS)])
             for pair in pairs
             if pair.kind != "rotation"
         ]

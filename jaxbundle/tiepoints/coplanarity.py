@@ -22,10 +22,10 @@ from jaxtyping import Array, Float, Int
 from jaxbundle.cameras import CameraModel, get_model, image_ray
 from jaxbundle.leastsquares.iterations.small import minimise
 from jaxbundle.network.tables import Camera
-from jaxbundle.orientation import many
+from jaxbundle.orientation import batched
+from jaxbundle.orientation.rays import ideal_points
 from jaxbundle.orientation.relative import retract, sampson_distance
-from jaxbundle.orientation.sights import ideal_points
-from jaxbundle.system.compilation import quick_jit
+from jaxbundle.system.programs import quick_jit
 from jaxbundle.types import AnyArray
 
 PAIRS, SLOTS = 8, 64
@@ -105,7 +105,7 @@ def estimate_interior(
     size = max(camera.image_size)
     limit = settings.misclosure * size / 3000
     clear = [
-        many.spread(max(int(settings.distinct_share * len(a)), least), SLOTS) for a, _ in pairs
+        batched.spread(max(int(settings.distinct_share * len(a)), least), SLOTS) for a, _ in pairs
     ]
     xy1, xy2 = ([pair[i][r] for pair, r in zip(pairs, clear)] for i in (0, 1))
     tried = [camera.parameters["fx"]] if known else [size * factor for factor in settings.factors]
@@ -137,7 +137,7 @@ def estimate_interior(
 def prepare() -> None:
     """Compile the programs of `estimate_interior` ahead of its data."""
     xy = np.random.default_rng(0).uniform(-0.5, 0.5, (PAIRS, SLOTS, 2))
-    many.orient_pairs(list(xy), list(xy), np.full(PAIRS, 1e-3))
+    batched.orient_pairs(list(xy), list(xy), np.full(PAIRS, 1e-3))
     camera = Camera("camera", "opencv", {"fx": 1.0, "fy": 1.0})
     M, b = np.tile(np.eye(3), (PAIRS, 1, 1)), np.tile([1.0, 0, 0], (PAIRS, 1))
     _adjust(camera, list(zip(xy, xy)), M, b, 1.0)
@@ -157,9 +157,9 @@ def _orient(
     sums, and angles of intersection."""
     f = np.repeat([camera.parameters["fx"] for camera in cameras], len(xy1))
     one, two = ([ideal_points(c, xy) for c in cameras for xy in side] for side in (xy1, xy2))
-    M, b, part, angle = many.orient_pairs(one, two, limit / f)
+    M, b, part, angle = batched.orient_pairs(one, two, limit / f)
     filled = (np.stack([_fill(a) for a in side]) for side in (one, two))
-    e = np.asarray(many.run_in_lanes(_sampson, many.LANES, M, b, *filled)[0])
+    e = np.asarray(batched.run_in_lanes(_sampson, batched.LANES, M, b, *filled)[0])
     # in pixels, so that the distances do not shrink with the scale of a larger c
     e = np.nan_to_num(f[:, None] * e, nan=1e3)
     # Cauchy's ρ = ln(1 + (e/limit)²); a pair that cannot be oriented counts as with 10 limits

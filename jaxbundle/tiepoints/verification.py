@@ -28,13 +28,13 @@ from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.leastsquares.iterations.small import minimise
 from jaxbundle.orientation import (
     apply_homography,
+    batched,
     homography,
-    many,
     ray_of,
 )
 from jaxbundle.orientation.absolute import rotation_between
 from jaxbundle.orientation.relative import retract, sampson_distance
-from jaxbundle.system.compilation import quick_jit
+from jaxbundle.system.programs import quick_jit
 
 SLOTS, LANES = 192, 8
 """Padded numbers of matches of a pair, and of pairs in one run of a compiled program. 192 matches
@@ -182,14 +182,14 @@ def _find_agreeing(
     matches may be wrong."""
     rows = {k: r for k, r in rows.items() if len(r) >= settings.min_matches}
     # the most distinct ones, but all of a few
-    clear = lambda n: many.spread(max(int(settings.distinct_share * n), min(n, many.SLOTS)))
+    clear = lambda n: batched.spread(max(int(settings.distinct_share * n), min(n, batched.SLOTS)))
     first = _orient_by_rows(rows, clear, xy1, xy2, tolerance, settings)
     again = {
         k: r
         for k, r in rows.items()
-        if k not in first and settings.distinct_share * len(r) > many.SLOTS
+        if k not in first and settings.distinct_share * len(r) > batched.SLOTS
     }
-    most_distinct = lambda _: np.arange(many.SLOTS)
+    most_distinct = lambda _: np.arange(batched.SLOTS)
     return {**_orient_by_rows(again, most_distinct, xy1, xy2, tolerance, settings), **first}
 
 
@@ -207,7 +207,7 @@ def _orient_by_rows(
         return {}
     keys = np.array(list(rows))
     few = [rows[k][clear(len(rows[k]))] for k in rows]
-    M, b, part, _ = many.orient_pairs(
+    M, b, part, _ = batched.orient_pairs(
         [xy1[k][r] for k, r in zip(rows, few)],
         [xy2[k][r] for k, r in zip(rows, few)],
         settings.first_tolerance * tolerance[keys],
@@ -235,8 +235,8 @@ def prepare() -> None:
     xy = np.random.default_rng(0).uniform(-0.5, 0.5, (LANES, SLOTS, 2))
     M, b = np.tile(np.eye(3), (LANES, 1, 1)), np.tile([1.0, 0, 0], (LANES, 1))
     weights = np.ones((LANES, SLOTS))
-    many.run_in_lanes(_refine, LANES, M, b, xy, xy, weights)
-    many.run_in_lanes(_simpler, LANES, M, xy, xy, weights)
+    batched.run_in_lanes(_refine, LANES, M, b, xy, xy, weights)
+    batched.run_in_lanes(_simpler, LANES, M, xy, xy, weights)
 
 
 def _find_rotation(
@@ -312,13 +312,13 @@ def _improve(
         good = chosen[_agree(M, b, xy1[k][chosen], xy2[k][chosen], tolerance[k])]
         if len(good) >= least:
             keys.append(k)
-            rows.append(good[many.spread(len(good), SLOTS)])
+            rows.append(good[batched.spread(len(good), SLOTS)])
     if not keys:
         return {}
     filled = lambda xy: np.stack([_fill(xy[k][r]) for k, r in zip(keys, rows)])
     weights = _used_slots(rows)
     start = [np.stack([poses[k][i] for k in keys]) for i in (0, 1)]
-    M, b = many.run_in_lanes(_refine, LANES, *start, filled(xy1), filled(xy2), weights)
+    M, b = batched.run_in_lanes(_refine, LANES, *start, filled(xy1), filled(xy2), weights)
     return {k: (M[i], b[i]) for i, k in enumerate(keys) if np.isfinite(M[i]).all()}
 
 
@@ -327,14 +327,14 @@ def turn_pairs(
     ideal: Sequence[tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]],
 ) -> Float[np.ndarray, "pairs 3 3"]:
     """M of pairs, refined with their matches at these coordinates, c = 1."""
-    rows = [many.spread(len(pair), SLOTS) for pair in pairs]
+    rows = [batched.spread(len(pair), SLOTS) for pair in pairs]
     weights = _used_slots(rows)
     xy1, xy2 = (np.stack([_fill(xy[i][r]) for xy, r in zip(ideal, rows)]) for i in (0, 1))
     # with a strong K1 rays of the border have no image: without weight
     weights *= np.isfinite(xy1 + xy2).all(-1)
     xy1, xy2 = np.nan_to_num(xy1), np.nan_to_num(xy2)
     start = [np.stack([getattr(pair, name) for pair in pairs]) for name in ("M", "b")]
-    return many.run_in_lanes(_refine, LANES, *start, xy1, xy2, weights)[0]
+    return batched.run_in_lanes(_refine, LANES, *start, xy1, xy2, weights)[0]
 
 
 def rotation_angle(M: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n"]:
@@ -386,13 +386,13 @@ def _classify(
     explained_share: float,
 ) -> list[tuple[Bool[np.ndarray, " _"], float, str]]:
     """Matches, angle and kind of every pair."""
-    rows = [np.flatnonzero(good)[many.spread(int(good.sum()), SLOTS)] for good, *_ in agreed]
+    rows = [np.flatnonzero(good)[batched.spread(int(good.sum()), SLOTS)] for good, *_ in agreed]
     if not agreed:
         return []
     filled = lambda xy: np.stack([_fill(a[r]) for a, r in zip(xy, rows)])
     weights = _used_slots(rows)
     M = np.stack([M for _, M, _ in agreed])
-    angle, turn, plane = many.run_in_lanes(_simpler, LANES, M, filled(xy1), filled(xy2), weights)
+    angle, turn, plane = batched.run_in_lanes(_simpler, LANES, M, filled(xy1), filled(xy2), weights)
     kinds = []
     for k, (good, *_) in enumerate(agreed):
         number, near = int((weights[k] > 0).sum()), 2 * tolerance[k]  # as in `_find_rotation`

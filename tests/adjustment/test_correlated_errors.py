@@ -12,7 +12,7 @@ from jaxbundle.adjustment.problem import make_problem
 from jaxbundle.adjustment.quality.correlated_errors import splines, wendland
 from jaxbundle.adjustment.quality.replication import compared_parameters
 from jaxbundle.leastsquares.quality import error_components
-from jaxbundle.network.sightings import keep_images
+from jaxbundle.network.undetermined import keep_images
 from jaxbundle.planning import grid_of_targets, ring_of_stations
 from jaxbundle.report.page import compose
 

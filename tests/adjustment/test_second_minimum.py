@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxbundle
-from jaxbundle.adjustment.quality.second_minimum import (
+from jaxbundle.adjustment.quality.two_minima import (
     MIRRORED,
     OTHER_PLANE,
     REVERSED,

@@ -14,7 +14,7 @@ from jaxbundle.network import Camera, Network
 from jaxbundle.network.build import make_network
 from jaxbundle.network.check import check_network, split_check_points
 from jaxbundle.network.rules import check_camera
-from jaxbundle.network.sightings import label_connected_parts
+from jaxbundle.network.undetermined import label_connected_parts
 from jaxbundle.planning.simulate import simulate
 from jaxbundle.planning.stations import aerial_block, cloud_of_targets
 

@@ -12,14 +12,14 @@ from jaxbundle import cli
 from jaxbundle.adjustment.quality.expected_precision import expected_precision
 from jaxbundle.errors import InputError
 from jaxbundle.network import Camera
-from jaxbundle.planning.planned_block import planned_network
-from jaxbundle.planning.vertical_photographs import (
+from jaxbundle.planning.block_design import (
     design_block,
     relief_displacement,
     scale,
     sigma_height,
     sigma_plan,
 )
+from jaxbundle.planning.block_network import planned_network
 
 C, H, SIGMA = 0.153, 1530.0, 5e-6
 DESIGN = dict(c=153.0, image_format=(230.0, 230.0), area=(3000.0, 3500.0), sigma_image=0.005)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from jaxbundle.photographs import at_once, reading
+from jaxbundle.photographs import concurrent, reading
 from jaxbundle.system import memory
 from jaxbundle.system.threads import map_in_threads
 
@@ -80,7 +80,7 @@ def test_other_errors_of_opencv_are_bad_input():
 def test_as_many_photographs_as_fit(monkeypatch, free, expected):
     # 1e8 pixels of 2.5 bytes, an arena of 64 MB, and 0.9 GB of work: 1.214 GB each
     monkeypatch.setattr(at_once, "free_memory", lambda: free)
-    assert at_once.photographs_at_once(1e8, 0.9e9, 8) == expected
+    assert concurrent.photographs_at_once(1e8, 0.9e9, 8) == expected
 
 
 def test_what_finds_no_memory_beside_others_is_tried_again_alone():

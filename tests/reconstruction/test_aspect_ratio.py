@@ -7,7 +7,7 @@ import pytest
 
 import jaxbundle
 from jaxbundle.network.build import make_further
-from jaxbundle.reconstruction.aspect_ratio import (
+from jaxbundle.reconstruction.square_pixels import (
     Ratio,
     contradicted_ratios,
     is_replicated,

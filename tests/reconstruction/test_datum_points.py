@@ -8,7 +8,7 @@ import numpy as np
 
 import jaxbundle
 from jaxbundle import Camera, grid_of_targets, ring_of_stations, simulate
-from jaxbundle.network.sightings import keep_points
+from jaxbundle.network.undetermined import keep_points
 from jaxbundle.reconstruction.datum import choose_datum_points
 
 

@@ -11,9 +11,9 @@ from jaxbundle.planning.rendering import Sensor, render
 from jaxbundle.tiepoints.features import Detection, find_features
 from jaxbundle.tiepoints.matching import FeatureMatchingSettings
 from jaxbundle.tiepoints.pairs import CandidateSettings
-from jaxbundle.tiepoints.search import match, verify
 from jaxbundle.tiepoints.store import Store
 from jaxbundle.tiepoints.verification import VerificationSettings, rotation_angle
+from jaxbundle.tiepoints.verified_pairs import match, verify
 
 
 def faint(grey, seed, blur=1.6, contrast=0.2, noise=1.0):

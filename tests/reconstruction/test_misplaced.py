@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import jaxbundle
-from jaxbundle.network.sightings import keep_images
-from jaxbundle.orientation import many
+from jaxbundle.network.undetermined import keep_images
+from jaxbundle.orientation import batched
 from jaxbundle.reconstruction.misplaced import find_misplaced
 from jaxbundle.tiepoints.verification import Pair
 
@@ -23,7 +23,7 @@ def network():
 
 @pytest.fixture(scope="module")
 def pairs(network):
-    X0, M = network.images.position, np.asarray(many.matrices(network.images.angles))
+    X0, M = network.images.position, np.asarray(batched.matrices(network.images.angles))
     none = np.zeros((9, 2), int)
 
     def pair(i, j):

@@ -8,10 +8,10 @@ import pytest
 import jaxbundle
 from jaxbundle.network.tables import Camera
 from jaxbundle.photographs.exif import Exif, StatedDistance
-from jaxbundle.reconstruction.aspect_ratio import release
 from jaxbundle.reconstruction.named import no_named_points
 from jaxbundle.reconstruction.network import FurtherData, observed_parameters, tie_network
 from jaxbundle.reconstruction.photographs import Cameras, Photograph
+from jaxbundle.reconstruction.square_pixels import release
 from jaxbundle.reconstruction.starting import _with_distances
 from jaxbundle.tiepoints import camera_starts
 from jaxbundle.tiepoints.coplanarity import CoplanarityResult

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from jaxbundle.reconstruction import aspect_ratio, reconstruct
+from jaxbundle.reconstruction import reconstruct, square_pixels
 from jaxbundle.reconstruction.reconstruct import ReconstructionSettings, _ReconstructionRun
 from jaxbundle.tiepoints.matching import FeatureMatches
 
@@ -40,7 +40,7 @@ def test_pixels_are_released_only_if_both_halves_of_the_photographs_agree(
     run, monkeypatch, confirmed
 ):
     """Otherwise the adjustment with square pixels is the result."""
-    ratio = aspect_ratio.Ratio(0.02, 0.001)
+    ratio = square_pixels.Ratio(0.02, 0.001)
     monkeypatch.setattr(aspect_ratio, "contradicted_ratios", lambda _: {"cam": ratio})
     monkeypatch.setattr(aspect_ratio, "replicated_ratios", lambda _: {"cam": (ratio, ratio)})
     monkeypatch.setattr(aspect_ratio, "is_replicated", lambda *_: confirmed)

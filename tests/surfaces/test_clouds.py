@@ -14,10 +14,10 @@ from jaxbundle.errors import InputError
 from jaxbundle.planning.texture import Texture
 from jaxbundle.surfaces.accuracy import accuracy_of, at_check_points, to_plane
 from jaxbundle.surfaces.cloud import Cloud, merge
+from jaxbundle.surfaces.cloud_filters import drop_isolated, drop_weak, thin
 from jaxbundle.surfaces.compare import compare
 from jaxbundle.surfaces.dsm import NO_DATA, Dsm, make_dsm, write_dsm
 from jaxbundle.surfaces.files import text_of
-from jaxbundle.surfaces.filtering import drop_isolated, drop_weak, thin
 from jaxbundle.surfaces.orthophoto import orthophoto
 from jaxbundle.surfaces.point_files import read_cloud, write_cloud
 

@@ -14,8 +14,8 @@ from jaxbundle.planning.shapes import HeightField
 from jaxbundle.planning.texture import Texture
 from jaxbundle.pushbroom import Trajectory, attitude_table, make_image, position_table
 from jaxbundle.pushbroom.scanner import FocalLine, LineTimes
-from jaxbundle.surfaces.ground import ScannerView
 from jaxbundle.surfaces.point_files import read_cloud
+from jaxbundle.surfaces.scanner_views import ScannerView
 from jaxbundle.surfaces.views import line_of_sight
 
 LINES, PIXELS = 120, 100

@@ -22,7 +22,6 @@ from jaxbundle.tiepoints.features import Detection, Features, find_features
 from jaxbundle.tiepoints.loops import split_contradicted
 from jaxbundle.tiepoints.matching import FeatureMatches, distances_within, match_features
 from jaxbundle.tiepoints.pairs import candidate_pairs
-from jaxbundle.tiepoints.search import _with_ideal
 from jaxbundle.tiepoints.still import MarkSettings, without_marks
 from jaxbundle.tiepoints.store import Store
 from jaxbundle.tiepoints.track_measurement import TrackMatchingSettings
@@ -33,6 +32,7 @@ from jaxbundle.tiepoints.verification import (
     rotation_angle,
     verify_pairs,
 )
+from jaxbundle.tiepoints.verified_pairs import _with_ideal
 
 SIZE, F, K1 = (1200, 900), 1000.0, -0.1
 

@@ -1,7 +1,7 @@
 """Check points: intersected with the adjusted orientations, compared with their given coordinates.
 
 They are excluded from the adjustment. Their σ includes that of the rays and the uncertainty of
-orientations and cameras (`leastsquares/checks.py`).
+orientations and cameras (`leastsquares/excluded_rows.py`).
 """
 
 import dataclasses
@@ -14,7 +14,7 @@ from jaxbundle.adjustment.problem import shifted_problem
 from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.adjustment.quality.variance_components import groups
 from jaxbundle.display import print_in_one_screen
-from jaxbundle.leastsquares.checks import determine
+from jaxbundle.leastsquares.excluded_rows import determine
 from jaxbundle.leastsquares.quality.components import rescale
 from jaxbundle.network.tables import Distances, Observations, Points
 

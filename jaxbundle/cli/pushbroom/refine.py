@@ -43,7 +43,7 @@ def refine(
     from jaxbundle.refinement import adjusted_photographs, point_rows, report, to_json
     from jaxbundle.report.page import UNKNOWN, head_line
     from jaxbundle.report.page.refinement import compose_refinement
-    from jaxbundle.report.refinement import conclude_refinement
+    from jaxbundle.report.refinement_verdict import conclude_refinement
 
     file = read_refinement(input)
     names = [REPORT, PAGE, RESULT, "points.csv", *(f"{PHOTOGRAPHS}/{name}" for name in FILES)]

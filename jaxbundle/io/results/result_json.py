@@ -20,7 +20,7 @@ from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.types import present
 
 if TYPE_CHECKING:
-    from jaxbundle.adjustment.quality.second_minimum import SecondMinimum
+    from jaxbundle.adjustment.quality.two_minima import SecondMinimum
     from jaxbundle.adjustment.result import Adjustment
     from jaxbundle.network.tables import Camera
     from jaxbundle.report.verdict import Verdict

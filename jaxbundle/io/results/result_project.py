@@ -10,8 +10,8 @@ from jaxbundle.cameras import get_model
 from jaxbundle.network.camera_tables import with_start
 from jaxbundle.network.kinds import CameraParameters, ExteriorPriors, Further, RollingShutter
 from jaxbundle.network.kinds.base import among
-from jaxbundle.network.sightings import keep_points, without_distances
 from jaxbundle.network.tables import ESTIMATED, Camera, Images, Network, Points
+from jaxbundle.network.undetermined import keep_points, without_distances
 
 if TYPE_CHECKING:
     from jaxbundle.adjustment.problem import NetworkProblem

@@ -1,5 +1,5 @@
 """Files of rational polynomial coefficients (RPC00B): text, RPB, tags of a GeoTIFF, and those of
-products (`rpc_products`).
+products (`rpc_vendor_files`).
 
     LINE_OFF: +003000.50 pixels          text, `…_RPC.TXT`: one value a line, a unit may follow
     LINE_NUM_COEFF_1: -1.2E-03
@@ -22,7 +22,7 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.rasters.reading import open_raster, rasterio
-from jaxbundle.io.scanner.rpc_products import from_geom, from_xml
+from jaxbundle.io.scanner.rpc_vendor_files import from_geom, from_xml
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.xml_fields import number_in
 from jaxbundle.io.writing.replacing import disk_of, replace_file

@@ -16,7 +16,7 @@ from jaxbundle.report.page.origin import UNKNOWN, Origin
 from jaxbundle.report.page.overview import give_verdict
 from jaxbundle.report.page.sections import photographs, show_correlations, show_residuals
 from jaxbundle.report.page.tables import Columns
-from jaxbundle.report.refinement import conclude_refinement
+from jaxbundle.report.refinement_verdict import conclude_refinement
 from jaxbundle.types import present
 
 KIND = "refinement of scanner images"

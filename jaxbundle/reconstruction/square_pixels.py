@@ -19,8 +19,8 @@ from jaxbundle.adjustment.adjust import adjust
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.kinds import Ties
-from jaxbundle.network.sightings import keep_images, keep_points
 from jaxbundle.network.tables import Images, Network, Points
+from jaxbundle.network.undetermined import keep_images, keep_points
 from jaxbundle.reconstruction.network import ASPECT, observed_parameters, with_observed
 
 CRITICAL_DEVIATION = NormalDist().inv_cdf(1 - 0.001 / 2)

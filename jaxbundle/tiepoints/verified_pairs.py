@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 
 from jaxbundle.network.tables import Camera
 from jaxbundle.network.units import from_image_unit
-from jaxbundle.orientation.sights import ideal_points
+from jaxbundle.orientation.rays import ideal_points
 from jaxbundle.photographs.reading import image_errors
 from jaxbundle.system.threads import map_in_threads
 from jaxbundle.tiepoints import coplanarity, verification

@@ -6,9 +6,9 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.network.tables import Camera, Network
+from jaxbundle.planning.block_design import BlockDesign
 from jaxbundle.planning.simulate import simulate
 from jaxbundle.planning.stations import aerial_block
-from jaxbundle.planning.vertical_photographs import BlockDesign
 
 
 def planned_network(

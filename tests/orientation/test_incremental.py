@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxbundle
-from jaxbundle.orientation import growth
+from jaxbundle.orientation import incremental
 from jaxbundle.orientation.one_place import name_one_place
 from jaxbundle.orientation.settings import DEFAULTS
 from jaxbundle.planning.stations import Stations
@@ -32,7 +32,7 @@ def test_a_growing_model_is_adjusted_whenever_it_has_grown_by_a_factor(monkeypat
     sizes = []
     settings = dataclasses.replace(DEFAULTS, first_improvement=5)
     improve = lambda strip, model: sizes.append(int(model.placed.sum()))
-    growth.grow(strip, model, improve=improve, settings=settings)
+    incremental.grow(strip, model, improve=improve, settings=settings)
     assert model.placed.all() and sizes == [5, 13, 33]
 
 

@@ -31,8 +31,7 @@ from jaxbundle.orientation.pose import CameraPose
 from jaxbundle.orientation.resection import refine_resection
 from jaxbundle.orientation.robust import robust_relative_orientation, robust_resection
 from jaxbundle.orientation.status import Status
-from jaxbundle.system.compilation import quick_jit
-from jaxbundle.system.programs import compile_once
+from jaxbundle.system.programs import compile_once, quick_jit
 from jaxbundle.types import AnyArray
 
 SLOTS = 64

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxbundle.surfaces.semiglobal import aggregate
+from jaxbundle.surfaces.cost_aggregation import aggregate
 
 SMALL, LARGE = 0.3, 0.8
 

@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbundle.network.tables import Points
-from jaxbundle.orientation import many
+from jaxbundle.orientation import batched
+from jaxbundle.orientation.rays import Sights, in_plane
 from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
-from jaxbundle.orientation.sights import Sights, in_plane
 from jaxbundle.orientation.status import Status
 from jaxbundle.types import Index
 
@@ -191,10 +191,10 @@ def _place_images(
     images, rows, R, xy = _in_planes(sights, model, images, settings)
     if not len(images):
         return 0
-    X0, M, part = many.resect(
+    X0, M, part = batched.resect(
         xy, [model.X[sights.point[r]] for r in rows], sights.tolerance[images]
     )
-    number = np.minimum([len(r) for r in rows], many.SLOTS)
+    number = np.minimum([len(r) for r in rows], batched.SLOTS)
     good = (part >= settings.agreeing_share) & (part * number >= settings.min_points)
     for i, image in enumerate(images):
         if good[i]:
@@ -233,11 +233,13 @@ def _refine(sights: Sights, model: Model, settings: StartValueSettings) -> None:
     weights = [(error[r] < sights.tolerance[i]).astype(float) for r, i in zip(rows, images)]
     # Of the rows that `many` uses: an image whose good points are not among these would be refined
     # by none.
-    use = [k for k, w in enumerate(weights) if w[many.spread(len(w))].sum() >= settings.min_points]
+    use = [
+        k for k, w in enumerate(weights) if w[batched.spread(len(w))].sum() >= settings.min_points
+    ]
     if not use:
         return
     images, rows, R = images[use], [rows[k] for k in use], R[use]
-    model.X0[images], M = many.refine(
+    model.X0[images], M = batched.refine(
         (model.X0[images], R @ model.M[images]),
         [xy[k] for k in use],
         [model.X[sights.point[r]] for r in rows],
@@ -270,10 +272,10 @@ def intersect(sights: Sights, model: Model, demands: Demands, again: bool = Fals
     wanted = np.flatnonzero((number >= 2) & ~model.control & (again | ~model.known))
     if not len(wanted):
         return
-    place = np.minimum(np.arange(many.RAYS), number[wanted, None] - 1)
-    scale = np.maximum((number[wanted, None] - 1) / (many.RAYS - 1), 1.0)
+    place = np.minimum(np.arange(batched.RAYS), number[wanted, None] - 1)
+    scale = np.maximum((number[wanted, None] - 1) / (batched.RAYS - 1), 1.0)
     row = rows[first[wanted, None] + (place * scale).astype(int)]
-    weights = (np.arange(many.RAYS) < number[wanted, None]).astype(float)
+    weights = (np.arange(batched.RAYS) < number[wanted, None]).astype(float)
     X0 = model.X0[sights.image[row]]
     rays = np.einsum("nkij,nki->nkj", model.M[sights.image[row]], sights.ray[row])
     tolerance = demands.miss * sights.tolerance[sights.image[row]]
@@ -281,7 +283,7 @@ def intersect(sights: Sights, model: Model, demands: Demands, again: bool = Fals
     X, good = np.full((len(wanted), 3), np.nan), np.zeros(len(wanted), bool)
     todo = np.arange(len(wanted))
     while len(todo):
-        found, angle, status = many.intersect(X0[todo], rays[todo], weights[todo])
+        found, angle, status = batched.intersect(X0[todo], rays[todo], weights[todo])
         off = _across(found[:, None] - X0[todo], rays[todo]) / tolerance[todo] * weights[todo]
         sound = status == int(Status.SOUND)
         agree = sound & (off.max(1) < 1)

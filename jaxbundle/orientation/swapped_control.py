@@ -14,11 +14,11 @@ from jaxtyping import Bool, Float
 
 from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Network
-from jaxbundle.orientation import many
+from jaxbundle.orientation import batched
 from jaxbundle.orientation.control_consistency import MIN_AGREEING
-from jaxbundle.orientation.growth import START_VALUE_DEMANDS, Model, are_controlled, intersect
+from jaxbundle.orientation.incremental import START_VALUE_DEMANDS, Model, are_controlled, intersect
+from jaxbundle.orientation.rays import Sights, sights
 from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
-from jaxbundle.orientation.sights import Sights, sights
 
 CONTRADICTORY_CONTROL = "control points contradict each other"
 MAX_POINTS_FOR_TRIALS = 12
@@ -46,7 +46,7 @@ def name_contradiction(
         images = network.images
         there = np.all(np.isfinite(np.concatenate([images.position, images.angles], 1)), axis=1)
         if there.any():
-            alone.place(there, images.position[there], many.matrices(images.angles[there]))
+            alone.place(there, images.position[there], batched.matrices(images.angles[there]))
     intersect(seen, alone, START_VALUE_DEMANDS)
     control = np.flatnonzero(are_controlled(points) & alone.known)
     found = contradiction(
@@ -129,7 +129,7 @@ def _by_majority(
 ) -> Contradiction | None:
     """Two of the points outside the largest consistent group are exchanged if both fit when
     swapped; the others are wrong."""
-    found = many.similarity(source, target, good.astype(float))
+    found = batched.similarity(source, target, good.astype(float))
     if found is None:
         return None
     A, t = found
@@ -202,7 +202,7 @@ def _misfits(
     use: Bool[np.ndarray, " n"],
 ) -> Float[np.ndarray, " n"] | None:
     """Distances of points after the similarity of some of them; None: these are on a line."""
-    found = many.similarity(source, target, use.astype(float))
+    found = batched.similarity(source, target, use.astype(float))
     if found is None:
         return None
     A, t = found

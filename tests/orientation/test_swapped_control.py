@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxbundle.orientation.alignment import similarity, similarity_of_most
-from jaxbundle.orientation.exchanges import contradiction
+from jaxbundle.orientation.swapped_control import contradiction
 
 RNG = np.random.default_rng(5)
 POINTS = RNG.uniform(-1, 1, (20, 3)) * [3, 2, 1]
