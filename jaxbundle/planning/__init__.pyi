@@ -1,5 +1,11 @@
 # Written by `make stubs` from the names in __init__.py.
 # ruff: noqa: I001
+from jaxbundle.planning.block_design import BlockDesign as BlockDesign
+from jaxbundle.planning.block_design import design_block as design_block
+from jaxbundle.planning.block_design import relief_displacement as relief_displacement
+from jaxbundle.planning.block_design import scale as scale
+from jaxbundle.planning.block_design import sigma_height as sigma_height
+from jaxbundle.planning.block_design import sigma_plan as sigma_plan
 from jaxbundle.planning.block_network import planned_network as planned_network
 from jaxbundle.planning.rendering import Rendered as Rendered
 from jaxbundle.planning.rendering import Scene as Scene
@@ -15,12 +21,6 @@ from jaxbundle.planning.stations import grid_of_targets as grid_of_targets
 from jaxbundle.planning.stations import ring_of_stations as ring_of_stations
 from jaxbundle.planning.stations import stations_looking_at as stations_looking_at
 from jaxbundle.planning.texture import Texture as Texture
-from jaxbundle.planning.block_design import BlockDesign as BlockDesign
-from jaxbundle.planning.block_design import design_block as design_block
-from jaxbundle.planning.block_design import relief_displacement as relief_displacement
-from jaxbundle.planning.block_design import scale as scale
-from jaxbundle.planning.block_design import sigma_height as sigma_height
-from jaxbundle.planning.block_design import sigma_plan as sigma_plan
 
 __all__ = [
     "BlockDesign",

@@ -79,7 +79,7 @@ def test_other_errors_of_opencv_are_bad_input():
 @pytest.mark.parametrize("free, expected", [(np.inf, 8), (4e9, 3), (2e9, 1), (0.0, 1)])
 def test_as_many_photographs_as_fit(monkeypatch, free, expected):
     # 1e8 pixels of 2.5 bytes, an arena of 64 MB, and 0.9 GB of work: 1.214 GB each
-    monkeypatch.setattr(at_once, "free_memory", lambda: free)
+    monkeypatch.setattr(concurrent, "free_memory", lambda: free)
     assert concurrent.photographs_at_once(1e8, 0.9e9, 8) == expected
 
 
