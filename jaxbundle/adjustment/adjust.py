@@ -159,8 +159,8 @@ def adjust(  # noqa: PLR0913 - the options of an adjustment
       objects and of small perspective effect may have; take a better one, and report those that
       cannot be separated from the result (`Adjustment.second_minima`; docs/statistics.md).
     - `progress(stage, done, total)`: called for every evaluation, with vᵀPv and the damping in
-      the stage; up to 200 000 observations at the end of the iterations (`jaxbundle.show_progress`
-      shows bars).
+      the stage; of up to 200 000 observations only when the iterations have ended
+      (`jaxbundle.show_progress` shows bars).
 
     **Returns:** an `Adjustment`; check `converged` first.
 
@@ -184,13 +184,14 @@ def adjust(  # noqa: PLR0913 - the options of an adjustment
     given = without_placeholders(
         as_network(network, format=format, overrides=overrides, control=control, check=check)
     )
+    # One step more: the first evaluation is of the start values.
     options: dict[str, Any] = {"search": SEARCHES[method], "max_steps": max_iterations + 1}
     try_again = partial(_try_mirrored, reduction, options)
     mirror = lambda sigma0: name_mirrored(given, sigma0, try_again, largest_sigma0(given))
     oriented = None
     if lacks_start_values(given):
         try:
-            oriented = _place(orient(given))
+            oriented = _require_most_oriented(orient(given))
         except NotSolvedError as error:
             if CONTRADICTORY_CONTROL in str(error) and (mirrored := mirror(None)):
                 raise NotSolvedError(
@@ -257,9 +258,9 @@ def _try_mirrored(
     reduction: str | None, options: Mapping[str, Any], network: Network
 ) -> float | None:
     """σ0 of a network from computed start values; None without a solution."""
-    problem, minimum, _ = _FirstMinimum(reduction, (), _place(orient(network)), options).find(
-        network, outliers=False
-    )
+    problem, minimum, _ = _FirstMinimum(
+        reduction, (), _require_most_oriented(orient(network)), options
+    ).find(network, outliers=False)
     solved = inspect_solution(with_factor(problem), minimum)
     return sigma0_at_end(problem, minimum) if solved else None
 
@@ -528,8 +529,8 @@ def check_options(  # noqa: PLR0913 - the options of an adjustment
         raise InputError(f"progress must be a function, but is {show(progress)}")
 
 
-def _place(found: Oriented) -> Oriented:
-    """Found start values; refused if half or more is excluded.
+def _require_most_oriented(found: Oriented) -> Oriented:
+    """The start values unchanged; refused if they exclude half of the images or points or more.
 
     **Raises:** `NotSolvedError`."""
     network = found.network

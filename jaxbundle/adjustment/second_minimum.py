@@ -55,7 +55,7 @@ from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import UNIT
 from jaxbundle.orientation import batched
 from jaxbundle.orientation.incremental import START_VALUE_DEMANDS, Model, grow, intersect
-from jaxbundle.orientation.rays import Sights, sights
+from jaxbundle.orientation.rays import MIN_COSINE, Sights, sights
 
 Minimise = Callable[..., tuple[NetworkProblem, Minimum]]
 """`minimise(problem, start)` iterates from given values, `max_steps` at most if given; returns the
@@ -87,8 +87,8 @@ def find_second_minima(
     settings: SecondMinimumSettings = SECOND_MINIMUM,
 ) -> tuple[NetworkProblem, Minimum, tuple[SecondMinimum, ...]]:
     """The best minimum of a solved problem, the given one unless another one fits better; and the
-    second minima that cannot be told from it, or that were left for it."""
-    left, problem = [], first.problem
+    second minima that the observations cannot distinguish from it, or that it has replaced."""
+    superseded, problem = [], first.problem
     for round in range(settings.max_rounds + 1):
         state = _State(first, minimise, settings)
         found = list(state.adjust_candidates())
@@ -96,16 +96,16 @@ def find_second_minima(
         if not better or round == settings.max_rounds:
             break
         best = min(better, key=lambda one: one.inspection.vtpv)
-        left.append((best, first.vtpv))
+        superseded.append((best, first.vtpv))
         problem, first = best.problem, best.inspection
         minimum = join_legs([minimum, best.minimum])
-    taken = [state.record_left(*one) for one in left]
+    records = [state.record_superseded(*one) for one in superseded]
     said = [
-        dataclasses.replace(one, taken=is_said(one, taken))
+        dataclasses.replace(one, taken=is_said(one, records))
         for one in map(state.record, found)
         if one.ambiguous
     ]
-    said += [one for one in taken if not is_said(one, said)]
+    said += [one for one in records if not is_said(one, said)]
     if len(state.untried) and said:
         ids = [str(problem.network.images.id[k]) for k in np.sort(state.untried)]
         words = f"the second minimum of {count(len(ids), 'further image')} was not adjusted"
@@ -281,8 +281,8 @@ class _State:
     # --- adjustment -------------------------------------------------------------------------
 
     def adjust_candidates(self) -> Iterator[Found]:
-        """The candidates that lead to another minimum, each minimum once, which is better or cannot
-        be told from the present one."""
+        """The candidates that lead to another minimum, each minimum once, if it fits better or
+        cannot be distinguished from the present one."""
         seen: list[Found] = []
         for candidate in self.candidates():
             found = self._adjust(candidate)
@@ -297,7 +297,8 @@ class _State:
         few = settings.evaluations_before_rejection
         problem, minimum = self.minimise(self.problem, start, max_steps=few)
         if int(minimum.termination) == LIMIT:
-            if not _cost(minimum) - self.first.vtpv < 10 * limit:
+            # `not … <`: NaN is rejected, too.
+            if not _cost(minimum) - self.first.vtpv < settings.early_limit * limit:
                 return None
             legs = [minimum]
             while int(legs[-1].termination) == LIMIT and len(legs) <= settings.max_legs:
@@ -337,7 +338,7 @@ class _State:
         return values
 
     def _differs(self, there: NetworkScene) -> bool:
-        """Whether the pose of an image, or a point, is significantly another one than the present:
+        """Whether the pose of an image, or a point, differs significantly from the present one:
         outside of the ellipsoid of its covariance that holds all but the error probability."""
         here, first = self.scene, self.first
         turn = rotation_vectors(there.M @ here.M.transpose(0, 2, 1))
@@ -367,13 +368,14 @@ class _State:
 
     def record(self, found: Found) -> SecondMinimum:
         """The other minimum as reported for the present one."""
-        return self._record(found, self.first.vtpv, found.inspection.vtpv, False)
+        return self._record(found, self.first.vtpv, found.inspection.vtpv, taken=False)
 
-    def record_left(self, found: Found, other: float) -> SecondMinimum:
-        """A minimum that was left for the present one; `other`: its vᵀPv."""
-        return self._record(found, self.first.vtpv, other, True)
+    def record_superseded(self, found: Found, other: float) -> SecondMinimum:
+        """A minimum that the present one has replaced; `other`: its vᵀPv."""
+        return self._record(found, self.first.vtpv, other, taken=True)
 
-    def _record(self, found: Found, vtpv: float, other: float, taken: bool) -> SecondMinimum:
+    def _record(self, found: Found, vtpv: float, other: float, *, taken: bool) -> SecondMinimum:
+        """`taken`: whether the iterations ended in the other one first."""
         counts = self.problem.counts
         E = evidence(vtpv, other, counts.redundancy, self.stated, self.rounding)
         ids = self.problem.network.images.id
@@ -416,6 +418,6 @@ def _common_rays(
     one, two = (seen.rows_of(k) for k in (first, second))
     _, a, b = np.intersect1d(seen.point[one], seen.point[two], return_indices=True)
     rays = seen.ray[one][a], seen.ray[two][b]
-    front = (rays[0][:, 2] < -0.15) & (rays[1][:, 2] < -0.15)
+    front = (rays[0][:, 2] < -MIN_COSINE) & (rays[1][:, 2] < -MIN_COSINE)
     xy = tuple(ray[front, :2] / -ray[front, 2:] for ray in rays)
     return xy[0], xy[1]

@@ -236,8 +236,8 @@ def adjust(  # noqa: PLR0913 - the options of an adjustment
     - `robust`: "huber", "cauchy" or "tukey"; `snooping`: "pope" or "baarda", at the level
       `significance`.
     - `estimate_components`: scale the σ of every kind until its variance component is 1.
-    - `progress(step, cost, λ)`: called for every evaluation; up to 200 000 observations at the end
-      of the iterations.
+    - `progress(step, cost, λ)`: called for every evaluation; of up to 200 000 observations only
+      when the iterations have ended.
 
     **Returns:** a `Result`.
 

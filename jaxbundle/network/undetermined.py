@@ -1,4 +1,4 @@
-"""Visibility: what the rays of a network can determine, and what must be excluded.
+"""What the rays of a network can determine, and what must be left out.
 
 A point needs three equations: two from every ray, one from every distance and every controlled
 axis. An image needs six: two from every ray, one from every prior. Disconnected parts of the
@@ -133,6 +133,8 @@ def leave_out_undetermined(network: Network) -> Network:
         ends = distances.points[keep[distances.points].all(1)]
         tied = np.bincount(ends.ravel(), minlength=len(points))
         determined = fixed | (2 * rays + tied + known >= 3)
+        # Fixed points that no image sees add nothing, nor do images without points, whatever is
+        # known of them.
         kept = keep & np.where(check, rays >= 2, (rays + tied > 0) & determined)
         taking_part = (kept & ~check)[point]
         seen = np.bincount(image[taking_part], minlength=len(images))
@@ -154,7 +156,7 @@ def leave_out_undetermined(network: Network) -> Network:
     ):
         notes.append((thing, [points.id[row] for row in np.flatnonzero(mask)], why))
     names = [images.id[row] for row in np.flatnonzero(~used)]
-    notes.append(("image", names, "with fewer than three points that other images determine"))
+    notes.append(("image", names, "with too few points that other images or control determine"))
     left = keep_images(keep_points(network, keep), used)
     for thing, those, why in notes:
         left = leave_out(left, thing, those, why, measured=thing == "image")
@@ -176,9 +178,9 @@ def leave_out_undetermined(network: Network) -> Network:
 
 
 def _too_few_points(
-    network: Network, row: int, used: Int[np.ndarray, " images"]
+    network: Network, row: int, usable: Int[np.ndarray, " images"]
 ) -> InputError | NotSolvedError:
-    """Why an image with only `used` [images] of its points is not determined."""
+    """Why an image with only `usable` [images] of its points is not determined."""
     images, points, rays = network.images, network.points, network.observations
     rays_of_point = np.bincount(rays.point, minlength=len(points))
     place = f"{images.source(row)}: image {images.id[row]!r}: "
@@ -195,10 +197,10 @@ def _too_few_points(
             [f"{name} of image {images.id[row]}" for name in EXTERIOR]
             + [f"X, Y, Z of point {id}" for id in lone],
         )
-    part = "" if used[row] == len(seen) else f" of the {len(seen)} measured ones"
+    part = "" if usable[row] == len(seen) else f" of the {len(seen)} measured ones"
     why = "" if not part else " (the others are check points or seen in one image only)"
     return InputError(
-        f"{place}only {count(used[row], 'point')}{part} can be used{why}; an image needs at "
+        f"{place}only {count(usable[row], 'point')}{part} can be used{why}; an image needs at "
         "least 3, or prior σ of its exterior orientation"
     )
 
@@ -208,14 +210,16 @@ def check_parts(network: Network) -> None:
     images, points, rays = network.images, network.points, network.observations
     known = count_controlled_axes(points) == 3
     ties = ~(known | points.has_role("check"))[rays.point]
-    # Only tie points connect: known ones have their coordinates in each part, and a check point is
-    # none of the adjustment's.
+    # Only tie points connect: known ones have their coordinates in each part, and check points
+    # take no part in the adjustment.
     part = label_connected_parts(rays.image[ties], rays.point[ties], len(images), len(points))
     labels, part = np.unique(part, return_inverse=True)
     if len(labels) == 1:
         return
-    datum = np.unique(np.stack([part[rays.image], rays.point])[:, known[rays.point]], axis=1)
-    known_points = np.bincount(datum[0], minlength=len(labels))
+    known_in_part = np.unique(
+        np.stack([part[rays.image], rays.point])[:, known[rays.point]], axis=1
+    )
+    known_points = np.bincount(known_in_part[0], minlength=len(labels))
     priors = (~np.isnan(images.sigma)).sum(1) + equations_of(network, "IMAGES")
     priors = np.bincount(part, priors, minlength=len(labels))
     loose = np.flatnonzero((known_points < 3) & (priors < 6))

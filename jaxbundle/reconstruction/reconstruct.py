@@ -31,7 +31,7 @@ from jaxbundle.reconstruction.folding import refuse_folded, refuse_superimposed
 from jaxbundle.reconstruction.georeferencing import georeference
 from jaxbundle.reconstruction.misplaced import NamedPairs
 from jaxbundle.reconstruction.named import find_named, name_unused
-from jaxbundle.reconstruction.network import FurtherData, tie_network, track_name
+from jaxbundle.reconstruction.network import FurtherData, photograph_network, track_name
 from jaxbundle.reconstruction.oriented_block import MIN_CONTROL, FrameData
 from jaxbundle.reconstruction.parts import SMALLEST_PART, group_connected, why_alone
 from jaxbundle.reconstruction.photographs import (
@@ -397,7 +397,7 @@ class _ReconstructionRun:
         settings = self.settings
         inside = [p for p in pairs if set(p.images) <= set(group)]
         measured = self._measure(features, inside)
-        network = tie_network(
+        network = photograph_network(
             self.photographs, self.cameras, measured, self.further, name, settings.aspect_sigma
         )
         self._begin("start values")

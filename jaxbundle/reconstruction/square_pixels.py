@@ -21,7 +21,7 @@ from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.kinds import Ties
 from jaxbundle.network.tables import Images, Network, Points
 from jaxbundle.network.undetermined import keep_images, keep_points
-from jaxbundle.reconstruction.network import ASPECT, observed_parameters, with_observed
+from jaxbundle.reconstruction.camera_priors import ASPECT, observed_parameters, with_observed
 
 CRITICAL_DEVIATION = NormalDist().inv_cdf(1 - 0.001 / 2)
 """Normalised deviation, 3.29, beyond which chance (one in a thousand, either sign) does not explain

@@ -22,8 +22,8 @@ from jaxbundle.network.tables import Camera, Network
 from jaxbundle.network.undetermined import keep_images, keep_points
 from jaxbundle.orientation.network import Oriented
 from jaxbundle.orientation.rays import TOLERANCE
+from jaxbundle.reconstruction.camera_priors import observed_parameters, with_observed
 from jaxbundle.reconstruction.misplaced import MisplacedSettings, NamedPairs, find_misplaced
-from jaxbundle.reconstruction.network import observed_parameters, with_observed
 from jaxbundle.tiepoints.verified_pairs import present_size
 
 

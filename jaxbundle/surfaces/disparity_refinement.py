@@ -76,7 +76,7 @@ class DisparityRefinementSettings:
     min_contrast_ratio: float = 0.2
     """Minimum ratio of the contrasts of both windows. Half: no difference; double: 0.1 % fewer
     pixels."""
-    min_sigma: float = 0.014
+    added_sigma: float = 0.014
     """σ added by interpolation and sampling: errors that depend on the fraction of the disparity
     are alike over whole surfaces, so that no scatter shows them. Half: RMS 1.005; double: 0.82, σ
     too large."""
@@ -209,7 +209,7 @@ def _estimate_noise(
 ) -> tuple[float, RowImage]:
     """The variance factor, and σ of the disparities d."""
     factor = robust_factor(across[np.isfinite(d)])
-    noise = np.hypot(np.sqrt(factor) * sigma, settings.min_sigma)
+    noise = np.hypot(np.sqrt(factor) * sigma, settings.added_sigma)
     apart = 2 * half + 1  # windows that do not overlap
     side, quantile = settings.block_side, settings.scatter_quantile
     shape = missing_sigma(d, noise, np.ones_like(noise), apart, side, quantile)
@@ -218,7 +218,7 @@ def _estimate_noise(
     # The shifts across the rows show only the noise. Where the scatter is not known, a factor below
     # 1 could not be told from one of windows that are bent.
     factor = max(factor, 1.0)
-    return factor, np.hypot(np.sqrt(factor) * sigma, settings.min_sigma)
+    return factor, np.hypot(np.sqrt(factor) * sigma, settings.added_sigma)
 
 
 def _reflect(index: Int[np.ndarray, " k"], n: int) -> Int[np.ndarray, " k"]:

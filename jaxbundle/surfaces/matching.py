@@ -52,20 +52,20 @@ class MatchingSettings:
     """Minimum distance of a point from the edge of its image, pixels: at least the `half_window` of
     the guide and `half_fine_window`."""
     half_fine_window: int = 6
-    """Half the side of the windows of least squares matching, whose plane a bent surface leaves in
-    large ones, pixels."""
+    """Half the side of the windows of least squares matching, pixels. In large ones a curved
+    surface leaves its plane."""
     min_rays: int = 2
     """Minimum rays of a point."""
     min_angle: float = np.radians(1.0)
     """Minimum of the widest angle between the rays of a point, radians: there σ along the line of
     sight is 80 times that across it (√2/tan 1°)."""
     search_margin: float = 2.0
-    """Pixels searched beyond the range of the guide. Half: a third of the points; double: 9 more,
-    and more time."""
+    """Pixels searched beyond the range of the guide. Half: only a third of the points are found;
+    double: 9 more, in more time."""
     min_correlation: float = 0.6
     """Minimum ρ, of the search and of least squares matching. 0.3: no difference, since other tests
     reject the same points; 0.8: 12 points fewer."""
-    min_sigma: float = 0.012
+    added_sigma: float = 0.012
     """σ added to a match by interpolation and sampling, pixels. Half: 99.5 % of the errors within 3
     σ (99.6); double: RMS 1.01, since the scatter adds less."""
     max_sigma: float = 0.5
@@ -129,6 +129,7 @@ def match_points(
     inner = is_inside(base, uv, settings.edge_margin)
     lost["at the edge"] += int((~inner).sum())
     uv = uv[inner]
+    # q: the parameter along the line of sight (`views`), first its bounds, then its value.
     _, reach, normal, _ = guide.look_up(uv, settings.search_margin)
     q, rho, second = search(base, others, pyramids, uv, reach, normal, 0, guide_settings)
     with np.errstate(invalid="ignore"):
@@ -145,12 +146,11 @@ def match_points(
     uv, X = uv[enough], X[enough]
     places, used, covariance, in_base, rhos = (a[enough] for a in found)
     mean = in_base.sum(1) / np.maximum(used.sum(1), 1)[:, None, None]
-    seen = np.where(used[..., None, None], covariance, 1)
     table = _Rays(
         (base, *others),
         np.concatenate([uv[:, None], places], 1),
         # half of a match's variance is of the window in the base, half of that in the other image
-        np.concatenate([mean[:, None], seen], 1) / 2,
+        np.concatenate([mean[:, None], covariance], 1) / 2,
         np.concatenate([np.ones((len(uv), 1), bool), used], 1),
     )
     return _accept(table, X, rhos, settings, lost)
@@ -193,7 +193,7 @@ def _match_windows(
         match = refine(base, other, uv, begin, window.A, half, settings.windows)
         pair = base, other
         place, uncertain = correct_bending(pair, nodes, uv, q, match, half, settings.bending)
-        uncertain = uncertain + settings.min_sigma**2 * np.eye(2)
+        uncertain = uncertain + settings.added_sigma**2 * np.eye(2)
         good = window.usable & _is_confirmed(match, begin, settings)
         good &= _agrees(other, guides[k], X, settings.max_guide_distance)
         good &= has_texture(base.grey, uv, match.sigma0, half, settings.windows.min_texture)

@@ -23,7 +23,7 @@ from jaxbundle.tiepoints.closure import (
 from jaxbundle.tiepoints.coplanarity import CoplanaritySettings, estimate_interior
 from jaxbundle.tiepoints.features import Features
 from jaxbundle.tiepoints.matching import FeatureMatches
-from jaxbundle.tiepoints.verification import SLOTS, Pair, VerificationSettings
+from jaxbundle.tiepoints.verification import MATCH_SLOTS, Pair, VerificationSettings
 from jaxbundle.tiepoints.verified_pairs import ideal_features, present_size, verify
 
 
@@ -140,7 +140,7 @@ def _close(
         pairs = verify(with_interior(x), camera_of, features, matches, quiet, verification)
         # only the matches that refine a rotation in every evaluation of the search
         pairs = [
-            dataclasses.replace(pair, matches=pair.matches[batched.spread(len(pair), SLOTS)])
+            dataclasses.replace(pair, matches=pair.matches[batched.spread(len(pair), MATCH_SLOTS)])
             for pair in pairs
             if pair.kind != "rotation"
         ]
@@ -178,7 +178,7 @@ def _ideal_matches(
 
 def _prefer_single(matches: FeatureMatches, sufficient: int) -> FeatureMatches:
     """The unique matches, if they are enough."""
-    use = matches.single
+    use = matches.unique
     return matches.take(use) if use.sum() >= sufficient else matches
 
 

@@ -27,7 +27,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxbundle.tiepoints.verification import Pair, rotation_angle, turn_pairs
+from jaxbundle.tiepoints.verification import Pair, refine_rotations, rotation_angle
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,7 +127,7 @@ def _search(
         return None
 
     def total(x: Interior) -> float:
-        M = turn_pairs(pairs, oriented.ideal(x))
+        M = refine_rotations(pairs, oriented.ideal(x))
         ij, jk, ik = (M[column] for column in loops.T)
         # a pair that cannot be refined with this camera counts as a half turn
         angle = np.nan_to_num(rotation_angle(jk @ ij @ np.swapaxes(ik, 1, 2)), nan=np.pi)

@@ -3,15 +3,15 @@
 Descriptors of SIFT are the square roots of their normalised counts (Arandjelović and Zisserman,
 2012), of unit length, so that the squared Euclidean distance of two is 2 − 2·a·b: one matrix
 product for all pairs. The distance used here is √(1 − a·b), 1/√2 of the Euclidean one: it is 0 for
-equal descriptors and 1 for those without a common direction.
+equal descriptors and 1 for orthogonal ones.
 
 A match is kept if it is mutually the best, and if its distance is below `max_ratio` times that
-of the second best (Lowe, 2004), from either side, and of the most similar feature in
-the same photograph: of identical windows the wrong one is as good as the right one.
+of the second best in the other photograph (Lowe, 2004), in both directions, and of the most similar
+feature in its own photograph: with identical windows the wrong match is as good as the right one.
 
 Windows seen at different angles are not identical, and one may be more similar to another window of
 the second photograph, seen at the same angle, than to itself. So a match also has a flag
-`single`: no feature in either photograph is as similar to it as two photographs of one
+`unique`: no feature in either photograph is as similar to it as two photographs of one
 point usually are.
 """
 
@@ -45,18 +45,18 @@ class FeatureMatchingSettings:
 
 
 class FeatureMatches(NamedTuple):
-    """Rows of matching features of two photographs, the most distinct first; their clarity (ratio
-    of distances, the smaller the clearer); and which are unique in the photographs."""
+    """Rows of matching features of two photographs, the most distinct first; the ratio of
+    their distance to that of the second best; and which are unique in the photographs."""
 
     images: tuple[int, int]
     rows: Int[np.ndarray, "n 2"]
-    clarity: Float[np.ndarray, " n"]
-    single: Bool[np.ndarray, " n"]
+    distance_ratio: Float[np.ndarray, " n"]
+    unique: Bool[np.ndarray, " n"]
 
     def take(self, chosen: Int[np.ndarray, " m"] | Bool[np.ndarray, " n"]) -> "FeatureMatches":
         """The chosen matches."""
         return FeatureMatches(
-            self.images, self.rows[chosen], self.clarity[chosen], self.single[chosen]
+            self.images, self.rows[chosen], self.distance_ratio[chosen], self.unique[chosen]
         )
 
 
@@ -81,26 +81,26 @@ def match_features(
     rows = np.flatnonzero(distance < settings.max_ratio * second)
     if not len(rows):
         return np.zeros((0, 2), int), np.zeros(0)
-    back, _, third = nearest(b[best[rows]], a)
+    back, _, second_back = nearest(b[best[rows]], a)
     # descriptors closer than 1e-3 are equal: three times √ε of float32, the rounding of √(1 − a·b)
-    clarity = distance[rows] / np.maximum(np.minimum(second[rows], third), 1e-3)
-    mutual = np.flatnonzero((back == rows) & (clarity < settings.max_ratio))
-    mutual = mutual[np.argsort(clarity[mutual], kind="stable")]
+    distance_ratio = distance[rows] / np.maximum(np.minimum(second[rows], second_back), 1e-3)
+    mutual = np.flatnonzero((back == rows) & (distance_ratio < settings.max_ratio))
+    mutual = mutual[np.argsort(distance_ratio[mutual], kind="stable")]
     rows = rows[mutual]
-    return np.stack([rows, best[rows]], 1), clarity[mutual]
+    return np.stack([rows, best[rows]], 1), distance_ratio[mutual]
 
 
-def single_matches(
+def unique_matches(
     rows: Int[np.ndarray, "n 2"],
     within: tuple[Float[np.ndarray, " a"], Float[np.ndarray, " b"]],
     settings: FeatureMatchingSettings = FeatureMatchingSettings(),
 ) -> Bool[np.ndarray, " n"]:
-    """Which matches have no similar feature in either photograph."""
+    """Which matches are not similar to any other feature of their photographs."""
     nearest = np.minimum(within[0][rows[:, 0]], within[1][rows[:, 1]])
     return nearest >= settings.similar_distance
 
 
-def number_alike(one: Features, other: Features, most: int) -> int:
+def count_matches_of_largest(one: Features, other: Features, most: int) -> int:
     """The number of matches of the largest features, at most `most` of each photograph: a quick
     check whether two overlap (Wu, 2013, preemptive matching)."""
     # features are in order of their size; the largest survive the largest changes of scale
@@ -121,13 +121,14 @@ def distances_within(features: Features) -> Float[np.ndarray, " n"]:
     if n < 2 or features.descriptor.shape[1] != SIFT_LENGTH:
         return nearest
     a, xy = _root(features.descriptor), features.xy.astype(np.float32)
-    near = features.size.astype(np.float32) ** 2
+    squared_size = features.size.astype(np.float32) ** 2
     for first in range(0, n, ROWS_AT_ONCE):
         rows = slice(first, first + ROWS_AT_ONCE)
         s = a[rows] @ a.T
-        # SIFT gives one place several directions and scales: those are no repetition of it
+        # not itself, nor the other directions and scales that SIFT gives one place: those are no
+        # repetition
         away = (xy[rows, None, 0] - xy[:, 0]) ** 2 + (xy[rows, None, 1] - xy[:, 1]) ** 2
-        s[away <= near[rows, None]] = -1
+        s[away <= squared_size[rows, None]] = -1
         nearest[rows] = _distance(s.max(1))
     return nearest
 

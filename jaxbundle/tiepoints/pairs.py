@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.tiepoints.features import Features
-from jaxbundle.tiepoints.matching import number_alike
+from jaxbundle.tiepoints.matching import count_matches_of_largest
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,7 +77,7 @@ def _most_similar(
 ) -> list[tuple[int, int]]:
     every = list(combinations(range(len(features)), 2))
     most = settings.largest_features
-    count = lambda pair: number_alike(features[pair[0]], features[pair[1]], most)
+    count = lambda pair: count_matches_of_largest(features[pair[0]], features[pair[1]], most)
     similar = [[] for _ in features]
     for (i, j), number in zip(every, run(count, every)):
         if number >= settings.min_matches:

@@ -64,20 +64,20 @@ class Store:
         )
 
     def load_matches(self, one: str, other: str) -> tuple[np.ndarray, ...] | None:
-        """The stored rows of matching features of two photographs, their clarity, and which are
-        single, if any."""
-        return self._load(self.name(one, other), "rows", "clarity", "single")
+        """The stored rows of matching features of two photographs, the ratios of their
+        distances, and which are unique, if any."""
+        return self._load(self.name(one, other), "rows", "distance_ratio", "unique")
 
     def save_matches(
         self,
         one: str,
         other: str,
         rows: Int[np.ndarray, "n 2"],
-        clarity: Float[np.ndarray, " n"],
-        single: Bool[np.ndarray, " n"],
+        distance_ratio: Float[np.ndarray, " n"],
+        unique: Bool[np.ndarray, " n"],
     ) -> None:
         """Store the matches of two photographs."""
-        self._save(self.name(one, other), rows=rows, clarity=clarity, single=single)
+        self._save(self.name(one, other), rows=rows, distance_ratio=distance_ratio, unique=unique)
 
     def drop_unused(self) -> None:
         """Remove the files of photographs that no longer exist."""

@@ -67,7 +67,7 @@ class TrackMatchingSettings:
     photographs of objects 3 to 40 m away this covariance reduced errors above 4 σ from 3.4 to
     0.9 %. Smaller: occlusions within a window are taken for noise; larger: fewer independent parts
     of the window, and σ too small."""
-    min_sigma: float = 0.01
+    added_sigma: float = 0.01
     """Floor of σ, pixels of its level, added in quadrature: interpolation and sampling add as much.
     By noise alone strong edges have σ of thousandths of a pixel, and would outweigh the others."""
     second_order_sigma: float = 1.0
@@ -375,7 +375,7 @@ def _collect(
     sigma = np.sqrt(np.maximum(covariance[:, [0, 1], [0, 1]], 0) / 2)
     good = (status == int(MatchingStatus.CONVERGED)) & (rho > settings.min_correlation)
     good &= (away < settings.max_shift) & (sigma < settings.max_sigma).all(1)
-    sigma = np.hypot(sigma, settings.min_sigma)
+    sigma = np.hypot(sigma, settings.added_sigma)
     rows = others[good]
     sigma_of = np.repeat(settings.feature_sigma * rays.size[:, None], 2, 1)
     sigma_of[rows] = sigma[good] * scale[rows, None]

@@ -37,8 +37,8 @@ def make_tracks(features: Sequence[Features], pairs: Sequence[Pair]) -> list[lis
     rows = [first[list(pair.images)] + pair.matches for pair in pairs if len(pair)]
     if not rows:
         return []
-    clarity = np.concatenate([pair.clarity for pair in pairs if len(pair)])
-    edges = same[np.concatenate(rows)[np.argsort(clarity, kind="stable")]]
+    distance_ratio = np.concatenate([pair.distance_ratio for pair in pairs if len(pair)])
+    edges = same[np.concatenate(rows)[np.argsort(distance_ratio, kind="stable")]]
     members = _join(edges, np.searchsorted(first, np.arange(first[-1]), side="right") - 1)
     tracks = []
     for nodes in members:

@@ -6,7 +6,7 @@ matches: the coplanarity misclosure (Sampson), and both rays in front. A pure ro
 homography, that explains nearly all of them as well is reported: two photographs from one position,
 or of a plane, which do not start a model.
 
-Unique matches come first (`FeatureMatches.single`): in a row of windows, matches of each window to
+Unique matches come first (`FeatureMatches.unique`): in a row of windows, matches of each window to
 its neighbour are consistent with a wrong orientation, shifted by their distance. All matches are
 used only if too few unique ones agree; such a pair is not `sure`. In a sure pair with sufficient
 unique matches the others are left out: windows follow one another along an epipolar line.
@@ -36,7 +36,7 @@ from jaxbundle.orientation.absolute import rotation_between
 from jaxbundle.orientation.relative import retract, sampson_distance
 from jaxbundle.system.programs import quick_jit
 
-SLOTS, LANES = 192, 8
+MATCH_SLOTS, LANES = 192, 8
 """Padded numbers of matches of a pair, and of pairs in one run of a compiled program. 192 matches
 give a third of the σ that 20 give, which suffices to judge the others; time grows with them."""
 
@@ -91,7 +91,7 @@ class Pair:
 
     images: tuple[int, int]
     matches: Int[np.ndarray, "n 2"]
-    clarity: Float[np.ndarray, " n"]
+    distance_ratio: Float[np.ndarray, " n"]
     M: Float[np.ndarray, "3 3"]
     b: Float[np.ndarray, "3"]
     angle: float
@@ -122,30 +122,30 @@ def verify_pairs(
     xy1: Sequence[Float[np.ndarray, "_ 2"]],
     xy2: Sequence[Float[np.ndarray, "_ 2"]],
     tolerance: Float[np.ndarray, " pairs"],
-    single: Sequence[Bool[np.ndarray, " _"]] | None = None,
+    unique: Sequence[Bool[np.ndarray, " _"]] | None = None,
     settings: VerificationSettings = VerificationSettings(),
 ) -> list[VerifiedPair | None]:
     """The part of each pair explained by one object; None if too few matches agree.
 
     **Arguments:** matches, the most distinct first, as ideal image coordinates, c = 1; `tolerance`:
-    of Sampson's distance, c = 1; `single`: which matches are unique; all, if not given.
+    of Sampson's distance, c = 1; `unique`: which matches are unique; all, if not given.
     """
-    single = [np.ones(len(xy), bool) for xy in xy1] if single is None else single
+    unique = [np.ones(len(xy), bool) for xy in xy1] if unique is None else unique
     least = settings.min_matches
     usable = [k for k, xy in enumerate(xy1) if len(xy) >= least]
     verified: list[VerifiedPair | None] = [None] * len(xy1)
     if not usable:
         return verified
     find = lambda rows: _find_agreeing(rows, xy1, xy2, tolerance, settings)
-    sure = find({k: np.flatnonzero(single[k]) for k in usable})
+    sure = find({k: np.flatnonzero(unique[k]) for k in usable})
     agreed = find(
-        {k: np.arange(len(xy1[k])) for k in usable if k not in sure and (~single[k]).sum() >= least}
+        {k: np.arange(len(xy1[k])) for k in usable if k not in sure and (~unique[k]).sum() >= least}
     )
     agreed |= sure
     for k in sure:
         good, M, b = agreed[k]
-        if (good & single[k]).sum() >= settings.sufficient_matches:
-            agreed[k] = good & single[k], M, b
+        if (good & unique[k]).sum() >= settings.sufficient_matches:
+            agreed[k] = good & unique[k], M, b
     # without a base the coplanarity condition is empty, and the robust orientation may fail; a
     # rotation alone has fewer unknowns and is sought for itself
     turned = {
@@ -232,9 +232,9 @@ def _orient_by_rows(
 
 def prepare() -> None:
     """Compile the programs of `verify_pairs` ahead of its data."""
-    xy = np.random.default_rng(0).uniform(-0.5, 0.5, (LANES, SLOTS, 2))
+    xy = np.random.default_rng(0).uniform(-0.5, 0.5, (LANES, MATCH_SLOTS, 2))
     M, b = np.tile(np.eye(3), (LANES, 1, 1)), np.tile([1.0, 0, 0], (LANES, 1))
-    weights = np.ones((LANES, SLOTS))
+    weights = np.ones((LANES, MATCH_SLOTS))
     batched.run_in_lanes(_refine, LANES, M, b, xy, xy, weights)
     batched.run_in_lanes(_simpler, LANES, M, xy, xy, weights)
 
@@ -312,7 +312,7 @@ def _improve(
         good = chosen[_agree(M, b, xy1[k][chosen], xy2[k][chosen], tolerance[k])]
         if len(good) >= least:
             keys.append(k)
-            rows.append(good[batched.spread(len(good), SLOTS)])
+            rows.append(good[batched.spread(len(good), MATCH_SLOTS)])
     if not keys:
         return {}
     filled = lambda xy: np.stack([_fill(xy[k][r]) for k, r in zip(keys, rows)])
@@ -322,12 +322,12 @@ def _improve(
     return {k: (M[i], b[i]) for i, k in enumerate(keys) if np.isfinite(M[i]).all()}
 
 
-def turn_pairs(
+def refine_rotations(
     pairs: Sequence[Pair],
     ideal: Sequence[tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]],
 ) -> Float[np.ndarray, "pairs 3 3"]:
     """M of pairs, refined with their matches at these coordinates, c = 1."""
-    rows = [batched.spread(len(pair), SLOTS) for pair in pairs]
+    rows = [batched.spread(len(pair), MATCH_SLOTS) for pair in pairs]
     weights = _used_slots(rows)
     xy1, xy2 = (np.stack([_fill(xy[i][r]) for xy, r in zip(ideal, rows)]) for i in (0, 1))
     # with a strong K1 rays of the border have no image: without weight
@@ -347,11 +347,11 @@ def rotation_angle(M: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n"]:
 
 def _used_slots(rows: Sequence[Int[np.ndarray, " _"]]) -> Float[np.ndarray, "pairs slots"]:
     """Weights of the matches of pairs: 1, and 0 in slots that they do not need."""
-    return np.stack([(np.arange(SLOTS) < len(r)).astype(float) for r in rows])
+    return np.stack([(np.arange(MATCH_SLOTS) < len(r)).astype(float) for r in rows])
 
 
 def _fill(a: Float[np.ndarray, "n *shape"]) -> Float[np.ndarray, "slots *shape"]:
-    return np.resize(a, (SLOTS, *a.shape[1:]))
+    return np.resize(a, (MATCH_SLOTS, *a.shape[1:]))
 
 
 @quick_jit
@@ -386,7 +386,9 @@ def _classify(
     explained_share: float,
 ) -> list[tuple[Bool[np.ndarray, " _"], float, str]]:
     """Matches, angle and kind of every pair."""
-    rows = [np.flatnonzero(good)[batched.spread(int(good.sum()), SLOTS)] for good, *_ in agreed]
+    rows = [
+        np.flatnonzero(good)[batched.spread(int(good.sum()), MATCH_SLOTS)] for good, *_ in agreed
+    ]
     if not agreed:
         return []
     filled = lambda xy: np.stack([_fill(a[r]) for a, r in zip(xy, rows)])

@@ -20,7 +20,7 @@ from jaxbundle.tiepoints.matching import (
     FeatureMatchingSettings,
     distances_within,
     match_features,
-    single_matches,
+    unique_matches,
 )
 from jaxbundle.tiepoints.pairs import CandidateSettings, candidate_pairs
 from jaxbundle.tiepoints.store import Store
@@ -85,8 +85,8 @@ def match(
         if columns is None:
             i, j = pair
             both = within[i], within[j]
-            rows, clarity = match_features(features[i], features[j], settings, both)
-            columns = rows, clarity, single_matches(rows, both, settings)
+            rows, distance_ratio = match_features(features[i], features[j], settings, both)
+            columns = rows, distance_ratio, unique_matches(rows, both, settings)
             store.save_matches(*names(pair), *columns)
         return FeatureMatches(pair, *columns)
 
@@ -117,12 +117,14 @@ def verify(
         some = [_with_ideal(ideal, m) for m in matches[first : first + chunk]]
         tolerance = np.array([settings.tolerance * size[list(m.images)].mean() for m in some])
         one, other = ([ideal[m.images[k]][m.rows[:, k]] for m in some] for k in (0, 1))
-        verified = verify_pairs(one, other, tolerance, [m.single for m in some], settings)
+        verified = verify_pairs(one, other, tolerance, [m.unique for m in some], settings)
         for m, pair in zip(some, verified):
             if pair is not None:
                 good, M, b, angle, kind, sure = pair
-                rows, clarity = m.rows[good], m.clarity[good]
-                pairs.append(Pair(m.images, rows, clarity, M, b, angle, kind, len(m.rows), sure))
+                rows, distance_ratio = m.rows[good], m.distance_ratio[good]
+                pairs.append(
+                    Pair(m.images, rows, distance_ratio, M, b, angle, kind, len(m.rows), sure)
+                )
         tell("verification", min(first + chunk, len(matches)), len(matches))
     return pairs
 

@@ -18,7 +18,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.leastsquares.datum.conditions import (
     generators,
-    leave_held,
+    keep_held_fixed,
     of_groups,
     zeros_of_tables,
 )
@@ -341,7 +341,7 @@ def dense(problem, values, data):
 
     @jax.jit
     def open_motions(values):
-        gauge = leave_held(problem.declared, problem.plan, values).datum.gauge
+        gauge = keep_held_fixed(problem.declared, problem.plan, values).datum.gauge
         moves = of_groups(problem.plan, generators(problem.declared, values))
         return gauge, {g: x @ gauge for g, x in moves.items()}
 

@@ -8,8 +8,9 @@ import pytest
 import jaxbundle
 from jaxbundle.network.tables import Camera
 from jaxbundle.photographs.exif import Exif, StatedDistance
+from jaxbundle.reconstruction.camera_priors import observed_parameters
 from jaxbundle.reconstruction.named import no_named_points
-from jaxbundle.reconstruction.network import FurtherData, observed_parameters, tie_network
+from jaxbundle.reconstruction.network import FurtherData, photograph_network
 from jaxbundle.reconstruction.photographs import Cameras, Photograph
 from jaxbundle.reconstruction.square_pixels import release
 from jaxbundle.reconstruction.starting import _with_distances
@@ -35,7 +36,7 @@ def network(stated, aspect_sigma=2e-4, lens=(0, 1)):
                             image == 0, np.zeros((n, 3), np.uint8))  # fmt: skip
     of = Cameras(cameras, (0, 0, 1, 1), stated, False, (), lens)
     further = FurtherData(no_named_points())
-    return tie_network(photographs, of, measured, further, "part", aspect_sigma)
+    return photograph_network(photographs, of, measured, further, "part", aspect_sigma)
 
 
 def rows(network):

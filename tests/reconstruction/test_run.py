@@ -63,7 +63,7 @@ def test_parts_state_errors_that_image_points_share_unless_turned_off(run, monke
     oriented = SimpleNamespace(images={})
     for photograph in run.photographs:
         photograph.exif = None
-    for name in ("tie_network", "refuse_folded", "describe_block"):
+    for name in ("photograph_network", "refuse_folded", "describe_block"):
         monkeypatch.setattr(reconstruct, name, lambda *_: None)
     monkeypatch.setattr(reconstruct, "refuse_superimposed", lambda *_: [])
     for name, found in {

@@ -239,7 +239,7 @@ def test_a_pair_that_does_not_close_around_three_photographs_is_found(windows):
     assert [p.images for p in wrong] == [shifted] and len(kept) == 9
     assert split_contradicted(pairs[3:4], ideal) == ([pairs[3]], [])
     # without common features the directions of the bases decide
-    third = [dataclasses.replace(p, matches=p.matches[k::3], clarity=p.clarity[k::3])
+    third = [dataclasses.replace(p, matches=p.matches[k::3], distance_ratio=p.distance_ratio[k::3])
              for k, p in enumerate(pair(i, j, 0) for i, j in ((0, 1), (0, 3), (1, 3)))]  # fmt: skip
     back = dataclasses.replace(third[1], b=-third[1].b)
     assert split_contradicted(third, ideal) == (third, [])
@@ -263,9 +263,9 @@ def features_at(xy):
     return Features(xy, np.ones(n), np.zeros(n), rng.integers(0, 255, (n, 128), np.uint8))
 
 
-def paired(i, j, rows, clarity):
+def paired(i, j, rows, distance_ratio):
     rows = np.array(rows)
-    return Pair((i, j), rows, np.array(clarity), np.eye(3), np.zeros(3), 0.1, "relative", 9)
+    return Pair((i, j), rows, np.array(distance_ratio), np.eye(3), np.zeros(3), 0.1, "relative", 9)
 
 
 def test_features_lie_at_the_centres_of_blobs():
@@ -387,8 +387,8 @@ def test_marks_at_the_same_pixels_of_photographs_match_nothing(cloud):
         for view in views
     ]  # fmt: skip
     rows = np.tile(np.arange(len(size))[:, None], 2)
-    clarity, single = np.full(len(rows), 0.5), np.ones(len(rows), bool)
-    pair = lambda i, j: FeatureMatches((i, j), rows, clarity, single)
+    distance_ratio, single = np.full(len(rows), 0.5), np.ones(len(rows), bool)
+    pair = lambda i, j: FeatureMatches((i, j), rows, distance_ratio, single)
     matches = [pair(i, j) for i in range(5) for j in range(i)]
     found, marked = without_marks(matches, photographs, [SIZE] * 5)
     assert marked == 5 and all(set(m.rows[:, 0]) == set(range(len(X))) for m in found)

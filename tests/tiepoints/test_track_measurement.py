@@ -94,7 +94,7 @@ def test_features_without_a_match_stay_where_they_are(scene):
 def test_sigma_has_a_floor_in_quadrature(scene):
     """Otherwise strong edges, whose σ by noise alone is thousandths of a pixel, outweigh the other
     measurements a hundred times."""
-    with_floor, without = measure(scene, min_sigma=0.05), measure(scene, min_sigma=0.0)
+    with_floor, without = measure(scene, added_sigma=0.05), measure(scene, added_sigma=0.0)
     scale = np.where(with_floor.level < 0, 0.0, 2.0**with_floor.level)[:, None]
     difference = with_floor.sigma**2 - without.sigma**2
     np.testing.assert_allclose(difference, np.tile((0.05 * scale) ** 2, 2), rtol=1e-6)

@@ -104,7 +104,9 @@ class SecondMinimumSettings:
       form, whatever its perspective: a wrong pose, not a wrong σ (`likely_causes`, `max_sigma0`).
     - `evaluations_before_rejection`: from an analytic start value, which is right to the square of
       the effect of perspective, a second minimum that counts is nearly reached in three. What is
-      then still above ten times the limit is rejected. Smaller: slowly converging ones are missed.
+      then still above `early_limit` times the limit is rejected. Smaller: slowly converging ones
+      are missed.
+    - `early_limit`: an order of magnitude, since vᵀPv still falls.
     - `max_images`: of images alone, this many of the least evidence are adjusted again, and this
       many of the worst resected in closed form.
     - `max_legs`: a second minimum of two images may lie in the valley of their bas-relief, along
@@ -113,6 +115,7 @@ class SecondMinimumSettings:
     """
 
     error_probability: float = 0.001
+    early_limit: float = 10.0
     min_turning_share: float = 9 / 16
     min_reversed_share: float = 0.01
     few_points: int = 5

@@ -52,7 +52,7 @@ def move_into_datum(
         return values, True
     if plan.datum.held:
         held = directions_of_motions(declared, {name: values[name] for name in plan.datum.held})
-        plan = _leave_held(declared, plan, values, held)
+        plan = _keep_held_fixed(declared, plan, values, held)
     pinned = jax.tree.map(np.asarray, present(plan.datum))
     curved, free = present(declared.motions).curved, _free(plan, declared, values)
     size = float(datum.largest(pinned.weight, start))
@@ -129,6 +129,6 @@ def _of_rows(program: Callable, *given: Any) -> Any:
 
 
 _generators = compile_once(datum.generators)
-_leave_held = compile_once(datum.leave_held)
+_keep_held_fixed = compile_once(datum.keep_held_fixed)
 _free = compile_once(datum.free_of_tables)
 _move_at_once = compile_once(move_at_once)

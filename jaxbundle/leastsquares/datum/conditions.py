@@ -45,7 +45,7 @@ class MotionSettings:
       alone do not converge for strong deformations; Newton steps from afar may go anywhere.
     - `longest`: limit of a single step in rotations (radians) and scale (a factor of e): farther
       off the linearised motion says nothing.
-    - `reached`: a smaller step is the last: a few hundred units of rounding.
+    - `reached`: a smaller step is the last: some thousand units of rounding (2.2e-16).
     - `small`: steps that are smaller, and no longer halve, are rounding too.
     - `max_steps`: converging motions take 3 to 15.
     """
@@ -101,15 +101,15 @@ def open_directions(
     """G: the directions of the open motions, [rows, w, defect]; `moves`: the `generators`, if
     known."""
     moves = generators(declared, values) if moves is None else moves
-    gauge = present(leave_held(declared, plan, values, moves).datum).gauge
+    gauge = present(keep_held_fixed(declared, plan, values, moves).datum).gauge
     return {name: rows @ gauge for name, rows in of_groups(plan, moves).items()}
 
 
-def leave_held(
+def keep_held_fixed(
     declared: Declared, plan: Plan, values: Values, moves: Tangent | None = None
 ) -> Plan:
-    """The plan with open motions minimally changed so that held unknowns keep their current values:
-    a rotation about a held point follows the point. `moves`: the `generators`, if known."""
+    """The plan with the smallest correction of its open motions that leaves held unknowns as they
+    are: a rotation about a held point follows the point. `moves`: the `generators`, if known."""
     datum = present(plan.datum)
     held, gauge = datum.held, datum.gauge
     if not held:
@@ -123,6 +123,7 @@ def leave_held(
     # = (RᵀR)⁺RᵀR·g, columns scaled, since radians stand beside metres.
     A = rows.T @ rows
     scale = jax.lax.stop_gradient(jnp.diagonal(A))
+    # Twice: a NaN of the branch that is not taken would enter the gradient.
     scale = jnp.where(scale > 0, jnp.where(scale > 0, scale, 1.0) ** -0.5, 1.0)
     A = A * scale * scale[:, None]
     moved = jnp.linalg.pinv(A, MIN_RELATIVE_MOTION, hermitian=True) @ (A @ (gauge / scale[:, None]))
@@ -175,7 +176,7 @@ def move_to_datum(
     not decrease."""
     if plan.datum is None:
         return values, jnp.asarray(True)
-    plan = leave_held(declared, plan, values)
+    plan = keep_held_fixed(declared, plan, values)
     datum = present(plan.datum)
     still, curved = jnp.zeros(datum.gauge.shape[1]), present(declared.motions).curved
     size = largest(datum.weight, start)
@@ -187,8 +188,8 @@ def move_to_datum(
     def further(state: tuple) -> tuple:
         values, before, _, count = state
         missing, slope = _datum_equations(declared, plan, values, start)
-        near = jax.jacfwd(_missing)(still, (declared, plan), (values, start))
-        slope = jnp.where(before > DATUM_MOTION.near * size, slope, near)
+        newton_slope = jax.jacfwd(_missing)(still, (declared, plan), (values, start))
+        slope = jnp.where(before > DATUM_MOTION.near * size, slope, newton_slope)
         step = limit_step(datum.gauge @ -jnp.linalg.solve(slope, missing), curved)
         moved = _move(declared, plan, step, values)
         differences = {
@@ -196,6 +197,7 @@ def move_to_datum(
         }
         return moved, largest(datum.weight, differences), before, count + 1
 
+    # Larger than any step, so that the first one is taken.
     begin = values, jnp.asarray(1e300), jnp.asarray(jnp.inf), 0
     values, distance, *_ = jax.lax.while_loop(moving, further, begin)
     return values, distance <= DATUM_MOTION.reached * size
@@ -268,7 +270,7 @@ def _missing(
 ) -> Float[AnyArray, " defect"]:
     """Bᵀ(x − x_start) after a motion along the open directions."""
     (declared, plan), (values, start) = fixed, given
-    plan = leave_held(declared, plan, values)
+    plan = keep_held_fixed(declared, plan, values)
     datum = present(plan.datum)
     tables = {name: values[name] for name in datum.weight}
     moved = _move(declared, plan, datum.gauge @ tau, tables)
@@ -283,7 +285,7 @@ def attach_motion(declared: Declared, plan: Plan, values: Values, start: Values)
     still, fixed = jnp.zeros(plan.datum.gauge.shape[1]), (declared, plan)
 
     def along(tau: Float[Array, " defect"], of: Values, values: Values) -> Values:
-        datum = present(leave_held(declared, plan, of).datum)
+        datum = present(keep_held_fixed(declared, plan, of).datum)
         return _move(declared, plan, datum.gauge @ tau, values)
 
     # First remove the remaining motion, so that derivatives are taken at zero motion.

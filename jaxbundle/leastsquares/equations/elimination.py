@@ -38,7 +38,8 @@ from jaxbundle.types import present
 FULL_PRECISION = 1e-12
 """Relative residual of a reduced system solved iteratively to full precision: what one refinement
 reaches after a run to 1e-10 (`ConjugateGradients.reachable`). A smaller one may be unreachable
-because of rounding, and open motions drift; half or double are a step more or less."""
+because of rounding, and open motions drift. Half costs a step of conjugate gradients more, double
+one less."""
 PIVOT = 1e-13
 """A pivot below this fraction of its diagonal element is rounding: the unknown is undetermined.
 
@@ -80,8 +81,8 @@ def regularise_diagonal(normal: Normal, ridge: float = 1e-10) -> Normal:
     """N + `ridge`·diag(N) (Tikhonov), so that it can be factorised if it is singular.
 
     The pivots are then at least 1e-10, a thousand times `PIVOT`, and undetermined unknowns get σ of
-    1e5 times their σ with all others given: far beyond all that is judged weak. Those that are
-    determined to 1e-3 of this keep theirs to 1e-4; half or double change no verdict."""
+    1e5 times their σ with all others given: far beyond all that is judged weak. An unknown with
+    a σ below 1e-3 of this keeps it to 1e-4; half or double change no verdict."""
     N, e = normal.blocks, normal.plan.eliminated
     diagonal = lambda B: jnp.diagonal(B, axis1=1, axis2=2)[:, :, None] * jnp.eye(B.shape[1])
     more = lambda B: B + ridge * diagonal(B)
@@ -94,8 +95,8 @@ def factorise(
     normal: Normal, regular: Bool[Array, ""] | bool = True, tolerance: float = FULL_PRECISION
 ) -> NormalFactor:
     """Factorise N, with regularised datum directions if `regular`; `tolerance`: of a reduced system
-    solved iteratively. NaN for pivots that are rounding, like negative ones: only chance separates
-    the two."""
+    solved iteratively. A pivot at the level of rounding gives NaN, as a negative one does: its sign
+    is an accident."""
     plan = normal.plan
     S, scale, lower_inverse, Z = reduced_system(normal, regular)
     if plan.reduction == "iterative":
@@ -145,13 +146,13 @@ def eliminate(normal: Normal) -> tuple[Reduced, Float[Array, "rows w w"] | None,
         return Reduced(own, off), None, {}
     # Held directions have zero rows in W: with a one on the diagonal they take no part.
     held = (1.0 - plan.groups[e].free)[:, :, None] * jnp.eye(plan.groups[e].width)
-    L = inverse_cholesky(present(N.eliminated) + held)
+    lower_inverse = inverse_cholesky(present(N.eliminated) + held)
     # L⁻¹ itself and not L: it is used for every incidence, for right-hand sides and for cofactors,
     # and a product of 3×3 vectorises where a substitution does not.
     Z, less, less_off = {}, {}, {}
     for g, W in N.W.items():
         at = plan.incidences[g]
-        Z[g] = _row_major(_lower_times(L, at.eliminated, W))
+        Z[g] = _row_major(_lower_times(lower_inverse, at.eliminated, W))
         # The diagonal blocks of ZᵀZ: an incidence with itself. All of a chunk belong to one kept
         # row, so their sum is one product of depth length × w; only the chunks are scattered.
         rows = Z[g].reshape(at.row.shape[0], -1, W.shape[-1])
@@ -167,13 +168,13 @@ def eliminate(normal: Normal) -> tuple[Reduced, Float[Array, "rows w w"] | None,
     own = {g: B - less[g] if g in less else B for g, B in own.items()}
     for key, B in less_off.items():
         off[key] = off[key] - B if key in off else -B
-    return Reduced(own, off), L, Z
+    return Reduced(own, off), lower_inverse, Z
 
 
 def solve(factor: NormalFactor, right: Tangent) -> Tangent:
     """N⁻¹·b for one right-hand side, linear and transposable in b."""
     plan, e, Z = factor.plan, factor.plan.eliminated, factor.Z
-    # free: a right-hand side along held unknowns, as of a function of them, has no answer here.
+    # free: held unknowns do not change, whatever a right-hand side has along them.
     kept = {g: right[g] * plan.groups[g].free * s for g, s in factor.scale.items()}
     if e is not None:
         free = plan.groups[e].free
@@ -266,13 +267,14 @@ def inverse_cholesky(V: Float[Array, "n w w"]) -> Float[Array, "n w w"]:
 
 
 def _lower_times(
-    L: Float[Array, "rows w w"],
+    lower: Float[Array, "rows w w"],
     at: Int[Array, "chunks length"],
     W: Float[Array, "chunks length w v"],
 ) -> Float[Array, "chunks length w v"]:
-    """L[at]·W of every incidence, L lower triangular; written out: half the time of a product."""
-    w = L.shape[-1]
-    of = look_up(L.reshape(-1, w * w), at)
+    """lower[at]·W of every incidence, `lower` triangular; written out: half the time of a
+    product."""
+    w = lower.shape[-1]
+    of = look_up(lower.reshape(-1, w * w), at)
     row = lambda i: sum(of[..., w * i + j, None] * W[..., j, :] for j in range(i + 1))
     return jnp.stack([row(i) for i in range(w)], -2)
 

@@ -32,7 +32,7 @@ from jaxbundle.types import Scalar, present
 
 
 def widths_of(declared: Declared, part: ObservationPart) -> tuple[int, ...]:
-    """The directions in which every slot of a part is differentiated."""
+    """The number of directions of every slot of a part, 0 if it is not differentiated."""
     of = declared.kinds[part.set_name].of
     used = {s for touch in part.touches for s, _ in touch.slots} | {part.slot}
     return tuple(declared.spaces[name].width if s in used else 0 for s, name in enumerate(of))
@@ -50,7 +50,7 @@ def differentiate(
     declared: Declared, plan: Plan, number: int, prepared: Prepared, laid: ChunkedData
 ) -> tuple[Array, tuple[Array, ...], Array | None]:
     """Residuals [chunks, length, r] of a part, the blocks of its touches, [chunks, length, r, w]
-    each, and of its eliminated rows (None without). Columns of held unknowns are zero."""
+    each, and of its eliminated rows (None if there are none). Columns of held unknowns are zero."""
     part = plan.parts[number]
     kind, widths = declared.kinds[part.set_name], widths_of(declared, part)
     rows = _Rows(residual_of(declared, part), widths, part.large)
@@ -61,11 +61,12 @@ def differentiate(
 
     def block(slots: Slots, start: int, stop: int) -> Float[Array, "chunks length r w"]:
         columns = columns_of(widths, slots, start, stop)
+        # The index behind the last column stands for a column of zeros.
         used = [starts[at[0]] + at[1] if at else starts[-1] for at in columns]
         if part.large:
             # Columns that no slot of this part has, as those of another table of the group.
             nil = jnp.zeros(shape)
-            parts = [[*columns, nil][c] for columns in found for c in used]
+            parts = [[*derivatives, nil][c] for derivatives in found for c in used]
             return jnp.stack(parts, -1).reshape(*shape, len(r), stop - start)
         return jnp.take(found, np.array(used, int), -1, mode="fill", fill_value=0.0)
 

@@ -24,9 +24,9 @@ class Choices:
     before: dict[Hashable, Any]
     made: dict[Hashable, Any] = dataclasses.field(default_factory=dict)
 
-    def __call__(self, *key: Hashable, found: Any) -> Any:
-        """The given choice, or an earlier one."""
-        self.made[key] = self.before.get(key, found)
+    def __call__(self, *key: Hashable, default: Any) -> Any:
+        """The earlier choice under this key if there is one, else `default`; it is recorded."""
+        self.made[key] = self.before.get(key, default)
         return self.made[key]
 
 
@@ -64,7 +64,7 @@ class Grouping:
         self.tables = {t.name: t for t in tables}
         self.observations = {given.name: given for given in observations}
         self.eliminate, self.choose, self.settings = eliminate, choose, settings
-        self.estimated = choose("estimated", found=[t.name for t in tables if t.free.any()])
+        self.estimated = choose("estimated", default=[t.name for t in tables if t.free.any()])
         self.coupled_rows = self._find_coupled_rows()
         self.shares = self._share_observations()
         self._form_groups()
@@ -84,7 +84,7 @@ class Grouping:
             # would not be block diagonal, so both go to the reduced system.
             for s in slots if len(slots) > 1 else ():
                 stays[given.rows[s]] = True
-        return self.choose("coupled rows", found=stays & table.free.any(1))
+        return self.choose("coupled rows", default=stays & table.free.any(1))
 
     def _share_observations(self) -> list[ObservationSubset]:
         """Observations of one set, separated by the slot that touches an eliminated row."""
@@ -95,9 +95,10 @@ class Grouping:
             slot_of = np.full(given.number, -1)
             for s in slots:
                 slot_of[~present(self.coupled_rows)[given.rows[s]]] = s
-            # Two held rows of the table may meet: the last counts as eliminated.
+            # An observation may touch two held rows of the table: the last one counts as
+            # eliminated.
             # A set without observations is an empty share.
-            for slot in self.choose("slots", o, found=np.unique(slot_of).tolist() or [-1]):
+            for slot in self.choose("slots", o, default=np.unique(slot_of).tolist() or [-1]):
                 rows = np.flatnonzero(slot_of == slot)
                 shares.append(ObservationSubset(o, rows, None if slot < 0 else slot))
         return shares
@@ -114,7 +115,7 @@ class Grouping:
             # A pose and the camera that took only this image, one block of 9 instead of blocks of 6
             # and 3: one list of pairs instead of three.
             host = next((g for g in self.members if self._meet_always(g, name)), None)
-            host = self.choose("host", name, found=host)
+            host = self.choose("host", name, default=host)
             if host is None:
                 self.members[name] = [(name, 0, None)]
                 self.group_of[name] = name, 0, np.arange(table.rows)
@@ -151,7 +152,8 @@ class Grouping:
                 continue
             a = [s for s, t in enumerate(of) if t == first]
             b = [s for s, t in enumerate(of) if t == name]
-            # Touched by one kind without the other: their blocks have different incidences.
+            # A set of observations that touches one table but not the other: their blocks have
+            # different incidences.
             if len(a) != len(b) or len(a) > 1:
                 return False
             if a:
@@ -168,12 +170,12 @@ class Grouping:
             index = None if rows is None else as_index(rows, ("group", name), ("table", table))
             members.append(Member(table, start, given.space.width, index))
         free = np.concatenate(free, 1)
-        # A slot of the eliminated table touches its kept rows, or a held one, which is not there.
+        # A slot of the eliminated table may touch a row that is not in this group: it is masked.
         partial = any(rows is not None for *_, rows in self.members[name])
         may_be_held = name == self.eliminate and len(free) < self.settings.masked_below
         may_be_held |= partial and name != self.eliminate
         all_free = bool(free.all()) and not may_be_held
-        all_free = self.choose("all free", name, found=all_free)
+        all_free = self.choose("all free", name, default=all_free)
         return UnknownGroup(tuple(members), as_column(free, ("group", name)), all_free)
 
     def touched_groups(self, number: int, share: ObservationSubset) -> list[TouchedGroup]:
@@ -190,13 +192,14 @@ class Grouping:
             row = place[given.rows[s][share.source]]
             same = (t for t, at in found if t.group == group and np.array_equal(at, row))
             tables = lambda t: [given.kind.of[q] for q, _ in t.slots]
+            # Two slots of one table need columns of their own.
             host = next((t for t in same if name not in tables(t)), None)
             if host is None:
                 found.append((TouchedGroup(group, [(s, start)]), row))
             else:
                 host.slots.append((s, start))
         found = sorted((t for t, _ in found), key=lambda t: self.kept.index(t.group))
-        return self.choose("touches", number, found=found)
+        return self.choose("touches", number, default=found)
 
     def rows(self, group: str) -> int:
         table, _, rows = self.members[group][0]

@@ -30,7 +30,7 @@ class PlanIndex:
 
 @dataclasses.dataclass
 class PlanColumn:
-    """Values along a list; `multiple`: its size is a multiple of this."""
+    """Values along a list; `fill`: the value of what fills it up to the size of the list."""
 
     rows: np.ndarray
     along: Hashable

@@ -41,10 +41,12 @@ def make_plan(
 ) -> tuple[Plan, Sizes, dict]:
     """The plan on the host, its arrays as `PlanIndex` and `PlanColumn` (`indices.finish`), the
     sizes of its lists, and the choices made (lengths of chunks, blocks of the reduced matrix,
-    settings). `choices`: those of a larger problem of which this is a part, to be reused; `ways`:
-    allowed solvers of the reduced system."""
+    settings).
+
+    **Arguments:** `choices`: those made for the larger problem that this one is a part of, to be
+    reused; `ways`: allowed solvers of the reduced system."""
     choose = Choices(choices or {})
-    settings = choose("settings", found=settings)
+    settings = choose("settings", default=settings)
     plan = _Planner(Grouping(tables, observations, eliminate, choose, settings), ways).plan()
     sizes = {("table", t.name): t.rows + 1 for t in tables}
     sizes |= {("observations", o.name): o.number + 1 for o in observations}
@@ -73,7 +75,7 @@ class _IncidencesInChunks:
     """Incidences of a group in their chunks; for each incidence: place, both rows."""
 
     incidences: Incidences
-    live: Int[np.ndarray, " n"]
+    place: Int[np.ndarray, " n"]
     eliminated: Int[np.ndarray, " n"]
     row: Int[np.ndarray, " n"]
     along: Hashable
@@ -81,7 +83,8 @@ class _IncidencesInChunks:
 
 
 DirectBlocks = dict[Key, list[tuple[int, int, np.ndarray, np.ndarray]]]
-"""By groups (later, earlier): part, number of its pair of touches, row and column by chunk."""
+"""By groups (later, earlier): for each entry the part, the index of the couple in it, and the rows
+and columns of the blocks."""
 
 
 class _PairList(NamedTuple):
@@ -96,21 +99,25 @@ class _PairList(NamedTuple):
 
 
 class _Planner:
-    """The steps of `make_plan`; `by`: what is eliminated, and the groups."""
+    """The steps of `make_plan`; `grouping`: what is eliminated, and the groups."""
 
     def __init__(self, grouping: Grouping, ways: Sequence[str]):
-        self.by, self.choose, self.settings = grouping, grouping.choose, grouping.settings
-        self.ways = self.choose("ways", found=tuple(ways))
+        self.grouping, self.choose, self.settings = grouping, grouping.choose, grouping.settings
+        self.ways = self.choose("ways", default=tuple(ways))
 
     def plan(self) -> Plan:
-        parts = [self.lay_out(k, share) for k, share in enumerate(self.by.shares)]
-        incidences = {g: self.incidences_of(g, parts) for g in self.by.kept}
+        parts = [self.lay_out(k, share) for k, share in enumerate(self.grouping.shares)]
+        incidences = {g: self.incidences_of(g, parts) for g in self.grouping.kept}
         incidences = {g: found for g, found in incidences.items() if found is not None}
-        groups = {g: self.by.group(g) for g in (*self.by.kept, self.by.eliminate) if g is not None}
+        groups = {
+            g: self.grouping.group(g)
+            for g in (*self.grouping.kept, self.grouping.eliminate)
+            if g is not None
+        }
         blocks, reduction, band = self.reduce(parts, incidences, groups)
         incidences = {g: found.incidences for g, found in incidences.items()}
         parts = tuple(p.part for p in parts)
-        return Plan(groups, self.by.eliminate, parts, incidences, blocks, reduction, band)
+        return Plan(groups, self.grouping.eliminate, parts, incidences, blocks, reduction, band)
 
     def reduce(
         self,
@@ -125,32 +132,32 @@ class _Planner:
         if len(ways) > 1 and (met * (met - 1)).sum() / 2 > self.settings.max_pairs:
             ways = ("iterative",)
         blocks = self.find_blocks(parts, {} if ways == ("iterative",) else incidences)
-        shapes = {g: groups[g].free.rows.shape for g in self.by.kept}
+        shapes = {g: groups[g].free.rows.shape for g in self.grouping.kept}
         none = np.zeros(0, np.int64)
         place = lambda at: (at.row.rows, at.column.rows) if at else (none, none)
         ties = lambda g: place(blocks.get((g, g)))
-        number = sum(given.number for given in self.by.observations.values())
+        number = sum(given.number for given in self.grouping.observations.values())
         way, band = plan_reduction(shapes, ties, number, ways, self.settings)
         self.choose.made["ways",] = (way,)
         return blocks if way in FACTORS else self.find_blocks(parts, {}), way, band
 
     def lay_out(self, k: int, share: ObservationSubset) -> _PartInChunks:
         """Part k in chunks, with its touches (couples and incidences are added later)."""
-        given = self.by.observations[share.set_name]
+        given = self.grouping.observations[share.set_name]
         of = given.kind.of
         rows = [np.asarray(r)[share.source] for r in given.rows]
-        slots = self.by.touched_groups(k, share)
+        slots = self.grouping.touched_groups(k, share)
         # One number for every combination of kept rows that occurs; `unique` keeps it small.
         major = np.zeros(len(share.source), np.int64)
         for _, touched in slots:
             slot = touched[0][0]
-            row = self.by.group_of[of[slot]][2][rows[slot]]
+            row = self.grouping.group_of[of[slot]][2][rows[slot]]
             # Rows from −1 on: none.
             major = np.unique(major * (row.max(initial=0) + 2) + row + 1, return_inverse=True)[1]
         minor = rows[share.slot] if share.slot is not None else np.arange(len(major))
         along = ("part", k)
-        length = self.choose("length", along, found=chunk_length(major, self.settings))
-        large = self.choose("large", k, found=len(major) >= self.settings.small_part)
+        length = self.choose("length", along, default=chunk_length(major, self.settings))
+        large = self.choose("large", k, default=len(major) >= self.settings.small_part)
         order, used = lay_out(major, minor, length)
         chunk = lambda x: x[order].reshape(-1, length)
         lookup, by_row, first = [], [], np.zeros(major.max(initial=0) + 1, np.int64)
@@ -160,14 +167,14 @@ class _Planner:
             # A slot whose row is the same in a chunk is looked up once for it, the others for each
             # observation.
             one = length == 1 or bool((rows[s] == rows[s][first[major]]).all())
-            one = self.choose("by chunk", k, s, found=one and s != share.slot)
+            one = self.choose("by chunk", k, s, default=one and s != share.slot)
             by_row.append(not one)
             lookup.append(as_index(at[:, 0] if one else at, along, ("table", name)))
         touches = []
         for group, touched in slots:
             slot = touched[0][0]
-            row = chunk(self.by.group_of[of[slot]][2][rows[slot]])[:, 0]
-            stop = max(start + self.by.tables[of[s]].space.width for s, start in touched)
+            row = chunk(self.grouping.group_of[of[slot]][2][rows[slot]])[:, 0]
+            stop = max(start + self.grouping.tables[of[s]].space.width for s, start in touched)
             start = min(start for _, start in touched)
             index = as_index(row, along, ("group", group))
             touches.append(TouchedRows(group, tuple(touched), start, stop, index, None))
@@ -176,8 +183,8 @@ class _Planner:
         place[share.source[order][used]] = np.flatnonzero(used)
         eliminated = None
         if share.slot is not None:
-            at = self.by.row_in[chunk(rows[share.slot])]
-            eliminated = as_index(at, along, ("group", self.by.eliminate))
+            at = self.grouping.row_in[chunk(rows[share.slot])]
+            eliminated = as_index(at, along, ("group", self.grouping.eliminate))
         number = ("observations", share.set_name)
         made = ObservationPart(
             set_name=share.set_name,
@@ -204,7 +211,7 @@ class _Planner:
         ]
         if not at:
             return None
-        number = len(self.by.row_in)
+        number = len(self.grouping.row_in)
         eliminated, row, used = [], [], []
         for k, t in at:
             p = parts[k]
@@ -218,16 +225,16 @@ class _Planner:
         keys, of = np.unique(keys, return_inverse=True)
         # Observations that are incidences themselves, the usual case: W needs no sum by incidence.
         apart = len(at) == 1 and len(keys) == used.sum()
-        if self.choose("incidences apart", group, found=apart):
+        if self.choose("incidences apart", group, default=apart):
             p = parts[at[0][0]]
             along, length = p.along, p.length
         else:
             r, q = keys // number, keys % number
             along = ("incidences", group)
-            length = self.choose("length", along, found=chunk_length(r, self.settings))
-            order, live = lay_out(r, q, length)
+            length = self.choose("length", along, default=chunk_length(r, self.settings))
+            order, filled = lay_out(r, q, length)
             place = np.empty(len(keys), np.int64)
-            place[order[live]] = np.flatnonzero(live)
+            place[order[filled]] = np.flatnonzero(filled)
             whole = np.full(len(used), -1)
             whole[used] = place[of]
             cuts = np.cumsum([len(parts[k].used) for k, _ in at])[:-1]
@@ -235,14 +242,14 @@ class _Planner:
                 p = parts[k]
                 index = as_index(where.reshape(-1, p.length), p.along, along, length)
                 p.set("touches", t, incidence=index)
-            eliminated, row, used = q[order], r[order], live
+            eliminated, row, used = q[order], r[order], filled
         plan = Incidences(
-            as_index(eliminated.reshape(-1, length), along, ("group", self.by.eliminate)),
+            as_index(eliminated.reshape(-1, length), along, ("group", self.grouping.eliminate)),
             as_index(row[::length], along, ("group", group)),
         )
-        live = np.flatnonzero(used)
-        eliminated, row = eliminated[live], row[live]
-        return _IncidencesInChunks(plan, live, eliminated, row, along, length)
+        places = np.flatnonzero(used)
+        eliminated, row = eliminated[places], row[places]
+        return _IncidencesInChunks(plan, places, eliminated, row, along, length)
 
     def find_blocks(
         self, parts: list[_PartInChunks], incidences: dict[str, _IncidencesInChunks]
@@ -254,8 +261,8 @@ class _Planner:
             self._couples(k, p, direct)
         blocks = {}
         # Blocks below the diagonal of the reduced matrix, groups in the order of JAX's pytrees.
-        for place, later in enumerate(self.by.kept):
-            for earlier in self.by.kept[: place + 1]:
+        for place, later in enumerate(self.grouping.kept):
+            for earlier in self.grouping.kept[: place + 1]:
                 key, a, b = (later, earlier), incidences.get(later), incidences.get(earlier)
                 pairs = self._pairs(a, b, later == earlier)
                 made = self._block_list(key, pairs, direct.get(key, ()), parts)
@@ -276,7 +283,7 @@ class _Planner:
                 if a.group == b.group:
                     equal, less = (row == column) & ~none, row < column
                     row, column = np.maximum(row, column), np.minimum(row, column)
-                    meets = self.choose("same", k, j, i, found=bool(equal.any()))
+                    meets = self.choose("same", k, j, i, default=bool(equal.any()))
                     same = as_column(equal.astype(float), p.along) if meets else None
                     turned = as_column(less.astype(float), p.along)
                     none |= equal
@@ -299,19 +306,19 @@ class _Planner:
             there &= later.row[i] > earlier.row[j]
         i, j = i[there], j[there]
         into = (later.along, later.length), (earlier.along, earlier.length)
-        return _PairList(later.live[i], earlier.live[j], later.row[i], earlier.row[j], into)
+        return _PairList(later.place[i], earlier.place[j], later.row[i], earlier.row[j], into)
 
     def _block_list(
         self, key: Key, pairs: _PairList, direct: Sequence, parts: list[_PartInChunks]
     ) -> Blocks | None:
         """The blocks of two groups, from their pairs and from observations that touch both."""
         i, j, row, column, into = pairs
-        columns = np.int64(self.by.rows(key[1]))
+        columns = np.int64(self.grouping.rows(key[1]))
         number = lambda r, c: r.astype(np.int64) * columns + c
-        # The blocks that occur, in the order of row and column: by the fill of S, not of a dense
-        # matrix.
+        # The blocks that occur, in the order of row and column: memory follows the fill
+        # of S, not its size.
         keys = [number(row, column), *(number(r[r >= 0], c[r >= 0]) for *_, r, c in direct)]
-        keys = self.choose("blocks", *key, found=np.unique(np.concatenate(keys)))
+        keys = self.choose("blocks", *key, default=np.unique(np.concatenate(keys)))
         if not len(keys):
             return None
         along = ("blocks", *key)
@@ -319,7 +326,9 @@ class _Planner:
             block = np.where(r >= 0, np.searchsorted(keys, number(r, c)), -1)
             parts[k].set("couples", couple, block=as_index(block, parts[k].along, along))
         found = None
-        lengths = self.choose("pair chunks", *key, found=pair_chunk_lengths(len(i), self.settings))
+        lengths = self.choose(
+            "pair chunks", *key, default=pair_chunk_lengths(len(i), self.settings)
+        )
         if lengths:
             block = np.searchsorted(keys, number(row, column))
             found = chunk_pairs(i, j, block, into, along, key, lengths)

@@ -97,8 +97,8 @@ class MarquardtDescent(optx.AbstractDescent):
 
     def step(self, step_size: Float[Array, ""], state: Info) -> tuple[Tangent, Any]:
         damped = damp(state.hessian, 1 / step_size)
-        # Pins in damped steps too would hold single unknowns of the datum and bend the steps: 15
-        # evaluations on BAL 16 instead of 10.
+        # Pins in damped steps, too, would hold single unknowns of the datum and distort the step:
+        # 15 evaluations on BAL 16 instead of 10.
         solver = Elimination(step_size > self.regular_from, self.inexact)
         change = lx.linear_solve(damped, state.grad, solver, throw=False).value
         return jax.tree.map(jnp.negative, change), optx.RESULTS.successful
@@ -155,6 +155,7 @@ class RegionState(eqx.Module):
         growth = 1 / jnp.maximum(1 / 3, 1 - (2 * gain_ratio - 1) ** 3)
         wider = jnp.minimum(finite * growth, rules.largest)
         radius = jnp.where(accept, wider, finite / self.divisor)
+        # The first evaluation is of the start values: no step was taken, its gain ratio is void.
         radius = jnp.where(first, self.radius, radius)
         divisor = jnp.where(accept, 2.0, 2.0 * self.divisor)
         return accept, RegionState(radius, divisor, rules)

@@ -67,10 +67,10 @@ class Tolerance(eqx.Module):
     """Tolerances.
 
     - `redundancy`: of the problem, for σ₀.
-    - `squares`: the sum of the squares of all measured values, divided by their σ.
+    - `squares`: Σ(l/σ)² of all measured values l.
     - `atol`: see the module; `rtol`: stop when an accepted step decreases vᵀPv by less than this
       fraction (0: disabled).
-    - `rounding`: a predicted decrease below this fraction of vᵀPv is rounding.
+    - `rounding`: a decrement d² below this fraction of ½vᵀPv is rounding.
     - `cost_rounding`: relative rounding error of a measured value, for that of vᵀPv.
     - `noise_floor`: residuals below this fraction of the measured values are arithmetic noise;
       without redundancy all residuals vanish, there is no σ₀ to compare steps with, and

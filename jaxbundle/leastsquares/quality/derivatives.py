@@ -15,7 +15,8 @@ differentiated (`jaxbundle.implicit`) in the tangent space at the solution, toge
 its chart. A problem that may float is pinned meanwhile (by a penalty, zero in the
 solution, on changes of as many unknowns as the defect) and then moved to its datum as a whole.
 The Gauss–Newton form is not the gradient of a computed quantity: its derivative would
-depend on the order of differentiation and is refused. Weights enter it as in JᵀPv.
+depend on the order of differentiation and is refused. Its derivatives by weights are those of JᵀPv
+with J constant.
 """
 
 import dataclasses
@@ -79,6 +80,7 @@ def solve(
       and datum rows (a rotation is free or held as a whole), measurements, weights.
     - `sensitivity`: `"exact"` (implicit function theorem with the full Hessian) or
       `"gauss-newton"` ((JᵀPJ)⁻¹JᵀP, error propagation, first order only); see the module.
+    - `max_iterations`: steps at most.
     - `atol`: stop when no unknown would move by more than this fraction of its σ.
     - `options`: of the solver, see `LeastSquares`.
 
@@ -89,7 +91,8 @@ def solve(
     form.
     """
     one_of("sensitivity", sensitivity, get_args(Sensitivity))
-    steps, atol = integer("max_iterations", max_iterations), positive("atol", atol)
+    # One more: the first evaluation is of the start values.
+    steps, atol = integer("max_iterations", max_iterations) + 1, positive("atol", atol)
     data = complete_data(problem, data)
     solver = make_solver(problem, atol=atol, max_steps=steps, **options)
     fixed = jax.lax.stop_gradient(data)
@@ -143,7 +146,7 @@ def attach_derivatives(
     values, fixed = jax.lax.stop_gradient((values, data))
     values, _ = datum.move_to_datum(declared, plan, values, fixed.start)
     at = linearise(declared, plan, values, fixed, sensitivity == "exact")
-    # Along open motions the gradient is rounding.
+    # Along open motions the gradient is only rounding: that part is removed.
     gradient = gradient_after(zero_tangent(plan), at, fixed)
     gradient = datum.s_transform_transposed(declared, plan, values, gradient)
     step = jax.tree.map(jnp.negative, elimination.solve(at.factor, gradient))
@@ -163,8 +166,8 @@ def linearise(
     laid = lay_out_data(plan, data)
     normal = Normal(plan, equations(declared, plan, values, laid)[-1])
     # Conjugate gradients tolerate open motions.
-    datum = plan.datum if plan.reduction in FACTORS else None
-    pins, own = {} if datum is None else datum.pins, normal.diagonal()
+    pinned = plan.datum if plan.reduction in FACTORS else None
+    pins, own = {} if pinned is None else pinned.pins, normal.diagonal()
     pins = {g: p * jnp.where(own[g] > 0, own[g], 1.0) for g, p in pins.items()}
     return LinearisedSolution(declared, plan, values, data, elimination.factorise(normal), pins)
 

@@ -240,9 +240,10 @@ def _worst(
             critical,
         )
     ]
-    rays = _Neighbours(found, touched, unit)
+    neighbours = _Neighbours(found, touched, unit)
     others = {
-        k: rays.alternatives(str(of[k]), int(row[k]), critical, apart) for k in chosen.tolist()
+        k: neighbours.alternatives(str(of[k]), int(row[k]), critical, apart)
+        for k in chosen.tolist()
     }
     # Those beyond doubt first: without them, some of the others may become separable.
     certain = [k for k in others if not others[k]]
@@ -253,8 +254,8 @@ def _worst(
 
 
 def _leverage(found: Solution) -> dict[str, Float[np.ndarray, " n"]]:
-    """h̃/r of every observation, the largest of its residuals: h minus the part of its eliminated
-    row alone."""
+    """(h − h_e)/(1 − h) of every observation, the largest of its residuals: its leverage h without
+    the part h_e of its eliminated row, over its redundancy number."""
     tested, tiny = found.reliability, np.finfo(float).tiny
     return {
         o: (np.clip(h - tested.own[o], 0.0, None) / np.maximum(1 - h, tiny)).max(1, initial=0.0)
@@ -390,6 +391,7 @@ def without(
         for o, own in touched.own.items():
             rows = used(weight[o]).sum(1)
             np.add.at(left, own[own >= 0], rows[own >= 0])
+        # −1: no eliminated row.
         changed = {int(touched.own[r.set][row]) for r in removed for row in r.rows} - {-1}
         lone = sorted({*excluded} | {row for row in changed if left[row] < width})
         for o, own in touched.own.items():
