@@ -1,4 +1,5 @@
-"""Refractive index of the U.S. Standard Atmosphere 1976, and its integral over the height.
+"""Refractive index of the U.S. Standard Atmosphere 1976, and its integral over the height; the
+bending of rays that follows: `corrections.refract`.
 
 With the geopotential height H = r·h/(r + h), the temperature T of each layer is linear in H and the
 pressure follows from the hydrostatic equation dp = −ρ·g·dh (U.S. Standard Atmosphere, 1976,

@@ -1,7 +1,5 @@
 """The accuracy report of a cloud: mean, largest and smallest σX, σY, σZ, and numbers by classes;
 RMS at check points, or to a plane.
-
-Source: the classes are those of seed 004's system.
 """
 
 from typing import Any

@@ -1,7 +1,6 @@
 """Clouds filtered and thinned: by cubes, by σ and rays, by the distances of neighbours.
 
-Sources: cubes with a least number of points, replaced by their corner or mean: seed 004's system;
-the statistical filter: Rusu et al. (2008), Towards 3D point cloud based object maps.
+The statistical filter: Rusu et al. (2008), Towards 3D point cloud based object maps.
 """
 
 import dataclasses

@@ -5,7 +5,8 @@ Line v is exposed at t = τ·(v − vm), vm the middle line, at which the exteri
 
     X0(t) = X0 + V·t        M(t) = exp([ω·t]×)·M
 
-V in object space, ω about the camera axes. v is the measured line, so that the image coordinates
+V in object space, ω about the camera axes; the residual of an image point is `MovingImagePoint` of
+`image_points.py`. v is the measured line, so that the image coordinates
 stay explicit.
 
 Columns: `image`, and start values of `vX`, `vY`, `vZ` (object unit per second), `wx`, `wy`, `wz`

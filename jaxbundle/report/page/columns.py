@@ -1,4 +1,4 @@
-"""Tables for the page: columns of numbers and names as compact JSON, which `tables.js` decodes.
+"""Tables for the page: columns of numbers and names as compact JSON, which `table.js` decodes.
 
 Numbers are base64 of little-endian arrays, of the smallest type of integers that holds them, of
 32-bit floats where these are enough; a column of equal values is one value. Names that repeat are
