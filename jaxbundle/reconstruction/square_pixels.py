@@ -7,6 +7,7 @@ ratios 4 to 8 σ apart. A contradiction is therefore believed only if it repeats
 photographs are divided into two halves, each is adjusted alone without the observed ratio, and both
 must deviate from 1 by more than chance explains, to the same side, and by more than they differ
 from each other.
+"""
 
 import dataclasses
 from collections.abc import Collection

@@ -1,6 +1,5 @@
 """The accuracy report of a cloud: mean, largest and smallest σX, σY, σZ, and numbers by classes;
-RMS at check points, or to a plane.
-"""
+RMS at check points, or to a plane."""
 
 from typing import Any
 
