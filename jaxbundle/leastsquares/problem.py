@@ -144,9 +144,9 @@ def make_problem(
     check(tables, observations)
     spaces = tuple((t.name, t.space) for t in tables)
     declared = Declared(tuple((o.name, o.kind) for o in observations), spaces, motions)
-    ways = REDUCTIONS if reduction is None else (reduction,)
+    solvers = REDUCTIONS if reduction is None else (reduction,)
     # The plan depends on which rows meet and what is free, not on values.
-    planned = _make_plan(tables, observations, eliminate, ways, planning)
+    planned = _make_plan(tables, observations, eliminate, solvers, planning)
     data = make_data(tables, observations)
     problem = Problem(
         tables,
@@ -169,11 +169,13 @@ def _make_plan(
     tables: Sequence[Table],
     observations: Sequence[ObservationSet],
     eliminate: str | None,
-    ways: Sequence[str],
+    solvers: Sequence[str],
     settings: PlanningSettings,
 ) -> tuple[Plan, Sizes, dict]:
     """The plan on the device, the sizes of its lists, and the choices made."""
-    host, sizes, choices = make_plan(tables, observations, eliminate, ways=ways, settings=settings)
+    host, sizes, choices = make_plan(
+        tables, observations, eliminate, solvers=solvers, settings=settings
+    )
     sizes = common([sizes], choose_rounding(observations, settings))
     return jax.device_put(finish(host, sizes)), sizes, choices
 

@@ -141,11 +141,13 @@ def leave_out_undetermined(network: Network) -> Network:
         still = used & (seen > 0) & (2 * seen + given >= 6)
         if (kept == keep).all() and (still == used).all():
             break
+        # Only the first image: those that follow are left out because of it.
         if first is None and (still != used).any():
             measured = np.bincount(image, minlength=len(images))
             worst = int(np.where(still, np.inf, measured).argmin())
             first = _too_few_points(network, worst, seen)
         keep, used = kept, still
+    # What is left of less than a half says more about what is wrong than about the object.
     if first is not None and 2 * (~used).sum() >= len(images):
         raise first
     out, notes = ~keep, []

@@ -50,6 +50,7 @@ def photograph_network(
     if not cameras.calibrated:
         free = [dataclasses.replace(camera, free=PARAMETERS) for camera in free]
     tracks = [track_name(t) for t in np.unique(measured.track).tolist()]
+    # Photographs without tie points are not in the network.
     named = extra.named.take(np.isin(extra.named.image, rows))
     points = [*tracks, *dict.fromkeys(named.name)]
     names = np.array([p.name for p in photographs], dtype=object)

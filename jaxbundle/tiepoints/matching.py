@@ -78,6 +78,7 @@ def match_features(
     best, distance, second = nearest(a, b)
     if within is not None:
         second = np.minimum(second, np.minimum(within[0], within[1][best]))
+    # Most features fall here, and need no search in the other direction.
     rows = np.flatnonzero(distance < settings.max_ratio * second)
     if not len(rows):
         return np.zeros((0, 2), int), np.zeros(0)
@@ -85,6 +86,7 @@ def match_features(
     # descriptors closer than 1e-3 are equal: three times √ε of float32, the rounding of √(1 − a·b)
     distance_ratio = distance[rows] / np.maximum(np.minimum(second[rows], second_back), 1e-3)
     mutual = np.flatnonzero((back == rows) & (distance_ratio < settings.max_ratio))
+    # stable: equal ratios keep their order on every machine
     mutual = mutual[np.argsort(distance_ratio[mutual], kind="stable")]
     rows = rows[mutual]
     return np.stack([rows, best[rows]], 1), distance_ratio[mutual]

@@ -137,6 +137,7 @@ def verify_pairs(
     if not usable:
         return verified
     find = lambda rows: _find_agreeing(rows, xy1, xy2, tolerance, settings)
+    # First the unique matches alone; then all, where enough are added to make it another trial.
     sure = find({k: np.flatnonzero(unique[k]) for k in usable})
     agreed = find(
         {k: np.arange(len(xy1[k])) for k in usable if k not in sure and (~unique[k]).sum() >= least}
@@ -184,6 +185,7 @@ def _find_agreeing(
     # the most distinct ones, but all of a few
     clear = lambda n: batched.spread(max(int(settings.distinct_share * n), min(n, batched.SLOTS)))
     first = _orient_by_rows(rows, clear, xy1, xy2, tolerance, settings)
+    # A second trial with the first `batched.SLOTS` needs a first one with more.
     again = {
         k: r
         for k, r in rows.items()

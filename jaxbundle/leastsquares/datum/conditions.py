@@ -122,6 +122,7 @@ def keep_held_fixed(
     # The combination of motions c that leaves held unknowns, R·(g − c) = 0, with the smallest c: c
     # = (RᵀR)⁺RᵀR·g, columns scaled, since radians stand beside metres.
     A = rows.T @ rows
+    # The scale cancels: no derivative of it is needed.
     scale = jax.lax.stop_gradient(jnp.diagonal(A))
     # Twice: a NaN of the branch that is not taken would enter the gradient.
     scale = jnp.where(scale > 0, jnp.where(scale > 0, scale, 1.0) ** -0.5, 1.0)

@@ -71,9 +71,9 @@ class NormalFactor(eqx.Module):
 def damp(normal: Normal, damping: Float[Array, ""]) -> Normal:
     """N + λ·D."""
     N, e = normal.blocks, normal.plan.eliminated
-    more = {name: damping * d for name, d in matrices(N.damping_matrix).items()}
-    own = {name: B + more[name] for name, B in N.own.items()}
-    eliminated = None if e is None else present(N.eliminated) + more[e]
+    added = {name: damping * d for name, d in matrices(N.damping_matrix).items()}
+    own = {name: B + added[name] for name, B in N.own.items()}
+    eliminated = None if e is None else present(N.eliminated) + added[e]
     return Normal(normal.plan, dataclasses.replace(N, own=own, eliminated=eliminated))
 
 
@@ -85,9 +85,9 @@ def regularise_diagonal(normal: Normal, ridge: float = 1e-10) -> Normal:
     a σ below 1e-3 of this keeps it to 1e-4; half or double change no verdict."""
     N, e = normal.blocks, normal.plan.eliminated
     diagonal = lambda B: jnp.diagonal(B, axis1=1, axis2=2)[:, :, None] * jnp.eye(B.shape[1])
-    more = lambda B: B + ridge * diagonal(B)
-    own = {name: more(B) for name, B in N.own.items()}
-    eliminated = None if e is None else more(N.eliminated)
+    add = lambda B: B + ridge * diagonal(B)
+    own = {name: add(B) for name, B in N.own.items()}
+    eliminated = None if e is None else add(N.eliminated)
     return Normal(normal.plan, dataclasses.replace(N, own=own, eliminated=eliminated))
 
 
@@ -127,14 +127,14 @@ def reduced_system(
     scale = {g: jnp.where(diagonal[g] > 0, diagonal[g], 1.0) ** -0.5 for g in plan.kept}
     S = S.scale_symmetrically(plan, scale)
     for g, B in S.own.items():
-        more = 1.0 - plan.groups[g].free
+        added = 1.0 - plan.groups[g].free
         # With d pins on a matrix of defect d, N + Σ eᵢeᵢᵀ is regular, and the solution is that of
         # the minimal datum in which the pinned unknowns do not change. Inner constraints instead
         # (G·Gᵀ added) would fill the whole matrix, band and all; a QR of G in the loop compiled
         # longer.
         if plan.datum is not None:
-            more = more + regular * plan.datum.pins[g]
-        S.own[g] = B + more[:, :, None] * jnp.eye(B.shape[1])
+            added = added + regular * plan.datum.pins[g]
+        S.own[g] = B + added[:, :, None] * jnp.eye(B.shape[1])
     return S, scale, lower_inverse, Z
 
 
@@ -149,7 +149,7 @@ def eliminate(normal: Normal) -> tuple[Reduced, Float[Array, "rows w w"] | None,
     lower_inverse = inverse_cholesky(present(N.eliminated) + held)
     # L⁻¹ itself and not L: it is used for every incidence, for right-hand sides and for cofactors,
     # and a product of 3×3 vectorises where a substitution does not.
-    Z, less, less_off = {}, {}, {}
+    Z, ZtZ, ZtZ_off = {}, {}, {}
     for g, W in N.W.items():
         at = plan.incidences[g]
         Z[g] = _row_major(_lower_times(lower_inverse, at.eliminated, W))
@@ -157,16 +157,16 @@ def eliminate(normal: Normal) -> tuple[Reduced, Float[Array, "rows w w"] | None,
         # row, so their sum is one product of depth length × w; only the chunks are scattered.
         rows = Z[g].reshape(at.row.shape[0], -1, W.shape[-1])
         of_chunks = jnp.einsum("cki,ckj->cij", rows, rows)
-        less[g] = jax.ops.segment_sum(of_chunks, at.row, own[g].shape[0])
+        ZtZ[g] = jax.ops.segment_sum(of_chunks, at.row, own[g].shape[0])
     # The others: pairs of incidences of one eliminated row, of two kept rows.
     for key, at in plan.blocks.items():
         if at.pairs is not None:
-            less_off[key] = sum_pairs(at.pairs, at.row.shape[0], Z[key[0]], Z[key[1]])
+            ZtZ_off[key] = sum_pairs(at.pairs, at.row.shape[0], Z[key[0]], Z[key[1]])
     # The only exchange between devices in a factorisation: every one has eliminated rows of its
     # own, and then the whole S.
-    less, less_off = total(plan, (less, less_off))
-    own = {g: B - less[g] if g in less else B for g, B in own.items()}
-    for key, B in less_off.items():
+    ZtZ, ZtZ_off = total(plan, (ZtZ, ZtZ_off))
+    own = {g: B - ZtZ[g] if g in ZtZ else B for g, B in own.items()}
+    for key, B in ZtZ_off.items():
         off[key] = off[key] - B if key in off else -B
     return Reduced(own, off), lower_inverse, Z
 
@@ -181,6 +181,7 @@ def solve(factor: NormalFactor, right: Tangent) -> Tangent:
         h = jnp.einsum("nij,nj->ni", factor.lower_inverse, right[e] * free)
         for g, x in gather(plan, Z, h).items():
             kept[g] = kept[g] - x * factor.scale[g]
+    # Devices that differ in the last digit would take different branches later.
     x = average_over_devices(plan, factor.reduced.solve(kept))
     x = {g: rows * plan.groups[g].free * factor.scale[g] for g, rows in x.items()}
     if e is not None:
@@ -219,6 +220,7 @@ def sum_pairs(
             product = turned.reshape(number, m, rows) @ right
         else:
             product = jnp.einsum("cki,ckj->cij", left.reshape(number, rows, m), right)
+        # `chunk_pairs` lists them by block.
         return sums.at[k].add(product, indices_are_sorted=True)
 
     return sum_over_pairs(pairs, add, jnp.zeros((blocks, m, n)))

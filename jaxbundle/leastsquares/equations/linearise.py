@@ -53,7 +53,7 @@ def differentiate(
     each, and of its eliminated rows (None if there are none). Columns of held unknowns are zero."""
     part = plan.parts[number]
     kind, widths = declared.kinds[part.set_name], widths_of(declared, part)
-    rows = _Rows(residual_of(declared, part), widths, part.large)
+    rows = _ResidualsAndDerivatives(residual_of(declared, part), widths, part.large)
     r, found = map_observations(part, kind, prepared, laid, number, rows)
     # Computed once, not again in every loop that uses some of its columns.
     r, found = (r, found) if part.large else jax.lax.optimization_barrier((r, found))
@@ -108,7 +108,7 @@ def differentiate_rows(
 ) -> tuple[Array, list[Array]]:
     """Residuals [chunks, length, r] of `function(blocks, measured, weight, changes)` of every
     observation, and their derivatives by the changes of every slot [chunks, length, r, width]."""
-    rows = _Rows(function, widths, True)
+    rows = _ResidualsAndDerivatives(function, widths, True)
     r, found = map_blocks(rows, part.by_row, blocks, measured, weight)
     starts = np.cumsum((0, *widths))
     none = jnp.zeros((*r[0].shape, 0))
@@ -128,16 +128,18 @@ def differentiate_chunks(
     at_once: int = 1 << 16,
 ) -> Any:
     """`of_chunk(part, r, touches, E)` of every chunk of a part, [length, …] each, some chunks at a
-    time, so that derivatives of all of it (2 000 000 rows) are never in memory at once. The
-    incidences of the touches are always numbered.
+    time, so that derivatives of all of it (2 000 000 rows) are never in memory at once. Every touch
+    has an `incidence` here, also where the observations are the incidences.
 
     `at_once`: observations differentiated together. With 65 536 the statistics of 1000 images (2
     million observations) take 3.4 GB, with all of them 5.2; half would save little more."""
     part = plan.parts[number]
     chunks, length = part.source.shape
     in_order = jnp.arange(chunks * length).reshape(chunks, length)
-    counted = lambda t: t if t.incidence is not None else dataclasses.replace(t, incidence=in_order)
-    touches = tuple(map(counted, part.touches))
+    with_incidence = lambda t: (
+        t if t.incidence is not None else dataclasses.replace(t, incidence=in_order)
+    )
+    touches = tuple(map(with_incidence, part.touches))
     part = dataclasses.replace(part, touches=touches, place=in_order)
 
     def differentiate_one(given: tuple) -> Any:
@@ -155,8 +157,9 @@ def differentiate_chunks(
 
 
 @dataclasses.dataclass(frozen=True)
-class _Rows:
-    """The residuals of one observation and their derivatives by the changes of its slots."""
+class _ResidualsAndDerivatives:
+    """The residuals of one observation and their derivatives with respect to the changes of its
+    slots."""
 
     residual: Callable
     widths: tuple[int, ...]

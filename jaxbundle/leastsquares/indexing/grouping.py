@@ -84,6 +84,7 @@ class Grouping:
             # would not be block diagonal, so both go to the reduced system.
             for s in slots if len(slots) > 1 else ():
                 stays[given.rows[s]] = True
+        # Held rows are no unknowns: in the reduced system they would be rows of zeros.
         return self.choose("coupled rows", default=stays & table.free.any(1))
 
     def _share_observations(self) -> list[ObservationSubset]:
@@ -172,6 +173,7 @@ class Grouping:
         free = np.concatenate(free, 1)
         # A slot of the eliminated table may touch a row that is not in this group: it is masked.
         partial = any(rows is not None for *_, rows in self.members[name])
+        # Small problems are snooped: the program of the whole then serves for every subset.
         may_be_held = name == self.eliminate and len(free) < self.settings.masked_below
         may_be_held |= partial and name != self.eliminate
         all_free = bool(free.all()) and not may_be_held

@@ -36,7 +36,7 @@ def make_plan(
     observations: Sequence[ObservationSet],
     eliminate: str | None,
     choices: dict | None = None,
-    ways: Sequence[str] = REDUCTIONS,
+    solvers: Sequence[str] = REDUCTIONS,
     settings: PlanningSettings = PLANNING,
 ) -> tuple[Plan, Sizes, dict]:
     """The plan on the host, its arrays as `PlanIndex` and `PlanColumn` (`indices.finish`), the
@@ -44,10 +44,10 @@ def make_plan(
     settings).
 
     **Arguments:** `choices`: those made for the larger problem that this one is a part of, to be
-    reused; `ways`: allowed solvers of the reduced system."""
+    reused; `solvers`: those allowed for the reduced system."""
     choose = Choices(choices or {})
     settings = choose("settings", default=settings)
-    plan = _Planner(Grouping(tables, observations, eliminate, choose, settings), ways).plan()
+    plan = _Planner(Grouping(tables, observations, eliminate, choose, settings), solvers).plan()
     sizes = {("table", t.name): t.rows + 1 for t in tables}
     sizes |= {("observations", o.name): o.number + 1 for o in observations}
     return plan, sizes | count(plan), choose.made
@@ -101,9 +101,9 @@ class _PairList(NamedTuple):
 class _Planner:
     """The steps of `make_plan`; `grouping`: what is eliminated, and the groups."""
 
-    def __init__(self, grouping: Grouping, ways: Sequence[str]):
+    def __init__(self, grouping: Grouping, solvers: Sequence[str]):
         self.grouping, self.choose, self.settings = grouping, grouping.choose, grouping.settings
-        self.ways = self.choose("ways", default=tuple(ways))
+        self.solvers = self.choose("solvers", default=tuple(solvers))
 
     def plan(self) -> Plan:
         parts = [self.lay_out(k, share) for k, share in enumerate(self.grouping.shares)]
@@ -114,12 +114,12 @@ class _Planner:
             for g in (*self.grouping.kept, self.grouping.eliminate)
             if g is not None
         }
-        blocks, reduction, band = self.reduce(parts, incidences, groups)
+        blocks, reduction, band = self.plan_reduced_system(parts, incidences, groups)
         incidences = {g: found.incidences for g, found in incidences.items()}
         parts = tuple(p.part for p in parts)
         return Plan(groups, self.grouping.eliminate, parts, incidences, blocks, reduction, band)
 
-    def reduce(
+    def plan_reduced_system(
         self,
         parts: list[_PartInChunks],
         incidences: dict[str, _IncidencesInChunks],
@@ -128,18 +128,20 @@ class _Planner:
         """The blocks of the reduced matrix, its solver, its band."""
         rows = [np.zeros(0, np.int64), *(found.eliminated for found in incidences.values())]
         # m incidences of an eliminated row are m(m − 1)/2 pairs: counted before they are listed.
-        met, ways = np.bincount(np.concatenate(rows)).astype(float), self.ways
-        if len(ways) > 1 and (met * (met - 1)).sum() / 2 > self.settings.max_pairs:
-            ways = ("iterative",)
-        blocks = self.find_blocks(parts, {} if ways == ("iterative",) else incidences)
+        count, solvers = np.bincount(np.concatenate(rows)).astype(float), self.solvers
+        if len(solvers) > 1 and (count * (count - 1)).sum() / 2 > self.settings.max_pairs:
+            solvers = ("iterative",)
+        blocks = self.find_blocks(parts, {} if solvers == ("iterative",) else incidences)
         shapes = {g: groups[g].free.rows.shape for g in self.grouping.kept}
         none = np.zeros(0, np.int64)
         place = lambda at: (at.row.rows, at.column.rows) if at else (none, none)
-        ties = lambda g: place(blocks.get((g, g)))
-        number = sum(given.number for given in self.grouping.observations.values())
-        way, band = plan_reduction(shapes, ties, number, ways, self.settings)
-        self.choose.made["ways",] = (way,)
-        return blocks if way in FACTORS else self.find_blocks(parts, {}), way, band
+        couplings = lambda g: place(blocks.get((g, g)))
+        observations = sum(given.number for given in self.grouping.observations.values())
+        solver, band = plan_reduction(shapes, couplings, observations, solvers, self.settings)
+        # The parts of a problem on several devices must not choose another one.
+        self.choose.made["solvers",] = (solver,)
+        # Without a factor nothing reads the lists of pairs, which are the largest of all.
+        return blocks if solver in FACTORS else self.find_blocks(parts, {}), solver, band
 
     def lay_out(self, k: int, share: ObservationSubset) -> _PartInChunks:
         """Part k in chunks, with its touches (couples and incidences are added later)."""
@@ -167,6 +169,7 @@ class _Planner:
             # A slot whose row is the same in a chunk is looked up once for it, the others for each
             # observation.
             one = length == 1 or bool((rows[s] == rows[s][first[major]]).all())
+            # That of the eliminated row is one of every observation.
             one = self.choose("by chunk", k, s, default=one and s != share.slot)
             by_row.append(not one)
             lookup.append(as_index(at[:, 0] if one else at, along, ("table", name)))

@@ -40,23 +40,23 @@ def plan_reduction(
     shapes: dict[str, tuple[int, int]],
     ties: Callable[[str], tuple[Rows, Rows]],
     observations: int,
-    ways: Sequence[str],
+    solvers: Sequence[str],
     settings: PlanningSettings,
 ) -> tuple[str | None, Band | None]:
-    """The solver for kept groups of these shapes (rows, width), None if none of `ways` fits into
-    memory, and the band if it is banded; a single one of `ways` is used regardless.
+    """The solver for kept groups of these shapes (rows, width), None if none of `solvers` fits into
+    memory, and the band if it is banded; a single one of `solvers` is used regardless.
 
-    `ties(group)`: row and column of its blocks beside the diagonal."""
+    `couplings(group)`: row and column of its blocks beside the diagonal."""
     unknowns = sum(n * w for n, w in shapes.values())
-    if not shapes or (len(ways) > 1 and unknowns < settings.always_dense_below):
+    if not shapes or (len(solvers) > 1 and unknowns < settings.always_dense_below):
         return "dense", None
     group = max(shapes, key=lambda g: np.prod(shapes[g]))
-    (row, column), (rows, w) = ties(group), shapes[group]
-    band = find_band(group, row, column, rows, w, settings) if "banded" in ways else None
-    way = ways[0]
-    if len(ways) > 1:
-        way = choose_reduction(band, w, unknowns, observations, ways, settings)
-    return way, band if way == "banded" else None
+    (row, column), (rows, w) = couplings(group), shapes[group]
+    band = find_band(group, row, column, rows, w, settings) if "banded" in solvers else None
+    solver = solvers[0]
+    if len(solvers) > 1:
+        solver = choose_reduction(band, w, unknowns, observations, solvers, settings)
+    return solver, band if solver == "banded" else None
 
 
 def find_band(
@@ -88,7 +88,7 @@ def choose_reduction(
     w: int,
     unknowns: int,
     observations: int,
-    ways: Sequence[str],
+    solvers: Sequence[str],
     settings: PlanningSettings = PLANNING,
 ) -> str | None:
     """The solver for this number of unknowns, those of the band in blocks of `w`; None: none
@@ -104,7 +104,9 @@ def choose_reduction(
         q = n - rows
         border = 2 * rows * m * q + rows * q**2 + q**3 / 3
         work["banded"] = band.blocks * 10 / 3 * m**3 + border, 3 * band.blocks * m**2 + n * q
-    fits = {way: work[way][0] for way in ways if work[way][1] <= settings.max_factor_elements}
+    fits = {
+        name: work[name][0] for name in solvers if work[name][1] <= settings.max_factor_elements
+    }
     least = min(fits, key=fits.__getitem__, default=None)
     return (
         "dense"

@@ -79,15 +79,16 @@ class Elimination(lx.AbstractLinearSolver):
 class MarquardtDescent(optx.AbstractDescent):
     """The step −(N + λ·D)⁻¹·g with λ = 1/`step_size`; infinite: undamped.
 
-    - `regular_from`: step sizes from which the datum directions of a problem that may float are
-      regularised. Damping alone makes them regular before: λ·D exceeds rounding there.
-    - `inexact`: relative residual of a reduced system that is solved iteratively. The step need not
-      be exact: the next one is computed from the true residuals (inexact Newton: Dembo, Eisenstat
+    - `pin_datum_from`: step size above which the open datum directions are pinned; below it the
+      damping alone keeps N regular: λ = 1e-8 leaves them pivots a hundred thousand times those
+      that count as rounding (`elimination.PIVOT`).
+    - `relative_residual`: of a reduced system that is solved iteratively. The step need not be
+      exact: the next one is computed from the true residuals (inexact Newton: Dembo, Eisenstat
       and Steihaug 1982).
     """
 
-    regular_from: float = eqx.field(static=True, default=1e8)
-    inexact: float = eqx.field(static=True, default=1e-2)
+    pin_datum_from: float = eqx.field(static=True, default=1e8)
+    relative_residual: float = eqx.field(static=True, default=1e-2)
 
     def init(self, y: Tangent, f_info_struct: Info) -> None:
         return None
@@ -99,7 +100,7 @@ class MarquardtDescent(optx.AbstractDescent):
         damped = damp(state.hessian, 1 / step_size)
         # Pins in damped steps, too, would hold single unknowns of the datum and distort the step:
         # 15 evaluations on BAL 16 instead of 10.
-        solver = Elimination(step_size > self.regular_from, self.inexact)
+        solver = Elimination(step_size > self.pin_datum_from, self.relative_residual)
         change = lx.linear_solve(damped, state.grad, solver, throw=False).value
         return jax.tree.map(jnp.negative, change), optx.RESULTS.successful
 

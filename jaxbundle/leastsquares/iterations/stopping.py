@@ -191,11 +191,13 @@ class Approach(eqx.Module):
         # undamped step settles; `repeat` below asks for it.
         small = finite & (decrement <= tolerance.limit(cost))
         settled = small & undamped
-        again = self.singular & undamped & ~finite
+        # The first failure may be the step after a start value; a second one is of the equations.
+        failed_again = self.singular & undamped & ~finite
         singular = self.singular | (~finite & undamped)
         # Equations that can just be factorised send undamped steps anywhere: each is rejected
         # although the damped ones have settled. Twice, since once is an accident of rounding.
         singular |= self.rejected >= rules.max_rejected_undamped
+        # `first`: the start values were evaluated, no step was taken.
         stalled = accept & ~first & (before - trial_cost < tolerance.rtol * before)
         # Gauss–Newton accepts every step: a sum of squares that grows has not stalled, it diverges.
         stalled &= trial_cost - before <= tolerance.noise(before)
@@ -204,7 +206,7 @@ class Approach(eqx.Module):
             (settled, SETTLED),
             (stalled & ~singular, RELATIVE_COST),
             ((small | stalled) & singular, SINGULAR),
-            (again, SINGULAR),
+            (failed_again, SINGULAR),
             ((step_size < rules.shortest_step) & ~small, STUCK),
         )
         termination = jnp.asarray(LIMIT)

@@ -144,6 +144,7 @@ def attach_derivatives(
     One more Newton step makes it exact, since the iterations end before the last digits
     converge."""
     values, fixed = jax.lax.stop_gradient((values, data))
+    # The factor is that of the solution itself, where its derivatives are taken.
     values, _ = datum.move_to_datum(declared, plan, values, fixed.start)
     at = linearise(declared, plan, values, fixed, sensitivity == "exact")
     # Along open motions the gradient is only rounding: that part is removed.

@@ -121,6 +121,7 @@ def snoop(
         found = _solve(whole, removed, excluded, found.values, adjust_from)
     # τ has f − 1 degrees of freedom.
     while found.problem.counts.redundancy >= 2:
+        # Exact data have σ0 = 0, and residuals of rounding that no test may be scaled by.
         unit = found.sigma0 if test == "pope" and found.sigma0 > 0 else 1.0
         counts = found.problem.counts
         critical = critical_w(
@@ -306,6 +307,7 @@ def _passing(
     if touched.eliminated is not None:
         free = lambda problem: problem.table(touched.eliminated).free.any(1)
         aside = free(whole) & ~free(found.problem)
+    # What remains of an excluded row agrees with anything.
     excluded = lambda r, row: touched.own[r.set][row] >= 0 and aside[touched.own[r.set][row]]
     return {
         (r.set, row, r.residual)
