@@ -38,7 +38,7 @@ class Band(eqx.Module):
 
 def plan_reduction(
     shapes: dict[str, tuple[int, int]],
-    ties: Callable[[str], tuple[Rows, Rows]],
+    couplings: Callable[[str], tuple[Rows, Rows]],
     observations: int,
     solvers: Sequence[str],
     settings: PlanningSettings,
