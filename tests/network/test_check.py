@@ -260,7 +260,7 @@ def test_images_without_enough_points_are_left_out_by_name(said, keep):
     found = check_network(make_network(**given))
     assert found.images.id == ("i0", "i2") and len(found.points) == 8
     (left,) = found.left_out
-    assert (left.thing, left.names) == ("image", ("i1",)) and "three points" in left.why
+    assert (left.thing, left.names) == ("image", ("i1",)) and "too few points" in left.why
     assert "left out 1 image" in " ".join(found.notes)
     given["images"][1] |= {"sX0": 0.1, "sY0": 0.1}
     kept = "i1" in check_network(make_network(**given)).images.id

@@ -27,8 +27,8 @@ def test_a_growing_model_is_adjusted_whenever_it_has_grown_by_a_factor(monkeypat
         model.known[point[np.isin(image, chosen)]] = True
         return True
 
-    monkeypatch.setattr(growth, "_place_images", place)
-    monkeypatch.setattr(growth, "intersect", lambda *_: None)
+    monkeypatch.setattr(incremental, "_place_images", place)
+    monkeypatch.setattr(incremental, "intersect", lambda *_: None)
     sizes = []
     settings = dataclasses.replace(DEFAULTS, first_improvement=5)
     improve = lambda strip, model: sizes.append(int(model.placed.sum()))

@@ -41,10 +41,10 @@ def test_pixels_are_released_only_if_both_halves_of_the_photographs_agree(
 ):
     """Otherwise the adjustment with square pixels is the result."""
     ratio = square_pixels.Ratio(0.02, 0.001)
-    monkeypatch.setattr(aspect_ratio, "contradicted_ratios", lambda _: {"cam": ratio})
-    monkeypatch.setattr(aspect_ratio, "replicated_ratios", lambda _: {"cam": (ratio, ratio)})
-    monkeypatch.setattr(aspect_ratio, "is_replicated", lambda *_: confirmed)
-    monkeypatch.setattr(aspect_ratio, "release", lambda network, ids: (network, [*ids]))
+    monkeypatch.setattr(square_pixels, "contradicted_ratios", lambda _: {"cam": ratio})
+    monkeypatch.setattr(square_pixels, "replicated_ratios", lambda _: {"cam": (ratio, ratio)})
+    monkeypatch.setattr(square_pixels, "is_replicated", lambda *_: confirmed)
+    monkeypatch.setattr(square_pixels, "release", lambda network, ids: (network, [*ids]))
     monkeypatch.setattr(reconstruct.dataclasses, "replace", lambda _, network: network)
     monkeypatch.setattr(run, "_adjust", lambda network, measured: (network, "again"))
     oriented, weighted = SimpleNamespace(network="network"), SimpleNamespace(adjustment=None)
