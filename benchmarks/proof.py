@@ -257,7 +257,18 @@ def rig(real: Path, folder: Path) -> Iterator[str]:
     folders, out = real / "rig4", folder / "rig4"
     cameras = ("back", "mid", "side", "top")
     words = [word for name in cameras for word in ("--camera", f"{name}={folders / name}")]
-    board = ("--board", "8x11", "--square", 24, "--marker", 18.75, "--dictionary", "DICT_4X4_1000")
+    board = (
+        "--board",
+        "8x11",
+        "--kind",
+        "charuco",
+        "--square",
+        24,
+        "--marker",
+        18.75,
+        "--dictionary",
+        "DICT_4X4_1000",
+    )
     run("calibrate", *words, "--rig", *board, "--out", out, out=out)
     result = result_of(out)
     residuals = result["residuals"]

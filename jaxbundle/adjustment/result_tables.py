@@ -15,7 +15,6 @@ from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.leastsquares.declarations import ObservationSet
 from jaxbundle.leastsquares.quality.correlation import correlation_matrix, total_correlation
 from jaxbundle.leastsquares.quality.reliability import external_reliability, minimal_detectable
-from jaxbundle.network.kinds import OF_ANGLES
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.network.units import ANGLE_UNITS
 
@@ -149,8 +148,8 @@ def _rays_and_rms(
 
 
 def residuals(adjustment: "Adjustment") -> dict[str, np.ndarray]:
-    """One row per observation: kind, image, point, axis, v, sigma (a priori), r, w (Baarda), tau
-    (Pope), mdb, external, and weight (the factor) after robust estimation; image observations
+    """One row per observation: kind, image, point, axis, unit, v, sigma (a priori), r, w (Baarda),
+    tau (Pope), mdb, external, and weight (the factor) after robust estimation; image observations
     first, in the given order."""
     found = adjustment.reliability
     parts = observations(adjustment.problem, *(getattr(found, name) for name in TESTED))
@@ -162,8 +161,8 @@ BySet = Mapping[str, Float[np.ndarray, "n r"]]
 
 class KindRows(NamedTuple):
     """Observations of one kind: ids of image and point of each ("" for none), names of its axes;
-    1/σ [observations, axes], and further quantities in that shape; `angle_scale`: factor from
-    radians to the unit of angles in tables."""
+    1/σ [observations, axes], and further quantities in that shape; `units`: of every axis the
+    factor from the unit of computation and the word of that in tables."""
 
     kind: str
     image: Sequence[str] | np.ndarray
@@ -171,7 +170,7 @@ class KindRows(NamedTuple):
     axes: Sequence[str]
     inverse_sigma: Float[np.ndarray, "observations axes"]
     quantities: tuple[Float[np.ndarray, "observations axes"], ...]
-    angle_scale: float = 1.0
+    units: Sequence[tuple[float, str]]
 
 
 def observations(problem: NetworkProblem, *found: BySet) -> Iterator[KindRows]:
@@ -183,14 +182,22 @@ def observations(problem: NetworkProblem, *found: BySet) -> Iterator[KindRows]:
     blank = lambda rows: np.full(rows, "", dtype=object)
     known = {o.name: o for o in problem.observations}
 
-    scale = 1 / ANGLE_UNITS[network.angle_unit]
+    words = {
+        "length": (1.0, network.object_unit),
+        "angle": (1 / ANGLE_UNITS[network.angle_unit], network.angle_unit),
+        "image": (1.0, network.image_unit),
+    }
 
-    def quantities(name: str) -> tuple[np.ndarray, tuple[np.ndarray, ...], float]:
-        return problem.weights(name), tuple(np.asarray(rows[name]) for rows in found), scale
+    def quantities(name: str) -> tuple[np.ndarray, tuple[np.ndarray, ...], list]:
+        weights, units = problem.weights(name), known[name].kind.units
+        every = [units] * weights.shape[1] if isinstance(units, str) else units
+        rows = tuple(np.asarray(rows[name]) for rows in found)
+        return weights, rows, [words.get(unit, (1.0, "")) for unit in every]
 
     weight, *rows = (np.asarray(problem.image_points(x)) for x in (problem.data.weight, *found))
     of_image, of_point = images[problem.image], points[problem.point]
-    yield KindRows("image", of_image, of_point, ("x", "y"), weight, tuple(rows))
+    units = [words["image"]] * 2
+    yield KindRows("image", of_image, of_point, ("x", "y"), weight, tuple(rows), units)
     if "control" in known:
         control = points[known["control"].rows[0]]
         yield KindRows(
@@ -215,8 +222,12 @@ def _of_further_kind(
     problem: NetworkProblem, given: ObservationSet
 ) -> tuple[str, np.ndarray, np.ndarray, tuple[str, ...]]:
     """The rows that observations of a further kind touch are in the column of the point."""
-    touched = [given.label(problem.tables, row) for row in range(given.number)]
-    touched = [label.removeprefix(f"{given.kind.name} of ") for label in touched]
+    if {*given.kind.of} == {"point"}:
+        ids = problem.table("point").label
+        touched = [" – ".join(ids(int(row)) for row in rows) for rows in zip(*given.rows)]
+    else:
+        touched = [given.label(problem.tables, row) for row in range(given.number)]
+        touched = [label.removeprefix(f"{given.kind.name} of ") for label in touched]
     width = problem.weights(given.name).shape[1]
     axes = given.kind.axes or tuple(str(i + 1) for i in range(width))
     blank = np.full(given.number, "", dtype=object)
@@ -297,9 +308,7 @@ def residual_rows(adjustment: TestedResult, part: KindRows) -> dict[str, np.ndar
     v, gain, r, w, hat = part.quantities
     kind, axes = part.kind, part.axes
     free = np.clip(1 - hat, 0, 1)
-    unit = np.ones(part.inverse_sigma.shape[1])
-    if kind in OF_ANGLES or tuple(axes) == EXTERIOR:
-        unit[-3:] = part.angle_scale
+    unit, words = (np.array(x) for x in zip(*part.units))
     used = part.inverse_sigma > 0
     sigma = np.where(used, unit / np.where(used, part.inverse_sigma, 1), np.nan)
     repeat = lambda ids: np.repeat(ids, len(axes))
@@ -308,6 +317,7 @@ def residual_rows(adjustment: TestedResult, part: KindRows) -> dict[str, np.ndar
         "image": repeat(part.image),
         "point": repeat(part.point),
         "axis": np.tile(np.array(axes, dtype=object), len(part.image)),
+        "unit": np.tile(words.astype(object), len(part.image)),
         "v": (v * sigma).ravel(),
         "sigma": sigma.ravel(),
         "r": r.ravel(),

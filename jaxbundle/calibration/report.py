@@ -363,7 +363,7 @@ def several_text(found: "Calibrations") -> str:
 
 def rig_text(rig: "RigCalibration") -> str:
     """The mountings of a rig and its cameras in the common adjustment."""
-    unit = clean(next(iter(rig.cameras.values())).adjustment.network.object_unit)
+    unit = clean(rig.object_unit)
     lines = [f"Rig of {len(rig.cameras)} cameras, reference {clean(rig.names[0])}", "=" * 100]
     lines += facts(rig_facts(rig, unit))
     for name, m in rig.mountings.items():

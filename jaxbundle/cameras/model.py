@@ -147,9 +147,9 @@ class CameraModel:
             formula, back = (corrected, back) if formula is None else (formula, corrected)
         assert formula is not None, "checked by _complete"
         # The formula stated is exact; the other direction is its inverse, to rounding.
-        back = back or implicit_inverse(
-            formula, self.start or _less_its_origin(formula), self.iterations
-        )
+        point = [self.parameters.index(name) for name in self.principal_point]
+        start = _at_the_point(point) if self.correct and point else _less_its_origin(formula)
+        back = back or implicit_inverse(formula, self.start or start, self.iterations)
         explicit = self.distort or self.project
         own, other = ("from_ideal", "to_ideal")[:: 1 if explicit else -1]
         made = {"own_formula": own, own: formula, other: back, "ideal": ideal, "ray": ray}
@@ -255,6 +255,13 @@ def _less_its_origin(formula: Formula) -> Formula:
         return X - x, Y - y
 
     return start
+
+
+def _at_the_point(columns: Sequence[int]) -> Formula:
+    """Undoes the shift to the principal point of a correction, exact on the axis. At the origin of
+    pixels, a corner, a correction may have no value at all."""
+    x0, y0 = columns
+    return lambda p, X, Y: (X + p[x0], Y + p[y0])
 
 
 def project(model: CameraModel, p: Parameters, r: Scalar, s: Scalar, q: Scalar) -> Pair:

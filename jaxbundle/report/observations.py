@@ -54,9 +54,8 @@ def residuals(adjustment: Any, limit: float, test: str, max_rows: int = 100) -> 
     lines += paragraph(
         f"Test: {'Pope, τ = w/σ0, σ a posteriori' if test == 'pope' else 'Baarda, σ a priori'}; "
         f"critical value {significant(critical_value(adjustment, test), 3)} for one observation at "
-        f"0.1 %. v and σ (a priori) of image coordinates in {adjustment.image_unit}, of control "
-        "points and distances in the object unit; r redundancy number; MDB the smallest blunder "
-        "that the test of w finds (α 0.1 %, power 80 %), with σ a priori; "
+        f"0.1 %. v, σ (a priori) and MDB in the unit of their row; r redundancy number; MDB the "
+        "smallest blunder that the test of w finds (α 0.1 %, power 80 %), with σ a priori; "
         "ext. (external reliability) its largest effect on an unknown, in σ of that unknown."
     )
     lines.append("")
@@ -81,13 +80,13 @@ def critical_value(adjustment: "Adjustment", test: str = "pope", level: float = 
 
 def _rows(adjustment: "Adjustment", chosen: Iterable[int]) -> list[str]:
     found, sigma0 = adjustment.residuals, adjustment.sigma0
-    header = ("kind", "image", "point", "axis", "v", "σ", "r", "w", "τ", "MDB", "ext.")
+    header = ("kind", "image", "point", "axis", "unit", "v", "σ", "r", "w", "τ", "MDB", "ext.")
     rows = []
     for i in chosen:
         sigma = found["sigma"][i]
         rows.append(
             (
-                *(found[name][i] for name in ("kind", "image", "point", "axis")),
+                *(found[name][i] for name in ("kind", "image", "point", "axis", "unit")),
                 to_place_of(found["v"][i], sigma0 * sigma),
                 significant(sigma, 3),
                 fixed(found["r"][i], 3),
@@ -97,7 +96,7 @@ def _rows(adjustment: "Adjustment", chosen: Iterable[int]) -> list[str]:
                 significant(found["external"][i], 3),
             )
         )
-    return table(header, rows, "llll" + "r" * 7)
+    return table(header, rows, "lllll" + "r" * 7)
 
 
 def _histogram(tau: Float[np.ndarray, " n"]) -> list[str]:

@@ -11,6 +11,7 @@ from camera_cases import CASES, Case, each_case, image_rays, project
 from numpy.testing import assert_allclose
 
 from jaxbundle import cameras
+from jaxbundle.choices import CAMERA_MODELS
 
 
 def test_every_model_has_a_case():
@@ -188,3 +189,7 @@ def test_what_is_free_by_default_is_no_rotation_of_the_camera(case):
     J = J[np.isfinite(J).all(1)]
     s = np.linalg.svd(J / np.linalg.norm(J, axis=0), compute_uv=False)
     assert s[-1] > 1e-9 * s[0]
+
+
+def test_the_options_of_commands_name_every_model():
+    assert set(CAMERA_MODELS) == set(cameras.MODEL_NAMES)

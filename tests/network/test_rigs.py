@@ -139,3 +139,28 @@ def test_what_is_wrong_is_named(simulated, rows, section, message):
     rows = [{"rig": rig, "epoch": epoch, "image": ids[i]} for rig, epoch, i in rows]
     with pytest.raises(InputError, match=message):
         jaxbundle.make_problem(mounted(simulated.network, rows, **section))
+
+
+def test_residuals_of_angles_have_the_unit_of_the_network(simulated):
+    """Those of mountings, of attitudes and of measured angles, and no others."""
+    network = mounted(simulated.network)
+    ids, points = network.images.id, network.points.id
+    angles = np.degrees(simulated.truth.images.angles[0])
+    rows = {
+        "attitudes": [{"image": ids[0], **dict(zip(("omega", "phi", "kappa"), angles)),
+                       **dict.fromkeys(("somega", "sphi", "skappa"), 1.0)}],
+        "angles": [{"from": points[0], "at": points[1], "to": points[2], "value": 60.0,
+                    "sigma": 30.0}],
+    }  # fmt: skip
+    more = make_further(rows, np.radians(1.0))
+    network = network.replace(further=(*network.further, *more))
+    radians, gon = (
+        jaxbundle.adjust(network.replace(angle_unit=unit)).residuals for unit in ("rad", "gon")
+    )
+    turned = gon["unit"] == "gon"
+    expected = {"turn x", "turn y", "turn z", "omega", "phi", "kappa", "angle"}
+    assert {*gon["axis"][turned]} == expected == {*radians["axis"][radians["unit"] == "rad"]}
+    for name in ("v", "sigma", "mdb"):
+        factor = np.where(turned, 200 / np.pi, 1.0)
+        np.testing.assert_allclose(gon[name], factor * radians[name], rtol=1e-7)
+    assert {*gon["unit"][gon["kind"] == "image"]} == {network.image_unit}

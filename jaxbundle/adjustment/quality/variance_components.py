@@ -6,7 +6,6 @@ import numpy as np
 
 from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.leastsquares.quality.components import VarianceGroup as Group
-from jaxbundle.network.kinds import OF_ANGLES
 from jaxbundle.network.units import ANGLE_UNITS
 
 
@@ -46,9 +45,11 @@ def groups(problem: NetworkProblem) -> list[Group]:
         Group("interior orientation", every(*interior), np.nan),
         Group("distances", every("distance")),
     ]
-    further: dict[str, list[tuple[str, Any]]] = {}
+    # Of kinds with several units the factor has none.
+    scale, further = {"length": 1.0, "image": 1.0, "angle": angle}, {}
     for name in problem.further_sets:
-        kind = problem.observations_of(name).kind.name
-        further.setdefault(kind, []).append((name, np.s_[:]))
-    unit = lambda name: angle if name in OF_ANGLES else 1.0
-    return found + [Group(name, parts, unit(name)) for name, parts in further.items()]
+        kind = problem.observations_of(name).kind
+        units = kind.units if isinstance(kind.units, str) else "several"
+        _, parts = further.setdefault(kind.name, (scale.get(units, np.nan), []))
+        parts.append((name, np.s_[:]))
+    return found + [Group(name, parts, unit) for name, (unit, parts) in further.items()]

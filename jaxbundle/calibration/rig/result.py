@@ -114,6 +114,11 @@ class RigCalibration(TableMethods):
         """The unit of image coordinates in the adjustment: that of the camera models."""
         return units_of(self.rig.cameras)
 
+    @property
+    def object_unit(self) -> str:
+        """The unit of object coordinates."""
+        return next(iter(self.cameras.values())).adjustment.network.object_unit
+
     @functools.cached_property
     def used(self) -> Bool[np.ndarray, " n"]:
         """Which image points were not removed."""
@@ -132,7 +137,7 @@ class RigCalibration(TableMethods):
 
     @functools.cached_property
     def residuals(self) -> dict[str, np.ndarray]:
-        """One row per observation: kind, image (camera and epoch), point, axis, v, sigma (a
+        """One row per observation: kind, image (camera and epoch), point, axis, unit, v, sigma (a
         priori), r, w (Baarda), tau (Pope), mdb, external."""
         rig, found, weight = self.rig, self.result.solution.reliability, self.result.problem.weights
         ids = np.array(rig.ids, dtype=object)
@@ -146,6 +151,7 @@ class RigCalibration(TableMethods):
                 ("x", "y"),
                 rows({table.image_set: weight(table.image_set) for table, _ in rig.sets}),
                 tuple(rows(getattr(found, name)) for name in result_tables.TESTED),
+                [(1.0, self.image_unit)] * 2,
             )
         ]
         if rig.point_sigma is not None:
@@ -158,6 +164,7 @@ class RigCalibration(TableMethods):
                     tuple("XYZ"),
                     weight("control"),
                     tuple(getattr(found, name)["control"] for name in result_tables.TESTED),
+                    [(1.0, self.object_unit)] * 3,
                 )
             )
         return result_tables.concatenate([result_tables.residual_rows(self, p) for p in parts])
@@ -302,9 +309,8 @@ class RigCalibration(TableMethods):
         self, name: str, distance: float = np.inf, frame: str = "rig", ax: "Axes | None" = None
     ) -> "Axes":
         """σ of a projected point over the image of a camera; matplotlib axes."""
-        found, one = self.uncertainty(name, distance, frame, DRAWN), self.cameras[name]
-        unit = one.adjustment.network.object_unit
-        return plotting.uncertainty_image(found, one.views.image_size, unit, name, ax)
+        found, size = self.uncertainty(name, distance, frame, DRAWN), self.cameras[name].views
+        return plotting.uncertainty_image(found, size.image_size, self.object_unit, name, ax)
 
     def report(self) -> str:
         """The full report as text."""

@@ -1,7 +1,6 @@
 """Further kinds of observations of a network: one file per kind, with a common interface
 (`base.Further`)."""
 
-from jaxbundle.network.kinds import attitudes, differences
 from jaxbundle.network.kinds.antennas import Antennas as Antennas
 from jaxbundle.network.kinds.attitudes import Attitudes as Attitudes
 from jaxbundle.network.kinds.base import Further as Further
@@ -34,6 +33,4 @@ KINDS = {
     )
 }
 """By the name of their table."""
-OF_ANGLES = {kind.name for kind in (attitudes.ATTITUDE, attitudes.PRIOR, differences.ANGLE)}
-"""The kinds whose residuals are angles, radians."""
 SECTIONS = tuple(kind.SECTION for kind in KINDS.values() if kind.SECTION)

@@ -69,6 +69,7 @@ POSITION = Kind(
     antenna,
     ("image", "lever arm", "GNSS strip", "GNSS clock"),
     AXES,
+    "length",
     scalars=True,
     snooped="whole",
 )
@@ -194,8 +195,8 @@ class Antennas(Further):
             covariance=self.covariance,
         )
         priors = (
-            *parameters.priors(arm, ARM),
-            *parameters.priors(shift, groups),
+            *parameters.priors(arm, ARM, "length"),
+            *parameters.priors(shift, groups, "length"),
             *parameters.priors(clock, ["time_offset"]),
         )
         return Contribution((arm, shift, clock), (seen, *priors), (("GNSS strip", _shift_back),))

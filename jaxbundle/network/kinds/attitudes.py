@@ -55,8 +55,10 @@ def boresight_misclosure(boresight: Turned, given: Float[Array, "3 3"]) -> Float
     return 0.5 * jnp.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
 
 
-ATTITUDE = Kind("attitudes", attitude, ("image", "boresight"), ANGLES)
-PRIOR = Kind("prior of boresight", boresight_misclosure, ("boresight",), ANGLES, snooped="")
+ATTITUDE = Kind("attitudes", attitude, ("image", "boresight"), ANGLES, "angle")
+PRIOR = Kind(
+    "prior of boresight", boresight_misclosure, ("boresight",), ANGLES, "angle", snooped=""
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -28,6 +28,8 @@ LENGTHS = frozenset(
         "R",
     )
 )
+POSE_UNITS = (*["length"] * 3, *["angle"] * 3)
+"""Of residuals of a pose: position and rotation."""
 ANGLES = frozenset(("omega", "phi", "kappa", "turn x", "turn y", "turn z"))
 """Unknowns of further tables that are lengths or angles: their σ are compared with the point
 distance and with a radian."""
@@ -231,14 +233,20 @@ class Parameters:
         """Which of these are free, in every row."""
         return np.array([[name in self.free for name in names]])
 
-    def priors(self, table: Table, names: Sequence[str]) -> list[ObservationSet]:
-        """Pseudo-observations of the start values of a table of vectors with these columns."""
+    def priors(self, table: Table, names: Sequence[str], units: str = "") -> list[ObservationSet]:
+        """Pseudo-observations of the start values of a table of vectors with these columns, in
+        `units` (`Kind`)."""
         # An infinite σ is no prior: a column without one is a row without weight.
         sigma = np.array([self.sigma.get(name, np.inf) for name in names])
         if not np.isfinite(sigma).any():
             return []
         kind = Kind(
-            f"prior of {table.title}", computed_minus_given, (table.name,), tuple(names), snooped=""
+            f"prior of {table.title}",
+            computed_minus_given,
+            (table.name,),
+            tuple(names),
+            units,
+            snooped="",
         )
         sigma = np.tile(sigma, (table.rows, 1))
         return [kind((np.arange(table.rows),), table.value, sigma=sigma)]

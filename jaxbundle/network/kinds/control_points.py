@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from jaxbundle.network.tables import Network
 
 CONTROL_POINTS = Kind(
-    "control points", computed_minus_given, ("point",), ("X", "Y", "Z"), snooped="single"
+    "control points", computed_minus_given, ("point",), ("X", "Y", "Z"), "length", snooped="single"
 )
 
 

@@ -39,8 +39,10 @@ def angle(
     return jnp.arctan2(sine, u @ v) - measured
 
 
-DIFFERENCE = Kind("coordinate differences", difference, ("point", "point"), AXES, snooped="single")
-ANGLE = Kind("angles", angle, ("point", "point", "point"), ("angle",))
+DIFFERENCE = Kind(
+    "coordinate differences", difference, ("point", "point"), AXES, "length", snooped="single"
+)
+ANGLE = Kind("angles", angle, ("point", "point", "point"), ("angle",), "angle")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

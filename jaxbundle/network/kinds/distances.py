@@ -17,7 +17,7 @@ def distance(a: Float[Array, "3"], b: Float[Array, "3"], given: Scalar) -> Scala
     return jnp.sqrt(jnp.sum((a - b) ** 2)) - given
 
 
-DISTANCES = Kind("distances", distance, ("point", "point"), ("d",), snooped="single")
+DISTANCES = Kind("distances", distance, ("point", "point"), ("d",), "length", snooped="single")
 
 
 def declare_distances(network: "Network") -> list[ObservationSet]:

@@ -20,7 +20,7 @@ from jaxbundle.geometry import omega_phi_kappa_near
 from jaxbundle.leastsquares.declarations import Kind, ObservationSet
 from jaxbundle.leastsquares.spaces import Posed
 from jaxbundle.network.columns import Columns
-from jaxbundle.network.kinds.base import Contribution, Further, positive_sigma, rows_of
+from jaxbundle.network.kinds.base import POSE_UNITS, Contribution, Further, positive_sigma, rows_of
 from jaxbundle.network.kinds.control_points import infinite_where_none
 from jaxbundle.network.tables import EXTERIOR
 
@@ -35,7 +35,9 @@ def exterior(pose: Posed, given: Float[Array, "6"]) -> Float[Array, "6"]:
     return jnp.concatenate([jnp.stack(pose.centre), angles]) - given
 
 
-EXTERIOR_ORIENTATION = Kind("exterior orientation", exterior, ("image",), EXTERIOR, snooped="")
+EXTERIOR_ORIENTATION = Kind(
+    "exterior orientation", exterior, ("image",), EXTERIOR, POSE_UNITS, snooped=""
+)
 
 
 def declare_exterior_orientation(

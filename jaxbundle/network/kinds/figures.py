@@ -225,7 +225,7 @@ class Figures(Further):
         residuals of points not yet on it must not count as observations of scale or rotation
         (`invariant`)."""
         residual, axes = RESIDUALS[type]
-        kind = Kind(f"{type}s", residual, (*tables, "point"), axes, invariant=invariant)
+        kind = Kind(f"{type}s", residual, (*tables, "point"), axes, "length", invariant=invariant)
         zero = np.zeros((len(point), len(axes))[: len(axes)])
         return kind((*figure, point), zero, sigma=sigma)
 
@@ -284,7 +284,7 @@ class Shapes(Further):
             parameters=DIRECTIONS,
         )
         sigma = np.where(self.sigma > 0, self.sigma, EXACT_SIGMA * across_rays(network))
-        kind = Kind("known shapes", in_shape, ("shape", "point"), ("x", "y", "z"))
+        kind = Kind("known shapes", in_shape, ("shape", "point"), ("x", "y", "z"), "length")
         seen = kind((shape, point), self.place, sigma=sigma)
         return Contribution((frame,), (seen,), (("shape", move_pose),))
 

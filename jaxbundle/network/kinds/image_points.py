@@ -116,7 +116,7 @@ def image_points(
         local = Local(
             of.index(camera), formula.number, ColumnsOfImagePoint(model), LocalImagePoint(model)
         )
-    return Kind(name, residual, of, ("x", "y"), scalars=True, invariant=True, local=local)
+    return Kind(name, residual, of, ("x", "y"), "image", scalars=True, invariant=True, local=local)
 
 
 def declare_image_points(

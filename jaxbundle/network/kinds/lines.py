@@ -124,6 +124,7 @@ class Edges(Further):
                 OnLine(table.model),
                 ("image", table.name, LINE),
                 ("across",),
+                "image",
                 scalars=True,
                 invariant=True,
             )

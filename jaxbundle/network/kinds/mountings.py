@@ -26,7 +26,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.rotations import matrix_from_omega_phi_kappa
 from jaxbundle.leastsquares.declarations import Kind, ObservationSet
 from jaxbundle.leastsquares.spaces import Posed
-from jaxbundle.network.kinds.base import check_settings, numbers
+from jaxbundle.network.kinds.base import POSE_UNITS, check_settings, numbers
 
 MOUNTING = "mounting"
 AXES = ("X", "Y", "Z", "turn x", "turn y", "turn z")
@@ -50,8 +50,8 @@ def given_base(one: Posed, other: Posed, length: Float[Array, ""]) -> Float[Arra
     return jnp.linalg.norm(jnp.stack(one.centre) - jnp.stack(other.centre)) - length
 
 
-GIVEN_MOUNTINGS = Kind("given mountings", given_mounting, (MOUNTING,), AXES, snooped="")
-BASES = Kind("bases", given_base, (MOUNTING, MOUNTING), ("length",), snooped="")
+GIVEN_MOUNTINGS = Kind("given mountings", given_mounting, (MOUNTING,), AXES, POSE_UNITS, snooped="")
+BASES = Kind("bases", given_base, (MOUNTING, MOUNTING), ("length",), "length", snooped="")
 
 
 class GivenMounting(NamedTuple):

@@ -28,7 +28,7 @@ from jaxbundle.geometry.rotations import matrix_from_omega_phi_kappa
 from jaxbundle.leastsquares.declarations import Kind, Table
 from jaxbundle.leastsquares.spaces import Pose, Posed, PoseValue
 from jaxbundle.network.columns import Columns, did_you_mean
-from jaxbundle.network.kinds.base import Contribution, Further, check_settings
+from jaxbundle.network.kinds.base import POSE_UNITS, Contribution, Further, check_settings
 from jaxbundle.network.kinds.figures import EXACT_SIGMA, across_rays
 from jaxbundle.network.kinds.mountings import (
     AXES,
@@ -72,7 +72,12 @@ def mounting_misclosure(
 
 # Invariant: residuals of a condition at the start scale with the network but define no scale.
 MOUNTED = Kind(
-    "mountings", mounting_misclosure, ("image", "image", MOUNTING, MOUNTING), AXES, invariant=True
+    "mountings",
+    mounting_misclosure,
+    ("image", "image", MOUNTING, MOUNTING),
+    AXES,
+    POSE_UNITS,
+    invariant=True,
 )
 
 

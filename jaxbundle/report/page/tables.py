@@ -162,6 +162,7 @@ def table_of_residuals(found: Mapping[str, np.ndarray], sigma0: float) -> Column
         "image": "image",
         "point": "point",
         "axis": "axis",
+        "unit": "unit",
         "measured": "measured",
         "v": "v",
         "sigma": "σ a priori",
