@@ -196,7 +196,7 @@ def test_residuals_over_the_limit_are_sorted(convergent4, test, column, limit):
     size = np.abs(convergent4.residuals[column])
     over = [row for row in found if row[0] == "image"]
     assert len(over) == (size > limit).sum() > 3
-    shown = [abs(float(row[{"tau": 8, "w": 7}[column]])) for row in over]
+    shown = [abs(float(row[{"tau": 9, "w": 8}[column]])) for row in over]
     np.testing.assert_allclose(shown, np.sort(size)[::-1][: len(over)], rtol=6e-3)
 
 
