@@ -19,6 +19,7 @@ from jaxbundle.adjustment.quality.weakness import (
     weakness_of_unsolved,
 )
 from jaxbundle.cli.outputs import why_not
+from jaxbundle.network.build import make_further
 from jaxbundle.network.repetitions import warn_of_repetitions
 from jaxbundle.orientation.one_place import name_one_place
 from jaxbundle.planning.stations import Stations
@@ -261,3 +262,20 @@ def test_what_repeats_another_is_named():
     other = given.replace(observations=dataclasses.replace(rays, xy=twin))
     (line,) = warn_of_repetitions(other).warnings
     assert "'8' repeats '4'" in line
+
+
+def test_an_observation_without_derivatives_is_named():
+    """An angle at a point whose other end starts in the same place."""
+    given = network(RING)
+    ids, X = given.points.id, given.points.position.copy()
+    X[2] = X[1]
+    rows = {"from": ids[0], "at": ids[1], "to": ids[2], "value": 1.0, "sigma": 0.1}
+    given = given.replace(
+        points=dataclasses.replace(given.points, position=X),
+        further=make_further({"angles": [rows]}, 1.0),
+    )
+    found = jaxbundle.adjust(given)
+    assert not found.converged
+    (cause,) = found.findings
+    assert "no derivatives" in cause
+    assert f"angles of point {ids[0]} and point {ids[1]} and point {ids[2]};" in cause

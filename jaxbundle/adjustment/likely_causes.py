@@ -7,9 +7,7 @@ import numpy as np
 from jaxbundle.adjustment.far_points import (
     noise_of_rays,
 )
-from jaxbundle.adjustment.minimum import (
-    name_inseparable,
-)
+from jaxbundle.adjustment.minimum import name_inseparable, name_undefined
 from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.adjustment.quality.misfit import contradicts
@@ -76,6 +74,8 @@ def likely_causes(
             name_sigma_unit(network, sigma0),
         )
         return tuple(filter(None, causes))
+    if not inspection and (undefined := name_undefined(problem, minimum)):
+        return (undefined,)
     told = any(CONTRADICTORY_CONTROL in line for line in network.warnings)
     conventions = name_conventions(problem, minimum, inspection)
     causes = (

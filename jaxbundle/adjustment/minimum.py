@@ -14,6 +14,7 @@ from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.iterations.solver import Minimum
 from jaxbundle.leastsquares.iterations.stopping import LIMIT, SINGULAR, TERMINATIONS, converged
 from jaxbundle.leastsquares.quality.names import undetermined, undetermined_rows
+from jaxbundle.leastsquares.quality.undefined import without_derivatives
 from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Camera
 
@@ -71,6 +72,19 @@ def name_inseparable(
     return (
         f"hardly separated where the iterations ended: {list_some(names, 8, str)}; hold some of "
         "them, give them a prior σ, or raise the limit of iterations"
+    )
+
+
+def name_undefined(problem: NetworkProblem, minimum: Minimum[Values]) -> str:
+    """The observations that have no derivatives where the iterations ended, in words; empty if
+    there are none."""
+    names = list(without_derivatives(problem, _last(problem, minimum)))
+    if not names:
+        return ""
+    return (
+        f"no derivatives at these values, as of a distance of 0 or an angle of 180°: "
+        f"{list_some(names, 5, str)}; give start values that are not in one place or one line, or "
+        "remove the observation"
     )
 
 

@@ -4,6 +4,8 @@
 precision of an image coordinate is σ0 times its a priori σ, in the unit of the image.
 """
 
+import textwrap
+from collections import Counter
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
@@ -30,6 +32,7 @@ from jaxbundle.report.rig_scale import scale_of_rigs
 from jaxbundle.types import present
 
 if TYPE_CHECKING:
+    from jaxbundle.adjustment.problem import NetworkProblem
     from jaxbundle.adjustment.result import Adjustment
     from jaxbundle.report.verdict import Verdict
 
@@ -202,6 +205,7 @@ def count_rows(adjustment: "Adjustment") -> list[tuple[str, str, str]]:
         ("exterior orientation", n.exterior),
         ("interior orientation", n.interior),
         ("distances", n.distances),
+        *_count_further(adjustment.problem).items(),
     ]
     free = lambda table: int(adjustment.problem.table(table).free.sum())
     groups = [
@@ -223,7 +227,19 @@ def count_rows(adjustment: "Adjustment") -> list[tuple[str, str, str]]:
         ("Unknowns", n.unknowns, _list(groups)),
         ("Redundancy", n.redundancy, "observations + pseudo-observations + conditions − unknowns"),
     ]
-    return [(name, str(n), detail) for name, n, detail in rows]
+    lines = []  # beside the columns of names and numbers, 35 letters
+    for name, n, detail in rows:
+        first, *more = textwrap.wrap(detail, WIDTH - 35) or [""]
+        lines += [(name, str(n), first), *(("", "", rest) for rest in more)]
+    return lines
+
+
+def _count_further(problem: "NetworkProblem") -> Counter[str]:
+    """The residuals with weight of further kinds."""
+    found: Counter[str] = Counter()
+    for name in problem.further_sets:
+        found[problem.observations_of(name).kind.name] += int((problem.weights(name) > 0).sum())
+    return found
 
 
 def count_points(adjustment: "Adjustment") -> int:

@@ -164,3 +164,8 @@ def test_residuals_of_angles_have_the_unit_of_the_network(simulated):
         factor = np.where(turned, 200 / np.pi, 1.0)
         np.testing.assert_allclose(gon[name], factor * radians[name], rtol=1e-7)
     assert {*gon["unit"][gon["kind"] == "image"]} == {network.image_unit}
+
+
+def test_counts_name_every_kind(simulated, result):
+    told = next(line for line in result.report().splitlines() if "Pseudo-observations" in line)
+    assert f"mountings {6 * EPOCHS}" in told and str(result.counts.other) == str(6 * EPOCHS)

@@ -1,0 +1,44 @@
+"""Observations without derivatives: a distance of 0, an angle of 180°.
+
+One such row makes every step undefined, so that nothing is accepted and no unknown is to blame.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbundle.leastsquares.equations.normal import Tangent
+from jaxbundle.leastsquares.indexing.rows import (
+    Values,
+    fill_places,
+    lay_out_data,
+    residuals,
+    restore_order,
+)
+from jaxbundle.leastsquares.iterations.retraction import retract
+from jaxbundle.leastsquares.problem import Problem, complete_data
+
+
+def without_derivatives(problem: Problem, values: Values) -> Iterator[str]:
+    """The observations, in words, whose residuals or derivatives are not finite at `values`."""
+    data = complete_data(problem, dataclasses.replace(problem.data, start=values))
+    plan, laid = fill_places(problem.plan, lay_out_data(problem.plan, data))
+    # Any direction that moves every free unknown shows them.
+    along = {name: group.free for name, group in problem.plan.groups.items()}
+
+    def seen(change: Tangent) -> tuple[Float[Array, "chunks length r"], ...]:
+        moved = retract(problem.declared, plan, data.start, change)
+        return residuals(problem.declared, plan, moved, laid)
+
+    still = jax.tree.map(jnp.zeros_like, along)
+    parts = [abs(v) + abs(dv) for v, dv in zip(*jax.jvp(seen, (still,), (along,)))]
+    found = restore_order(plan, parts)
+    for given in problem.observations:
+        # Rows behind the observations fill up the size of the program.
+        finite = np.isfinite(np.asarray(found[given.name])[: given.number]).all(1)
+        for row in np.flatnonzero(~finite):
+            yield given.label(problem.tables, int(row))
