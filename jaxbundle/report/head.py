@@ -227,9 +227,11 @@ def count_rows(adjustment: "Adjustment") -> list[tuple[str, str, str]]:
         ("Unknowns", n.unknowns, _list(groups)),
         ("Redundancy", n.redundancy, "observations + pseudo-observations + conditions − unknowns"),
     ]
-    lines = []  # beside the columns of names and numbers, 35 letters
+    # What the columns of names and numbers, two blanks behind each, leave of a line.
+    width = WIDTH - 4 - sum(max(len(str(row[k])) for row in rows) for k in (0, 1))
+    lines = []
     for name, n, detail in rows:
-        first, *more = textwrap.wrap(detail, WIDTH - 35) or [""]
+        first, *more = textwrap.wrap(detail, width) or [""]
         lines += [(name, str(n), first), *(("", "", rest) for rest in more)]
     return lines
 
