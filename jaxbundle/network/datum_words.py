@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.network.columns import count
 from jaxbundle.network.motions import SIMILARITY
 
 
@@ -19,4 +20,7 @@ def open_directions_in_words(
     gauge[:3] += np.cross(gauge[3:6].T, about).T + np.outer(about, gauge[6])
     q, _ = np.linalg.qr(gauge / np.linalg.norm(gauge, axis=0)) if gauge.size else (gauge, None)
     parts = [name for name, row in zip(SIMILARITY.names, q) if np.linalg.norm(row) > 0.1]
-    return ", ".join(parts) if parts else "none"
+    words, defect = ", ".join(parts), gauge.shape[1]
+    if len(parts) > defect:  # as when scale and a shift compensate each other
+        return f"{count(defect, 'combination')} of {words}"
+    return words or "none"

@@ -121,6 +121,8 @@ def test_words():
     assert open_directions_in_words(gauge("nothing")).endswith("rotation Z, scale")
     assert open_directions_in_words(gauge("a distance")).endswith("rotation Z")
     assert open_directions_in_words(np.zeros((7, 0))) == "none"
+    together = np.array([[0, 0, 1, 0, 0, 0, 1.0]]).T
+    assert open_directions_in_words(together) == "1 combination of shift Z, scale"
 
 
 def test_an_open_datum_is_refused_unless_asked_for():
