@@ -277,5 +277,5 @@ def test_an_observation_without_derivatives_is_named():
     found = jaxbundle.adjust(given)
     assert not found.converged
     (cause,) = found.findings
-    assert "no derivatives" in cause
+    assert "no derivative" in cause
     assert f"angles of point {ids[0]} and point {ids[1]} and point {ids[2]};" in cause

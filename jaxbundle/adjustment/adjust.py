@@ -210,7 +210,7 @@ def adjust(  # noqa: PLR0913 - the options of an adjustment
     found = _AdjustmentState(
         problem.network, with_factor(problem), minimum, method, problem.reduction
     )
-    # Not told: every candidate would start the bars anew.
+    # Without `progress`: every candidate would begin the bars anew.
     look = partial(find_second_minima, minimise=partial(minimise_with_infinity, **options))
     # Before anything is excluded or downweighted because of residuals of the wrong minimum.
     if second_minimum:

@@ -76,15 +76,16 @@ def name_inseparable(
 
 
 def name_undefined(problem: NetworkProblem, minimum: Minimum[Values]) -> str:
-    """The observations that have no derivatives where the iterations ended, in words; empty if
-    there are none."""
-    names = list(without_derivatives(problem, _last(problem, minimum)))
+    """The distances and observations of further kinds that have no derivatives where the iterations
+    ended, in words; empty if there are none. (Image points have none where a camera model has no
+    image: of that other causes are named.)"""
+    sets = ("distance", *problem.further_sets)
+    names = list(without_derivatives(problem, _last(problem, minimum), sets))
     if not names:
         return ""
     return (
-        f"no derivatives at these values, as of a distance of 0 or an angle of 180°: "
-        f"{list_some(names, 5, str)}; give start values that are not in one place or one line, or "
-        "remove the observation"
+        f"no derivative, as of a distance of 0 or an angle of 180°: {list_some(names, 5, str)}; "
+        "give its points start values that are not in one place or on one line, or remove it"
     )
 
 

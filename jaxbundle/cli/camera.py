@@ -30,11 +30,9 @@ def camera(
     """Print field of view, 35 mm equivalent, and distortion by radius."""
     import jaxbundle
     from jaxbundle.cli.camera_inputs import calibration_given, pair, write_png
-    from jaxbundle.cli.outputs import check_json_target
+    from jaxbundle.cli.outputs import check_json_target, put_json
     from jaxbundle.commands.cameras import CameraDescription
-    from jaxbundle.io.results.result_json import json_text
-    from jaxbundle.io.text.csv_tables import table_rows, write_csv, write_text
-    from jaxbundle.system.terminals import write_json
+    from jaxbundle.io.text.csv_tables import table_rows, write_csv
 
     check_json_target(json, (file.partition("#")[0] for file in files))
     smooth = 200  # points of a curve that looks smooth
@@ -52,8 +50,7 @@ def camera(
         id = described.camera.id
         found[id if id not in found else f"{id} ({file})"] = described
     if json:
-        text = json_text({"cameras": [one.to_dict() for one in found.values()]})
-        write_json(text) if json == "-" else write_text(Path(json), text)
+        put_json(json, {"cameras": [one.to_dict() for one in found.values()]})
     if plot is not None:
         units = {one.unit for one in found.values()}
         if len(units) > 1:

@@ -131,13 +131,19 @@ def check_json_target(json: str, inputs: Iterable[str | Path]) -> None:
 def print_result(result: ReportedResult, json: str, quiet: bool = False) -> None:
     """Print the report of a result, or write its JSON (`-`: instead of the report). `quiet`: no
     report beside a file."""
-    if json == "-":
-        write_json(json_text(result.to_dict()))
-        return
     if json:
-        write_text(Path(json), json_text(result.to_dict()))
-    if not (quiet and json):
+        put_json(json, result.to_dict())
+    if json != "-" and not (quiet and json):
         print(result.report())
+
+
+def put_json(json: str, document: Mapping) -> None:
+    """Write a document to the file of --json; `-`: standard output."""
+    text = json_text(document)
+    if json == "-":
+        write_json(text)
+    else:
+        write_text(Path(json), text)
 
 
 def check_json(json: str, way: str = "", option: str = "--json") -> None:

@@ -7,7 +7,6 @@ import typer
 
 from jaxbundle.choices import SURFACE_POINTS
 from jaxbundle.cli.app import Force, Quiet, app, choice
-from jaxbundle.system.terminals import write_json
 
 FILES = (
     "cloud.csv",
@@ -74,7 +73,7 @@ def surface(  # noqa: PLR0913 - the options of the command
 ) -> None:
     """Match oriented images to a cloud with the σ of every point, and report its accuracy."""
     import jaxbundle
-    from jaxbundle.cli.outputs import check_json
+    from jaxbundle.cli.outputs import check_json, put_json
     from jaxbundle.cli.progress import staging
     from jaxbundle.io.results.result_json import json_text
     from jaxbundle.io.text.csv_tables import write_text
@@ -109,7 +108,6 @@ def surface(  # noqa: PLR0913 - the options of the command
         )
     files = [str(file) for one in input for file in input_files(one)]
     told = f"{', '.join(stamp(files, in_words(now())))}\n{found.report()}"
-    text = json_text(found.to_dict())
     with replace_folder(out, "surface", FILES, force) as folder:
         write_cloud_csv(found.cloud, folder / "cloud.csv")
         write_cloud(found.cloud, folder / "cloud.ply")
@@ -117,11 +115,9 @@ def surface(  # noqa: PLR0913 - the options of the command
             write_dsm(found.dsm, folder / "dsm.tif", folder / "dsm_sigma.tif")
             if found.orthophoto is not None:
                 write_orthophoto(found.orthophoto, found.dsm, folder / "orthophoto.tif")
-        write_text(folder / "surface.json", text)
+        write_text(folder / "surface.json", json_text(found.to_dict()))
         write_text(folder / "report.txt", told + "\n")
-    if json == "-":
-        write_json(text)
-    elif json:
-        write_text(Path(json), text)
+    if json:
+        put_json(json, found.to_dict())
     if not quiet and json != "-":
         print(told)

@@ -147,7 +147,7 @@ def leave_out_undetermined(network: Network) -> Network:
             worst = int(np.where(still, np.inf, measured).argmin())
             first = _too_few_points(network, worst, seen)
         keep, used = kept, still
-    # What is left of less than a half says more about what is wrong than about the object.
+    # So many say that something is wrong with the network, not with these images.
     if first is not None and 2 * (~used).sum() >= len(images):
         raise first
     out, notes = ~keep, []

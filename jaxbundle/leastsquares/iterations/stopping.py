@@ -191,7 +191,8 @@ class Approach(eqx.Module):
         # undamped step settles; `repeat` below asks for it.
         small = finite & (decrement <= tolerance.limit(cost))
         settled = small & undamped
-        # The first failure may be the step after a start value; a second one is of the equations.
+        # Levenberg–Marquardt goes on with damping after a failure, and `small` decides in the end;
+        # Gauss–Newton has no other step, and fails again at the same point.
         failed_again = self.singular & undamped & ~finite
         singular = self.singular | (~finite & undamped)
         # Equations that can just be factorised send undamped steps anywhere: each is rejected

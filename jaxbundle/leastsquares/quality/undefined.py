@@ -4,7 +4,7 @@ One such row makes every step undefined, so that nothing is accepted and no unkn
 """
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 
 import jax
 import jax.numpy as jnp
@@ -23,8 +23,9 @@ from jaxbundle.leastsquares.iterations.retraction import retract
 from jaxbundle.leastsquares.problem import Problem, complete_data
 
 
-def without_derivatives(problem: Problem, values: Values) -> Iterator[str]:
-    """The observations, in words, whose residuals or derivatives are not finite at `values`."""
+def without_derivatives(problem: Problem, values: Values, sets: Collection[str]) -> Iterator[str]:
+    """The observations of these sets, in words, whose residuals or derivatives are not finite at
+    `values`."""
     data = complete_data(problem, dataclasses.replace(problem.data, start=values))
     plan, laid = fill_places(problem.plan, lay_out_data(problem.plan, data))
     # Any direction that moves every free unknown shows them.
@@ -37,7 +38,7 @@ def without_derivatives(problem: Problem, values: Values) -> Iterator[str]:
     still = jax.tree.map(jnp.zeros_like, along)
     parts = [abs(v) + abs(dv) for v, dv in zip(*jax.jvp(seen, (still,), (along,)))]
     found = restore_order(plan, parts)
-    for given in problem.observations:
+    for given in (o for o in problem.observations if o.name in sets):
         # Rows behind the observations fill up the size of the program.
         finite = np.isfinite(np.asarray(found[given.name])[: given.number]).all(1)
         for row in np.flatnonzero(~finite):
