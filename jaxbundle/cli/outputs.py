@@ -119,7 +119,9 @@ def check_file(option: str, file: str, out: Path | None, inputs: Iterable[str | 
             raise InputError(f"{option} {file}: cannot be written: no permission in {path.parent}")
     # by real paths: an input may be named through a link
     if any(str(real) == os.path.realpath(given) for given in inputs):
-        raise InputError(f"{path} is part of the input and would be overwritten; give another")
+        raise InputError(
+            f"{option} {file}: is part of the input and would be overwritten; give another"
+        )
 
 
 def check_json_target(json: str, inputs: Iterable[str | Path]) -> None:
