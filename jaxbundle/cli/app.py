@@ -17,7 +17,7 @@ from typer.core import TyperCommand, TyperGroup
 import jaxbundle
 from jaxbundle.choices import CAMERA_MODELS, FORMATS, MODEL_FAMILIES
 from jaxbundle.cli.common_options import Quiet as Quiet
-from jaxbundle.cli.common_options import add_habits
+from jaxbundle.cli.common_options import add_common_options
 from jaxbundle.cli.small_inputs import is_small
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.system.configuration import leave
@@ -114,7 +114,7 @@ class Application(typer.Typer):
         register = super().command(name, cls=kind, **options)
 
         def add(function: Callable) -> Callable:
-            register(add_habits(function))
+            register(add_common_options(function))
             return function
 
         return add

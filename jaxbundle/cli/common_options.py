@@ -22,7 +22,7 @@ verbose: ContextVar[bool] = ContextVar("verbose", default=False)
 """Whether the running command was called with --verbose."""
 
 
-def add_habits(function: Callable) -> Callable:
+def add_common_options(function: Callable) -> Callable:
     """The function of a command with the options `quiet` and `verbose`. A function without a
     `quiet` parameter is silenced as a whole: standard error, and standard output if its result is
     in a file (`RESULT_FILES`)."""
