@@ -10,9 +10,9 @@ import sys
 
 from jaxbundle.system.interrupts import handle_interrupts, set_status
 
+# Thresholds of Python's garbage collector. Tracing makes millions of objects, nearly all of them
+# permanent: with the default thresholds the collector takes a sixth of the tracing time.
 GC_THRESHOLDS = 50_000, 20, 100
-"""Thresholds of Python's garbage collector. Tracing makes millions of objects, nearly all of them
-permanent: with the default thresholds the collector takes a sixth of the tracing time."""
 
 
 def main() -> None:

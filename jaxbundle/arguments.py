@@ -20,8 +20,8 @@ from jaxbundle.errors import InputError
 
 P = ParamSpec("P")
 T = TypeVar("T")
+# Largest integer.
 LARGEST_INTEGER = 10**9
-"""Largest integer."""
 
 
 def show(value: Any) -> str:

@@ -7,15 +7,15 @@ them without importing JAX.
 from typing import Literal, get_args
 
 METHODS = ("levenberg-marquardt", "gauss-newton")
+# Solvers of the reduced system.
 REDUCTIONS = ("dense", "banded", "iterative")
-"""Solvers of the reduced system."""
+# Robust estimators.
 ESTIMATORS = ("huber", "cauchy", "tukey")
-"""Robust estimators."""
+# Tests of data snooping.
 TESTS = ("pope", "baarda")
-"""Tests of data snooping."""
+# Where a priori σ come from: somebody stated them; nobody did, so that they are units of weight;
+# they were estimated from the residuals of the same measurements.
 STATED, UNIT, ESTIMATED = SIGMA_ORIGINS = ("stated", "unit", "estimated")
-"""Where a priori σ come from: somebody stated them; nobody did, so that they are units of weight;
-they were estimated from the residuals of the same measurements."""
 
 CAMERA_MODELS = (
     "brown", "brown-projected", "usgs", "bingo", "opencv", "snavely", "division",
@@ -24,12 +24,13 @@ CAMERA_MODELS = (
     "equidistant", "stereographic", "equisolid", "orthographic", "equirectangular",
 )  # fmt: skip
 _DEGREES = r"(\d+(?:\.\d+)?)"
+# Camera models whose names contain numbers, and the form of these names.
 MODEL_FAMILIES = {
     "radial-spline-N-FOV": rf"radial-spline-(\d+)-{_DEGREES}",
     "spline-NXxNY-FOV": rf"spline-(\d+)x(\d+)-{_DEGREES}",
 }
-"""Camera models whose names contain numbers, and the form of these names."""
 
+# Kinds of inputs that are networks, and what they look like.
 NETWORK_FILES = {
     "project": "a .toml file, or a folder with project.toml",
     "photo-list": "a .txt file whose first line is the focal length",
@@ -59,7 +60,7 @@ NETWORK_FILES = {
     "nvm": "an .nvm file of VisualSFM",
     "alicevision": "an .sfm or .json of AliceVision",
 }
-"""Kinds of inputs that are networks, and what they look like."""
+# Kinds of inputs that are cameras alone.
 CAMERA_INPUTS = {
     "colmap-cameras": "cameras.txt or cameras.bin of COLMAP",
     "cameras": "a .toml with [[camera]] entries",
@@ -70,7 +71,6 @@ CAMERA_INPUTS = {
     "slam-yaml": "a .yaml of camodocal or VINS (model_type: …), of ORB-SLAM (Camera.fx: …)",
     "opencv": "a .yaml, .json or .xml of OpenCV, ROS or EuRoC (camera_matrix, K, intrinsics, …)",
 }
-"""Kinds of inputs that are cameras alone."""
 FORMATS = tuple(NETWORK_FILES)
 """Kinds of inputs that are networks."""
 TARGETS = (
@@ -78,51 +78,51 @@ TARGETS = (
     "transforms", "kalibr", "micmac", "jaicov", "mrcal", "opencv-stereo", "ros-stereo",
     "anipose", "project",
 )  # fmt: skip
+# Kinds of outputs: networks, and cameras alone.
 CAMERA_FILES = (
     "colmap-cameras", "opensfm-cameras", "ros", "cameramodel", "autocal", "opencv", "cameras",
 )  # fmt: skip
-"""Kinds of outputs: networks, and cameras alone."""
 
+# Measures of σ that a design minimises.
 AIMS = ("mean", "worst", "determinant", "reliability")
-"""Measures of σ that a design minimises."""
+# Problems of design, with their names.
 ORDERS = {
     "zero": "zero order: the datum",
     "first": "first order: the configuration",
     "second": "second order: the weights of photographs",
     "third": "third order: further photographs",
 }
-"""Problems of design, with their names."""
+# Variables of a first-order design.
 DESIGNED = ("position", "direction", "roll", "targets")
-"""Variables of a first-order design."""
 
 BOARDS = ("chessboard", "circles", "asymmetric-circles", "charuco", "aprilgrid")
 CODED_TARGETS = ("aruco", "apriltag", "aprilgrid", "charuco", "ring12", "ring14")
+# OpenCV's dictionaries of square markers.
 DICTIONARIES = (
     *(f"DICT_{n}X{n}_{words}" for n in (4, 5, 6, 7) for words in (50, 100, 250, 1000)),
     "DICT_ARUCO_ORIGINAL", "DICT_ARUCO_MIP_36h12",
     *(f"DICT_APRILTAG_{family}" for family in ("16h5", "25h9", "36h10", "36h11")),
 )  # fmt: skip
-"""OpenCV's dictionaries of square markers."""
 FEATURES = ("sift", "akaze", "orb")
+# Selections of photograph pairs for matching.
 MATCHED_PAIRS = ("auto", "all", "sequence", "place", "alike")
-"""Selections of photograph pairs for matching."""
 
+# Points matched for a surface.
 SURFACE_POINTS = ("grid", "edges", "corners")
-"""Points matched for a surface."""
 CLOUD_FILES = (".csv", ".ply", ".las", ".laz", ".dxf")
+# The point that replaces those of a cube.
 CUBE_POINTS = ("mean", "corner", "best")
-"""The point that replaces those of a cube."""
 
 Resampling = Literal["nearest", "bilinear", "cubic"]
 RESAMPLINGS: tuple[Resampling, ...] = get_args(Resampling)
 AttitudeError = Literal["bias", "white"]
+# One error per image, or one per record of the attitude table.
 ATTITUDE_ERRORS: tuple[AttitudeError, ...] = get_args(AttitudeError)
-"""One error per image, or one per record of the attitude table."""
+# Bias models of coefficients, in the image.
 RPC_BIASES = ("shift", "affine")
-"""Bias models of coefficients, in the image."""
 
+# Inputs of the explorer.
 EXPLORED = ("network", "camera", "scanner")
-"""Inputs of the explorer."""
 
+# How `replicate` forms halves.
 REPLICATION = ("photographs", "points", "runs", "views")
-"""How `replicate` forms halves."""

@@ -13,8 +13,8 @@ import numpy as np
 from jaxbundle.system.terminals import for_printing
 
 LINES, WIDTH = 24, 100
+# Numbers of an array, or entries of a list, that are shown.
 SHOWN_ENTRIES = 4
-"""Numbers of an array, or entries of a list, that are shown."""
 T = TypeVar("T", bound=type)
 
 

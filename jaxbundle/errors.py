@@ -3,10 +3,10 @@
 import re
 from collections.abc import Sequence
 
+# Characters that end a line (`str.splitlines`), or that move the cursor of a terminal.
 CONTROL = re.compile("[\0-\x1f\x7f-\x9f\u2028\u2029]+")
-"""Characters that end a line (`str.splitlines`), or that move the cursor of a terminal."""
+# A word of 300 characters or more, longer than any file name with its context.
 TOO_LONG = re.compile(r"([^\s/\\]{40})[^\s/\\]{260,}")
-"""A word of 300 characters or more, longer than any file name with its context."""
 
 
 class InputError(ValueError):

@@ -13,12 +13,12 @@ from jaxtyping import Float
 
 AnyArray = Array | np.ndarray
 Numbers = Sequence[float] | Float[np.ndarray, " n"]
+# Cells of a table: numbers, text, or other content of a file.
 Column = Sequence[Any] | np.ndarray
-"""Cells of a table: numbers, text, or other content of a file."""
 Index = int | np.integer
 Scalar = float | Float[AnyArray, "..."]
+# `progress(stage, done, total)`: called when a stage of long work begins and as it advances.
 Progress = Callable[[str, int, int], object]
-"""`progress(stage, done, total)`: called when a stage of long work begins and as it advances."""
 T = TypeVar("T")
 
 

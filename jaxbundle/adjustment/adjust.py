@@ -77,8 +77,8 @@ from jaxbundle.orientation.network import Oriented, lacks_start_values, without_
 from jaxbundle.orientation.swapped_control import CONTRADICTORY_CONTROL
 from jaxbundle.types import AnyArray, Progress, present
 
+# Name of the undetermined if no single unknown dominates.
 UNNAMED = ("a combination of unknowns that spreads over many of them",)
-"""Name of the undetermined if no single unknown dominates."""
 
 
 @dataclasses.dataclass(frozen=True)

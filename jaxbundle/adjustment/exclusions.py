@@ -43,9 +43,9 @@ from jaxbundle.orientation.missing import explain_missing, note_missing
 from jaxbundle.orientation.rays import Sights, sights
 from jaxbundle.types import AnyArray
 
+# On points and image points that come back: adjusted images are better than start values, which may
+# miss by three times as much; blunders should not come back with the others.
 COMES_BACK = Demands(START_VALUE_DEMANDS.angle, 1.0)
-"""On points and image points that come back: adjusted images are better than start values, which
-may miss by three times as much; blunders should not come back with the others."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -125,10 +125,10 @@ def influence(given: Adjustment | NetworkProblem, of: Any = CAMERAS) -> Influenc
     )
 
 
+# The columns that identify a measurement.
 COLUMNS = {
     "kind": lambda kind, image, _point, axes: np.full(len(image) * len(axes), kind, object),
     "image": lambda _kind, image, _point, axes: np.repeat(image, len(axes)),
     "point": lambda _kind, _image, point, axes: np.repeat(point, len(axes)),
     "axis": lambda _kind, image, _point, axes: np.tile(np.array(axes, object), len(image)),
 }
-"""The columns that identify a measurement."""

@@ -18,12 +18,12 @@ from jaxbundle.leastsquares.quality.undefined import without_derivatives
 from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Camera
 
+# Reduced systems with more unknowns are not searched for null vectors: the time of a dense
+# eigendecomposition grows with the cube of their number, and here it would be minutes.
 EIGENVECTORS = 3000
-"""Reduced systems with more unknowns are not searched for null vectors: the time of a dense
-eigendecomposition grows with the cube of their number, and here it would be minutes."""
+# A principal distance that changed by more than this factor is implausible. Not critical: a start
+# value is seldom wrong by more than two, and a collapsing c passes every factor.
 LARGEST_FACTOR = 20.0
-"""A principal distance that changed by more than this factor is implausible. Not critical:
-a start value is seldom wrong by more than two, and a collapsing c passes every factor."""
 
 
 def inspect_solution(problem: NetworkProblem, minimum: Minimum[Values]) -> Inspection | None:

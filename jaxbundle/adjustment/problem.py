@@ -227,8 +227,8 @@ class NetworkProblem(engine.Problem):
         )
 
 
+# The sets of a network beside image points; with cameras of several models "interior, MODEL".
 PSEUDO_OBSERVATIONS = ("control", "exterior", "interior", "distance")
-"""The sets of a network beside image points; with cameras of several models "interior, MODEL"."""
 
 
 def coordinates(values: Values) -> Float[AnyArray, "points 3"]:

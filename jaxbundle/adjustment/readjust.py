@@ -36,8 +36,8 @@ from jaxbundle.leastsquares.quality.snooping import RemovedRow, snoop, without
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.network.blunders import Removed
 
+# Iterates a changed problem from given values to its minimum; returns the problem as it ended.
 Minimise = Callable[[Problem, Values], tuple[NetworkProblem, Minimum]]
-"""Iterates a changed problem from given values to its minimum; returns the problem as it ended."""
 
 
 def snoop_network(

@@ -84,8 +84,8 @@ if TYPE_CHECKING:
     from mpl_toolkits.mplot3d import Axes3D
 
 
+# Random halves that are tried for the replication of a result.
 MAX_SPLITS = 3
-"""Random halves that are tried for the replication of a result."""
 
 
 @print_anywhere

@@ -286,8 +286,8 @@ def control_measurements(adjustment: "Adjustment") -> dict[str, np.ndarray]:
     return table | {"probability": found.image_probability}
 
 
+# Of `Reliability`, what a row of residuals is made of.
 TESTED = ("residual", "gain", "redundancy", "w", "hat")
-"""Of `Reliability`, what a row of residuals is made of."""
 
 
 class TestedResult(Protocol):

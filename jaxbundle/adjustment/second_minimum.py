@@ -57,9 +57,9 @@ from jaxbundle.orientation import batched
 from jaxbundle.orientation.incremental import START_VALUE_DEMANDS, Model, grow, intersect
 from jaxbundle.orientation.rays import MIN_COSINE, Sights, sights
 
+# `minimise(problem, start)` iterates from given values, `max_steps` at most if given; returns the
+# problem as it ended.
 Minimise = Callable[..., tuple[NetworkProblem, Minimum]]
-"""`minimise(problem, start)` iterates from given values, `max_steps` at most if given; returns the
-problem as it ended."""
 
 
 class Found(NamedTuple):

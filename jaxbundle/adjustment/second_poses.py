@@ -32,8 +32,8 @@ from jaxbundle.leastsquares.quality.distributions import chi2_quantile
 from jaxbundle.orientation import batched
 from jaxbundle.orientation.rays import Sights, in_plane
 
+# Of an image: fewer leave its pose open.
 MIN_POINTS = 3
-"""Of an image: fewer leave its pose open."""
 
 
 @dataclasses.dataclass

@@ -45,8 +45,8 @@ NETWORK = (
     Source,
     *KINDS.values(),
 )
+# Its number changes when older files cannot be read any more.
 FORMAT = "jaxbundle adjustment 1"
-"""Its number changes when older files cannot be read any more."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -55,14 +55,14 @@ from jaxbundle.system.devices import on_accelerator
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, Progress
 
+# Poses in the form of the solver, only for data snooping.
 OF_A_START = ("quaternion", "shift")
-"""Poses in the form of the solver, only for data snooping."""
 OF_A_VIEW = ("position", "angles", "sigma_position", "sigma_angles", "rotation")
+# Fields of a `BatchCalibration`, and what it is made of, by name.
 Rows = dict[str, Shaped[np.ndarray, "cameras *axes"]]
-"""Fields of a `BatchCalibration`, and what it is made of, by name."""
 
+# Statuses of cameras with residuals that data snooping can test.
 TESTED = (CONVERGED, LIMIT, SINGULAR)
-"""Statuses of cameras with residuals that data snooping can test."""
 
 
 class ProgramKey(NamedTuple):

@@ -25,8 +25,8 @@ from jaxbundle.network.columns import did_you_mean
 from jaxbundle.results import TableMethods
 from jaxbundle.types import Progress
 
+# Sections of a project that the rigs of a batch may have.
 SECTIONS = ("rolling_shutter", "rig")
-"""Sections of a project that the rigs of a batch may have."""
 
 
 @print_in_one_screen

@@ -43,8 +43,9 @@ STATUS = (
     "misfit",
 )
 CONVERGED, LIMIT, SINGULAR, NOT_FINITE, TOO_FEW, WEAK, MISFIT = range(7)
+# Statuses of cameras that have values.
 SOLVED = (STATUS[CONVERGED], STATUS[WEAK], STATUS[MISFIT])
-"""Statuses of cameras that have values."""
+# The status of a camera by termination.
 MEANING = {
     stopping.LIMIT: LIMIT,
     stopping.SETTLED: CONVERGED,
@@ -53,14 +54,12 @@ MEANING = {
     stopping.STUCK: LIMIT,
     stopping.NOT_FINITE: NOT_FINITE,
 }
-"""The status of a camera by termination."""
 
+# Smallest part of a parameter that is independent of the others; below it rounding: singular.
+#
+# Measured: 5 coefficients 1e-8 to 1e-4; 8, where 5 are enough, 1e-13 to 1e-11; one view repeated
+# 1e-15.
 INDETERMINATE = 1e-13
-"""Smallest part of a parameter that is independent of the others; below it rounding: singular.
-
-Measured: 5 coefficients 1e-8 to 1e-4; 8, where 5 are enough, 1e-13 to 1e-11; one view repeated
-1e-15.
-"""
 
 
 class CameraSolution(eqx.Module):

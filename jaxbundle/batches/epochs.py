@@ -13,9 +13,9 @@ from jaxtyping import Bool, Float, Int
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import list_some
 
+# Minimum number of epochs shared by two cameras: of two mountings that differ, nothing says which
+# is wrong; of three, two agree.
 MIN_SHARED_EPOCHS = 3
-"""Minimum number of epochs shared by two cameras: of two mountings that differ, nothing says which
-is wrong; of three, two agree."""
 
 
 def contradicting(

@@ -20,14 +20,14 @@ from jaxbundle.cameras import CameraModel, convert_camera, get_model, is_own
 from jaxbundle.cameras.pixel_frame import in_model_units
 from jaxbundle.errors import NotSolvedError
 
+# Models in pixels that `calibrate_batch` solves without start values.
 SOLVED = ("opencv", "kannala-brandt", "snavely")
-"""Models in pixels that `calibrate_batch` solves without start values."""
 SIMPLE = ("fx", "fy", "cx", "cy", "k1", "k2")
+# Model, free parameters and start values.
 Attempt = tuple[str, tuple[str, ...], dict[str, float] | None]
-"""Model, free parameters and start values."""
+# Fields of view tried if the views give no start values for a fisheye; between them every principal
+# distance is within a third of one.
 WIDE = tuple(np.radians([60.0, 100.0, 140.0, 180.0]))
-"""Fields of view tried if the views give no start values for a fisheye; between them every
-principal distance is within a third of one."""
 
 
 @dataclasses.dataclass(frozen=True)

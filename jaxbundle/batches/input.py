@@ -14,8 +14,8 @@ from jaxbundle.cameras import CameraModel, check_own, default_parameters, get_mo
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.stored_rows import StoredRows
 
+# Larger numbers count as infinite: products of more than three of them overflow 64 bits.
 LARGEST_NUMBER = 1e100
-"""Larger numbers count as infinite: products of more than three of them overflow 64 bits."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -20,10 +20,10 @@ from jaxtyping import Bool, Float
 from jaxbundle.batches.input import Batch
 from jaxbundle.cameras import CameraModel
 
+# The standard deviation of a normal distribution over its median absolute deviation, 1/Φ⁻¹(¾).
 MEDIAN_DEVIATION_AS_SIGMA = 1.4826
-"""The standard deviation of a normal distribution over its median absolute deviation, 1/Φ⁻¹(¾)."""
+# √(mean of squares)/mean of the lengths of normal residuals (Rayleigh's distribution).
 NORMAL = 2 / np.sqrt(np.pi)
-"""√(mean of squares)/mean of the lengths of normal residuals (Rayleigh's distribution)."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -35,8 +35,8 @@ from jaxbundle.cameras import CameraModel
 from jaxbundle.geometry import matrix_from_quaternion, retract_quaternion
 from jaxbundle.types import AnyArray, Scalar
 
+# Unknowns of a view: δt (3), δθ (3).
 POSE = 6
-"""Unknowns of a view: δt (3), δθ (3)."""
 ByPoint = Float[AnyArray, "views points"]
 
 

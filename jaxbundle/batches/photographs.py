@@ -38,8 +38,8 @@ class NotSearched(str):
     """Why a photograph could not be searched: the machine lacked memory, or the search crashed."""
 
 
+# The entry of a line: names of photographs that the result lacks by a fault of the machine.
 NOT_SEARCHED = "photographs_not_searched"
-"""The entry of a line: names of photographs that the result lacks by a fault of the machine."""
 
 
 def is_photograph_folder(path: str | Path) -> bool:

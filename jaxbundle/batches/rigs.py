@@ -32,8 +32,8 @@ from jaxbundle.network.build import make_network
 from jaxbundle.network.kinds.rolling_shutter import VELOCITY
 from jaxbundle.network.tables import STATED, UNIT, UNSTATED_BOARD_SIGMA, Camera, Network
 
+# Errors of one network that must not end the others.
 UNEXPECTED = (ValueError, ArithmeticError, RuntimeError, OSError, MemoryError)
-"""Errors of one network that must not end the others."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -29,8 +29,8 @@ from jaxbundle.io.writing.locks import hold_lock
 from jaxbundle.measure.boards import Board
 from jaxbundle.types import Progress
 
+# The stage in reports of progress.
 STAGE = "calibrating"
-"""The stage in reports of progress."""
 
 
 def run_batch(  # noqa: PLR0913 keyword arguments of a public function

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
+# A matrix by rows, up to the diagonal where it is symmetrical or triangular.
 Rows = list[list[Array]]
-"""A matrix by rows, up to the diagonal where it is symmetrical or triangular."""
 
 
 def rows_of(matrices: Float[Array, "systems n m"]) -> Rows:

@@ -16,9 +16,9 @@ from jaxbundle.leastsquares.quality.distributions import critical_w
 from jaxbundle.leastsquares.quality.snooping import REMOVED_TOGETHER
 
 TESTS = ("pope",)
+# Rounds of removal and adjustment. Each removes at most a point of every view; a camera that needs
+# more has more blunders than a test can find. It only bounds the time.
 MAX_ROUNDS = 200
-"""Rounds of removal and adjustment. Each removes at most a point of every view; a camera that needs
-more has more blunders than a test can find. It only bounds the time."""
 
 
 class Snooping:

@@ -33,8 +33,8 @@ from jaxbundle.io.writing.fingerprints import of_arrays
 EXPECTED = "a readable .npz file of plain arrays"
 REQUIRED_ARRAYS = ("object_points", "image_points", "image_size")
 KNOWN_ARRAYS = (*REQUIRED_ARRAYS, "visible", "ids", "cameras")
+# Numbers of axes of arrays with one row per camera, or per rig.
 BY_CAMERA = {"object_points": (3,), "image_points": (4, 5), "visible": (3, 4)}
-"""Numbers of axes of arrays with one row per camera, or per rig."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -30,10 +30,10 @@ from jaxbundle.geometry import quaternion_from_matrix
 from jaxbundle.leastsquares.spaces import cross
 
 ByView = Float[Array, " views"]
+# The three elements of a column of H or P, of all views.
 Column = Sequence[ByView]
-"""The three elements of a column of H or P, of all views."""
+# From the computer vision frame to ours.
 FLIP = (1.0, -1.0, -1.0)
-"""From the computer vision frame to ours."""
 
 
 @dataclasses.dataclass(frozen=True)

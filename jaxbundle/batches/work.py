@@ -41,14 +41,14 @@ from jaxbundle.photographs.formats import is_photograph
 from jaxbundle.photographs.opencv import need_opencv
 from jaxbundle.system.workers import Workers
 
+# Rigs between two writes: what an interruption loses. A rig is a network of its own, and takes
+# longer than a camera of a batch; not critical.
 RIGS_A_WRITE = 32
-"""Rigs between two writes: what an interruption loses. A rig is a network of its own, and takes
-longer than a camera of a batch; not critical."""
 SIGMA_IMAGE = "sigma_image"
+# Settings present only in lines computed with them.
 WHERE_GIVEN = ("snooping", "significance", "pixel_size", "set", "sigma_image", *SECTIONS)
-"""Settings present only in lines computed with them."""
+# Called with the share of the work that is done, 0 to 1.
 ShareDone = Callable[[float], None]
-"""Called with the share of the work that is done, 0 to 1."""
 
 
 @dataclasses.dataclass(frozen=True)

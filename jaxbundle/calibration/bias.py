@@ -55,8 +55,8 @@ from jaxbundle.calibration.quality import used_rays
 from jaxbundle.cameras import get_model
 from jaxbundle.leastsquares.quality.distributions import f_tail, normal_quantile
 
+# Joint level of the tests: one good calibration in a hundred is suspected.
 SIGNIFICANCE = 0.01
-"""Joint level of the tests: one good calibration in a hundred is suspected."""
 
 
 @dataclasses.dataclass(frozen=True)

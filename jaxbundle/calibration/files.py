@@ -57,9 +57,11 @@ COMMAND = "calibrate"
 REPORT, PAGE, RESULT = "report.txt", "report.html", "result.json"
 COLMAP = "colmap"
 OWN_FIGURES = ("coverage.png", "uncertainty*.png", "halves.png")
+# Files of a comparison of models.
 COMPARED = ["models.txt", "models.json", "difference_*.png"]
-"""Files of a comparison of models."""
 RIG, CONVERSIONS = "rig", "conversions.txt"
+# Files and folders of a rig for other programs, by their format; `opencv-stereo` and `ros-stereo`
+# in pairs of cameras.
 RIG_FILES: dict[str, tuple[str, tuple[str, ...]]] = {
     "kalibr": ("camchain.yaml", ()),
     "mrcal": ("mrcal", MRCAL_FILES),
@@ -67,11 +69,9 @@ RIG_FILES: dict[str, tuple[str, tuple[str, ...]]] = {
     "ros-stereo": ("camera_info", ROS_FILES),
     "anipose": ("calibration.toml", ()),
 }
-"""Files and folders of a rig for other programs, by their format; `opencv-stereo` and `ros-stereo`
-in pairs of cameras."""
 STEREO_PAIRS = "stereo_*.yaml"
+# Models that OpenCV and COLMAP have.
 FOREIGN = ("opencv", "kannala-brandt")
-"""Models that OpenCV and COLMAP have."""
 
 
 def camera_text(camera: Camera, sigma: Mapping[str, float], *remarks: str) -> str:

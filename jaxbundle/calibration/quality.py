@@ -27,11 +27,11 @@ from jaxbundle.leastsquares.quality.correlation import squared_difference
 from jaxbundle.network.camera_tables import with_start
 from jaxbundle.network.tables import Camera, Network
 
+# Columns and rows of the grid of a map: odd, so that the middle of the image is a point of it; σ is
+# smooth, and changes little between neighbours.
 GRID = (11, 9)
-"""Columns and rows of the grid of a map: odd, so that the middle of the image is a point of it; σ
-is smooth, and changes little between neighbours."""
+# Those of the grid of a figure, half as far apart, with σ interpolated in between.
 DRAWN = (21, 17)
-"""Those of the grid of a figure, half as far apart, with σ interpolated in between."""
 
 if TYPE_CHECKING:
     from xarray import Dataset

@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from jaxbundle.calibration.rig.result import RigCalibration
     from jaxbundle.calibration.several import Calibrations
 
+# Findings of the adjustment that do not apply to a board.
 WITHOUT = ("Control",)
-"""Findings of the adjustment that do not apply to a board."""
 
 
 def conclude_calibration(calibration: "Calibration") -> Verdict:

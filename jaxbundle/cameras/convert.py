@@ -33,9 +33,9 @@ from jaxbundle.display import print_anywhere
 from jaxbundle.types import Numbers
 
 Area = tuple[Numbers, Numbers]
+# Minimum part of the image with rays. Of less a fit says nothing about the rest, and such a
+# distortion is rather a mistake in the parameters.
 MEASURABLE = 0.5
-"""Minimum part of the image with rays. Of less a fit says nothing about the rest, and such a
-distortion is rather a mistake in the parameters."""
 
 
 @print_anywhere

@@ -40,9 +40,9 @@ from jaxbundle.types import Numbers
 
 CORRECTIONS = ("brown", "usgs")
 DISTORTIONS = ("brown-projected", "opencv", "snavely")
+# Two numbers this close, relatively, are the same: some thousand roundings, and a hundred times
+# less than the last digit of any file of camera parameters.
 EQUAL = 1e-12
-"""Two numbers this close, relatively, are the same: some thousand roundings, and a hundred times
-less than the last digit of any file of camera parameters."""
 
 Values = Mapping[str, float]
 Sizes = tuple[Numbers | None, Numbers | None]

@@ -37,6 +37,7 @@ from jaxbundle.cameras.model import CameraModel
 CORE = ("fx", "fy", "cx", "cy")
 _K = {f"k{i}": f"k{i}" for i in (1, 2, 3, 4)}
 _P = {"p1": "p1", "p2": "p2"}
+# The terms of a model by its names.
 ANGLE: dict[str, dict[str, str]] = {
     "equidistant": {},
     "kannala-brandt": _K,
@@ -49,7 +50,6 @@ ANGLE: dict[str, dict[str, str]] = {
         },
     },
 }
-"""The terms of a model by its names."""
 SPHERES = ("mei", "eucm", "double-sphere", "stereographic", *DISTORTIONS, "division")
 DIVISIONS = ("division", "scaramuzza", "eucm", "stereographic")
 

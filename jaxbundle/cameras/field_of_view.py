@@ -25,8 +25,8 @@ from jaxbundle.cameras.model import CameraModel
 from jaxbundle.cameras.parameters import default_parameters
 from jaxbundle.types import Numbers
 
+# Width and height of a small-format ("35 mm") image, mm.
 SMALL_FORMAT = (36.0, 24.0)
-"""Width and height of a small-format ("35 mm") image, mm."""
 CLASSES = ((75.0, "normal angle"), (100.0, "wide angle"), (np.inf, "superwide angle"))
 
 

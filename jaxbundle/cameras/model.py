@@ -30,15 +30,15 @@ IMAGES = {
     "equisolid": equisolid,
     "orthographic": orthographic,
 }
+# Ideal images of rays less than 90° from the axis.
 NARROW_PROJECTIONS = ("perspective", "orthographic")
-"""Ideal images of rays less than 90° from the axis."""
 FORMULAS = ("correct", "distort", "project", "unproject")
 Image = Literal["perspective", "equidistant", "stereographic", "equisolid", "orthographic"]
 PRINCIPAL_DISTANCES = ("c",), ("fx", "fy"), ("f",)
+# Default names.
 PRINCIPAL_POINTS = ("x0", "y0"), ("cx", "cy")
-"""Default names."""
+# Further fields of a camera; a parameter cannot have one of these names.
 RESERVED_NAMES = ("id", "model", "image_size", "pixel_size", "free", "sigma")
-"""Further fields of a camera; a parameter cannot have one of these names."""
 
 
 class LocalFormula(NamedTuple):

@@ -11,11 +11,11 @@ import jax.numpy as jnp
 
 from jaxbundle.cameras.scalars import Scalar
 
+# Number of radii at which the slope is tested. The slope of a lens's polynomial falls below zero
+# once, and stays there for the rest of the image; a dip narrower than an eighth of the radius,
+# which needs four coefficients of alternating sign, may be missed. Every sample costs another
+# polynomial for every point of the image.
 SAMPLES = 8
-"""Number of radii at which the slope is tested. The slope of a lens's polynomial falls below zero
-once, and stays there for the rest of the image; a dip narrower than an eighth of the radius, which
-needs four coefficients of alternating sign, may be missed. Every sample costs another polynomial
-for every point of the image."""
 
 
 def radial(k: Sequence[Scalar], square: Scalar) -> Scalar:

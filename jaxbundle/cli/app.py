@@ -25,8 +25,8 @@ from jaxbundle.system.memory import free_memory, is_memory_shortage, require_add
 from jaxbundle.system.terminals import for_output
 
 BAD_INPUT, NOT_SOLVED = 2, 3
+# Exit status of a Unix tool ended by SIGPIPE (13): the reader has closed the pipe.
 NO_READER = 128 + 13
-"""Exit status of a Unix tool ended by SIGPIPE (13): the reader has closed the pipe."""
 
 EXIT_STATUS = (
     "0 done; 2 bad input: one line, nothing written; 3 not solved, with the reason; "

@@ -19,8 +19,8 @@ from jaxbundle.system.interrupts import advise
 if TYPE_CHECKING:
     from jaxbundle.network.columns import Columns
 
+# Statuses of networks whose lines have an `error`.
 STATUSES_WITH_REASON = ("bad input", "not solved", "failed")
-"""Statuses of networks whose lines have an `error`."""
 
 
 @app.command(example="cameras.npz PROJECT.toml --json-lines results.jsonl")

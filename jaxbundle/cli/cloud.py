@@ -69,13 +69,13 @@ def cloud(  # noqa: PLR0913 - the options of the command
     print_result(found, json)
 
 
+# The beginning of a cloud, by its suffix.
 CONTENT = {
     ".csv": re.compile(rb"\s*X,Y,Z"),
     ".ply": re.compile(rb"ply\s"),
     ".las": re.compile(rb"LASF"),
     ".laz": re.compile(rb"LASF"),
 }
-"""The beginning of a cloud, by its suffix."""
 TIFF = re.compile(rb"II[*+]\0|MM\0[*+]")
 
 

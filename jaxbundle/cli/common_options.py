@@ -18,8 +18,8 @@ Quiet = Annotated[
 Verbose = Annotated[
     bool, typer.Option("--verbose", help="print versions, iterations, and times of stages")
 ]
+# Whether the running command was called with --verbose.
 verbose: ContextVar[bool] = ContextVar("verbose", default=False)
-"""Whether the running command was called with --verbose."""
 
 
 def add_common_options(function: Callable) -> Callable:
@@ -52,8 +52,8 @@ def add_common_options(function: Callable) -> Callable:
 _nothing = contextlib.nullcontext
 
 
+# Parameters of commands for a file or folder of the result.
 RESULT_FILES = ("out", "json", "html", "save", "folder")
-"""Parameters of commands for a file or folder of the result."""
 
 
 def is_in_file(*files: object) -> bool:

@@ -43,8 +43,9 @@ from jaxbundle.types import Progress
 
 REPORT, PAGE, RESULT = "report.txt", "report.html", "result.json"
 TABLES = ("cameras", "images", "points", "residuals", "checks", "far_points")
+# The table of an error budget, and its entry in the JSON.
 BUDGET = "budget"
-"""The table of an error budget, and its entry in the JSON."""
+# The files of a folder, figures as patterns.
 FILES = (
     REPORT,
     PAGE,
@@ -54,16 +55,15 @@ FILES = (
     f"{ADJUSTED}/{PRECISION}",
     *FIGURES,
 )
-"""The files of a folder, figures as patterns."""
 
 NOTHING: Mapping = MappingProxyType({})
 
+# The beginning of JSON; a TOML table, `[project]`, does not match.
 JSON = re.compile(rb'\s*(\{\s*["}]|\[[\s\[]*([]{"\d-]|true|false|null))')
-"""The beginning of JSON; a TOML table, `[project]`, does not match."""
+# The beginning of a saved adjustment, an .npz.
 SAVED_ADJUSTMENT = re.compile(rb"PK\x03\x04")
-"""The beginning of a saved adjustment, an .npz."""
+# The beginning of a page.
 HTML = re.compile(rb"\s*<(!doctype\s+html|html)\b", re.IGNORECASE)
-"""The beginning of a page."""
 FORCE_ADVICE = ", or --force to replace it"
 
 

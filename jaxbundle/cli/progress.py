@@ -57,8 +57,8 @@ def counting(quiet: bool) -> Progress:
 
 
 REQUEST_EVENT = "/jax/compilation_cache/compile_requests_use_cache"
+# JAX's monitoring events of a program: looking it up in the cache or compiling it; done.
 COMPILED_EVENT = "/jax/core/compile/backend_compile_duration"
-"""JAX's monitoring events of a program: looking it up in the cache or compiling it; done."""
 
 
 class iterating:

@@ -18,8 +18,8 @@ from jaxbundle.measure.boards import Board
 from jaxbundle.results import TableMethods
 from jaxbundle.types import Progress
 
+# The count of inputs that had a result before.
 SKIPPED = "skipped"
-"""The count of inputs that had a result before."""
 
 
 @print_in_one_screen

@@ -30,15 +30,15 @@ from jaxbundle.network.tables import Camera
 from jaxbundle.results import TableMethods
 
 Pair = tuple[float, float]
+# A camera, a calibration, a camera with the covariance of its free parameters; or a file of
+# cameras, a network, or the JSON result of `calibrate` or `adjust`, with `#ID` behind it where it
+# has several cameras.
 CameraSource = Camera | Calibration | tuple[Camera, Covariance] | str | Path
-"""A camera, a calibration, a camera with the covariance of its free parameters; or a file of
-cameras, a network, or the JSON result of `calibrate` or `adjust`, with `#ID` behind it where it has
-several cameras."""
 
+# Rows of a table without a given step: as many as fit a terminal with the lines above them.
 TABLE_ROWS = 12
-"""Rows of a table without a given step: as many as fit a terminal with the lines above them."""
+# A step that gives more rows was meant in another unit: 1e-3 pixels are a micrometre or less.
 MAX_ROWS = 100_000
-"""A step that gives more rows was meant in another unit: 1e-3 pixels are a micrometre or less."""
 
 
 def open_camera(given: CameraSource, image_size: Pair | None = None) -> Camera:

@@ -26,8 +26,8 @@ from jaxbundle.network.tables import Camera
 from jaxbundle.results import TableMethods
 from jaxbundle.system.file_content import beginning
 
+# The beginning of a saved adjustment, an .npz.
 SAVED_ADJUSTMENT = b"PK\x03\x04"
-"""The beginning of a saved adjustment, an .npz."""
 
 
 @print_in_one_screen

@@ -35,8 +35,8 @@ from jaxbundle.types import Progress
 
 NETWORK, CAMERA, SCANNER = EXPLORED
 RESULT = "result.json"
+# Keys of the result of an adjustment or a calibration.
 RESULTS = {"cameras", "calibrations"}
-"""Keys of the result of an adjustment or a calibration."""
 
 Explored = Adjustment | Network | Camera | Calibration | str | Path
 

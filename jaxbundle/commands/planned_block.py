@@ -21,8 +21,8 @@ from jaxbundle.planning.block_design import BlockDesign, design_block, relief_di
 from jaxbundle.planning.block_network import planned_network
 from jaxbundle.results import TableMethods
 
+# Photographs whose covariance is computed: that of 12 000 elements takes 1.2 GB.
 MAX_PHOTOGRAPHS = 2000
-"""Photographs whose covariance is computed: that of 12 000 elements takes 1.2 GB."""
 
 
 @print_in_one_screen

@@ -38,8 +38,8 @@ from jaxbundle.refinement import Refinement
 from jaxbundle.refinement import refine as refine_images
 from jaxbundle.types import Progress
 
+# The command that an output folder belongs to, and the names in it.
 SIMULATE, NAME, IMAGE, TRUTH = "pushbroom simulate", "scanner", "image.tif", "truth"
-"""The command that an output folder belongs to, and the names in it."""
 
 
 @print_in_one_screen

@@ -27,6 +27,7 @@ from jaxbundle.types import Column
 CORNERS = ("first line, first pixel", "first line, last pixel", "last line, last pixel")
 CORNERS += ("last line, first pixel",)
 
+# Units and meaning of the figures.
 WORDS = {
     "height": "m, of the ground that these figures are for",
     "ground_sampling_along": "m, from line to line",
@@ -41,7 +42,6 @@ WORDS = {
     "rpc_largest": "m",
     "heights": "m, between which the coefficients hold",
 }
-"""Units and meaning of the figures."""
 
 
 @print_in_one_screen

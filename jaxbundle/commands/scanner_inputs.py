@@ -22,13 +22,13 @@ from jaxbundle.pushbroom.rpc_image import RpcImage, heights_in_words, heights_of
 from jaxbundle.pushbroom.surfaces import Ground, GroundSurface, Height, Plane
 from jaxbundle.pushbroom.terrain import Terrain
 
+# Called with a warning, a line of text.
 Message = Callable[[str], object]
-"""Called with a warning, a line of text."""
 OFF_IMAGE = "off the image"
 CARTESIAN, GEOGRAPHIC = ("X", "Y", "Z"), ("longitude", "latitude", "height")
 LOCATED_COLUMNS = ("id", *CARTESIAN, *GEOGRAPHIC, "count", "status")
+# Further columns of the tables of `locate` and `project`, which are accepted as input.
 PROJECTED_COLUMNS = ("id", "line", "pixel", "count", "status")
-"""Further columns of the tables of `locate` and `project`, which are accepted as input."""
 
 
 def ignore(_: str) -> None:

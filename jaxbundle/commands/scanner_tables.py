@@ -47,10 +47,10 @@ from jaxbundle.results import TableMethods
 from jaxbundle.types import Column
 
 GAP_REASON = "found beyond a place without height"
+# Lines that see one point: several do where they overlap, as of a platform that sways.
 MAX_IMAGES = 4
-"""Lines that see one point: several do where they overlap, as of a platform that sways."""
+# The RMS of n draws is uncertain by up to 1/√n, here 22 %.
 MIN_DRAWS = 20
-"""The RMS of n draws is uncertain by up to 1/√n, here 22 %."""
 
 
 @print_in_one_screen

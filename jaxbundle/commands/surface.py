@@ -40,8 +40,8 @@ from jaxbundle.surfaces.views import OrientedImage
 from jaxbundle.types import Progress
 
 DEFAULT = SurfaceSettings()
+# The lowest and the highest height searched.
 Heights = tuple[float, float]
-"""The lowest and the highest height searched."""
 
 
 @print_in_one_screen

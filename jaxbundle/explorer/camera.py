@@ -39,8 +39,8 @@ from jaxbundle.report.page.charts import Curve, draw_curves, draw_plan
 from jaxbundle.report.page.markup import figure, grid, items, paragraph
 
 Radii = Float[np.ndarray, " radii"]
+# Radial distortion and decentring.
 Distortion = Float[np.ndarray, "2 radii"]
-"""Radial distortion and decentring."""
 Lattice = Float[np.ndarray, "rows columns 2"]
 
 

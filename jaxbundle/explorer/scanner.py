@@ -75,8 +75,8 @@ from jaxbundle.report.page import UNKNOWN, Origin, Page, Section
 from jaxbundle.report.page.charts import Curve, draw_field, draw_plan
 from jaxbundle.report.page.markup import figure, grid, paragraph
 
+# The index of an angle in an attitude error: about right (pitch), forward (roll), up (yaw).
 ANGLES = {"roll": 1, "pitch": 0, "yaw": 2}
-"""The index of an angle in an attitude error: about right (pitch), forward (roll), up (yaw)."""
 POSITIVE_KEYS = ("altitude", "speed", "height")
 FLIGHT_FILE, TABLE_FILE, PICTURE_FILE = "flight.zip", "accuracy.csv", "error_map.png"
 

@@ -30,11 +30,11 @@ from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.report.page import write
 
 HOST = "127.0.0.1"
+# Maximum bytes of the body of a request: about 2000 stations of a network, moved.
 MOST_BYTES = 256 * 1024
-"""Maximum bytes of the body of a request: about 2000 stations of a network, moved."""
+# Seconds in which a request must arrive, all of it: a sender that trickles bytes must not hold a
+# connection.
 REQUEST_TIMEOUT = 30.0
-"""Seconds in which a request must arrive, all of it: a sender that trickles bytes must not hold a
-connection."""
 METHODS = "GET, POST"
 HTML, JSON = "text/html; charset=utf-8", "application/json"
 

@@ -14,6 +14,7 @@ from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid
 from jaxbundle.pushbroom.image import PushbroomImage
 
 ORBIT, STRAIGHT = "orbit", "straight track"
+# The parameters of an orbit and of a straight track: label and unit.
 LABELS = {
     "height": ("height of the orbit", "m"),
     "inclination": ("inclination", "°"),
@@ -23,9 +24,8 @@ LABELS = {
     "speed": ("speed over ground", "m/s"),
     "heading": ("heading, clockwise from y", "°"),
 }
-"""The parameters of an orbit and of a straight track: label and unit."""
+# A circular orbit; at 500 km an inclination of 97.4° makes it synchronous with the sun.
 USUAL = {"height": 500e3, "inclination": 97.4, "node": 0.0, "argument": 0.0}
-"""A circular orbit; at 500 km an inclination of 97.4° makes it synchronous with the sun."""
 
 
 class Tracks(NamedTuple):

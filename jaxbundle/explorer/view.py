@@ -8,8 +8,8 @@ from jaxbundle.errors import InputError
 from jaxbundle.network.columns import did_you_mean, show
 from jaxbundle.report.page import Page
 
+# Values of the controls, by their keys.
 Given = Mapping[str, Any]
-"""Values of the controls, by their keys."""
 
 
 class File(NamedTuple):

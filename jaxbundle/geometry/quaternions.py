@@ -34,8 +34,8 @@ from jaxtyping import Float
 
 from jaxbundle.types import AnyArray
 
+# Traced once for all callers, and compiled as a part of each.
 traced_once = partial(jax.jit, inline=True)
-"""Traced once for all callers, and compiled as a part of each."""
 
 
 @traced_once

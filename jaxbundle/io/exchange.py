@@ -39,10 +39,10 @@ from jaxbundle.network.image_bounds import outside_warnings
 from jaxbundle.network.rules import check_camera
 from jaxbundle.network.tables import Camera, Network
 
+# What a file of cameras loses of a network; its kind says what of the cameras.
 FILES_OF_CAMERAS = losing(
     "orientations of images", "points", keeping=("prior σ of camera parameters",)
 )
-"""What a file of cameras loses of a network; its kind says what of the cameras."""
 
 
 @print_anywhere

@@ -437,6 +437,7 @@ TARGETS: dict[str, OutputFormat] = {
         files=PROJECT_FILES,
     ),
 }
+# Outputs that hold cameras only.
 CAMERA_KINDS: dict[str, CameraTarget] = {
     "colmap-cameras": CameraTarget(
         _is_named("cameras.txt"),
@@ -487,7 +488,6 @@ CAMERA_KINDS: dict[str, CameraTarget] = {
     ),
     "cameras": CameraTarget(_ends(".toml"), write_cameras, "NAME.toml", broad=True),
 }
-"""Outputs that hold cameras only."""
 
 
 def has_model(models: Sequence[str], model: str | CameraModel) -> bool:

@@ -11,10 +11,10 @@ from jaxbundle.leastsquares.datum.motions import JointMotion
 from jaxbundle.leastsquares.spaces import Change, WithoutChart, hold_by_retraction, tangent_basis
 from jaxbundle.types import AnyArray, Scalar
 
+# Infinity, in units of the length s of a row: rays to it from places a length s apart differ by
+# 1e-8, a ten-thousandth of a pixel of an image of 10 000 · 10 000. At a hundredth of it they would
+# differ by more than images are measured; a hundred times more changes nothing.
 LARGEST_DISTANCE = 1e8
-"""Infinity, in units of the length s of a row: rays to it from places a length s apart differ by
-1e-8, a ten-thousandth of a pixel of an image of 10 000 · 10 000. At a hundredth of it they would
-differ by more than images are measured; a hundred times more changes nothing."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -21,8 +21,8 @@ from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.spaces import Pose, PoseValue, Space, Vector
 from jaxbundle.leastsquares.weights import whitening
 
+# Placeholder: the space is derived from the values of the table.
 OF_THE_VALUES: Any = None
-"""Placeholder: the space is derived from the values of the table."""
 
 
 @print_in_one_screen

@@ -100,8 +100,8 @@ class Problem:
         return kept
 
 
+# A problem, or one that knows more, such as the network it is of.
 AnyProblem = TypeVar("AnyProblem", bound=Problem)
-"""A problem, or one that knows more, such as the network it is of."""
 
 
 @dataclasses.dataclass(frozen=True)

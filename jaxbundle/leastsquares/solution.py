@@ -50,15 +50,15 @@ from jaxbundle.leastsquares.sharding import distribute, find_minimum_of_shards, 
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, present
 
+# Placeholder of the plan in a factor returned by a compiled function.
 PLAN_PLACEHOLDER = "the plan"
-"""Placeholder of the plan in a factor returned by a compiled function."""
 
+# Problems with at least so many observations are distributed over several devices; of smaller ones
+# (5 ms an iteration) the devices would wait for each other longer than they compute.
 MIN_SHARED_OBSERVATIONS = 10_000
-"""Problems with at least so many observations are distributed over several devices; of smaller ones
-(5 ms an iteration) the devices would wait for each other longer than they compute."""
 
+# By the name of the set, rows in the given order.
 Rows = dict[str, Float[np.ndarray, "n r"]]
-"""By the name of the set, rows in the given order."""
 
 
 def find_minimum(

@@ -29,10 +29,10 @@ from jaxbundle.geometry.quaternions import small_difference
 from jaxbundle.types import AnyArray, Scalar
 
 Change = tuple[Scalar, ...]
+# Three scalars, x, y, z; a comprehension makes a tuple of no known length for a type checker.
 Triple = tuple[Scalar, ...]
-"""Three scalars, x, y, z; a comprehension makes a tuple of no known length for a type checker."""
+# What an observation receives of a row: scalars, or objects of scalars such as `Posed`.
 Block = PyTree[Scalar]
-"""What an observation receives of a row: scalars, or objects of scalars such as `Posed`."""
 Matrix = Float[Array, "width width"]
 Value = TypeVar("Value")
 

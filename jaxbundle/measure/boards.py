@@ -29,6 +29,7 @@ from jaxbundle.choices import BOARDS, DICTIONARIES
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import did_you_mean
 
+# Minimum columns and rows of a board.
 SMALLEST_SIDE = {
     "chessboard": 3,
     "circles": 2,
@@ -36,9 +37,8 @@ SMALLEST_SIDE = {
     "charuco": 3,
     "aprilgrid": 2,
 }
-"""Minimum columns and rows of a board."""
+# Dictionaries of `charuco` and `aprilgrid`, if none is given.
 ARUCO, APRILTAGS = "DICT_4X4_50", "DICT_APRILTAG_36h11"
-"""Dictionaries of `charuco` and `aprilgrid`, if none is given."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -56,8 +56,8 @@ class RingSettings:
 
 
 Grey = UInt8[np.ndarray, "rows columns"]
+# Name, pixels, covariance.
 MeasuredPoint = tuple[str, Float[np.ndarray, "2"], Float[np.ndarray, "2 2"]]
-"""Name, pixels, covariance."""
 
 
 @print_in_one_screen

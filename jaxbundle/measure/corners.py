@@ -26,14 +26,14 @@ from jaxbundle.photographs.reading import image_errors
 
 Grey = UInt8[np.ndarray, "rows columns"]
 Places = Float[np.ndarray, "n 2"]
+# Image points of a board by row and column.
 Grid = Float[np.ndarray, "rows columns 2"]
-"""Image points of a board by row and column."""
 
+# Longer sides of the reduced copies in which boards are searched in turn, in pixels. The first
+# takes a second (see above); the second, of four times the pixels, finds squares of half the size.
 SIDES = (1600, 3200)
-"""Longer sides of the reduced copies in which boards are searched in turn, in pixels. The first
-takes a second (see above); the second, of four times the pixels, finds squares of half the size."""
+# The same for boards of other sizes, a hint only, in a quarter of the pixels of the first copy.
 QUICK_SIDE = 800
-"""The same for boards of other sizes, a hint only, in a quarter of the pixels of the first copy."""
 
 
 def find_board(grey: Grey, board: Board) -> Float[np.ndarray, "points 2"]:

@@ -27,8 +27,8 @@ from jaxbundle.network.columns import did_you_mean
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, Scalar
 
+# Parameters of each kind, the letters above.
 UNKNOWNS = {"similarity": 4, "affine": 6, "projective": 8}
-"""Parameters of each kind, the letters above."""
 
 
 @print_in_one_screen

@@ -61,8 +61,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxbundle.types import AnyArray, Scalar
 
+# A [2, 3], row by row, h0, h1.
 UNKNOWNS = 8
-"""A [2, 3], row by row, h0, h1."""
 Unknowns = Float[Array, "8"]
 Normal = Float[Array, "8 8"]
 Pixels = Float[AnyArray, " n*n"]

@@ -25,12 +25,12 @@ from jaxtyping import Bool, Float, Real
 from jaxbundle.measure.corner_quality import MAX_SIGMA, NO_CORNER, TOO_SMALL
 from jaxbundle.measure.grey_value_fit import noise_of_residuals, normal_equations
 
+# x, y, θ₁, θ₂, M, D, ln τ, m of corners.
 Theta = Float[np.ndarray, "n 9"]
-"""x, y, θ₁, θ₂, M, D, ln τ, m of corners."""
 UNKNOWNS = 9
 Pixels = Float[np.ndarray, "n pixels"]
+# Widths of the light strips by both lines, in the quarter of these signs of s₁ and s₂.
 Strips = Float[np.ndarray, "n 2 2 2"]
-"""Widths of the light strips by both lines, in the quarter of these signs of s₁ and s₂."""
 
 
 @dataclasses.dataclass(frozen=True)

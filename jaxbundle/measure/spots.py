@@ -18,9 +18,9 @@ from jaxbundle.errors import InputError
 Window = Float[np.ndarray, "rows columns"]
 Mask = Bool[np.ndarray, "rows columns"]
 
+# Pixels of the blurred edge beyond the spot: that of a lens a little out of focus, τ = 1 pixel, to
+# 3·τ. A spot whose margin is cut is not measured.
 MARGIN = 3
-"""Pixels of the blurred edge beyond the spot: that of a lens a little out of focus, τ = 1 pixel, to
-3·τ. A spot whose margin is cut is not measured."""
 
 
 @dataclasses.dataclass(frozen=True)

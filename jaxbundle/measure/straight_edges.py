@@ -29,10 +29,10 @@ from jaxtyping import Bool, Float, Int, Real
 
 from jaxbundle.measure.grey_value_fit import noise_of_residuals, normal_equations
 
+# The unknowns of edges, in the order of `UNKNOWNS`.
 Theta = Float[np.ndarray, "n 9"]
-"""The unknowns of edges, in the order of `UNKNOWNS`."""
+# a, b, c, W at the middle, its change to the end, the same of B, V, ln τ.
 UNKNOWNS = 9
-"""a, b, c, W at the middle, its change to the end, the same of B, V, ln τ."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -21,11 +21,11 @@ from jaxbundle.measure.saddles import fit_saddles
 
 Grey = UInt8[np.ndarray, "rows columns"]
 
+# Four middles, not in one row, determine the homography of the grid.
 MIN_TAGS = 4
-"""Four middles, not in one row, determine the homography of the grid."""
 
+# Kalibr prints tags with borders of two bits, everybody else of one.
 BORDER_BITS = 2, 1
-"""Kalibr prints tags with borders of two bits, everybody else of one."""
 
 
 def get_dictionary(name: str) -> Any:

@@ -28,8 +28,8 @@ from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.measure.spots import MARGIN, Spot, find_spot
 
+# x, y, the three elements of M, G, C, ln τ, and the two of m.
 UNKNOWNS = 10
-"""x, y, the three elements of M, G, C, ln τ, and the two of m."""
 Theta = Float[np.ndarray, " 10"]
 Pixels = Float[np.ndarray, " pixels"]
 

@@ -32,15 +32,15 @@ from jaxbundle.system.file_content import read_content
 from jaxbundle.system.threads import map_in_threads
 from jaxbundle.types import Progress
 
+# The stage in reports of progress.
 SEARCHING = "searching the board"
-"""The stage in reports of progress."""
+# Number of photographs searched for boards of other sizes: those without a board, if few have it,
+# and the others, whether their board is a part of a larger one. A search takes longest where there
+# is nothing to find; most of three decide about a larger board.
 MAX_SEARCHED = 3
-"""Number of photographs searched for boards of other sizes: those without a board, if few
-have it, and the others, whether their board is a part of a larger one. A search takes longest where
-there is nothing to find; most of three decide about a larger board."""
 
+# Search result of a board in a photograph: image size and image points, or why none.
 Look = tuple[tuple[int, int], Float[np.ndarray, "points 2"]] | str
-"""Search result of a board in a photograph: image size and image points, or why none."""
 HINT = "give --"
 
 

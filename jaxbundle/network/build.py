@@ -65,13 +65,13 @@ from jaxbundle.network.units import ANGLE_UNITS, from_image_unit
 
 CAMERA_FIELDS = ("id", "model", "image_size", "pixel_size", "free", "sigma", "observed", "tie")
 IMAGE_COLUMNS = ("id", "camera", *EXTERIOR)
+# Columns of images that may be omitted together.
 GROUPS = EXTERIOR[:3], EXTERIOR[3:]
-"""Columns of images that may be omitted together."""
 IMAGE_SIGMAS = tuple(f"s{name}" for name in EXTERIOR)
 POINT_COLUMNS = ("id", "role", *AXES)
 POINT_SIGMAS = tuple(f"s{name}" for name in AXES)
+# Reprojection errors in written point tables; not used.
 POINT_ERRORS = ("error_px", "error_mm")
-"""Reprojection errors in written point tables; not used."""
 OBSERVATION_COLUMNS = ("image", "point", "x", "y")
 OBSERVATION_SIGMAS = ("sx", "sy")
 DISTANCE_COLUMNS = ("from", "to", "value", "sigma")

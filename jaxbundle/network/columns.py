@@ -20,9 +20,9 @@ from jaxbundle.errors import InputError
 from jaxbundle.network.tables import Source
 from jaxbundle.types import Column
 
+# Types that Python or NumPy would convert silently: Booleans to 0 and 1, complex numbers to their
+# real parts.
 NO_NUMBERS = (bool, np.bool_, complex, np.complexfloating, type(np.ma.masked))
-"""Types that Python or NumPy would convert silently: Booleans to 0 and 1, complex numbers to their
-real parts."""
 
 
 class RepeatedIds:

@@ -21,6 +21,7 @@ from jaxbundle.network.rules import model_of
 from jaxbundle.network.tables import Camera, Network
 
 SIZES = ("image_size", "pixel_size")
+# Corresponding parameters of different models; free in one means free in the other.
 COUNTERPARTS = (
     ("c", "f", "fx", "fy"),
     ("x0", "cx"),
@@ -30,7 +31,6 @@ COUNTERPARTS = (
     ("K3", "k3"),
     ("P1", "P2", "p1", "p2"),
 )
-"""Corresponding parameters of different models; free in one means free in the other."""
 
 
 def convert_cameras(

@@ -46,9 +46,9 @@ from jaxbundle.network.tables import EXTERIOR, Network
 from jaxbundle.network.user_observations import place, split
 from jaxbundle.system.programs import compile_once
 
+# Smallest batch of rotations, so that networks of fewer images share one compiled program:
+# compiling takes a second, converting 64 rotations no time. Not critical.
 LEAST_IMAGES = 64
-"""Smallest batch of rotations, so that networks of fewer images share one compiled program:
-compiling takes a second, converting 64 rotations no time. Not critical."""
 
 
 @dataclasses.dataclass(frozen=True)

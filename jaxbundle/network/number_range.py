@@ -5,9 +5,9 @@ import numpy as np
 from jaxbundle.errors import InputError
 from jaxbundle.network.tables import Network
 
+# Normal equations and cofactors have products of four lengths, and sums over many of them: a
+# hundredth of the fourth root of the largest number.
 LARGEST = float(f"{np.finfo(float).max ** (1 / 4) / 100:.0e}")
-"""Normal equations and cofactors have products of four lengths, and sums over many of them: a
-hundredth of the fourth root of the largest number."""
 
 
 def check_coordinates(

@@ -11,8 +11,8 @@ from jaxtyping import Float, Int
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import Network
 
+# Odd numbers that spread the bits of measurements over a hash.
 MIX = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
-"""Odd numbers that spread the bits of measurements over a hash."""
 
 
 def warn_of_repetitions(network: Network) -> Network:

@@ -24,13 +24,13 @@ from jaxbundle.network.tables import DATUMS, RESIDUAL_DOMAINS, Camera, Source
 from jaxbundle.network.units import ANGLE_UNITS, IMAGE_UNITS
 
 AXES = ("X", "Y", "Z")
+# The settings with a fixed set of values.
 CHOICES = {
     "datum": DATUMS,
     "residuals": RESIDUAL_DOMAINS,
     "angle_unit": tuple(ANGLE_UNITS),
     "image_unit": IMAGE_UNITS,
 }
-"""The settings with a fixed set of values."""
 
 
 def check_choice(key: str, value: str, choices: Sequence[str], where: str = "") -> None:

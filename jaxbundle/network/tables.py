@@ -33,11 +33,11 @@ ROLES = ("tie", "control", "fixed", "check")
 DATUMS = ("control", "inner", "minimal")
 RESIDUAL_DOMAINS = ("corrected", "measured")
 EXTERIOR = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
+# Which rows of a table: a mask, or indices.
 Rows = Bool[np.ndarray, " n"] | Int[np.ndarray, " k"] | Sequence[int]
-"""Which rows of a table: a mask, or indices."""
+# σ of an image coordinate of a calibration, pixels, where none is stated: a unit of weight, about
+# what corners of boards have, which σ0 estimates.
 UNSTATED_BOARD_SIGMA = 0.1
-"""σ of an image coordinate of a calibration, pixels, where none is stated: a unit of weight, about
-what corners of boards have, which σ0 estimates."""
 
 
 def row_indices(rows: Rows) -> Int[np.ndarray, " k"]:

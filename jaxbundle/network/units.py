@@ -23,8 +23,8 @@ from jaxbundle.cameras.pixel_frame import pixel_frame
 from jaxbundle.errors import InputError
 from jaxbundle.network.tables import Camera
 
+# Radians in one unit.
 ANGLE_UNITS = {"rad": 1.0, "deg": math.pi / 180, "gon": math.pi / 200}
-"""Radians in one unit."""
 
 IMAGE_UNITS = ("mm", "px")
 

@@ -42,13 +42,13 @@ from jaxbundle.network_design.visibility import (
 )
 from jaxbundle.types import AnyArray
 
+# Of a determined target: four coordinates for three unknowns.
 MIN_RAYS = 2
-"""Of a determined target: four coordinates for three unknowns."""
+# Of an included photograph: six coordinates for six unknowns.
 MIN_TARGETS = 3
-"""Of an included photograph: six coordinates for six unknowns."""
+# Of the rays of an excluded photograph, the factor of 1/σ: 1e-7 of its information, which no aim
+# shows, and far above rounding (1e-16), so that its orientation stays determined.
 IDLE_VISIBILITY = 3e-4
-"""Of the rays of an excluded photograph, the factor of 1/σ: 1e-7 of its information, which no aim
-shows, and far above rounding (1e-16), so that its orientation stays determined."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -20,8 +20,8 @@ from jaxbundle.leastsquares.problem import with_data
 from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.network_design.aims import Aim, aim_of, functions_of, measure, points_of_interest
 
+# Sets whose measurements are simulated.
 STANDARD = (*PSEUDO_OBSERVATIONS, "image")
-"""Sets whose measurements are simulated."""
 
 
 @print_in_one_screen

@@ -25,9 +25,9 @@ from jaxbundle.network_design.settings import DEFAULTS, DesignSettings
 from jaxbundle.network_design.variables import Configuration, Variables
 from jaxbundle.types import AnyArray
 
+# The logarithm of an undetermined aim: beyond that of every number (e⁷⁰⁹), and finite, so that a
+# line search steps back from it.
 UNDETERMINED_AIM = 1e3
-"""The logarithm of an undetermined aim: beyond that of every number (e⁷⁰⁹), and finite, so that a
-line search steps back from it."""
 
 
 class Step(NamedTuple):

@@ -29,12 +29,11 @@ from jaxbundle.network.tables import Camera
 from jaxbundle.network_design.conditions import Conditions
 from jaxbundle.types import AnyArray
 
+# Rays of cameras with a smaller largest angle are compared by tangents of the angle off the axis,
+# as a perspective camera images them; of fisheyes, whose tangents grow without limit, by the angle.
 WIDE_ANGLE = np.radians(70.0)
-"""Rays of cameras with a smaller largest angle are compared by tangents of the angle off the axis,
-as a perspective camera images them; of fisheyes, whose tangents grow without limit, by the
-angle."""
+# Angles off the axis whose tangents are compared; beyond, the angle is added.
 LARGEST_ANGLE = np.radians(87.0)
-"""Angles off the axis whose tangents are compared; beyond, the angle is added."""
 
 
 class UsableFormat(NamedTuple):

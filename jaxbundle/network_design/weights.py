@@ -24,10 +24,10 @@ from jaxbundle.network_design.search import UNDETERMINED_AIM, make_program
 from jaxbundle.network_design.settings import DEFAULTS, DesignSettings
 from jaxbundle.types import AnyArray
 
+# The weight of an unselected photograph, so that its orientation stays determined.
 IDLE_WEIGHT = IDLE_VISIBILITY**2
-"""The weight of an unselected photograph, so that its orientation stays determined."""
+# `weights -> (log aim², gradient)`.
 Squared = Callable[[Float[AnyArray, " images"]], tuple[float, Float[np.ndarray, " images"]]]
-"""`weights -> (log aim², gradient)`."""
 
 
 class Selection(NamedTuple):

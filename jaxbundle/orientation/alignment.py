@@ -14,8 +14,8 @@ from jaxbundle.orientation.robust import OUTLIER_LIMIT
 from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
 from jaxbundle.types import Index
 
+# A and t of X' = A·X + t, A a rotation times a scale.
 Similarity = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]
-"""A and t of X' = A·X + t, A a rotation times a scale."""
 
 
 def move_to_given_frame(network: Network, sights: Sights, model: Model) -> Model | None:

@@ -27,14 +27,14 @@ from jaxtyping import Bool, Float, Int
 
 from jaxbundle.leastsquares.quality.distributions import chi2_tail, f_tail, level_of_one
 
+# With at most this many points two are also tested together: two errors of one size, as of
+# exchanged names, hide each other in the estimated σ of a few points. Of 20 points there are 190
+# pairs, each with a σ estimated anew.
 MAX_POINTS_FOR_PAIRS = 20
-"""With at most this many points two are also tested together: two errors of one size, as of
-exchanged names, hide each other in the estimated σ of a few points. Of 20 points there are 190
-pairs, each with a σ estimated anew."""
+# Control points that remain at least: three of a similarity always nearly agree.
 MIN_AGREEING = 4
-"""Control points that remain at least: three of a similarity always nearly agree."""
+# Of an estimated σ: its relative σ is 1/√(2·redundancy), 40 %.
 MIN_REDUNDANCY = 3.0
-"""Of an estimated σ: its relative σ is 1/√(2·redundancy), 40 %."""
 
 
 @dataclasses.dataclass(frozen=True)

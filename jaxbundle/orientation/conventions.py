@@ -21,8 +21,8 @@ from jaxbundle.orientation.incremental import Model, misclosures
 from jaxbundle.orientation.rays import sights
 from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
 
+# The symmetry of the expected convention: a 2 × 2 matrix, row by row.
 IDENTITY = (1, 0, 0, 1)
-"""The symmetry of the expected convention: a 2 × 2 matrix, row by row."""
 SYMMETRIES = {
     (1, 0, 0, -1): "{y} is counted in the other direction",
     (-1, 0, 0, 1): "{x} is counted in the other direction",

@@ -163,5 +163,5 @@ def _times_x() -> tuple[Float[np.ndarray, "10 10"], Float[np.ndarray, "10 10"]]:
 
 _COLLECT = _collect()
 _TAKE_CUBIC, _TAKE_BASIS = _times_x()
+# The permutation symbol of Levi-Civita: det E = Σ εⱼₖₗ·E₁ⱼ·E₂ₖ·E₃ₗ.
 _PERMUTATION = np.cross(np.eye(3)[:, None], np.eye(3)[None])
-"""The permutation symbol of Levi-Civita: det E = Σ εⱼₖₗ·E₁ⱼ·E₂ₖ·E₃ₗ."""

@@ -31,12 +31,12 @@ class Demands:
     miss: float
 
 
+# A point known well enough for resection: an angle of 0.02 (1.1°) makes an error of a direction 50
+# times as large along the ray, which an image from the side sees in full.
 RESECTION_DEMANDS = Demands(0.02, 1.0)
-"""A point known well enough for resection: an angle of 0.02 (1.1°) makes an error of a direction 50
-times as large along the ray, which an image from the side sees in full."""
+# A point that needs a start value: the adjustment decides about it. Its rays may miss it by more
+# than `gross_ratio`, so that one bad ray of two is excluded and named, not the point lost.
 START_VALUE_DEMANDS = Demands(1e-3, 4.0)
-"""A point that needs a start value: the adjustment decides about it. Its rays may miss it by more
-than `gross_ratio`, so that one bad ray of two is excluded and named, not the point lost."""
 
 
 @dataclasses.dataclass
@@ -111,8 +111,8 @@ def are_held(
     return known & (sigma.max(1) * settings.extent_to_misfit <= extent)
 
 
+# Adjusts the images and points of a model among themselves, in place.
 Improve = Callable[[Sights, Model], None]
-"""Adjusts the images and points of a model among themselves, in place."""
 
 
 def grow(

@@ -14,13 +14,13 @@ from jaxtyping import Bool, Float
 from jaxbundle.implicit import implicit_root, solve_dense
 from jaxbundle.types import AnyArray
 
+# Singular values below this part of the largest count as zero: points lie on a line or in a plane,
+# or linear equations leave a parameter open. It lies between rounding and noise: rounding is 1e-16
+# of a coordinate, so 1e-10 of the extent of points a million extents from the origin (map
+# coordinates); measurements of images are good to 1e-6 of the format at best, which spreads even
+# the points of a line by more. So it finds degenerate configurations of exact data; of measured
+# data the cofactors show them.
 RANK_TOLERANCE = 1e-7
-"""Singular values below this part of the largest count as zero: points lie on a line or in a plane,
-or linear equations leave a parameter open. It lies between rounding and noise: rounding is 1e-16 of
-a coordinate, so 1e-10 of the extent of points a million extents from the origin (map coordinates);
-measurements of images are good to 1e-6 of the format at best, which spreads even the points of a
-line by more. So it finds degenerate configurations of exact data; of measured data the cofactors
-show them."""
 
 
 def null_vector(

@@ -16,10 +16,10 @@ from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Network
 from jaxbundle.orientation.rays import Sights, sights
 
+# Misclosures up to this number of σ are explained by the measurements. Medians of points are
+# compared with it, which are 0.83 for good σ (Rayleigh distribution): σ of image points may be
+# stated too small by a factor of 3.6.
 MAX_SIGMA_RATIO = 3.0
-"""Misclosures up to this number of σ are explained by the measurements. Medians of points are
-compared with it, which are 0.83 for good σ (Rayleigh distribution): σ of image points may be stated
-too small by a factor of 3.6."""
 
 
 def name_one_place(network: Network) -> str:

@@ -20,14 +20,14 @@ from jaxbundle.network.tables import Camera, Network
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import Index
 
+# Of the angle between a ray and the axis of a camera (81°) for plane coordinates: beyond it they
+# grow without limit, and with them the effect of noise: across the axis by 1/cos = 6.7, along the
+# radius by its square.
 MIN_COSINE = 0.15
-"""Of the angle between a ray and the axis of a camera (81°) for plane coordinates: beyond it they
-grow without limit, and with them the effect of noise: across the axis by 1/cos = 6.7, along the
-radius by its square."""
+# Largest unknown lens distortion, relative to the image extent: that of wide-angle lenses of
+# consumer cameras, whose parameters are not known before the adjustment. Smaller: such images are
+# not oriented; larger: blunders of that size are accepted as start values.
 TOLERANCE = 0.03
-"""Largest unknown lens distortion, relative to the image extent: that of wide-angle lenses of
-consumer cameras, whose parameters are not known before the adjustment. Smaller: such images are not
-oriented; larger: blunders of that size are accepted as start values."""
 
 
 @dataclasses.dataclass(frozen=True)

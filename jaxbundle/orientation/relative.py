@@ -33,16 +33,16 @@ from jaxbundle.orientation.pose import CameraPose, image_of, ray_of
 from jaxbundle.orientation.status import Status, first_of
 from jaxbundle.types import AnyArray, Scalar
 
+# Ratio of variances below which the simpler explanation counts: about the 99 % quantile of F for a
+# dozen points, F(0.99; 21, 7) = 6.1 (a rotation has 2·12 − 3 = 21 redundant coordinates, a relative
+# orientation 12 − 5 = 7). One value for all numbers of points: with more, a rotation that explains
+# the images nearly as well is no base to work with either.
 MAX_VARIANCE_RATIO = 6.0
-"""Ratio of variances below which the simpler explanation counts: about the 99 % quantile of F for a
-dozen points, F(0.99; 21, 7) = 6.1 (a rotation has 2·12 − 3 = 21 redundant coordinates, a relative
-orientation 12 − 5 = 7). One value for all numbers of points: with more, a rotation that explains
-the images nearly as well is no base to work with either."""
+# Variance of image coordinates (c = 1) that is rounding: (1e-10)², a million roundings of a
+# coordinate, a thousandth of the best measurements.
 ROUNDING_VARIANCE = 1e-20
-"""Variance of image coordinates (c = 1) that is rounding: (1e-10)², a million roundings of a
-coordinate, a thousandth of the best measurements."""
+# (M, b) of the second camera relative to the first.
 Motion = tuple[Float[AnyArray, "3 3"], Float[AnyArray, "3"]]
-"""(M, b) of the second camera relative to the first."""
 
 
 class RelativeOrientation(eqx.Module):

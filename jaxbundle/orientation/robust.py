@@ -40,12 +40,12 @@ from jaxbundle.orientation.status import Status
 from jaxbundle.orientation.three_points import three_points
 from jaxbundle.types import AnyArray, Scalar
 
+# Error of an observation that is impossible in a model (a point behind the camera): above every
+# threshold in use, and finite, so that sums of other errors still rank two bad models.
 IMPOSSIBLE_ERROR = 1e6
-"""Error of an observation that is impossible in a model (a point behind the camera): above every
-threshold in use, and finite, so that sums of other errors still rank two bad models."""
+# Observations beyond this number of robust standard deviations are gross errors (LMedS): the value
+# of Rousseeuw and Leroy (1987), beyond which 1.2 % of good normal observations are.
 OUTLIER_LIMIT = 2.5
-"""Observations beyond this number of robust standard deviations are gross errors (LMedS): the value
-of Rousseeuw and Leroy (1987), beyond which 1.2 % of good normal observations are."""
 
 
 class Consensus(eqx.Module):

@@ -21,9 +21,9 @@ from jaxbundle.orientation.rays import Sights, sights
 from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
 
 CONTRADICTORY_CONTROL = "control points contradict each other"
+# With at most this many points every swap of two (66) is tried, and every similarity of three (220)
+# tested. More points have a majority, which needs no trial.
 MAX_POINTS_FOR_TRIALS = 12
-"""With at most this many points every swap of two (66) is tried, and every similarity of three
-(220) tested. More points have a majority, which needs no trial."""
 
 
 def name_contradiction(

@@ -22,8 +22,8 @@ from jaxtyping import Bool, Float
 from jaxbundle.orientation.pose import CameraPose
 from jaxbundle.types import AnyArray
 
+# The points at the ends of the three sides.
 SIDES = tuple(itertools.combinations(range(3), 2))
-"""The points at the ends of the three sides."""
 
 
 def three_points(

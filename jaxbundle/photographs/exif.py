@@ -17,19 +17,19 @@ from jaxbundle.photographs.reading import open_image
 from jaxbundle.photographs.sensors import sensor_width
 from jaxbundle.photographs.xmp import CameraAttitude, Xmp, parse_xmp
 
+# Name of the XMP packet among the text chunks of PNG (XMP specification, part 3).
 PNG_PACKET = "XML:com.adobe.xmp"
-"""Name of the XMP packet among the text chunks of PNG (XMP specification, part 3)."""
+# mm: reference of focal lengths equivalent to 35 mm film.
 FILM_DIAGONAL = math.hypot(36, 24)
-"""mm: reference of focal lengths equivalent to 35 mm film."""
+# mm by the code of the unit of the resolution in the focal plane: inch, centimetre (Exif 2.32),
+# millimetre (of some makers).
 RESOLUTION_UNIT = {2: 25.4, 3: 10.0, 4: 1.0}
-"""mm by the code of the unit of the resolution in the focal plane: inch, centimetre (Exif 2.32),
-millimetre (of some makers)."""
+# Orientation of a photograph stored as on the sensor (Exif 2.32, tag 0x0112).
 UPRIGHT = 1
-"""Orientation of a photograph stored as on the sensor (Exif 2.32, tag 0x0112)."""
+# Relative σ of a principal distance from a stated focal length: focal lengths are rounded, the
+# sensor is a few per cent wider than the photograph, and focused at 20 focal lengths the principal
+# distance is 5 % longer.
 NOMINAL_SIGMA = 0.05
-"""Relative σ of a principal distance from a stated focal length: focal lengths are rounded, the
-sensor is a few per cent wider than the photograph, and focused at 20 focal lengths the principal
-distance is 5 % longer."""
 
 
 class StatedDistance(NamedTuple):

@@ -10,8 +10,8 @@ from pathlib import Path
 from jaxbundle.network.columns import count
 from jaxbundle.photographs.formats import RAW, SUFFIXES, is_photograph
 
+# Files that operating systems put into folders, beside those whose name begins with a dot.
 HIDDEN = ("thumbs.db", "desktop.ini")
-"""Files that operating systems put into folders, beside those whose name begins with a dot."""
 
 
 def list_photographs(folder: Path) -> list[Path]:

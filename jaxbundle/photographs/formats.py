@@ -6,6 +6,7 @@ HEIC is read if `pillow-heif` is installed, AVIF if Pillow was built with it.
 import importlib
 from pathlib import Path
 
+# Suffixes of photographs that OpenCV or Pillow reads.
 SUFFIXES = (
     ".jpg",
     ".jpeg",
@@ -20,14 +21,13 @@ SUFFIXES = (
     ".ppm",
     ".pgm",
 )
-"""Suffixes of photographs that OpenCV or Pillow reads."""
 HEIC = (".heic", ".heif", ".hif")
 RAW = (
     ".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".srf", ".sr2", ".raf", ".orf", ".rw2",
     ".rwl", ".pef", ".srw", ".x3f", ".3fr", ".iiq", ".erf", ".kdc", ".mrw", ".gpr", ".raw",
 )  # fmt: skip
+# Some of them are read by Pillow, depending on how it was built.
 OTHERS = (".avif", ".jxl", ".psd", ".exr", ".jxr")
-"""Some of them are read by Pillow, depending on how it was built."""
 
 OF_HEIC = (
     "HEIC is read after pip install pillow-heif; or convert it to JPEG with its metadata "
@@ -38,6 +38,7 @@ OF_RAW = (
     "the program of the camera's maker, darktable or RawTherapee"
 )
 OF_OTHERS = "this format is not read: convert it to JPEG or TIFF, with its metadata"
+# By the brand in the header of an ISO media file: photographs are also named .jpg wrongly.
 BRANDS = {
     b"heic": OF_HEIC,
     b"heix": OF_HEIC,
@@ -46,7 +47,6 @@ BRANDS = {
     b"avif": OF_OTHERS,
     b"crx ": OF_RAW,
 }
-"""By the brand in the header of an ISO media file: photographs are also named .jpg wrongly."""
 
 
 def is_photograph(path: Path) -> bool:

@@ -16,10 +16,10 @@ from jaxtyping import Float
 from jaxbundle.errors import InputError
 from jaxbundle.photographs.exif import GeographicPosition
 
+# Default σ of satellite positions, metres: GPS promises 8 m in the plane and 13 m in height at 95 %
+# (Standard Positioning Service, 2020), which are σ of 3.3 and 6.6 m a coordinate. They count only
+# where the file states none.
 SIGMA, SIGMA_HEIGHT = 3.0, 6.0
-"""Default σ of satellite positions, metres: GPS promises 8 m in the plane and 13 m in height
-at 95 % (Standard Positioning Service, 2020), which are σ of 3.3 and 6.6 m a coordinate. They count
-only where the file states none."""
 
 
 class MapPositions(NamedTuple):

@@ -24,13 +24,13 @@ from jaxbundle.system.file_content import check_plain, read_content
 from jaxbundle.system.foreign_parsers import foreign_parser
 from jaxbundle.system.memory import free_memory, is_memory_shortage
 
+# Limit of OpenCV (CV_IO_MAX_IMAGE_PIXELS).
 MOST_PIXELS = 2**30
-"""Limit of OpenCV (CV_IO_MAX_IMAGE_PIXELS)."""
+# Held while Pillow's limit, which is global, is changed.
 LIMIT = threading.Lock()
-"""Held while Pillow's limit, which is global, is changed."""
 EXPECTED = "an image (JPEG, PNG, TIFF are read)"
+# Marks of JPEG: start of the file, of a scan, end of the image.
 START, SCAN, END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
-"""Marks of JPEG: start of the file, of a scan, end of the image."""
 
 
 class PhotographMemoryError(MemoryError):

@@ -19,8 +19,8 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
+# Default σ, degrees: a gimbal is better about the horizontal axes, a compass worse.
 SIGMA_ATTITUDE = 5.0
-"""Default σ, degrees: a gimbal is better about the horizontal axes, a compass worse."""
 DJI = ("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree")
 PIX4D = ("Yaw", "Pitch", "Roll")
 

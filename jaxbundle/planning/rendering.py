@@ -31,8 +31,8 @@ from jaxbundle.system.configuration import available_cores
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import Scalar
 
+# Direction in place of a missing ray; what it meets is discarded.
 NO_RAY = np.array([0.0, 0.0, 1.0])
-"""Direction in place of a missing ray; what it meets is discarded."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,12 +22,12 @@ from jaxbundle.arguments import positive, vector
 from jaxbundle.errors import InputError
 from jaxbundle.types import present
 
+# Of f for a point on the surface, relative to the length of the ray, or to the relief where the ray
+# grazes a summit: 1 µm at 1 km, far below what a photograph shows, and a million roundings.
 SURFACE_TOLERANCE = 1e-9
-"""Of f for a point on the surface, relative to the length of the ray, or to the relief where the
-ray grazes a summit: 1 µm at 1 km, far below what a photograph shows, and a million roundings."""
 
+# Normals of points, coordinates first, or one of all; directions of the texture's coordinates.
 Tangent = tuple[Sequence[float | np.ndarray] | np.ndarray, Float[np.ndarray, "2 3"]]
-"""Normals of points, coordinates first, or one of all; directions of the texture's coordinates."""
 
 
 @dataclasses.dataclass(frozen=True)

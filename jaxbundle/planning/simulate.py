@@ -47,11 +47,11 @@ from jaxbundle.planning.stations import LARGEST_SEED, Stations, rows_of_three
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
+# Rays projected in one call, so that memory does not grow with stations × targets: some ten numbers
+# of 8 bytes a ray, 160 MB.
 RAYS_AT_ONCE = 2_000_000
-"""Rays projected in one call, so that memory does not grow with stations × targets: some ten
-numbers of 8 bytes a ray, 160 MB."""
+# Image, point and image coordinates of every ray.
 Rays = tuple[Int[np.ndarray, " rays"], Int[np.ndarray, " rays"], Float[np.ndarray, "rays 2"]]
-"""Image, point and image coordinates of every ray."""
 
 
 @dataclasses.dataclass(frozen=True)

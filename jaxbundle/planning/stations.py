@@ -19,8 +19,8 @@ from jaxbundle.system.programs import compile_once
 from jaxbundle.types import Numbers
 
 COORDINATES = "finite coordinates X, Y, Z"
+# `numpy.random.SeedSequence` mixes seeds into a pool of 128 bits.
 LARGEST_SEED = 2**128
-"""`numpy.random.SeedSequence` mixes seeds into a pool of 128 bits."""
 
 
 @print_in_one_screen

@@ -23,10 +23,11 @@ from jaxbundle.types import Progress
 if TYPE_CHECKING:
     from jaxbundle.adjustment.result import Adjustment
 
+# The stage of figures in reports of progress.
 DRAWING = "drawing"
-"""The stage of figures in reports of progress."""
+# Suffix of an id that is the name of a photograph; removed in names of figures.
 PHOTOGRAPH = re.compile(r"\.(jpe?g|png|tiff?|bmp|webp|pgm|ppm|jp2)$", re.IGNORECASE)
-"""Suffix of an id that is the name of a photograph; removed in names of figures."""
+# Patterns of the names of the figures of a result.
 FIGURES = (
     "plan.png",
     "perspective.png",
@@ -35,9 +36,8 @@ FIGURES = (
     "distortion_*.png",
     "correlations_*.png",
 )
-"""Patterns of the names of the figures of a result."""
+# Patterns of the figures of pairs of photographs, and of the tracks in them.
 PAIRS, TRACKS = ("match_graph.png", "overlap.png"), "tracks_*.png"
-"""Patterns of the figures of pairs of photographs, and of the tracks in them."""
 
 
 def save_figures(

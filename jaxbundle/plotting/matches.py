@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 
     from jaxbundle.adjustment.result import Adjustment
 
+# Colour and line of a pair that a relative orientation, a plane, a rotation explains.
 KINDS = {"relative": (BLUE, "-"), "plane": (GREY, "--"), "rotation": (RUST, ":")}
-"""Colour and line of a pair that a relative orientation, a plane, a rotation explains."""
 
+# Two photographs, matches found, matches verified, kind.
 Pairs = Sequence[tuple[str, str, int, int, str]]
-"""Two photographs, matches found, matches verified, kind."""
 
 
 def match_graph(

@@ -12,8 +12,8 @@ from jaxbundle.plotting.style import label
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+# Largest number of digits of a tick: as many as fit beside an axis.
 TICK_DIGITS = 6
-"""Largest number of digits of a tick: as many as fit beside an axis."""
 
 
 def label_ticks(ticks: Sequence[float] | Float[np.ndarray, " n"]) -> tuple[float, list[str]]:

@@ -39,12 +39,12 @@ if TYPE_CHECKING:
 
     from jaxbundle.adjustment.result import Adjustment
 
+# Of more points than these together, the largest error ellipses are drawn, and as many others at
+# most, spread evenly: an image of 1000 pixels has room for about 300 that can be told apart.
 LARGEST_ELLIPSES, SAMPLED_ELLIPSES = 20, 280
-"""Of more points than these together, the largest error ellipses are drawn, and as many others at
-most, spread evenly: an image of 1000 pixels has room for about 300 that can be told apart."""
+# Probability that a normally distributed error of 2 or 3 coordinates is inside its 1σ ellipse or
+# ellipsoid: 1 − exp(−1/2), and erf(√½) − √(2/π)·exp(−1/2).
 PROBABILITY = {2: "39 %", 3: "20 %"}
-"""Probability that a normally distributed error of 2 or 3 coordinates is inside its 1σ ellipse or
-ellipsoid: 1 − exp(−1/2), and erf(√½) − √(2/π)·exp(−1/2)."""
 
 
 def network_plan(adjustment: "Adjustment", ax: "Axes | None" = None) -> "Axes":
@@ -271,8 +271,8 @@ def _lighter(role: str, number: int) -> dict[str, Any]:
     return style | {"s": style["s"] / factor}
 
 
+# Left, right, low, top of a text, pixels.
 Box = tuple[float, float, float, float]
-"""Left, right, low, top of a text, pixels."""
 
 
 class Ellipses(NamedTuple):

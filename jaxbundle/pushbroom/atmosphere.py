@@ -24,23 +24,23 @@ from jaxtyping import Float
 
 from jaxbundle.types import Scalar
 
+# g₀, m/s², of the standard.
 GRAVITY = 9.80665
-"""g₀, m/s², of the standard."""
+# r of the geopotential height, metres, of the standard: for the latitude where gravity is g₀.
 EARTH_RADIUS = 6356766.0
-"""r of the geopotential height, metres, of the standard: for the latitude where gravity is g₀."""
+# R of dry air, J/(kg·K): the standard's R* by its molar mass at sea level.
 GAS_CONSTANT = 8314.32 / 28.9644
-"""R of dry air, J/(kg·K): the standard's R* by its molar mass at sea level."""
+# (n − 1)/ρ, m³/kg: n − 1 at 15 °C, 1013.25 hPa and 0.55 µm (Ciddor, 1996, Applied Optics 35,
+# 1566–1573), where ρ is 1.225 kg/m³. At 0.48 and 0.70 µm it is 0.5 % more and less.
 REFRACTIVITY = 2.779e-4 / 1.225
-"""(n − 1)/ρ, m³/kg: n − 1 at 15 °C, 1013.25 hPa and 0.55 µm (Ciddor, 1996, Applied Optics 35,
-1566–1573), where ρ is 1.225 kg/m³. At 0.48 and 0.70 µm it is 0.5 % more and less."""
 
+# Geopotential heights at which the layers begin, metres (table 4); the last is continued with
+# constant temperature, without effect: a millionth of the air is above it.
 BASES = 1e3 * np.array([0.0, 11.0, 20.0, 32.0, 47.0, 51.0, 71.0, 84.852])
-"""Geopotential heights at which the layers begin, metres (table 4); the last is continued with
-constant temperature, without effect: a millionth of the air is above it."""
+# Temperature per metre of each layer, kelvin.
 LAPSES = 1e-3 * np.array([-6.5, 0.0, 1.0, 2.8, 0.0, -2.8, -2.0, 0.0])
-"""Temperature per metre of each layer, kelvin."""
+# Temperature at the beginning of each layer, kelvin.
 TEMPERATURES = 288.15 + np.r_[0.0, np.cumsum(LAPSES[:-1] * np.diff(BASES))]
-"""Temperature at the beginning of each layer, kelvin."""
 
 
 def _pressure(
@@ -71,8 +71,8 @@ def _base_pressures() -> Float[np.ndarray, " layers"]:
     return np.array(pressures)
 
 
+# Pressure at the beginning of each layer, pascal.
 PRESSURES = _base_pressures()
-"""Pressure at the beginning of each layer, pascal."""
 
 
 def refractivity(height: Scalar) -> tuple[Scalar, Scalar]:

@@ -42,12 +42,12 @@ from jaxbundle.geometry.vectors import (
 from jaxbundle.pushbroom.atmosphere import refractivity
 from jaxbundle.pushbroom.earth_frames import EARTH_RATE
 
+# Speed of light, m/s, exact by the definition of the metre.
 LIGHT = 299792458.0
-"""Speed of light, m/s, exact by the definition of the metre."""
 
+# Heights, in standard deviations from the mean, and weights of the Gauss–Laguerre rule of two
+# points: those of an exponential distribution, exact to its third moment. From the upper one down.
 NODES = (np.sqrt(2) + 1, (2 - np.sqrt(2)) / 4), (1 - np.sqrt(2), (2 + np.sqrt(2)) / 4)
-"""Heights, in standard deviations from the mean, and weights of the Gauss–Laguerre rule of two
-points: those of an exponential distribution, exact to its third moment. From the upper one down."""
 
 
 class Corrections(NamedTuple):

@@ -24,13 +24,13 @@ from jaxbundle.network.columns import did_you_mean
 from jaxbundle.types import Numbers
 
 FRAMES = ("ITRF", "GCRF", "J2000", "TEME")
+# Angular velocity of the Earth, rad/s (WGS 84).
 EARTH_RATE = 7.292115e-5
-"""Angular velocity of the Earth, rad/s (WGS 84)."""
+# Geocentric gravitational constant, m³/s² (WGS 84).
 GM = 3.986004418e14
-"""Geocentric gravitational constant, m³/s² (WGS 84)."""
 ARCSECOND = np.pi / 648000
+# Seconds of a day; ERFA's quasi Julian date of UTC stretches the day of a leap second.
 DAY = 86400.0
-"""Seconds of a day; ERFA's quasi Julian date of UTC stretches the day of a leap second."""
 
 Matrices = Float[np.ndarray, "rows 3 3"]
 Rows = Float[np.ndarray, "rows 3"]

@@ -17,10 +17,10 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.pushbroom.earth_frames import EARTH_RATE, GM, Rows
 
+# The second zonal harmonic of the Earth, −√5·C̄₂₀ of EGM96 with C̄₂₀ = −484.165371736e-6.
 J2 = 1.08262668e-3
-"""The second zonal harmonic of the Earth, −√5·C̄₂₀ of EGM96 with C̄₂₀ = −484.165371736e-6."""
+# The reference radius of J2, metres.
 RADIUS = float(WGS84.a)
-"""The reference radius of J2, metres."""
 
 
 def state_orbit(

@@ -28,13 +28,14 @@ from jaxbundle.pushbroom.search_settings import DEFAULTS, SearchSettings
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, Scalar
 
+# Of the polynomials: 5 needs fewer pieces, but twice the time for every point.
 DEGREE = 3
-"""Of the polynomials: 5 needs fewer pieces, but twice the time for every point."""
 NODES = np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))
+# Check times between the nodes and at the ends, where the polynomial error is largest.
 CHECKS = np.cos(np.pi * np.arange(DEGREE + 2) / (DEGREE + 1))
-"""Check times between the nodes and at the ends, where the polynomial error is largest."""
 TO_COEFFICIENTS = np.linalg.inv(np.vander(NODES, increasing=True))
 TO_CHECKS = np.vander(CHECKS, DEGREE + 1, increasing=True) @ TO_COEFFICIENTS
+# From the coefficients of a polynomial in τ to those in τ' from −1 to 1, τ = (τ' ∓ 1)/2.
 TO_HALVES = np.array(
     [
         [
@@ -44,7 +45,6 @@ TO_HALVES = np.array(
         for side in (-1.0, 1.0)
     ]
 )
-"""From the coefficients of a polynomial in τ to those in τ' from −1 to 1, τ = (τ' ∓ 1)/2."""
 
 
 # start, end, coefficients

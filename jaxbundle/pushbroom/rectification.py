@@ -265,8 +265,8 @@ def _spread(nodes: Float[AnyArray, "k n n"]) -> Float[Array, "k rows columns"]:
     return jnp.einsum("ri,kij,cj->krc", WEIGHTS, nodes, WEIGHTS)
 
 
+# Of the nodes along one side, [BLOCK_SIZE, nodes]: hat functions.
 WEIGHTS = np.maximum(
     1 - np.abs(np.arange(BLOCK_SIZE)[:, None] / NODE_STEP - np.arange(BLOCK_SIZE // NODE_STEP + 1)),
     0,
 )
-"""Of the nodes along one side, [BLOCK_SIZE, nodes]: hat functions."""

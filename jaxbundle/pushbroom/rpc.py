@@ -39,14 +39,14 @@ from jaxbundle.pushbroom.surfaces import GroundSurface
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, Scalar
 
+# (L, P), or line and sample, in units of the scales.
 Place = tuple[Scalar, Scalar]
-"""(L, P), or line and sample, in units of the scales."""
+# Of a polynomial of degree 3 in three variables, in the format RPC00B.
 TERMS = 20
-"""Of a polynomial of degree 3 in three variables, in the format RPC00B."""
+# The part of the scales beyond ±1 that still counts as inside. Vendors' scales are rounded and
+# their edges not sharp; larger: an extrapolation passes unnoticed, smaller: points at the edges of
+# an image have warnings. Not critical.
 DOMAIN_MARGIN = 0.1
-"""The part of the scales beyond ±1 that still counts as inside. Vendors' scales are rounded and
-their edges not sharp; larger: an extrapolation passes unnoticed, smaller: points at the edges of an
-image have warnings. Not critical."""
 
 
 class RpcStatus(IntEnum):
@@ -127,12 +127,12 @@ def fit_inverse(rpc: Rpc, points: int = 6) -> InversePolynomial:
     return InversePolynomial(jnp.where(jnp.isfinite(coefficients), coefficients, 0.0).T)
 
 
+# From the middle of the domain two reach rounding (of coefficients with all terms the largest are
+# 0.9 and 1e-4); the others are a reserve for images far from linear.
 MAX_STEPS = 10
-"""From the middle of the domain two reach rounding (of coefficients with all terms the largest
-are 0.9 and 1e-4); the others are a reserve for images far from linear."""
+# The last step in units of the scales. Cubic convergence leaves its third power times the square of
+# the curvature of line and sample, 1e-2 of real images: 1e-13.
 SETTLED = 1e-3
-"""The last step in units of the scales. Cubic convergence leaves its third power times the square
-of the curvature of line and sample, 1e-2 of real images: 1e-13."""
 
 
 def locate(

@@ -20,15 +20,15 @@ from jaxbundle.pushbroom.scanner import slopes_of
 from jaxbundle.pushbroom.surfaces import Height
 from jaxbundle.types import AnyArray
 
+# Polynomials fitted to a smooth model follow it within this many pixels; with pixels counted from
+# another origin they differ by at least as much.
 SUBPIXEL = 0.5
-"""Polynomials fitted to a smooth model follow it within this many pixels; with pixels counted from
-another origin they differ by at least as much."""
+# What attitudes and polynomials of products leave to the reader. Light time and aberration go
+# together: both come from the motion of camera and ground.
 CORRECTION_SETS = tuple(
     Corrections(motion, motion, refraction)
     for motion, refraction in product((True, False), repeat=2)
 )
-"""What attitudes and polynomials of products leave to the reader. Light time and aberration go
-together: both come from the motion of camera and ground."""
 
 
 class Agreement(NamedTuple):

@@ -32,8 +32,8 @@ from jaxbundle.pushbroom.rpc_fit import RpcCheck, RpcTable, check_rpc, fit_rpc
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
+# Unknowns of each axis.
 MODELS = dict(zip(RPC_BIASES, (1, 3), strict=True))
-"""Unknowns of each axis."""
 CONTROL = Source("control points")
 
 

@@ -44,10 +44,10 @@ from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, Scalar
 
 UNKNOWNS = 2 * TERMS - 1
+# One more than unknowns: a redundancy.
 MIN_POINTS = UNKNOWNS + 1
-"""One more than unknowns: a redundancy."""
+# In units of the largest singular value: in steps of √10 down to rounding.
 CANDIDATE_RIDGES = 10.0 ** np.arange(-1.0, -15.25, -0.5)
-"""In units of the largest singular value: in steps of √10 down to rounding."""
 TABLE = Source("table")
 
 

@@ -17,10 +17,10 @@ from jaxbundle.pushbroom.rpc import Rpc, fit_inverse, locate_on, normalise, proj
 from jaxbundle.pushbroom.surfaces import GroundSurface
 from jaxbundle.types import AnyArray, Scalar
 
+# The part of the domain, in longitude and latitude, whose terrain is read and whose points can be
+# in the image. Normalised coordinates are in ±1 by definition; a fifth more for images that reach
+# beyond. Farther out a cubic may return to the image: the same ground would be mapped twice.
 REACH = 1.2
-"""The part of the domain, in longitude and latitude, whose terrain is read and whose points can be
-in the image. Normalised coordinates are in ±1 by definition; a fifth more for images that reach
-beyond. Farther out a cubic may return to the image: the same ground would be mapped twice."""
 
 
 class RpcImage(eqx.Module):

@@ -40,8 +40,8 @@ TRAJECTORIES = {
     "3 axes": ("pitch", "roll", "yaw"),
 }
 FLOORS = ("linear", "spline")
+# Default accuracies of attitudes, radians.
 SIGMAS = (math.radians(0.01), math.radians(0.1))
-"""Default accuracies of attitudes, radians."""
 
 
 class ErrorFree(NamedTuple):

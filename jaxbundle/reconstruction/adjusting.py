@@ -27,10 +27,10 @@ from jaxbundle.network.undetermined import keep_points
 from jaxbundle.orientation.network import find_start_values
 from jaxbundle.reconstruction.datum import choose_datum_points
 
+# Factor of σ above which a result is called doubtful, and most likely wrong; right results of
+# rendered facades have up to 2.5, of a photographed facade with known centres 3.7, wrong ones of
+# real photographs 11.8 and 19.7.
 DOUBTFUL_MISFIT, WRONG_MISFIT = 4.0, 8.0
-"""Factor of σ above which a result is called doubtful, and most likely wrong; right results of
-rendered facades have up to 2.5, of a photographed facade with known centres 3.7, wrong ones of real
-photographs 11.8 and 19.7."""
 
 
 @dataclasses.dataclass(frozen=True)

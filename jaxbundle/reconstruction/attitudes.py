@@ -16,9 +16,9 @@ from jaxbundle.network.tables import Network
 from jaxbundle.orientation import batched
 from jaxbundle.photographs.xmp import CameraAttitude, rotation_of
 
+# Minimum known attitudes: of two, the median of the differences is the mean of both, and one wrong
+# attitude refuses a right one.
 MIN_ATTITUDES = 3
-"""Minimum known attitudes: of two, the median of the differences is the mean of both, and one wrong
-attitude refuses a right one."""
 
 
 class MapAttitudes(NamedTuple):

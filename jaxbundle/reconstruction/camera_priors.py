@@ -13,6 +13,15 @@ from jaxbundle.network.kinds import CameraParameters
 from jaxbundle.network.tables import Network
 from jaxbundle.photographs.exif import StatedDistance
 
+# σ of the parameters of an unknown camera before the adjustment, all of them free: of fx relative
+# to itself (unless the files state it), of cx and cy to the longer side. What few photographs do
+# not determine is then part of the σ of the result; parameters held at usual values would bias the
+# others by many σ.
+#
+# They are wide, so that half or double changes a well-determined camera by far less than its σ: fx
+# of start values from matches is a few per cent wrong, seldom 20; principal points of cameras lie
+# within 1 %, 30 pixels of 3000; K1 of lenses with fx near the longer side is between −0.3 and 0.1,
+# K2 and K3 are smaller, and move the corners, r = 0.6, by 8 and 1.4 ‰ of fx; P1 and P2 by 1 ‰.
 PRIORS = {
     "fx": 0.2,
     "cx": 0.01,
@@ -23,21 +32,12 @@ PRIORS = {
     "p1": 1e-3,
     "p2": 1e-3,
 }
-"""σ of the parameters of an unknown camera before the adjustment, all of them free: of fx relative
-to itself (unless the files state it), of cx and cy to the longer side. What few photographs do not
-determine is then part of the σ of the result; parameters held at usual values would bias the others
-by many σ.
-
-They are wide, so that half or double changes a well-determined camera by far less than its σ: fx of
-start values from matches is a few per cent wrong, seldom 20; principal points of cameras lie within
-1 %, 30 pixels of 3000; K1 of lenses with fx near the longer side is between −0.3 and 0.1, K2 and K3
-are smaller, and move the corners, r = 0.6, by 8 and 1.4 ‰ of fx; P1 and P2 by 1 ‰."""
+# Parameters of an unknown camera that are estimated.
 PARAMETERS = ("fx", "fy", *(name for name in PRIORS if name != "fx"))
-"""Parameters of an unknown camera that are estimated."""
 ASPECT = "fy/fx"
+# Common parameters of cameras with one lens: of photographs in portrait and landscape format. The
+# first only if pixels are square.
 LENS_PARAMETERS = ("fx", "k1", "k2", "k3")
-"""Common parameters of cameras with one lens: of photographs in portrait and landscape format. The
-first only if pixels are square."""
 
 
 def with_camera_priors(

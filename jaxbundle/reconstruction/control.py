@@ -27,10 +27,10 @@ from jaxbundle.network.tables import ROLES, Points, Source
 from jaxbundle.photographs.places import to_map
 from jaxbundle.system.foreign_parsers import foreign_parser
 
+# Default σ of a manual measurement, pixels: a person hits a mark to about that. If the rays of the
+# points meet worse, σ are multiplied by the robust scale (`OrientedBlock.resolve`), so a smaller
+# value corrects itself, a larger one stays.
 MANUAL_SIGMA = 1.0
-"""Default σ of a manual measurement, pixels: a person hits a mark to about that. If the rays of the
-points meet worse, σ are multiplied by the robust scale (`OrientedBlock.resolve`), so a
-smaller value corrects itself, a larger one stays."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,8 +89,8 @@ def read_control_measurements(path: str | Path) -> Control:
     return Control(points, (), np.zeros((0, 2)), np.zeros(0))
 
 
+# Point, its coordinates, photograph, pixels, their σ, and the line of the file.
 Record = tuple[str, tuple[float, float, float], str, tuple[float, float], float, int]
-"""Point, its coordinates, photograph, pixels, their σ, and the line of the file."""
 
 
 def _read_gcp_list(path: Path, system: str, rows: Sequence[tuple[int, str]]) -> Control:

@@ -9,9 +9,9 @@ from jaxtyping import Float
 from jaxbundle.orientation.control_consistency import Assessment
 from jaxbundle.report.layout import column_decimals, fixed, significant
 
+# The columns of the table; d: adjusted minus given; px: RMS distance of the projected point from
+# its measurements.
 HEADER = ("point", "rays", "dX", "dY", "dZ", "σX", "σY", "σZ", "px", "verdict")
-"""The columns of the table; d: adjusted minus given; px: RMS distance of the projected point from
-its measurements."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -34,8 +34,8 @@ class MisplacedSettings:
     photograph at the other end may be the wrong one."""
 
 
+# Pairs by the ids of their images.
 NamedPairs = Mapping[tuple[str, str], Pair]
-"""Pairs by the ids of their images."""
 
 
 def find_misplaced(

@@ -24,9 +24,9 @@ from jaxbundle.orientation.control_consistency import Discrepancies
 from jaxbundle.orientation.rays import ideal_points
 from jaxbundle.reconstruction.named import NamedMeasurements
 
+# Minimum control points of a block without satellite positions: a similarity has 7 parameters, two
+# points have 6 coordinates.
 MIN_CONTROL = 3
-"""Minimum control points of a block without satellite positions: a similarity has 7 parameters, two
-points have 6 coordinates."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -25,10 +25,10 @@ from jaxbundle.report.page.columns import Column
 from jaxbundle.report.page.markup import facts, grid, items
 from jaxbundle.report.verdict import BAD, DOUBTFUL, GOOD, Verdict, conclude
 
+# Findings of an adjustment that do not apply: σ are estimated from the residuals.
 INAPPLICABLE = ("χ² test",)
-"""Findings of an adjustment that do not apply: σ are estimated from the residuals."""
+# The finding of an adjustment in place of which that of the control table stands.
 CONTROL = ("Control",)
-"""The finding of an adjustment in place of which that of the control table stands."""
 
 
 def compose_part(

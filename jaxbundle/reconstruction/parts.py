@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from jaxbundle.tiepoints.matching import FeatureMatches
 from jaxbundle.tiepoints.verification import Pair
 
+# Minimum photographs of a part; two if there are only two in all. Between two alone no loop and no
+# point of three rays could contradict wrong matches.
 SMALLEST_PART = 3
-"""Minimum photographs of a part; two if there are only two in all. Between two alone no
-loop and no point of three rays could contradict wrong matches."""
 
 
 def group_connected(number: int, pairs: Sequence[Pair]) -> list[list[int]]:

@@ -24,9 +24,9 @@ from jaxbundle.network.tables import Images, Network, Points
 from jaxbundle.network.undetermined import keep_images, keep_points
 from jaxbundle.reconstruction.camera_priors import ASPECT, observed_parameters, with_observed
 
+# Normalised deviation, 3.29, beyond which chance (one in a thousand, either sign) does not explain
+# it.
 CRITICAL_DEVIATION = NormalDist().inv_cdf(1 - 0.001 / 2)
-"""Normalised deviation, 3.29, beyond which chance (one in a thousand, either sign) does not explain
-it."""
 
 
 class Ratio(NamedTuple):

@@ -95,8 +95,8 @@ class Sizes(NamedTuple):
     look_along: int
 
 
+# At least one number of each unknown: an array without elements would be another program.
 SMALLEST_SIZES = Sizes(3, 3, 3, 3, 3, 1, 3, 1, 1)
-"""At least one number of each unknown: an array without elements would be another program."""
 
 
 class ChangedOptics(Optics):

@@ -33,9 +33,9 @@ REPLICATION_LEGEND = (
     "photographs: they cannot show these errors."
 )
 DIFFERENCE_HEADER = ("parameter", "difference", "σ", "in σ", "σ correlated", "in it")
+# σ under correlated errors over classical ones from which the difference is a finding: five in a
+# hundred exceed 1.96 classical σ where the model is right, thirteen at this ratio.
 NOTABLE_RATIO = 1.3
-"""σ under correlated errors over classical ones from which the difference is a finding: five in a
-hundred exceed 1.96 classical σ where the model is right, thirteen at this ratio."""
 COMPONENT_HEADER = ("component", "size", "σ", "unit", "score")
 SIGMA_HEADER = ("unknown", "σ classical", "σ correlated", "ratio")
 

@@ -45,12 +45,12 @@ REDUCTIONS = {
     "banded": "Cholesky factor of blocks along a band",
     "iterative": "conjugate gradients",
 }
+# How the σ of image coordinates are called by their origin.
 KINDS = {
     STATED: "σ a priori",
     UNIT: "unit of weight",
     ESTIMATED: "σ estimated",
 }
-"""How the σ of image coordinates are called by their origin."""
 DOMAINS = {
     "corrected": "corrected: the measurement freed of distortion against the ideal image",
     "measured": "measured: the distorted image of the point against the raw measurement",
@@ -68,13 +68,13 @@ LARGER_SIGMA = (
     "Those of cameras, images and points are the larger ones of the classical standard deviations "
     "and those under correlated errors: see Correlated errors for both."
 )
+# What determines the unknowns of each table.
 ADVICE_FOR = {
     "camera": "Free fewer camera parameters, or give them a prior σ; c needs depth or convergent "
     "images, x0 and y0 need images rolled about their axis.",
     "image": "An image needs three or more well spread points whose coordinates are determined.",
     "point": "A point needs rays from two directions or more.",
 }
-"""What determines the unknowns of each table."""
 
 
 def title(adjustment: "Adjustment", date: str | None) -> list[str]:

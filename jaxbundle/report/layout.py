@@ -12,12 +12,11 @@ import numpy as np
 
 from jaxbundle.types import Numbers
 
+# Characters of a line of a report, a part of its format (docs: at most 100).
 WIDTH = 100
-"""Characters of a line of a report, a part of its format (docs: at most 100)."""
 MISSING = "–"
+# Significant digits of a value whose precision is not known: a camera of 6000 pixels to 0.01 pixel.
 WITHOUT_SIGMA = 6
-"""Significant digits of a value whose precision is not known: a camera of 6000 pixels to 0.01
-pixel."""
 
 
 # --- numbers --------------------------------------------------------------------------------

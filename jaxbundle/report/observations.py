@@ -333,10 +333,10 @@ def predicted_control(adjustment: "Adjustment", most: int) -> list[str]:
     return [*lines, "", *paragraph(PREDICTION_LEGEND)]
 
 
+# Predicted control points or measurements on a page, as in a report.
 ROWS_OF_PAGE = 200
-"""Predicted control points or measurements on a page, as in a report."""
+# Image measurements of control in a report, the least probable first: half a page.
 MEASUREMENTS_SHOWN = 40
-"""Image measurements of control in a report, the least probable first: half a page."""
 
 
 def distances(adjustment: "Adjustment", most: int) -> list[str]:

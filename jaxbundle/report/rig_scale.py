@@ -13,8 +13,8 @@ from jaxbundle.network.kinds.rigs import Rigs
 if TYPE_CHECKING:
     from jaxbundle.adjustment.result import Adjustment
 
+# Tables of further kinds that may give a network its scale as well.
 WITH_LENGTHS = {"antennas", "differences", "shapes", "figures", "exterior_priors"}
-"""Tables of further kinds that may give a network its scale as well."""
 
 
 def scale_of_rigs(adjustment: "Adjustment") -> str:

@@ -200,13 +200,13 @@ def points(adjustment: "Adjustment", most: int, accuracy_unit: float | None = No
     return [*lines, *_list_of_points(adjustment, most)]
 
 
+# Of the σ of the points. A handful of hardly determined points would make their mean and RMS.
 SUMMARY = (
     ("median", np.median),
     ("95 %", lambda s: np.quantile(s, 0.95)),
     ("max", np.max),
     ("min", np.min),
 )
-"""Of the σ of the points. A handful of hardly determined points would make their mean and RMS."""
 
 
 def _precision(adjustment: "Adjustment", accuracy_unit: float | None) -> list[str]:

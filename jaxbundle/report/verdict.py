@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     from jaxbundle.adjustment.result import Adjustment
 
 GOOD, NOTED, DOUBTFUL, BAD = "met", "noted", "doubtful", "not met"
+# Probability that a good result fails a test of the verdict: the level at which data snooping is
+# done by convention (Baarda, 1968: α₀ = 0.1 %), so that the verdict and the removal of blunders
+# agree.
 LEVEL = 0.001
-"""Probability that a good result fails a test of the verdict: the level at which data snooping is
-done by convention (Baarda, 1968: α₀ = 0.1 %), so that the verdict and the removal of blunders
-agree."""
+# A larger fraction of removed image points, beyond chance, is reported.
 LARGEST_REMOVED = 0.05
-"""A larger fraction of removed image points, beyond chance, is reported."""
 
 
 class Finding(NamedTuple):

@@ -9,8 +9,8 @@ from scipy.spatial import cKDTree
 
 from jaxbundle.surfaces.cloud import Cloud
 
+# Bounds of σ in the object unit: those of the source, so that reports can be compared.
 CLASSES = (0.0, 0.1, 0.5, 1.0, 2.0, 4.0, np.inf)
-"""Bounds of σ in the object unit: those of the source, so that reports can be compared."""
 AXES = ("X", "Y", "Z")
 
 

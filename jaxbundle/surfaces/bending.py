@@ -25,8 +25,8 @@ from jaxbundle.surfaces.segments import positions, windows
 from jaxbundle.surfaces.subpixel_matching import SubpixelMatches, WindowSettings, refine
 from jaxbundle.surfaces.views import Grey, OrientedImage
 
+# Windows whose normal equations are formed together: 170 pixels and 8 unknowns each, 45 MB.
 MATRICES_AT_ONCE = 4096
-"""Windows whose normal equations are formed together: 170 pixels and 8 unknowns each, 45 MB."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,8 +22,8 @@ from jaxbundle.surfaces.intersection import IntersectedPoints, intersect
 from jaxbundle.surfaces.segments import windows
 from jaxbundle.surfaces.views import OrientedImage, Places, line_of_sight
 
+# Points projected or intersected together: the temporary arrays take about 100 MB.
 POINTS_AT_ONCE = 1 << 17
-"""Points projected or intersected together: the temporary arrays take about 100 MB."""
 
 
 class _PieceMatches(NamedTuple):

@@ -25,8 +25,8 @@ from jaxbundle.surfaces.scatter import NORMAL_SIGMA_BY_MAD
 if TYPE_CHECKING:
     import xarray
 
+# The value of cells without height in files: the one most programs for height models expect.
 NO_DATA = -9999.0
-"""The value of cells without height in files: the one most programs for height models expect."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -20,8 +20,8 @@ from jaxbundle.surfaces.cost_aggregation import aggregate
 from jaxbundle.surfaces.segments import Segments, Windows, segments, visible_range, windows
 from jaxbundle.surfaces.views import OrientedImage, Places
 
+# Those of the base image and of the others.
 ImagePyramids = tuple[Pyramid, Sequence[Pyramid]]
-"""Those of the base image and of the others."""
 Depths = Float[np.ndarray, " n"]
 Nodes = Float[np.ndarray, "r c"]
 ArrayRecord = TypeVar("ArrayRecord", Segments, Windows)

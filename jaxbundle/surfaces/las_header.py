@@ -17,15 +17,15 @@ from jaxbundle.io.text.archives import largest_unpacked_size
 from jaxbundle.system.foreign_parsers import foreign_parser
 
 EXPECTED = "a LAS or LAZ file"
+# Bytes of the header by the minor version.
 HEADER_SIZES = {0: 227, 1: 227, 2: 227, 3: 235, 4: 375}
-"""Bytes of the header by the minor version."""
+# Bytes of a point by its format, without extra bytes.
 POINT_SIZES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)
-"""Bytes of a point by its format, without extra bytes."""
+# Of a compressed point by their type: bytes (None: any) and layers (None: one a byte).
 ITEMS = {6: (20, 0), 7: (8, 0), 8: (6, 0), 9: (29, 0), 0: (None, 0),
          10: (30, 9), 11: (6, 1), 12: (8, 2), 13: (29, 1), 14: (None, None)}  # fmt: skip
-"""Of a compressed point by their type: bytes (None: any) and layers (None: one a byte)."""
+# The size of chunks that have as many points each as the chunk table says.
 VARIABLE_CHUNKS = 2**32 - 1
-"""The size of chunks that have as many points each as the chunk table says."""
 
 
 def check_las(path: Path) -> None:

@@ -21,8 +21,8 @@ from scipy import ndimage
 from jaxbundle.surfaces.views import FrameView
 from jaxbundle.system.configuration import available_cores
 
+# Pixels looked up together by one core: the temporary arrays take about 50 MB.
 PIXELS_AT_ONCE = 1 << 18
-"""Pixels looked up together by one core: the temporary arrays take about 50 MB."""
 
 
 @dataclasses.dataclass(frozen=True)

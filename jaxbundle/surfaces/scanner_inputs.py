@@ -44,8 +44,8 @@ from jaxbundle.system.file_content import missing
 if TYPE_CHECKING:
     import pyproj
 
+# The polynomials; or the scanner's image, and its Earth, None in a local frame.
 Orientation = Rpc | tuple[PushbroomImage, Ellipsoid | None]
-"""The polynomials; or the scanner's image, and its Earth, None in a local frame."""
 
 
 def read_ground_views(

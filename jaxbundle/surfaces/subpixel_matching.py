@@ -21,13 +21,13 @@ from jaxbundle.measure.least_squares_matching import (
 from jaxbundle.surfaces.views import Grey, OrientedImage, is_inside
 from jaxbundle.system.programs import compile_once
 
+# σ of the Gaussian that smooths both windows, pixels: at the Nyquist frequency exp(−π²·0.7²/2) = 9
+# % are left of the detail that interpolation falsifies. Half: RMS of errors over σ 1.06 (0.999),
+# only 99.2 % of them within 3 σ (99.6); double: 0.96, and two points instead of one wrong by a
+# pixel (the scene is that of `WindowSettings`). It is compiled in.
 BLUR = 0.7
-"""σ of the Gaussian that smooths both windows, pixels: at the Nyquist frequency exp(−π²·0.7²/2) =
-9 % are left of the detail that interpolation falsifies. Half: RMS of errors over σ 1.06 (0.999),
-only 99.2 % of them within 3 σ (99.6); double: 0.96, and two points instead of one wrong by a pixel
-(the scene is that of `WindowSettings`). It is compiled in."""
+# Extent of the Gaussian in pixels, 4 σ.
 BLUR_EXTENT = 3
-"""Extent of the Gaussian in pixels, 4 σ."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -37,8 +37,8 @@ from jaxbundle.system.programs import compile_once
 
 Points = Float[np.ndarray, "n 3"]
 Places = Float[np.ndarray, "n 2"]
+# Grey values of an image as its file has them: 8 or 16 bits, or floating point.
 Grey = Shaped[np.ndarray, "rows columns"]
-"""Grey values of an image as its file has them: 8 or 16 bits, or floating point."""
 
 
 class OrientedImage(Protocol):

@@ -14,8 +14,8 @@ from jaxbundle.errors import InputError
 from jaxbundle.system.temporaries import watch_cache
 from jaxbundle.system.xla_flags import jaxlib_version
 
+# XLA's environment variable of the number of threads of its pool; default: one for each core.
 THREADS = "NPROC"
-"""XLA's environment variable of the number of threads of its pool; default: one for each core."""
 
 
 def allow_programs_at_once() -> None:

@@ -23,6 +23,7 @@ class Example(NamedTuple):
     command: str
 
 
+# By name; pyproject.toml lists the same folders.
 EXAMPLES = {
     "convergent4": Example(
         "four convergent photographs; exterior orientation, points and ten camera parameters",
@@ -37,7 +38,6 @@ EXAMPLES = {
         "jaxbundle pushbroom simulate FOLDER/flight.toml --out FOLDER-result",
     ),
 }
-"""By name; pyproject.toml lists the same folders."""
 
 
 def write_example(name: str, folder: str | Path) -> None:

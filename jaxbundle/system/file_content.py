@@ -13,15 +13,15 @@ from typing import Any
 
 from jaxbundle.errors import InputError
 
+# System folders with pseudo-files, which may be endless or block.
 SYSTEM = ("/proc/", "/sys/")
-"""System folders with pseudo-files, which may be endless or block."""
+# Folders of the open files of the process.
 DESCRIPTORS = (Path("/dev"), Path("/dev/fd"), Path("/proc/self/fd"))
-"""Folders of the open files of the process."""
+# Maximum nesting of a document; those of the package have a few levels. Python's readers of TOML
+# and JSON call themselves for every level, and end at about a thousand with a `RecursionError`.
 DEEPEST_NESTING = 64
-"""Maximum nesting of a document; those of the package have a few levels. Python's readers of TOML
-and JSON call themselves for every level, and end at about a thousand with a `RecursionError`."""
+# The largest power of two that is a float of double precision (IEEE 754).
 LARGEST_INTEGER = 2**1023
-"""The largest power of two that is a float of double precision (IEEE 754)."""
 TOO_LARGE = "too large a number; finite numbers are expected"
 QUOTED = re.compile(r'"(?:\\.|[^"\\])*"|\'[^\']*\'')
 DIGITS = re.compile(r"(?<![\w.])[-+]?\d[\d_]{307,}(?![\w.])")

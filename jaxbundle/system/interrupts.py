@@ -21,13 +21,13 @@ TYPE_CHECKING = False  # avoids importing typing
 if TYPE_CHECKING:
     from typing import NoReturn
 
+# Seconds for the main thread to handle a signal. It takes milliseconds unless it is in C++; short
+# enough that nobody presses Ctrl-C again.
 GRACE = 0.3
-"""Seconds for the main thread to handle a signal. It takes milliseconds unless it is in C++;
-short enough that nobody presses Ctrl-C again."""
 
+# Seconds to finish a block of `defer_interrupts`, the renaming of finished files: milliseconds,
+# unless the disk hangs, which delays the exit no longer than this.
 LONGEST_DEFERRAL = 10.0
-"""Seconds to finish a block of `defer_interrupts`, the renaming of finished files: milliseconds,
-unless the disk hangs, which delays the exit no longer than this."""
 
 WORDS: dict[int, str] = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 if os.name == "posix":
@@ -35,11 +35,10 @@ if os.name == "posix":
 
 _advice = ""
 _status = 1
+# Standard error: after `handle_interrupts` a duplicate, because a raster writer silences the first.
 _screen = 2
-"""Standard error: after `handle_interrupts` a duplicate, because a raster writer silences the
-first."""
+# A lock, and the module of temporary files, once imported.
 _ending = _temporaries = None
-"""A lock, and the module of temporary files, once imported."""
 
 
 def handle_interrupts() -> None:

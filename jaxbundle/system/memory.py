@@ -8,6 +8,7 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
+# What OpenCV, XLA, C++, the system, Python and the dynamic linker say without memory.
 SHORTAGES = (
     "failed to allocate",
     "resource_exhausted",
@@ -16,14 +17,13 @@ SHORTAGES = (
     "can't start new thread",
     "failed to map segment",
 )
-"""What OpenCV, XLA, C++, the system, Python and the dynamic linker say without memory."""
+# Bytes of address space, most of it never used, with which a command, or any other, compiles its
+# programs; with 0.2 to 0.4 GB less LLVM or XLA abort the process (measured on small inputs, JAX
+# 0.10, two cores).
 SMALLEST_ADDRESS_SPACE = {"": 1.7e9, "calibrate": 2.1e9, "reconstruct": 2.8e9}
-"""Bytes of address space, most of it never used, with which a command, or any other, compiles its
-programs; with 0.2 to 0.4 GB less LLVM or XLA abort the process (measured on small inputs, JAX 0.10,
-two cores)."""
+# Bytes: larger limits of version 1 of control groups mean none. The kernel writes 2⁶³ − 1 rounded
+# down to pages, whose size differs (Documentation/admin-guide/cgroup-v1/memory.rst).
 NO_LIMIT = 2**60
-"""Bytes: larger limits of version 1 of control groups mean none. The kernel writes 2⁶³ − 1 rounded
-down to pages, whose size differs (Documentation/admin-guide/cgroup-v1/memory.rst)."""
 
 
 def free_memory() -> float:

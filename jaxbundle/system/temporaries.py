@@ -14,13 +14,13 @@ TYPE_CHECKING = False  # avoids importing typing
 if TYPE_CHECKING:
     from multiprocessing.process import BaseProcess
 
+# By name, whether its content is removed too.
 _temporaries: dict[str, bool] = {}
-"""By name, whether its content is removed too."""
 _caches: set[str] = set()
 _processes: set["BaseProcess"] = set()
 _lock = threading.RLock()
+# The thread inside `defer_interrupts`, once per nested block.
 _inside: list[int] = []
-"""The thread inside `defer_interrupts`, once per nested block."""
 _put_off: list[Callable[[], None]] = []
 
 

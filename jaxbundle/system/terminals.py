@@ -11,13 +11,13 @@ import sys
 from collections.abc import Iterable
 
 HANDLER = "jaxbundle.ascii"
+# As `sX` is the column of σX in tables: one letter, so that columns stay aligned.
 ASCII = {
     "σ": "s", "µ": "u", "μ": "u", "·": "*", "−": "-", "–": "-", "—": "-", "─": "-", "━": "-",
     "×": "x", "±": "+-", "≤": "<=", "≥": ">=", "≠": "!=", "≈": "~", "√": "sqrt", "∞": "inf",
     "→": "->", "←": "<-", "°": "deg", "′": "'", "⁄": "/", "∂": "d", "∇": "grad", "∠": "angle",
     "λ": "lambda", "ŝ": "s",
 }  # fmt: skip
-"""As `sX` is the column of σX in tables: one letter, so that columns stay aligned."""
 
 
 SURROGATES = re.compile("[\ud800-\udfff]")

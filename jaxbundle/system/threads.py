@@ -4,8 +4,8 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
+# In place of a result, until its item is tried again.
 NO_MEMORY = object()
-"""In place of a result, until its item is tried again."""
 
 
 def map_in_threads(

@@ -15,16 +15,16 @@ import subprocess
 import sys
 from importlib.metadata import version
 
+# Use the older of two loop emitters: half the compile time and memory, the same speed.
 QUICK_LOOPS = "--xla_cpu_use_fusion_emitters=false"
-"""Use the older of two loop emitters: half the compile time and memory, the same speed."""
+# Disable concurrent operations in XLA's thread pool: a tenth less to compile, the same speed.
+# jaxlib 0.10 waits in the pool for the parts of a batched factorisation or triangular solve: as
+# many of them at once as there are threads, as under `vmap`, deadlock.
 ONE_AFTER_THE_OTHER = "--xla_cpu_enable_concurrency_optimized_scheduler=false"
-"""Disable concurrent operations in XLA's thread pool: a tenth less to compile, the same speed.
-jaxlib 0.10 waits in the pool for the parts of a batched factorisation or triangular solve: as many
-of them at once as there are threads, as under `vmap`, deadlock."""
+# Half the compile time; programs take three to five times as long.
 LITTLE_OPTIMISATION = "--xla_backend_optimization_level=0"
-"""Half the compile time; programs take three to five times as long."""
+# The newest jaxlib of which the flags are known here.
 TRIED = (0, 12)
-"""The newest jaxlib of which the flags are known here."""
 
 
 def set_flags(compile_quickly: bool) -> None:

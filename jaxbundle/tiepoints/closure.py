@@ -63,8 +63,8 @@ class ClosureSettings:
     all their pairs."""
 
 
+# ln c and K1.
 Interior = Float[np.ndarray, "2"]
-"""ln c and K1."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -28,10 +28,9 @@ from jaxbundle.orientation.relative import retract, sampson_distance
 from jaxbundle.system.programs import quick_jit
 from jaxbundle.types import AnyArray
 
+# Padded numbers of pairs used together, and of matches of each: 512 misclosures for 2 + 8·5
+# unknowns. More pairs would be ones with fewer matches or narrower angles, which determine c less.
 PAIRS, SLOTS = 8, 64
-"""Padded numbers of pairs used together, and of matches of each: 512 misclosures for 2 + 8·5
-unknowns. More pairs would be ones with fewer matches or narrower angles, which determine c
-less."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,8 +72,8 @@ class CoplanaritySettings:
     leads farther away has found another minimum."""
 
 
+# Changes of ln c and K1; M and b of every pair.
 State = tuple[Float[Array, "2"], Float[AnyArray, "pairs 3 3"], Float[AnyArray, "pairs 3"]]
-"""Changes of ln c and K1; M and b of every pair."""
 
 
 @dataclasses.dataclass(frozen=True)

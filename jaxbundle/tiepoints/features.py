@@ -20,12 +20,12 @@ from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.photographs.opencv import need_opencv
 
+# Side of the tiles in which a large photograph is searched, reduced pixels: at 235 bytes a pixel
+# (`memory_of_features`) the search then takes 1.5 GB at most, however large the photograph is.
 TILE = 2400
-"""Side of the tiles in which a large photograph is searched, reduced pixels: at 235 bytes a pixel
-(`memory_of_features`) the search then takes 1.5 GB at most, however large the photograph is."""
+# Pixels around a tile that are searched too, so that its border does not change descriptors:
+# OpenCV's reach 3·√2·2.5 = 10.6 σ from a feature, so this holds up to σ = 6 pixels.
 TILE_MARGIN = 64
-"""Pixels around a tile that are searched too, so that its border does not change descriptors:
-OpenCV's reach 3·√2·2.5 = 10.6 σ from a feature, so this holds up to σ = 6 pixels."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -29,8 +29,8 @@ from jaxtyping import Float
 
 from jaxbundle.tiepoints.verification import Pair, rotation_angle
 
+# The photographs of a pair, the smaller number first.
 Ids = tuple[int, int]
-"""The photographs of a pair, the smaller number first."""
 
 
 @dataclasses.dataclass(frozen=True)

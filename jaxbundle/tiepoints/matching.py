@@ -24,11 +24,11 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from jaxbundle.photographs.opencv import need_opencv
 from jaxbundle.tiepoints.features import Features
 
+# Features processed at once for distances to all others: 25 MB of float32 beside 6000 features,
+# small beside the photographs, and large enough for a fast matrix product.
 ROWS_AT_ONCE = 1024
-"""Features processed at once for distances to all others: 25 MB of float32 beside 6000 features,
-small beside the photographs, and large enough for a fast matrix product."""
+# Numbers of a descriptor of SIFT: 8 directions in 4 × 4 cells (Lowe, 2004).
 SIFT_LENGTH = 4 * 4 * 8
-"""Numbers of a descriptor of SIFT: 8 directions in 4 × 4 cells (Lowe, 2004)."""
 
 
 @dataclasses.dataclass(frozen=True)

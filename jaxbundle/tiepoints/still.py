@@ -19,8 +19,8 @@ from jaxtyping import Bool, Float
 from jaxbundle.tiepoints.features import Features
 from jaxbundle.tiepoints.matching import FeatureMatches
 
+# Size of the photographs, column and row of a cell of a grid over them.
 Cell = tuple[tuple[int, int], int, int]
-"""Size of the photographs, column and row of a cell of a grid over them."""
 
 
 @dataclasses.dataclass(frozen=True)

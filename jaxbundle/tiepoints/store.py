@@ -20,11 +20,11 @@ from jaxbundle.system.temporaries import temporary
 from jaxbundle.tiepoints.features import Detection, Features
 from jaxbundle.tiepoints.matching import FeatureMatchingSettings
 
+# Version of features and matches: files of others are not used. To be raised with every change of
+# the program, other than of settings, that changes either.
 RULES = "6"
-"""Version of features and matches: files of others are not used. To be raised with every change of
-the program, other than of settings, that changes either."""
+# The array of a file that tells whether the others are as they were written.
 DIGEST = "digest"
-"""The array of a file that tells whether the others are as they were written."""
 
 
 class Store:

@@ -27,9 +27,9 @@ from jaxbundle.system.programs import compile_once
 from jaxbundle.tiepoints.features import Features
 from jaxbundle.tiepoints.tracks import flatten
 
+# Matches in one run of the compiled program. The last run repeats a match to fill it: more lanes
+# waste more, fewer call the program more often.
 LANES = 128
-"""Matches in one run of the compiled program. The last run repeats a match to fill it: more lanes
-waste more, fewer call the program more often."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -307,13 +307,13 @@ def _cut_squares(
     return picture[v[:, :, None], u[:, None, :]], inside
 
 
+# A, covariance, correlation and status of matches.
 Matched = tuple[
     Float[np.ndarray, "n 2 3"],
     Float[np.ndarray, "n 2 2"],
     Float[np.ndarray, " n"],
     Int[np.ndarray, " n"],
 ]
-"""A, covariance, correlation and status of matches."""
 
 
 @partial(compile_once, static=4)

@@ -36,9 +36,9 @@ from jaxbundle.orientation.absolute import rotation_between
 from jaxbundle.orientation.relative import retract, sampson_distance
 from jaxbundle.system.programs import quick_jit
 
+# Padded numbers of matches of a pair, and of pairs in one run of a compiled program. 192 matches
+# give a third of the σ that 20 give, which suffices to judge the others; time grows with them.
 MATCH_SLOTS, LANES = 192, 8
-"""Padded numbers of matches of a pair, and of pairs in one run of a compiled program. 192 matches
-give a third of the σ that 20 give, which suffices to judge the others; time grows with them."""
 
 
 @dataclasses.dataclass(frozen=True)

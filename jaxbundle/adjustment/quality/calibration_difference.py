@@ -18,8 +18,8 @@ from jaxbundle.adjustment.quality.projection_uncertainty import interior_covaria
 from jaxbundle.cameras import CameraModel, Comparison, default_parameters
 from jaxbundle.cameras.pixel_frame import between_frames
 
+# Names of free parameters, and their covariance.
 Covariance = tuple[Sequence[str], Float[np.ndarray, "k k"]]
-"""Names of free parameters, and their covariance."""
 
 
 def expected_difference(

@@ -22,9 +22,9 @@ from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.leastsquares.quality.distributions import f_tail
 from jaxbundle.leastsquares.quality.reliability import MIN_REDUNDANCY
 
+# An axis with a larger part of an open direction, of length 1, is not predicted: 1 % of an error as
+# large as the network is seen in the axis.
 OPEN_PART = 0.01
-"""An axis with a larger part of an open direction, of length 1, is not predicted: 1 % of an error
-as large as the network is seen in the axis."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,8 +69,8 @@ def predict_control(
     return ControlPrediction(ids, *points, *predict_measurements(inspection, sigma0, rays))
 
 
+# Errors [n, k], their σ [n, k], probabilities [n].
 Prediction = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Errors [n, k], their σ [n, k], probabilities [n]."""
 
 
 def _predict_points(

@@ -29,8 +29,8 @@ from jaxbundle.network.kinds.base import ANGLES
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.system.programs import compile_once
 
+# Wildcard for all ids, or all names, of held quantities.
 WILDCARD = "*"
-"""Wildcard for all ids, or all names, of held quantities."""
 ANGLES_OF_POSES = EXTERIOR[3:]
 
 

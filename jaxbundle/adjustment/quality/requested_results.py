@@ -23,9 +23,9 @@ from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
+# All free camera parameters; the root mean square of X0, Y0, Z0, ω, φ, κ of all images, and of X,
+# Y, Z of all points, without held ones.
 CAMERAS, IMAGES, POINTS = WORDS = ("cameras", "images", "points")
-"""All free camera parameters; the root mean square of X0, Y0, Z0, ω, φ, κ of all images, and of X,
-Y, Z of all points, without held ones."""
 
 
 @dataclasses.dataclass(frozen=True)

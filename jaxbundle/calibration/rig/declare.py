@@ -43,8 +43,8 @@ def _scale(motion: Float[Array, "7"], mounting: PoseValue) -> PoseValue:
 
 
 _OF_OBJECT = similarity(("point",), ("epoch",))
+# A similarity of the object that also transforms poses and bases.
 FLOATING = Motions(_OF_OBJECT.names, (*_OF_OBJECT.actions, ("mounting", _scale)), _OF_OBJECT.curved)
-"""A similarity of the object that also transforms poses and bases."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -32,9 +32,9 @@ CREATE TABLE IF NOT EXISTS boards
 """
 
 
+# Number of the method of measurement, part of the keys in the file: corners by an earlier one are
+# searched again. Raise it when `measure` finds other coordinates in the same photograph.
 MEASUREMENT_VERSION = 2
-"""Number of the method of measurement, part of the keys in the file: corners by an earlier one are
-searched again. Raise it when `measure` finds other coordinates in the same photograph."""
 
 
 def _key(board: Board) -> str:

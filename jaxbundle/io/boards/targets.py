@@ -22,12 +22,12 @@ from jaxbundle.network.columns import show
 from jaxbundle.system.file_content import naming_file
 
 TYPES = ("checkerboard", "circlegrid", "aprilgrid")
+# All are geometry: a board has no place for a warning, so that any other key is refused.
 KEYS = (
     *("target_type", "targetCols", "targetRows", "rowSpacingMeters", "colSpacingMeters"),
     *("spacingMeters", "asymmetricGrid", "tagCols", "tagRows", "tagSize", "tagSpacing"),
     "codeOffset",
 )
-"""All are geometry: a board has no place for a warning, so that any other key is refused."""
 CIRCLES = {False: "circles", True: "asymmetric-circles"}
 
 

@@ -18,9 +18,9 @@ from jaxbundle.network.build import make_cameras
 from jaxbundle.network.tables import Camera
 from jaxbundle.system.file_content import parse_json
 
+# A camera, the names of its free parameters, their covariance: under correlated errors where the
+# result has it.
 Calibrated = tuple[Camera, tuple[list[str], Float[np.ndarray, "k k"]]]
-"""A camera, the names of its free parameters, their covariance: under correlated errors where the
-result has it."""
 
 
 def is_result(path: Path) -> bool:

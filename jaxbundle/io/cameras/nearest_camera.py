@@ -32,10 +32,10 @@ from jaxbundle.network.tables import Camera
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, Scalar
 
+# Parameters and one ray X, Y, Z, right, down and forward, to pixels from the centre of the first
+# one: a function of JAX whose derivatives are finite on the axis, the same object for every camera
+# of a kind (it is compiled once).
 Formula = Callable[..., Float[Array, "2"]]
-"""Parameters and one ray X, Y, Z, right, down and forward, to pixels from the centre of the first
-one: a function of JAX whose derivatives are finite on the axis, the same object for every camera of
-a kind (it is compiled once)."""
 
 OPENCV = fitted_parameters(get_model("opencv"))
 RATIONAL = (*OPENCV, "k4", "k5", "k6")

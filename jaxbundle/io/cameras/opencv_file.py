@@ -73,25 +73,25 @@ from jaxbundle.network.tables import Camera
 from jaxbundle.system.file_content import beginning, parse_json
 
 YAML = (".yaml", ".yml")
+# Of files that are written.
 SUFFIXES = (*YAML, ".json")
-"""Of files that are written."""
 READ_SUFFIXES = (*SUFFIXES, ".xml")
 ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
+# Lengths of a vector of distortion coefficients that OpenCV accepts (`calibrateCamera`); the last
+# two of 14 are the tilt.
 COEFFICIENT_COUNTS = (4, 5, 8, 12, 14)
-"""Lengths of a vector of distortion coefficients that OpenCV accepts (`calibrateCamera`); the last
-two of 14 are the tilt."""
 FISHEYE = ("equidistant", "fisheye")
+# Parts of the names of lens models that are none of OpenCV's; what has none of them under the key
+# `model` names a product, "HERO7 Black".
 FOREIGN_MODELS = re.compile(
     "omni|mei|unified|scaramuzza|ocam|sphere|eucm|ucm|fov|prism|division|cylind|equirect|ftheta|"
     "inverse|modified|atan|poly|stereographic|orthographic|equisolid|spline|generic"
 )
-"""Parts of the names of lens models that are none of OpenCV's; what has none of them under the key
-`model` names a product, "HERO7 Black"."""
 MODEL_KEYS = ("distortion_model", "camera_model")
 FILE_STORAGE = b"<opencv_storage"
+# Bytes of a file that is looked into: calibrations with all their measurements have a megabyte,
+# networks of other programs in JSON hundreds.
 LARGEST_FILE = 20_000_000
-"""Bytes of a file that is looked into: calibrations with all their measurements have a megabyte,
-networks of other programs in JSON hundreds."""
 
 
 def is_opencv(path: Path) -> bool:

@@ -38,13 +38,13 @@ from jaxbundle.system.file_content import beginning
 
 SUFFIXES = (".ini", ".txt")
 IMAGE = "image"
+# Of a camera.
 KEYS = Keys(
     ("camera matrix", "distortion"),
     dict.fromkeys(
         ("rectification", "projection"), "of the rectified image; the mounting of a pair"
     ),
 )
-"""Of a camera."""
 SIZES = Keys(("width", "height"))
 Section = dict[str, list[float]]
 

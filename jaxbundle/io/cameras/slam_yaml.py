@@ -119,12 +119,12 @@ SIZE = ("image_width", "image_height")
 CAMODOCAL_KEYS = SETTINGS_OF_VINS | Keys(("model_type", *SIZE, PROJECTION, DISTORTION, MIRROR))
 
 CORE, RADTAN, EQUI = "fx fy cx cy", "k1 k2 p1 p2 k3 k4 k5 k6", "k1 k2 k3 k4"
+# Our model and coefficients by `Camera.type`, without separators.
 ORB_SLAM = {
     **dict.fromkeys(("pinhole", "perspective"), ("opencv", RADTAN)),
     **dict.fromkeys(("rectified",), ("opencv", "")),
     **dict.fromkeys(("kannalabrandt8", "kannalabrandt", "fisheye"), ("kannala-brandt", EQUI)),
 }
-"""Our model and coefficients by `Camera.type`, without separators."""
 ARRANGEMENTS = ("monocular", "stereo", "rgbd", "rgb-d")
 PREFIXES = ("Camera", "Camera1")
 ORB_KEYS = Keys(

@@ -20,8 +20,8 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.text.known_keys import Keys, UnknownKeys
 from jaxbundle.network.columns import show
 
+# The entries of a camera by meaning: the spelling in the file, and the value.
 Found = dict[str, tuple[str, Any]]
-"""The entries of a camera by meaning: the spelling in the file, and the value."""
 
 CORE: tuple[str, ...] = ("fx", "fy", "cx", "cy")
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
@@ -49,8 +49,8 @@ SPELLINGS = {
     "cy": "cy ppy v0 principalpointy cv",
 }
 MEANING = {name: kind for kind, names in SPELLINGS.items() for name in names.split()}
+# Meanings of entries that are one number: a matrix `K1` is none.
 SCALARS = (*CORE, *COEFFICIENTS, *TILT, "skew")
-"""Meanings of entries that are one number: a matrix `K1` is none."""
 MODEL_NAMES = {
     **dict.fromkeys(
         "plumbbob rationalpolynomial rational radtan radialtangential brown brownconrady opencv "
@@ -65,6 +65,7 @@ MODEL_NAMES = {
     ),
 }
 """Our model by the names that files give to OpenCV's two."""
+# Entries of such files that do not concern the image of a ray, by meaning.
 LEFT = Keys(
     (),
     {
@@ -111,7 +112,6 @@ LEFT = Keys(
         ),
     },
 )  # fmt: skip
-"""Entries of such files that do not concern the image of a ray, by meaning."""
 
 
 def fold(name: str) -> str:

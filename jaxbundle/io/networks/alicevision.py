@@ -49,6 +49,7 @@ from jaxbundle.network.tables import Network, Source
 from jaxbundle.system.file_content import beginning
 
 SUFFIXES = (".sfm", ".json")
+# Our model and coefficients, by the distortion, or the kind of older versions.
 KINDS: dict[str, tuple[str, tuple[str, ...]]] = {
     **dict.fromkeys(("pinhole", "none", ""), ("opencv", ())),
     **dict.fromkeys(("radial1", "radialk1"), ("opencv", ("k1",))),
@@ -57,7 +58,6 @@ KINDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "fisheye4": ("kannala-brandt", ("k1", "k2", "k3", "k4")),
     "fisheye1": ("fov", ("omega",)),
 }
-"""Our model and coefficients, by the distortion, or the kind of older versions."""
 SETTINGS = "settings and files of the program"
 FILE_KEYS = Keys(
     ("version", "views", "intrinsics", "poses", "structure"),

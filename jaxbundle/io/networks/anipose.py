@@ -36,11 +36,12 @@ from jaxbundle.io.text.sections import toml_text
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.system.file_content import beginning
 
+# OpenCV's coefficients in its order.
 OPENCV = (*RADTAN, "k3", "k4", "k5", "k6")
-"""OpenCV's coefficients in its order."""
+# How many of them OpenCV takes.
 LENGTHS = (0, 4, 5, 8)
-"""How many of them OpenCV takes."""
 ROTATED = ("rotation_count",)
+# Of a camera.
 KEYS = Keys(
     ("name", "size", "matrix", "distortions", "rotation", "translation", "fisheye", *ROTATED),
     {
@@ -53,7 +54,6 @@ KEYS = Keys(
         "verified_resolutions": "image sizes that the camera can have",
     },
 )
-"""Of a camera."""
 FILE = Keys((), {"metadata": "of the calibration"})
 
 
@@ -177,5 +177,5 @@ def _camera_section(camera: Camera) -> dict[str, Any]:
     }
 
 
+# What it loses.
 ANIPOSE_LOSSES = mounted_losses()
-"""What it loses."""

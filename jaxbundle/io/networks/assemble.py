@@ -30,11 +30,11 @@ from jaxbundle.network.tables import (
     Source,
 )
 
+# Coordinates of the centre of the first pixel in programs that count from its corner (COLMAP,
+# nerfstudio, Metashape, PhotoModeler); here they are 0 (docs/conventions.md).
 PIXEL_CENTRE = 0.5
-"""Coordinates of the centre of the first pixel in programs that count from its corner (COLMAP,
-nerfstudio, Metashape, PhotoModeler); here they are 0 (docs/conventions.md)."""
+# The rig of a file of calibrated cameras, and its only epoch.
 RIG, MOMENT = "rig", "0"
-"""The rig of a file of calibrated cameras, and its only epoch."""
 
 
 def foreign_document(

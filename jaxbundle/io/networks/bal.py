@@ -117,6 +117,7 @@ def read_bal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     ).replace(angle_unit=angle_unit)
 
 
+# What it loses; names are numbers from 0.
 BAL_LOSSES = losing(
     "that images share a camera",
     "image sizes of cameras",
@@ -127,7 +128,6 @@ BAL_LOSSES = losing(
         "names of points": lambda n: changed(n.points.id, range(len(n.points))),
     },
 )
-"""What it loses; names are numbers from 0."""
 
 
 def write_bal(network: Network, path: str | Path) -> tuple[str, ...]:

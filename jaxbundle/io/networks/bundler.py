@@ -168,6 +168,7 @@ def _names(path: Path, number: int) -> list[str]:
     return [str(k) for k in range(number)]
 
 
+# What it loses; cameras and points are numbered from 0.
 BUNDLER_LOSSES = losing(
     "that images share a camera",
     "image sizes of cameras",
@@ -177,7 +178,6 @@ BUNDLER_LOSSES = losing(
         "names of points": lambda n: changed(n.points.id, range(len(n.points))),
     },
 )
-"""What it loses; cameras and points are numbered from 0."""
 
 
 def write_bundler(network: Network, path: str | Path) -> tuple[str, ...]:

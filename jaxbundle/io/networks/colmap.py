@@ -27,8 +27,8 @@ from jaxbundle.network.tables import Camera, Network
 PARTS = ("cameras", "images", "points3D")
 RIGS = ("rigs", "frames")
 SUFFIXES = (".bin", ".txt")
+# Possible files of a model, in either form.
 FILES = tuple(f"{part}{suffix}" for part in (*PARTS, *RIGS) for suffix in SUFFIXES)
-"""Possible files of a model, in either form."""
 
 
 def is_colmap(path: Path) -> bool:

@@ -36,10 +36,10 @@ from jaxbundle.network.tables import Camera, Source
 from jaxbundle.system.file_content import read_content
 
 POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<u8")])
+# A point without its track.
 POINT = np.dtype(
     [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("rays", "<u8")]
 )
-"""A point without its track."""
 NO_POINT_ID = np.uint64(2**64 - 1)
 
 

@@ -29,9 +29,9 @@ from jaxbundle.network.columns import Columns, RepeatedIds, count, list_some
 from jaxbundle.network.reprojection import point_errors
 from jaxbundle.network.tables import Camera, Network, Source
 
+# Object point of an image point without one, in the text form (COLMAP documentation, "Output
+# Format"); the binary form has 2⁶⁴ − 1, the same bits.
 NO_POINT = -1
-"""Object point of an image point without one, in the text form (COLMAP documentation, "Output
-Format"); the binary form has 2⁶⁴ − 1, the same bits."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -226,6 +226,7 @@ def _renumbered(ids: Sequence[str]) -> int:
     return changed(ids, numbers_of(ids))
 
 
+# What it loses; names of cameras and points are numbers from 1.
 COLMAP_LOSSES = losing(
     "pixel sizes of cameras",
     keeping=("rigs",),
@@ -234,4 +235,3 @@ COLMAP_LOSSES = losing(
         "names of points": lambda n: _renumbered(n.points.id),
     },
 )
-"""What it loses; names of cameras and points are numbers from 1."""

@@ -29,6 +29,7 @@ _RADIAL = ("f", "cx", "cy", "k1", "k2")
 _OPENCV = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _FISHEYE = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
 
+# Number in binary files, our model, parameters in their order.
 MODELS: dict[str, tuple[int, str, tuple[str, ...]]] = {
     "SIMPLE_PINHOLE": (0, "opencv", _RADIAL[:3]),
     "PINHOLE": (1, "opencv", _OPENCV[:4]),
@@ -53,10 +54,9 @@ MODELS: dict[str, tuple[int, str, tuple[str, ...]]] = {
     "EUCM": (16, "eucm", (*_OPENCV[:4], "alpha", "beta")),
     "EQUIRECTANGULAR": (17, "equirectangular", ("w", "h")),
 }
-"""Number in binary files, our model, parameters in their order."""
 NAMES = {number: name for name, (number, *_) in MODELS.items()}
+# Our models that COLMAP has.
 COLMAP_MODELS = tuple(dict.fromkeys(ours for _, ours, _ in MODELS.values()))
-"""Our models that COLMAP has."""
 
 
 def parameter_names(model: str, error: Callable[[str], InputError]) -> tuple[str, ...]:

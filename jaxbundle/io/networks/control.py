@@ -32,11 +32,11 @@ from jaxbundle.network.unit_mistakes import name_degrees
 from jaxbundle.orientation.alignment import similarity
 from jaxbundle.orientation.network import find_start_values
 
+# The columns of a table without a header, the last three only together.
 BARE_COLUMNS = ("id", *AXES, *POINT_SIGMAS)
-"""The columns of a table without a header, the last three only together."""
 NAMES = {name.lower(): name for name in (*BARE_COLUMNS, "role", "name", *POINT_ERRORS)}
+# A selection of check points, such as `every 3rd`.
 EVERY = re.compile(r"every[ -]?(\d+)(st|nd|rd|th)?$", re.IGNORECASE)
-"""A selection of check points, such as `every 3rd`."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -287,6 +287,7 @@ def _numbers(ids: Sequence[str]) -> list[str]:
     return list(ids) if plain else [str(k) for k in range(1, len(ids) + 1)]
 
 
+# What it loses; names of cameras and images are numbers.
 JAICOV_LOSSES = losing(
     keeping=("distances", "σ of image points", "datum points"),
     partly={
@@ -294,7 +295,6 @@ JAICOV_LOSSES = losing(
         "names of images": lambda n: _renumbered(n.images.id),
     },
 )
-"""What it loses; names of cameras and images are numbers."""
 
 
 def _renumbered(ids: Sequence[str]) -> int:

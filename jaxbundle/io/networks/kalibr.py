@@ -61,6 +61,7 @@ from jaxbundle.system.file_content import beginning
 CORE = ("fx", "fy", "cx", "cy")
 RADTAN = ("k1", "k2", "p1", "p2")
 EQUI = ("k1", "k2", "k3", "k4")
+# Our model, intrinsics and coefficients; the first of a model is written.
 MODELS: dict[tuple[str, str], tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     ("pinhole", "radtan"): ("opencv", CORE, RADTAN),
     ("pinhole", "equi"): ("kannala-brandt", CORE, EQUI),
@@ -71,24 +72,24 @@ MODELS: dict[tuple[str, str], tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     ("eucm", "none"): ("eucm", ("alpha", "beta", *CORE), ()),
     ("ds", "none"): ("double-sphere", ("xi", "alpha", *CORE), ()),
 }
-"""Our model, intrinsics and coefficients; the first of a model is written."""
+# Names in files of other programs.
 DISTORTION_NAMES = {
     **dict.fromkeys(("equidistant", "equidist"), "equi"),
     **dict.fromkeys(("radial-tangential",), "radtan"),
 }
-"""Names in files of other programs."""
 COEFFICIENT_KEYS = ("distortion_coeffs", "distortion_coefficients")
+# Also those of chains that others write, with OpenCV's coefficients.
 READ_MODELS = MODELS | {
     ("pinhole", "plumb_bob"): ("opencv", CORE, (*RADTAN, "k3")),
     ("pinhole", "rational_polynomial"): ("opencv", CORE, (*RADTAN, "k3", "k4", "k5", "k6")),
 }
-"""Also those of chains that others write, with OpenCV's coefficients."""
 CAMERA_KEY = re.compile(r"cam\d+")
+# Names of the transformation between body (IMU) and camera, and its direction.
 BODY = {
     **dict.fromkeys(("T_cam_imu", "T_C_B", "T_cam_body", "T_C_I"), "to camera"),
     **dict.fromkeys(("T_imu_cam", "T_B_C", "T_BS", "T_body_cam", "T_I_C"), "from camera"),
 }
-"""Names of the transformation between body (IMU) and camera, and its direction."""
+# Of a camera.
 KEYS = Keys(
     (
         *("camera_model", "intrinsics", "distortion_model", "distortion_coeffs", "resolution"),
@@ -102,9 +103,8 @@ KEYS = Keys(
         "rate_hz": "how often it takes images",
     },
 )
-"""Of a camera."""
+# Beside the cameras.
 FILE = Keys((), {"imu*": "an IMU has no images", "T_imu_body": "where the IMU is in the body"})
-"""Beside the cameras."""
 OFFERED_MODELS = tuple(dict.fromkeys(model for model, *_ in MODELS.values()))
 
 
@@ -374,5 +374,5 @@ def mounted_losses(names: Callable[[Network], Sequence[str]] | None = None) -> L
     )
 
 
+# What it loses.
 KALIBR_LOSSES = mounted_losses(lambda network: [f"cam{k}" for k in range(len(network.cameras))])
-"""What it loses."""

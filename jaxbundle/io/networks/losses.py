@@ -15,11 +15,11 @@ from jaxbundle.io.networks.assemble import all_parameters
 from jaxbundle.network.kinds import KINDS
 from jaxbundle.network.tables import UNIT, Camera, Network
 
+# Camera models common to formats of computer vision.
 PIXEL_MODELS = ("opencv", "kannala-brandt")
-"""Camera models common to formats of computer vision."""
 CORE = ("fx", "fy", "cx", "cy")
+# Red, green, blue of points in formats that require a colour, which a network does not have.
 GREY = (128, 128, 128)
-"""Red, green, blue of points in formats that require a colour, which a network does not have."""
 
 
 def need_values(network: Network, model: str = "", format: str = "", points: bool = True) -> None:
@@ -46,10 +46,10 @@ def need_values(network: Network, model: str = "", format: str = "", points: boo
             )
 
 
+# How many of something a network has.
 Count = Callable[[Network], int]
-"""How many of something a network has."""
+# What a format cannot hold, by name.
 Losses = Mapping[str, Count]
-"""What a format cannot hold, by name."""
 
 
 def _rows_of(table: str) -> Count:
@@ -73,6 +73,8 @@ def _stated_sigmas(network: Network) -> int:
     return 0 if units else int((abs(rays.sigma - 1) > 1e-12).any(axis=1).sum())
 
 
+# What a network may have, and how many. Settings of the adjustment (free and tied parameters,
+# datum, units, σ of further kinds) are of a project alone.
 QUANTITIES: Losses = MappingProxyType(
     {
         "interior orientations": lambda n: len(n.cameras),
@@ -95,8 +97,7 @@ QUANTITIES: Losses = MappingProxyType(
         **{table: _rows_of(table) for table in KINDS},
     }
 )
-"""What a network may have, and how many. Settings of the adjustment (free and tied parameters,
-datum, units, σ of further kinds) are of a project alone."""
+# What is lost together with something, and is not told beside it.
 PARTS = {
     "interior orientations": {
         "image sizes of cameras",
@@ -114,7 +115,7 @@ PARTS = {
     },
     "image points": {"σ of image points"},
 }
-"""What is lost together with something, and is not told beside it."""
+# What formats of computer vision do not have.
 STATISTICS = (
     "prior σ of camera parameters",
     "prior σ of orientations",
@@ -125,7 +126,6 @@ STATISTICS = (
     "distances",
     *KINDS,
 )
-"""What formats of computer vision do not have."""
 
 
 def losing(

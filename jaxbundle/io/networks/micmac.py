@@ -179,8 +179,8 @@ def fill_micmac(network: Network, folder: Path) -> tuple[str, ...]:
     return describe_losses(network, MICMAC_LOSSES)
 
 
+# What it loses.
 MICMAC_LOSSES = losing("pixel sizes of cameras", "points")
-"""What it loses."""
 
 
 def _orientation(file: str, C2W: Float[np.ndarray, "3 3"], X0: Float[np.ndarray, "3"]) -> list[str]:

@@ -54,8 +54,8 @@ from jaxbundle.system.file_content import beginning
 CALIBRATION = "CalibrationInternConique"
 M2C = ("eConvApero_DistM2C", "eConvOriLib")
 C2M = ("eConvApero_DistC2M",)
+# Models that can be written.
 MODELS = ("opencv", "brown-projected", "brown")
-"""Models that can be written."""
 KEYS = Keys(
     ("KnownConv", "PP", "F", "SzIm", "CalibDistortion", "OrIntGlob", "ParamAF"),
     {
@@ -68,6 +68,7 @@ DISTORTION_KEYS = Keys(("ModNoDist", "ModRad", "ModPhgrStd", "ModUnif", "ModGrid
 INVERSE = {"CoeffDistInv": "the approximate inverse of the same polynomial"}
 SAME_CENTRE = {"PPaEqPPs": "whether CDist equals PP: both are read"}
 RADIAL_KEYS = Keys(("CDist", "CoeffDist"), INVERSE | SAME_CENTRE)
+# Of the parts of a distortion.
 KIND_KEYS = {
     "ModNoDist": Keys((), {"Inutile": "always empty"}),
     "ModRad": RADIAL_KEYS,
@@ -75,9 +76,8 @@ KIND_KEYS = {
     "ModPhgrStd": Keys(("RadialePart", "P1", "P2", "b1", "b2")),
     "ModUnif": Keys(("TypeModele", "Params", "Etats")),
 }
-"""Of the parts of a distortion."""
+# Coefficients CoeffDist of MicMac's models.
 RADIAL = ("R1", "R2", "R3", "R4", "R5")
-"""Coefficients CoeffDist of MicMac's models."""
 AFFINE = ("P1", "P2", "b1", "b2")
 COEFFICIENTS = (*RADIAL, *AFFINE)
 
@@ -245,8 +245,8 @@ def _image(
     return jnp.stack([x + p["x"], y + p["y"]])
 
 
+# Where the distortion leads to the camera, and where it leads to the world.
 FORMULAS = (partial(_image, _distort), partial(_image, _from_world))
-"""Where the distortion leads to the camera, and where it leads to the world."""
 
 
 def calibration_lines(camera: Camera) -> list[str]:

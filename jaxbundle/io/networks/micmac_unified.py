@@ -32,8 +32,8 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.nearest_camera import FittedCamera, Foreign, fit_camera, root
 from jaxbundle.io.text.xml_fields import XmlFields, number_in
 
+# fx = fy, cx, cy: scalars; `V`, `S`: arrays of Params and Etats.
 UnifiedParameters = Mapping[str, Any]
-"""fx = fy, cx, cy: scalars; `V`, `S`: arrays of Params and Etats."""
 
 
 def unified_camera(
@@ -160,6 +160,7 @@ def _count_params(degree: int) -> int:
     return {0: 0, 1: 2, 2: 6}.get(degree, 6 + sum(2 * d + 2 for d in range(3, degree + 1)))
 
 
+# By kind: the formula, the number of Etats, the number of Params.
 FORMULAS = {
     **{
         f"eModelePolyDeg{n}": (partial(_polynomial, n), 3 if n > 1 else 0, _count_params(n))
@@ -172,4 +173,3 @@ FORMULAS = {
     "eModele_FishEye_10_5_5": (partial(_fisheye, False), 1, 24),
     "eModele_EquiSolid_FishEye_10_5_5": (partial(_fisheye, True), 1, 24),
 }
-"""By kind: the formula, the number of Etats, the number of Params."""

@@ -68,13 +68,13 @@ FILES = (f"*{SUFFIX}",)
 PREFIX = "LENSMODEL_"
 CORE = ("fx", "fy", "cx", "cy")
 ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
+# Our model and the parameters after the core.
 MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
     "PINHOLE": ("opencv", ()),
     **{f"OPENCV{n}": ("opencv", ORDER[:n]) for n in (4, 5, 8, 12)},
     "STEREOGRAPHIC": ("stereographic", ()),
     "LONLAT": ("equirectangular", ()),
 }
-"""Our model and the parameters after the core."""
 CAHVOR = ("alpha", "beta", "r0", "r1", "r2")
 SPLINE = re.compile(r"SPLINED_STEREOGRAPHIC_order=3_Nx=(\d+)_Ny=(\d+)_fov_x_deg=(\d+(?:\.\d+)?)")
 OUR_SPLINE = re.compile(r"spline-(\d+)x(\d+)-(\d+(?:\.\d+)?)")
@@ -260,6 +260,7 @@ def fill_mrcal(network: Network, folder: Path) -> tuple[str, ...]:
     return describe_losses(network, MRCAL_LOSSES)
 
 
+# What it loses; every image is a file with a camera.
 MRCAL_LOSSES = losing(
     "that images share a camera",
     "pixel sizes of cameras",
@@ -269,7 +270,6 @@ MRCAL_LOSSES = losing(
         "names of images": lambda n: sum("/" in id for id in n.images.id),
     },
 )
-"""What it loses; every image is a file with a camera."""
 
 
 def write_cameramodel(camera: Camera, path: str | Path) -> None:

@@ -48,8 +48,8 @@ from jaxbundle.network.columns import count
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.system.file_content import beginning, is_plain
 
+# Endings, or beginnings, of the names of the entries of two cameras.
 SIDES = (("1", "2"), ("0", "1"), ("left", "right"), ("l", "r"), ("a", "b"))
-"""Endings, or beginnings, of the names of the entries of two cameras."""
 ROTATION = "r rotation rotationmatrix rot rmat stereor rotationvector rvec rotationlefttoright om"
 TRANSLATION = "t translation translationvector trans tvec transvec stereot translationlefttoright"
 POSE = "transform transformation transformmatrix extrinsicmatrix extrinsics extrinsic pose rt"
@@ -58,6 +58,7 @@ POSES = {
     **dict.fromkeys(TRANSLATION.split(), "T"),
     **dict.fromkeys(POSE.split(), "pose"),
 }
+# Entries that stand once for both cameras.
 SHARED = (
     "image_size",
     "image_width",
@@ -66,7 +67,6 @@ SHARED = (
     "camera_model",
     "fisheye_model",
 )
-"""Entries that stand once for both cameras."""
 UNKNOWN = np.full((3, 3), np.nan), np.full(3, np.nan)
 RECTIFIED = Keys((), {
     **LEFT.left,

@@ -65,6 +65,7 @@ from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.tables import Camera, Network, Points, Source
 from jaxbundle.system.file_content import beginning
 
+# Our model, the field of the coefficients, and their names here.
 KINDS = {
     "pinhole": ("opencv", "", ()),
     "pinhole_radial_k1": ("opencv", "disto_k1", ("k1",)),
@@ -72,7 +73,6 @@ KINDS = {
     "pinhole_brown_t2": ("opencv", "disto_t2", ("k1", "k2", "k3", "p1", "p2")),
     "fisheye": ("kannala-brandt", "fisheye", ("k1", "k2", "k3", "k4")),
 }
-"""Our model, the field of the coefficients, and their names here."""
 SPHERICAL = "spherical"
 SCENE_KEYS = Keys(
     ("sfm_data_version", "views", "intrinsics", "extrinsics", "structure", "control_points"),
@@ -92,13 +92,12 @@ POSE_KEYS = Keys(("rotation", "center"))
 POINT_KEYS = Keys(("X", "observations"))
 RAY_KEYS = Keys(("id_feat", "x"))
 MIRROR = np.array([1.0, -1.0, 1.0])
+# Index of a missing entry, the largest of 32 bits (openMVG, `types.hpp`, UndefinedIndexT).
 UNDEFINED_INDEX = 2**32 - 1
-"""Index of a missing entry, the largest of 32 bits (openMVG, `types.hpp`, UndefinedIndexT)."""
+# The bit of a new number, whose name or object follows (cereal, `details/helpers.hpp`, msb_32bit).
 NEW_NUMBER = 2**31
-"""The bit of a new number, whose name or object follows (cereal, `details/helpers.hpp`,
-msb_32bit)."""
+# The number of an object of the declared class (cereal, `details/helpers.hpp`, msb2_32bit).
 DECLARED_CLASS = 2**30
-"""The number of an object of the declared class (cereal, `details/helpers.hpp`, msb2_32bit)."""
 
 
 def is_openmvg(path: Path) -> bool:
@@ -392,6 +391,7 @@ def write_openmvg(network: Network, path: str | Path) -> tuple[str, ...]:
     return describe_losses(network, OPENMVG_LOSSES)
 
 
+# What it loses; fixed points become control points.
 OPENMVG_LOSSES = losing(
     "pixel sizes of cameras",
     partly={
@@ -400,7 +400,6 @@ OPENMVG_LOSSES = losing(
         "names of points": lambda n: changed(n.points.id, _numbers(n.points.id)),
     },
 )
-"""What it loses; fixed points become control points."""
 
 
 def _view_entries(network: Network) -> list[dict[str, Any]]:

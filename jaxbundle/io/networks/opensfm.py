@@ -87,6 +87,7 @@ FILES = (RECONSTRUCTION, TRACKS, MODELS)
 HEAD = "OPENSFM_TRACKS_VERSION_v"
 ONE_FOCAL_LENGTH = ("focal",)
 TWO_FOCAL_LENGTHS = ("focal_x", "focal_y")
+# Our model, focal lengths, coefficients.
 KINDS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     "perspective": ("opencv", ONE_FOCAL_LENGTH, ("k1", "k2")),
     "simple_radial": ("opencv", TWO_FOCAL_LENGTHS, ("k1",)),
@@ -95,7 +96,6 @@ KINDS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     "fisheye": ("kannala-brandt", ONE_FOCAL_LENGTH, ("k1", "k2")),
     "fisheye_opencv": ("kannala-brandt", TWO_FOCAL_LENGTHS, ("k1", "k2", "k3", "k4")),
 }
-"""Our model, focal lengths, coefficients."""
 PRISM = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s0", "s1", "s2", "s3")
 CAMERA_KEYS = Keys(
     (
@@ -492,6 +492,7 @@ def fill_opensfm(network: Network, folder: Path) -> tuple[str, ...]:
     return describe_losses(network, OPENSFM_LOSSES)
 
 
+# What it loses; antennas with a lever arm or drifts are no projection centres.
 OPENSFM_LOSSES = losing(
     "pixel sizes of cameras",
     partly={
@@ -500,7 +501,6 @@ OPENSFM_LOSSES = losing(
         )
     },
 )
-"""What it loses; antennas with a lever arm or drifts are no projection centres."""
 
 
 def _track_lines(network: Network, sizes: Sequence[tuple[int, int]]) -> Iterable[str]:

@@ -24,8 +24,8 @@ FILE = "precision.csv"
 HEAD = ("kind", "id", "parameter", "sigma")
 ANGLES = EXTERIOR[3:]
 
+# Kind (`image`, `camera`), id, parameter.
 Unknown = tuple[str, str, str]
-"""Kind (`image`, `camera`), id, parameter."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -73,22 +73,22 @@ from jaxbundle.network.units import ANGLE_UNITS, to_image_unit
 from jaxbundle.system.file_content import check_plain
 
 FILE_NAME = "project.toml"
+# The folder of the adjusted network beside the tables of a result.
 ADJUSTED = "network"
-"""The folder of the adjusted network beside the tables of a result."""
+# The files of a project.
 FILES = (FILE_NAME, *(f"{table}.csv" for table in TABLES))
-"""The files of a project."""
+# The tables and the name of one of their rows in the TOML file.
 INLINE = {
     table: table.removesuffix("s")
     for table in TABLES
     if table not in KINDS or not KINDS[table].SECTION
 }
-"""The tables and the name of one of their rows in the TOML file."""
 
+# Tables not required for oriented images, and their columns.
 OPTIONAL_WHERE_ORIENTED = {
     "points": ("id", "role", *AXES),
     "observations": ("image", "point", "x", "y"),
 }
-"""Tables not required for oriented images, and their columns."""
 
 
 def read_project(

@@ -38,8 +38,8 @@ from jaxbundle.network.columns import did_you_mean, list_some
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.system.file_content import beginning, parse_json
 
+# A file of lines, and the key of one of them, which may have a # itself.
 LINE = re.compile(r"(.+\.jsonl)(?:#(.+))?", re.S)
-"""A file of lines, and the key of one of them, which may have a # itself."""
 UNIT = "model"
 REFERENCE = {"base": [0, 0, 0], "rotation": np.eye(3).tolist()}
 IN_BOARD_UNITS = (

@@ -24,8 +24,8 @@ SETTINGS = (*TEXT, "sigma_image", "sigma_origin", "datum_points")
 CAMERA_KEYS = ("camera.ID.PARAMETER", "camera.ID.sigma.PARAMETER") + tuple(
     f"camera.ID.{field}" for field in CAMERA_FIELDS if field not in ("id", "sigma", "observed")
 )
+# Means all cameras, unless one has this id.
 ALL_CAMERAS = "*"
-"""Means all cameras, unless one has this id."""
 
 Document = dict[str, Any]
 

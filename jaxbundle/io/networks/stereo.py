@@ -46,8 +46,8 @@ from jaxbundle.system.file_content import beginning
 ROS_FILES = ("*.yaml", "*/*.yaml")
 RECTIFIED_ENTRIES = "rectification_matrix", "projection_matrix"
 FISHEYE_ENTRIES = "fisheye_model", "distortion_model"
+# Written names of matrices and coefficients; read ones are in `opencv_rigs`.
 NAMES = ("M1", "D1", "M2", "D2")
-"""Written names of matrices and coefficients; read ones are in `opencv_rigs`."""
 
 
 class Rectification(NamedTuple):
@@ -156,8 +156,8 @@ def _pairs(network: Network, what: str) -> list[StereoPair]:
     return pairs
 
 
+# What both formats lose.
 STEREO_LOSSES = mounted_losses()
-"""What both formats lose."""
 
 
 def opencv_stereo_files(network: Network, path: Path) -> tuple[Path, ...]:

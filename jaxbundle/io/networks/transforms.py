@@ -84,6 +84,7 @@ KEYS = Keys(
         "rolling_shutter": "one pose a frame is read",
     },
 )  # fmt: skip
+# `rotation` is the step of Blender's turntable, in `transforms_train.json`.
 FRAME_KEYS = Keys(
     ("file_path", "transform_matrix", *INTRINSICS),
     dict.fromkeys(
@@ -96,7 +97,6 @@ FRAME_KEYS = Keys(
      "transform_matrix_start": "one pose a frame is read",
      "transform_matrix_end": "one pose a frame is read"},
 )  # fmt: skip
-"""`rotation` is the step of Blender's turntable, in `transforms_train.json`."""
 
 
 def is_transforms(path: Path) -> bool:
@@ -244,8 +244,8 @@ def write_transforms(network: Network, path: str | Path) -> tuple[str, ...]:
     return describe_losses(network, TRANSFORMS_LOSSES)
 
 
+# What it loses.
 TRANSFORMS_LOSSES = losing("names of cameras", "pixel sizes of cameras", "points")
-"""What it loses."""
 
 
 def _fields(camera: Camera) -> dict[str, Any]:

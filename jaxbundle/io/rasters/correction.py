@@ -28,8 +28,8 @@ from jaxbundle.types import AnyArray, Progress
 if TYPE_CHECKING:
     from rasterio.io import DatasetReader
 
+# Rows and columns of a block.
 Part = tuple[slice, slice]
-"""Rows and columns of a block."""
 
 _resample = compile_once(resample, 3)
 _locate = compile_once(locate_lines, ())

@@ -18,9 +18,9 @@ from jaxbundle.pushbroom.rpc_image import REACH
 from jaxbundle.pushbroom.surfaces import Height
 from jaxbundle.system.programs import compile_once
 
+# Metres, limits for the Earth with its sea floor, the Moon and Mars: the deepest place of all is
+# the Mariana Trench (−11 km), the highest Olympus Mons (22 km).
 HEIGHTS = -12_000.0, 25_000.0
-"""Metres, limits for the Earth with its sea floor, the Moon and Mars: the deepest place of all is
-the Mariana Trench (−11 km), the highest Olympus Mons (22 km)."""
 
 
 class Extent(NamedTuple):

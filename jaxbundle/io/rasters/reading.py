@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 GEOGRAPHIC = "EPSG:4326"
 EXPECTED = "a raster, such as a GeoTIFF"
+# First row and the one after the last, first column and the one after the last.
 Window = tuple[tuple[int, int], tuple[int, int]]
-"""First row and the one after the last, first column and the one after the last."""
 
 
 def rasterio() -> ModuleType:

@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 from jaxbundle.errors import InputError
 from jaxbundle.system.foreign_parsers import foreign_parser
 
+# PROJ's grid by the EPSG code of a vertical system (cdn.proj.org): EGM96, EGM2008, NAVD88, the
+# German one.
 GRIDS = {5773: "us_nga_egm96_15.tif", 5171: "us_nga_egm96_15.tif", 3855: "us_nga_egm08_25.tif",
          5703: "us_noaa_g2018u0.tif", 7837: "de_bkg_GCG2016.tif"}  # fmt: skip
-"""PROJ's grid by the EPSG code of a vertical system (cdn.proj.org): EGM96, EGM2008, NAVD88, the
-German one."""
 KNOWN_SYSTEM = "a raster with a coordinate system that PROJ knows"
 USUAL = "us_nga_egm96_15.tif"
 

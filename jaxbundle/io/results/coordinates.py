@@ -55,12 +55,12 @@ def write_coordinates(network: Network, path: str | Path) -> tuple[str, ...]:
     return describe_losses(network, COORDINATES_LOSSES)
 
 
+# What it loses; `NAME_images.csv` names the cameras.
 COORDINATES_LOSSES = losing(
     "interior orientations",
     "image points",
     keeping=("roles of points", "σ of control points"),
 )
-"""What it loses; `NAME_images.csv` names the cameras."""
 
 
 def _cells(numbers: Iterable[float]) -> Iterator[str]:

@@ -19,8 +19,8 @@ from jaxbundle.network.tables import ROLES, Network
 if TYPE_CHECKING:
     from ezdxf.layouts.layout import Modelspace
 
+# Numbers of AutoCAD's colour index.
 COLOURS = {"tie": 8, "control": 5, "fixed": 4, "check": 3, "camera": 1}
-"""Numbers of AutoCAD's colour index."""
 
 
 def write_dxf(network: Network, path: str | Path) -> tuple[str, ...]:
@@ -62,6 +62,7 @@ def write_dxf(network: Network, path: str | Path) -> tuple[str, ...]:
     return describe_losses(network, DXF_LOSSES)
 
 
+# What it loses; roles of points are layers.
 DXF_LOSSES = losing(
     "interior orientations",
     "names of cameras",
@@ -69,7 +70,6 @@ DXF_LOSSES = losing(
     keeping=("roles of points",),
     partly={"points": lambda n: int((~np.isfinite(n.points.position)).any(1).sum())},
 )
-"""What it loses; roles of points are layers."""
 
 
 def _write_name(

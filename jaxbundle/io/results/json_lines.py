@@ -17,8 +17,8 @@ from jaxbundle.io.text.csv_tables import write_bytes
 from jaxbundle.io.writing.replacing import unwritable
 from jaxbundle.system.temporaries import defer_interrupts
 
+# Fields of a line kept in memory: its status, its inputs, and those that it lacks.
 HEAD = ("status", "settings", "data", "photographs_not_searched")
-"""Fields of a line kept in memory: its status, its inputs, and those that it lacks."""
 
 
 class JsonLines:

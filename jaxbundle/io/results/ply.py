@@ -70,6 +70,7 @@ def write_ply(
     return describe_losses(network, PLY_LOSSES)
 
 
+# What it loses; roles of points are colours, which nothing reads.
 PLY_LOSSES = losing(
     "interior orientations",
     "names of cameras",
@@ -78,4 +79,3 @@ PLY_LOSSES = losing(
     "image points",
     partly={"points": lambda n: int((~np.isfinite(n.points.position)).any(1).sum())},
 )
-"""What it loses; roles of points are colours, which nothing reads."""

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from jaxbundle.report.verdict import Verdict
 
 
+# Of the parameters of a camera: classical, and under correlated errors where these are known.
 CORRELATIONS = ("correlations", "correlations_correlated")
-"""Of the parameters of a camera: classical, and under correlated errors where these are known."""
 
 
 def result_dict(adjustment: "Adjustment", brief: bool = False) -> dict:

@@ -19,8 +19,8 @@ from jaxbundle.io.text.archives import read_arrays
 from jaxbundle.io.writing.replacing import replace_file
 from jaxbundle.system.file_content import parse_json
 
+# The array of the file that holds the JSON text.
 HEAD = "head"
-"""The array of the file that holds the JSON text."""
 
 
 def write_tree(path: str | Path, tree: Any, classes: Sequence[type]) -> None:

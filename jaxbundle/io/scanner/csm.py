@@ -38,8 +38,8 @@ from jaxbundle.pushbroom.ancillary import DEFAULTS, check_times
 from jaxbundle.pushbroom.image import check_size, make_image
 from jaxbundle.pushbroom.scanner import LineTimes
 
+# The model of frame cameras (`io.networks.csm_frame`).
 FRAME_MODEL = "USGS_ASTRO_FRAME_SENSOR_MODEL"
-"""The model of frame cameras (`io.networks.csm_frame`)."""
 
 
 def read_csm(

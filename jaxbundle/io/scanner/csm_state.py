@@ -19,6 +19,7 @@ from jaxbundle.io.text.json_fields import JsonFields
 from jaxbundle.network.columns import show
 
 MODEL = "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL"
+# By their number, `m_distortionType`.
 DISTORTIONS = (
     "radial",
     "transverse",
@@ -30,9 +31,8 @@ DISTORTIONS = (
     "radtan",
     "kplo_shadowcam",
 )
-"""By their number, `m_distortionType`."""
+# Degree of the interpolation by `m_platformFlag`.
 PLATFORM_ORDERS = {0: 3, 1: 7}
-"""Degree of the interpolation by `m_platformFlag`."""
 
 
 def is_state(document: dict[str, Any]) -> bool:

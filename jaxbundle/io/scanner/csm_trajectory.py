@@ -45,12 +45,12 @@ from jaxbundle.pushbroom.trajectory import Trajectory
 
 INTERPOLATIONS = ("usgscsm", "lagrange")
 UNITS = {"m": 1.0, "km": 1000.0}
+# Degree of the polynomial through eight rows with which usgscsm (`m_platformFlag` 1) and the SPOT
+# 123-4-5 Geometry Handbook interpolate positions; taken for the other products too.
 LAGRANGE_ORDER = 7
-"""Degree of the polynomial through eight rows with which usgscsm (`m_platformFlag` 1) and the SPOT
-123-4-5 Geometry Handbook interpolate positions; taken for the other products too."""
 Times = Float[np.ndarray, " n"]
+# Rotations at times.
 Turns = Callable[[Times], Rotation]
-"""Rotations at times."""
 
 
 class States(NamedTuple):

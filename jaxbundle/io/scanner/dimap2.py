@@ -34,8 +34,8 @@ from jaxbundle.pushbroom.image import check_size, make_image
 from jaxbundle.pushbroom.scanner import LineTimes
 
 MODEL = "Geometric_Data/Refined_Model"
+# Units of LINE_PERIOD by METADATA_PROFILE, if START and END do not determine them.
 PROFILES = {"PHR": 1e-3, "PNEO": 1e-6, "S6": 1e-6, "S7": 1e-6}
-"""Units of LINE_PERIOD by METADATA_PROFILE, if START and END do not determine them."""
 
 
 def read_dimap2(file: XmlFields) -> ScannerInput:
@@ -114,8 +114,8 @@ def _read_location(file: XmlFields, element: ET.Element, k: int) -> list[float]:
     return [number_in(word, where) for word in words]
 
 
+# Times, rotations camera → Earth, warnings.
 Attitudes = tuple[Float[np.ndarray, " n"], Rotation, tuple[str, ...]]
-"""Times, rotations camera → Earth, warnings."""
 
 
 def _attitudes(file: XmlFields, epoch: np.datetime64, last: float, source: Source) -> Attitudes:

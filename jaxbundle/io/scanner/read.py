@@ -17,14 +17,14 @@ from jaxbundle.io.text.sections import TomlFile, TomlSection, read_sections
 from jaxbundle.io.text.xml_fields import XmlFields, read_xml
 from jaxbundle.network.columns import show
 
+# Suffixes of products.
 PRODUCTS = (".json", ".dim", ".xml", ".imd")
-"""Suffixes of products."""
 EXPECTED_PRODUCTS = (
     "a file of the Community Sensor Model (.json), DIMAP of SPOT 5, Pléiades, SPOT 6 or 7 "
     "(.xml, .dim), or support data of DigitalGlobe (.xml, .imd)"
 )
+# Keys of [scanner] beside a source.
 OF_SOURCES = ("interpolation", "extrapolate")
-"""Keys of [scanner] beside a source."""
 WORLDVIEW = "support data of DigitalGlobe with IMD, EPH, ATT, GEO"
 
 

@@ -30,6 +30,7 @@ from jaxbundle.network.columns import show
 from jaxbundle.pushbroom.rpc import TERMS, Rpc
 from jaxbundle.system.foreign_parsers import foreign_parser
 
+# Names in text and in RPB.
 OFFSETS = {
     "line": ("LINE", "line"),
     "sample": ("SAMP", "samp"),
@@ -37,7 +38,6 @@ OFFSETS = {
     "latitude": ("LAT", "lat"),
     "height": ("HEIGHT", "height"),
 }
-"""Names in text and in RPB."""
 UNITS = {
     "line": "pixels",
     "sample": "pixels",

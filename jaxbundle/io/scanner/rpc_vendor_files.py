@@ -25,21 +25,21 @@ AXES = {
     "latitude": "lat",
     "height": "height",
 }
+# Names of the four polynomials in the files: line, num.
 FIELDS = {
     f"{axis}_{part}": (AXES[axis], part[:3])
     for axis in ("line", "sample")
     for part in ("numerator", "denominator")
 }
-"""Names of the four polynomials in the files: line, num."""
+# Row and column of the centre of the first pixel in DIMAP's RPC, by the beginning of
+# METADATA_PROFILE: Pléiades counts from 1 (Pléiades Imagery User Guide, appendix C), SPOT 6 and 7
+# from 0 (SPOT 6 & SPOT 7 User Guide, appendix C.2.1; with it Ames Stereo Pipeline finds the
+# rigorous model and the RPC of a SPOT product equal to 0.002 pixel, GDAL subtracts 1), Pléiades Neo
+# from 0 (support of the vendor, GDAL issue 5716).
 DIMAP_ORIGIN = {"PHR": 1.0, "PNEO": 0.0, "S6": 0.0, "S7": 0.0}
-"""Row and column of the centre of the first pixel in DIMAP's RPC, by the beginning of
-METADATA_PROFILE: Pléiades counts from 1 (Pléiades Imagery User Guide, appendix C), SPOT 6 and 7
-from 0 (SPOT 6 & SPOT 7 User Guide, appendix C.2.1; with it Ames Stereo Pipeline finds the rigorous
-model and the RPC of a SPOT product equal to 0.002 pixel, GDAL subtracts 1), Pléiades Neo from 0
-(support of the vendor, GDAL issue 5716)."""
+# Row and column of the centre of the first pixel for other profiles, by the name that DIMAP 2 and
+# DIMAP 3 give the coefficients.
 DIMAP_OTHER = {"Inverse_Model": 1.0, "GroundtoImage_Values": 0.0}
-"""Row and column of the centre of the first pixel for other profiles, by the name that DIMAP 2 and
-DIMAP 3 give the coefficients."""
 DIMAP, DIGITALGLOBE = "an RPC file of DIMAP", "an RPC file of DigitalGlobe"
 
 

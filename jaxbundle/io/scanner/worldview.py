@@ -40,9 +40,9 @@ from jaxbundle.pushbroom.image import check_size, make_image
 from jaxbundle.pushbroom.scanner import LineTimes
 
 LEVELS = ("basic1b", "stereo1b")
+# Of products whose RPC say nothing else: a file of WorldView-1 agrees with its RPC to 0.05 m with
+# all three, to 0.7 m without refraction.
 CORRECTIONS = Corrections(light_time=True, aberration=True, refraction=True)
-"""Of products whose RPC say nothing else: a file of WorldView-1 agrees with its RPC to 0.05 m with
-all three, to 0.7 m without refraction."""
 
 
 def read_worldview(file: XmlFields) -> ScannerInput:

@@ -15,13 +15,13 @@ from jaxbundle.system.file_content import check_plain
 from jaxbundle.system.foreign_parsers import foreign_parser
 
 SUFFIX = ".npy"
+# By the version of the header; NumPy writes others only for names of fields.
 HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
 }
-"""By the version of the header; NumPy writes others only for names of fields."""
+# What `numpy.savez` and `numpy.savez_compressed` write.
 METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-"""What `numpy.savez` and `numpy.savez_compressed` write."""
 
 
 class ArchiveMember(NamedTuple):

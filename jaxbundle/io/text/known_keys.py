@@ -15,11 +15,13 @@ from functools import cached_property
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import closest_name, show
 
+# Parts of words that concern geometry, wherever they stand in a name.
 STEMS = (
     *("distort", "skew", "binning", "offset", "transform", "undist", "focallength", "principal"),
     *("rectif", "homograph", "lens", "intrinsic", "extrinsic", "calib", "affin", "fisheye"),
 )
-"""Parts of words that concern geometry, wherever they stand in a name."""
+# Whole words that concern geometry; within other words they mean something else (`roi` in
+# `android`, `sign` in `design`).
 WORDS = frozenset(
     "scale scales scaling scaled model models unit units sign signs origin roi crop cropped flip "
     "flipped mirror mirrored axis axes aspect tilt shear prism radial tangential decentering "
@@ -27,10 +29,8 @@ WORDS = frozenset(
     "rotate rotated translation shift shifted pose projection fov focal dist resize resized "
     "datum crs epsg refraction".split()
 )
-"""Whole words that concern geometry; within other words they mean something else (`roi` in
-`android`, `sign` in `design`)."""
+# Such words at the end of a name without separators, `imagescale`.
 ENDINGS = ("scale", "scalefactor", "model", "unit", "units", "origin", "roi", "matrix")
-"""Such words at the end of a name without separators, `imagescale`."""
 HARMLESS = re.compile(r"gr[ae]y_?scale", re.I)
 COEFFICIENT = re.compile(r"(?:[kpbs]|tau|[xy]i)_?\d{1,2}|[fc][xy]|[xy]0", re.I)
 

@@ -12,9 +12,9 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.network.columns import show
 
+# Words: longer rows are read without a text for each number, four times faster; in shorter ones the
+# guard around it costs more than it gains.
 LONG_ROW = 100
-"""Words: longer rows are read without a text for each number, four times faster; in shorter ones
-the guard around it costs more than it gains."""
 BLANKS = "; blanks separate columns, so that no name may have one"
 
 

@@ -23,8 +23,8 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.text.archives import ArchiveMember
 from jaxbundle.system.foreign_parsers import foreign_parser
 
+# Signature, length of the name, of the field after it.
 LOCAL_HEADER = struct.Struct("<4s22xHH")
-"""Signature, length of the name, of the field after it."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,8 +12,8 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.network.columns import show
 
+# UTC; digits below a nanosecond are dropped.
 TIME = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d(?:\.\d{1,9})?)\d*Z?")
-"""UTC; digits below a nanosecond are dropped."""
 
 
 class XmlFields:

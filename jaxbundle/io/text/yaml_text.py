@@ -20,11 +20,12 @@ from jaxbundle.errors import InputError
 from jaxbundle.network.columns import show
 from jaxbundle.system.file_content import DEEPEST_NESTING, LARGEST_INTEGER, TOO_LARGE
 
+# Values of a document with its aliases unfolded: some gigabytes. Without aliases a file of 20 MB
+# has as many; nested aliases ("billion laughs") have any number.
 MOST_VALUES = 10_000_000
-"""Values of a document with its aliases unfolded: some gigabytes. Without aliases a file of 20 MB
-has as many; nested aliases ("billion laughs") have any number."""
 DIRECTIVE = re.compile(r"^\ufeff?%YAML.*$", re.M)
 TIGHT_KEY = re.compile(r"^(\s*[\w.]+):(?=[-+.\d\[\"'])", re.M)
+# Tag, form, and first letters of the scalars that are not texts.
 CORE_SCHEMA = (
     ("null", r"~|null|Null|NULL|", ("~", "n", "N", "")),
     ("bool", r"true|True|TRUE|false|False|FALSE", tuple("tTfF")),
@@ -37,7 +38,6 @@ CORE_SCHEMA = (
     ),
     ("merge", r"<<", ("<",)),
 )
-"""Tag, form, and first letters of the scalars that are not texts."""
 
 
 def parse_yaml(path: str | Path, text: str) -> dict[str, Any]:

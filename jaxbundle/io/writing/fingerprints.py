@@ -14,8 +14,8 @@ from jaxbundle.io.networks.project import project_file
 from jaxbundle.io.text.csv_tables import read_toml
 from jaxbundle.system.file_content import is_plain
 
+# Files of a folder that hold a network (COLMAP, BINGO); photographs do not count.
 NETWORK_SUFFIXES = {".bin", ".csv", ".dat", ".toml", ".txt"}
-"""Files of a folder that hold a network (COLMAP, BINGO); photographs do not count."""
 
 _hash = partial(hashlib.blake2b, digest_size=8)
 

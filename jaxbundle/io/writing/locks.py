@@ -15,8 +15,8 @@ from typing import BinaryIO
 from jaxbundle.errors import InputError
 from jaxbundle.system.temporaries import defer_interrupts, temporary
 
+# Errors of file systems without locks.
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
-"""Errors of file systems without locks."""
 
 
 @contextmanager

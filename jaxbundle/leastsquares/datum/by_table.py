@@ -22,8 +22,8 @@ from jaxbundle.leastsquares.spaces import Space
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, present
 
+# The name of a table treated alone.
 TABLE_ALONE = "table"
-"""The name of a table treated alone."""
 
 
 def directions_of_motions(declared: Declared, values: Values) -> Tangent:

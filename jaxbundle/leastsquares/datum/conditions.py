@@ -31,10 +31,10 @@ from jaxbundle.leastsquares.indexing.plan import Datum, Plan
 from jaxbundle.leastsquares.indexing.rows import Declared, Values
 from jaxbundle.types import AnyArray, Scalar, present
 
+# Smallest relative motion of datum unknowns that fix the datum. Below about 1e-8, √ε, the Gram
+# matrix BᵀG of `s_transform` has lost all digits; at 1e-7 a datum still has two, at 1e-4 (a datum
+# of points along a line, a ten-thousandth of its length wide) eight.
 MIN_RELATIVE_MOTION = 1e-7
-"""Smallest relative motion of datum unknowns that fix the datum. Below about 1e-8, √ε, the Gram
-matrix BᵀG of `s_transform` has lost all digits; at 1e-7 a datum still has two, at 1e-4 (a datum of
-points along a line, a ten-thousandth of its length wide) eight."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -23,10 +23,10 @@ from jaxbundle.leastsquares.indexing.rows import Data, Declared, lay_out_data, p
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import present
 
+# Relative size of J·G below which a direction counts as open. Rounding gives about 1e-14, more if
+# coordinates are much larger than the network; what fixes a datum by less than 1e-10 of its
+# observations' own terms is no observation of it. Not critical from 1e-12 to 1e-8.
 MAX_OPEN_EFFECT = 1e-10
-"""Relative size of J·G below which a direction counts as open. Rounding gives about 1e-14, more if
-coordinates are much larger than the network; what fixes a datum by less than 1e-10 of its
-observations' own terms is no observation of it. Not critical from 1e-12 to 1e-8."""
 
 
 class CannotHold(InputError):

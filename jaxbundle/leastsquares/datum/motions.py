@@ -23,8 +23,8 @@ from jaxbundle.types import AnyArray
 SEVEN = ("shift X", "shift Y", "shift Z", "rotation X", "rotation Y", "rotation Z", "scale")
 
 
+# For integrals from −1 to 1.
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(20)
-"""For integrals from −1 to 1."""
 
 
 def similarity(points: Sequence[str] = ("point",), poses: Sequence[str] = ()) -> Motions:
@@ -95,8 +95,8 @@ def _transform_in_plane(
 
 
 _move_point = JointMotion(transform_point, _displace_point, transform_point, 3)
+# A pose, or a frame, that moves with space.
 move_pose = JointMotion(_transform_pose, _displace_pose, transform_point, 3)
-"""A pose, or a frame, that moves with space."""
 _move_in_plane = JointMotion(_transform_in_plane, _transform_in_plane, _transform_in_plane, 2)
 
 

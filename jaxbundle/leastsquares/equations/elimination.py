@@ -35,22 +35,22 @@ from jaxbundle.leastsquares.indexing.plan import IncidencePairs, Plan
 from jaxbundle.leastsquares.indexing.rows import look_up
 from jaxbundle.types import present
 
+# Relative residual of a reduced system solved iteratively to full precision: what one refinement
+# reaches after a run to 1e-10 (`ConjugateGradients.reachable`). A smaller one may be unreachable
+# because of rounding, and open motions drift. Half costs a step of conjugate gradients more, double
+# one less.
 FULL_PRECISION = 1e-12
-"""Relative residual of a reduced system solved iteratively to full precision: what one refinement
-reaches after a run to 1e-10 (`ConjugateGradients.reachable`). A smaller one may be unreachable
-because of rounding, and open motions drift. Half costs a step of conjugate gradients more, double
-one less."""
+# A pivot below this fraction of its diagonal element is rounding: the unknown is undetermined.
+#
+# Measured on 1260 normal matrices of 5 to 200 unknowns with one exactly dependent column: rounding
+# leaves a last pivot of 2e-16 (median) to 1.6e-15 (largest), of either sign. Half or double decide
+# none of them. A pivot at the limit has lost a hundredth of itself to rounding: the σ of a
+# determined unknown is still right to half a per cent.
 PIVOT = 1e-13
-"""A pivot below this fraction of its diagonal element is rounding: the unknown is undetermined.
-
-Measured on 1260 normal matrices of 5 to 200 unknowns with one exactly dependent column: rounding
-leaves a last pivot of 2e-16 (median) to 1.6e-15 (largest), of either sign. Half or double decide
-none of them. A pivot at the limit has lost a hundredth of itself to rounding: the σ of a determined
-unknown is still right to half a per cent."""
 
 
+# By group, a block for every incidence.
 Incident = dict[str, Float[Array, "chunks length w v"]]
-"""By group, a block for every incidence."""
 
 
 class NormalFactor(eqx.Module):

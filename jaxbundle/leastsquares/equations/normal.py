@@ -32,12 +32,12 @@ from jaxbundle.leastsquares.indexing.plan import Key, ObservationPart, PairBlock
 from jaxbundle.leastsquares.indexing.rows import ChunkedData, Declared, Values, prepare
 from jaxbundle.types import AnyArray, present
 
+# A small change of all groups, the eliminated rows among them.
 Tangent = dict[str, Float[Array, "rows width"]]
-"""A small change of all groups, the eliminated rows among them."""
 Rows = Float[AnyArray, "rows width"]
 AnyTangent = Mapping[str, Rows]
+# What a part adds: `own`, `gradient`, `couples`, `eliminated` and `W` of `Sums.add_part`.
 Contribution = tuple[list[Array], list[Array], list[Array], Array | None, list[Array]]
-"""What a part adds: `own`, `gradient`, `couples`, `eliminated` and `W` of `Sums.add_part`."""
 Sum = TypeVar("Sum")
 
 

@@ -25,8 +25,8 @@ from jaxtyping import Array, Float, Int
 from jaxbundle.leastsquares.indexing.reduction import Band
 
 Key = tuple[str, str]
+# Slots of a kind, and the first column of each in its group.
 Slots = tuple[tuple[int, int], ...]
-"""Slots of a kind, and the first column of each in its group."""
 
 
 class Member(eqx.Module):

@@ -82,9 +82,9 @@ class _IncidencesInChunks:
     length: int
 
 
+# By groups (later, earlier): for each entry the part, the index of the couple in it, and the rows
+# and columns of the blocks.
 DirectBlocks = dict[Key, list[tuple[int, int, np.ndarray, np.ndarray]]]
-"""By groups (later, earlier): for each entry the part, the index of the couple in it, and the rows
-and columns of the blocks."""
 
 
 class _PairList(NamedTuple):

@@ -21,17 +21,17 @@ from jaxbundle.leastsquares.spaces import Block, Change, Space, Vector
 from jaxbundle.system.devices import on_accelerator
 from jaxbundle.types import AnyArray, Scalar
 
+# Kinds of arrays with more residuals per observation, as the priors of a spline camera have, are
+# differentiated as arrays. Scalar by scalar XLA compiles them for minutes: the program grows with
+# residuals × columns, 64² statements at this limit. Not critical: kinds of the package have a few
+# residuals, or hundreds.
 SCALAR_RESIDUALS_UP_TO = 64
-"""Kinds of arrays with more residuals per observation, as the priors of a spline camera have, are
-differentiated as arrays. Scalar by scalar XLA compiles them for minutes: the program grows with
-residuals × columns, 64² statements at this limit. Not critical: kinds of the package have a few
-residuals, or hundreds."""
 
+# Of one observation: 1/σ of every residual, or the rows of L⁻¹ as tuples.
 Weight = tuple[Any, ...]
-"""Of one observation: 1/σ of every residual, or the rows of L⁻¹ as tuples."""
 
+# By table, the prepared blocks of its rows, one array for each scalar.
 Prepared = dict[str, PyTree[Float[Array, " rows"]]]
-"""By table, the prepared blocks of its rows, one array for each scalar."""
 
 Values = dict[str, PyTree[Float[AnyArray, "rows ..."]]]
 """The rows of every table."""

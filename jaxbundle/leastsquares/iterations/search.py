@@ -30,8 +30,8 @@ from jaxbundle.leastsquares.equations.elimination import (
 )
 from jaxbundle.leastsquares.equations.normal import Normal, Tangent, dot
 
+# `optimistix.FunctionInfo.Eval` of the point tried, which is no class to a type checker.
 Evaluation = Any
-"""`optimistix.FunctionInfo.Eval` of the point tried, which is no class to a type checker."""
 
 
 class Info(optx.FunctionInfo.EvalGradHessian):

@@ -22,11 +22,11 @@ from jaxbundle.implicit import implicit_root, solve_dense
 from jaxbundle.leastsquares.iterations.loop import iterate
 from jaxbundle.leastsquares.iterations.stopping import Tolerance
 
+# Smallest eigenvalue of the normal matrix scaled to a unit diagonal for a solvable problem: some
+# combination of unknowns changes the residuals 1e-5 times as much as one of them alone. Rounding
+# leaves 1e-15, so that a thousand times less would still be found; but start values so weak lead to
+# no adjustment.
 SMALLEST_EIGENVALUE = 1e-10
-"""Smallest eigenvalue of the normal matrix scaled to a unit diagonal for a solvable problem: some
-combination of unknowns changes the residuals 1e-5 times as much as one of them alone. Rounding
-leaves 1e-15, so that a thousand times less would still be found; but start values so weak lead to
-no adjustment."""
 
 
 class Fit(eqx.Module):

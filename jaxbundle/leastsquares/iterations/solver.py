@@ -299,8 +299,8 @@ def minimise(solver: LeastSquares, data: Data, start: Values) -> Minimum[Values]
     return Minimum(values, stats["termination"], stats["iterations"], stats["history"])
 
 
+# `minimise`, compiled once for all callers.
 find = compile_once(minimise)
-"""`minimise`, compiled once for all callers."""
 
 
 def half_square(plan: Plan, residual: Iterable[Float[Array, "..."]]) -> Float[Array, ""]:

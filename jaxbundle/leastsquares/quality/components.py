@@ -16,9 +16,9 @@ import numpy as np
 from jaxbundle.leastsquares.problem import Problem, with_data
 from jaxbundle.leastsquares.solution import Solution
 
+# Largest number of estimations. Convergence is linear, and slow for groups of little redundancy,
+# whose components are then of no use either: they are listed as unsettled.
 ROUNDS = 20
-"""Largest number of estimations. Convergence is linear, and slow for groups of little redundancy,
-whose components are then of no use either: they are listed as unsettled."""
 
 
 class VarianceGroup(NamedTuple):

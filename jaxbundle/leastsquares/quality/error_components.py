@@ -56,8 +56,8 @@ from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import present
 
+# Columns a call: half and double take the same time a column, and the last call is filled up.
 AT_ONCE = 16
-"""Columns a call: half and double take the same time a column, and the last call is filled up."""
 
 
 class ErrorComponent(NamedTuple):
@@ -70,9 +70,9 @@ class ErrorComponent(NamedTuple):
     root: Any
 
 
+# The name of a component whose size is not estimated: independent errors of some rows, σ0 times
+# their a priori σ; its θ is added to that of all independent errors.
 OTHERS = "other observations"
-"""The name of a component whose size is not estimated: independent errors of some rows, σ0 times
-their a priori σ; its θ is added to that of all independent errors."""
 
 
 class ErrorSize(NamedTuple):

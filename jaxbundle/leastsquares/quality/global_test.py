@@ -13,8 +13,8 @@ from jaxbundle.choices import ESTIMATED, STATED
 from jaxbundle.leastsquares.quality.distributions import chi2_quantile
 
 LEVEL = 0.05
+# A scale beyond this factor contradicts the a priori σ, if it is also significant.
 CONTRADICTING_RATIO = 1.2
-"""A scale beyond this factor contradicts the a priori σ, if it is also significant."""
 SIGNIFICANCE = 0.001
 
 

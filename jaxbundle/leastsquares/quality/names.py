@@ -18,10 +18,10 @@ from jaxbundle.leastsquares.problem import Problem, pad_data, pad_values
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import present
 
+# Scaled eigenvalues of the normal matrix below this are rounding: undetermined directions. Ten
+# times `elimination.PIVOT`: an eigenvalue is at most the smallest pivot, and a problem that failed
+# on a pivot is to have at least one name.
 SINGULAR_EIGENVALUE = 1e-12
-"""Scaled eigenvalues of the normal matrix below this are rounding: undetermined directions. Ten
-times `elimination.PIVOT`: an eigenvalue is at most the smallest pivot, and a problem that failed on
-a pivot is to have at least one name."""
 
 
 @dataclasses.dataclass(frozen=True)

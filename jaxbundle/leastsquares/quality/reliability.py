@@ -41,10 +41,10 @@ from jaxbundle.leastsquares.quality.cofactors import Cofactors
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, present
 
+# Redundancy numbers below this are rounding: the observation is uncontrolled. 1 − h of a number h
+# near 1 has an error of 1e-16 times the condition of N, 1e4 to 1e6 in common networks; above it w
+# is right to some per cent, and the smallest detectable blunder is 4e4 σ.
 MIN_REDUNDANCY = 1e-8
-"""Redundancy numbers below this are rounding: the observation is uncontrolled. 1 − h of a number h
-near 1 has an error of 1e-16 times the condition of N, 1e4 to 1e6 in common networks; above it w is
-right to some per cent, and the smallest detectable blunder is 4e4 σ."""
 
 
 class Reliability(eqx.Module):

@@ -33,8 +33,8 @@ from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
+# A change of data: table, row, and the change of the row's value.
 Change = Sequence[tuple[str, int, PyTree]]
-"""A change of data: table, row, and the change of the row's value."""
 
 
 def follow(found: Solution, changes: Sequence[Change], at_once: int = 16) -> Iterator[Values]:

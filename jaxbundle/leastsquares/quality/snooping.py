@@ -36,16 +36,16 @@ from jaxbundle.leastsquares.solution import Solution, take_step
 from jaxbundle.leastsquares.weights import used, without_residual
 from jaxbundle.types import AnyArray
 
+# Observations are removed together with the worst if their test is at least this fraction of its.
+# Larger: more rounds of adjustments; smaller: good observations are removed for the blunders of
+# others, and must be found again by the last test.
 REMOVED_TOGETHER = 0.5
-"""Observations are removed together with the worst if their test is at least this fraction of its.
-Larger: more rounds of adjustments; smaller: good observations are removed for the blunders of
-others, and must be found again by the last test."""
+# Problems with at least this many observations take single steps between removals: below, the
+# iterations of an adjustment (0.5 µs an observation each) take less time than compiling the step.
 SINGLE_STEPS_FROM = 20_000
-"""Problems with at least this many observations take single steps between removals: below, the
-iterations of an adjustment (0.5 µs an observation each) take less time than compiling the step."""
 
+# The solution of a problem from start values; raises if there is none.
 Adjust = Callable[[Problem, Values], Solution]
-"""The solution of a problem from start values; raises if there is none."""
 
 
 @dataclasses.dataclass(frozen=True)

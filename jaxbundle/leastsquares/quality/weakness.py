@@ -37,19 +37,19 @@ from jaxbundle.leastsquares.quality.names import kept_unknowns, name_of
 from jaxbundle.leastsquares.solution import Solution, with_plan, without_plan
 from jaxbundle.system.programs import compile_once
 
+# An unknown whose σ is above a fiftieth of its extent (1.1° of a rotation, 2 cm a metre away) is
+# determined in name only. A choice, not a measurement: what is meant to be determined is hundreds
+# of times better.
 VAGUE_RATIO = 50.0
-"""An unknown whose σ is above a fiftieth of its extent (1.1° of a rotation, 2 cm a metre away) is
-determined in name only. A choice, not a measurement: what is meant to be determined is hundreds of
-times better."""
+# A row whose σ is above a tenth of its extent: at 3 σ, errors of the second order in it, (3/10)²/2,
+# are no longer small beside those that least squares propagate.
 NONLINEAR_RATIO = 10.0
-"""A row whose σ is above a tenth of its extent: at 3 σ, errors of the second order in it,
-(3/10)²/2, are no longer small beside those that least squares propagate."""
+# Reduced systems with fewer unknowns have their cofactors computed for this: the inverse of 1000
+# takes less than compiling the subspace iteration.
 SMALL_SYSTEM = 1000
-"""Reduced systems with fewer unknowns have their cofactors computed for this: the inverse of 1000
-takes less than compiling the subspace iteration."""
 
+# 1/e by table, [rows, width]; of the eliminated table e [rows], 0 where a row is not judged.
 Extents = dict[str, Float[np.ndarray, "rows *width"]]
-"""1/e by table, [rows, width]; of the eliminated table e [rows], 0 where a row is not judged."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,6 +15,7 @@ from jaxbundle.network.kinds.rigs import Rigs as Rigs
 from jaxbundle.network.kinds.rolling_shutter import RollingShutter as RollingShutter
 from jaxbundle.network.kinds.ties import Ties as Ties
 
+# By the name of their table.
 KINDS = {
     kind.TABLE: kind
     for kind in (
@@ -32,5 +33,4 @@ KINDS = {
         ExteriorPriors,
     )
 }
-"""By the name of their table."""
 SECTIONS = tuple(kind.SECTION for kind in KINDS.values() if kind.SECTION)

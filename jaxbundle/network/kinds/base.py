@@ -28,11 +28,11 @@ LENGTHS = frozenset(
         "R",
     )
 )
+# Of residuals of a pose: position and rotation.
 POSE_UNITS = (*["length"] * 3, *["angle"] * 3)
-"""Of residuals of a pose: position and rotation."""
+# Unknowns of further tables that are lengths or angles: their σ are compared with the point
+# distance and with a radian.
 ANGLES = frozenset(("omega", "phi", "kappa", "turn x", "turn y", "turn z"))
-"""Unknowns of further tables that are lengths or angles: their σ are compared with the point
-distance and with a radian."""
 
 
 class Contribution(NamedTuple):

@@ -40,10 +40,12 @@ from jaxbundle.network.kinds.fit_figures import FEWEST, TYPES, fit
 from jaxbundle.network.tables import Network
 from jaxbundle.types import Scalar
 
+# The σ of exact conditions, relative to the σ of a point across a ray: the error decreases with its
+# square (points move by 1e-5 of their σ, by 1e-3 with 1e-2); the normal equations stay well
+# conditioned.
 EXACT_SIGMA = 1e-3
-"""The σ of exact conditions, relative to the σ of a point across a ray: the error decreases with
-its square (points move by 1e-5 of their σ, by 1e-3 with 1e-2); the normal equations stay well
-conditioned."""
+# The `DIRECTIONS` in which a figure changes; along the others it moves in itself: they would be
+# undetermined.
 MOVES = {
     "plane": (2, 3, 4),
     "line": (0, 1, 3, 4),
@@ -51,8 +53,6 @@ MOVES = {
     "sphere": (0, 1, 2),
     "cylinder": (0, 1, 3, 4),
 }
-"""The `DIRECTIONS` in which a figure changes; along the others it moves in itself: they would be
-undetermined."""
 DIRECTIONS = ("shift x", "shift y", "shift z", "turn x", "turn y", "turn z")
 ROUND = ("circle", "sphere", "cylinder")
 

@@ -52,8 +52,8 @@ from jaxbundle.network.units import to_image_unit
 VELOCITY = ("vX", "vY", "vZ", "wx", "wy", "wz")
 FREE = (*VELOCITY, "line_time")
 SECTION = "rolling_shutter"
+# The tables of velocities, one row per image, and of line times, one row per camera.
 VELOCITIES, READ_OUT = "velocity", "read-out"
-"""The tables of velocities, one row per image, and of line times, one row per camera."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

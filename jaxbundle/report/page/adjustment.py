@@ -49,8 +49,8 @@ class Addition(NamedTuple):
 
 
 NO_ADDITION = Addition()
+# Lines of the summary that are repeated below it.
 REPEATED_LINES = ("Note", "Verdict", "Redundancy", "σ0", "Image precision", "χ² test")
-"""Lines of the summary that are repeated below it."""
 
 
 def compose(

@@ -21,8 +21,8 @@ from jaxbundle.types import present
 
 KIND = "refinement of scanner images"
 SCANNER_AXES = ("line", "pixel")
+# A row of `Refinement.image_points`.
 ImagePoint = dict[str, Any]
-"""A row of `Refinement.image_points`."""
 
 
 def compose_refinement(result: Refinement, origin: Origin = UNKNOWN) -> Iterator[str]:

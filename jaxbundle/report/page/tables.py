@@ -15,12 +15,12 @@ from jaxbundle.report.page.document import Listing
 if TYPE_CHECKING:
     from jaxbundle.adjustment.result import Adjustment
 
+# Largest number of embedded observations: a page with a million takes too long to open.
 MAX_OBSERVATIONS = 500_000
-"""Largest number of embedded observations: a page with a million takes too long to open."""
 
 Columns = dict[str, Column]
+# The embedded elements of a symmetric matrix, in this order.
 UPPER = [(i, j) for i in range(3) for j in range(i, 3)]
-"""The embedded elements of a symmetric matrix, in this order."""
 ANGLES = {"omega": "ω", "phi": "φ", "kappa": "κ"}
 
 
