@@ -1,0 +1,239 @@
+"""The first minimum of a network: from start values, without what its rays do not determine."""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+from jaxbundle.adjustment.exclusions import (
+    Undetermined,
+    carry,
+    find_undetermined,
+    may_be_undetermined,
+    take_back,
+)
+from jaxbundle.adjustment.far_points import (
+    join_legs,
+    minimise_at_any_distance,
+)
+from jaxbundle.adjustment.likely_causes import (
+    noise_factor,
+)
+from jaxbundle.adjustment.minimum import (
+    adjusted_cameras,
+    inspect_solution,
+    is_misjudged,
+    start_with,
+)
+from jaxbundle.adjustment.orient import orient_again, screen
+from jaxbundle.adjustment.problem import NetworkProblem, make_problem
+from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.leastsquares.declarations import ObservationSet, Table
+from jaxbundle.leastsquares.indexing.rows import Values
+from jaxbundle.leastsquares.iterations.solver import Minimum
+from jaxbundle.leastsquares.problem import with_factor
+from jaxbundle.leastsquares.solution import find_minimum
+from jaxbundle.network.check import check_network
+from jaxbundle.network.columns import count, list_some
+from jaxbundle.network.tables import Network, Observations, Points
+from jaxbundle.network.undetermined import split_check_points
+from jaxbundle.network.unit_mistakes import (
+    name_pixels,
+)
+from jaxbundle.orientation.conventions import name_image_extent
+from jaxbundle.orientation.network import Oriented
+
+
+@dataclasses.dataclass(frozen=True)
+class RoundSettings:
+    """When the rounds of an adjustment exclude and bring back.
+
+    - `evaluations_before_look`: evaluations before points that rays may not determine are looked
+      for: the images are then nearly where they end. More: such points drift away meanwhile and
+      slow the iterations; fewer: images that still move make points look weak that are not.
+    - `max_retries`: repeated adjustments with what start values excluded. Each brings back what
+      agrees with a better orientation, most of it the first; what is left after five is said in a
+      warning.
+    """
+
+    evaluations_before_look: int = 6
+    max_retries: int = 5
+
+
+ROUNDS = RoundSettings()
+
+
+class FoundMinimum(NamedTuple):
+    """Where the iterations of a network ended.
+
+    `check`: check points and their image points; `undetermined`: what was left out because rays do
+    not determine it; `network`: what was adjusted, with its check points."""
+
+    problem: NetworkProblem
+    minimum: Minimum
+    check: tuple[Points, Observations]
+    undetermined: Undetermined
+    network: Network
+
+    @property
+    def is_solved(self) -> bool:
+        return inspect_solution(with_factor(self.problem), self.minimum) is not None
+
+
+@dataclasses.dataclass(frozen=True)
+class FirstMinimum:
+    """How the first minimum is found; `oriented`: computed start values, if they were needed."""
+
+    reduction: str | None
+    also: Sequence[Table | ObservationSet]
+    oriented: Oriented | None
+    options: Mapping[str, Any]
+    settings: RoundSettings = ROUNDS
+
+    def find(self, given: Network, outliers: bool) -> FoundMinimum:
+        """Adjust from the start values of `given`, which may contain `outliers`, or those computed
+        for it."""
+        network = given if self.oriented is None else self.oriented.network
+        found = self._minimise(network)
+        # Observations excluded because of a wrong principal distance may agree with the adjusted
+        # one: start values are computed again with it, as long as that uses more of them.
+        while len(network.observations) < len(given.observations) and is_misjudged(
+            found.problem, found.minimum
+        ):
+            cameras, fewer = adjusted_cameras(found.problem, found.minimum.values), network
+            network = orient_again(given, fewer, cameras)
+            if network is fewer:
+                break
+            found = self._minimise(network, partial(start_with, cameras=cameras))
+        # Blunders may keep the iterations from a solution that snooping could start from: those
+        # that contradict the start values by far are removed first.
+        if outliers and not found.is_solved:
+            screened = screen(network)
+            if len(screened.observations) < len(network.observations):
+                found, network = self._minimise(screened), screened
+        left_out = network is not given and network.left_out[len(given.left_out) :]
+        return self._try_again(given, found) if left_out or found.undetermined else found
+
+    def _try_again(self, given: Network, found: FoundMinimum) -> FoundMinimum:
+        """Adjust again, with everything left out because of start values that agrees with the
+        adjusted orientation, until nothing more does."""
+        if self.oriented is not None:
+            given = given.note(f"start values found, {self.oriented.frame}")
+            given = given.warn(*filter(None, [self.oriented.finding]))
+        # Excluded because of start values is not excluded for good: a point that misses by three
+        # tolerances of a rough orientation may fit the adjusted one to its σ. What rays do not
+        # determine (`final`) stays out, or it would return and leave in every round.
+        rounds, final = 0, Undetermined()
+        while found.is_solved:
+            problem, minimum, _, gone, current = found
+            # In the first round they may only be weak because others were still missing.
+            if rounds:
+                final += gone
+            part, factor = final.leave_out(given), noise_factor(problem, minimum)
+            try:
+                whole = take_back(part, current, problem, minimum.values, factor)
+                whole = check_network(whole)
+                gained = len(whole.observations) - len(current.observations)
+                if gained <= 0 or rounds == self.settings.max_retries:
+                    if gained > 0:
+                        whole = whole.warn(
+                            f"{count(gained, 'image point')} left out because of start values "
+                            f"would still come back after {rounds} repeated adjustments"
+                        )
+                    network = problem.network.replace(
+                        warnings=whole.warnings, notes=whole.notes, left_out=whole.left_out
+                    )
+                    return found._replace(problem=dataclasses.replace(problem, network=network))
+                carried = partial(carry, before=problem, values=minimum.values)
+                again = self._minimise(whole, carried, look=False)
+                solved = again.is_solved
+            except (InputError, NotSolvedError):
+                solved = False
+            if not solved:
+                network = problem.network.warn(
+                    "what start values excluded was tried again with the adjusted orientation, "
+                    "but with it there is no solution"
+                )
+                return found._replace(problem=dataclasses.replace(problem, network=network))
+            found, rounds = again, rounds + 1
+        return found
+
+    def _minimise(
+        self,
+        network: Network,
+        begin: Callable[[NetworkProblem], Values] | None = None,
+        look: bool = True,
+    ) -> FoundMinimum:
+        """The minimum of a network without what its rays do not determine; `look`: for that also
+        before the minimum."""
+        # Three looks at what rays do not determine: at the start values (cheap, but they may be
+        # poor), after a few evaluations (before such points slow the iterations down), and at the
+        # minimum. Each exclusion begins again from where the last iterations ended.
+        gone, factor = Undetermined(), None
+        while True:
+            current = check_network(gone.leave_out(network))
+            used, *check = split_check_points(current)
+            make = partial(make_problem, used, reduction=self.reduction, also=self.also)
+            try:
+                problem = make()
+            except InputError as error:
+                # Without the control points that were excluded the datum may be open; `orient`
+                # has said why they were.
+                finding = "" if self.oriented is None else self.oriented.finding
+                raise InputError(f"{error} {finding}".strip()) from None
+            start = problem.data.start if begin is None else begin(problem)
+            legs, left = [], self.options["max_steps"]
+            find = partial(self._find_more, network, gone)
+            more = find(problem, start, factor) if look else Undetermined()
+            if not more and look and may_be_undetermined(problem, start):
+                options = {
+                    **self.options,
+                    "max_steps": min(self.settings.evaluations_before_look, left),
+                }
+                legs, look = [find_minimum(problem, start, **options)], False
+                left -= int(legs[0].iterations)
+                factor, start = noise_factor(problem, legs[0]), legs[0].values
+                more = find(problem, start, factor)
+                begin = partial(carry, before=problem, values=start)
+            if not more:
+                found = problem
+                if left > 0:
+                    options = {**self.options, "max_steps": left}
+                    found, last = minimise_at_any_distance(problem, start, make, **options)
+                    legs.append(last)
+                minimum = join_legs(legs)
+                factor = noise_factor(found, minimum)
+                more = find(found, minimum.values, factor)
+                begin = partial(carry, before=found, values=minimum.values)
+                if not more:
+                    return FoundMinimum(found, minimum, (check[0], check[1]), gone, current)
+            gone += more
+
+    @staticmethod
+    def _find_more(network: Network, gone: Undetermined, *where: Any) -> Undetermined:
+        more = find_undetermined(*where)
+        return more if (gone + more).spares_most_of(network) else Undetermined()
+
+
+def require_most_oriented(found: Oriented) -> Oriented:
+    """The start values unchanged; refused if they exclude half of the images or points or more.
+
+    **Raises:** `NotSolvedError`."""
+    network = found.network
+    # A half that is placed may be the wrong half: with so little, what is excluded says more about
+    # the network than what is left.
+    for thing, reasons, left in (
+        ("image", found.images, len(network.images)),
+        ("point", found.points, len(network.points)),
+    ):
+        if len(reasons) >= left:
+            said = list_some((f"{thing} {id} ({why})" for id, why in reasons.items()), 5, str)
+            causes = filter(None, (name_pixels(network), name_image_extent(network)))
+            cause = "; ".join(causes)
+            raise NotSolvedError(
+                f"not solved: no start values for {len(reasons)} of "
+                f"{count(len(reasons) + left, thing)}: {said}; jaxbundle orient lists them all"
+                + (f"; {cause}" if cause else ""),
+                [f"{thing} {id}" for id in reasons],
+            )
+    return found
