@@ -33,7 +33,7 @@ from jaxbundle.errors import NotSolvedError
 from jaxbundle.orientation.alignment import similarity
 from jaxbundle.reconstruction.reconstruct import reconstruct
 from jaxbundle.reconstruction.result import ReconstructedPart
-from jaxbundle.system.configuration import allow_programs_at_once
+from jaxbundle.system.cores import allow_programs_at_once
 
 SETS = SETS | LIFELIKE
 LIMIT = 4.0

@@ -10,7 +10,7 @@ Levenberg-Marquardt with derivatives by differences reaches from 51 poses. Netwo
 with unknown points (a free network) follow; their truth is the reversed network, adjusted densely.
 
 Ambiguous: two minima whose poses differ beyond the ellipsoid of their covariance (99.9 %), with
-E below 13.8 (`adjustment/quality/two_minima.py`). A false alarm is a report where there is no
+E below 13.8 (`adjustment/second_minima/evidence.py`). A false alarm is a report where there is no
 such minimum, in parts of the cases without.
 """
 

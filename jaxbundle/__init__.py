@@ -34,7 +34,7 @@ _HOME = {
         "Influence",
         "influence",
     ),
-    "jaxbundle.adjustment.load": ("load_adjustment",),
+    "jaxbundle.adjustment.load_saved": ("load_adjustment",),
     "jaxbundle.adjustment.orient": ("orient",),
     "jaxbundle.adjustment.replicate": (
         "Replication",
@@ -129,11 +129,9 @@ _HOME = {
         "precision",
         "redundancy",
     ),
-    "jaxbundle.system.configuration": (
-        "join_processes",
-        "keep_programs",
-        "use_cores",
-    ),
+    "jaxbundle.system.cores": ("use_cores",),
+    "jaxbundle.system.joined_processes": ("join_processes",),
+    "jaxbundle.system.kept_programs": ("keep_programs",),
     "jaxbundle.system.progress": ("show_progress",),
 }
 # Imported on first use, so that the command line can configure JAX and the linear algebra library

@@ -31,7 +31,7 @@ from jaxbundle.adjustment.compare import AdjustmentComparison as AdjustmentCompa
 from jaxbundle.adjustment.gradients import check_gradients as check_gradients
 from jaxbundle.adjustment.influence import Influence as Influence
 from jaxbundle.adjustment.influence import influence as influence
-from jaxbundle.adjustment.load import load_adjustment as load_adjustment
+from jaxbundle.adjustment.load_saved import load_adjustment as load_adjustment
 from jaxbundle.adjustment.orient import orient as orient
 from jaxbundle.adjustment.quality.precision import Precision as Precision
 from jaxbundle.adjustment.quality.precision import precision as precision
@@ -96,9 +96,9 @@ from jaxbundle.planning.stations import grid_of_targets as grid_of_targets
 from jaxbundle.planning.stations import ring_of_stations as ring_of_stations
 from jaxbundle.planning.stations import stations_looking_at as stations_looking_at
 from jaxbundle.reconstruction.result import Reconstruction as Reconstruction
-from jaxbundle.system.configuration import join_processes as join_processes
-from jaxbundle.system.configuration import keep_programs as keep_programs
-from jaxbundle.system.configuration import use_cores as use_cores
+from jaxbundle.system.cores import use_cores as use_cores
+from jaxbundle.system.joined_processes import join_processes as join_processes
+from jaxbundle.system.kept_programs import keep_programs as keep_programs
 from jaxbundle.system.progress import show_progress as show_progress
 
 __version__: str

@@ -26,7 +26,7 @@ def main() -> None:
     # warnings about unknown tags of TIFF; errors come to the caller, and are said in one line
     os.environ.setdefault("OPENCV_LOG_LEVEL", "FATAL")
     if "reconstruct" in sys.argv[1:2]:
-        from jaxbundle.system.configuration import allow_programs_at_once
+        from jaxbundle.system.cores import allow_programs_at_once
 
         allow_programs_at_once()
     from jaxbundle.cli import main
@@ -40,7 +40,7 @@ def main() -> None:
 
 
 def _keep_programs() -> None:
-    from jaxbundle.system.configuration import keep_programs
+    from jaxbundle.system.kept_programs import keep_programs
 
     keep_programs()
 

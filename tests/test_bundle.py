@@ -195,7 +195,7 @@ def test_check_points_have_the_sigma_of_the_estimated_weights(estimated):
 
 
 def test_components_that_do_not_settle_are_told(simulation, monkeypatch):
-    for module in ("leastsquares.quality.components", "adjustment.readjust"):
+    for module in ("leastsquares.quality.variance_components", "adjustment.readjust"):
         monkeypatch.setattr(f"jaxbundle.{module}.ROUNDS", 1)
     network = simulation.network
     observations = dataclasses.replace(

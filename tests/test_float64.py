@@ -98,7 +98,7 @@ def test_the_policy_is_in_one_module():
 PROGRAMS_AT_ONCE = """
 import threading
 import jaxbundle
-from jaxbundle.system.configuration import allow_programs_at_once, available_cores
+from jaxbundle.system.cores import allow_programs_at_once, available_cores
 allow_programs_at_once()
 jaxbundle.enable_x64()
 import jax, numpy as np

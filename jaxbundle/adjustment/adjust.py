@@ -39,7 +39,7 @@ from jaxbundle.adjustment.readjust import (
     with_components,
 )
 from jaxbundle.adjustment.result import Adjustment
-from jaxbundle.adjustment.second_minimum import can_have_second, find_second_minima, is_said
+from jaxbundle.adjustment.second_minima.search import can_have_second, find_second_minima, is_said
 from jaxbundle.arguments import at_least_zero, integer, one_of, show, truth
 from jaxbundle.choices import ESTIMATORS, METHODS, REDUCTIONS
 from jaxbundle.errors import InputError, NotSolvedError

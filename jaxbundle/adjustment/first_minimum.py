@@ -172,7 +172,7 @@ class FirstMinimum:
         gone, factor = Undetermined(), None
         while True:
             current = check_network(gone.leave_out(network))
-            used, *check = split_check_points(current)
+            used, points, observations = split_check_points(current)
             make = partial(make_problem, used, reduction=self.reduction, also=self.also)
             try:
                 problem = make()
@@ -206,7 +206,7 @@ class FirstMinimum:
                 more = find(found, minimum.values, factor)
                 begin = partial(carry, before=found, values=minimum.values)
                 if not more:
-                    return FoundMinimum(found, minimum, (check[0], check[1]), gone, current)
+                    return FoundMinimum(found, minimum, (points, observations), gone, current)
             gone += more
 
     @staticmethod

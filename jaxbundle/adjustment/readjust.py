@@ -12,19 +12,13 @@ from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.adjustment.quality.blunder_names import image_points_removed, name_removed
 from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.adjustment.quality.misfit import contradicts, doubt_of_baarda
-from jaxbundle.adjustment.quality.variance_components import groups
+from jaxbundle.adjustment.quality.variance_groups import groups
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.iterations.solver import Minimum
 from jaxbundle.leastsquares.problem import Problem, hold, with_data
-from jaxbundle.leastsquares.quality.components import (
-    ROUNDS,
-    Component,
-    estimate,
-    variance_components,
-)
 from jaxbundle.leastsquares.quality.names import Name
 from jaxbundle.leastsquares.quality.robust import (
     Reweighted,
@@ -33,6 +27,12 @@ from jaxbundle.leastsquares.quality.robust import (
     robust_scale,
 )
 from jaxbundle.leastsquares.quality.snooping import RemovedRow, snoop, without
+from jaxbundle.leastsquares.quality.variance_components import (
+    ROUNDS,
+    Component,
+    estimate,
+    variance_components,
+)
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.network.blunders import Removed
 

@@ -37,10 +37,10 @@ from jaxbundle.adjustment.quality.replication import (
     compare_halves,
     random_halves,
 )
-from jaxbundle.adjustment.quality.two_minima import SecondMinimum
-from jaxbundle.adjustment.quality.variance_components import groups
+from jaxbundle.adjustment.quality.variance_groups import groups
 from jaxbundle.adjustment.quality.weakness import Weakness, weakness
-from jaxbundle.adjustment.storage import network_fingerprint, store
+from jaxbundle.adjustment.saved_state import network_fingerprint, store
+from jaxbundle.adjustment.second_minima.evidence import SecondMinimum
 from jaxbundle.adjustment.unknowns import (
     angles_near,
     find_unknowns,
@@ -62,12 +62,12 @@ from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.iterations.solver import Minimum
 from jaxbundle.leastsquares.iterations.stopping import SINGULAR, TERMINATIONS
 from jaxbundle.leastsquares.iterations.stopping import converged as reached_minimum
-from jaxbundle.leastsquares.quality.components import Component, variance_components
 from jaxbundle.leastsquares.quality.error_components import ErrorModel
 from jaxbundle.leastsquares.quality.global_test import chi_squared_test, is_tested
 from jaxbundle.leastsquares.quality.names import Name
 from jaxbundle.leastsquares.quality.reliability import Reliability
 from jaxbundle.leastsquares.quality.robust import Reweighted, residual_lengths, robust_scale
+from jaxbundle.leastsquares.quality.variance_components import Component, variance_components
 from jaxbundle.network.blunders import Removed, Suspect
 from jaxbundle.network.columns import list_some
 from jaxbundle.network.declare import LEAST_IMAGES
@@ -115,7 +115,7 @@ class Adjustment:
     - `error_model`: of errors that image points share, if it was requested (`correlations`, its
       settings) and the network can show any, else None; `replication`: two halves of the network
       compared, if requested (`halves_by`), else None
-    - `second_minima`: other minima (`adjustment.quality.second_minimum.SecondMinimum`) that cannot
+    - `second_minima`: other minima (`adjustment.second_minima.evidence.SecondMinimum`) that cannot
       be separated from the result, or that were left for a better one
     - `fingerprint`: of the adjusted network; `save` writes the result into a file
     """

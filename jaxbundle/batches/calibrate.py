@@ -50,7 +50,7 @@ from jaxbundle.geometry import (
     omega_phi_kappa_from_matrix,
 )
 from jaxbundle.leastsquares.quality.snooping import check_test
-from jaxbundle.system.configuration import available_cores
+from jaxbundle.system.cores import available_cores
 from jaxbundle.system.devices import on_accelerator
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, Progress

@@ -20,8 +20,7 @@ from jaxbundle.cameras.fisheye_prism import (
     RAD_TAN_THIN_PRISM_FISHEYE,
     THIN_PRISM_FISHEYE,
 )
-from jaxbundle.cameras.fov import FOV
-from jaxbundle.cameras.ideal_fisheyes import EQUIDISTANT, EQUISOLID, ORTHOGRAPHIC, STEREOGRAPHIC
+from jaxbundle.cameras.fov_model import FOV
 from jaxbundle.cameras.kannala_brandt import KANNALA_BRANDT
 from jaxbundle.cameras.mei import MEI
 from jaxbundle.cameras.model import CameraModel
@@ -31,6 +30,12 @@ from jaxbundle.cameras.radial_spline import radial_spline
 from jaxbundle.cameras.scaramuzza import SCARAMUZZA
 from jaxbundle.cameras.snavely import SNAVELY
 from jaxbundle.cameras.spline import spline
+from jaxbundle.cameras.undistorted_fisheyes import (
+    EQUIDISTANT,
+    EQUISOLID,
+    ORTHOGRAPHIC,
+    STEREOGRAPHIC,
+)
 from jaxbundle.cameras.usgs import USGS
 from jaxbundle.choices import MODEL_FAMILIES
 

@@ -31,8 +31,8 @@ from jaxbundle.cameras.convert_exact import (
     distortion,
     with_distortion,
 )
-from jaxbundle.cameras.ideal_fisheyes import STEREOGRAPHIC
 from jaxbundle.cameras.model import CameraModel
+from jaxbundle.cameras.undistorted_fisheyes import STEREOGRAPHIC
 
 CORE = ("fx", "fy", "cx", "cy")
 _K = {f"k{i}": f"k{i}" for i in (1, 2, 3, 4)}

@@ -1,12 +1,14 @@
-"""Three ideal images of fisheyes beside the equidistant one (`equidistant.py`).
+"""The four ideal images of fisheyes.
 
+    equidistant     u = θ              equal angles; rays to 180°, which have no image
     stereographic   u = 2·tan(θ/2)     conformal; rays to 180°, which have no image
     equisolid       u = 2·sin(θ/2)     equal areas; rays to 180°, on the circle u = 2
     orthographic    u = sin θ          rays to 90°, on the circle u = 1
 
     xi = fx·u·cos ψ,  yi = fy·u·sin ψ          θ the angle to the optical axis, ψ the azimuth
 
-Written in r, s, q without θ: with R = |r, s, q|, sin θ = √(r² + s²)/R and cos θ = −q/R,
+The equidistant one, written in even functions (below), is smooth on the optical axis too. The
+others are written in r, s, q without θ: with R = |r, s, q|, sin θ = √(r² + s²)/R and cos θ = −q/R,
 
     2·tan(θ/2) = 2·sin θ/(1 + cos θ),        2·sin(θ/2) = sin θ·√(2/(1 + cos θ))
 
@@ -23,8 +25,29 @@ import jax.numpy as jnp
 from jaxbundle.cameras.scalars import OfRay, Pair, Parameters, Scalar, ToRay, Triple
 
 
+def equidistant(columns: Sequence[int], up: bool) -> tuple[OfRay, ToRay]:
+    """The ideal image of a ray, and the ray of an ideal image, NaN beyond θ = 180°.
+
+    **Arguments:** as of `perspective.perspective`.
+    """
+    first, last = columns[0], columns[-1]
+
+    def ideal(p: Parameters, r: Scalar, s: Scalar, q: Scalar) -> Pair:
+        scale = angle_over_sine(r * r + s * s, q)
+        return p[first] * scale * r, p[last] * scale * s if up else -p[last] * scale * s
+
+    def ray(p: Parameters, xi: Scalar, yi: Scalar) -> Triple:
+        X, Y = xi / p[first], yi / p[last]
+        square = X * X + Y * Y
+        square = jnp.where(square < jnp.pi**2, square, jnp.nan)
+        scale = sine_over_angle(square)
+        return scale * X, scale * Y if up else -scale * Y, -cosine(square)
+
+    return ideal, ray
+
+
 def stereographic(columns: Sequence[int], up: bool) -> tuple[OfRay, ToRay]:
-    """The ideal image of a ray, and the ray of an ideal image; arguments as of `perspective`."""
+    """As `equidistant`; every ideal image has a ray."""
 
     def scale(R: Scalar, q: Scalar) -> Scalar:
         return 2 / (R - q)
@@ -36,7 +59,7 @@ def stereographic(columns: Sequence[int], up: bool) -> tuple[OfRay, ToRay]:
 
 
 def equisolid(columns: Sequence[int], up: bool) -> tuple[OfRay, ToRay]:
-    """As `stereographic`; NaN beyond θ = 180°."""
+    """As `equidistant`; NaN beyond θ = 180°."""
 
     def scale(R: Scalar, q: Scalar) -> Scalar:
         return jnp.sqrt(2 / (R * (R - q)))
@@ -49,7 +72,7 @@ def equisolid(columns: Sequence[int], up: bool) -> tuple[OfRay, ToRay]:
 
 
 def orthographic(columns: Sequence[int], up: bool) -> tuple[OfRay, ToRay]:
-    """As `stereographic`; NaN from θ = 90° on, where the image would turn back."""
+    """As `equidistant`; NaN from θ = 90° on, where the image would turn back."""
 
     def scale(R: Scalar, q: Scalar) -> Scalar:
         return jnp.where(q < 0, 1 / R, jnp.nan)
@@ -80,3 +103,40 @@ def _image(
         return X * sine, Y * sine if up else -Y * sine, -cosine
 
     return ideal, ray
+
+
+# The three functions below are even in the angle, so they are smooth in its square, but √ is not at
+# 0: near 0 a series replaces them, exact to rounding. The inner `where` keeps the derivative of the
+# branch not taken finite.
+
+# Below this the first omitted term of the longest series, t¹⁰/11, is 9e-17, less than rounding; of
+# the others less still.
+_NEAR = 1e-3
+
+
+def angle_over_sine(square: Scalar, q: Scalar) -> Scalar:
+    """θ/ρ with ρ² = `square` = r² + s² and θ = atan2(ρ, −q)."""
+    # Not near θ = 180°, where the ray has no azimuth and the image none: there the quotient is
+    # right, infinite.
+    near = (square < _NEAR * q * q) & (q < 0)
+    t2 = jnp.where(near, square / jnp.where(near, q * q, 1.0), 0.0)
+    series = (1 - t2 * (1 / 3 - t2 * (1 / 5 - t2 * (1 / 7 - t2 / 9)))) / jnp.where(near, -q, 1.0)
+    rho = jnp.sqrt(jnp.where(near, 1.0, square))
+    return jnp.where(near, series, jnp.arctan2(rho, -q) / rho)
+
+
+def sine_over_angle(square: Scalar) -> Scalar:
+    """sin θ/θ with θ² = `square`."""
+    near = square < _NEAR
+    t2 = jnp.where(near, square, 0.0)
+    theta = jnp.sqrt(jnp.where(near, 1.0, square))
+    return jnp.where(near, 1 - t2 / 6 * (1 - t2 / 20 * (1 - t2 / 42)), jnp.sin(theta) / theta)
+
+
+def cosine(square: Scalar) -> Scalar:
+    """cos θ with θ² = `square`."""
+    near = square < _NEAR
+    t2 = jnp.where(near, square, 0.0)
+    theta = jnp.sqrt(jnp.where(near, 1.0, square))
+    series = 1 - t2 / 2 * (1 - t2 / 12 * (1 - t2 / 30 * (1 - t2 / 56)))
+    return jnp.where(near, series, jnp.cos(theta))

@@ -28,7 +28,7 @@ from collections.abc import Callable
 
 import jax.numpy as jnp
 
-from jaxbundle.cameras.equidistant import equidistant
+from jaxbundle.cameras.fisheye_images import equidistant
 from jaxbundle.cameras.inverse import implicit_inverse
 from jaxbundle.cameras.model import CameraModel
 from jaxbundle.cameras.radial import is_increasing, radial

@@ -4,7 +4,7 @@
     θd = θ·(1 + k1·θ² + k2·θ⁴ + k3·θ⁶ + k4·θ⁸)
     u = fx·θd·cos ψ + cx,  v = fy·θd·sin ψ + cy
 
-The ideal image is the equidistant one (`equidistant.py`), (fx·θ·cos ψ, fy·θ·sin ψ) from the
+The ideal image is the equidistant one (`fisheye_images.py`), (fx·θ·cos ψ, fy·θ·sin ψ) from the
 principal point, and the distortion a polynomial in it, smooth everywhere.
 
 Units: fx, fy, cx, cy in pixels, (0, 0) the centre of the upper-left pixel, u right, v down; the

@@ -17,8 +17,7 @@ from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 
-from jaxbundle.cameras.equidistant import equidistant
-from jaxbundle.cameras.fisheye_images import equisolid, orthographic, stereographic
+from jaxbundle.cameras.fisheye_images import equidistant, equisolid, orthographic, stereographic
 from jaxbundle.cameras.inverse import implicit_inverse
 from jaxbundle.cameras.perspective import perspective
 from jaxbundle.cameras.scalars import Formula, OfRay, Pair, Parameters, Scalar, ToRay, Triple

@@ -20,7 +20,7 @@ from jaxbundle.cli.common_options import Quiet as Quiet
 from jaxbundle.cli.common_options import add_common_options
 from jaxbundle.cli.small_inputs import is_small
 from jaxbundle.errors import InputError, NotSolvedError
-from jaxbundle.system.configuration import leave
+from jaxbundle.system.joined_processes import leave
 from jaxbundle.system.memory import free_memory, is_memory_shortage, require_address_space
 from jaxbundle.system.terminals import for_output
 

@@ -20,9 +20,9 @@ from jaxbundle.cameras.field_of_view import (
 )
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
-from jaxbundle.io.cameras.calibrated import is_result, read_calibrated
 from jaxbundle.io.cameras.camera_files import choose_camera, is_camera_file, read_cameras
 from jaxbundle.io.cameras.nearest_camera import with_messages
+from jaxbundle.io.cameras.result_json import is_result, read_calibrated
 from jaxbundle.io.formats import expected_inputs, read_network, recognise_format
 from jaxbundle.io.networks.assemble import all_parameters
 from jaxbundle.io.results.result_json import without_nan

@@ -20,8 +20,8 @@ from jaxbundle.explorer.scanner import FlightView
 from jaxbundle.explorer.server import Server
 from jaxbundle.explorer.view import ExplorerView
 from jaxbundle.io import read_network
-from jaxbundle.io.cameras.calibrated import is_result
 from jaxbundle.io.cameras.camera_files import is_camera_file
+from jaxbundle.io.cameras.result_json import is_result
 from jaxbundle.io.formats import recognise_format
 from jaxbundle.io.scanner.flight import read_flight
 from jaxbundle.io.scanner.read import read_scanner

@@ -28,16 +28,16 @@ from jaxbundle.leastsquares.iterations.search import SEARCHES
 from jaxbundle.leastsquares.iterations.solver import Minimum
 from jaxbundle.leastsquares.iterations.stopping import SINGULAR, TERMINATIONS, converged
 from jaxbundle.leastsquares.problem import Problem, SystemCounts, make_problem, with_factor
-from jaxbundle.leastsquares.quality.components import (
+from jaxbundle.leastsquares.quality.names import undetermined
+from jaxbundle.leastsquares.quality.reliability import external_reliability, minimal_detectable
+from jaxbundle.leastsquares.quality.robust import SuspectRow, reweight
+from jaxbundle.leastsquares.quality.snooping import RemovedRow, check_test, snoop
+from jaxbundle.leastsquares.quality.variance_components import (
     Component,
     VarianceGroup,
     estimate,
     variance_components,
 )
-from jaxbundle.leastsquares.quality.names import undetermined
-from jaxbundle.leastsquares.quality.reliability import external_reliability, minimal_detectable
-from jaxbundle.leastsquares.quality.robust import SuspectRow, reweight
-from jaxbundle.leastsquares.quality.snooping import RemovedRow, check_test, snoop
 from jaxbundle.leastsquares.solution import Solution, find_minimum
 from jaxbundle.types import AnyArray
 

@@ -19,7 +19,7 @@ from jaxbundle.arguments import numeric_array
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.spaces import Pose, PoseValue, Space, Vector
-from jaxbundle.leastsquares.weights import whitening
+from jaxbundle.leastsquares.whitening import whitening
 
 # Placeholder: the space is derived from the values of the table.
 OF_THE_VALUES: Any = None

@@ -36,7 +36,7 @@ from jaxbundle.leastsquares.iterations.retraction import retract
 from jaxbundle.leastsquares.iterations.solver import LeastSquares
 from jaxbundle.leastsquares.iterations.stopping import Tolerance
 from jaxbundle.leastsquares.spaces import Space
-from jaxbundle.leastsquares.weights import diagonal, inverse_sigma, used
+from jaxbundle.leastsquares.whitening import diagonal, inverse_sigma, used
 from jaxbundle.system.memory import return_freed_memory
 from jaxbundle.types import AnyArray, Scalar
 

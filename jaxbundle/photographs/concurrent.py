@@ -1,6 +1,6 @@
 """Memory for work on photographs: how many fit at once."""
 
-from jaxbundle.system.configuration import available_cores
+from jaxbundle.system.cores import available_cores
 from jaxbundle.system.memory import free_memory
 
 

@@ -27,7 +27,7 @@ from jaxbundle.float64 import require_x64
 from jaxbundle.network.tables import Camera
 from jaxbundle.planning.shapes import Shape, Tangent
 from jaxbundle.planning.texture import Texture
-from jaxbundle.system.configuration import available_cores
+from jaxbundle.system.cores import available_cores
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import Scalar
 

@@ -12,7 +12,7 @@ They depend on the product and cannot be guessed: the quaternions of some provid
 aberration, those of others do not. All three assume Earth-fixed positions.
 
 The velocity of the aberration is the inertial one, V + Ω × P (classical addition; relativity
-changes 20 m by a micrometre). The air is the U.S. Standard Atmosphere 1976 (`atmosphere`).
+changes 20 m by a micrometre). The air is the U.S. Standard Atmosphere 1976 (`refractivity`).
 """
 
 from typing import NamedTuple
@@ -39,8 +39,8 @@ from jaxbundle.geometry.vectors import (
     unit,
     unpack,
 )
-from jaxbundle.pushbroom.atmosphere import refractivity
 from jaxbundle.pushbroom.earth_frames import EARTH_RATE
+from jaxbundle.pushbroom.refractivity import refractivity
 
 # Speed of light, m/s, exact by the definition of the metre.
 LIGHT = 299792458.0

@@ -50,7 +50,7 @@ from jaxbundle.reconstruction.result import (
 from jaxbundle.reconstruction.satellite_positions import find_positions
 from jaxbundle.reconstruction.settings import ReconstructionSettings
 from jaxbundle.reconstruction.starting import is_plausible, start_again, start_values
-from jaxbundle.system.configuration import available_cores, can_run_two_programs
+from jaxbundle.system.cores import available_cores, can_run_two_programs
 from jaxbundle.tiepoints import track_measurement
 from jaxbundle.tiepoints.camera_starts import start_cameras
 from jaxbundle.tiepoints.duplicates import find_duplicates

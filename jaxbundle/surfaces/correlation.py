@@ -19,7 +19,7 @@ from jaxtyping import Float, Float32, Int, Shaped
 from jaxbundle.photographs.opencv import need_opencv
 from jaxbundle.surfaces.segments import Segments, Windows, positions
 from jaxbundle.surfaces.views import Grey, OrientedImage, Places
-from jaxbundle.system.configuration import available_cores
+from jaxbundle.system.cores import available_cores
 
 
 @dataclasses.dataclass(frozen=True)

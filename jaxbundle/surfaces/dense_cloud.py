@@ -23,7 +23,7 @@ from jaxbundle.surfaces.guide import Guide
 from jaxbundle.surfaces.orientation import orientation_covariance
 from jaxbundle.surfaces.rectification import PIXELS_AT_ONCE, RectifiedPair, disparity_range, rectify
 from jaxbundle.surfaces.views import FrameView, Places, Points
-from jaxbundle.system.configuration import available_cores
+from jaxbundle.system.cores import available_cores
 
 
 def dense_cloud(

@@ -20,7 +20,7 @@ from jaxbundle.photographs.opencv import need_opencv
 from jaxbundle.surfaces.disparity_search import RowImage, RowMask
 from jaxbundle.surfaces.row_windows import correct
 from jaxbundle.surfaces.scatter import missing_sigma, robust_factor
-from jaxbundle.system.configuration import available_cores
+from jaxbundle.system.cores import available_cores
 
 
 @dataclasses.dataclass(frozen=True)

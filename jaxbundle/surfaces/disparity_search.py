@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbundle.photographs.opencv import need_opencv
-from jaxbundle.system.configuration import available_cores
+from jaxbundle.system.cores import available_cores
 
 RowImage = Float[np.ndarray, "rows columns"]
 RowMask = Bool[np.ndarray, "rows columns"]

@@ -26,7 +26,7 @@ from jaxbundle.surfaces.views import (
     pixel_of,
     run_in_lanes,
 )
-from jaxbundle.system.configuration import available_cores
+from jaxbundle.system.cores import available_cores
 from jaxbundle.system.programs import compile_once
 
 

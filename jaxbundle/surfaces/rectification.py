@@ -19,7 +19,7 @@ from jaxtyping import Float
 from scipy import ndimage
 
 from jaxbundle.surfaces.views import FrameView
-from jaxbundle.system.configuration import available_cores
+from jaxbundle.system.cores import available_cores
 
 # Pixels looked up together by one core: the temporary arrays take about 50 MB.
 PIXELS_AT_ONCE = 1 << 18

@@ -9,21 +9,21 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxbundle
-from jaxbundle.adjustment.quality.two_minima import (
-    MIRRORED,
-    OTHER_PLANE,
-    REVERSED,
-    SECOND_MINIMUM,
-    TURNED,
-    evidence,
-)
-from jaxbundle.adjustment.second_solutions import (
+from jaxbundle.adjustment.second_minima.closed_forms import (
     ImageRays,
     NetworkScene,
     mirror,
     perspective_effect,
     reverse_depth,
     turn_over,
+)
+from jaxbundle.adjustment.second_minima.evidence import (
+    MIRRORED,
+    OTHER_PLANE,
+    REVERSED,
+    SECOND_MINIMUM,
+    TURNED,
+    evidence,
 )
 from jaxbundle.geometry import omega_phi_kappa_from_matrix
 from jaxbundle.network import Camera, Images, Network, Observations, Points

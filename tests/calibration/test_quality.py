@@ -28,7 +28,7 @@ from jaxbundle.cameras.convert_fit import images_of
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.io import read_cameras, read_network, read_opencv
-from jaxbundle.io.cameras.calibrated import read_calibrated
+from jaxbundle.io.cameras.result_json import read_calibrated
 from jaxbundle.plotting import write_figures
 
 DRAWS = 416

@@ -12,7 +12,7 @@ import pytest
 
 import jaxbundle
 from jaxbundle.io import exchange
-from jaxbundle.io.cameras.calibrated import read_calibrated
+from jaxbundle.io.cameras.result_json import read_calibrated
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "convergent4"

@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 
 from jaxbundle.errors import InputError
 from jaxbundle.io import read_corners, read_target, write_corners, write_target
-from jaxbundle.io.cameras.calibrated import is_result, read_calibrated
+from jaxbundle.io.cameras.result_json import is_result, read_calibrated
 from jaxbundle.measure.boards import Board
 
 BOARD = Board(4, 3, 0.05)

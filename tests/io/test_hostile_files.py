@@ -16,9 +16,9 @@ from foreign_samples import NVM, SAMPLES, write_sample
 from jaxbundle.batches.stacks import read_camera_stack
 from jaxbundle.errors import InputError
 from jaxbundle.io import read_cameras, read_network, write_project
-from jaxbundle.io.cameras.calibrated import read_calibrated
 from jaxbundle.io.cameras.camera_files import is_camera_file
 from jaxbundle.io.cameras.opencv_writing import write_opencv
+from jaxbundle.io.cameras.result_json import read_calibrated
 from jaxbundle.io.networks.bal import write_bal
 from jaxbundle.io.networks.bundler import write_bundler
 from jaxbundle.io.networks.colmap import write_colmap

@@ -16,10 +16,10 @@ import pytest
 from scipy.integrate import quad, solve_ivp
 
 from jaxbundle.geometry import ellipsoid as el
-from jaxbundle.pushbroom.atmosphere import refractivity
 from jaxbundle.pushbroom.corrections import Corrections, refract
 from jaxbundle.pushbroom.image import LinePose
 from jaxbundle.pushbroom.image_to_ground import ground_point
+from jaxbundle.pushbroom.refractivity import refractivity
 from jaxbundle.pushbroom.surfaces import Height
 
 RADIUS = 6371e3

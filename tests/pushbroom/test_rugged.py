@@ -28,8 +28,8 @@ from jaxbundle.pushbroom import (
     turn_positions,
     turn_quaternions,
 )
-from jaxbundle.pushbroom.atmosphere import refractivity
 from jaxbundle.pushbroom.earth_frames import EARTH_RATE
+from jaxbundle.pushbroom.refractivity import refractivity
 from jaxbundle.pushbroom.trajectory import orbital_frame
 
 A, F = 6378137.0, 1 / 298.257223563

@@ -11,7 +11,7 @@ from rendered_photographs import CAMERA, SIZE, F, corner, write_photographs
 
 import jaxbundle
 from jaxbundle.errors import InputError
-from jaxbundle.io.cameras.calibrated import read_calibrated
+from jaxbundle.io.cameras.result_json import read_calibrated
 from jaxbundle.io.results.result_json import result_text
 from jaxbundle.orientation.alignment import similarity
 from jaxbundle.reconstruction.parts import group_connected

@@ -12,10 +12,10 @@ from jaxtyping import Float
 
 from jaxbundle.adjustment.problem import shifted_problem
 from jaxbundle.adjustment.quality.inspection import Inspection
-from jaxbundle.adjustment.quality.variance_components import groups
+from jaxbundle.adjustment.quality.variance_groups import groups
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.leastsquares.excluded_rows import determine
-from jaxbundle.leastsquares.quality.components import rescale
+from jaxbundle.leastsquares.quality.variance_components import rescale
 from jaxbundle.network.tables import Distances, Observations, Points
 
 

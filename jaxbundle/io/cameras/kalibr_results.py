@@ -26,7 +26,7 @@ from jaxbundle.network.build import make_cameras
 from jaxbundle.system.file_content import beginning
 
 if TYPE_CHECKING:
-    from jaxbundle.io.cameras.calibrated import Calibrated
+    from jaxbundle.io.cameras.result_json import Calibrated
 
 HEAD = b"Camera-system parameters"
 CAMERA = re.compile(r"^\s*(cam\d+)\s*\(.*\):\s*$", re.M)

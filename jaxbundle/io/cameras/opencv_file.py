@@ -109,7 +109,7 @@ def find_cameras(path: Path) -> list[tuple[str, Mapping[str, Any]]]:
         return []
     if path.stat().st_size > LARGEST_FILE or is_kalibr(path):
         return []
-    # a result of ours has cameras with their covariance: `io/cameras/calibrated.py` reads it
+    # a result of ours has cameras with their covariance: `io/cameras/result_json.py` reads it
     if b'"converged"' in head and b'"termination"' in head:
         return []
     try:

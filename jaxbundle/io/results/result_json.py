@@ -20,8 +20,8 @@ from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.types import present
 
 if TYPE_CHECKING:
-    from jaxbundle.adjustment.quality.two_minima import SecondMinimum
     from jaxbundle.adjustment.result import Adjustment
+    from jaxbundle.adjustment.second_minima.evidence import SecondMinimum
     from jaxbundle.network.tables import Camera
     from jaxbundle.report.verdict import Verdict
 

@@ -7,8 +7,8 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.scanner.csm import read_csm
 from jaxbundle.io.scanner.dimap import read_dimap
 from jaxbundle.io.scanner.dimap2 import MODEL, read_dimap2
-from jaxbundle.io.scanner.own_rpc import check_against_rpc
 from jaxbundle.io.scanner.pvl import read_support_data
+from jaxbundle.io.scanner.rpc_check import check_against_rpc
 from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.scanner.scanner_file import REQUIRED_FIELDS, SECTIONS, scanner_of
 from jaxbundle.io.scanner.worldview import read_worldview
@@ -30,7 +30,7 @@ WORLDVIEW = "support data of DigitalGlobe with IMD, EPH, ATT, GEO"
 
 def read_scanner(path: str | Path) -> ScannerInput:
     """The pushbroom image of a scanner file, `.toml`, or of a product; one that has RPC too is
-    compared with them (`own_rpc`).
+    compared with them (`rpc_check`).
 
     **Raises:** `InputError` naming file, section and key, or table and line; also for unknown
     formats.

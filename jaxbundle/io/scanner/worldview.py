@@ -14,7 +14,7 @@ EPH, ATT, GEO (the camera).
   from 0 at the centres of the first.
 
 The attitude is that of the arriving light: light time, aberration and refraction are switched on,
-unless the RPC of the file say otherwise (`own_rpc`). Optical distortion, decreasing times, and
+unless the RPC of the file say otherwise (`rpc_check`). Optical distortion, decreasing times, and
 products resampled to a map are refused.
 """
 

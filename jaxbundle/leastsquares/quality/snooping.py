@@ -33,7 +33,7 @@ from jaxbundle.leastsquares.problem import Problem, hold, with_data
 from jaxbundle.leastsquares.quality.distributions import critical_w, normal_quantile
 from jaxbundle.leastsquares.quality.names import eliminated_rows
 from jaxbundle.leastsquares.solution import Solution, take_step
-from jaxbundle.leastsquares.weights import used, without_residual
+from jaxbundle.leastsquares.whitening import used, without_residual
 from jaxbundle.types import AnyArray
 
 # Observations are removed together with the worst if their test is at least this fraction of its.

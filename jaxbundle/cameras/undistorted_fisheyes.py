@@ -3,7 +3,7 @@
     u = cx + fx·ρ(θ)·cos ψ,  v = cy + fy·ρ(θ)·sin ψ
 
 with ρ = 2·tan(θ/2), θ, 2·sin(θ/2), sin θ: no distortion at all, four parameters. The formulas are
-those of the ideal images (`fisheye_images.py`, `equidistant.py`), where also their ranges stand.
+those of the ideal images (`fisheye_images.py`), where also their ranges stand.
 
 Units: pixels, (0, 0) the centre of the upper-left pixel, u right, v down.
 

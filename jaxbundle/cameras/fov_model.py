@@ -17,7 +17,7 @@ Applications 13(1), eq. 13 and 14; COLMAP's FOV.
 
 import jax.numpy as jnp
 
-from jaxbundle.cameras.equidistant import angle_over_sine, cosine, sine_over_angle
+from jaxbundle.cameras.fisheye_images import angle_over_sine, cosine, sine_over_angle
 from jaxbundle.cameras.model import CameraModel
 from jaxbundle.cameras.scalars import Pair, Parameters, Scalar, Triple
 

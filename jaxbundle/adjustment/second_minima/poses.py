@@ -13,12 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbundle.adjustment.problem import NetworkProblem
-from jaxbundle.adjustment.quality.two_minima import (
-    OTHER_POSE,
-    TURNED,
-    SecondMinimumSettings,
-)
-from jaxbundle.adjustment.second_solutions import (
+from jaxbundle.adjustment.second_minima.closed_forms import (
     ImageRays,
     NetworkScene,
     OtherSolution,
@@ -27,6 +22,11 @@ from jaxbundle.adjustment.second_solutions import (
     turn_over,
     turns,
     unit,
+)
+from jaxbundle.adjustment.second_minima.evidence import (
+    OTHER_POSE,
+    TURNED,
+    SecondMinimumSettings,
 )
 from jaxbundle.leastsquares.quality.distributions import chi2_quantile
 from jaxbundle.orientation import batched

@@ -1,6 +1,6 @@
 """After convergence: the second minima of a network, adjusted from their closed forms.
 
-The candidates (`second_solutions`) are few, and most are excluded before anything is adjusted: by
+The candidates (`closed_forms`) are few, and most are excluded before anything is adjusted: by
 the effect of perspective, which is of the order of the square of the image and known without any
 iteration, and of single images by a resection on the adjusted points. The others are adjusted by
 the program of the first minimum from other start values.
@@ -18,17 +18,7 @@ from jaxbundle.adjustment.far_points import join_legs, noise_of_rays
 from jaxbundle.adjustment.minimum import adjusted_cameras, inspect_solution
 from jaxbundle.adjustment.problem import NetworkProblem, with_coordinates
 from jaxbundle.adjustment.quality.inspection import Inspection
-from jaxbundle.adjustment.quality.two_minima import (
-    MIRRORED,
-    OTHER_PLANE,
-    REVERSED,
-    SECOND_MINIMUM,
-    SecondMinimum,
-    SecondMinimumSettings,
-    evidence,
-)
-from jaxbundle.adjustment.second_poses import SecondPoses
-from jaxbundle.adjustment.second_solutions import (
+from jaxbundle.adjustment.second_minima.closed_forms import (
     NetworkScene,
     OtherSolution,
     angles,
@@ -44,6 +34,16 @@ from jaxbundle.adjustment.second_solutions import (
     turns,
     unit,
 )
+from jaxbundle.adjustment.second_minima.evidence import (
+    MIRRORED,
+    OTHER_PLANE,
+    REVERSED,
+    SECOND_MINIMUM,
+    SecondMinimum,
+    SecondMinimumSettings,
+    evidence,
+)
+from jaxbundle.adjustment.second_minima.poses import SecondPoses
 from jaxbundle.cameras import get_model
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
 from jaxbundle.leastsquares.indexing.rows import Values

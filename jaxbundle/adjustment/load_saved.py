@@ -12,7 +12,7 @@ import numpy as np
 from jaxbundle.adjustment.problem import NetworkProblem, make_problem
 from jaxbundle.adjustment.quality.correlated_errors import error_components
 from jaxbundle.adjustment.result import Adjustment
-from jaxbundle.adjustment.storage import CLASSES, FORMAT, State, Stored, with_own_models
+from jaxbundle.adjustment.saved_state import CLASSES, FORMAT, State, Stored, with_own_models
 from jaxbundle.arguments import path as given_path
 from jaxbundle.cameras import CameraModel
 from jaxbundle.errors import InputError

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from jaxbundle.adjustment.problem import NetworkProblem
-from jaxbundle.leastsquares.quality.components import VarianceGroup as Group
+from jaxbundle.leastsquares.quality.variance_components import VarianceGroup as Group
 from jaxbundle.network.units import ANGLE_UNITS
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.adjustment.quality.correlated_errors import CorrelationSettings
 from jaxbundle.adjustment.quality.replication import HalvesDifference, Replication
-from jaxbundle.adjustment.quality.two_minima import SecondMinimum
+from jaxbundle.adjustment.second_minima.evidence import SecondMinimum
 from jaxbundle.cameras import CameraModel, get_model, is_own
 from jaxbundle.io.results.stored_tree import fingerprint, write_tree
 from jaxbundle.leastsquares.quality.error_components import ErrorSettings
