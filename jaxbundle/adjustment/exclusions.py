@@ -43,8 +43,8 @@ from jaxbundle.orientation.missing import explain_missing, note_missing
 from jaxbundle.orientation.rays import Sights, sights
 from jaxbundle.types import AnyArray
 
-# On points and image points that come back: adjusted images are better than start values, which may
-# miss by three times as much; blunders should not come back with the others.
+# Demands on what comes back. Start values may miss by 3 tolerances (image points) or 4 (rays of a
+# point); adjusted images are better, and blunders should not come back with the others.
 COMES_BACK = Demands(START_VALUE_DEMANDS.angle, 1.0)
 
 
@@ -104,10 +104,12 @@ def find_undetermined(
 
 def may_be_undetermined(problem: NetworkProblem, values: Values) -> bool:
     """Whether start values show points or images that rays may not determine: worth a look after a
-    few iterations, before they cost many. Rays of poor start values converge in appearance, so that
-    all narrow points count that would be narrow at the usual distance as well, unless some are
-    parallel: these would drift meanwhile."""
+    few iterations, before they cost many."""
     narrow, flat = _find_candidates(problem, values, None)
+    # Poor start values may put a point so near that its rays seem to converge: points of narrow
+    # rays count too, if they would be narrow at the usual distance. But not where some rays are
+    # parallel: those points are at any distance from the start (`far_points`), and would drift in
+    # the few iterations before the look.
     angle = angle_of_rays(problem, values)
     near = (angle < FAR_POINTS.narrow) & (
         _parallax_at_usual_distance(problem, values) < FAR_POINTS.narrow
@@ -154,8 +156,8 @@ def _find_candidates(
     is in a wrong unit or was not given, and says nothing before the adjustment has estimated it.
     """
     network = problem.network
-    ties, one = network.points.has_role("tie"), len(network.images)
-    none = np.zeros(len(ties), bool), np.zeros(one, bool)
+    ties, images = network.points.has_role("tie"), len(network.images)
+    none = np.zeros(len(ties), bool), np.zeros(images, bool)
     noise = noise_of_rays(problem.network)
     if not are_finite(problem, values) or factor is None and noise > largest_sigma:
         return none
@@ -185,7 +187,7 @@ def _notes(
     ):
         by = np.unique(seen.image[mask[seen.point]])
         where = where.format(list_some((network.images.id[k] for k in by), 4))
-        why = f"whose rays are one line to their noise, {where}, so that they have no distance"
+        why = f"whose rays coincide within their noise, {where}: their distance is undetermined"
         groups.append(LeftOut("tie point", of(network.points.id, mask), why))
     why = "whose points are on one line, about which the image may turn"
     groups.append(LeftOut("image", of(network.images.id, images), why))
@@ -194,8 +196,9 @@ def _notes(
 
 def _width_of_points(problem: NetworkProblem, values: Values) -> Float[np.ndarray, " images"]:
     """The RMS angle between the points of every image and their best line, radians."""
-    # The middle eigenvalue of Σ(X − X̄)(X − X̄)ᵀ/s²: the largest is along the line, the sum of the
-    # other two across it. Weighted by 1/s, since an angle counts, not a distance.
+    # The middle eigenvalue of Σ(X − X̄)(X − X̄)ᵀ/s²: the largest belongs to the line, the other two
+    # to the directions across it, of which this is the larger (of points on a plane the other is
+    # 0). Weighted by 1/s², since an angle counts, not a distance.
     image, n = problem.image, len(problem.network.images)
     X = np.asarray(coordinates(values))[problem.point]
     away = np.linalg.norm(X - np.asarray(values["image"].position)[image], axis=1)
@@ -271,6 +274,7 @@ def take_back(
     # A tie point that was left out comes back if its rays meet, even if it has given coordinates.
     known = np.isfinite(X).all(1) & (before | model.known | ~given.points.has_role("tie"))
     missing_images, missing_points = explain_missing(given, seen, model, known | line)
+    # Two points are always on one line; that there are too few of them is said elsewhere.
     for k in np.flatnonzero(straight & (np.bincount(seen.image, minlength=seen.images) > 2)):
         missing_images[images.id[k]] = "its points are on one line, about which it may turn"
     network = network.replace(

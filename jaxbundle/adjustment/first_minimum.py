@@ -223,8 +223,8 @@ def require_most_oriented(found: Oriented) -> Oriented:
     # A half that is placed may be the wrong half: with so little, what is excluded says more about
     # the network than what is left.
     for thing, reasons, left in (
-        ("image", found.images, len(network.images)),
-        ("point", found.points, len(network.points)),
+        ("image", found.images_not_placed, len(network.images)),
+        ("point", found.points_not_placed, len(network.points)),
     ):
         if len(reasons) >= left:
             said = list_some((f"{thing} {id} ({why})" for id, why in reasons.items()), 5, str)

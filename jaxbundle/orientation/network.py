@@ -55,14 +55,14 @@ CONTRADICTION = "that contradict the start values"
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Oriented(TableMethods):
-    """A network with start values; `images`, `points`: reasons for those that could not be
-    oriented; `left_out`: image points that contradict the start values; `frame`: the reference of
-    the coordinates; `finding`: contradictory control points, and the correction."""
+    """A network with start values; `images_not_placed`, `points_not_placed`: the reason by id;
+    `left_out`: image points that contradict the start values; `frame`: the reference of the
+    coordinates; `finding`: contradictory control points, and, if found, what would correct them."""
 
     network: Network
     frame: str
-    images: Mapping[str, str]
-    points: Mapping[str, str]
+    images_not_placed: Mapping[str, str]
+    points_not_placed: Mapping[str, str]
     left_out: tuple[str, ...] = ()
     finding: str = ""
 
@@ -73,8 +73,8 @@ class Oriented(TableMethods):
             "frame": self.frame,
             "images": list(self.network.images.id),
             "points": len(self.network.points),
-            "images_not_placed": dict(self.images),
-            "points_not_placed": dict(self.points),
+            "images_not_placed": dict(self.images_not_placed),
+            "points_not_placed": dict(self.points_not_placed),
             "left_out": list(self.left_out),
             "finding": self.finding,
         }
@@ -83,9 +83,9 @@ class Oriented(TableMethods):
         """One row an image or a point: columns kind, id, oriented, reason (of those that could not
         be oriented)."""
         found = [("image", id, True, "") for id in self.network.images.id]
-        found += [("image", id, False, why) for id, why in self.images.items()]
+        found += [("image", id, False, why) for id, why in self.images_not_placed.items()]
         found += [("point", id, True, "") for id in self.network.points.id]
-        found += [("point", id, False, why) for id, why in self.points.items()]
+        found += [("point", id, False, why) for id, why in self.points_not_placed.items()]
         kind, id, oriented, reason = zip(*found) if found else ((), (), (), ())
         return {
             "kind": np.array(kind, dtype=object),
@@ -97,10 +97,13 @@ class Oriented(TableMethods):
     def __str__(self) -> str:
         placed, known = len(self.network.images), len(self.network.points)
         lines = [
-            f"placed {count(placed, 'image')} of {placed + len(self.images)} and "
-            f"{count(known, 'point')} of {known + len(self.points)}, {self.frame}"
+            f"placed {count(placed, 'image')} of {placed + len(self.images_not_placed)} and "
+            f"{count(known, 'point')} of {known + len(self.points_not_placed)}, {self.frame}"
         ]
-        for thing, reasons in (("image", self.images), ("point", self.points)):
+        for thing, reasons in (
+            ("image", self.images_not_placed),
+            ("point", self.points_not_placed),
+        ):
             lines += [f"{thing} {id} not placed: {why}" for id, why in reasons.items()]
         if self.left_out:
             names = list_some(self.left_out, 5, str)
@@ -124,7 +127,8 @@ def lacks_start_values(network: Network) -> bool:
 
 def without_placeholders(network: Network) -> Network:
     """The network without start values that say nothing, with a warning: of two and more tie points
-    that are all at one place, or images that all have one orientation, as of columns of zeros."""
+    all at one place, or all images with one pose, as from columns of zeros. (With σ, poses are
+    observations, and stay.)"""
     images, points = network.images, network.points
     position, angles, X = images.position, images.angles, points.position
     said = []
@@ -162,6 +166,7 @@ def find_start_values(
     Returns and raises like `jaxbundle.orient`, which adds intermediate adjustments.
     """
     network = check_tables(network)
+    # Observations of further kinds may give start values, as satellite positions do.
     for rows in network.further:
         network = rows.begin(network)
     seen = sights(network, tolerance)
@@ -264,9 +269,10 @@ def _place_doubtful_again(
     settings: StartValueSettings,
 ) -> Model:
     """The model, or a better one in which images with few agreeing rays are resected again, from
-    the points of the others. An image that repeated parts of an object place wrongly was resected
-    from few points, and hides it by leaving the others unknown."""
+    the points of the others. An image misplaced because parts of the object repeat was resected
+    from few points; the error does not show, since its other points stay unknown."""
     placed = model.placed
+    # The points of an image are checked by two others.
     if placed.sum() < 3:
         return model
     agreeing, share = _count_agreeing(seen, model)
@@ -317,6 +323,7 @@ def _with_approximate_points(network: Network, model: Model, settings: StartValu
     given = np.isfinite(points.position).all(1) & ~points.has_role("check")
     given &= are_held(points, settings) | ~are_controlled(points)
     X = np.where(given[:, None], points.position, model.X)
+    # A copy: `grow` changes it in place, and this attempt may be discarded.
     return dataclasses.replace(model, X=X, known=model.known | given, placed=model.placed.copy())
 
 
@@ -349,6 +356,7 @@ def _grow_from_a_pair(
 def _result(
     network: Network, seen: Sights, model: Model, frame: str, settings: StartValueSettings
 ) -> Oriented:
+    """The network with the start values of a model, and reasons where there are none."""
     images, points = network.images, network.points
     position, angles = images.position.copy(), images.angles.copy()
     lacking = model.placed & ~np.isfinite(np.concatenate([position, angles], 1)).all(1)
@@ -357,6 +365,7 @@ def _result(
     of_image = lambda rows: np.bincount(seen.image, rows, minlength=seen.images)
     wrong_share = 1 - settings.agreeing_share
     disagrees = of_image(gross) > wrong_share * of_image(model.known[seen.point])
+    # In the model itself: `find_start_values` counts only the images left.
     model.placed[lacking & disagrees] = False
     lacking &= model.placed
     position[lacking] = model.X0[lacking]

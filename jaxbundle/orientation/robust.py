@@ -40,11 +40,12 @@ from jaxbundle.orientation.status import Status
 from jaxbundle.orientation.three_points import three_points
 from jaxbundle.types import AnyArray, Scalar
 
-# Error of an observation that is impossible in a model (a point behind the camera): above every
-# threshold in use, and finite, so that sums of other errors still rank two bad models.
+# Error of an observation that is impossible in a model (a point behind the camera, NaN): above
+# every threshold in use.
 IMPOSSIBLE_ERROR = 1e6
 # Observations beyond this number of robust standard deviations are gross errors (LMedS): the value
-# of Rousseeuw and Leroy (1987), beyond which 1.2 % of good normal observations are.
+# of Rousseeuw and Leroy (1987), beyond which 1.2 % of good normal observations are. The norm of two
+# coordinates has a larger median, and the limit is 4.4 σ of one of them (0.007 %); of three, 5.7 σ.
 OUTLIER_LIMIT = 2.5
 
 
@@ -57,10 +58,12 @@ class Consensus(eqx.Module):
 
 
 def samples_needed(size: int, gross: float = 0.4, confidence: float = 0.999) -> int:
-    """Number of samples of `size` of which one is free of errors, as probable as `confidence`.
+    """Number of samples of `size` observations of which at least one is free of gross errors, with
+    the probability `confidence`.
 
-    The functions below draw 1.2 to 2 times as many by default: a sample free of gross errors may
-    still be a poor one, of points close together.
+    The functions below draw 1.2 to 2.1 times as many by default: a sample free of gross errors may
+    still be a poor one, of points close together. 0.4: a share of gross errors well below the half
+    at which the median breaks down; 0.999: one failure in a thousand calls.
     """
     return ceil(log(1 - confidence) / log(1 - (1 - gross) ** size))
 
@@ -85,6 +88,7 @@ def consensus(
     present = ones_unless(weights, data[0]) > 0
     n = present.shape[0]
     draws = jax.random.uniform(key, (samples, n))
+    # The `size` largest of uniform numbers: a sample without repetition; absent ones come last.
     _, chosen = jax.lax.top_k(jnp.where(present, draws, -1), size)
     models, valid = jax.vmap(lambda k: solve(*(a[k] for a in data)))(chosen)
     models = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), models)
@@ -110,9 +114,10 @@ def robust_limit(
     """OUTLIER_LIMIT·σ with σ = 1.4826·(1 + 5/(n − size))·median e (Rousseeuw and Leroy, 1987, p.
     202)."""
     redundancy = jnp.maximum(jnp.sum(present) - size, 1)
-    # 1.4826 = 1/Φ⁻¹(3/4) makes the median a σ of normal errors; the bracket corrects that a sample
-    # chosen for a small median has too small a one. At least 1e-11, a hundred thousand roundings of
-    # coordinates of size 1: of exact data the median is rounding, and half would be gross errors.
+    # 1.4826 = 1/Φ⁻¹(3/4) makes the median a σ of normal errors; the bracket corrects for the median
+    # being too small in a sample chosen to minimise it. At least 1e-11, a hundred thousand
+    # roundings of coordinates of size 1: of exact data the median is rounding, and half would be
+    # gross errors.
     sigma = jnp.maximum(1.4826 * (1 + 5 / redundancy) * _median(e, present), 1e-11)
     return OUTLIER_LIMIT * sigma
 
@@ -159,8 +164,8 @@ def robust_relative_orientation(
 ) -> tuple[RelativeOrientation, Bool[Array, " n"]]:
     """Relative orientation of points with up to 40 % gross errors, and which points are good.
 
-    Arguments as in `relative_orientation` and `consensus`. A gross error along the epipolar line is
-    not detectable.
+    Arguments as in `relative_orientation` and `consensus`; the threshold is a Sampson distance,
+    c = 1. A gross error along the epipolar line is not detectable.
     """
     p = ones_unless(weights, xy1)
 
@@ -219,7 +224,7 @@ def robust_homography(
         return jnp.linalg.norm(image - target, axis=1)
 
     data = (source, target)
-    return _robust_linear(key, homography, errors, data, weights, 4, samples, threshold)
+    return _robust_weighted(key, homography, errors, data, weights, 4, samples, threshold)
 
 
 def robust_absolute_orientation(
@@ -244,7 +249,7 @@ def robust_absolute_orientation(
         return jnp.linalg.norm(moved - target, axis=1)
 
     data = (source, target)
-    return _robust_linear(key, absolute_orientation, errors, data, weights, 3, samples, threshold)
+    return _robust_weighted(key, absolute_orientation, errors, data, weights, 3, samples, threshold)
 
 
 def robust_direct_linear_transformation(
@@ -268,7 +273,7 @@ def robust_direct_linear_transformation(
         return jnp.where(w > 0, jnp.hypot(x / w - xy[:, 0], y / w - xy[:, 1]), IMPOSSIBLE_ERROR)
 
     solve = direct_linear_transformation
-    return _robust_linear(key, solve, errors, (xy, X), weights, 6, samples, threshold)
+    return _robust_weighted(key, solve, errors, (xy, X), weights, 6, samples, threshold)
 
 
 def robust_intersection(
@@ -289,13 +294,13 @@ def robust_intersection(
     ) -> Float[Array, " n"]:
         d = found.X - X0
         along = jnp.sum(d * rays, 1)
-        angle = jnp.arctan2(jnp.linalg.norm(jnp.cross(d, rays), axis=1), jnp.abs(along))
+        angle = jnp.arctan2(jnp.linalg.norm(jnp.cross(d, rays), axis=1), along)
         return jnp.where(along > 0, angle, IMPOSSIBLE_ERROR)
 
-    return _robust_linear(key, intersection, errors, (X0, rays), weights, 2, samples, threshold)
+    return _robust_weighted(key, intersection, errors, (X0, rays), weights, 2, samples, threshold)
 
 
-def _robust_linear(
+def _robust_weighted(
     key: AnyArray,
     solve: Callable,
     errors: Callable,

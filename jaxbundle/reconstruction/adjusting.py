@@ -6,8 +6,8 @@
 
        f² = Σ(v/σ)²/Σr,        r = 1 − 3/(2n) for a point with n rays,
 
-   over normalised residuals v/(σ·√r) below `gross_residual`·f. (2n coordinates determine 3 of the
-   point; what they add to images and cameras is neglected.)
+   over the measurements whose normalised residual v/(σ·√r) is below `gross_residual`·f. (2n
+   coordinates determine 3 of the point; what they add to images and cameras is neglected.)
 3. Data snooping, and 2. again for the remaining measurements, with their redundancy numbers, until
    the factors converge.
 """
@@ -39,8 +39,8 @@ class WeightingSettings:
 
     gross_residual: float = 4.0
     """Normalised residuals above it, in factors of their kind, take no part in its factor. Normally
-    distributed ones are cut off with 6e-5, which reduces the factor by 0.05 %; at 3 it would be
-    1.3 %, and larger limits let small gross errors in."""
+    distributed ones are cut off with a probability of 6e-5, which reduces the factor by 0.05 %; at
+    3 it would be 1.3 %, and larger limits let small gross errors in."""
     suspect_residual: float = 5.0
     """Normalised residual, in factors of its kind, above which an image point is excluded when data
     snooping begins, with a probability of 6e-7; snooping restores it if it agrees. Smaller: more to
@@ -66,8 +66,9 @@ class WeightingSettings:
     """Share of gross errors that, together with `some_misfit`, makes a result doubtful: undetected
     ones may distort it."""
     some_misfit: float = 2.0
-    """Factor of σ of the other measurements for the same: around the fountain of the set `loop` it
-    is 1.3, on facades, which repeat themselves, 1.5 to 3."""
+    """Largest factor of σ (`WeightedAdjustment.worst`) above which a result with `some_errors` is
+    doubtful: around the fountain of the set `loop` it is 1.3, on facades, which repeat themselves,
+    1.5 to 3."""
     agreeing_ray: float = 0.001
     """Maximum misclosure of a ray that agrees with a result, relative to the image extent: 3 pixels
     of 3000, like the tolerance of verified pairs."""
@@ -75,8 +76,9 @@ class WeightingSettings:
 
 @dataclasses.dataclass(frozen=True)
 class WeightedAdjustment:
-    """The adjustment, and the factor of σ of each kind of measurement, which is also in it; the
-    number of measurements that agree with it, and `unused_points` of two rays."""
+    """The adjustment, and the factor of σ of each kind of measurement, which the adjustment has as
+    its `sigma_factors`; the number of measurements that agree with it, and `unused_points` of two
+    rays."""
 
     adjustment: Adjustment
     factors: dict[str, float]
@@ -89,8 +91,8 @@ class WeightedAdjustment:
         return max(self.factors.values(), default=1.0)
 
     def __post_init__(self) -> None:
-        # σ estimated from the residuals are not confirmed by them: no χ² test, also not of the
-        # adjustment to control that takes the place of this one
+        # σ estimated from the residuals are not confirmed by them: no χ² test, neither of this
+        # adjustment nor of that to control which takes its place (`control.py`)
         if self.adjustment.converged:
             factors = {f"image points {name}": f for name, f in self.factors.items()}
             changed = self.adjustment.with_changes(sigma_factors=factors)
@@ -109,7 +111,8 @@ def adjust_weighted(
     a doubtful one, adjust again without points of two rays, whose gross errors can hardly be
     detected: where an object repeats itself, some agree with its photographs by chance.
 
-    **Arguments:** `kinds`: of every observation of the network.
+    **Arguments:** `kinds`: of every observation of the network, with their `names`;
+    `significance`: of data snooping; `tell(stage)`.
 
     **Raises:** as `jaxbundle.adjust`; `NotSolvedError` if, with very many gross errors, points of
     three rays do not confirm the result.
@@ -223,6 +226,7 @@ def limit_iterations(network: Network) -> int:
 
 def _are_determined(network: Network, undetermined: Iterable[str]) -> Bool[np.ndarray, " points"]:
     """False for tie points named among the undetermined."""
+    # as `leastsquares.quality.names` writes them: "X of point 17"
     lost = {name.partition(" of point ")[2] for name in undetermined}
     tie = network.points.has_role("tie")
     return ~(tie & np.isin(np.array(network.points.id, object), [*lost]))
@@ -240,27 +244,27 @@ def _weight(
     tell("adjustment")
     result, network, kept = adjust_determined(network)
     kinds, sigma = kinds[kept], network.observations.sigma
-    total, suspects = np.ones(len(kept)), []
+    factor_so_far, suspects = np.ones(len(kept)), []
     if result.converged:
-        (w, r), rows = _approximate_redundancy(result), _rows(result, network)
-        total[rows] = _factors(w, r, kinds[rows], settings, settings.gross_residual)
+        (v, r), rows = _approximate_redundancy(result), _rows(result, network)
+        factor_so_far[rows] = _factors(v, r, kinds[rows], settings, settings.gross_residual)
         # r ≥ 1/4 for two rays; one ray, r < 0, is judged like those that are hardly checked
-        beyond = np.abs(w) / np.sqrt(np.maximum(r, 0.1)) > (
-            settings.suspect_residual * total[rows, None]
+        beyond = np.abs(v) / np.sqrt(np.maximum(r, 0.1)) > (
+            settings.suspect_residual * factor_so_far[rows, None]
         )
-        suspects = _name(result, np.any(beyond, axis=1))
+        suspects = _pairs_of_ids(result, np.any(beyond, axis=1))
         # once: a datum that changes with each round would change all σ, too
         network = network.replace(datum_points=choose_datum_points(result))
     for _ in range(settings.max_rounds):
         tell("data snooping")
-        weighted = dataclasses.replace(network.observations, sigma=sigma * total[:, None])
+        weighted = dataclasses.replace(network.observations, sigma=sigma * factor_so_far[:, None])
         result, network, kept = adjust_determined(
             network.replace(observations=weighted),
             snooping="pope",
             significance=significance,
             doubtful=suspects,
         )
-        kinds, sigma, total = kinds[kept], sigma[kept], total[kept]
+        kinds, sigma, factor_so_far = kinds[kept], sigma[kept], factor_so_far[kept]
         if not result.converged:
             break
         rows = _rows(result, network)
@@ -268,10 +272,12 @@ def _weight(
         factor = _factors(*_redundancy(result), kinds[rows], settings, np.inf)
         if np.all(np.abs(factor - 1) < settings.last_change):
             break
-        total[rows] *= factor
-        suspects = _name(result, ~result.problem.used)
+        factor_so_far[rows] *= factor
+        suspects = _pairs_of_ids(result, ~result.problem.used)
     factors = {
-        name: float(np.median(total[kinds == k])) for k, name in names.items() if (kinds == k).any()
+        name: float(np.median(factor_so_far[kinds == k]))
+        for k, name in names.items()
+        if (kinds == k).any()
     }
     return WeightedAdjustment(result, factors, int(result.problem.used.sum()))
 
@@ -280,7 +286,7 @@ def _rows(result: Adjustment, network: Network) -> Int[np.ndarray, " rays"]:
     """For every image point of a result its row in the network, without excluded ones."""
     rays = network.observations
     index = {ids: k for k, ids in enumerate(_ids(network, rays.image, rays.point))}
-    return np.array([index[ids] for ids in _name(result, slice(None))], int)
+    return np.array([index[ids] for ids in _pairs_of_ids(result, slice(None))], int)
 
 
 def _ids(
@@ -291,7 +297,9 @@ def _ids(
     return [(images[i], points[p]) for i, p in zip(image.tolist(), point.tolist())]
 
 
-def _name(result: Adjustment, rows: slice | Bool[np.ndarray, " rays"]) -> list[tuple[str, str]]:
+def _pairs_of_ids(
+    result: Adjustment, rows: slice | Bool[np.ndarray, " rays"]
+) -> list[tuple[str, str]]:
     """Image and point, by id, of image points."""
     problem = result.problem
     return _ids(result.network, problem.image[rows], problem.point[rows])
@@ -302,9 +310,9 @@ def _approximate_redundancy(
 ) -> tuple[Float[np.ndarray, "rays 2"], Float[np.ndarray, "rays 2"]]:
     """v/σ of the rays, and redundancy numbers from the number of rays of their points: exact ones
     need the cofactors of the whole network, which gross errors would spoil."""
-    w = result.inspection.image_residuals
+    v = result.inspection.image_residuals
     rays = np.bincount(result.problem.point)[result.problem.point]
-    return w, np.repeat(1 - 3 / (2 * rays[:, None]), 2, 1)
+    return v, np.repeat(1 - 3 / (2 * rays[:, None]), 2, 1)
 
 
 def _redundancy(
@@ -312,25 +320,26 @@ def _redundancy(
 ) -> tuple[Float[np.ndarray, "rays 2"], Float[np.ndarray, "rays 2"]]:
     """v/σ of the rays, NaN of excluded ones, and their redundancy numbers."""
     reliability, problem = result.reliability, result.problem
-    w, r = (problem.image_points(x) for x in (reliability.residual, reliability.redundancy))
-    return np.where(problem.used_coordinates, w, np.nan), r
+    v, r = (problem.image_points(x) for x in (reliability.residual, reliability.redundancy))
+    return np.where(problem.used_coordinates, v, np.nan), r
 
 
 def _factors(
-    w: Float[np.ndarray, "rays 2"],
+    v: Float[np.ndarray, "rays 2"],
     r: Float[np.ndarray, "rays 2"],
     kinds: Int[np.ndarray, " rays"],
     settings: WeightingSettings,
     gross: float,
 ) -> Float[np.ndarray, " rays"]:
-    """Factors of the σ of every ray, from normalised residuals below `gross` factors."""
+    """Factors of the σ of every ray, from v/σ, of normalised residuals below `gross` factors."""
+    # of rows that are not judged (below): no division by 0
     r = np.maximum(r, 1e-3)
-    factor = np.ones(len(w))
+    factor = np.ones(len(v))
     for kind in np.unique(kinds):
         rows = kinds == kind
-        normalised_residual, redundancy = np.abs(w[rows]) / np.sqrt(r[rows]), r[rows]
-        # with r below 0.05 the residual is less than a fifth of an error, and that of rounding
-        # and neglected terms counts
+        normalised_residual, redundancy = np.abs(v[rows]) / np.sqrt(r[rows]), r[rows]
+        # with r below 0.05 less than a twentieth of an error appears in the residual, as much as
+        # rounding and neglected terms
         checked = np.isfinite(normalised_residual) & (redundancy > 0.05)
         if checked.sum() < 2 * settings.min_measurements:
             continue
@@ -339,6 +348,6 @@ def _factors(
         # the choice of good ones and the factor depend on each other; five rounds settle both
         for _ in range(5):
             good = checked & (normalised_residual < gross * max(scale, 1e-9))
-            scale = np.sqrt(np.sum(w[rows][good] ** 2) / np.sum(redundancy[good]))
+            scale = np.sqrt(np.sum(v[rows][good] ** 2) / np.sum(redundancy[good]))
         factor[rows] = np.clip(scale, settings.min_factor, settings.max_factor)
     return factor

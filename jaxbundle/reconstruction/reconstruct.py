@@ -444,7 +444,7 @@ class _ReconstructionRun:
             self._warn(f"{name}: {misfit_in_words(part)}", part.misfit)
         for said in (*self._compare_with_files(weighted.adjustment), *doubts):
             self._warn(f"{name}: {said}")
-        return part, dict(oriented.images)
+        return part, dict(oriented.images_not_placed)
 
     def _compare_with_files(self, result: Adjustment) -> list[str]:
         """Principal distances that contradict those of the files, in words."""

@@ -82,10 +82,10 @@ def start_values(
             failed = error
         else:
             # a wide tolerance lets wrong points in: only if the narrow one loses photographs
-            if not candidates[-1].images:
+            if not candidates[-1].images_not_placed:
                 break
     # those that leave out the fewest photographs first
-    yield from sorted(candidates, key=lambda oriented: len(oriented.images))
+    yield from sorted(candidates, key=lambda oriented: len(oriented.images_not_placed))
     others = []
     for changed in _try_other_distances(network, guessed, settings):
         try:
@@ -111,7 +111,7 @@ def _orient(
     if misplaced:
         others = _without(network, np.isin(np.array(network.images.id), [*misplaced]))
         oriented = orient(others, tolerance=tolerance)
-    network, images = oriented.network, {**oriented.images, **misplaced}
+    network, images = oriented.network, {**oriented.images_not_placed, **misplaced}
     # leaving out one photograph takes rays from the points of others: until none has too few
     while True:
         rays = np.bincount(network.observations.point, minlength=len(network.points))
@@ -119,7 +119,7 @@ def _orient(
         number = np.bincount(network.observations.image, tied, len(network.images))
         few = number < settings.min_rays
         if not few.any() or few.all():
-            return dataclasses.replace(oriented, network=network, images=images)
+            return dataclasses.replace(oriented, network=network, images_not_placed=images)
         for k in np.flatnonzero(few):
             why = f"only {int(number[k])} of its points agree with the others"
             images[network.images.id[k]] = why
@@ -182,7 +182,7 @@ def start_again(
     settings: BlockStartSettings = BlockStartSettings(),
 ) -> Oriented | None:
     """Start values with the adjusted cameras, if these orient more photographs."""
-    if not oriented.images:
+    if not oriented.images_not_placed:
         return None
     better: Mapping[str, Camera] = {
         c.id: dataclasses.replace(c, parameters={**c.parameters, **_parameters(result, c)})
@@ -197,7 +197,7 @@ def start_again(
         again = _orient(changed, settings.tolerance, pairs if near else {}, settings)
     except NotSolvedError:
         return None
-    return again if len(again.images) < len(oriented.images) else None
+    return again if len(again.images_not_placed) < len(oriented.images_not_placed) else None
 
 
 def _parameters(result: Adjustment, camera: Camera) -> dict[str, float]:

@@ -4,7 +4,8 @@ At the coarsest level of the pyramids all positions between the bounds are compa
 in all images at once, with semi-global aggregation. Every finer level searches around the result of
 its neighbours in the coarser one, with windows on the plane through these.
 
-    rate = pixels of the other image per unit of q, the greatest of all images
+    q:    the parameter along a line of sight: 1/s of a photograph, the height of a scanner image
+    rate: pixels of the other image per unit of q, the greatest of all images
 """
 
 import dataclasses
@@ -22,7 +23,7 @@ from jaxbundle.surfaces.views import OrientedImage, Places
 
 # Those of the base image and of the others.
 ImagePyramids = tuple[Pyramid, Sequence[Pyramid]]
-Depths = Float[np.ndarray, " n"]
+PerNode = Float[np.ndarray, " n"]
 Nodes = Float[np.ndarray, "r c"]
 ArrayRecord = TypeVar("ArrayRecord", Segments, Windows)
 
@@ -60,8 +61,8 @@ class GuideSettings:
     """Maximum distance of a node from the median of its neighbours, pixels. Half and double: the
     same points within 1, RMS 0.99."""
     max_slope: float = 0.7
-    """Change of position from node to node on one plane, relative to their distance. Half: RMS
-    1.006; double: 0.998."""
+    """Maximum change of position from node to node on one plane, relative to their distance. Half:
+    RMS 1.006; double: 0.998."""
     small_change: float = 0.08
     """P₁ of the semi-global aggregation, for costs 1 − ρ. Half and double: the same points within
     1."""
@@ -168,9 +169,9 @@ def _place_nodes(base: OrientedImage, level: int, spacing: int) -> tuple[Places,
 class NodeMatches(NamedTuple):
     """q of nodes (NaN: none), pixels of another image per unit of q, ρ."""
 
-    q: Depths
-    rate: Depths
-    rho: Depths
+    q: PerNode
+    rate: PerNode
+    rho: PerNode
 
 
 class PairSearch(NamedTuple):
@@ -241,20 +242,22 @@ def _prepare_searches(
     settings: GuideSettings,
 ) -> tuple[list[PairSearch], int]:
     """The images in which nodes are visible, and the number of common positions of all."""
+    # at least 8 positions: a peak, its neighbours, and others to tell it from (`find_peaks`)
     searches, steps = [], 8
     for other, pyramid in zip(others, pyramids):
         r = visible_range(base, other, uv, q)
         visible = np.isfinite(r).all(1) & (r[:, 0] < r[:, 1])
         window = windows(base, other, base.points(uv, np.where(visible, r.mean(1), 1.0)))
         segment = segments(base, other, uv, np.where(visible[:, None], r, np.nan))
-        spacing = 2.0**level * np.linalg.norm(window.other_axis, axis=1)
+        step_length = 2.0**level * np.linalg.norm(window.other_axis, axis=1)
         with np.errstate(invalid="ignore"):
-            number = segment.length / spacing
+            number = segment.length / step_length
             share = (r[:, 1] - r[:, 0]) / (q[:, 1] - q[:, 0])
         visible = visible & window.usable & np.isfinite(number)
         if visible.any():
             # One number for all nodes, for arrays without gaps. The longest 2 % of the segments are
-            # those at the edge of a wide image: they would double the positions of all.
+            # those at the edge of a wide image: they would double the positions of all. Three more
+            # positions: n steps have n + 1, and a peak at either end needs a neighbour beyond.
             number_here = int(np.ceil(np.percentile(number[visible], 98))) + 3
             steps = max(steps, int(np.ceil(np.percentile((number / share)[visible], 98))) + 1)
             number_here = min(number_here, settings.max_steps)
@@ -277,9 +280,9 @@ def _correlate_at(
 ) -> Float[np.ndarray, "n k"]:
     """ρ at common parameters, interpolated along each segment."""
     rho, _ = correlate(pair, pyramids, uv, segment, window, level=level, half=half, steps=steps)
-    spacing = 2.0**level * np.linalg.norm(window.other_axis, axis=1)[:, None]
+    step_length = 2.0**level * np.linalg.norm(window.other_axis, axis=1)[:, None]
     with np.errstate(invalid="ignore", divide="ignore"):
-        index = (segment.length_at(common) - segment.length[:, None] / 2) / spacing + (
+        index = (segment.length_at(common) - segment.length[:, None] / 2) / step_length + (
             steps - 1
         ) / 2
         inside = (index >= 0) & (index <= steps - 1) & visible[:, None]
@@ -320,7 +323,7 @@ def search(
     settings: GuideSettings,
 ) -> Float[np.ndarray, "3 n"]:
     """The best position of each point between its bounds, in all images: q, ρ, and the largest ρ
-    other than its neighbours. Points with segments of similar length are processed together."""
+    more than two positions away. Points with segments of similar length are processed together."""
     middle = base.points(uv, q.mean(1))
     window = [windows(base, other, middle, normal) for other in others]
     segment = [segments(base, other, uv, q) for other in others]
@@ -386,7 +389,7 @@ def _smooth(
     with np.errstate(invalid="ignore"):
         known &= np.abs(q - middle) * rate <= settings.max_deviation * 2.0**level
     filled = np.where(known, q, middle)
-    filled = _fill_from_nearest(np.where(np.isfinite(filled), filled, np.nan), q)
+    filled = _fill_from_nearest(filled, q)
     X = base.points(uv, filled.ravel()).reshape(*shape, 3)
     return Guide(
         step,
@@ -400,7 +403,8 @@ def _smooth(
 
 
 def _median(q: Nodes) -> Nodes:
-    """Median of the known ones of the 3 × 3 nodes around each; NaN: fewer than 3."""
+    """Median of the known ones of the 3 × 3 nodes around each; NaN: fewer than 3, of which a wrong
+    one may be the median."""
     padded = np.pad(q, 1, constant_values=np.nan)
     nine = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).reshape(*q.shape, 9)
     enough = np.isfinite(nine).sum(-1) >= 3
@@ -441,7 +445,9 @@ def _normals(
         bent |= np.pad(off, width)
         width[axis] = (0, 1)
         bent |= np.pad(off, width)
-    d = X - base.points(uv, q.ravel() * 1.01).reshape(X.shape)
+    # the line of sight, to a point one pixel of the other image nearer (q itself may be 0: a
+    # height)
+    d = X - base.points(uv, (q + 1 / rate).ravel()).reshape(X.shape)
     bent |= ~(np.linalg.norm(normal, axis=-1) > 0)
     found = np.where(bent[..., None], d, normal)
     return found / np.linalg.norm(found, axis=-1, keepdims=True)

@@ -53,8 +53,8 @@ class ClosureSettings:
     """Size of the last steps, in ln c, K1 and the sum: the adjustment estimates both anew, and
     starts from values that are a few per cent wrong."""
     max_evaluations: int = 40
-    """Maximum evaluations of one search, each a refinement of all pairs. What is not
-    reached then, the adjustment does."""
+    """Maximum evaluations of one search, each a refinement of all pairs. A search that is cut
+    off has come nearer, and the adjustment estimates both anew."""
     clear_sum: float = 0.5
     """Sum per independent loop below which no other first principal distance is tried: that of
     loops with ω = 0.8·ω₀."""
@@ -83,8 +83,8 @@ def close_rotations(
 ) -> Interior:
     """ln c and K1 with which rotations close; the start value if there are too few loops.
 
-    **Arguments:** `orient`: orients the pairs robustly with an interior orientation; `middle`: ln c
-    before; default: that of `start`.
+    **Arguments:** `orient`: orients the pairs robustly with an interior orientation; `middle`: the
+    ln c about which ln c is weighted (`sigma_log_distance`); default: that of `start`.
     """
     middle = float(start[0]) if middle is None else middle
     minima = []
@@ -92,26 +92,26 @@ def close_rotations(
         first = start + [np.log(factor), 0.0]
         minimum = _search(orient(first), first, middle, settings)
         if minimum is not None:
-            if minimum.sum < settings.clear_sum:
+            if minimum.per_loop < settings.clear_sum:
                 return minimum.interior
             minima.append(minimum)
     if not minima:
         return start
     # with a wrong camera few pairs are oriented, and a few loops may close by chance: only minima
     # with more than half of the largest number of loops are compared
-    most = max(minimum.loops for minimum in minima)
-    many = [minimum for minimum in minima if 2 * minimum.loops > most]
-    best = min(many, key=lambda minimum: minimum.sum).interior
+    most = max(minimum.independent for minimum in minima)
+    many = [minimum for minimum in minima if 2 * minimum.independent > most]
+    best = min(many, key=lambda minimum: minimum.per_loop).interior
     again = _search(orient(best), best, middle, settings)
     return best if again is None else again.interior
 
 
 class ClosureMinimum(NamedTuple):
-    """A minimum, the sum per independent loop, and their number."""
+    """A minimum, the sum per independent loop, and the number of independent loops."""
 
     interior: Interior
-    sum: float
-    loops: int
+    per_loop: float
+    independent: int
 
 
 def _search(
@@ -135,8 +135,8 @@ def _search(
         off = (x[0] - middle) / settings.sigma_log_distance, x[1] / settings.sigma_k1
         return misclosure + off[0] ** 2 + off[1] ** 2
 
-    # without derivatives: each evaluation re-weights every pair, and the sum has kinks where wrong
-    # loops close
+    # without derivatives: each evaluation refines every pair anew (and may lose rays at the
+    # border), and the sum has kinks where wrong loops close
     simplex = first + np.array([[0, 0], [settings.step_log_distance, 0], [0, settings.step_k1]])
     minimum = minimize(
         total,
@@ -168,7 +168,8 @@ def count_independent(pairs: Sequence[tuple[int, int]]) -> int:
 
 
 def find_loops(pairs: Sequence[tuple[int, int]]) -> Int[np.ndarray, "loops 3"]:
-    """Positions of the pairs ij, jk and ik of every three photographs that have them."""
+    """Positions of the pairs ij, jk and ik of every three photographs that have them; each pair
+    (i, j) has i < j."""
     row = {pair: k for k, pair in enumerate(pairs)}
     after: dict[int, set[int]] = {}
     for i, j in pairs:

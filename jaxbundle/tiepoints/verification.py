@@ -70,9 +70,9 @@ class VerificationSettings:
     """Minimum standard deviation of agreeing matches across their longest direction, relative to
     that of a photograph's features: not a spot, and not a line. An object in a tenth of a
     photograph has 0.3."""
-    first_tolerance: float = 3.0
-    """The first choice of matches, in tolerances: an orientation from five matches predicts the
-    others worse than one refined with all of them."""
+    first_factor: float = 3.0
+    """The tolerance of the first choice of matches, as a factor of `tolerance`: an orientation from
+    five matches predicts the others worse than one refined with all of them."""
     rotation_trials: int = 40
     """Number of pairs of matches for trial rotations: with half of the matches right (fewer are
     not accepted) all trials have a wrong match with a probability of 0.75⁴⁰ = 1e-5."""
@@ -183,9 +183,11 @@ def _find_agreeing(
     matches may be wrong."""
     rows = {k: r for k, r in rows.items() if len(r) >= settings.min_matches}
     # the most distinct ones, but all of a few
-    clear = lambda n: batched.spread(max(int(settings.distinct_share * n), min(n, batched.SLOTS)))
-    first = _orient_by_rows(rows, clear, xy1, xy2, tolerance, settings)
-    # A second trial with the first `batched.SLOTS` needs a first one with more.
+    distinct = lambda n: batched.spread(
+        max(int(settings.distinct_share * n), min(n, batched.SLOTS))
+    )
+    first = _orient_by_rows(rows, distinct, xy1, xy2, tolerance, settings)
+    # The first `batched.SLOTS` are another trial only if the first trial was spread over more.
     again = {
         k: r
         for k, r in rows.items()
@@ -197,26 +199,26 @@ def _find_agreeing(
 
 def _orient_by_rows(
     rows: Mapping[int, Int[np.ndarray, " _"]],
-    clear: Callable[[int], Int[np.ndarray, " _"]],
+    choose: Callable[[int], Int[np.ndarray, " _"]],
     xy1: Sequence[Float[np.ndarray, "_ 2"]],
     xy2: Sequence[Float[np.ndarray, "_ 2"]],
     tolerance: Float[np.ndarray, " pairs"],
     settings: VerificationSettings,
 ) -> dict[int, Agreement]:
-    """By pair, the matches that agree with the orientation from those that `clear` chooses of the
-    number of `rows`, if enough of `rows` do."""
+    """By pair, the matches that agree with the orientation from the rows that `choose(len(rows))`
+    selects, if enough of all `rows` agree."""
     if not rows:
         return {}
     keys = np.array(list(rows))
-    few = [rows[k][clear(len(rows[k]))] for k in rows]
+    few = [rows[k][choose(len(rows[k]))] for k in rows]
     M, b, part, _ = batched.orient_pairs(
         [xy1[k][r] for k, r in zip(rows, few)],
         [xy2[k][r] for k, r in zip(rows, few)],
-        settings.first_tolerance * tolerance[keys],
+        settings.first_factor * tolerance[keys],
     )
     poses = {k: (M[i], b[i]) for i, k in enumerate(rows) if part[i] > 0}
     # matches and orientation by turns, the second time with those of the final tolerance
-    for factor in (settings.first_tolerance, 1.0):
+    for factor in (settings.first_factor, 1.0):
         poses = _improve(poses, rows, xy1, xy2, factor * tolerance, settings.min_matches)
     agreed = {}
     for k, (M, b) in poses.items():
@@ -353,6 +355,7 @@ def _used_slots(rows: Sequence[Int[np.ndarray, " _"]]) -> Float[np.ndarray, "pai
 
 
 def _fill(a: Float[np.ndarray, "n *shape"]) -> Float[np.ndarray, "slots *shape"]:
+    # Cyclically repeated, with weights of 0: rows of zeros have no rays, and 0·NaN is NaN.
     return np.resize(a, (MATCH_SLOTS, *a.shape[1:]))
 
 

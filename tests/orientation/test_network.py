@@ -112,7 +112,7 @@ def test_control_seen_once_throughout(with_control):
     first[np.unique(rays.point, return_index=True)[1]] = True
     network = with_control.network.replace(observations=rays.take(first | (rays.point >= 8)))
     found = orient(bare(network))
-    assert found.frame == "in the frame given" and not found.images
+    assert found.frame == "in the frame given" and not found.images_not_placed
     off = found.network.images.position - with_control.truth.images.position
     assert np.abs(off).max() < 0.05 * 1000
 
@@ -122,7 +122,7 @@ def test_a_strip_that_hangs_together_by_pairs():
     """With few points in three images resection stops, and a pair continues."""
     simulation = block(1, 11, 130, control=())
     found = orient(bare(simulation.network))
-    assert not found.images
+    assert not found.images_not_placed
     truth, position = simulation.truth.images.position, found.network.images.position
     along = np.linalg.norm(np.diff(position, axis=0), axis=1)
     assert np.ptp(along) < 0.3 * along.mean()
@@ -146,7 +146,7 @@ def test_several_cameras_of_several_models():
         stations, targets, cameras, noise=0.01, camera_of_station=[0, 1, 2] * 3
     )
     found = orient(bare(network))
-    assert not found.images and not found.points
+    assert not found.images_not_placed and not found.points_not_placed
     ratio = [
         np.linalg.norm(n.images.position[:, None] - n.images.position[None], axis=-1)
         for n in (found.network, network)
@@ -181,7 +181,7 @@ def test_half_a_network_is_none(solid):
     rays = network.observations
     apart = (rays.image < 5) == (rays.point < 40)
     network = network.replace(observations=rays.take(apart))
-    assert len(orient(network).images) == 5
+    assert len(orient(network).images_not_placed) == 5
     with pytest.raises(NotSolvedError, match="for 5 of 10 images"):
         adjust(network)
 
@@ -192,8 +192,8 @@ def test_what_cannot_be_placed_is_named_with_the_reason(solid):
     rays = network.observations
     keep = (rays.image != 4) | np.isin(rays.point, [10, 11])
     found = orient(network.replace(observations=rays.take(keep)))
-    assert list(found.images) == [network.images.id[4]]
-    assert "2 known points of 2" in found.images[network.images.id[4]]
+    assert list(found.images_not_placed) == [network.images.id[4]]
+    assert "2 known points of 2" in found.images_not_placed[network.images.id[4]]
     assert network.images.id[4] in str(found)
     assert len(found.network.images) == 9
     warning = next(w for w in found.network.notes if w.startswith("left out 1 image"))
@@ -314,7 +314,7 @@ def test_control_in_the_corners_of_a_block():
     """No image sees enough control: pairs first, then the transformation to the control."""
     simulation = block()
     found = orient(bare(simulation.network))
-    assert not found.images and not found.points and "given" in found.frame
+    assert not found.images_not_placed and not found.points_not_placed and "given" in found.frame
     off = found.network.images.position - simulation.truth.images.position
     assert np.abs(off).max() < 0.05 * 1000  # the principal distance is 2 % wrong
     assert_same_answer(simulation.network, bare(simulation.network))
@@ -325,7 +325,7 @@ def test_one_measurement_in_twenty_wrong(with_control):
     """Most blunders are left out with the start values, the rest by data snooping."""
     network = bare(with_blunders(with_control.network, 0.05, 20.0))
     found = orient(network)
-    assert not found.images
+    assert not found.images_not_placed
     off = found.network.images.position - with_control.truth.images.position
     assert np.abs(off).max() < 0.2 * 1000
     result = adjust(network, snooping="pope")
@@ -416,6 +416,6 @@ def test_handheld_control_is_not_refused(with_control):
     xy[wrong] += [15.0, -9.0]
     network = bare(network.replace(points=points, observations=dataclasses.replace(rays, xy=xy)))
     found = orient(network)
-    assert not found.images and not found.finding
+    assert not found.images_not_placed and not found.finding
     name = f"{points.id[control[-1]]} in {network.images.id[rays.image[wrong]]}"
     assert found.left_out == (name,)

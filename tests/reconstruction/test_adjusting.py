@@ -158,8 +158,8 @@ def test_start_values_that_leave_out_the_fewest_photographs_come_first(monkeypat
     """With a narrow tolerance three are left out, with the wide one only one."""
     left_out = {starting.BlockStartSettings().tolerance: "abc", starting.TOLERANCE: "d"}
     assert len(left_out) == 2
-    orient = lambda network, tolerance, *_: SimpleNamespace(images=left_out[tolerance])
+    orient = lambda network, tolerance, *_: SimpleNamespace(images_not_placed=left_out[tolerance])
     monkeypatch.setattr(starting, "_orient", orient)
     monkeypatch.setattr(starting, "_try_other_distances", lambda *_: ())
     found = starting.start_values(SimpleNamespace(images="abcdefgh"), (), {})
-    assert [oriented.images for oriented in found] == ["d", "abc"]
+    assert [oriented.images_not_placed for oriented in found] == ["d", "abc"]

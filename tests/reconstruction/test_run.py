@@ -60,7 +60,7 @@ def test_parts_state_errors_that_image_points_share_unless_turned_off(run, monke
     weighted = SimpleNamespace(adjustment=adjusted, factors={}, unused_points=0)
     none = np.zeros(0, int)
     measured = SimpleNamespace(is_template=none > 0, track=none, colour=np.zeros((0, 3), int))
-    oriented = SimpleNamespace(images={})
+    oriented = SimpleNamespace(images_not_placed={})
     for photograph in run.photographs:
         photograph.exif = None
     for name in ("photograph_network", "refuse_folded", "describe_block"):

@@ -54,7 +54,7 @@ def move_into_datum(
         held = directions_of_motions(declared, {name: values[name] for name in plan.datum.held})
         plan = _keep_held_fixed(declared, plan, values, held)
     pinned = jax.tree.map(np.asarray, present(plan.datum))
-    curved, free = present(declared.motions).curved, _free(plan, declared, values)
+    curved, free = present(declared.motions).curved, _free(declared, plan, values)
     size = float(datum.largest(pinned.weight, start))
 
     def further(values: Values) -> tuple[Values, float]:

@@ -98,7 +98,7 @@ def _survey(
         there = jnp.isfinite(terms).all(1, keepdims=True)
         products.append(jnp.where(there, product, 0.0))
         squares += jnp.where(there, terms**2, 0.0).sum(0)
-    free = free_of_tables(plan, declared, data.start)
+    free = free_of_tables(declared, plan, data.start)
     held = [
         jnp.where((free[name] > 0)[..., None] | ~real[name][:, None, None], 0.0, rows)
         for name, rows in moves.items()

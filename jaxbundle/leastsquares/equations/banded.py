@@ -33,7 +33,8 @@ from jaxbundle.types import present
 
 
 class BandFactor(eqx.Module):
-    """S block tridiagonal with a border; see the module. `below`: C of the next block."""
+    """S block tridiagonal with a border; see the module. `lower`: L_k; `below`: C of the next
+    block; `border`: X; `corner`: the Cholesky factor of the corner."""
 
     plan: Plan
     lower: Float[Array, "blocks m m"]
@@ -77,8 +78,8 @@ class BandFactor(eqx.Module):
         ) -> tuple[tuple[Array, Array], tuple[Array, Array, Array]]:
             D_next, with_border_next = carry
             L, C, X = block
-            # Q_k,k+1 is written E, Q_kk D, Q_kb with_border; the last block has no next one
-            # (zeros).
+            # Q_k,k+1, above the diagonal, is written E, Q_kk D, Q_kb with_border; the last block
+            # has no next one (zeros). Here `corner` is Q_bb.
             divided = lambda b: solve_triangular(L, b, lower=True, trans=1)
             with_border = -divided(C.T @ with_border_next + X @ corner)
             E = -divided(C.T @ D_next + X @ with_border_next.T)
@@ -89,8 +90,8 @@ class BandFactor(eqx.Module):
         start = jnp.zeros((m, m)), jnp.zeros((m, q))
         factor = (self.lower, self.below, self.border)
         _, (D, E, with_border) = jax.lax.scan(backward, start, factor, reverse=True)
-        # Of Q only the blocks in which S has blocks: all that statistics ask for, and all there
-        # are.
+        # Only the blocks of Q where S has blocks: statistics need no others, and the recursion
+        # gives no others.
         Q, index = blocks_of(plan, others, corner), jnp.arange(plan.groups[g].rows)
         Q.own[g] = _blocks(plan, D, E, index, index)
         border = split(plan, others, jnp.moveaxis(_from_band(plan, with_border), -1, 0))
@@ -117,7 +118,7 @@ def factorise_band(plan: Plan, S: Reduced) -> BandFactor:
     w = plan.groups[g].width
     m = width * w
     # Two rows at most one band width apart are in one super-block (0: D) or in two neighbouring
-    # ones (1: E): that is what a width of the band means. One scatter for both.
+    # ones (1: E): this defines the width. One scatter for both.
     both = jnp.zeros((2, blocks, width, width, w, w))
     both = both.at[0, place // width, place % width, place % width].set(S.own[g])
     if (g, g) in S.off:
@@ -132,6 +133,7 @@ def factorise_band(plan: Plan, S: Reduced) -> BandFactor:
     unused = 1.0 - _into_band(plan, jnp.ones(plan.groups[g].free.shape))
     D = D + unused[:, :, None] * jnp.eye(m)
     border = [S.block(plan, g, other) for other in others]
+    # The empty columns: of a band without a border nothing else is joined.
     border = jnp.concatenate([jnp.zeros((plan.groups[g].free.size, 0)), *border], 1)
     # All other groups (shared cameras, mostly): q columns beside the band, dense.
     border = _into_band(plan, border.reshape(plan.groups[g].rows, w, border.shape[1]))
@@ -148,7 +150,8 @@ def factorise_band(plan: Plan, S: Reduced) -> BandFactor:
 
     start = jnp.zeros((m, m)), jnp.zeros((m, border.shape[2]))
     # From super-block to super-block: time and memory grow with the length of the street, not with
-    # its cube. A street of 1723 images has 15 507 unknowns: 1.9 GB dense, 29 images a block.
+    # its cube. A street of 1723 images has 15 507 unknowns: 1.9 GB dense; here in blocks of
+    # 29 images.
     _, (L, C, X) = jax.lax.scan(step, start, (D, E, border))
     corner = S.matrix(plan, others) - jnp.einsum("bmi,bmj->ij", X, X)
     return BandFactor(plan, L, C, X, cholesky_of_lower(corner))

@@ -1,8 +1,8 @@
 """The structured solve: eliminate rows, solve the reduced system, substitute back.
 
-With N = [A W; Wᵀ V] and V block diagonal (Brown 1958; Triggs et al. 2000, section 6.1):
+With N = [A Wᵀ; W V] and V block diagonal (Brown 1958; Triggs et al. 2000, section 6.1):
 
-    V = L·Lᵀ,   Z = L⁻¹·Wᵀ,   h = L⁻¹·b_e
+    V = L·Lᵀ,   Z = L⁻¹·W,   h = L⁻¹·b_e
     S = A − Zᵀ·Z                      (sums over pairs of incidences of one eliminated row)
     S·x = b − Zᵀ·h                    (`reduced.py`)
     x_e = L⁻ᵀ·(h − Z·x)
@@ -37,15 +37,15 @@ from jaxbundle.types import present
 
 # Relative residual of a reduced system solved iteratively to full precision: what one refinement
 # reaches after a run to 1e-10 (`ConjugateGradients.reachable`). A smaller one may be unreachable
-# because of rounding, and open motions drift. Half costs a step of conjugate gradients more, double
-# one less.
+# because of rounding, and the iterates then drift along open motions. Half costs a step of
+# conjugate gradients more, double one less.
 FULL_PRECISION = 1e-12
 # A pivot below this fraction of its diagonal element is rounding: the unknown is undetermined.
 #
 # Measured on 1260 normal matrices of 5 to 200 unknowns with one exactly dependent column: rounding
 # leaves a last pivot of 2e-16 (median) to 1.6e-15 (largest), of either sign. Half or double decide
-# none of them. A pivot at the limit has lost a hundredth of itself to rounding: the σ of a
-# determined unknown is still right to half a per cent.
+# none of them. A pivot at the limit has lost up to 1.6 % of itself to rounding: the σ of a
+# determined unknown is still right to 0.8 %.
 PIVOT = 1e-13
 
 
@@ -82,7 +82,7 @@ def regularise_diagonal(normal: Normal, ridge: float = 1e-10) -> Normal:
 
     The pivots are then at least 1e-10, a thousand times `PIVOT`, and undetermined unknowns get σ of
     1e5 times their σ with all others given: far beyond all that is judged weak. An unknown with
-    a σ below 1e-3 of this keeps it to 1e-4; half or double change no verdict."""
+    a σ below 1e-3 of this keeps it to 1e-6; half or double the ridge change no verdict."""
     N, e = normal.blocks, normal.plan.eliminated
     diagonal = lambda B: jnp.diagonal(B, axis1=1, axis2=2)[:, :, None] * jnp.eye(B.shape[1])
     add = lambda B: B + ridge * diagonal(B)
@@ -105,7 +105,8 @@ def factorise(
         factor = (factorise_band if plan.reduction == "banded" else factorise_dense)(plan, S)
     # S is scaled, so a squared pivot is 1 − R² of its unknown on those before it: the part of its
     # information that no other unknown explains. One unsound pivot spoils all: σ of other unknowns
-    # would be finite and wrong.
+    # would be finite and wrong. (An iterative solution has only the pivots of its diagonal blocks:
+    # it finds what one row leaves open, and not what several rows do together.)
     sound = jnp.all(factor.pivots**2 > PIVOT)
     scale = {g: jnp.where(sound, s, jnp.nan) for g, s in scale.items()}
     return NormalFactor(plan, factor, scale, lower_inverse, Z)
@@ -153,8 +154,9 @@ def eliminate(normal: Normal) -> tuple[Reduced, Float[Array, "rows w w"] | None,
     for g, W in N.W.items():
         at = plan.incidences[g]
         Z[g] = _row_major(_lower_times(lower_inverse, at.eliminated, W))
-        # The diagonal blocks of ZᵀZ: an incidence with itself. All of a chunk belong to one kept
-        # row, so their sum is one product of depth length × w; only the chunks are scattered.
+        # The diagonal blocks of ZᵀZ: an incidence with itself (observations of the same two rows
+        # share one incidence). All of a chunk belong to one kept row, so their sum is one product
+        # of depth length × w; only the chunks are scattered.
         rows = Z[g].reshape(at.row.shape[0], -1, W.shape[-1])
         of_chunks = jnp.einsum("cki,ckj->cij", rows, rows)
         ZtZ[g] = jax.ops.segment_sum(of_chunks, at.row, own[g].shape[0])
@@ -195,12 +197,12 @@ def sum_pairs(
     pairs: IncidencePairs,
     blocks: int,
     a: Float[Array, "chunks length w v"],
-    b: Float[Array, "chunks length w v"],
-) -> Float[Array, "blocks w v"]:
+    b: Float[Array, "chunks length w v2"],
+) -> Float[Array, "blocks v v2"]:
     """Σ aᵀb over the pairs of every block: one small matrix product of depth (length × w) per
     chunk, at most a quarter of the time of scattered outer products."""
     a, b = (x.reshape(-1, *x.shape[2:]) for x in (a, b))
-    depth, m, n = a.shape[1], a.shape[2], b.shape[2]
+    width, m, n = a.shape[1], a.shape[2], b.shape[2]
 
     def add(
         sums: Float[Array, "blocks w v"],
@@ -208,18 +210,17 @@ def sum_pairs(
         j: Int[Array, "chunks length"],
         k: Int[Array, " chunks"],
     ) -> Float[Array, "blocks w v"]:
-        number, rows = len(i), i.shape[1] * depth
-        # Whole blocks at a time: column by column before the products took 53 ms for the pairs of
-        # BAL 16 instead of 18.
-        left, right = look_up(a, i), look_up(b, j).reshape(number, rows, n)
+        number, depth = len(i), i.shape[1] * width
+        # Gathering whole blocks takes 18 ms for the pairs of BAL 16; column by column, 53.
+        left, right = look_up(a, i), look_up(b, j).reshape(number, depth, n)
         # With the left factor transposed as it is gathered, chunks of up to 100 pairs take three
         # quarters of the time (BAL 49: 8.9 ms for all pairs instead of 12.1); in longer ones, most
         # of those of BAL 16, the transposition costs a third more than it saves.
         if i.shape[1] <= 100:
             turned = _row_major(jnp.moveaxis(left, 3, 1))
-            product = turned.reshape(number, m, rows) @ right
+            product = turned.reshape(number, m, depth) @ right
         else:
-            product = jnp.einsum("cki,ckj->cij", left.reshape(number, rows, m), right)
+            product = jnp.einsum("cki,ckj->cij", left.reshape(number, depth, m), right)
         # `chunk_pairs` lists them by block.
         return sums.at[k].add(product, indices_are_sorted=True)
 
@@ -286,6 +287,7 @@ def _row_major(x: Array) -> Array:
     """Blocks in row-major order. Otherwise XLA chooses the layout of a shared array for one of its
     readers (the product by chunks), and the gathers of the pairs take three times as long.
 
-    A separate function: if a compiled function returns its constrained array, JAX (0.10) lets
-    XLA choose the layout of the other results, but reads them in the default order."""
+    Jitted by itself because of a fault of JAX 0.10: if a function returns a constrained array, XLA
+    also chooses the layout of its other results, which are then read in the default order, with
+    wrong numbers."""
     return with_layout_constraint(x, Layout(major_to_minor=tuple(range(x.ndim))))

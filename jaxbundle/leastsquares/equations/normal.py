@@ -1,7 +1,7 @@
 """The normal equations N·δ = −g in blocks.
 
-    N = ⎡ A   W ⎤   A: kept groups, `own` diagonal blocks and `off` off-diagonal blocks
-        ⎣ Wᵀ  V ⎦   V: one small block for each eliminated row; W: one for each incidence
+    N = ⎡ A  Wᵀ ⎤   A: kept groups, `own` diagonal blocks and `off` off-diagonal blocks
+        ⎣ W  V  ⎦   V: one small block for each eliminated row; W: one for each incidence
 
 They are filled either from the Jacobian (N = JᵀPJ, Gauss–Newton) or from second derivatives of
 every observation (the exact Hessian, `hessian.py`); everything after that is the same.

@@ -77,14 +77,15 @@ class Elimination(lx.AbstractLinearSolver):
 
 
 class MarquardtDescent(optx.AbstractDescent):
-    """The step −(N + λ·D)⁻¹·g with λ = 1/`step_size`; infinite: undamped.
+    """The step −(N + λ·D)⁻¹·g with λ = 1/`step_size`; infinite: undamped. D: `damping.py`.
 
     - `pin_datum_from`: step size above which the open datum directions are pinned; below it the
       damping alone keeps N regular: λ = 1e-8 leaves them pivots a hundred thousand times those
       that count as rounding (`elimination.PIVOT`).
     - `relative_residual`: of a reduced system that is solved iteratively. The step need not be
       exact: the next one is computed from the true residuals (inexact Newton: Dembo, Eisenstat
-      and Steihaug 1982).
+      and Steihaug 1982). A residual of η, in the norm of N⁻¹, costs η² of the predicted
+      decrease: 1e-4.
     """
 
     pin_datum_from: float = eqx.field(static=True, default=1e8)
@@ -115,7 +116,8 @@ class RegionSettings:
     """
 
     # The radius of Ceres' Levenberg–Marquardt (`initial_trust_region_radius`): λ = 1e-4 of the
-    # diagonal, nearly undamped. Nielsen's rule changes it threefold a step.
+    # diagonal, nearly undamped. Nielsen's rule triples it after a good step, so that a poor first
+    # radius costs few steps.
     initial: float = 1e4
     # Ceres' `min_relative_decrease`, too: any step that decreases vᵀPv more than by accident.
     sufficient_decrease: float = 1e-3
@@ -223,15 +225,16 @@ def predicted_decrease(info: Info, change: Tangent) -> Float[Array, ""]:
 def gain_ratio(
     predicted: Float[Array, ""], decrease: Float[Array, ""], noise: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """The decrease of ½vᵀPv as a fraction of the predicted one; −1 if it is not finite.
+    """The decrease of ½vᵀPv as a fraction of the predicted one; −1 if it is not finite, or no
+    decrease is predicted.
 
     A prediction below rounding counts as achieved unless the sum of squares visibly grows.
     """
-    # Without the last rule the final steps, whose decrease rounding makes negative as often as
-    # positive, are rejected by chance: λ grows until the problem is stuck at its minimum.
-    # A residual that is not finite, as of a point behind a camera, makes the ratio −1: rejected,
-    # and the radius shrinks until the step stays in the domain.
     ratio = jnp.where(predicted > 0, decrease / predicted, -1.0)
+    # A residual that is not finite, as of a point behind a camera: rejected, and the radius shrinks
+    # until the step stays in the domain.
     ratio = jnp.where(jnp.isfinite(ratio), ratio, -1.0)
+    # Without this rule the final steps, whose decrease rounding makes negative as often as
+    # positive, are rejected by chance: λ grows until the problem is stuck at its minimum.
     below_rounding = (predicted > 0) & (predicted < noise) & (decrease > -noise)
     return jnp.where(below_rounding, 1.0, ratio)

@@ -117,7 +117,7 @@ class LinearisedSolution(eqx.Module):
 
     def hold_given(self, data: Data) -> Values:
         """The solution with held values taken from the start values."""
-        free = datum.free_of_tables(self.plan, self.declared, self.values)
+        free = datum.free_of_tables(self.declared, self.plan, self.values)
         return {
             name: jax.vmap(space.hold)(self.values[name], data.start[name], free[name])
             for name, space in self.declared.named_spaces

@@ -12,17 +12,19 @@ The unknowns stay those of least squares; their covariance is that of x = N⁻¹
 The sizes follow from the residuals v = M·e, M = 1 − A·N⁻¹·Aᵀ, whose quadratic forms have the
 expectations (MINQUE: Rao 1971; Koch 1999, section 3.6)
 
-    vᵀV_k·v = Σ_j θ_j·tr(M·V_k·M·V_j),      tr(M·V_k·M·V_j) = ‖F_kᵀ·M·F_j‖²
+    q_k = vᵀV_k·v = Σ_j θ_j·T_kj,      T_kj = tr(M·V_k·M·V_j) = ‖F_kᵀ·M·F_j‖²
+
+with M² = M: T_00 is the redundancy.
 
 Roots of many columns are replaced by random combinations of them, F·Ξ/√R with E ΞΞᵀ = R·1, on one
 side of a trace (Hutchinson 1990). V_k that fit the residuals no better than the independent part
 get the size zero. Observations that are said to have their own σ (`OTHERS`: control, priors beside
 image points) are independent errors of the size σ0, whatever that of the others is.
 
-Estimating the effects as unknowns with priors gives honest σ too, and estimates that are not nearer
-to each other in halves of real networks; so does whitening. Covariances clustered by image or point
-(White 1980; Bell and McCaffrey 2002) do not help: unknowns of an image absorb what its residuals
-should show.
+Alternatives that did not help: effects as unknowns with priors give honest σ too, but estimates in
+two halves of a real network agree no better; neither do they with whitening. Covariances clustered
+by image or point (White 1980; Bell and McCaffrey 2002) miss the errors: unknowns of an image absorb
+what its residuals should show.
 """
 
 import dataclasses
@@ -62,8 +64,8 @@ AT_ONCE = 16
 
 class ErrorComponent(NamedTuple):
     """One V = F·Fᵀ: `root`: F as a sparse matrix [rows, columns], rows of all observations in
-    units of their a priori σ, set by set (`stack_rows`), one after the other; of size 1 in the
-    `unit` of the component."""
+    units of their a priori σ, set by set (`stack_rows`); a column is the effect of an error of one
+    `unit`."""
 
     name: str
     unit: str
@@ -91,7 +93,8 @@ class ErrorSettings:
     """How components are estimated.
 
     - `max_columns`: roots of more columns are replaced by random combinations: a column is a
-      solution of the normal equations (10 ms for 60 images and 26 000 points).
+      solution of the normal equations (10 ms for 60 images and 26 000 points), so that these take
+      ten seconds.
     - `draws`: their number. Variances from 100 are right to √(2/100) = 14 %, σ to 7 %.
     - `seed`: of the combinations.
     """
@@ -122,7 +125,7 @@ class ErrorModel:
         """√θ of the independent part, as a factor of the a priori σ, and of all components."""
         names = [("independent errors", "σ"), *((c.name, c.unit) for c in self.components)]
         names = [one for one in names if one[0] != OTHERS]
-        # σ of √θ: σ_θ/(2√θ); not more than the size that one σ of θ would have, as at zero
+        # σ of √θ: σ_θ/(2√θ), but at most √σ_θ, its value at θ = 0
         theta, spread = self.theta[: len(names)], self.theta_sigma[: len(names)]
         root, most = np.sqrt(theta), np.sqrt(spread)
         sigma = np.minimum(spread, 2 * root * most) / np.where(root > 0, 2 * root, 1.0)
@@ -175,6 +178,7 @@ def fit_error_model(
                 blocks[table] = blocks[table] + more if table in blocks else more
         T[k, 0] = T[0, k]
         own.append(blocks)
+    # random combinations, on one side of the traces, make it unsymmetric
     T[1:, 1:] = (T[1:, 1:] + T[1:, 1:].T) / 2
     given = np.zeros(len(v), bool)
     if components and components[-1].name == OTHERS:
@@ -223,6 +227,7 @@ def _nonnegative(
     A = T / scale[:, None] / scale
     # T is symmetric and positive semidefinite: T = L·Lᵀ, and ‖Lᵀθ − L⁻¹q‖ is the least-squares form
     w, E = np.linalg.eigh(A)
+    # components that are combinations of others leave eigenvalues of rounding
     some = w > 1e-10 * w.max()
     L = E[:, some] * np.sqrt(w[some])
     right = (E[:, some].T @ (q / scale)) / np.sqrt(w[some])
@@ -235,6 +240,7 @@ def _scores(T: Float[np.ndarray, "k k"], q: Float[np.ndarray, " k"]) -> Float[np
     variance = np.diag(T) - T[:, 0] ** 2 / T[0, 0]
     away = q - T[:, 0] * white
     # the form of the independent part determines its size: it exceeds nothing
+    # (a difference of two numbers of the size of T: smaller ones are rounding)
     good = variance > 1e-9 * np.diag(T)
     return np.where(good, away / np.sqrt(2 * np.where(good, variance, 1.0)) / white, 0.0)
 
@@ -250,9 +256,10 @@ def _covariance_of_sizes(
     draws: int = AT_ONCE,
 ) -> Float[np.ndarray, "k k"]:
     """T⁻¹·cov(q)·T⁻¹ of normal errors of the fitted Σ: cov(q)_ij = 2·tr(V_i·MΣM·V_j·MΣM), by
-    residuals drawn from it; `independent`: variances of the rows, of which some are `given`."""
+    residuals drawn from it; `independent`: variances of the rows, of which some are `given`. From
+    16 draws σ of a size is right to about 1/√32 = 18 %."""
     of_components = [lambda e, f=f: np.asarray((f @ (f.T @ e.T)).T) for f in F]
-    times = [lambda e: e * ~given, *of_components]
+    of_parts = [lambda e: e * ~given, *of_components]
     parts = list(zip(theta[1:], of_components))
     sigma = lambda e: independent * e + sum(t * V(e) for t, V in parts if t > 0)
     errors = np.sqrt(independent) * rng.standard_normal((draws, len(given)))
@@ -260,10 +267,11 @@ def _covariance_of_sizes(
         if t > 0:
             errors += np.sqrt(t) * np.asarray((f @ rng.standard_normal((f.shape[1], draws))).T)
     u, _ = remove_fit(found, errors)
-    b = [remove_fit(found, V(u))[0] for V in times]
+    b = [remove_fit(found, V(u))[0] for V in of_parts]
     Sb = [sigma(x) for x in b]
     G = np.array([[np.sum(x * y) / draws for y in Sb] for x in b])
     inverse = np.linalg.pinv(T, 1e-10, hermitian=True)
+    # G + Gᵀ is twice the symmetric part: the factor 2 of the covariance
     return inverse @ (G + G.T) @ inverse
 
 
