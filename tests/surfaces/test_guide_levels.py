@@ -28,3 +28,18 @@ def test_a_guide_has_at_most_so_many_nodes(monkeypatch, max_nodes, finest):
     assert levels == list(range(4, finest - 1, -1))
     assert max(numbers[1:], default=0) <= max_nodes
     assert finest == 0 or 4 * numbers[-1] > 0.9 * max_nodes
+
+
+def test_the_normal_at_an_edge_is_the_line_of_sight_at_height_zero():
+    """Of scanner images q is a height, which may be 0."""
+    v, u = np.mgrid[0:4, 0:5].astype(float)
+    sight = np.array([0.6, 0.0, 0.8])
+    points = lambda uv, q: np.pad(uv, ((0, 0), (0, 1))) + q[:, None] * sight / 0.8
+    base = SimpleNamespace(points=points)
+    q, rate = np.zeros((4, 5)), np.full((4, 5), 2.0)
+    q[:, 3:] = 10.0
+    uv = np.stack([u.ravel(), v.ravel()], 1)
+    X = points(uv, q.ravel()).reshape(4, 5, 3)
+    normal = guide._normals(base, uv, X, q, rate, max_change=1.0)
+    np.testing.assert_allclose(abs(normal[:, 2:4] @ sight), 1, atol=1e-12)
+    np.testing.assert_allclose(abs(normal[:, 0, 2]), 1, atol=1e-12)
