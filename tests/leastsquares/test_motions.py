@@ -31,7 +31,7 @@ def test_tables_of_other_values_have_no_motions():
     assert likely_motions([ls.Table("coefficients", np.zeros((4, 5)))]) is None
 
 
-@pytest.mark.parametrize("offset", [0.0, 1e5, 4e6])
+@pytest.mark.parametrize("offset", [0.0, 1e5])
 def test_open_motions_leave_held_points_wherever_they_are(offset):
     """Two held points leave the rotation about their line open; far from the origin, translations
     and rotations of them are nearly the same."""
