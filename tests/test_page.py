@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from jaxbundle.report.head import NO_RESULT
 from jaxbundle.report.page import InputFile, Origin, compose, compose_failure, fingerprint_files
 from jaxbundle.report.page.columns import Column, encode_table, encode_values
 from jaxbundle.report.page.document import SCRIPTS, STYLE
-from jaxbundle.report.page.tables import choose_largest
+from jaxbundle.report.page.tables import choose_largest, measured_values
 from jaxbundle.report.verdict import BAD, DOUBTFUL, GOOD, NOTED, Finding, in_words, judge
 
 ROOT = Path(__file__).parent.parent
@@ -106,6 +107,25 @@ def test_measured_coordinates_stand_beside_their_residuals(convergent4, text):
     assert_allclose(measured, given.observations.xy, rtol=1e-6)
     images = np.array(given.images.id, dtype=object)[given.observations.image]
     assert_array_equal(column(text, "observations", "image")[::2], images)
+
+def test_what_was_measured_stands_beside_residuals_of_every_kind():
+    """Angles in the unit of the network, coordinates of control with their origin, and nothing for
+    what is not given."""
+    network = jaxbundle.read_network(EXAMPLE)
+    ids, X = network.points.id[:3], network.points.position[:3]
+    angles = {"from": [ids[0]], "at": [ids[1]], "to": [ids[2]], "value": [61.5], "sigma": [0.01]}
+    levelled = {"from": [ids[0]], "to": [ids[1]], "dZ": [1.25], "sdZ": [0.001]}
+    network = jaxbundle.add_further(
+        network.replace(angle_unit="gon"), angle_unit="gon", angles=angles, differences=levelled
+    )
+    role, sigma = np.array(network.points.role, dtype=object), network.points.sigma.copy()
+    role[2], sigma[2] = "control", 0.001
+    points = dataclasses.replace(network.points, role=tuple(role), sigma=sigma)
+    problem = jaxbundle.make_problem(network.replace(points=points))
+    rays = 2 * len(network.observations)
+    measured = measured_values(SimpleNamespace(problem=problem))
+    assert_array_equal(measured[:rays].reshape(-1, 2), network.observations.xy)
+    assert_allclose(np.sort(measured[rays:]), np.sort([*X[2], 61.5, 1.25]), atol=1e-12)
 
 
 @pytest.mark.parametrize("values, kind", [

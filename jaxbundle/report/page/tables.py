@@ -3,9 +3,11 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.adjustment.result_tables import observations as observation_rows
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.report.correlated import stated_sigma, stated_sigma_of
 from jaxbundle.report.layout import clean, coordinate_decimals
@@ -148,9 +150,9 @@ def checks(adjustment: "Adjustment") -> Columns:
 
 
 def observations(adjustment: "Adjustment") -> Columns:
-    """All observations, of very many those with the largest |τ|; `measured` of image points."""
+    """All observations, of very many those with the largest |τ|, and what was measured."""
     return table_of_residuals(
-        adjustment.residuals | {"measured": measured_coordinates(adjustment)}, adjustment.sigma0
+        adjustment.residuals | {"measured": measured_values(adjustment)}, adjustment.sigma0
     )
 
 
@@ -182,14 +184,23 @@ def table_of_residuals(found: Mapping[str, np.ndarray], sigma0: float) -> Column
     }
 
 
-def measured_coordinates(adjustment: "Adjustment") -> np.ndarray:
-    """By row of the table of residuals, the measured image coordinate; NaN for other kinds."""
-    problem, kind = adjustment.problem, adjustment.residuals["kind"]
-    # the table has rows of other kinds, too
-    measured = np.full(len(kind), np.nan)
-    used = problem.used_coordinates
-    measured[kind == "image"] = problem.image_coordinates()[used]
-    return measured
+def measured_values(adjustment: "Adjustment") -> np.ndarray:
+    """By row of the table of residuals, what was measured; NaN of priors, and of kinds that measure
+    something else than one number for each residual."""
+    problem = adjustment.problem
+    blank = lambda name: np.full(problem.weights(name).shape, np.nan)
+    measured = {o.name: blank(o.name) for o in problem.observations}
+    for name in ("control", "distance", *problem.further_sets):
+        given = problem.data.measured.get(name)
+        if isinstance(given, jax.Array | np.ndarray) and given.size == measured[name].size:
+            origin = problem.origin if name == "control" else 0.0
+            measured[name] = np.reshape(given, measured[name].shape) + origin
+    columns = []
+    for part in observation_rows(problem, measured):
+        values = problem.image_coordinates() if part.kind == "image" else part.quantities[0]
+        unit = np.array([factor for factor, _ in part.units])
+        columns.append((values * unit)[part.inverse_sigma > 0])
+    return np.concatenate(columns)
 
 
 def choose_largest(tau: np.ndarray, most: int) -> np.ndarray:
