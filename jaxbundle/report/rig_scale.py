@@ -13,9 +13,6 @@ from jaxbundle.network.kinds.rigs import Rigs
 if TYPE_CHECKING:
     from jaxbundle.adjustment.result import Adjustment
 
-# Tables of further kinds that may give a network its scale as well.
-WITH_LENGTHS = {"antennas", "differences", "shapes", "figures", "exterior_priors"}
-
 
 def scale_of_rigs(adjustment: "Adjustment") -> str:
     """Which base of a rig gives the scale, with its σ; empty where other lengths are known."""
@@ -26,7 +23,7 @@ def scale_of_rigs(adjustment: "Adjustment") -> str:
     known = network.points.has_role("control", "fixed").sum()
     known += len(problem.data.measured.get("exterior", ()))
     known += (problem.table("image").free == 0).all(1).sum()
-    others = {one.TABLE for one in network.further} & WITH_LENGTHS
+    others = any(one.GIVES_SCALE for one in network.further)
     if known or others or len(network.distances):
         return ""
     bases = _given_bases(adjustment, rigs)

@@ -86,6 +86,7 @@ class Antennas(Further):
     time: Float[np.ndarray, " n"]
 
     TABLE, SECTION, IMAGES = "antennas", SECTION, ("image",)
+    GIVES_SCALE = True
     MEASURED = "position"
 
     @classmethod

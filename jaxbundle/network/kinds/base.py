@@ -60,6 +60,8 @@ class Further(abc.ABC):
     """The fields that hold ids of images, of points."""
     MEASURED: ClassVar[str] = ""
     """The field of measurements; none for conditions."""
+    GIVES_SCALE: ClassVar[bool] = False
+    """Whether the rows may contain lengths that give a network its scale."""
 
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     source: Source = Source("table")
@@ -136,6 +138,63 @@ class Further(abc.ABC):
     def number_of_equations(self) -> int:
         """Equations per row; they help to determine every image and point it touches."""
         return 1
+
+
+# "from" is a word of Python: the field of this column has another name.
+COLUMNS_OF_FIELDS = {"start": "from"}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SingleValues(Further):
+    """Rows of one measured value each, with its σ. A subclass has its id columns, `TABLE`, `IMAGES`
+    or `POINTS`, and `KIND`: one residual, of the tables "image" and "point", in the order of the
+    id columns. Angles (`Kind.units`) are in radians here, and in the project's unit in a table."""
+
+    value: Float[np.ndarray, " n"]
+    sigma: Float[np.ndarray, " n"]
+
+    KIND: ClassVar[Kind]
+    MEASURED = "value"
+
+    @classmethod
+    def from_columns(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> Self:
+        names = {field: COLUMNS_OF_FIELDS.get(field, field) for field in (*cls.IMAGES, *cls.POINTS)}
+        table.check_names((*names.values(), "value", "sigma"))
+        ids: dict[str, Any] = {field: table.ids(name) for field, name in names.items()}
+        unit = radians if cls.KIND.units == "angle" else 1.0
+        made = cls(
+            value=unit * table.numbers("value", required=True),
+            sigma=unit * positive_sigma(table, "sigma"),
+            source=table.source,
+            **ids,
+        )
+        for row, objects in enumerate(zip(*(getattr(made, field) for field in cls.POINTS))):
+            if len({*objects}) < len(objects):
+                raise InputError(
+                    f"{table.source(row)}: {len(objects)} different points are expected"
+                )
+        made.check_values(radians)
+        return made
+
+    def check_values(self, radians: float) -> None:
+        """Refuse values that cannot be measured; all are accepted by default.
+
+        **Raises:** `InputError`."""
+
+    def columns(self, radians: float) -> dict[str, Sequence[Any]]:
+        fields = (*self.IMAGES, *self.POINTS)
+        ids: dict[str, Any] = {COLUMNS_OF_FIELDS.get(f, f): getattr(self, f) for f in fields}
+        unit = radians if self.KIND.units == "angle" else 1.0
+        ids |= {"value": self.value / unit, "sigma": self.sigma / unit}
+        return ids
+
+    def declare(self, network: Network, origin: Float[np.ndarray, "3"]) -> Contribution:
+        fields = {"image": iter(self.IMAGES), "point": iter(self.POINTS)}
+        tables = {"image": network.images, "point": network.points}
+        rows = tuple(
+            rows_of(getattr(self, next(fields[name])), tables[name]) for name in self.KIND.of
+        )
+        return Contribution((), (self.KIND(rows, self.value, sigma=self.sigma),))
 
 
 def rows_of(ids: Sequence[str], table: Images | Points) -> Int[np.ndarray, " n"]:

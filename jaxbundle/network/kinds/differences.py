@@ -16,7 +16,13 @@ from jaxtyping import Array, Float
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.declarations import Kind
 from jaxbundle.network.columns import Columns
-from jaxbundle.network.kinds.base import Contribution, Further, positive_sigma, rows_of
+from jaxbundle.network.kinds.base import (
+    Contribution,
+    Further,
+    SingleValues,
+    positive_sigma,
+    rows_of,
+)
 from jaxbundle.network.tables import Network
 
 AXES = ("dX", "dY", "dZ")
@@ -55,6 +61,7 @@ class Differences(Further):
     sigma: Float[np.ndarray, "n 3"]
 
     TABLE, POINTS, MEASURED = "differences", ("start", "to"), "value"
+    GIVES_SCALE = True
 
     @classmethod
     def from_columns(
@@ -90,48 +97,18 @@ class Differences(Further):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Angles(Further):
-    """Angles and their σ, radians."""
+class Angles(SingleValues):
+    """Angles at a point between two others."""
 
     start: tuple[str, ...]
     at: tuple[str, ...]
     to: tuple[str, ...]
-    value: Float[np.ndarray, " n"]
-    sigma: Float[np.ndarray, " n"]
 
-    TABLE, POINTS, MEASURED = "angles", ("start", "at", "to"), "value"
+    TABLE, POINTS, KIND = "angles", ("start", "at", "to"), ANGLE
 
-    @classmethod
-    def from_columns(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Angles":
-        table.check_names(("from", "at", "to", "value", "sigma"))
-        value = radians * table.numbers("value", required=True)
-        for row in np.flatnonzero(~((value > 0) & (value < np.pi)))[:1]:
+    def check_values(self, radians: float) -> None:
+        for row in np.flatnonzero(~((self.value > 0) & (self.value < np.pi)))[:1]:
             raise InputError(
-                f"{table.source(row)}: an angle between 0 and half a turn is "
-                f"expected, not {value[row] / radians:g}"
+                f"{self.source(row)}: an angle between 0 and half a turn is "
+                f"expected, not {self.value[row] / radians:g}"
             )
-        start, at, to = (table.ids(name) for name in ("from", "at", "to"))
-        for row, ids in enumerate(zip(start, at, to)):
-            if len({*ids}) < 3:
-                raise InputError(f"{table.source(row)}: three different points are expected")
-        return cls(
-            start=start,
-            at=at,
-            to=to,
-            value=value,
-            sigma=radians * positive_sigma(table, "sigma"),
-            source=table.source,
-        )
-
-    def columns(self, radians: float) -> dict:
-        return {
-            "from": self.start,
-            "at": self.at,
-            "to": self.to,
-            "value": self.value / radians,
-            "sigma": self.sigma / radians,
-        }
-
-    def declare(self, network: Network, origin: Float[np.ndarray, "3"]) -> Contribution:
-        ends = tuple(rows_of(ids, network.points) for ids in (self.start, self.at, self.to))
-        return Contribution((), (ANGLE(ends, self.value, sigma=self.sigma),))

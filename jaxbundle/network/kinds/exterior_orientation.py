@@ -63,6 +63,7 @@ class ExteriorPriors(Further):
     sigma: Float[np.ndarray, "n 6"]
 
     TABLE, IMAGES, MEASURED = "exterior_priors", ("image",), "value"
+    GIVES_SCALE = True
 
     @classmethod
     def from_columns(

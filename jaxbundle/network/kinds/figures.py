@@ -110,6 +110,7 @@ class Figures(Further):
     radius: Float[np.ndarray, " n"]
 
     TABLE, POINTS = "figures", ("point",)
+    GIVES_SCALE = True
 
     @classmethod
     def from_columns(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Figures":
@@ -240,6 +241,7 @@ class Shapes(Further):
     sigma: Float[np.ndarray, " n"]
 
     TABLE, POINTS = "shapes", ("point",)
+    GIVES_SCALE = True
 
     @classmethod
     def from_columns(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Shapes":
