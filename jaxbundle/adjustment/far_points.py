@@ -38,12 +38,13 @@ class FarPointSettings:
     - `narrow`: radians; largest angle between the rays of a point that may be at any distance.
       0.03 is a base of 1/33 of the distance. Larger: well determined points lose their place among
       the datum points; smaller: an adjustment that fails because of such points is not saved.
-    - `parallel`: radians; largest angle of a point that is so from the start, unless half of the
-      tie points are: then all images have nearly the same projection centre, and no point is far.
-    - `vague`: points with an angle below this number of σ of a ray are at any distance from the
-      start as well. σ of their distance is above 1/`vague` of it: at a tenth, errors of second
-      order at 3 σ, (3/10)²/2, are no longer small, while the reciprocal distance is nearly linear
-      in the observations.
+    - `parallel`: radians; largest angle between the rays of a point that is at any distance from
+      the start, unless half of the tie points are: then all images have nearly the same projection
+      centre, and no point is far.
+    - `vague`: points with an angle below this number of σ of a ray (but at most `narrow`) are at
+      any distance from the start as well. σ of their distance is above 1/`vague` of it: at a tenth,
+      errors of second order at 3 σ, (3/10)² of the distance, are no longer small, while the
+      reciprocal distance is nearly linear in the observations.
     - `evaluations_before_release`: evaluations before narrow points are put at any distance; twice
       as many if half of the tie points are narrow, since then the network may only be slow.
       Larger: failing adjustments take longer to recover; smaller: points move to the other
@@ -83,10 +84,11 @@ def minimise_at_any_distance(
     if not narrow.any():
         return problem, find_minimum(problem, start, max_steps=max_steps, **options)
     mostly = lambda chosen: 2 * chosen.sum() >= (angle < np.pi).sum()
-    noise = min(settings.vague * noise_of_rays(problem.network), settings.narrow)
-    legs, parallel = [], angle < max(settings.parallel, noise)
+    vague = min(settings.vague * noise_of_rays(problem.network), settings.narrow)
+    legs, parallel = [], angle < max(settings.parallel, vague)
     # First only points whose rays are parallel; if that does not converge, all narrow points. The
-    # other parametrisation costs little, but points at any distance carry no datum.
+    # other parametrisation costs little, but points at any distance carry no datum. Evaluations of
+    # a first attempt that fails are forgotten: the second one has all of `max_steps` again.
     for chosen in (parallel & ~mostly(parallel), None):
         if chosen is None:
             patience = settings.evaluations_before_release * (2 if mostly(narrow) else 1)
@@ -103,6 +105,7 @@ def minimise_at_any_distance(
             )
             if inspect_solution(with_factor(found), minimum):
                 return found, join_legs([*legs, minimum])
+    # It ended before the limit without a solution: further evaluations would change nothing.
     if int(legs[0].termination) != LIMIT:
         return problem, legs[0]
     return problem, join_legs([*legs, find_minimum(problem, start, max_steps=left, **options)])
@@ -163,13 +166,15 @@ def noise_of_rays(network: Network) -> float:
 
 
 def angle_of_rays(problem: NetworkProblem, values: Values) -> Float[np.ndarray, " points"]:
-    """Approximately the largest angle between two rays of every tie point, radians; 180° for other
-    points and points with fewer than two rays."""
+    """Approximately the largest angle between two rays of every tie point, radians: twice the sine
+    of the largest angle to the mean of its rays; π for other points and points with fewer than two
+    rays."""
     point, image = problem.point[problem.used], problem.image[problem.used]
     X0, X = np.asarray(values["image"].position), np.asarray(coordinates(values))
     ray = _unit_vectors(X[point] - X0[image])
     first = np.zeros_like(X)
-    # Lines, not directions: a point between two images has opposite rays.
+    # Lines, not directions: a point between two images has opposite rays. All are given the side of
+    # the first ray of the point, which is assigned last.
     first[point[::-1]] = ray[::-1]
     ray *= np.where((ray * first[point]).sum(1) < 0, -1.0, 1.0)[:, None]
     middle = np.zeros_like(X)
@@ -257,14 +262,16 @@ def _are_pulled_outward(problem: NetworkProblem, values: Values) -> Bool[np.ndar
 
 
 def _unit(problem: NetworkProblem) -> float:
-    """RMS distance of the projection centres from their centroid."""
+    """RMS distance of the projection centres from the origin that a problem with points at any
+    distance has: their centroid, in whole units (`make_problem`)."""
     centres = problem.network.images.position
     return float(np.sqrt(((centres - np.round(centres.mean(0))) ** 2).sum(1).mean()))
 
 
 def join_legs(legs: Sequence[Minimum]) -> Minimum:
-    """Several successive minimisations combined into one; each but the first re-evaluates the end
-    point of the previous one."""
+    """Several successive minimisations combined into one. The first evaluation of all but the
+    first is left out: it repeats the last of the previous one (or is that of other start values, as
+    those of a second minimum)."""
     if len(legs) == 1:
         return legs[0]
     rows = [slice(k > 0, int(leg.iterations)) for k, leg in enumerate(legs)]

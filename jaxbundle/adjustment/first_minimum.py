@@ -126,7 +126,8 @@ class FirstMinimum:
         rounds, final = 0, Undetermined()
         while found.is_solved:
             problem, minimum, _, gone, current = found
-            # In the first round they may only be weak because others were still missing.
+            # What the first minimum leaves undetermined may only be so because of what was still
+            # missing.
             if rounds:
                 final += gone
             part, factor = final.leave_out(given), noise_factor(problem, minimum)
@@ -164,8 +165,9 @@ class FirstMinimum:
         begin: Callable[[NetworkProblem], Values] | None = None,
         look: bool = True,
     ) -> FoundMinimum:
-        """The minimum of a network without what its rays do not determine; `look`: for that also
-        before the minimum."""
+        """The minimum of a network without what its rays do not determine; `begin`: gives the
+        values to begin from (default: start values); `look`: whether what rays do not determine is
+        looked for before the minimum, too."""
         # Three looks at what rays do not determine: at the start values (cheap, but they may be
         # poor), after a few evaluations (before such points slow the iterations down), and at the
         # minimum. Each exclusion begins again from where the last iterations ended.
@@ -216,7 +218,7 @@ class FirstMinimum:
 
 
 def require_most_oriented(found: Oriented) -> Oriented:
-    """The start values unchanged; refused if they exclude half of the images or points or more.
+    """The start values unchanged; refused if they exclude half or more of the images or points.
 
     **Raises:** `NotSolvedError`."""
     network = found.network

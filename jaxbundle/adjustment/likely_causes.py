@@ -36,10 +36,10 @@ class CauseSettings:
     - `max_ray_misfit`: radians, RMS; takes the place of `max_sigma0` where σ are only units of
       weight: a pixel of cameras with 1000 pixels in the principal distance. A search that finds
       nothing costs time only.
-    - `max_start_misfit`: radians, RMS of the residuals of the start values: no start values in the
-      right convention predict image points so badly that an adjustment from them settles by
-      itself. 0.1 is 6°. Smaller: rough start values are suspected of another convention; larger:
-      a mirrored network that settles is not named.
+    - `max_start_misfit`: radians, RMS of the residuals of the start values: from start values in
+      the right convention that predict image points so badly no adjustment settles. 0.1 is 6°.
+      Smaller: rough start values are suspected of another convention; larger: a mirrored network
+      that settles is not named.
     """
 
     max_sigma0: float = 5.0
@@ -62,10 +62,10 @@ def likely_causes(
     if inspection and not (vtpv > largest**2 * problem.counts.redundancy).any():
         # A good fit may still be wrong: settled far from its start it may be a mirror image, and
         # σ in a larger unit fit everything.
-        start = np.sqrt(
+        start_misfit = np.sqrt(
             2 * np.asarray(minimum.history.cost)[0] / problem.rows_and_unknowns.observations
         )
-        far = start * noise_of_rays(problem.network) > CAUSES.max_start_misfit
+        far = start_misfit * noise_of_rays(problem.network) > CAUSES.max_start_misfit
         sigma0 = sigma0_at_end(problem, minimum)
         poor = sigma0 > 1 and contradicts(sigma0, problem.counts.redundancy)
         causes = (
@@ -120,7 +120,7 @@ def noise_factor(problem: NetworkProblem, minimum: Minimum) -> float:
 
 
 def sigma0_at_end(problem: NetworkProblem, minimum: Minimum) -> float:
-    """√(vᵀPv/redundancy) where the iterations ended; 1 without redundancy."""
+    """√(vᵀPv/redundancy) where the iterations ended; 1 without redundancy, or a finite vᵀPv."""
     cost = np.asarray(minimum.history.cost)[: int(minimum.iterations)]
     accepted = np.asarray(minimum.history.accepted)[: int(minimum.iterations)]
     vtpv, redundancy = 2 * cost[accepted][-1:], problem.counts.redundancy

@@ -19,8 +19,8 @@ from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Camera
 
 # Reduced systems with more unknowns are not searched for null vectors: the time of a dense
-# eigendecomposition grows with the cube of their number, and here it would be minutes.
-EIGENVECTORS = 3000
+# eigendecomposition grows with the cube of their number, and would soon be minutes.
+MAX_FOR_EIGENVECTORS = 3000
 # A principal distance that changed by more than this factor is implausible. Not critical: a start
 # value is seldom wrong by more than two, and a collapsing c passes every factor.
 LARGEST_FACTOR = 20.0
@@ -42,7 +42,7 @@ def names_of_defects(problem: NetworkProblem, minimum: Minimum[Values]) -> list[
     if bool(converged(int(minimum.termination))) and (fallen := _find_collapsed(problem, values)):
         return fallen
     last = _last(problem, minimum)
-    if problem.plan.reduction == "dense" and problem.reduced_size <= EIGENVECTORS:
+    if problem.plan.reduction == "dense" and problem.reduced_size <= MAX_FOR_EIGENVECTORS:
         return undetermined(problem, last)
     rows = undetermined_rows(problem, last)
     if rows:
@@ -62,7 +62,7 @@ def name_inseparable(
     iterations take long."""
     if int(minimum.termination) != LIMIT or problem.plan.reduction != "dense":
         return ""
-    if problem.reduced_size > EIGENVECTORS:
+    if problem.reduced_size > MAX_FOR_EIGENVECTORS:
         return ""
     names = undetermined(problem, _last(problem, minimum), inseparable)
     # Where a camera parameter is open, so are the orientations that follow it: it is the cause.
@@ -84,8 +84,8 @@ def name_undefined(problem: NetworkProblem, minimum: Minimum[Values]) -> str:
     if not names:
         return ""
     return (
-        f"no derivative, as of a distance of 0 or an angle of 180°: {list_some(names, 5, str)}; "
-        "give its points start values that are not in one place or on one line, or remove it"
+        f"no derivative (as at a distance of 0, or an angle of 180°): {list_some(names, 5, str)}; "
+        "give their points start values that are not in one place or on one line, or remove them"
     )
 
 
@@ -123,7 +123,8 @@ def require_solved(problem: NetworkProblem, minimum: Minimum[Values], when: str)
 def _find_collapsed(problem: NetworkProblem, values: Values) -> list[str]:
     """Principal distances that diverged from their start values by a factor of `LARGEST_FACTOR`.
 
-    If c and an image scale are both free, c = 0 makes all corrected residuals zero.
+    If c and a scale of the corrected image are both free, the image shrinks to a point at c = 0,
+    with residuals of zero.
     """
     return [
         f"{parameter} of camera {camera.id} (it diverged from its start value)"

@@ -1,4 +1,5 @@
-"""Repeated adjustments: robust estimation, data snooping, variance components, elimination."""
+"""Repeated adjustments: robust estimation, data snooping, variance components, and without camera
+parameters that are not significant."""
 
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator
@@ -48,8 +49,8 @@ def snoop_network(
     significance: float,
     doubtful: Iterable[tuple[str, str]] = (),
 ) -> tuple[NetworkProblem, Minimum, list[Removed], str | None]:
-    """The problem and its minimum without blunders, the removed observations, and warnings about a
-    priori σ that the test relies on although the data contradict them.
+    """The problem and its minimum without blunders, the removed observations, and a warning about a
+    priori σ that the test relies on although the data contradict them (None without).
 
     `doubtful`: image and point, by id, of initially removed image points."""
     # The engine removes and restores in its own terms (sets and rows); names are given at the end.
@@ -65,6 +66,7 @@ def snoop_network(
     removed = [name_removed(problem, r) for r in removed]
     counts = problem.counts
     if test == "baarda" and counts.redundancy > 0:
+        # Its own adjustments, whose minima are not that of the result (`repeat`).
         scale = _scale_of_good(whole, _Repeat(again, "after data snooping", minimum))
         rays = sum(len(r.rows) for r in removed if r.kind == "image")
         doubt = doubt_of_baarda(
@@ -159,7 +161,7 @@ def _unchanged(components: dict[str, Component]) -> Iterator[str]:
 def eliminate_parameters(
     problem: NetworkProblem, minimum: Minimum, again: Minimise, critical_t: float
 ) -> tuple[NetworkProblem, Minimum, list[Name]]:
-    """Fix insignificant additional parameters at their default (mostly 0), the weakest first."""
+    """Hold insignificant additional parameters at their default (mostly 0), the weakest first."""
     names = []
     models = {camera.id: get_model(camera.model) for camera in problem.network.cameras}
     while True:

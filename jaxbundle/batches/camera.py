@@ -64,7 +64,7 @@ INDETERMINATE = 1e-13
 
 class CameraSolution(eqx.Module):
     """The end of the iterations: unknowns, ½vᵀv, cofactors, the scaled reduced normal matrix,
-    termination, steps, views used."""
+    redundancy, views used, the index of the status in `STATUS`, number of evaluations."""
 
     at: CameraUnknowns
     cost: Float[Array, ""]

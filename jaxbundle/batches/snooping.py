@@ -2,11 +2,11 @@
 again.
 
 Only the worst point of a view is removed at a time, and only points at least half as bad as the
-worst of all, because a blunder affects the residuals of its view. Finally removed points are tested
-against the calibration without them and restored if they pass. A camera without blunders keeps its
-first solution. The test is Pope's (`leastsquares.distributions`), because a batch has no a priori
-σ. Its σ0 is that of the residuals, or from their median if this is smaller: many blunders make σ0
-so large that they mask each other.
+worst of all, because a blunder affects the residuals of its view. Finally, removed points are
+tested against the calibration without them and restored if they pass. A camera without blunders
+keeps its first solution. The test is Pope's (`leastsquares.quality.distributions`), because a batch
+has no a priori σ. Its σ0 is that of the residuals, or from their median if this is smaller: many
+blunders make σ0 so large that they mask each other.
 """
 
 import numpy as np

@@ -13,7 +13,7 @@ from jaxbundle.leastsquares.quality.weakness import VAGUE_RATIO
 
 @dataclasses.dataclass(frozen=True)
 class AdviceSettings:
-    """From where on photographs of a board are good enough; below it, advice is given.
+    """Limits of what photographs of a board should be like; beyond them, advice is given.
 
     **Fields:**
 
@@ -63,8 +63,8 @@ def advice(
     """Warnings in words, the most serious first; empty if there are none.
 
     **Arguments:** X0 and M of the views of a board in the plane Z = const, whose centre is
-    `middle`; `covered`; `rms` of the residuals in pixels; `t` = |value|/σ by parameter of
-    the `model`.
+    `middle`; `covered`: the part of the image with points; `rms` of the residuals in pixels; `t` =
+    |value|/σ by parameter of the `model`; `validation`: by halves of the photographs.
     """
     found = [
         f"{name} is known only to {100 / max(t[name], 1e-9):.0f} %: the photographs do not "

@@ -259,12 +259,13 @@ def _homogeneity(
 def _without_rotation(
     G: Float[np.ndarray, "k k"], H: Float[np.ndarray, "k k"], scale: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, "m k"]:
-    """Functions F·p of the parameters that are invariant to rotation-like changes."""
+    """F of the functions F·p of the parameters that do not change with what is nearly a rotation;
+    `scale`: the size of a change of each parameter."""
     unit = np.outer(scale, scale)
-    # H·s = μ·G·s with a root of G, which is singular where changes of parameters cancel in the
-    # image
+    # H·s = μ·G·s is reduced to an ordinary eigenvalue problem by a root of G. G is singular where
+    # changes of parameters cancel in the image: these are dropped. 1e-12, since G holds squares:
+    # they move the image by less than 1e-6 of what the others do.
     size, U = np.linalg.eigh(G * unit)
-    # changes that move no image are dropped: rounding of the squares in G
     seen = size > 1e-12 * size[-1]
     root = U[:, seen] / np.sqrt(size[seen])
     mu, V = np.linalg.eigh(root.T @ (H * unit) @ root)
@@ -290,7 +291,8 @@ def _line_of(
         found = Q @ A.T @ (w * p)
         return found[-1], np.sqrt(Q[-1, -1]), float(w @ (p - A @ found) ** 2)
 
-    # τ² is 0 if the epochs scatter no more than their σ, and at most the whole variance
+    # τ² is 0 if the epochs scatter no more than their σ; it is below n times their variance, where
+    # χ² ≤ (n − 1)/n is already less than any number of degrees of freedom
     low, high = 0.0, float(np.var(p, ddof=1) * len(p))
     chi2 = fit(0.0)[2]
     if chi2 <= degrees:

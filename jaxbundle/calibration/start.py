@@ -1,6 +1,6 @@
 """Start values of a camera and its photographs of a board, and exclusion of impossible views.
 
-The camera is that of `batch.first_cameras`.
+The camera is that of `batches.first_cameras`.
 
 A view whose points do not fit the others (a wrong board, a wrong order of corners) is excluded:
 more than a third of its residuals are gross compared with the median of all, or it looks at the
@@ -74,7 +74,7 @@ def start_values(
         gross = _gross_views(views, solved)
         if not gross.any():
             break
-        # most views bad: nothing says which are right
+        # fewer than two views would be left: nothing says which are right
         if gross.sum() > len(views) - 2:
             raise NotSolvedError(
                 "not solved: the photographs contradict one another: the points of "
@@ -112,9 +112,10 @@ def _gross_views(views: BoardViews, solved: FirstCamera) -> Bool[np.ndarray, " v
     # lengths of the residuals, pixels; NaN for missing points
     v = np.linalg.norm(computed - in_model_units(views.xy, model, views.image_size), axis=2)
     typical = 1.4826 * np.nanmedian(v)
-    # Gross: above 12 times the typical size (1.4826·median, as σ) and 3 pixels. The camera of the
-    # start may have fewer coefficients than its model, and what they leave grows towards the
-    # corners to several times its median; a wrong board or order of corners is off by squares.
-    # Single blunders are left to data snooping.
+    # Gross: above 12 times the typical size and 3 pixels. (Of lengths 1.4826·median is not σ of a
+    # coordinate, but 1.75 times as much.) The camera of the start may have fewer coefficients than
+    # its model, and what they leave grows towards the corners to several times its median; a wrong
+    # board or order of corners is off by squares of the board. Single blunders are left to data
+    # snooping.
     gross = v > max(12.0 * typical, 3.0)
     return gross.sum(1) > views.visible.sum(1) / 3

@@ -12,8 +12,9 @@ from jaxbundle.leastsquares.spaces import Change, WithoutChart, hold_by_retracti
 from jaxbundle.types import AnyArray, Scalar
 
 # Infinity, in units of the length s of a row: rays to it from places a length s apart differ by
-# 1e-8, a ten-thousandth of a pixel of an image of 10 000 · 10 000. At a hundredth of it they would
-# differ by more than images are measured; a hundred times more changes nothing.
+# 1e-8 radians, a ten-thousandth of a pixel if the principal distance is 10 000 pixels. At a
+# hundredth of this distance they would differ by a hundredth of a pixel, which can be measured; a
+# hundred times more changes nothing.
 LARGEST_DISTANCE = 1e8
 
 

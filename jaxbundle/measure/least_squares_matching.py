@@ -10,12 +10,12 @@ differentiation. Damped steps (Marquardt).
 Interpolated noise of variance σ² has the variance σ²·κ(u)·κ(v), periodic by pixels: 1 at a pixel,
 0.57 in the middle of four. With equal noise in both windows
 
-    E vᵀv/(n − 8) = σ²·(1 + h1²·κ̄),    C = σ²·(1 + h1²)·N⁻¹,
+    E vᵀv/(n² − 8) = σ²·(1 + h1²·κ̄),    C = σ²·(1 + h1²)·N⁻¹,
 
-since the gradients are smooth and interpolation does not reduce their noise. C is the
-covariance of one position relative to the other: each window has half of it. Noise makes vᵀv
-smallest midway between pixels; its expectation ½·σ²·h1²·Σκ(u)·κ(v) shifts p by
-−N⁻¹·∂/∂p of it, which is subtracted.
+with n² pixels in the window and κ̄ the mean of κ(u)·κ(v) over them, since the gradients are smooth
+and interpolation does not reduce their noise. C is the covariance of one position relative to the
+other: each window has half of it. Noise makes vᵀv smallest midway between pixels: the expectation
+of ½·vᵀv contains ½·σ²·h1²·Σκ(u)·κ(v), which shifts p by −N⁻¹·∂/∂p of it; this is subtracted.
 
 Cubic convolution instead of the spline shifts positions by up to 0.03 pixel on sharp photographs.
 
@@ -77,7 +77,7 @@ class LeastSquaresSettings:
     - `last_step`: pixels; steps below this, anywhere in the window, end the iterations. A match of
       good texture has a σ of 0.016, and the next step is far smaller.
     - `max_shift`: the centre may move from its start by this part of the side of the window: beyond
-      half of it, nothing of the expected window is seen.
+      half of it, the point is outside the window that was expected.
     - `min_scale`: smallest determinant of A relative to its start; below 0 it is mirrored.
     - `min_contrast`: standard deviation of grey values, relative to the largest, below which there
       is none: ten roundings of 32 bits.
@@ -105,13 +105,14 @@ class MatchingStatus(IntEnum):
     NO_TEXTURE = 3
     """The grey values do not determine the position."""
     DIVERGED = 4
-    """The match moved too far from its start, or was mirrored."""
+    """The match moved too far from its start, shrank (`min_scale`), or was mirrored."""
 
 
 class LeastSquaresMatch(eqx.Module):
     """`affine`: A, pixels of the other image; `radiometry`: (h0, h1); `covariance`: of the position
-    A[:, 2], pixels², relative to the window; `sigma0`: of a grey value; `correlation`: ρ of the
-    window and its match; `status`: a `MatchingStatus`."""
+    A[:, 2], pixels², relative to the window; `sigma0`: of a residual v, which has the noise of both
+    windows, grey values; `correlation`: ρ of the window and its match; `status`: a
+    `MatchingStatus`."""
 
     affine: Float[Array, "2 3"]
     radiometry: Float[Array, "2"]
@@ -143,7 +144,8 @@ def match_least_squares(
     down) to pixels of `image`; `steps`: maximum evaluations, of which two matches in three need
     six; `blur`: σ, pixels, of the Gaussian by which both were smoothed, 0: white noise; `reach`:
     pixels, less than n/2, over which residuals may be correlated, 0: not at all (then no `bend`);
-    `bend`: σ of terms of second order at the edge of the window, pixels of `image`.
+    `bend`: σ of terms of second order at the edge of the window, pixels of `image`. With `blur`,
+    `reach` and `bend` are not used.
 
     **Returns:** `status` gives the reason of a failure; the covariance is infinite if undetermined.
     """
@@ -205,12 +207,13 @@ def _status(
     corners = jnp.asarray([[-h, h, h, -h], [-h, -h, h, h], [1, 1, 1, 1]], affine.dtype)
     reach = jnp.max(jnp.abs(affine @ corners - middle[:, None]), 1)
     away = jnp.linalg.norm(affine[:, 2] - start[:, 2])
-    turned = jnp.linalg.det(affine[:, :2]) / jnp.linalg.det(start[:, :2])
+    area = jnp.linalg.det(affine[:, :2]) / jnp.linalg.det(start[:, :2])
     reasons = (
         (~textured, MatchingStatus.NO_TEXTURE),
         (jnp.any(reach > middle), MatchingStatus.OUTSIDE),
         (
-            ~((away < settings.max_shift * n) & (turned > settings.min_scale)),
+            # so written that NaN counts, too
+            ~((away < settings.max_shift * n) & (area > settings.min_scale)),
             MatchingStatus.DIVERGED,
         ),
         (~known, MatchingStatus.NO_TEXTURE),
@@ -290,7 +293,7 @@ def _bend(
     their covariance from correlated residuals."""
     x, y = x / jnp.max(x), y / jnp.max(y)
     second = [J[:, k] * term for k in (2, 5) for term in (x * x, x * y, y * y)]
-    # in units of their σ: of size 0 if there are none
+    # as unknowns in units of their σ: columns of 0 if `bend` is 0, which change nothing
     J = jnp.column_stack([J, *(bend * column for column in second)])
     weight = jnp.diag(variance * np.repeat([0, 1], [UNKNOWNS, len(second)]).astype(J.dtype))
     Q, _ = _inverse(J.T @ J + weight, min_pivot)
@@ -330,7 +333,8 @@ def _white_noise(
     contrast2: Scalar,
     window: tuple[Unknowns, Pixels, Pixels],
 ) -> tuple[Normal, Unknowns]:
-    """C from equal white noise in both windows, and what p is drawn between the pixels."""
+    """C from equal white noise in both windows, and the correction of p, which noise draws towards
+    the middle between pixels."""
     size, x, y = window
     fraction = lambda u: u - jnp.floor(jax.lax.stop_gradient(u))
 
@@ -389,7 +393,7 @@ def _minimise(
 
     def improve(state: tuple[Any, ...]) -> tuple[Any, ...]:
         count, p, N, g, square, damping, moving = state
-        # undetermined unknowns do not change: a unit diagonal, and a small addition
+        # scaled to a unit diagonal; by 1e-20 the step of an unknown without effect is 0, not NaN
         scale = 1 / jnp.sqrt(jnp.diag(N) + 1e-20)
         scaled = N * scale * scale[:, None] + damping * jnp.eye(UNKNOWNS, dtype=N.dtype)
         step = -scale * cho_solve(cho_factor(scaled), scale * g)

@@ -6,13 +6,14 @@
 | `aberration` | the moving camera sees light c·l coming along c·l + v | 13 to 20 m (v/c·ρ) |
 | `refraction` | the air bends the ray, n₁·sin i₁ = n₂·sin i₂ | 0.2 m |
 
-5° off the nadir; at 50° 1.3 to 2.1 m, 21 to 34 m, 11 to 15 m.
+These sizes are for 5° off the nadir; at 50° they are 1.3 to 2.1 m, 21 to 34 m, 11 to 15 m.
 
-They depend on the product and cannot be guessed: the quaternions of some providers contain
-aberration, those of others do not. All three assume Earth-fixed positions.
+Which of them are needed depends on the product and cannot be guessed: the quaternions of some
+providers contain aberration, those of others do not. All three assume Earth-fixed positions.
 
 The velocity of the aberration is the inertial one, V + Ω × P (classical addition; relativity
-changes 20 m by a micrometre). The air is the U.S. Standard Atmosphere 1976 (`refractivity`).
+changes the direction by (v/c)²/4 at most, 0.2 mm from 800 km). The air is the U.S. Standard
+Atmosphere 1976 (`refractivity`).
 """
 
 from typing import NamedTuple
@@ -115,7 +116,8 @@ def refract(earth: Ellipsoid | None, height: Scalar, o: Vector, d: Vector) -> tu
     mean = (whole - above - N1 * (start - height)) / step
     # The heights of the bending dN/dh have a standard deviation of 0.86 of their mean above the
     # ground at sea level, 0.88 at 3.4 km, 0.95 at 8.8 km in this atmosphere (1: exponential). Below
-    # an aircraft the air ends at the aircraft: both borders stay under it.
+    # an aircraft the air ends at the aircraft: the upper border, 1 + √2 < 3 times the spread above
+    # the mean, stays under it.
     spread = jnp.minimum(0.88 * mean, (start - height - mean) / 3)
     *ray, index = *o, *unit(d), N1
     for node, weight in NODES:
@@ -148,7 +150,7 @@ def apparent_point(
 ) -> Triple:
     """The apparent position of the point X for a camera at P with the velocity V.
 
-    The inverse of the ray corrections of `locate`; without corrections X.
+    The inverse of the corrections of `ground_point`; without corrections X.
     """
     if not corrections.any:
         x, y, z = X
@@ -163,7 +165,8 @@ def apparent_point(
     d = difference(X, o)
     if corrections.refraction:
         height = geodetic(require_ellipsoid(earth), X)[2]
-        # a fixed point: the direction whose refracted ray passes X
+        # A fixed point: the direction whose refracted ray passes X. From 800 km the second round
+        # leaves 5 µm at 50° off the nadir, 1 mm at 60°.
         for _ in range(2):
             start, bent = refract(earth, height, o, d)
             nearest = along(start, bent, dot(difference(X, start), bent))

@@ -50,11 +50,11 @@ def spread_positions(
     """
     rows, columns = cells
     n = -(-least // (rows * columns))
-    draw = np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     # each row of cells deals its parts of the lines to its columns at random
-    turns = draw.permuted(np.tile(np.arange(columns), (rows, n, 1)), axis=2)
+    turns = rng.permuted(np.tile(np.arange(columns), (rows, n, 1)), axis=2)
     part = np.moveaxis(columns * np.arange(n)[:, None] + turns, 2, 1)
-    down = (part + draw.random(part.shape)) / (columns * n)
+    down = (part + rng.random(part.shape)) / (columns * n)
     across = (np.arange(part.size).reshape(part.shape) * (np.sqrt(5) - 1) / 2) % 1
     row, column = np.arange(rows)[:, None, None], np.arange(columns)[:, None]
     place = lambda within, cell, count, size: (cell + within) * size / count - 0.5

@@ -71,7 +71,8 @@ _MEANING = {
 class Projected(eqx.Module):
     """Lines and pixels that see the points, in order of time; NaN for unused places.
 
-    `count`: their number. `status`: the `ProjectionStatus` of the point.
+    `count`: their number, with passages beyond the places, which were not refined and may be
+    outside the image. `status`: the `ProjectionStatus` of the point.
     """
 
     line: Float[AnyArray, "most n"]

@@ -8,9 +8,10 @@ and c = (a, b) the 20 coefficients of the numerator and the 19 free ones of the 
 The start is linear, a·T − y·b·T' = y (Tao and Hu, 2001, PE&RS 67(12)); Gauss-Newton steps follow,
 halved until the sum decreases and no denominator vanishes at a point.
 
-The unknowns are nearly dependent, so τ keeps them small (Tikhonov), except the four linear terms of
-the numerator, for which D is a thousand times smaller. τ is the largest that predicts each point
-from all others as well as the best τ (PRESS, Allen, 1974; `RpcFitSettings`):
+The unknowns are nearly dependent, so τ keeps them small (Tikhonov), except the constant and the
+three linear terms of the numerator, for which D is a thousand times smaller. τ is the largest that
+predicts each point from all others about as well as the best τ (PRESS, Allen, 1974;
+`RpcFitSettings`):
 
     PRESS(τ) = mean (vᵢ/(1 − hᵢ))²,        h = diag J·(N + τ²D²)⁻¹·Jᵀ,    N = Jᵀ·J.
 
@@ -340,7 +341,8 @@ def _shorten(
     now = square(c)
     for _ in range(halvings):
         # at the minimum the sum changes by rounding only: relative, and absolute of an exact fit
-        if square(c + step) < np.inf and square(c + step) <= now * (1 + 1e-12) + 1e-28:
+        after = square(c + step)
+        if after < np.inf and after <= now * (1 + 1e-12) + 1e-28:
             return step
         step = step / 2
     if now == np.inf:

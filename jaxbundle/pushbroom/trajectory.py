@@ -7,12 +7,12 @@ or the angles (pitch θ₂, roll θ₁, yaw θ₃) in radians,
     R = Rx(θ₂)·Ry(θ₁)·Rz(θ₃) = (R3(θ₃)·R2(θ₁)·R1(θ₂))ᵀ,
 
 so that pitch, roll, yaw are the ω, φ, κ of a photograph: nose up, right side down, nose left are
-positive. The object frame is Earth-fixed (or local), or the orbital frame, which is rotated to the
-former by the columns
+positive. Attitudes refer to the object frame, Earth-fixed or local, or to the orbital frame, whose
+axes in the object frame are
 
     x = y × z,   y = z × (V × z)/|…|,   z = P/|P|          right, forward, up
 
-of the position P and its rate V.
+with the position P and its rate V.
 
 Quaternions are interpolated by `slerp`, qᵢ∘exp(τ·log(qᵢ*∘qᵢ₊₁)), a rotation about a fixed axis at a
 constant rate (Shoemake, 1985), or as four numbers by a method of `interpolation`, normalised.

@@ -80,7 +80,8 @@ def assess_control(
     block: OrientedBlock, control: Points, usable: Sequence[int], assumed: float
 ) -> tuple[list[int], Assessment]:
     """The usable points in the order of their assessment: very many in groups that spread over all
-    of them, since time grows with the cube of their number."""
+    of them, since time grows with the cube of their number. Redundancy, and whether σ was assumed,
+    are then those of the first group; the factor of stated σ is the largest."""
     number = max(1, -(-len(usable) // block.settings.compared_together))
     groups = [list(usable[first::number]) for first in range(number)]
     of_groups = [assess(block.compare(group, control), assumed) for group in groups]
@@ -164,15 +165,15 @@ def _settle_by_coordinates(
     X = control.position[k] + shift
     # without a height, that of the points around
     if np.isinf(control.sigma[k, 2]):
-        depth = [block.X[row, 2] for row in block.determined.values()]
-        X[2] = np.median(depth) if depth else X[2]
+        heights = [block.X[row, 2] for row in block.determined.values()]
+        X[2] = np.median(heights) if heights else X[2]
     distance = np.linalg.norm(X - block.X0[point.image], axis=1)
     spread = np.sqrt((np.where(np.isfinite(choice.sigma[k]), choice.sigma[k], 0.0) ** 2).sum())
     off = block.misses(point, X)
     # σ of the measurement and, in pixels, of the coordinates
     sigma = np.hypot(point.sigma, spread / (distance * point.pixel))
     agree = off < block.settings.wrong_ray * sigma
-    # of several rays that do not meet exactly one may pass the coordinates: then that one is right
+    # if exactly one of several rays that do not meet passes the coordinates, that one is right
     if control.role[k] == "check" or (len(point.rows) > 1 and agree.sum() != 1):
         number = count(len(point.rows), "ray")
         choice.reasons[id] = (
@@ -202,7 +203,7 @@ def _name_wrong(block: OrientedBlock, choice: ControlChoice, id: str) -> None:
         passes = np.linalg.norm(np.cross(X - block.X0[point.image[n]], point.rays[n]))
         said = (
             f"{block.name_of(point, n)} is a wrong measurement and not used: {off[n]:.0f} px "
-            "from where the other photographs see it, its ray passes at "
+            "from where the other photographs see it, and its ray misses the point by "
             f"{passes:.2f} m"
         )
         other = block.seen_there(point, n, id, choice.points)

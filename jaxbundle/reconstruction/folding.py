@@ -39,8 +39,9 @@ class SuperpositionSettings:
     max_scale: float = 1.5
     """Maximum ratio of the lengths of these rays: half an octave of SIFT."""
     min_points: int = 50
-    """Minimum expected points of a pair: a tenth of them are five; if every second of right ones is
-    found again, fewer than five are with a probability of 2e-10."""
+    """Minimum expected points of a pair, both directions together: a tenth of them are five; if
+    every second one is found again in a right pair, fewer than five are found with a probability of
+    2e-10."""
     min_of_each: int = 10
     """Minimum expected points of each photograph in the other one."""
     min_shared: float = 0.1
@@ -67,8 +68,8 @@ def refuse_folded(
     number = int(rays[rays > 1].sum())
     if weighted.agreeing_rays < settings.min_agreeing * number:
         raise _folded(
-            f"of {number} measurements in {count(len(placed), 'photograph')} "
-            f"{weighted.agreeing_rays} agree with one object",
+            f"only {weighted.agreeing_rays} of {number} measurements in "
+            f"{count(len(placed), 'photograph')} agree with one object",
             names,
         )
 
@@ -199,6 +200,6 @@ def _is_in_field(
 def _folded(what: str, names: Sequence[str]) -> NotSolvedError:
     return NotSolvedError(
         f"not solved: {what}: the object repeats itself, and parts of it would be superimposed; "
-        "take photographs with shorter bases, or leave out those that show repeated parts alone",
+        "take photographs with shorter bases, or leave out those that show only repeated parts",
         list(names),
     )

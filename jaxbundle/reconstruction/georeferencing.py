@@ -71,8 +71,8 @@ def georeference(
     if not block.has_positions:
         block.move(usable, control)
         measured = block.resolve()
-    assumed = block.settings.assumed_pixels * block.ground_sample_distance
     # in object units: a pixel is larger on the ground the higher the camera
+    assumed = block.settings.assumed_pixels * block.ground_sample_distance
     usable, assessed = assess_control(block, control, usable, assumed)
     choice = choose_control(block, control, measured, usable, assessed, assumed)
     if not block.has_positions and choice.used.sum() < MIN_CONTROL:

@@ -1,7 +1,8 @@
 """Photographs whose start values contradict the relative orientations of most of their pairs.
 
-Around a photograph that repeated parts of an object place wrongly, enough points agree: those along
-epipolar lines. But its pairs were oriented, and closed in triplets, without this model.
+With a photograph that repeated parts of an object place wrongly, enough points still agree: those
+along epipolar lines. But its pairs, oriented and closed in triplets without the start values of the
+whole, contradict it.
 """
 
 import dataclasses
@@ -42,8 +43,8 @@ def find_misplaced(
     network: Network, pairs: NamedPairs, settings: MisplacedSettings = MisplacedSettings()
 ) -> dict[str, str]:
     """Images that contradict more than half of their pairs, with the reason; the worst first,
-    whose pairs no longer count for the others. None if these are most images: then it is not known
-    which of them are right."""
+    whose pairs no longer count for the others. Empty if these are half of the images or more: then
+    it is not known which of them are right."""
     contradicted = _compare(network, pairs, settings)
     misplaced: dict[str, str] = {}
     # one at a time: the pairs of a misplaced photograph make its neighbours look wrong, too

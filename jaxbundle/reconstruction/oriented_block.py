@@ -39,11 +39,12 @@ class ControlSettings:
     (EGM2008)."""
     wrong_ray: float = 5.0
     """A ray that misses its point by more, in σ of the measurement, is a wrong measurement: by
-    chance 4e-6 (Rayleigh). Wrong names and marks miss by tens of pixels; between, σ is
-    enlarged by the robust scale of all."""
+    chance with a probability of 4e-6 (Rayleigh). Wrong names and marks miss by tens of pixels. If
+    the misclosures of all rays are larger than their σ explain, `resolve` multiplies σ by their
+    robust scale."""
     paired_rays: int = 8
-    """Most rays of one point of which every pair is tried: 28 pairs, of which with half of the rays
-    wrong six are right."""
+    """Maximum number of rays of a point of which every pair is tried: eight have 28 pairs, and if
+    half of the rays are wrong, six of these are right."""
     assumed_pixels: float = 2.0
     """σ of control that its residuals do not determine, and the smallest estimated one, in pixels
     on the ground: what is marked and identified in photographs is hardly more exact, unless it is
@@ -241,13 +242,13 @@ class OrientedBlock:
         return float(np.median(np.concatenate(lengths))) if lengths else 1.0
 
     def compare(self, places: Sequence[int], points: Points) -> Discrepancies:
-        """Coordinates from the block minus given ones, and their joint cofactors."""
+        """Coordinates from the block minus given ones, and their joint covariance."""
         rows = [self.determined[points.id[k]] for k in places]
         if not rows:
             none = np.zeros((0, 3))
             return Discrepancies(none, np.zeros((0, 3, 0, 3)), none, np.zeros((0, 3, 0)))
         X, given = self.X[rows], points.position[list(places)]
-        C = self._joint_cofactors(rows)
+        C = self._joint_covariance(rows)
         n, sigma = len(rows), points.sigma[list(places)].copy()
         if self.has_positions:
             C = C + np.diag(self.offset_sigma**2)[None, :, None, :]
@@ -262,7 +263,7 @@ class OrientedBlock:
         sigma[fixed] = 0.0
         return Discrepancies(X - given, C, sigma, G)
 
-    def _joint_cofactors(self, rows: Sequence[int]) -> Float[np.ndarray, "n 3 n 3"]:
+    def _joint_covariance(self, rows: Sequence[int]) -> Float[np.ndarray, "n 3 n 3"]:
         """The covariance of the coordinates of some points among each other."""
         problem, n = self.result.problem, len(rows)
         tables = {t.name: np.zeros((3 * n, t.rows, t.space.width)) for t in problem.tables}

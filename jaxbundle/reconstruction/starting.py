@@ -3,9 +3,9 @@
 1. With the cameras from consistent pairs of photographs: misclosures above 1 % of the image extent
    are contradictions. If photographs are left out, the limit is that of an unknown lens.
 2. With other principal distances, unless the file gives one; those that explain the most matches
-come first.
+   come first.
 
-In both cases, left out photographs are tried again with the adjusted cameras. Photographs that
+In both cases, photographs left out are tried again with the adjusted cameras. Photographs that
 contradict their pairs are left out, as long as the principal distance is that of the pairs.
 """
 
@@ -32,17 +32,19 @@ class BlockStartSettings:
     """Settings of the start values of a part."""
 
     tolerance: float = 0.01
-    """Tolerance of start values by cameras from consistent pairs, relative to the image extent: 30
-    pixels of 3000: their K1 is not exact, and K2 and K3 are missing. Larger: points of repeated
-    parts agree by chance; smaller: photographs with much distortion are left out (and tried with
-    the tolerance of an unknown lens)."""
+    """Tolerance of start values by cameras from consistent pairs, relative to the image extent, the
+    angle to the axis that 95 % of the rays do not exceed (`orientation.rays.sights`): 14 pixels of
+    3000. Their K1 is not exact, and K2 and K3 are missing. Larger: points of repeated parts agree
+    by chance; smaller: photographs with much distortion are left out (and tried with the tolerance
+    of an unknown lens)."""
     min_distance: float = 0.35
     """Smallest plausible adjusted principal distance, relative to the longer side: 110° of view."""
     max_distance: float = 12.0
-    """Largest plausible one: 5° of view. Adjustments that fail end in 0 or infinity."""
+    """Largest plausible one: 5° of view, 430 mm of full frame. Adjustments that fail end in 0 or
+    infinity."""
     other_distances: tuple[float, ...] = (0.7, 0.9, 1.2, 1.6, 2.2)
-    """Other principal distances to try, relative to the longer side, in steps of about 4/3, so
-    that one lies within 15 % of the right one, from telephones and drones (0.7) to beyond normal
+    """Other principal distances to try, relative to the longer side, in steps of 1.29 to 1.375, so
+    that one lies within 17 % of the right one, from telephones and drones (0.7) to beyond normal
     lenses (1.4)."""
     distinct_ratio: float = 1.15
     """Others are tried only if they differ from the present ones by more than this factor: half a

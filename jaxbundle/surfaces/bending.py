@@ -33,8 +33,8 @@ MATRICES_AT_ONCE = 4096
 class BendingSettings:
     """The correction of matches for the curvature of the surface.
 
-    Figures "half …, double …" are of `benchmarks/surface_accuracy.py "no texture" --sparse` with
-    every fifth pixel: 2251 points, RMS of errors over σ 0.999, robust 0.964.
+    Figures "half …, double …" are of `benchmarks/surface_settings.py` (scene "no texture", every
+    fifth pixel): 2251 points, RMS of errors over σ 0.999, robust 0.964.
     """
 
     wide_reach: int = 4
@@ -44,8 +44,8 @@ class BendingSettings:
     """Those of the polynomial for surfaces that the wide one does not fit: 25 nodes for 6
     coefficients."""
     max_missing: float = 0.16
-    """Maximum share of nodes that were not found, a corner of a square of them. Half: RMS 1.01,
-    robust 0.986; double: 1.005."""
+    """Maximum share of nodes that were not found: 4 of 25, a corner of their square. Half: RMS
+    1.01, robust 0.986; double: 1.005."""
     max_misfit: float = 0.03
     """Maximum RMS of the nodes relative to the polynomial, in distances of nodes (0.12 pixel of
     their level). Half: no difference; double: 0.986."""
@@ -222,7 +222,7 @@ def response(
     for first in range(0, len(uv), MATRICES_AT_ONCE):
         part = slice(first, first + MATRICES_AT_ONCE)
         T, gx, gy = _cut_out_with_gradient(grey, np.rint(uv[part]).astype(int), half)
-        # the unknowns: A·c with the other four of an affine transformation, brightness, contrast
+        # the unknowns: c, the four elements of B, brightness, contrast
         G = np.stack([gx, gy, gx * x, gx * y, gy * x, gy * y, np.ones_like(T), T], 2)
         w = np.einsum("nij,nkj->nki", np.linalg.inv(A[part]), second[part])
         moved = np.einsum("nki,kp->nip", w, squares)
@@ -230,6 +230,7 @@ def response(
         # columns of length 1: gradients and grey values have different units
         scale = 1 / np.maximum(np.linalg.norm(G, axis=1), 1e-9)
         G = G * scale[:, None]
+        # 1e-9 of the unit diagonal: without texture N is singular, and `solve` would raise
         N = np.swapaxes(G, 1, 2) @ G + 1e-9 * np.eye(8)
         c = np.linalg.solve(N, np.einsum("npi,np->ni", G, away)[:, :, None])[:, :, 0] * scale
         found = np.einsum("nij,nj->ni", A[part], c[:, :2])

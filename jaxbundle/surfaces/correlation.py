@@ -5,8 +5,8 @@ segment are parts of one strip, and column k + x of row y is sampled once:
 
     ρ(k) = Σ t(x, y)·s(k + x, y)/√(Σt²·Σ(s − s̄ₖ)²),    Σt = 0
 
-Positions are one window pixel apart; between them ρ is a parabola. Subpixel positions are left to
-least squares matching.
+Positions are one window pixel apart; between them ρ is interpolated by a parabola. Subpixel
+positions are left to least squares matching.
 """
 
 import dataclasses
@@ -75,7 +75,7 @@ def _halve(a: Grey) -> Float32[np.ndarray, "half_rows half_columns"]:
 def _find_extent(
     place: Float[np.ndarray, "*n 2"], shape: tuple[int, ...]
 ) -> tuple[Int[np.ndarray, "2"], Int[np.ndarray, "2"]]:
-    """The corner (u, v) of the used part of an image, and the one after its last."""
+    """The first pixel (u, v) of the used part of an image, and the one after its last."""
     finite = np.where(np.isfinite(place), place, 0.0).reshape(-1, 2)
     size = np.array(shape[::-1])
     low = np.clip(np.floor(finite.min(0)).astype(int) - 1, 0, size - 1)
@@ -117,7 +117,7 @@ def correlate(
     def correlate_rows(first: int) -> Float[np.ndarray, "m steps"]:
         rows = slice(first, first + together)
         template = _sample_templates(
-            pyramids[0], uv[rows], sign[rows] * shape.axis[rows], np.sign(sign[rows]), half, level
+            pyramids[0], uv[rows], sign[rows] * shape.axis[rows], sign[rows], half, level
         )
         strip = _sample_strips(
             pyramids[1],
@@ -158,8 +158,8 @@ def slide(
             cross += product
     total, square = (_sliding_sum(np.asarray(a.sum(1, dtype=np.float64)), w) for a in (s, s * s))
     spread = np.sqrt(np.maximum(square - total**2 / w**2, 0))
-    # a standard deviation of 0.001 grey values is the rounding of float32, no texture;
-    # half and double: no difference
+    # below a standard deviation of 0.001 grey values there is no texture (float32 resolves 255 to
+    # 1.5e-5); half and double: no difference
     flat = (norm[:, None] <= 1e-3 * w) | (spread <= 1e-3 * w)
     with np.errstate(invalid="ignore", divide="ignore"):
         rho = np.where(flat, -1.0, cross / (norm[:, None] * spread))
@@ -189,8 +189,8 @@ def find_peaks(rho: Float[np.ndarray, "n k"]) -> tuple[np.ndarray, np.ndarray, n
 def combine(
     curves: Sequence[Float[np.ndarray, "n k"]],
 ) -> Float[np.ndarray, "n k"]:
-    """ρ of several images at common positions: the mean of the better half, rounded up, so
-    that an image with a hidden point does not spoil the others; NaN: in no image."""
+    """ρ of several images at common positions: the mean of the best ⌊n/2⌋ + 1 of n, so that an
+    image with a hidden point does not spoil the others; NaN: in no image."""
     if len(curves) == 1:
         return curves[0]
     stacked = np.sort(np.where(np.isfinite(curves), curves, -2.0), axis=0)[::-1]

@@ -28,7 +28,8 @@ class DisparityRefinementSettings:
     """Least squares at every pixel, and the σ of the disparities; pixels where nothing is said.
 
     Figures "half …, double …" are of `benchmarks/surface_accuracy.py "no texture" --dense`: 66 870
-    points, RMS of errors over σ 1.003, robust 0.943, 0.106 % wrong by more than a pixel.
+    points, RMS of errors over σ 1.003, robust 0.943, 0.106 % wrong by more than a pixel; those of
+    other values are printed by `benchmarks/surface_settings.py --dense`.
     """
 
     half_window: int = 4
@@ -74,8 +75,8 @@ class DisparityRefinementSettings:
     """Minimum ρ of a window beside a step, where disparities of one side extend to the other. 0.35:
     1.2 % more pixels, 0.13 % wrong; 0.95: 0.4 % fewer, 0.093 % wrong."""
     min_contrast_ratio: float = 0.2
-    """Minimum ratio of the contrasts of both windows. Half: no difference; double: 0.1 % fewer
-    pixels."""
+    """Minimum contrast h₁ of the left window relative to the right one (`row_windows`). Half: no
+    difference; double: 0.1 % fewer pixels."""
     added_sigma: float = 0.014
     """σ added by interpolation and sampling: errors that depend on the fraction of the disparity
     are alike over whole surfaces, so that no scatter shows them. Half: RMS 1.005; double: 0.82, σ
@@ -140,8 +141,8 @@ class _RowSpline(NamedTuple):
         columns: Int[np.ndarray, " columns"],
         disparity: RowImage,
     ) -> RowImage:
-        """Grey values to the left of some rows and columns by the disparities; those of the edge
-        beyond it."""
+        """Grey values at some rows, and at columns moved to the left by the disparities; beyond the
+        edge those of the edge."""
         whole = np.floor(-disparity)
         t = -disparity - whole
         first = columns + whole.astype(np.int32)
@@ -169,8 +170,9 @@ def _refine_with_windows(
     """Disparities by windows of 2·`half` + 1 pixels, with the factor of those wanted in σ; which
     windows have a step of the surface in them."""
     rows, columns = left.shape
-    # a pixel depends on two smooth shapes and two windows of least squares, `half` each, and on two
-    # pixels each for the median and the gradients
+    # In two rounds a pixel depends on two smooth shapes and two windows of least squares, `half`
+    # each, and on two pixels each for the median and the gradients of both rounds. Two pixels of
+    # these are left out: they change a disparity by less than 1e-6 pixel.
     margin = 4 * (half + 1)
     height, width = (n - 2 * margin for n in settings.piece)
     d, sigma, rho, across = (np.full(left.shape, np.nan, np.float32) for _ in range(4))
@@ -243,8 +245,8 @@ def _refine_piece(
     known = np.isfinite(start)
     shape = _smooth(_remove_noise(start, known), known, half, settings.surface_tolerance)
     moved = np.zeros_like(shape)
-    for last in range(settings.rounds):
-        if last:
+    for number in range(settings.rounds):
+        if number > 0:
             # a smooth shape and the windows' mean of what is left of it: no bias from curvature
             shape = _smooth(
                 np.where(known, shape + moved, np.nan), known, half, settings.surface_tolerance
@@ -276,8 +278,8 @@ def _edge_variance(
 
 
 def _remove_noise(disparity: RowImage, known: RowMask) -> RowImage:
-    """Medians of 5 × 5 against single wrong disparities; an edge of the surface, where the median
-    is of the other side, keeps its own."""
+    """Medians of 5 × 5. Where one differs by 1.5 pixels or more, it may be of the other side of an
+    edge, and the disparity is kept."""
     cv2 = need_opencv()
     median = cv2.medianBlur(np.where(known, disparity, -1e3).astype(np.float32), 5)
     with np.errstate(invalid="ignore"):

@@ -1,7 +1,7 @@
 """Search for disparities along the rows of a rectified pair, by OpenCV's semi-global matching.
 
-The grey values are reduced by their means over large windows, with equal contrast, since exposures
-differ. Surfaces whose texture repeats itself are removed if they are small and separate.
+Means over large windows are subtracted from the grey values, and contrasts are made equal, since
+exposures differ. Surfaces whose texture repeats itself are removed if they are small and separate.
 
 Source: Hirschmüller (2008), Stereo processing by semiglobal matching and mutual information.
 """
@@ -24,7 +24,8 @@ class DisparitySearchSettings:
     """The search for disparities, by OpenCV's semi-global matching.
 
     Figures "half …, double …" are of `benchmarks/surface_accuracy.py "no texture" --dense`: 66 870
-    points, RMS of errors over σ 1.003, 0.106 % wrong by more than a pixel.
+    points, RMS of errors over σ 1.003, 0.106 % wrong by more than a pixel; those of other values
+    are printed by `benchmarks/surface_settings.py --dense`.
     """
 
     block_side: int = 3
@@ -52,8 +53,9 @@ class DisparitySearchSettings:
     parts visible in one image only, matched to the repetition in the other. Half: 1.6 % wrong in
     the scene "repeated"; double: no difference."""
     max_costs: float = 4e8
-    """Pixels times disparities up to which all costs, of 2 bytes and more, are held in memory, and
-    paths from below are followed, too. A larger pair is matched in strips."""
+    """Pixels times disparities up to which all costs, of 2 bytes and more, are held in memory and
+    four paths are followed, both ways along rows and columns. A larger pair is matched in strips,
+    along five paths, none of them from below."""
 
 
 def equalise_exposures(
@@ -111,11 +113,11 @@ def semi_global(
             # keeps surfaces of little texture together
             P1=8 * block**2,
             P2=48 * block**2,
-            disp12MaxDiff=1,
+            disp12MaxDiff=1,  # pixels; the least that does not disable the check
             preFilterCap=31,
             uniquenessRatio=settings.uniqueness,
             speckleWindowSize=settings.min_region,
-            speckleRange=2,
+            speckleRange=2,  # pixels; OpenCV recommends 1 or 2
             mode=mode,
         )
         found = matcher.compute(*(np.ascontiguousarray(a[low:high]) for a in wide))
@@ -147,6 +149,7 @@ def find_repetitions(
     known = np.isfinite(disparity)
     whole = np.where(known, 16 * np.nan_to_num(disparity), -16).astype(np.int16)
     largest = int(settings.min_repetitive_share * left.size)
+    # neighbours of one surface differ by up to a pixel, 16 of OpenCV's units
     remaining, _ = cv2.filterSpeckles(whole, -16, largest, 16)
     return known & repeated & (remaining < 0)
 

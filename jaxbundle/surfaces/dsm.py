@@ -2,9 +2,10 @@
 
 A cell has the weighted mean of the heights of its points, p = 1/σ_Z², without those that differ
 from their median by more than three times its spread. Its σ is that of the mean, enlarged by the
-scatter of the points: σ² = max(1, χ²/(n − 1))/Σp. Small gaps are filled linearly, with σ from the
-points around and the distance to them; beside a wall from the lower surface, since hidden parts
-are low (Hirschmüller 2008).
+scatter of the points: σ² = max(1, χ²/(n − 1))/Σp. Small gaps are filled with the mean of the
+heights around, weighted by the inverse squares of their distances, with σ from the cells around and
+the distance to them; beside a wall from the lower surface, since hidden parts are low
+(Hirschmüller 2008).
 """
 
 import dataclasses
@@ -43,9 +44,9 @@ class DsmSettings:
     """σ of a filled cell, in cell sizes for each cell of distance: the slope of the surface that is
     not known in a gap, 17°. To be larger for steep terrain; no measurement stands behind it."""
     wall: float = 1.0
-    """Scatter of the heights around a gap, in cell sizes, above which they are of two surfaces:
-    larger, walls less than twice as high are filled by means; smaller, steep slopes are filled from
-    below."""
+    """Standard deviation of the heights around a gap, in cell sizes, above which they are of two
+    surfaces: that of a wall is half its height. Larger: higher walls are filled with means;
+    smaller: steep slopes are filled from below."""
     max_cells: float = 2e9
     """A larger grid is refused: the three grids of so many cells take 48 GB."""
 
@@ -110,7 +111,9 @@ def make_dsm(
     left, top = column.min(), row.min()
     columns, rows = int(column.max() - left) + 1, int(row.max() - top) + 1
     if rows * columns > settings.max_cells:
-        raise InputError(f"DSM: {rows} × {columns} cells of {size:g}; give a larger size")
+        raise InputError(
+            f"a DSM of {rows} × {columns} cells of {size:g} is too large; give larger cells"
+        )
     cell = ((row - top) * columns + (column - left)).astype(np.int64)
     Z, sigma_Z, number = cloud.X[:, 2], cloud.sigma[:, 2], rows * columns
     height, sigma, count = _average_cells(cell, Z, sigma_Z, size, number, settings)

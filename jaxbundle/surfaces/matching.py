@@ -4,13 +4,13 @@
     → checks → intersection
 
 The residuals across the epipolar lines are errors of the same matching that gives the heights: the
-median of vᵀC⁻¹v over its expectation is the variance factor by which all covariances are
-multiplied. It includes error sources unknown to the matching, such as small errors of orientation.
-Below 1 it means that the differences of the windows are finer than those that shift them. But the
-shape of the surface within the windows shifts all matches of a point along its line of sight, which
-no residual shows. The scatter of the points (`scatter.py`) does: what it has beyond their
-covariances is added, the same for all points in pixels. Where it is not known, the factor is at
-least 1.
+median of vᵀC⁻¹v over that of its χ² distribution is the variance factor by which all covariances
+are multiplied. It includes error sources unknown to the matching, such as small errors of
+orientation. A factor below 1 means that the windows differ in detail too fine to shift a match. But
+the shape of the surface within the windows shifts all matches of a point along its line of sight,
+which no residual shows. The scatter of the points (`scatter.py`) does: with a factor below 1, what
+the scatter has beyond the covariances is added, the same for all points in pixels. Where the
+scatter is not known, the factor is at least 1.
 """
 
 import dataclasses
@@ -44,8 +44,8 @@ class MatchingSettings:
     """How points are matched in the other images, and which are kept; pixels are those of the full
     images.
 
-    Figures "half …, double …" are of `benchmarks/surface_accuracy.py "no texture" --sparse` with
-    every fifth pixel: 2251 points, RMS of errors over σ 0.999, 0.04 % wrong by more than a pixel.
+    Figures "half …, double …" are of `benchmarks/surface_settings.py` (scene "no texture", every
+    fifth pixel): 2251 points, RMS of errors over σ 0.999, 0.04 % wrong by more than a pixel.
     """
 
     edge_margin: int = 8
@@ -67,7 +67,7 @@ class MatchingSettings:
     reject the same points; 0.8: 12 points fewer."""
     added_sigma: float = 0.012
     """σ added to a match by interpolation and sampling, pixels. Half: 99.5 % of the errors within 3
-    σ (99.6); double: RMS 1.01, since the scatter adds less."""
+    σ (99.6); double: RMS 1.01, since the variance factor falls from 0.59 to 0.34."""
     max_sigma: float = 0.5
     """σ of a match above which the texture does not determine it, pixels. Half: 4 points fewer, the
     only one wrong by a pixel among them; double: 1 more."""
@@ -85,7 +85,7 @@ class MatchingSettings:
     scatter is not known, and σ is too large (RMS 0.77); double: no difference."""
     scatter_quantile: float = 0.45
     """Quantile of the blocks that is used, in the smoother direction. Half: no difference, since
-    the scatter adds up to a limit; 0.9: RMS 0.87."""
+    the scatter adds nothing in both cases; 0.9: it adds 0.011 pixel, RMS 0.87."""
     significance: float = 1e-3
     """Level of the test of a point's residuals. Half: 3 points more; double: 1 fewer."""
     windows: WindowSettings = WindowSettings()
@@ -97,9 +97,10 @@ class MatchingSettings:
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class SurfaceMatches:
-    """Points from a base image: their pixels, points, and rejected ones by reason.
+    """Points of a base image: pixels in it, object points with covariance, numbers of rays, widest
+    angle between them, smallest ρ of a match, positions in the other images (NaN: not used).
 
-    `factor`: the variance factor of the covariances.
+    `factor`: the variance factor of the covariances; `rejected`: numbers of points by reason.
     """
 
     uv: Float[np.ndarray, "n 2"]
@@ -134,22 +135,22 @@ def match_points(
     q, rho, second = search(base, others, pyramids, uv, reach, normal, 0, guide_settings)
     with np.errstate(invalid="ignore"):
         found = np.isfinite(q) & (rho >= settings.min_correlation)
-        double = found & (second > settings.max_second_ratio * rho)
+        ambiguous = found & (second > settings.max_second_ratio * rho)
     lost["low correlation"] += int((~found).sum())
-    lost["not unique"] += int(double.sum())
-    rows = np.flatnonzero(found & ~double)
+    lost["not unique"] += int(ambiguous.sum())
+    rows = np.flatnonzero(found & ~ambiguous)
     uv, q, normal = uv[rows], q[rows], normal[rows]
     X = base.points(uv, q)
-    found = _match_windows(base, others, guide, (uv, q, normal), guides, settings)
-    enough = found.is_used.sum(1) + 1 >= settings.min_rays
+    matches = _match_windows(base, others, guide, (uv, q, normal), guides, settings)
+    enough = matches.is_used.sum(1) + 1 >= settings.min_rays
     lost["not confirmed by least squares matching"] += int((~enough).sum())
     uv, X = uv[enough], X[enough]
-    places, used, covariance, in_base, rhos = (a[enough] for a in found)
+    places, used, covariance, in_base, rhos = (a[enough] for a in matches)
     mean = in_base.sum(1) / np.maximum(used.sum(1), 1)[:, None, None]
     table = _Rays(
         (base, *others),
         np.concatenate([uv[:, None], places], 1),
-        # half of a match's variance is of the window in the base, half of that in the other image
+        # half of a match's variance is due to the window in the base, half to the other window
         np.concatenate([mean[:, None], covariance], 1) / 2,
         np.concatenate([np.ones((len(uv), 1), bool), used], 1),
     )
@@ -157,8 +158,8 @@ def match_points(
 
 
 class WindowMatches(NamedTuple):
-    """Positions of points in the other images, which are good, their covariances, these as
-    displacements in the base image, ρ."""
+    """Positions of points in the other images; which are used; their covariances, and these carried
+    over to the base image; ρ."""
 
     places: Float[np.ndarray, "n others 2"]
     is_used: Bool[np.ndarray, "n others"]
@@ -238,7 +239,8 @@ def _accept(
     settings: MatchingSettings,
     lost: Counter[str],
 ) -> SurfaceMatches:
-    """Intersect; inconsistent rays are left out, inconsistent points are rejected."""
+    """Intersect; an inconsistent point with rays to spare loses its worst one, and is rejected if
+    it stays inconsistent."""
     found = table.intersect(X)
     factor = variance_factor(found.vtpv, found.redundancy)
     shape = _shape_variance(table, found, factor, settings) if factor < 1 else None
@@ -280,7 +282,7 @@ def variance_factor(
     vtpv: Float[np.ndarray, " n"], redundancy: Int[np.ndarray, " n"], min_points: int = 30
 ) -> float:
     """The median of vᵀPv over that of its distribution, 1 for fewer than `min_points`: of 30 values
-    of χ²₁ the median has a standard deviation of 40 %, and a factor from fewer says nothing."""
+    of χ²₁ the median has a standard deviation of 43 %, and a factor from fewer says nothing."""
     good = np.isfinite(vtpv) & (redundancy > 0)
     if good.sum() < min_points:
         return 1.0
@@ -299,7 +301,8 @@ def _shape_variance(
     X, place = found.X[good], table.uv[good, 0].astype(int)
     step = int(np.gcd.reduce(np.diff(np.unique(place[:, 0])))) or 1
     column, row = ((place - place.min(0)) // step).T
-    # along the line of sight d: σ of each point, and the length of one pixel of the other images
+    # along the line of sight d: σ of each point, and the length that moves it by one pixel in the
+    # other image where it moves most
     d = line_of_sight(base.derivative(X))
     along = np.sqrt(factor * np.einsum("ni,nij,nj->n", d, found.covariance[good], d))
     moved = [np.linalg.norm(o.derivative(X) @ d[:, :, None], axis=(1, 2)) for o in others]
@@ -324,7 +327,7 @@ def _shape_variance(
     )
     if missing is None:
         return None
-    # what is more than the matches have without a factor is the surface itself
+    # scatter beyond the σ that the matches have without the factor is the shape of the surface
     missing = min(missing, np.sqrt(1 / factor - 1) * np.median(along / pixel))
     C = np.zeros_like(found.covariance)
     C[good] = ((missing * pixel) ** 2)[:, None, None] * d[:, :, None] * d[:, None]
@@ -342,7 +345,7 @@ def _find_misfits(
 def _drop_worst_rays(
     table: _Rays, found: IntersectedPoints, several: Bool[np.ndarray, " n"]
 ) -> tuple[_Rays, IntersectedPoints]:
-    """The points again without the ray with the largest residual, other than the base ray."""
+    """Intersect some points again without the ray of the largest residual; the base ray stays."""
     used = table.is_used.copy()
     rows = np.flatnonzero(several)
     misfit = np.where(used[rows][:, 1:], found.misfit[rows][:, 1:], -1)
@@ -362,7 +365,8 @@ def _drop_worst_rays(
 def _agrees(
     other: OrientedImage, guide: Guide | None, X: Float[np.ndarray, "n 3"], max_distance: float
 ) -> Bool[np.ndarray, " n"]:
-    """Whether the guide of the other image has its surface at X, within pixels of its partners."""
+    """Whether the guide of the other image has its surface at X, within `max_distance` pixels of
+    the images that the guide was matched with."""
     if guide is None:
         return np.ones(len(X), bool)
     uv = other.project(X)

@@ -1,7 +1,8 @@
 """Epipolar rectification of two photographs: both are rotated to the normal case.
 
-The x axis of the rectified cameras is the base b, z is the mean of both optical axes less its part
-along it; the principal distance f keeps the resolution of the base image. Then lines are rows, and
+The x axis of the rectified cameras is along the base b, z along the mean of both optical axes less
+its component along b; the principal distance f keeps the resolution of the base image. Then
+epipolar lines are rows, and
 
     d = x − x' = f·b/Z,        X = X0 + Z·Rᵀ·[x/f, y/f, 1].
 
@@ -39,7 +40,7 @@ class RectificationSettings:
     double: as for the relative margin."""
     max_angle: float = 1.25
     """Maximum angle between the axis of the rectified camera and a ray of the base image, radians:
-    there the rectified image has ten times (1/cos²) the pixels of the photograph."""
+    there an angle takes ten times (1/cos²) the pixels that it takes on the axis."""
     max_size_ratio: float = 5.0
     """Maximum pixels of the rectified image, as a multiple of those of the base image: of
     convergent photographs most of it would be empty. Larger: more memory."""
@@ -87,8 +88,9 @@ def rectify(
     X: Float[np.ndarray, "n 3"],
     settings: RectificationSettings = RectificationSettings(),
 ) -> tuple[RectifiedPair, int] | None:
-    """The pair, and the range of its disparities, that of the points X with a margin; None
-    if one camera is in front of the other, or they are at one position."""
+    """The pair, and the range of its disparities, that of the points X with a margin; None if one
+    camera is in front of the other, or they are at one position, if the rectified image would be
+    too wide or too large (`settings`), or if no point is in front."""
     b = other.X0 - base.X0
     length = float(np.linalg.norm(b))
     if not length > 0:
@@ -122,6 +124,8 @@ def rectify(
     # a disparity of 0 is a point at infinity
     lowest = int(np.floor(max(d_low - margin, 0.0)))
     span = int(np.ceil(d_high + margin)) - lowest
+    # `span` columns more on the left: a pixel of the base image at column c ≥ span has its match at
+    # a column from c − span to c of the right image
     origin = first - [span, 0]
     shape = (rows, columns + span)
     left = _look_up(base, R, f, origin, shape)
@@ -130,7 +134,8 @@ def rectify(
 
 
 def disparity_range(base: FrameView, other: FrameView, X: Float[np.ndarray, "n 3"]) -> float | None:
-    """Approximate range of the disparities of points, pixels; None for cameras at one position."""
+    """Approximate range of the disparities of points, pixels; None for cameras at one position, or
+    without a point in front."""
     b = other.X0 - base.X0
     length = float(np.linalg.norm(b))
     if not length > 0:

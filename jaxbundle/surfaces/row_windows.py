@@ -27,7 +27,7 @@ class RowCorrections(NamedTuple):
 
     delta: Float32[Array, "rows columns"]
     sigma: Float32[Array, "rows columns"]
-    row_shift: Float32[Array, "rows columns"]
+    normalised_row_shift: Float32[Array, "rows columns"]
     rho: Float32[Array, "rows columns"]
     contrast: Float32[Array, "rows columns"]
     has_texture: Bool[Array, "rows columns"]
@@ -137,8 +137,8 @@ def _min_side_variance(
 
 
 def _gradient(a: Float32[Array, "rows columns"], axis: int) -> Float32[Array, "rows columns"]:
-    """Derivative of the cubic spline through the pixels' neighbours (fourth order central
-    difference)."""
+    """Derivative of the cubic polynomial through two neighbours on each side (central difference of
+    fourth order)."""
     n = a.shape[axis]
     a = jnp.pad(a, [(2, 2) if k == axis else (0, 0) for k in (0, 1)], mode="edge")
     m2, m1, p1, p2 = (lax.slice_in_dim(a, k, k + n, axis=axis) for k in (0, 1, 3, 4))

@@ -3,8 +3,8 @@ sight (vertical line locus, epipolar segment), curved by distortion or the scann
 
     λ(x) = α·x/(1 + γ·x),    x = (q − q₁)/(q₂ − q₁)
 
-is the length along the segment; exact for perspective images, and otherwise from three of its
-points: positions are then nearly evenly spaced, and each is projected individually.
+is the length along the segment, determined by three of its points: exact for perspective images.
+Otherwise positions are nearly evenly spaced; each is projected individually.
 
 `Windows` describe a window of the base image in the other one, through the local plane: its
 axes are e, along the epipolar line in the base, and e⊥; in the other image they are A·e,
@@ -29,7 +29,7 @@ from jaxbundle.surfaces.views import (
 @dataclasses.dataclass(frozen=True)
 class Windows:
     """Axes of the windows: e [n, 2] in the base, A·e and A·e⊥ [n, 2] in the other image; `A`;
-    `usable`: the plane is visible in both, at similar scales."""
+    `usable`: A exists, and both images show the plane at similar scales."""
 
     axis: Float[np.ndarray, "n 2"]
     other_axis: Float[np.ndarray, "n 2"]
@@ -129,11 +129,12 @@ def windows(
     across = d + f
     across = across / np.linalg.norm(across, axis=1, keepdims=True)
     if normal is not None:
-        steep = np.minimum(np.abs(np.sum(normal * d, 1)), np.abs(np.sum(normal * f, 1)))
+        # sine of the smaller angle between the plane and a line of sight: 1 if seen from the front
+        facing = np.minimum(np.abs(np.sum(normal * d, 1)), np.abs(np.sum(normal * f, 1)))
         # A plane seen from nearly its side is stretched without limit. Below a sine of 0.2 (12°)
         # the windows would be five times as long in one direction; a normal of the guide is rarely
         # that steep, and mostly by an error.
-        across = np.where((steep > 0.2)[:, None], normal, across)
+        across = np.where((facing > 0.2)[:, None], normal, across)
     with np.errstate(invalid="ignore", divide="ignore"):
         A = K @ steps_on_plane(J, across)
         # the image in the base of the line of sight of the other: its epipolar line

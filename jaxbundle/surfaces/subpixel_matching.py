@@ -34,8 +34,8 @@ BLUR_EXTENT = 3
 class WindowSettings:
     """Least squares matching of single windows.
 
-    Figures "half …, double …" are of `benchmarks/surface_accuracy.py "no texture" --sparse` with
-    every fifth pixel: 2251 points, RMS of errors over σ 0.999, 0.04 % wrong by more than a pixel.
+    Figures "half …, double …" are of `benchmarks/surface_settings.py` (scene "no texture", every
+    fifth pixel): 2251 points, RMS of errors over σ 0.999, 0.04 % wrong by more than a pixel.
     """
 
     search_margin: int = 5
@@ -117,17 +117,18 @@ def has_texture(
     half: int,
     min_texture: float = WindowSettings.min_texture,
 ) -> Bool[np.ndarray, " n"]:
-    """Whether windows have texture on all sides of their points, by the squares of its gradients
+    """Whether windows have texture on all sides of their points, by the squares of the gradients
     relative to noise; otherwise they measure a neighbour: the ground at the edge of a roof. The row
     and the column of a point belong to no side: the edge itself may be there.
 
-    Smoothed noise of variance σ² has σ²/4πs², twice this is σ0²; central differences of it
-    have σ²/2 on each axis.
+    Noise of variance σ² has σ²/4πs² after smoothing; twice this is σ0². Central differences of the
+    grey values, which are not smoothed here, have σ²/2 on each axis, σ² in all.
     """
     k = np.arange(-half - 1, half + 2)
     rows, columns = grey.shape
     noise = 2 * np.pi * BLUR**2 * sigma0**2
     good = np.zeros(len(uv), bool)
+    # 15 × 15 pixels of each (`half` 6): 4 MB
     together = 4096
     for first in range(0, len(uv), together):
         part = slice(first, first + together)
@@ -165,7 +166,7 @@ def _match(
 
 
 def _smooth(pieces: Float32[Array, "n wide wide"]) -> Float32[Array, "n side side"]:
-    """Smoothed pieces, without pixels beyond them."""
+    """The pieces smoothed, without the `BLUR_EXTENT` pixels on all sides."""
     side = pieces.shape[-1] - 2 * BLUR_EXTENT
     away = np.arange(side + 2 * BLUR_EXTENT) - np.arange(side)[:, None] - BLUR_EXTENT
     weight = np.where(np.abs(away) <= BLUR_EXTENT, np.exp(-(away**2) / (2 * BLUR**2)), 0.0)

@@ -42,8 +42,8 @@ class CameraStartSettings:
     time of a search grows with it, its σ falls with the root."""
     believed_ratio: float = 1.5
     """Ratio to the principal distance stated by the files above which that of the matches is not
-    believed: flat objects and nearly parallel views hardly determine it (half of it on a beach),
-    whereas files are wrong by that much only if a photograph was cropped."""
+    believed: flat objects and nearly parallel views hardly determine it (on a beach, matches gave
+    half of it), whereas files are wrong by that much only if a photograph was cropped."""
     coplanarity: CoplanaritySettings = CoplanaritySettings()
     closure: ClosureSettings = ClosureSettings()
 
@@ -69,7 +69,7 @@ def start_cameras(
     for number in dict.fromkeys(lens):
         own = [c for c in range(len(cameras)) if lens[c] == number]
         pairs = [
-            _prefer_single(m, sufficient)
+            _prefer_unique(m, sufficient)
             for m in matches
             if {camera_of[k] for k in m.images} <= {*own}
         ]
@@ -176,7 +176,7 @@ def _ideal_matches(
     return ideal
 
 
-def _prefer_single(matches: FeatureMatches, sufficient: int) -> FeatureMatches:
+def _prefer_unique(matches: FeatureMatches, sufficient: int) -> FeatureMatches:
     """The unique matches, if they are enough."""
     use = matches.unique
     return matches.take(use) if use.sum() >= sufficient else matches
@@ -208,8 +208,8 @@ def _choose_loops(
     loops = loops[np.argsort(-weakest, kind="stable")]
     pairs = np.array(list(number)).reshape(-1, 2)
     new, chosen = np.ones(len(loops), bool), np.zeros(len(pairs), bool)
-    # each loop next to chosen ones, so that they share pairs: k loops of k + 2 photographs with
-    # 2k + 1 pairs are independent, those apart need 3k pairs
+    # each loop has at least a photograph in common with chosen ones, so that they can share pairs:
+    # k loops of k + 2 photographs with 2k + 1 pairs are independent, those apart need 3k pairs
     while new.any() and chosen.sum() < most:
         reached = np.any(np.isin(pairs, pairs[chosen]), axis=1) if chosen.any() else ~chosen
         next_to = new & np.any(reached[loops], axis=1)

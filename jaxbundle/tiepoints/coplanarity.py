@@ -1,6 +1,6 @@
 """The principal distance and K1 of a camera from pairs of its photographs, without prior knowledge.
 
-FeatureMatches of two photographs satisfy the coplanarity condition only for the right interior
+Matches of two photographs satisfy the coplanarity condition only for the right interior
 orientation. Every pair is oriented relatively with principal distances over a wide range, and the
 distance with the smallest robust sum of Sampson's distances (in pixels) starts an adjustment of
 
@@ -92,10 +92,11 @@ def estimate_interior(
     known: bool,
     settings: CoplanaritySettings = CoplanaritySettings(),
 ) -> CoplanarityResult:
-    """A camera of model `opencv` with the principal distance and K1 of consistent pairs.
+    """The camera with the principal distance and K1 of consistent pairs.
 
-    **Arguments:** matches of each pair in pixels, the most distinct first, the best pairs first;
-    `known`: whether the principal distance of the camera is a usable start value.
+    **Arguments:** `camera`: of model `opencv`; `pairs`: the matches of each in pixels, the most
+    distinct first, the best pairs first; `known`: whether the principal distance of the camera is a
+    usable start value.
     """
     least = settings.min_matches
     pairs = [(one, other) for one, other in pairs if len(one) >= least][: settings.candidates]
@@ -126,7 +127,7 @@ def estimate_interior(
     if not len(use):
         return CoplanarityResult(_with(camera, f), 0, np.nan)
     f, k1, e = _adjust(_with(camera, f), [(xy1[k], xy2[k]) for k in use], M[use], b[use], limit)
-    # 0.3 and 12 longer sides: 118° and 5° of view, beyond any lens of this camera model
+    # 0.3 and 12 longer sides: 118° and 5° of view, lenses of 11 and 430 mm of full frame
     sane = np.isfinite(f) and 0.3 * size < f < 12 * size and abs(k1) < settings.max_k1
     sane &= 1 / settings.max_ratio < f / tried[best] < settings.max_ratio
     better = _with(camera, f, k1) if sane else _with(camera, tried[best])
@@ -213,11 +214,11 @@ def _self_calibrate(
     """f, K1 and the misclosures, by iteratively re-weighted least squares."""
     names = model.parameters
     fx, fy, k1 = (names.index(name) for name in ("fx", "fy", "k1"))
-    size = p[fx]
+    first = p[fx]
 
     def camera(change: Float[Array, "2"]) -> Float[Array, " parameters"]:
         # ln c: it stays positive, and a change is relative to it
-        f = size * jnp.exp(change[0])
+        f = first * jnp.exp(change[0])
         return p.at[fx].set(f).at[fy].set(f).at[k1].add(change[1])
 
     def ideal(q: Float[Array, " parameters"], xy: Float[Array, "2"]) -> Float[Array, "2"]:

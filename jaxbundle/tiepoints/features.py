@@ -1,9 +1,10 @@
 """Features of a photograph: points recognisable from other positions, with descriptors.
 
 A photograph is first reduced to `Detection.side` pixels; OpenCV's SIFT (Lowe, 2004) begins
-by doubling it, so that the finest features are those of twice that side; least squares matching
-measures in the original afterwards. The most distinct features are kept, equally
-many in each cell of a grid: they cover photographs evenly, including parts with little texture.
+by doubling it, so that the finest features are those of a photograph of twice that side; least
+squares matching measures in the original afterwards. The most distinct features are kept, equally
+many in each cell of a grid as far as it has them: they cover photographs evenly, including parts
+with little texture.
 """
 
 import dataclasses
@@ -53,7 +54,7 @@ class Detection:
     10 of 10 pairs were verified instead of 7."""
     faint_share: float = 1 / 3
     """Share of `number` below which a photograph has few features. The second search doubles the
-    time of such a photograph; with 1 all of simple objects would be searched twice."""
+    time of such a photograph; with 1, all photographs of simple objects would be searched twice."""
 
     def __post_init__(self):
         one_of("features", self.kind, FEATURES)

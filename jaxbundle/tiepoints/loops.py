@@ -5,15 +5,15 @@ For photographs i, j, k, each two of which are a pair with M and a base b of len
     M_jk·M_ij = M_ik,        β_ij·b_ij + β_jk·M_ijᵀ·b_jk = β_ik·b_ik
 
 with the lengths β of the bases; their ratios follow from the depths of features common to two
-pairs (a depth s of a pair is s·β). Without such features b_ik must still lie between b_ij and
-M_ijᵀ·b_jk. A row of windows matched one window further keeps the rotation, and moves the camera:
-only the bases do not close.
+pairs (a depth s computed with a base of 1 is s·β in the object). Without such features b_ik must
+still lie between b_ij and M_ijᵀ·b_jk. A row of windows matched one window further keeps the
+rotation, and moves the camera: only the bases do not close.
 
 Pairs are accepted one after another, sure ones first, and among these those with many matches and
 closing loops. A pair that contradicts accepted pairs in more loops than it agrees with is
-left out. A pair that alone connects photographs has no loop: it stays, unless it is not sure
-and its photographs are already connected: any two photographs of a long row of windows match, even
-distant ones as if they were neighbours, and such pairs are consistent.
+left out. One without loops stays, but one that is not sure only if nothing else connects its
+photographs yet; otherwise a loop must confirm it: any two photographs of a long row of windows
+match, even distant ones as if they were neighbours, and such pairs are consistent.
 
 A photograph with most of its pairs left out shows mostly moving or repeated objects, and its other
 pairs may show them unnoticed: only those with at least half the matches of its best pair stay.
@@ -46,8 +46,9 @@ class LoopSettings:
     by their distance, which is seen if that is more than this part of the base; a smaller limit
     rejects right pairs whose ratios of bases rest on `min_common` features."""
     max_aside: float = 0.5
-    """Maximum distance of a base (unit length) of unknown ratio from the angle between the others:
-    30 degrees. Without common features only gross contradictions count."""
+    """Maximum distance of a base (of length 1) from the sector between the directions of the two
+    others, where their ratios are unknown: the sine of 30 degrees. Without common features only
+    gross contradictions count."""
     narrow_angle: float = 0.03
     """Angle of intersection, radians (2 degrees), below which the direction of a base is
     uncertain."""
@@ -95,8 +96,8 @@ def split_contradicted(
             if {_pair(i, k), _pair(j, k)} <= accepted
         ]
         # a pair by repeated features must be confirmed, unless nothing else connects its sides
-        needed = pair.sure or group[i] != group[j]
-        if closed.count(False) <= closed.count(True) and (needed or any(closed)):
+        needs_no_loop = pair.sure or group[i] != group[j]
+        if closed.count(False) <= closed.count(True) and (needs_no_loop or any(closed)):
             accepted.add((i, j))
             group = {k: group[i] if g == group[j] else g for k, g in group.items()}
     accepted = _without_weak(pairs, accepted, settings.accepted_share)
@@ -179,7 +180,9 @@ class _Loops:
         # photograph that they share; two of the three ratios suffice
         at_j, at_i = self._ratio((i, j), (j, k), 1, 0), self._ratio((i, j), (i, k), 0, 0)
         at_k = self._ratio((j, k), (i, k), 1, 1)
-        # without two of them the bases can have any lengths: β > 0 is left of the second equation
+        # without two of them the bases can have any lengths: of the second equation only β > 0 is
+        # left. If ik is narrow, its base may be the small difference of two opposite ones, of any
+        # direction; if ij or jk is narrow, its base is short, and ik nearly has that of the other
         if np.isnan([at_j, at_i, at_k]).sum() > 1:
             between = _is_between(ij.b, ij.M.T @ jk.b, ik.b, self.settings.max_aside)
             return None if between or ik.angle < self.settings.narrow_angle else False

@@ -37,11 +37,11 @@ class FeatureMatchingSettings:
 
     max_ratio: float = 0.8
     """Maximum distance of a match relative to that of the second best. Lowe (2004, figure 11): 0.8
-    removes 90 % of the false matches and 5 % of the right ones."""
+    removes 90 % of the false matches and less than 5 % of the right ones."""
     similar_distance: float = 0.22
-    """Distance, 0 to 1, below which two features of a photograph may be repetitions: that of most
-    true matches of SIFT. Smaller: repeated windows count as unique; larger: hardly any feature is
-    unique, and pairs are oriented by all matches."""
+    """Distance, 0 to 1, below which two features of a photograph may be repetitions: most true
+    matches of SIFT are closer than this. Smaller: repeated windows count as unique; larger: hardly
+    any feature is unique, and pairs are oriented by all matches."""
 
 
 class FeatureMatches(NamedTuple):
@@ -78,7 +78,7 @@ def match_features(
     best, distance, second = nearest(a, b)
     if within is not None:
         second = np.minimum(second, np.minimum(within[0], within[1][best]))
-    # Most features fall here, and need no search in the other direction.
+    # most features are dropped here, and need no search in the other direction
     rows = np.flatnonzero(distance < settings.max_ratio * second)
     if not len(rows):
         return np.zeros((0, 2), int), np.zeros(0)

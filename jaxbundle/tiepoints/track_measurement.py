@@ -9,7 +9,9 @@ measurement in the template's photograph has the mean of these halves, every oth
 The prior σ of terms of second order is that of perspective and curved surfaces. Without them, the
 RMS of errors on hills was 2 σ at 400 × 300 pixels; neighbours within 40 pixels agreed.
 
-Unmatched measurements are at the position of their feature, with a σ that grows with its size.
+Unmatched measurements are where their feature predicts the point: the pixel of the window,
+transformed by the similarity of the two features. Without any match in a track, all are at the
+positions of their features. Their σ grows with the size of the feature.
 """
 
 import dataclasses
@@ -39,7 +41,7 @@ class TrackMatchingSettings:
     window: int = 17
     """Side of the window, pixels, odd. Larger: smaller σ, by the root of the number of pixels, but
     more surfaces that are no plane within it, and more occlusions; smaller: repeated texture is
-    mistaken, and more than the 8 unknowns take part of the noise."""
+    mistaken, and the 8 unknowns absorb a larger part of the noise."""
     search_window: int = 41
     """Side of the part of another photograph in which it is matched, pixels, odd. Half of it, 20,
     holds half of the window, 8, turned by 45 degrees and larger by √2 (as between two levels), and
@@ -53,14 +55,14 @@ class TrackMatchingSettings:
     min_correlation: float = 0.75
     """Minimum correlation ρ of a match: ρ² = 0.56 of the variance of the grey values is then
     explained. Smaller: windows at an occlusion match; larger: those with noise or reflections do
-    not, and their features, some times less exact, take their place."""
+    not, and the positions of their features, several times less exact, take their place."""
     max_shift: float = 3.0
     """Maximum distance of a match from its feature, pixels of its level: 2.5 σ of the difference of
     two features of 7 pixels (`feature_sigma`). Larger: matches with the next period of
     a texture."""
     max_sigma: float = 0.4
-    """Maximum σ of a match, pixels of its level: a half of that of a feature of 7 pixels
-    (`feature_sigma`), which is then taken."""
+    """Maximum σ of a match, pixels of its level: half of the σ of a feature of 7 pixels, 0.84
+    (`feature_sigma`), whose position is taken instead above it."""
     correlation_length: int = 7
     """Pixels over which residuals within a window are correlated; less than half the window, since
     Σ Jᵀv over all of it vanishes at the minimum, and with it the estimated covariance. On
@@ -71,9 +73,9 @@ class TrackMatchingSettings:
     """Floor of σ, pixels of its level, added in quadrature: interpolation and sampling add as much.
     By noise alone strong edges have σ of thousandths of a pixel, and would outweigh the others."""
     second_order_sigma: float = 1.0
-    """σ of the terms of second order of a match, times the longer side of the photograph:
-    perspective and curvature of the surface bend a window by about (half its side)²/(principal
-    distance)."""
+    """σ of the terms of second order at the edge of a window, in units of (half its side)²/(longer
+    side of the photograph), all in pixels of the original: perspective and curvature of the surface
+    bend a window by about (half its side)²/(principal distance)."""
     feature_sigma: float = 0.12
     """σ of the position of a feature relative to its diameter. Only a start: the variance component
     of this kind (`reconstruction.adjusting`) replaces it where there are 60 of them."""
@@ -211,7 +213,8 @@ def _choose_templates(
     """The measurement of a track that gives the window, and the levels.
 
     The window is that of the feature of median size: the scales of the others differ from it least.
-    Its level is coarse enough that the smallest feature of the track is matched in the original."""
+    Its level is at least so coarse that the smallest feature of the track has a level, too: the
+    original, or a coarser one."""
     order = np.lexsort((size, track))
     begin = np.searchsorted(track[order], np.arange(track.max(initial=-1) + 1))
     length = np.bincount(track)

@@ -1,6 +1,6 @@
 """Tracks: one point in all its photographs, from matches of pairs.
 
-FeatureMatches are joined, the most distinct first (union-find); one that would put two points of a
+Matches are joined, the most distinct first (union-find); one that would put two points of a
 photograph into a track contradicts better ones and is left out. The kept tracks cover
 every photograph evenly, long ones first, and none next to another.
 """
@@ -24,9 +24,9 @@ class TrackSettings:
     points in 3:2, 21 in each. Fewer: the points follow the texture; more: the quota of a cell
     is a handful, and long tracks lose against even cover."""
     merging_distance: float = 0.0015
-    """Tracks nearer than this part of the longer side, in two photographs, are one point: 4 pixels
-    of 3000. Larger: fewer points where there is much texture; smaller: points whose windows
-    nearly coincide, with correlated errors."""
+    """Side of the cells of a fine grid, relative to the longer side: 4.5 pixels of 3000. Of tracks
+    that share cells in two photographs only the first is kept. Larger: fewer points where there is
+    much texture; smaller: points whose windows nearly coincide, with correlated errors."""
 
 
 def make_tracks(features: Sequence[Features], pairs: Sequence[Pair]) -> list[list[tuple[int, int]]]:

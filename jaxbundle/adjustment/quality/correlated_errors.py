@@ -39,7 +39,8 @@ class CorrelationSettings:
     - `min_images`: photographs of a camera from which photograph-wise components are estimated: a
       size from n photographs is right to 1/√(2n), of eight to a quarter. From four, chance alone
       made σ of a principal distance 1.7 times larger.
-    - `knots`: columns and rows of the splines of a field, for the longer side of the image.
+    - `knots`: columns (x) and rows (y) of the splines of a field, over the measured part of the
+      image whatever its sides.
     - `min_points_of_knot`: image points for each, so that residuals show the field.
     - `reach`: distance of stations at which errors along a track are independent, in units of the
       median distance to the points. Half and double have scores of the same size in five real sets.

@@ -44,9 +44,9 @@ from jaxbundle.results import TableMethods, rows_of
 
 # Image points of a photograph in a half: four determine its orientation, as many are redundant.
 MIN_RAYS_OF_IMAGE = 8
-# Photographs of a camera in a half: two determine no interior orientation.
+# Photographs of a camera in a half: two hardly determine an interior orientation.
 MIN_IMAGES = 3
-# The weight 1/σ of an image point of the other half, in its own: its square, 1e-8, is far below the
+# Factor of the weights 1/σ of image points of the other half: its square, 1e-8, is far below the
 # share of a half in the information on a camera, and far above the rounding of the normal
 # equations, 1e-16.
 FAINT = 1e-4

@@ -15,8 +15,9 @@ whole object, reflected on a plane with any normal n through o: all choices diff
     X' = o + S(n)·(X − o),        (1) with n for m, and X0' about c'                         (2)
 
 **Mirrored** (all images). The collinearity equations do not see the sign of q, so that every
-network fits exactly as its mirror image behind its cameras; mirrored on a plane on which its
-control lies, control fits too: the images look away from their points, from below the floor.
+network fits just as well mirrored, with its points behind the cameras; if it is mirrored on the
+plane in which its control lies, control fits too: the images look away from their points, from
+below the floor.
 
     X' = o + S(n)·(X − o),        X0' = o + S(n)·(X0 − o),        M' = −M·S(n)               (3)
 
@@ -77,7 +78,7 @@ def rays_of(problem: NetworkProblem) -> ImageRays:
         for camera in network.cameras
         for names in [get_model(camera.model).principal_distance]
     ]
-    # σ of the better coordinate: the effects that are compared with it shall not look small.
+    # σ of the better coordinate: effects that are compared with it must not look too small.
     weight = problem.image_weights.max(1)[used] * np.array(c)[problem.camera[used]]
     return ImageRays(problem.image[used], problem.point[used], 1 / weight)
 
@@ -172,9 +173,9 @@ def perspective_effect(
     p = 1 / rays.sigma**2
     total = lambda value: np.bincount(rays.image, value, images)
     complex_total = lambda value: total(value.real) + 1j * total(value.imag)
-    number = np.where(total(p) > 0, total(p), 1.0)
-    z = z - (complex_total(p * z) / number)[rays.image]
-    w = w - (complex_total(p * w) / number)[rays.image]
+    weight = np.where(total(p) > 0, total(p), 1.0)
+    z = z - (complex_total(p * z) / weight)[rays.image]
+    w = w - (complex_total(p * w) / weight)[rays.image]
     # w ≈ b·z, b a complex number: scale and roll.
     square = total(p * abs(z) ** 2)
     b = complex_total(p * w * z.conj()) / np.where(square > 0, square, 1.0)
@@ -182,8 +183,8 @@ def perspective_effect(
 
 
 def _in_tangent_plane(scene: NetworkScene, rays: ImageRays, images: int) -> np.ndarray:
-    """Directions to the points as complex numbers x + iy, c = 1, in a camera turned towards the
-    mean of them; those at its side are cut off at 80°."""
+    """Directions to the points as complex numbers x + iy, c = 1, in a camera turned towards their
+    mean; those more than 80° off it are divided by cos 80°, so that they stay finite."""
     d = np.einsum(
         "nij,nj->ni", scene.M[rays.image], unit(scene.X[rays.point] - scene.X0[rays.image])
     )
@@ -216,7 +217,7 @@ def _reflect_poses(
     c: Float[np.ndarray, "images 3"],
     there: Float[np.ndarray, "images 3"],
 ) -> tuple[Float[np.ndarray, "images 3"], Float[np.ndarray, "images 3 3"]]:
-    """Equation (1) with the centres `there` of the points afterwards."""
+    """Equation (1) about the centres `c` of the points, which afterwards are at `there`."""
     local = np.einsum("nij,nj->ni", scene.M, c - scene.X0)
     M = _reflection(unit(local)) @ scene.M @ _reflection(normal)
     return there - np.einsum("nji,nj->ni", M, local), M

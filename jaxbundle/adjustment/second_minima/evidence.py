@@ -13,8 +13,8 @@ at most α if it is only accepted with (Wald, 1945, equation 3.16)
     L₁/L₂ ≥ (1 − α)/α,        E ≥ T = 2·ln((1 − α)/α)                     α = 0.1 %: T = 13.8
 
 Below this both remain: they are ambiguous. As probabilities, neither preferred before, the second
-one has 1/(1 + exp(E/2)); that both curve alike is assumed (the determinants of their normal
-equations, of a solution and its mirror image, differ little).
+one has 1/(1 + exp(E/2)). This assumes that vᵀPv is curved alike at both (the determinants of the
+normal equations of a solution and of its mirror image differ little).
 """
 
 import dataclasses
@@ -34,10 +34,10 @@ OTHER_PLANE = "two orientations of a plane"
 class SecondMinimum:
     """Another minimum of an adjustment.
 
-    `ambiguity`: which one (one of the constants above); `images`: that differ,
-    by id; `vtpv` of the result, `other_vtpv`; `evidence`: E of the module, for the result;
-    `ambiguous`: it is below the threshold; `taken`: the iterations ended in the other one first,
-    and the result was found from it; `turn`: radians, `shift`: object unit, the largest differences
+    `ambiguity`: which one (one of the constants above); `images`: ids of those that differ; `vtpv`:
+    of the result, `other_vtpv`: of the other minimum; `evidence`: E of the module, for the result;
+    `ambiguous`: E is below the threshold; `taken`: the iterations ended in the other one first, and
+    the result was found from it; `turn` (radians), `shift` (object unit): the largest differences
     of rotations and projection centres.
     """
 
@@ -91,15 +91,17 @@ class SecondMinimumSettings:
       plane. With the cost A·(τ² − θ²)²/4 + B·(τ − θ)² of its tilt τ, true θ, (foreshortening, even
       in τ, and perspective, odd) the second minimum is between −θ and −θ/2, where it vanishes:
       at least (3/4)² of the effect 4·B·θ² at −θ remains.
-    - `min_reversed_share`: the same of a network whose points are free, and absorb more. Of 2
-      images to 5, flat or not, 5 to 500 times as far as the object is large, 0.0005 (two images) to
-      0.4 remained, of three images and more at least 0.05. Larger: second minima of two images are
-      missed; smaller: networks that have none are adjusted again for nothing.
+    - `min_reversed_share`: the same of a network whose points are free, and absorb more; also for
+      the other plane of two images. In networks of 2 to 5 images, flat or not, at distances of 5 to
+      500 times the size of the object, 0.0005 (two images) to 0.4 remained, and at least 0.05 of
+      three images and more. Larger: second minima of two images are missed; smaller: networks that
+      have none are adjusted again for nothing.
     - `few_points`: images of no more points are tried whatever their perspective. Four points keep
       four coordinates beside shift, scale and roll, and the tilt may absorb nearly all of them: of
       5000 random images one had E = 2 with an effect of 1000, and four points. Larger: more images
       are resected for nothing.
-    - `safety`: by which both are divided, for what these orders of the effect leave out.
+    - `safety`: by which both shares are divided, for what these orders of the effect leave out; and
+      by which the threshold is multiplied for resections, in which points and cameras are held.
     - `max_misfit`: an image whose residuals exceed this many σ (RMS) is also resected in closed
       form, whatever its perspective: a wrong pose, not a wrong σ (`likely_causes`, `max_sigma0`).
     - `evaluations_before_rejection`: from an analytic start value, which is right to the square of
@@ -110,8 +112,9 @@ class SecondMinimumSettings:
     - `max_images`: of images alone, this many of the least evidence are adjusted again, and this
       many of the worst resected in closed form.
     - `max_legs`: a second minimum of two images may lie in the valley of their bas-relief, along
-      which iterations are slow: they are repeated this many times, up to the limit of each.
-    - `max_rounds`: of taking a better one.
+      which iterations are slow: they are continued up to this many times, each time up to the limit
+      of iterations.
+    - `max_rounds`: how often a better minimum may take the place of the result.
     """
 
     error_probability: float = 0.001
@@ -133,10 +136,10 @@ class SecondMinimumSettings:
 
     @property
     def limit(self) -> float:
-        """An effect Σ(δ/σ)² above which noise does not bring E below the threshold.
+        """An effect d² = Σ(δ/σ)² above which noise hardly brings E below the threshold T.
 
-        E = d² + 2·d·z with a standard normal z: of d² = (z + √(z² + T))² it is T if −z is exceeded
-        with the error probability."""
+        E = d² + 2·d·x, x standard normal. With z, which x exceeds with the error probability, E is
+        below T with that probability if d² − 2·d·z = T: d = z + √(z² + T)."""
         z = normal_quantile(1 - self.error_probability)
         return (z + math.sqrt(z * z + self.threshold)) ** 2
 
@@ -145,7 +148,7 @@ SECOND_MINIMUM = SecondMinimumSettings()
 
 
 def evidence(vtpv: float, other: float, redundancy: int, stated: bool, rounding: float) -> float:
-    """E of the module; `rounding`: vᵀPv that is none, of exact data."""
+    """E of the module; `rounding`: the vᵀPv that rounding leaves of exact data."""
     if redundancy <= 0 or abs(other - vtpv) <= rounding:
         return 0.0
     if stated:

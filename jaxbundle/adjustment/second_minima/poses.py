@@ -1,8 +1,8 @@
 """Second poses of single images, found by resection before anything is adjusted.
 
-The pose with the object turned over, and of images with large residuals the best one in closed
-form, are improved on the adjusted points with a resection; by how much Σ(v/σ)² of the image grows
-tells what is worth an adjustment.
+The pose with the object turned over, and for images with large residuals also the best one in
+closed form, are improved by a resection on the adjusted points; by how much Σ(v/σ)² of the image
+grows tells what is worth an adjustment.
 """
 
 import dataclasses
@@ -40,10 +40,11 @@ MIN_POINTS = 3
 class SecondPoses:
     """The search for second poses of the images of one minimum.
 
-    **Fields:** `rays`: a sample of `all_rays`; `squares`: of the residuals of these, (v/σ)²;
-    `free`: images that are not held; `scale`: the variance factor that differences are compared
-    with; `stated`: whether σ are stated, not units of weight; `sights`: of the adjusted cameras,
-    made when they are needed; `untried`: images that were not tried alone, since they are too many.
+    **Fields:** `rays`: a sample of `all_rays`; `squares`: (v/σ)² of each of `all_rays`, x and y
+    together; `free`: images that are not held; `scale`: the variance factor that differences are
+    compared with; `stated`: whether σ are stated, not units of weight; `sights`: of the adjusted
+    cameras, made when they are needed; `untried`: images that were not tried alone, since they are
+    too many.
     """
 
     problem: NetworkProblem
@@ -77,20 +78,21 @@ class SecondPoses:
             return
         views = self._views(np.flatnonzero(weak | doubted))
         pose, change = self._improve(turned, views)
-        # Near the end of its second minimum (see `min_turning_share`) an iteration may step over to
-        # the first one, or wander off: then the closed form is the better start.
+        # Where the second minimum nearly vanishes (see `min_turning_share`) an iteration may step
+        # over to the first one, which shows in a pose more than halfway back, or wander off: then
+        # the closed form is the better start.
         closed = np.full(images, np.inf)
         for view in views:
             closed[view.image] = self._change(view, turned)
-        back = turns(self.scene, pose) < 0.5 * turns(self.scene, turned)
-        back |= closed < change
-        pose, change = _choose(back, turned, pose), np.where(back, closed, change)
+        unimproved = turns(self.scene, pose) < 0.5 * turns(self.scene, turned)
+        unimproved |= closed < change
+        pose, change = _choose(unimproved, turned, pose), np.where(unimproved, closed, change)
         # A wrong minimum need not be that of the object turned over.
         views = [view for view in views if doubted[view.image]]
         best, by_best = self._improve(self._resect(turned, views), views)
         other = by_best < change
         pose, change = _choose(other, best, pose), np.where(other, by_best, change)
-        # A hundredth of the way is the present pose, found again.
+        # What is turned by less than a hundredth of the way is the present pose, found again.
         apart = turns(self.scene, pose) > 0.01 * turns(self.scene, turned)
         apart &= np.isfinite(change) & (share_behind(pose, self.rays) <= 0.5)
         # All that fit better at once; alone only those that may also be ambiguous.

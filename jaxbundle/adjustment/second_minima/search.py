@@ -1,9 +1,9 @@
 """After convergence: the second minima of a network, adjusted from their closed forms.
 
-The candidates (`closed_forms`) are few, and most are excluded before anything is adjusted: by
-the effect of perspective, which is of the order of the square of the image and known without any
-iteration, and of single images by a resection on the adjusted points. The others are adjusted by
-the program of the first minimum from other start values.
+The candidates (`closed_forms`) are few, and most are excluded before anything is adjusted: by the
+effect of perspective, which is of second order in the image coordinates and known without any
+iteration, and those of single images by a resection on the adjusted points. The others are adjusted
+from their own start values by the program of the first minimum.
 """
 
 import dataclasses
@@ -133,7 +133,7 @@ class _State:
         network, counts = self.problem.network, self.problem.counts
         self.known = network.points.has_role("control", "fixed")
         self.stated = network.observations.sigma_origin != UNIT
-        # vᵀPv of rounding: 1e-10 of the principal distance in all image coordinates.
+        # vᵀPv of rounding: 1e-10 of the principal distance in every observation.
         self.rounding = counts.observations * (1e-10 / noise_of_rays(network)) ** 2
         vtpv, r = first.vtpv, max(counts.redundancy, 1)
         self.scale = max(vtpv / r, 1.0 if self.stated else self.rounding)
@@ -226,7 +226,7 @@ class _State:
 
     def _is_plane(self, first: int, partners: Int[np.ndarray, " n"]) -> bool:
         """Whether the points of an image are so near to a plane that the second orientation of a
-        plane may fit: by the parallax of what is off it."""
+        plane may fit: by the parallax that `partners` see of points off it."""
         rays, scene = self.all_rays, self.scene
         seen = self.rays.point[self.rays.image == first]
         X = scene.X[seen]
@@ -281,8 +281,8 @@ class _State:
     # --- adjustment -------------------------------------------------------------------------
 
     def adjust_candidates(self) -> Iterator[Found]:
-        """The candidates that lead to another minimum, each minimum once, if it fits better or
-        cannot be distinguished from the present one."""
+        """The candidates that lead to another minimum, each minimum once, unless its vᵀPv is above
+        the present one by more than `limit` times the variance factor."""
         seen: list[Found] = []
         for candidate in self.candidates():
             found = self._adjust(candidate)

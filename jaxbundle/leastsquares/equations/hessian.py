@@ -48,8 +48,8 @@ def exact_equations(
 def _derivatives(
     declared: Declared, plan: Plan, number: int, prepared: Prepared, laid: ChunkedData
 ) -> tuple[Array, Array, Array]:
-    """½|v|² of every observation of a part, its gradient and Hessian by all directions of its
-    slots, with a column of zeros at the end."""
+    """½|v|² of every observation of a part, its gradient and Hessian with respect to all directions
+    of its slots, with a row and a column of zeros at the end."""
     part = plan.parts[number]
     kind, widths = declared.kinds[part.set_name], widths_of(declared, part)
     one = _HalfSquare(residual_of(declared, part), widths)
@@ -58,7 +58,8 @@ def _derivatives(
 
 @dataclasses.dataclass(frozen=True)
 class _HalfSquare:
-    """½|v|² of one observation, its gradient and Hessian by the changes of its slots."""
+    """½|v|² of one observation, its gradient and Hessian with respect to the changes of its
+    slots."""
 
     residual: Residual
     widths: tuple[int, ...]
@@ -114,11 +115,11 @@ def _blocks(
     if part.slot is not None:
         e = columns(((part.slot, 0),), 0, widths[part.slot])
         # V and W of observations, as in Gauss–Newton, from H instead of JᵀJ.
-        own = e, plan.groups[present(plan.eliminated)].free[part.eliminated]
+        of_row = e, plan.groups[present(plan.eliminated)].free[part.eliminated]
         flat = lambda x: x.reshape(-1, *x.shape[2:])
-        beside = (g[..., e] * own[1])[..., None]
-        eliminated = flat(jnp.concatenate([block(H, own, own), beside], -1))
-        W = [flat(block(H, own, (j, free[:, None]))) for j, free in touches]
+        beside = (g[..., e] * of_row[1])[..., None]
+        eliminated = flat(jnp.concatenate([block(H, of_row, of_row), beside], -1))
+        W = [flat(block(H, of_row, (j, free[:, None]))) for j, free in touches]
     own, gradient = [block(summed, t, t) for t in touches], [right[:, i] * f for i, f in touches]
     couples = [block(summed, touches[c.first], touches[c.second]) for c in part.couples]
     return own, gradient, couples, eliminated, W

@@ -93,13 +93,15 @@ class ConjugateGradients(eqx.Module):
         return back(y)
 
     def inverse(self) -> Reduced:
-        raise ValueError("conjugate gradients have no factor to read an inverse from: with_factor")
+        raise ValueError(
+            "conjugate gradients have no factor to read an inverse from; see `problem.with_factor`"
+        )
 
     @property
     def pivots(self) -> Float[Array, " n"]:
         """The pivots of every block alone."""
-        roots = [jnp.diagonal(M, axis1=1, axis2=2).ravel() for M in self.lower_inverse.values()]
-        return 1 / jnp.concatenate(roots)
+        inverses = [jnp.diagonal(M, axis1=1, axis2=2).ravel() for M in self.lower_inverse.values()]
+        return 1 / jnp.concatenate(inverses)
 
     def _times(self, x: Tangent) -> Tangent:
         """S·x."""
@@ -132,7 +134,7 @@ def inverse_of_lower(B: Float[Array, "rows w w"]) -> Float[Array, "rows w w"]:
     """
     w = B.shape[1]
 
-    # Gauss–Jordan without pivoting, which a positive definite matrix does not need.
+    # Gaussian elimination without pivoting, which a positive definite matrix does not need.
     def eliminate(k: Int[Array, ""], both: Float[Array, "rows w v"]) -> Float[Array, "rows w v"]:
         row = both[:, k] / jnp.sqrt(both[:, k, k])[:, None]
         below = jnp.where(jnp.arange(w) > k, row[:, :w], 0.0)

@@ -55,7 +55,7 @@ def differentiate(
     kind, widths = declared.kinds[part.set_name], widths_of(declared, part)
     rows = _ResidualsAndDerivatives(residual_of(declared, part), widths, part.large)
     r, found = map_observations(part, kind, prepared, laid, number, rows)
-    # Computed once, not again in every loop that uses some of its columns.
+    # Of few observations: computed once, not again in every loop that uses some of its columns.
     r, found = (r, found) if part.large else jax.lax.optimization_barrier((r, found))
     shape, starts = r[0].shape, np.cumsum((0, *widths))
 
@@ -107,7 +107,8 @@ def differentiate_rows(
     weight: PyTree,
 ) -> tuple[Array, list[Array]]:
     """Residuals [chunks, length, r] of `function(blocks, measured, weight, changes)` of every
-    observation, and their derivatives by the changes of every slot [chunks, length, r, width]."""
+    observation, and their derivatives with respect to the changes of every slot [chunks, length, r,
+    width]."""
     rows = _ResidualsAndDerivatives(function, widths, True)
     r, found = map_blocks(rows, part.by_row, blocks, measured, weight)
     starts = np.cumsum((0, *widths))
@@ -140,6 +141,8 @@ def differentiate_chunks(
         t if t.incidence is not None else dataclasses.replace(t, incidence=in_order)
     )
     touches = tuple(map(with_incidence, part.touches))
+    # `place` runs along the set, not along chunks, and could not be cut into these; nothing here
+    # reads it.
     part = dataclasses.replace(part, touches=touches, place=in_order)
 
     def differentiate_one(given: tuple) -> Any:
@@ -149,10 +152,10 @@ def differentiate_chunks(
         return of_chunk(given[0], *jax.tree.map(lambda x: x[0], found))
 
     given = part, laid.measured[number], laid.weight[number]
-    at_once = max(at_once // max(length, 1), 1)
+    batch = max(at_once // max(length, 1), 1)
     # One chunk at a time would be a loop of tiny operations; all at once 1 kB an observation.
-    if chunks > at_once:
-        return jax.lax.map(differentiate_one, given, batch_size=at_once)
+    if chunks > batch:
+        return jax.lax.map(differentiate_one, given, batch_size=batch)
     return jax.vmap(differentiate_one)(given)
 
 

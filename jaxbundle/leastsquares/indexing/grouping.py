@@ -18,8 +18,8 @@ from jaxbundle.types import present
 
 @dataclasses.dataclass
 class Choices:
-    """Free choices of a plan (lengths of chunks, sharing of groups): made once for a large problem
-    and reused for every part of it."""
+    """Free choices of a plan (lengths of chunks, which tables form a group): made once for a large
+    problem and reused for every part of it."""
 
     before: dict[Hashable, Any]
     made: dict[Hashable, Any] = dataclasses.field(default_factory=dict)
@@ -140,8 +140,8 @@ class Grouping:
         self.kept = sorted(g for g in self.members if g != name)
 
     def _meet_always(self, group: str, name: str) -> bool:
-        """Whether the rows of a table occur in exactly the same observations of eliminated rows as
-        those of a group."""
+        """Whether every row of a table occurs in exactly the same observations of eliminated rows
+        as the row of a group with its number."""
         first = self.members[group][0][0]
         if self.tables[first].rows != self.tables[name].rows:
             return False

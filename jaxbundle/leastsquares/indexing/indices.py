@@ -73,10 +73,10 @@ def common(all_sizes: Iterable[Sizes], rounder: Callable[[Hashable, int], int]) 
 
 
 def round_up(number: int, steps: int = 8) -> int:
-    """The next number of the form m·2ⁿ with `steps` ≤ m < 2·`steps` (a power of two); small ones as
-    they are.
+    """The next number of the form m·2ⁿ with `steps` ≤ m < 2·`steps`; small ones as they are.
+    `steps` is a power of two.
 
-    With 8 steps between one power of two and the next at most an eighth is padding, a sixteenth on
+    With 8 steps between one power of two and the next less than an eighth is added, 4.5 % on
     average. 4 would double both; 16 would compile twice as many programs in a session."""
     step = 1 << max(number.bit_length() - steps.bit_length(), 0)
     return -(-number // step) * step

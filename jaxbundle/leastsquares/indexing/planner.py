@@ -128,14 +128,15 @@ class _Planner:
         """The blocks of the reduced matrix, its solver, its band."""
         rows = [np.zeros(0, np.int64), *(found.eliminated for found in incidences.values())]
         # m incidences of an eliminated row are m(m − 1)/2 pairs: counted before they are listed.
-        count, solvers = np.bincount(np.concatenate(rows)).astype(float), self.solvers
-        if len(solvers) > 1 and (count * (count - 1)).sum() / 2 > self.settings.max_pairs:
+        m, solvers = np.bincount(np.concatenate(rows)).astype(float), self.solvers
+        if len(solvers) > 1 and (m * (m - 1)).sum() / 2 > self.settings.max_pairs:
+            # Also where it is not among those allowed: `problem.with_factor` then finds no factor.
             solvers = ("iterative",)
         blocks = self.find_blocks(parts, {} if solvers == ("iterative",) else incidences)
         shapes = {g: groups[g].free.rows.shape for g in self.grouping.kept}
         none = np.zeros(0, np.int64)
-        place = lambda at: (at.row.rows, at.column.rows) if at else (none, none)
-        couplings = lambda g: place(blocks.get((g, g)))
+        rows_of = lambda at: (at.row.rows, at.column.rows) if at else (none, none)
+        couplings = lambda g: rows_of(blocks.get((g, g)))
         observations = sum(given.number for given in self.grouping.observations.values())
         solver, band = plan_reduction(shapes, couplings, observations, solvers, self.settings)
         # The parts of a problem on several devices must not choose another one.
@@ -154,7 +155,7 @@ class _Planner:
         for _, touched in slots:
             slot = touched[0][0]
             row = self.grouping.group_of[of[slot]][2][rows[slot]]
-            # Rows from −1 on: none.
+            # Rows begin at −1, none: row + 1 is one of max + 2 numbers from 0 on.
             major = np.unique(major * (row.max(initial=0) + 2) + row + 1, return_inverse=True)[1]
         minor = rows[share.slot] if share.slot is not None else np.arange(len(major))
         along = ("part", k)
@@ -169,7 +170,7 @@ class _Planner:
             # A slot whose row is the same in a chunk is looked up once for it, the others for each
             # observation.
             one = length == 1 or bool((rows[s] == rows[s][first[major]]).all())
-            # That of the eliminated row is one of every observation.
+            # The eliminated row is looked up for each observation in any case.
             one = self.choose("by chunk", k, s, default=one and s != share.slot)
             by_row.append(not one)
             lookup.append(as_index(at[:, 0] if one else at, along, ("table", name)))

@@ -6,9 +6,10 @@ together: a drive along a street, a traverse, or successive strips become a
 narrow band. Cut into super-blocks as wide as the band, the matrix is block tridiagonal. The group
 with most unknowns is ordered in this way; all others are a border.
 
-The solver with the lowest operation count is chosen: n³/3 for a dense factor, a few m³ for
-each super-block of m unknowns, and for conjugate gradients about forty passes over all
-observations, without pairs of incidences.
+Of the solvers whose factor fits into memory, the one with the lowest operation count is chosen:
+n³/3 for a dense factor, a few m³ for each super-block of m unknowns, and for conjugate gradients
+about forty passes over all observations, without pairs of incidences. The dense one is preferred
+unless another needs at most a third of its operations (`PlanningSettings.required_gain`).
 """
 
 from collections.abc import Callable, Sequence
@@ -93,16 +94,17 @@ def choose_reduction(
 ) -> str | None:
     """The solver for this number of unknowns, those of the band in blocks of `w`; None: none
     fits."""
-    passes = settings.conjugate_gradient_steps * settings.conjugate_gradient_work
-    n, work = float(unknowns), {"iterative": (passes * observations, 0.0)}
+    per_observation = settings.conjugate_gradient_steps * settings.conjugate_gradient_work
+    # By solver: operations, and elements of the factor.
+    n, work = float(unknowns), {"iterative": (per_observation * observations, 0.0)}
     work["dense"] = n**3 / 3, n**2
     if band is not None:
         place: Any = band.place  # not an array yet (`as_column`)
-        m, rows = float(band.width * w), len(place.rows) * w
+        m, in_band = float(band.width * w), len(place.rows) * w
         # Super-blocks: L (m³/3), C by substitution (m³), C·Cᵀ (2·m³); then X and the corner of the
         # border of q unknowns.
-        q = n - rows
-        border = 2 * rows * m * q + rows * q**2 + q**3 / 3
+        q = n - in_band
+        border = 2 * in_band * m * q + in_band * q**2 + q**3 / 3
         work["banded"] = band.blocks * 10 / 3 * m**3 + border, 3 * band.blocks * m**2 + n * q
     fits = {
         name: work[name][0] for name in solvers if work[name][1] <= settings.max_factor_elements

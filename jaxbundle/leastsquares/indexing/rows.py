@@ -42,7 +42,8 @@ class Data(eqx.Module):
 
     `start`: the start values of the tables, including held values; `measured` and `weight` of every
     set of observations (see `ObservationSet`), by its name. `weight` is 1/σ, the root of the
-    textbook's weight p = 1/σ²; of correlated observations W with P = WᵀW; 0 is not used.
+    textbook's weight p = 1/σ²; of correlated observations W with P = WᵀW. A residual of weight 0
+    does not count.
     """
 
     start: Values
@@ -135,7 +136,7 @@ class Residual:
         changes: Sequence[Float[Array, " width"]],
     ) -> Float[Array, " r"]:
         """Residuals / σ as an array, of changes [width] of every slot: for kinds of arrays with
-        hundreds of columns (`SCALAR_RESIDUALS_UP_TO`)."""
+        many residuals (`SCALAR_RESIDUALS_UP_TO`)."""
         moved = []
         for space, block, change in zip(self.spaces, blocks, changes, strict=True):
             if isinstance(space, Vector) and space.size:
@@ -152,7 +153,8 @@ class Residual:
         return jnp.where(w > 0, w * v, 0.0)
 
     def is_wide(self, weight: Weight) -> bool:
-        """Whether to use `array`: the kind works on arrays and has a weight per residual."""
+        """Whether to use `array`: the kind works on arrays and has many residuals, with a weight
+        each."""
         many = len(weight) > SCALAR_RESIDUALS_UP_TO
         return not self.kind.scalars and many and not isinstance(weight[0], tuple)
 
@@ -205,8 +207,8 @@ def fill_places(plan: Plan, laid: ChunkedData) -> tuple[Plan, ChunkedData]:
     for part, values, weight in zip(plan.parts, laid.measured, laid.weight):
         shape = part.source.shape
         live = jnp.stack([w > 0 for w in diagonal_of(weight)]).any(0)
-        # Of weights that are constants of a program, XLA's compiler would search the first one
-        # itself: 4 of 11 s of compiling the gradient of 100 000 observations.
+        # If the weights are constants of a program, XLA would search for the first one while it
+        # compiles: 4 of 11 s of compiling the gradient of 100 000 observations.
         live = jax.lax.optimization_barrier(live)
         # `argmax`: the first position with weight, or 0.
         place = jnp.where(live, jnp.arange(live.size).reshape(shape), jnp.argmax(live))
@@ -254,8 +256,8 @@ def look_up(
     """The elements of every column at these (non-negative) indices of a plan."""
     # Indices of a plan are in bounds by construction. Without the promise XLA compares and clamps
     # each, and negative ones are counted from the end.
-    there = {"mode": "promise_in_bounds", "wrap_negative_indices": False}
-    return jax.tree.map(lambda column: column.at[at].get(**there), columns)
+    promise = {"mode": "promise_in_bounds", "wrap_negative_indices": False}
+    return jax.tree.map(lambda column: column.at[at].get(**promise), columns)
 
 
 def _look_up_in_copies(
@@ -265,9 +267,9 @@ def _look_up_in_copies(
     of a column are not more numbers than the observations.
 
     In reverse mode a look-up is a sum over all observations of a row, whose additions wait for
-    each other: the gradient of 100 000 observations of 120 images took 68 ms on an H200, of which
-    these sums were 49, with copies 18 (benchmarks/gpu.py, "gradient"). A processor adds one by one
-    anyway."""
+    each other: the gradient of 100 000 observations of 120 images took 68 ms on an H200, 49 of them
+    in these sums, and takes 18 in all with copies (benchmarks/gpu.py, "gradient"). A processor adds
+    one by one anyway."""
 
     def look(column: Float[Array, " rows"]) -> Float[Array, "..."]:
         if at.ndim == 1 or column.size * at.shape[1] > at.size:

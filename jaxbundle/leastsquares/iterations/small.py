@@ -66,7 +66,8 @@ def minimise(
     unknowns: int,
     steps: int = 30,
 ) -> tuple[PyTree[Float[Array, "..."]], Float[Array, ""]]:
-    """The estimate at the end of the iterations, and its vᵀv, without derivatives.
+    """The estimate at the end of the iterations, and its vᵀv (infinite where it cannot be
+    computed), without derivatives.
 
     **Arguments:** `residuals(x, *data)` [n], `retract(x, δ)`; `start`: initial x; `steps`: maximum
     evaluations. Starts are those of closed forms, a few steps away; a hopeless one is given up
@@ -125,7 +126,7 @@ def finish(
     x = retract(x, jnp.where(good, step, 0))
     still = jnp.zeros(unknowns, step.dtype)
     fixed = (residuals, retract, x)
-    # The step here is zero; it carries the derivatives of the minimum by the data.
+    # The step here is zero; it carries the derivatives of the minimum with respect to the data.
     x = retract(x, implicit_root(_half_gradient, solve_dense, still, fixed, data))
     N, _ = normal_equations(residuals, retract, x, data, unknowns)
     N = jnp.where(determined, N, jnp.eye(unknowns, dtype=N.dtype))

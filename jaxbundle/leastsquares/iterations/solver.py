@@ -1,8 +1,8 @@
 """Least squares on manifolds with `optimistix.least_squares`.
 
-From one accepted point to the next, a search accepts or rejects the step tried, a
-descent computes the next one, and `stopping` decides. Residuals, Jacobian and normal equations are
-formed once per accepted point; a rejected step costs a factorisation and the residuals.
+From one accepted point to the next, a search accepts or rejects the step tried, a descent computes
+the next one, and `stopping` decides when to end. Every step tried costs a factorisation and the
+residuals; Jacobian and normal equations are formed at accepted points only.
 """
 
 # Arguments that the interfaces of optimistix prescribe:
@@ -121,6 +121,7 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
     rows: int = eqx.field(static=True, default=128)
     progress: Callable | None = eqx.field(static=True, default=None)
     stopping: StoppingSettings = eqx.field(static=True, default=STOPPING)
+    # Required by optimistix, and not used: `terminate` decides by `tolerance` and `stopping`.
     rtol: ClassVar[float] = 0.0
     atol: ClassVar[float] = 0.0
     norm: ClassVar[Callable] = staticmethod(optx.max_norm)
@@ -188,8 +189,7 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
             self.tolerance, step_size, finite, decrement, state.first, accept, *costs
         )
         following = self.retract(self.plan, y, change)
-        # A settled step is taken without being tried: it moves nothing by more than `atol` σ, and
-        # its error is the square of that.
+        # A settled step is taken without being tried: it moves nothing by more than `atol` σ.
         y = jax.tree.map(lambda a, b: jnp.where(termination == SETTLED, b, a), y, following)
         if self.progress is not None:
             jax.debug.callback(self.progress, state.steps, trial.f, 1 / state.step_size)
@@ -279,7 +279,8 @@ V = TypeVar("V")
 
 class Minimum(eqx.Module, Generic[V]):
     """The end of the loop: unknowns (tables, or those of a network), termination
-    (`stopping.TERMINATIONS`), number of steps, history."""
+    (`stopping.TERMINATIONS`), number of evaluations (that of the start values is the first),
+    history."""
 
     values: V
     termination: Int[Array, ""]

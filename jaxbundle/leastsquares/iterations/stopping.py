@@ -17,7 +17,7 @@ from jaxbundle.types import AnyArray
 TERMINATIONS = (
     "iteration limit",
     "settled: no unknown would move by more than the tolerance times its standard deviation",
-    "relative cost: the sum of squares no longer decreases",
+    "relative cost: the sum of squares decreases by less than the tolerance, or no longer",
     "singular: the undamped normal equations cannot be solved",
     "stuck: no step reduces the sum of squares",
     "not finite: the residuals of the start values, or of a full step, cannot be computed",
@@ -37,7 +37,8 @@ class StoppingSettings:
     - `near_solution`: undamped steps are tried once the last step was predicted to decrease vᵀPv by
       less than this fraction.
     - `quadratic_gain`, `quadratic_decrease`: … and if steps converge quadratically, which shows in
-      a gain ratio above the first and a predicted decrease below this fraction of the one before.
+      a gain ratio above the first, and in a predicted decrease below the second times the one
+      before.
     - `narrowing`: a rejected undamped step was tried too early: `near_solution` of this problem is
       multiplied by this.
     - `max_rejected_undamped`: after so many rejected undamped steps at points where the damped
@@ -51,10 +52,12 @@ class StoppingSettings:
     near_solution: float = 0.1
     quadratic_gain: float = 0.95
     quadratic_decrease: float = 0.5
-    # Each rejected trial costs an evaluation: with 0.1 a problem wastes one per digit.
+    # Each rejected trial costs an evaluation: with 0.1 a problem wastes one at most for every
+    # decimal digit by which its predicted decrease falls.
     narrowing: float = 0.1
     # With 1 a single step rejected by rounding would be called singular; with 4 every nearly
-    # singular problem takes two more evaluations. The problems above take the same with 1.
+    # singular problem takes four more evaluations: a damped and an undamped step for each
+    # rejection. The problems above take the same with 1.
     max_rejected_undamped: int = 2
     # λ = 1e20 times the diagonal moves no unknown by its last digit.
     shortest_step: float = 1e-20
@@ -69,7 +72,7 @@ class Tolerance(eqx.Module):
     - `redundancy`: of the problem, for σ₀.
     - `squares`: Σ(l/σ)² of all measured values l.
     - `atol`: see the module; `rtol`: stop when an accepted step decreases vᵀPv by less than this
-      fraction (0: disabled).
+      fraction (0: only when it does not decrease it, and the increase is rounding).
     - `rounding`: a decrement d² below this fraction of ½vᵀPv is rounding.
     - `cost_rounding`: relative rounding error of a measured value, for that of vᵀPv.
     - `noise_floor`: residuals below this fraction of the measured values are arithmetic noise;
@@ -149,10 +152,10 @@ class Approach(eqx.Module):
         #     try undamped  if  ρ > 0.95, q < near·½vᵀPv and q < 0.5·(q of the step before)
         #     if rejected   near ← 0.1·near
         #
-        # Alternatives on BAL 49: whenever the last step was good, every second evaluation was
-        # wasted; delayed tenfold by each rejection alone, 5 of 60; with a condition on q (there a
-        # tenth of the step before) none, and a street of 200 images converges after 31 evaluations
-        # instead of 36.
+        # Alternatives on BAL 49: with an undamped step after every good one, every second
+        # evaluation was wasted; with the tenfold narrowing after a rejection as well, 5 of 60; with
+        # the condition on q as well (measured with 0.1 instead of 0.5) none, and a street of 200
+        # images converges after 31 evaluations instead of 36.
         rules = self.settings
         # A rejected undamped step was tried too early.
         near = jnp.where(jnp.isinf(last_size) & ~accept, rules.narrowing * self.near, self.near)
@@ -195,8 +198,8 @@ class Approach(eqx.Module):
         # Gauss–Newton has no other step, and fails again at the same point.
         failed_again = self.singular & undamped & ~finite
         singular = self.singular | (~finite & undamped)
-        # Equations that can just be factorised send undamped steps anywhere: each is rejected
-        # although the damped ones have settled. Twice, since once is an accident of rounding.
+        # Equations that can only just be factorised send undamped steps anywhere: each is rejected
+        # although the damped ones have settled. Twice, since once may be an accident of rounding.
         singular |= self.rejected >= rules.max_rejected_undamped
         # `first`: the start values were evaluated, no step was taken.
         stalled = accept & ~first & (before - trial_cost < tolerance.rtol * before)

@@ -14,8 +14,8 @@ The exact form holds to any order, in forward, reverse and mixed mode: the equat
 differentiated (`jaxbundle.implicit`) in the tangent space at the solution, together with `retract`,
 its chart. A problem that may float is pinned meanwhile (by a penalty, zero in the
 solution, on changes of as many unknowns as the defect) and then moved to its datum as a whole.
-The Gauss–Newton form is not the gradient of a computed quantity: its derivative would
-depend on the order of differentiation and is refused. Its derivatives by weights are those of JᵀPv
+The Gauss–Newton form is not the gradient of a computed quantity: its derivative would depend on the
+order of differentiation and is refused. Its derivatives with respect to weights are those of JᵀPv
 with J constant.
 """
 
@@ -105,8 +105,9 @@ def solve(
 
 
 class LinearisedSolution(eqx.Module):
-    """The problem at a solution, as a constant for the derivative rules. `pins`: the penalty on
-    changes of the kept unknowns, in units of g (none if nothing is open)."""
+    """The problem at a solution, as a constant for the derivative rules. `pins`: of the penalty
+    ½·Σ pins·δ² on changes of the kept unknowns: the diagonal elements of N where one is pinned,
+    else 0, as in `factor` (empty if nothing is open)."""
 
     declared: Declared = eqx.field(static=True)
     plan: Plan
@@ -177,8 +178,8 @@ def gradient_after(change: Tangent, at: LinearisedSolution, data: Data) -> Tange
     """g of ½vᵀPv and of the penalty on the pins, after a change of the unknowns."""
 
     def penalised(change: Tangent) -> Float[Array, ""]:
-        # As many unknowns as the defect cannot change: H is regular; the motion into the datum
-        # follows.
+        # It keeps as many unknowns as the defect from changing, so that H is regular; the motion
+        # into the datum follows.
         penalty = sum(jnp.sum(pins * change[g] ** 2) for g, pins in at.pins.items())
         return half_square(at.plan, at.residuals(change, data)) + 0.5 * penalty
 
@@ -230,7 +231,8 @@ def _(primals: tuple, tangents: tuple) -> tuple[Tangent, Tangent]:
 
 
 def _change_of_start(at: LinearisedSolution, data: Data) -> Tangent:
-    """The difference of the datum start values from those at the solution."""
+    """The change of the start values of datum unknowns from those that the solution was computed
+    with: zero, but with derivatives."""
     moved = datum.zeros_of_tables(at.declared, at.values)
     for name in () if at.plan.datum is None else at.plan.datum.weight:
         difference = jax.vmap(at.declared.spaces[name].difference)

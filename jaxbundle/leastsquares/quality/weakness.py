@@ -1,4 +1,4 @@
-"""What observations determine in name only: the weakest directions, in the words of the unknowns.
+"""What observations determine in name only: the weakest directions, by the names of unknowns.
 
 The σ of an unknown means little by itself; it is compared with an *extent* e: that of a position
 with a distance, that of an angle with a radian. With E = diag(e), the datum S and Q = N⁻¹, the
@@ -143,8 +143,8 @@ def _far_rows(
     rows, free = rows[real], np.asarray(problem.plan.groups[e].free)[real].any(1)
     extent = extents[e][rows]
     judged = free & (extent > 0)
-    size = np.sqrt((L[real] ** 2).sum((1, 2))) * sigma0
-    ratio = np.where(judged, size / np.where(judged, extent, 1.0), 0.0)
+    sigma = np.sqrt((L[real] ** 2).sum((1, 2))) * sigma0
+    ratio = np.where(judged, sigma / np.where(judged, extent, 1.0), 0.0)
     far = np.argsort(-ratio, kind="stable")[: (NONLINEAR_RATIO * ratio > 1).sum()]
     return tuple(rows[far].tolist()), int(judged.sum())
 
@@ -174,7 +174,8 @@ def _sigma_of_weakest(
 ) -> Float[np.ndarray, " reduced"]:
     """σ/e (a priori) of the reduced system's columns, as far as the weakest directions give it."""
     # Six directions: a free camera, a pose or a similarity hidden in the datum can be weak as a
-    # whole. After 8 products the part of directions with σ of less than half is below 1/4⁸.
+    # whole. The last of the 8 products is that of Rayleigh and Ritz; in the directions after the 7
+    # before it, the part of those with σ of less than half is below 1/4⁷.
     directions = np.random.default_rng(0).standard_normal((6, len(per_extent)))
     directions *= per_extent > 0
     for _ in range(8):
@@ -185,7 +186,7 @@ def _sigma_of_weakest(
             _products(declared, values, factor, found.moves, per_extent, directions)
         )
     # Rayleigh and Ritz: A restricted to the subspace has the largest eigenvalues μ, and the σ² of
-    # an unknown are Σ μ·(component)².
+    # an unknown is Σ μ·(component)².
     mu, turn = np.linalg.eigh(previous @ directions.T)
     return np.sqrt(np.maximum(mu, 0) @ (turn.T @ previous) ** 2)
 
