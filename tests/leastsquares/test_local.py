@@ -17,28 +17,29 @@ from jaxbundle.leastsquares.problem import make_problem, pad_data
 KNOTS, CURVES, SHIFTS, POINTS = 12, 2, 3, 40
 
 
-def curve(c, shift, z, given):
+def curve(c, shift, tilt, z, given):
     """A cubic spline at a shifted place, above a point, twice and with a slope."""
     t, y, slope = given
     weights = basis(t + shift[0], 0, KNOTS)
     height = sum(weights[..., j] * c[j] for j in range(KNOTS))
-    return height + z[0] - y, height * (1 + shift[0]) + c[0] - slope
+    return height + z[0] - y + tilt[0] * tilt[1], height * (1 + shift[0]) + c[0] - slope + tilt[0]
 
 
-def columns(c, shift, z, given):
+def columns(c, shift, tilt, z, given):
     first = jnp.clip(jnp.floor(given[0] + shift[0]) - 1, 0, KNOTS - 4).astype(int)
     return (*(first + k for k in range(4)), 0 * first)
 
 
-def by_columns(c, shift, z, at, values, given):
+def by_columns(c, shift, tilt, z, at, values, given):
     """c[0] may be among the four as well: the two derivatives are added up."""
     t, y, slope = given
     weights = basis(t + shift[0] - at[0], 0, 4)
     height = sum(weights[..., j] * values[j] for j in range(4))
-    return height + z[0] - y, height * (1 + shift[0]) + values[4] - slope
+    second = height * (1 + shift[0]) + values[4] - slope + tilt[0]
+    return height + z[0] - y + tilt[0] * tilt[1], second
 
 
-OF = ("curve", "shift", "point")
+OF = ("curve", "shift", "tilt", "point")
 LOCAL = Kind("curve", curve, OF, ("y", "slope"), scalars=True,
              local=Local(0, 5, columns, by_columns))  # fmt: skip
 
@@ -50,12 +51,15 @@ def problem(request):
     value = random.normal(size=(CURVES, KNOTS))
     free = np.ones((CURVES, KNOTS), bool)
     free[1, 3] = False
+    # Shifts and tilts, met at the same rows, are one group, in the order of the tables.
     tables = [
         Table("curve", value, free=free),
+        Table("tilt", random.normal(size=(SHIFTS, 2))),
         Table("shift", random.normal(0, 0.2, (SHIFTS, 1))),
         Table("point", random.normal(size=(POINTS, 1)), free=np.arange(POINTS) > 4),
     ]
-    touched = tuple(random.integers(0, n, number) for n in (CURVES, SHIFTS, POINTS))
+    curves, shifts, points = (random.integers(0, n, number) for n in (CURVES, SHIFTS, POINTS))
+    touched = (curves, shifts, shifts, points)
     measured = np.c_[random.uniform(1, KNOTS - 2, number), random.normal(size=(number, 2))]
     seen = LOCAL(touched, measured, sigma=random.uniform(0.1, 0.3, (number, 2)))
     return make_problem(tables, [seen], eliminate=request.param)
@@ -63,6 +67,8 @@ def problem(request):
 
 def test_the_normal_equations_are_those_of_all_columns(problem):
     data = pad_data(problem, problem.data)
+    merged = [len(group.members) for group in problem.plan.groups.values()]
+    assert (max(merged) > 1) == (problem.plan.eliminated is not None)
     found = []
     for kind in (LOCAL, dataclasses.replace(LOCAL, local=None)):
         declared = dataclasses.replace(problem.declared, named_kinds=((LOCAL.name, kind),))

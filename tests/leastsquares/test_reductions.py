@@ -181,6 +181,16 @@ def test_iteration_plans_no_pairs_and_finds_the_minimum(ways):
     assert sum(float(jnp.vdot(gradient[g], change[g])) for g in change) < 1e-6
 
 
+@pytest.mark.parametrize("ways", [*CASES.values()][:1], ids=[*CASES][:1], indirect=True)
+def test_a_system_that_is_not_solved_in_time_has_no_solution(ways):
+    """Neither exactly nor to a hundredth: half a step is none, and a step of zero is no end."""
+    gradient, _, factor, _ = ways["iterative"][2]
+    for tolerance in (1e-2, 1e-12):
+        few = dataclasses.replace(factor.reduced, tolerance=tolerance, max_steps=2)
+        change = solve(dataclasses.replace(factor, reduced=few), gradient)
+        assert all(np.isnan(change[name]).any() for name in gradient)
+
+
 def test_rows_that_are_tied_stand_close():
     plan = traverse("banded").plan
     band, at = plan.band, plan.blocks["station", "station"]

@@ -38,7 +38,7 @@ class ConjugateGradients(eqx.Module):
     - `tolerance`: the norm of the residual relative to that of the right-hand side.
     - `reachable`: the relative residual that rounding allows in one run. Below it the search
       directions are noise, and steps may drift, above all along open motions. Solutions with a
-      smaller `tolerance` are refined once more, and are NaN if even this was not reached.
+      smaller `tolerance` are refined once more. A solution that misses both is NaN.
     - `max_steps`, `max_refinement_steps`: more show that the system cannot be solved so. In exact
       arithmetic conjugate gradients end after as many steps as unknowns; a tolerance of 1e-2 takes
       some tens.
@@ -87,10 +87,11 @@ class ConjugateGradients(eqx.Module):
         if self.tolerance < self.reachable:
             more = self.tolerance / self.reachable
             y, left = improved(y, left, more, self.max_refinement_steps)
-            # Twice: the residual is computed anew, not by the recursion that met the limit.
-            solved = optx.two_norm(left) <= 2 * self.reachable * optx.two_norm(right)
-            y = jax.tree.map(lambda x: jnp.where(solved, x, jnp.nan), y)
-        return back(y)
+        # NaN if it is not solved: the step is rejected, and more damping makes it easier. Half a
+        # step would be taken for the whole one, a step of zero for the end of the iterations.
+        # Twice: the residual is computed anew, not by the recursion that met the limit.
+        solved = optx.two_norm(left) <= 2 * reached * optx.two_norm(right)
+        return back(jax.tree.map(lambda x: jnp.where(solved, x, jnp.nan), y))
 
     def inverse(self) -> Reduced:
         raise ValueError(

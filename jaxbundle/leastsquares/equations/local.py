@@ -21,6 +21,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from jaxbundle.leastsquares.declarations import Kind
 from jaxbundle.leastsquares.equations.linearise import (
+    columns_of,
     differentiate_rows,
     widths_of,
     zero_held_columns,
@@ -98,8 +99,8 @@ def differentiate_locally(
     free = group.free[part.touches[touch].row][:, None]
     found = []
     for t, one in enumerate(part.touches):
-        J = jnp.concatenate([derivatives[slot] for slot, _ in one.slots], -1)
         if t == touch:
+            J = derivatives[local.slot]
             mask = jnp.take_along_axis(
                 jnp.broadcast_to(free, (*columns.shape[:2], group.width)),
                 columns,
@@ -109,6 +110,10 @@ def differentiate_locally(
             )
             J = J * mask[:, :, None, :]
         else:
+            # In the order of the group's columns, not of the slots.
+            places = columns_of(widths, one.slots, one.start, one.stop)
+            nil = jnp.zeros(r.shape)
+            J = jnp.stack([derivatives[p[0]][..., p[1]] if p else nil for p in places], -1)
             J = zero_held_columns(plan, one, J)
         found.append(J)
     E = None
