@@ -39,8 +39,8 @@ FIGURES = {
     "iterations/search.py": {
         "sufficient_decrease": ("5e-4", "2e-3", "0.1"),
         "initial": ("5e3", "2e4", "1e2", "1e6"),
-        "regular_from": ("5e7", "2e8", "1e6", "1e10"),
-        "inexact": ("5e-3", "2e-2", "0.1", "1e-6"),
+        "pin_datum_from": ("5e7", "2e8", "1e6", "1e10"),
+        "relative_residual": ("5e-3", "2e-2", "0.1", "1e-6"),
     },
     "iterations/stopping.py": {
         "rounding": ("1e-14", "4e-14"),

@@ -8,7 +8,14 @@ import pytest
 
 from jaxbundle import leastsquares as ls
 from jaxbundle.leastsquares.datum.conditions import DATUM_MOTION, moves_on
-from jaxbundle.leastsquares.iterations.stopping import STOPPING, Approach
+from jaxbundle.leastsquares.iterations.stopping import (
+    LIMIT,
+    SETTLED,
+    SINGULAR,
+    STOPPING,
+    Approach,
+    Tolerance,
+)
 
 ANGLE = ls.Kind("angle", lambda x, measured: jnp.arctan(x) - measured, of=("x",))
 
@@ -68,3 +75,26 @@ def test_a_motion_to_the_datum_ends():
     assert moves_on(size, 0.5, 0.4, most - 1) and not moves_on(size, 0.5, 0.4, most)
     assert moves_on(size, near, 2.1 * near, 1) and not moves_on(size, near, 1.9 * near, 1)
     assert not moves_on(size, arrived, 1.0, 1)
+
+
+def test_a_factorisation_that_failed_far_from_the_minimum_is_tried_again_there():
+    """A small damped step is repeated without damping, and that one decides, also after an earlier
+    failure; equations that send it away twice are singular."""
+    tolerance = Tolerance(*(jnp.asarray(x) for x in (10.0, 1e4, 1e-3, 0.0)))
+    far = dataclasses.replace(Approach.begin(STOPPING), singular=jnp.asarray(True))
+
+    def judge(approach, step_size, decrement, finite=True):
+        given = (jnp.asarray(x) for x in (step_size, finite, decrement, False, True, 5.1, 5.0, 5.0))
+        termination, approach = approach.judge(tolerance, *given)
+        return int(termination), approach
+
+    small, inf = 1e-12, np.inf
+    termination, approach = judge(far, 1e4, small)
+    assert termination == LIMIT and approach.repeat_undamped
+    again = dataclasses.replace(approach, repeated=jnp.asarray(True))
+    assert judge(again, inf, small)[0] == SETTLED
+    assert judge(again, inf, small, finite=False)[0] == SINGULAR
+    begun = dataclasses.replace(Approach.begin(STOPPING), repeated=jnp.asarray(True))
+    assert judge(begun, inf, small, finite=False)[0] == SINGULAR
+    twice = dataclasses.replace(far, rejected=jnp.asarray(2))
+    assert judge(twice, 1e4, small)[0] == SINGULAR

@@ -101,10 +101,10 @@ def choose_reduction(
     if band is not None:
         place: Any = band.place  # not an array yet (`as_column`)
         m, in_band = float(band.width * w), len(place.rows) * w
-        # Super-blocks: L (m³/3), C by substitution (m³), C·Cᵀ (2·m³); then X and the corner of the
-        # border of q unknowns.
+        # Super-blocks: L (m³/3), C by substitution (m³), C·Cᵀ (2·m³); then, of the border of q
+        # unknowns, X (C·X, substitution), XᵀX and the corner.
         q = n - in_band
-        border = 2 * in_band * m * q + in_band * q**2 + q**3 / 3
+        border = 3 * in_band * m * q + 2 * in_band * q**2 + q**3 / 3
         work["banded"] = band.blocks * 10 / 3 * m**3 + border, 3 * band.blocks * m**2 + n * q
     fits = {
         name: work[name][0] for name in solvers if work[name][1] <= settings.max_factor_elements

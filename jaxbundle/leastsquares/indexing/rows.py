@@ -186,9 +186,11 @@ def _stack(block: Block) -> Any:
 def whiten(v: Change, weight: Weight) -> Change:
     """L⁻¹·v, or v/σ; 0 if the weight is 0, whatever v is."""
     if isinstance(weight[0], tuple):
-        # L⁻¹ is lower triangular, but its zeros cost less than a loop that knows them.
-        rows = [sum(w * x for w, x in zip(row, v)) for row in weight]
-        return tuple(jnp.where(row[i] > 0, r, 0.0) for i, (row, r) in enumerate(zip(weight, rows)))
+        used = [row[i] > 0 for i, row in enumerate(weight)]
+        v = [jnp.where(u, x, 0.0) for u, x in zip(used, v)]
+        # L⁻¹ is lower triangular.
+        rows = [sum(w * x for w, x in zip(row[: i + 1], v)) for i, row in enumerate(weight)]
+        return tuple(jnp.where(u, r, 0.0) for u, r in zip(used, rows))
     return tuple(jnp.where(w > 0, w * x, 0.0) for w, x in zip(weight, v))
 
 

@@ -194,13 +194,14 @@ class Approach(eqx.Module):
         # undamped step settles; `repeat` below asks for it.
         small = finite & (decrement <= tolerance.limit(cost))
         settled = small & undamped
-        # Levenberg–Marquardt goes on with damping after a failure, and `small` decides in the end;
-        # Gauss–Newton has no other step, and fails again at the same point.
-        failed_again = self.singular & undamped & ~finite
-        singular = self.singular | (~finite & undamped)
+        # Levenberg–Marquardt goes on with damping after a failure, until a damped step is small and
+        # the undamped one that repeats it fails as well; a failure far from the minimum says
+        # nothing. Gauss–Newton has no other step, and fails again at the same point.
+        failed = undamped & ~finite & (self.singular | self.repeated)
         # Equations that can only just be factorised send undamped steps anywhere: each is rejected
         # although the damped ones have settled. Twice, since once may be an accident of rounding.
-        singular |= self.rejected >= rules.max_rejected_undamped
+        sent_away = self.rejected >= rules.max_rejected_undamped
+        singular = self.singular | (undamped & ~finite) | sent_away
         # `first`: the start values were evaluated, no step was taken.
         stalled = accept & ~first & (before - trial_cost < tolerance.rtol * before)
         # Gauss–Newton accepts every step: a sum of squares that grows has not stalled, it diverges.
@@ -209,8 +210,8 @@ class Approach(eqx.Module):
             (~jnp.isfinite(cost), NOT_FINITE),
             (settled, SETTLED),
             (stalled & ~singular, RELATIVE_COST),
-            ((small | stalled) & singular, SINGULAR),
-            (failed_again, SINGULAR),
+            ((small & sent_away) | (stalled & singular), SINGULAR),
+            (failed, SINGULAR),
             ((step_size < rules.shortest_step) & ~small, STUCK),
         )
         termination = jnp.asarray(LIMIT)
@@ -218,5 +219,5 @@ class Approach(eqx.Module):
         for happened, reason in reversed(reasons):
             termination = jnp.where(happened, reason, termination)
         # A small damped step says nothing: λ may have made it small.
-        repeat = small & ~singular & ~settled
+        repeat = small & ~sent_away & ~settled
         return termination, dataclasses.replace(self, singular=singular, repeat_undamped=repeat)

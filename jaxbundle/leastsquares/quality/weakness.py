@@ -140,10 +140,11 @@ def _far_rows(
     size = problem.table(e).rows
     rows = np.arange(len(L)) if members[0].rows is None else np.asarray(members[0].rows)
     real = rows < size
-    rows, free = rows[real], np.asarray(problem.plan.groups[e].free)[real].any(1)
+    rows, free = rows[real], np.asarray(problem.plan.groups[e].free)[real]
     extent = extents[e][rows]
-    judged = free & (extent > 0)
-    sigma = np.sqrt((L[real] ** 2).sum((1, 2))) * sigma0
+    judged = free.any(1) & (extent > 0)
+    # L⁻¹ has a one for a held unknown, whose σ is 0 (`elimination.eliminate`).
+    sigma = np.sqrt((L[real] ** 2 * free[:, None, :]).sum((1, 2))) * sigma0
     ratio = np.where(judged, sigma / np.where(judged, extent, 1.0), 0.0)
     far = np.argsort(-ratio, kind="stable")[: (NONLINEAR_RATIO * ratio > 1).sum()]
     return tuple(rows[far].tolist()), int(judged.sum())
