@@ -15,6 +15,7 @@ engine (`rigs`).
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -118,8 +119,10 @@ def solve_camera(
     meaning = jnp.array([MEANING[code] for code in range(len(MEANING))])
     status = jnp.where(few, TOO_FEW, meaning[loop.termination])
     lost = (status == CONVERGED) & ~(weakest > INDETERMINATE)
+    # A settled step is taken without being tried, as by the engine; another one may yet be rejected.
+    settled = loop.termination == stopping.SETTLED
     return CameraSolution(
-        loop.trial,
+        jax.tree.map(lambda one, other: jnp.where(settled, one, other), loop.trial, loop.at),
         loop.cost,
         Q_interior,
         Q_pose,

@@ -14,7 +14,10 @@ from scipy import optimize
 import jaxbundle
 from jaxbundle import cameras
 from jaxbundle.batches import input as batch_input
+from jaxbundle.batches.camera import solve_camera
 from jaxbundle.batches.input import bucket, single_list
+from jaxbundle.batches.normal import Sightings, residual_lengths
+from jaxbundle.batches.start import start_values
 from jaxbundle.geometry import omega_phi_kappa_from_matrix
 
 SIZE = (1280, 960)
@@ -397,6 +400,24 @@ def test_iteration_limit_gives_no_numbers(three):
     assert list(found.status) == ["iteration limit"] * 3
     assert np.isnan(found.values).all() and np.isnan(found.position).all()
     assert not np.isnan(found.redundancy).any()
+
+
+def test_unknowns_and_sum_of_squares_at_the_limit_are_of_one_point(three):
+    """The next step is computed then, but not tried."""
+    model = cameras.get_model("opencv")
+    xy, points = three[0][0], BOARD - BOARD.mean(0)
+    seen = Sightings(points, np.asarray(xy), np.ones(xy.shape[:2]))
+
+    @jax.jit
+    def solve(seen, first):
+        usable, start = start_values(model, True, False, seen, first, float(max(SIZE)))
+        solved = solve_camera(model, tuple(range(9)), 1, float(max(SIZE)), usable, start)
+        return solved.cost, 0.5 * (residual_lengths(model, usable, solved.at) ** 2).sum()
+
+    first = np.zeros(len(model.parameters))
+    first[2:4] = (np.array(SIZE) - 1) / 2
+    cost, there = solve(seen, first)
+    assert float(there) == pytest.approx(float(cost), rel=1e-9) and cost > 1
 
 
 GOOD = dict(
