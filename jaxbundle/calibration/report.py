@@ -13,6 +13,7 @@ from jaxbundle.calibration.verdict import (
 )
 from jaxbundle.io.results.result_json import result_dict, verdict_dict
 from jaxbundle.io.text.csv_tables import table_rows
+from jaxbundle.measure.boards import Board, BoardSet
 from jaxbundle.measure.views import BoardViews
 from jaxbundle.report import observations
 from jaxbundle.report.layout import (
@@ -64,10 +65,12 @@ def _photographs(calibration: "Calibration") -> list[str]:
 def photograph_facts(views: BoardViews) -> list[tuple[str, str]]:
     """The board, the number of photographs and of detected points."""
     size = " × ".join(map(str, views.image_size))
+    boards = views.board.items if isinstance(views.board, BoardSet) else [("", views.board)]
+    used = len({*views.photographs})
     return [
-        ("Board", str(views.board)),
-        ("Photographs", f"{len(views)} used, {len(views.failed)} not; {size} pixels"),
-        ("Points", f"{int(views.visible.sum())} of {views.visible.size} image points found"),
+        *((f"Board {clean(name)}".strip(), str(board)) for name, board in boards),
+        ("Photographs", f"{used} used, {len(views.failed)} not; {size} pixels"),
+        ("Points", f"{int(views.visible.sum())} of {views.possible} image points found"),
         *(("Note", note) for note in views.notes),
     ]
 
@@ -159,16 +162,12 @@ def as_dict(calibration: "Calibration", brief: bool = False) -> dict:
     views, adjustment = calibration.views, calibration.adjustment
     about = {
         "camera": calibration.name,
-        "board": {
-            "kind": views.board.kind,
-            "columns": views.board.columns,
-            "rows": views.board.rows,
-            "square": views.board.square,
-            "row_spacing": views.board.spacing[1],
-            "first_marker": views.board.first_marker,
-        },
+        **_boards_dict(views.board),
         "image_size": list(views.image_size),
-        "photographs": {"used": list(views.names), "failed": dict(views.failed)},
+        "photographs": {
+            "used": list(dict.fromkeys(views.photographs)),
+            "failed": dict(views.failed),
+        },
     }
     if calibration.converged:
         about |= _quality_dict(calibration)
@@ -176,6 +175,22 @@ def as_dict(calibration: "Calibration", brief: bool = False) -> dict:
     if "verdict" in found:
         found["verdict"] = verdict_dict(conclude_calibration(calibration))
     return found
+
+
+def _boards_dict(board: Board | BoardSet) -> dict:
+    """The board, or several by name."""
+    if isinstance(board, BoardSet):
+        return {"boards": {name: _boards_dict(one)["board"] for name, one in board.items}}
+    return {
+        "board": {
+            "kind": board.kind,
+            "columns": board.columns,
+            "rows": board.rows,
+            "square": board.square,
+            "row_spacing": board.spacing[1],
+            "first_marker": board.first_marker,
+        }
+    }
 
 
 def _quality_dict(calibration: "Calibration") -> dict:
