@@ -105,7 +105,6 @@ def calibrate(  # noqa: PLR0913 keyword arguments of a public function
     check_options(**options)
     check_test(snooping, options.get("significance", 0.001))
     views = views_of(photographs, board, progress)
-    board = views.board
     start = start_values(views, camera_model, free, pixel_size, given)
     columns, rows = views.image_size
     # held parameters need no prior
@@ -128,7 +127,7 @@ def calibrate(  # noqa: PLR0913 keyword arguments of a public function
         object_unit=object_unit,
     )
     result = adjust(network, **options)
-    if board.diameters.any() and result.converged:
+    if views.board.diameters.any() and result.converged:
         # twice: the shifts depend on the poses, and these change by the shifts, by a small part
         for _ in range(2):
             centred = _without_eccentricity(start, result, made)

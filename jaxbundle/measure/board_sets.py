@@ -7,6 +7,7 @@ view is one board in one photograph: a photograph of two boards has two views.
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -39,14 +40,15 @@ def join_views(views: Mapping[str, BoardViews]) -> BoardViews:
 
     **Raises:** `InputError` if image sizes differ.
     """
-    sizes = {name: tuple(one.image_size) for name, one in views.items()}
+    sizes = {name: one.image_size for name, one in views.items()}
     if len({*sizes.values()}) > 1:
         shown = ", ".join(f"{c} × {r} of {name!r}" for name, (c, r) in sizes.items())
         raise InputError(
             f"views of boards have different image sizes: {shown}; expected photographs of one "
             "camera, all of one size"
         )
-    boards = BoardSet(tuple(views), tuple(require_board(one.board) for one in views.values()))
+    known = require_boards({name: one.board for name, one in views.items()})
+    boards = BoardSet(tuple(known), tuple(known.values()))
     rows, number = [], boards.number
     for b, one in enumerate(views.values()):
         for name, xy in zip(one.names, one.xy):
@@ -117,7 +119,7 @@ def measure_board_set(
     return join_views(views)
 
 
-def require_boards(boards: object) -> dict[str, Board]:
+def require_boards(boards: Any) -> dict[str, Board]:
     """Boards by name.
 
     **Raises:** `InputError` about another argument.

@@ -25,7 +25,7 @@ def views_of_camera(
     board: Board | Mapping[str, Board] | str | Path | None,
     seen_by: Mapping[str, Sequence[str]] | None = None,
     progress: Progress | None = None,
-) -> tuple[dict[str, BoardViews | Calibration], dict[str, Sequence[str]] | None]:
+) -> tuple[dict[str, BoardViews | Calibration], Mapping[str, Sequence[str]] | None]:
     """The views of every camera, measured where photographs are given; and the bodies of a file of
     boards.
 
@@ -130,7 +130,6 @@ def _require_views(given: Mapping[Any, Any]) -> Mapping[str, BoardViews]:
     for name, one in given.items():
         if not isinstance(one, BoardViews):
             raise InputError(f"views of board {show(name)} are {show(one)}; expected BoardViews")
-    require_boards({name: one.board for name, one in given.items()})
     return given
 
 

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.boards.targets import read_target
+from jaxbundle.io.text.csv_tables import read_toml
 from jaxbundle.io.text.sections import refuse_unknown
 from jaxbundle.measure.boards import Board
 from jaxbundle.network.columns import show
