@@ -35,6 +35,12 @@ def calibrate_rig(  # noqa: PLR0913 - the options of the command
         bool,
         typer.Option("--fixed", help="the boards are fixed to each other, to walls for instance"),
     ] = False,
+    mountings: Annotated[
+        str,
+        typer.Option(
+            help="FILE.toml with a section [rig], as of a project: what is known of the mountings"
+        ),
+    ] = "",
     model: options.Model = "opencv",
     free: options.Free = "",
     given: options.Given = None,
@@ -91,6 +97,7 @@ def calibrate_rig(  # noqa: PLR0913 - the options of the command
         "--square": square,
         "--kind": kind,
         "--fixed": fixed,
+        "--mountings": mountings,
         "--model": model,
         "--free": free,
         "--given": ", ".join(given or ()),
@@ -108,6 +115,7 @@ def calibrate_rig(  # noqa: PLR0913 - the options of the command
             {name: [folder] for name, folder in cameras.items()},
             known,
             fixed=fixed,
+            mountings=mountings or None,
             model=model,
             free=words(free) or None,
             given=values(given),

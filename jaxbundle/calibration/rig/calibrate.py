@@ -26,7 +26,9 @@ from jaxbundle.calibration.calibrate import calibrate
 from jaxbundle.calibration.each_camera import calibrate_each
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.result import Calibration
+from jaxbundle.calibration.rig.connections import Connections
 from jaxbundle.calibration.rig.declare import Rig, adjust_rig, leave_out, snoop_rig, used_rays
+from jaxbundle.calibration.rig.known_mountings import known_mountings
 from jaxbundle.calibration.rig.photographs import RigPhotographs, views_of_camera
 from jaxbundle.calibration.rig.result import RigCalibration
 from jaxbundle.calibration.rig.start import start_rig
@@ -49,6 +51,8 @@ def calibrate_rig(
     fixed: bool = False,
     bodies: Mapping[str, Sequence[str]] | None = None,
     seen_by: Mapping[str, Sequence[str]] | None = None,
+    mountings: Mapping[str, Any] | str | Path | None = None,
+    bases: Sequence[Mapping[str, Any]] = (),
     progress: Progress | None = None,
     **options: Any,
 ) -> RigCalibration:
@@ -69,6 +73,9 @@ def calibrate_rig(
       boards move by themselves.
     - `seen_by`: by the name of a board, the cameras in whose photographs it is searched; all by
       default.
+    - `mountings`, `bases`: what is known of the mountings, held or with σ, as in the section
+      `[rig]` of a project (degrees), such as `{"b": {"position": [0, 0, 0.1], "sigma_position":
+      0.01}}`; or a file with that section.
     - `board_sigma` (object unit), `board_free` (one board only), `snooping`, `significance`,
       `max_iterations` of cameras and rig, and further `options` of the cameras: as in `calibrate`.
       Without snooping, epochs that contradict the mounting are kept and listed in `contradicting`.
@@ -81,6 +88,7 @@ def calibrate_rig(
     check_test(options.get("snooping", "pope"), options.get("significance", 0.001))
     _check(photographs)
     views, declared = views_of_camera(photographs, board, seen_by, progress)
+    known = known_mountings(mountings, bases, list(photographs))
     if fixed and bodies:
         raise InputError("fixed: all boards are one body; give either fixed or bodies")
 
@@ -105,13 +113,15 @@ def calibrate_rig(
     if options.get("robust") and not given.get("snooping"):
         # Points downweighted in a camera have full weight in the rig.
         given["snooping"] = "pope"
-    return _adjust_together(calibrations, declared if bodies is None else bodies, fixed, **given)
+    bodies = declared if bodies is None else bodies
+    rig, connections = start_rig(calibrations, bodies, fixed, known)
+    return _adjust_together(calibrations, rig, connections, **given)
 
 
 def _adjust_together(
     calibrations: Mapping[str, Calibration],
-    bodies: Mapping[str, Sequence[str]] | None,
-    fixed: bool,
+    rig: Rig,
+    connections: Connections,
     *,
     board_sigma: float | None = None,
     board_free: bool = False,
@@ -120,7 +130,6 @@ def _adjust_together(
     max_iterations: int = 50,
 ) -> RigCalibration:
     """The common adjustment of separately calibrated cameras."""
-    rig, connections = start_rig(calibrations, bodies, fixed)
     if board_free and len(rig.boards) > 1:
         raise InputError(
             f"the points of {len(rig.boards)} boards cannot be free: each would have a frame of "

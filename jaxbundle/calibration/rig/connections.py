@@ -19,7 +19,7 @@ cameras see different boards of one body at the same epochs, the motion of the r
 
 import dataclasses
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
 from typing import NamedTuple
 
@@ -58,12 +58,14 @@ class MotionTie:
     """Two groups of cameras that only the motion of the rig ties.
 
     **Fields:** `cameras`: the names in both groups; `boards`: those that each sees; `epochs`:
-    number of them.
+    number of them; `open`: number of directions along which the motion leaves the position open,
+    and only what is given of a mounting determines it.
     """
 
     cameras: tuple[tuple[str, ...], tuple[str, ...]]
     boards: tuple[tuple[str, ...], tuple[str, ...]]
     epochs: int
+    open: int = 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,10 +108,13 @@ def connect(
     boards: Sequence[str],
     bodies: Sequence[int],
     views: Iterable[BoardView],
+    given: Mapping[int, Float[np.ndarray, "3"]] | None = None,
 ) -> Connections:
     """The mountings of the cameras and the places of the boards.
 
-    **Arguments:** names of cameras and boards; `bodies`: of each board the number of its body.
+    **Arguments:** names of cameras and boards; `bodies`: of each board the number of its body;
+    `given`: positions of cameras in the frame of the first, by index, for what a motion leaves
+    open.
 
     **Raises:** `InputError` if the cameras do not hang together: which ones do, and what would join
     them; `NotSolvedError` if the motion of the rig, which alone could tie them, does not.
@@ -120,7 +125,7 @@ def connect(
         poses = _poses(views, rigs, walls)
         if _join_cameras(poses, views, rigs) or _join_boards(poses, walls, body):
             continue
-        found, open_motions = _find_motion(poses, body)
+        found, open_motions = _find_motion(poses, body, rigs, given or {})
         if found is None:
             break
         (g1, h1), (g2, h2), motion, number = found
@@ -130,6 +135,7 @@ def connect(
                 (named(cameras, rigs.members(g1)), named(cameras, rigs.members(g2))),
                 (named(boards, walls.members(h1)), named(boards, walls.members(h2))),
                 number,
+                motion.open.shape[1],
             )
         )
         _merge_cameras(rigs, g1, g2, np.linalg.inv(motion.X))
@@ -222,7 +228,8 @@ def _merge_boards(walls: _Groups, one: int, other: int, change: Matrix) -> None:
 
 
 class _OpenMotion(NamedTuple):
-    """Two pairs of groups, the motion that does not tie them, and its epochs."""
+    """Two pairs of groups, the motion that does not tie them (None: too few epochs), and its
+    epochs."""
 
     one: tuple[int, int]
     other: tuple[int, int]
@@ -230,8 +237,11 @@ class _OpenMotion(NamedTuple):
     epochs: int
 
 
-def _find_motion(poses: Poses, body: np.ndarray) -> tuple[tuple | None, list[_OpenMotion]]:
-    """The motion over most epochs that ties two groups of cameras; those that do not."""
+def _find_motion(
+    poses: Poses, body: np.ndarray, rigs: _Groups, given: Mapping[int, Float[np.ndarray, "3"]]
+) -> tuple[tuple | None, list[_OpenMotion]]:
+    """The motion over most epochs that ties two groups of cameras, if with what is given; those
+    that do not."""
     candidates = []
     for one, other in combinations(sorted(poses), 2):
         if one[0] == other[0] or one[1] == other[1] or body[one[1]] != body[other[1]]:
@@ -244,10 +254,22 @@ def _find_motion(poses: Poses, body: np.ndarray) -> tuple[tuple | None, list[_Op
         motion = None
         if len(epochs) >= MIN_MOTION_EPOCHS:
             motion = tie_by_motion(*(np.array([poses[p][e] for e in epochs]) for p in (one, other)))
-            if motion.determined:
+            known = [k for k in rigs.members(other[0]) if k in given and rigs.of[0] == one[0]]
+            if known and not motion.determined:
+                motion = _shift_to(motion, rigs, known[0], given[known[0]])
+            if known or motion.determined:
                 return (one, other, motion, len(epochs)), open_motions
         open_motions.append(_OpenMotion(one, other, motion, len(epochs)))
     return None, open_motions
+
+
+def _shift_to(
+    motion: Motion, rigs: _Groups, camera: int, position: Float[np.ndarray, "3"]
+) -> Motion:
+    """A motion with its open part such that a camera is at a position in the frame of the first."""
+    place = np.linalg.inv(rigs.place[camera])  # its centre in the frame of its group
+    now = rigs.place[0] @ motion.X @ place[:, 3]
+    return motion.shifted(rigs.place[0][:3, :3].T @ (position - now[:3]))
 
 
 def _describe_separate(
@@ -310,17 +332,18 @@ def _boards(names: Sequence[str], seen: Iterable[int]) -> str:
 
 def _why_open(motion: Motion, epochs: int, one: str, other: str, reference: str) -> str:
     """What a motion leaves open, and which would not."""
-    if not motion.turned:
+    common = f"Over the {epochs} epochs that {one} and {other} have in common"
+    if motion.open.shape[1] > 1:
         return (
-            f"Over the {epochs} epochs that {one} and {other} have in common the rig is only "
-            f"shifted, not rotated: the position of {other} is not determined; rotate the rig "
-            "about two axes as well"
+            f"{common} the rig is only shifted, not rotated: the position of {other} is not "
+            "determined; rotate the rig about two axes as well, or give what is known of the "
+            "position (--mountings)"
         )
-    axis = ", ".join(f"{x:.2f}" for x in (motion.axis if motion.axis is not None else ()))
+    axis = ", ".join(f"{x + 0.0:.2f}" for x in motion.open[:, 0].round(2))
     return (
-        f"Over the {epochs} epochs that {one} and {other} have in common all rotations of the rig "
-        f"are about one axis, ({axis}) in the frame of {reference!r}: the position of {other} "
-        "along it is not determined; rotate the rig about a second axis as well"
+        f"{common} all rotations of the rig are about one axis, ({axis}) in the frame of "
+        f"{reference!r}: the position of {other} along it is not determined; rotate the rig about "
+        "a second axis as well, or give what is known of the position (--mountings)"
     )
 
 

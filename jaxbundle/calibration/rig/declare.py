@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxbundle.calibration.rig.known_mountings import NOTHING_KNOWN, KnownMountings
 from jaxbundle.leastsquares import Result, adjust
 from jaxbundle.leastsquares.datum.motions import similarity
 from jaxbundle.leastsquares.declarations import Motions, ObservationSet, Table
@@ -35,6 +36,7 @@ from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network.declare import CameraTable, camera_tables
 from jaxbundle.network.kinds.control_points import CONTROL_POINTS
 from jaxbundle.network.kinds.image_points import image_points
+from jaxbundle.network.kinds.mountings import BASES, MOUNTING, observe_mountings
 from jaxbundle.network.tables import EXTERIOR, Camera
 
 POSES = ("epoch", "mounting")
@@ -69,6 +71,7 @@ class Rig:
     - `boards`: their names; `board`: of every point the index of its board; `centroids` of the
       boards, in their own frames; `place`: c_j and P_j of every board, None if every board is a
       body of its own; `body`: of every board the index of the first board of its body.
+    - `known`: what is given of the mountings.
     """
 
     cameras: tuple[Camera, ...]
@@ -90,6 +93,7 @@ class Rig:
     centroids: Float[np.ndarray, "boards 3"] | None = None
     place: PoseValue | None = None
     body: tuple[int, ...] = (0,)
+    known: KnownMountings = NOTHING_KNOWN
 
     @property
     def epoch_of_rows(self) -> tuple[str, ...]:
@@ -129,9 +133,9 @@ def declare_rig(rig: Rig) -> tuple[list[Table], list[ObservationSet]]:
     tables = [
         Table("epoch", rig.pose, labels=rig.epochs, parameters=EXTERIOR),
         Table(
-            "mounting",
+            MOUNTING,
             rig.mounting,
-            free=np.arange(len(names)) > 0,
+            free=_free_mountings(rig),
             labels=names,
             parameters=("bx", "by", "bz", "omega", "phi", "kappa"),
         ),
@@ -160,11 +164,34 @@ def declare_rig(rig: Rig) -> tuple[list[Table], list[ObservationSet]]:
         observations.append(
             kind(touched, rig.xy[rows], sigma=rig.sigma[rows], name=table.image_set)
         )
+    observations += _given_mountings(rig)
     if rig.point_sigma is not None:
         every = np.arange(len(rig.points))
         control = CONTROL_POINTS((every,), rig.points, sigma=rig.point_sigma, name="control")
         observations.append(control)
     return tables, observations
+
+
+def _free_mountings(rig: Rig) -> Float[np.ndarray, "cameras 6"]:
+    """The free columns of the mountings: not of the reference, nor what is held."""
+    free = np.ones((len(rig.cameras), 6))
+    free[0] = 0
+    for k, camera in enumerate(rig.cameras):
+        if camera.id in rig.known.mountings:
+            free[k] = ~np.repeat(rig.known.mountings[camera.id].held, 3)
+    return free
+
+
+def _given_mountings(rig: Rig) -> list[ObservationSet]:
+    """The observations of what is given of mountings and bases."""
+    row = {camera.id: k for k, camera in enumerate(rig.cameras)}
+    known = rig.known.mountings
+    found = observe_mountings([row[name] for name in known], [*known.values()])
+    if rig.known.bases:
+        ends = np.array([[row[name] for name in base.cameras] for base in rig.known.bases])
+        length, sigma = np.array([(base.length, base.sigma) for base in rig.known.bases]).T
+        found.append(BASES(tuple(ends.T), length, sigma=sigma))
+    return found
 
 
 def adjust_rig(rig: Rig, max_iterations: int = 50, **options: Any) -> Result:

@@ -14,14 +14,15 @@ from jaxbundle.calibration import quality
 from jaxbundle.calibration.result import Calibration
 from jaxbundle.calibration.rig.connections import BoardView, Connections, body_pose, connect
 from jaxbundle.calibration.rig.declare import Rig
+from jaxbundle.calibration.rig.known_mountings import NOTHING_KNOWN, KnownMountings
 from jaxbundle.calibration.rig.motion import transformation
 from jaxbundle.errors import InputError
-from jaxbundle.geometry import quaternion_from_matrix
+from jaxbundle.geometry import matrix_from_omega_phi_kappa, quaternion_from_matrix
 from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.measure.boards import Board, BoardSet
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray
+from jaxbundle.types import AnyArray, present
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,10 +134,12 @@ def start_rig(
     calibrations: Mapping[str, Calibration],
     bodies: Mapping[str, Sequence[str]] | None = None,
     fixed: bool = False,
+    known: KnownMountings = NOTHING_KNOWN,
 ) -> tuple[Rig, Connections]:
     """The rig with start values, and the image points that the calibration of each camera kept.
 
-    **Arguments:** `bodies`: by name, boards that are fixed to each other; `fixed`: all are.
+    **Arguments:** `bodies`: by name, boards that are fixed to each other; `fixed`: all are;
+    `known`: what is given of the mountings.
 
     **Raises:** `InputError`, `NotSolvedError` if the cameras do not hang together
     (`connections.connect`).
@@ -147,7 +150,8 @@ def start_rig(
     names, views = list(boards.boards), _board_views(cameras, boards, epochs)
     body = list(dict.fromkeys(boards.body.values()))
     numbers = [body.index(boards.body[name]) for name in names]
-    found = connect(list(calibrations), names, numbers, views)
+    given = known.positions(list(calibrations))
+    found = connect(list(calibrations), names, numbers, views, given)
     reference = [next(g[0] for g in found.bodies if j in g) for j in range(len(names))]
     # an epoch of each body, by the view of it with most points
     rows: dict[tuple[int, int], BoardView] = {}
@@ -169,7 +173,7 @@ def start_rig(
             dataclasses.replace(one.camera, id=name, free=free[name])
             for name, one in calibrations.items()
         ),
-        _pose_values(found.mountings),
+        _hold(_pose_values(found.mountings), list(calibrations), known),
         tuple(labels),
         _pose_values(poses),
         boards.ids,
@@ -185,6 +189,7 @@ def start_rig(
         centroids=np.array([one.points.mean(0) for one in boards.boards.values()]),
         place=None if len(found.bodies) == len(names) else _pose_values(found.places),
         body=tuple(reference),
+        known=known,
     )
     return rig, found
 
@@ -210,6 +215,19 @@ def _pose_values(matrices: Sequence[Float[np.ndarray, "4 4"]]) -> PoseValue:
     found = np.array(matrices)
     R, t = found[:, :3, :3], found[:, :3, 3]
     return PoseValue(-np.einsum("nji,nj->ni", R, t), np.asarray(_quaternions(R)))
+
+
+def _hold(mounting: PoseValue, cameras: Sequence[str], known: KnownMountings) -> PoseValue:
+    """Mountings with those parts that are held as they are given."""
+    position, rotation = np.array(mounting.position), np.array(mounting.rotation)
+    for name, one in known.mountings.items():
+        k = cameras.index(name)
+        if one.held[0]:
+            position[k] = one.position
+        if one.held[1]:
+            M = matrix_from_omega_phi_kappa(present(one.angles))
+            rotation[k] = quaternion_from_matrix(M)
+    return PoseValue(position, rotation)
 
 
 @partial(compile_once, static=())
