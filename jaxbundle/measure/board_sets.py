@@ -95,7 +95,7 @@ def measure_board_set(
         return search_board(file_of[name], boards[board])
 
     def tell(done: int) -> None:
-        if progress is not None:
+        if progress is not None and done % len(boards) == 0:
             progress(SEARCHING, done // len(boards), len(file_of))
 
     # as many at once as of the board whose search takes most memory

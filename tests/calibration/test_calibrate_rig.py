@@ -43,6 +43,7 @@ def test_a_chain_of_overlaps_is_one_rig(chain):
     # the farther in the chain, the weaker
     lengths = [m.length_sigma for m in chain.mountings.values()]
     assert lengths == sorted(lengths)
+    assert chain.calibrations.rig is chain and list(chain.calibrations.cameras) == chain.names
     assert chain.advice[-1].startswith("next: the position of 'c3' is the weakest")
     assert "'c3' and 'c2' at the same time" in chain.advice[-1]
 

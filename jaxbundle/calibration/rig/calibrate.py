@@ -29,7 +29,7 @@ from jaxbundle.calibration.result import Calibration
 from jaxbundle.calibration.rig.connections import Connections
 from jaxbundle.calibration.rig.declare import Rig, adjust_rig, leave_out, snoop_rig, used_rays
 from jaxbundle.calibration.rig.known_mountings import known_mountings
-from jaxbundle.calibration.rig.photographs import RigPhotographs, views_of_camera
+from jaxbundle.calibration.rig.photographs import RigPhotographs, require_lists, views_of_camera
 from jaxbundle.calibration.rig.result import RigCalibration
 from jaxbundle.calibration.rig.start import start_rig
 from jaxbundle.cameras import get_model
@@ -87,10 +87,12 @@ def calibrate_rig(
     """
     check_test(options.get("snooping", "pope"), options.get("significance", 0.001))
     _check(photographs)
-    views, declared = views_of_camera(photographs, board, seen_by, progress)
     known = known_mountings(mountings, bases, list(photographs))
+    if bodies is not None:
+        bodies = require_lists("bodies", bodies, "{'room': ['front', 'rear']}")
     if fixed and bodies:
         raise InputError("fixed: all boards are one body; give either fixed or bodies")
+    views, declared = views_of_camera(photographs, board, seen_by, progress)
 
     def calibrate_one(name: str, given: Any, tell: Progress | None) -> Calibration:
         if isinstance(given, Calibration):
@@ -158,7 +160,7 @@ def _check(photographs: Any) -> None:
             f"is {show(photographs)}"
         )
     if len(photographs) < 2:
-        raise InputError("a rig has at least two cameras: give --camera NAME=PATTERN for each")
+        raise InputError("a rig has at least two cameras: give the photographs of each")
 
 
 def require_solved(found: Result) -> Result:

@@ -55,12 +55,31 @@ def views_of_camera(
     return found, bodies or None
 
 
+def require_lists(name: str, given: Any, example: str) -> dict[str, list[str]]:
+    """Lists of names by name; none if nothing is given.
+
+    **Raises:** `InputError` about another argument."""
+    found = {} if given is None else given
+    good = isinstance(found, Mapping) and all(
+        isinstance(names, Sequence)
+        and not isinstance(names, str)
+        and all(isinstance(one, str) for one in (key, *names))
+        for key, names in found.items()
+    )
+    if not good:
+        raise InputError(
+            f"{name} must be lists of names by name, such as {example}, but is {show(given)}"
+        )
+    return {key: list(names) for key, names in found.items()}
+
+
 def _boards_of(
     board: Board | Mapping[str, Board] | str | Path | None,
     seen_by: Mapping[str, Sequence[str]] | None,
-) -> tuple[dict[str, Board], Mapping[str, Sequence[str]], dict[str, Sequence[str]]]:
+) -> tuple[dict[str, Board], Mapping[str, Sequence[str]], Mapping[str, Sequence[str]]]:
     """Boards by name, their bodies, and the cameras that see each."""
-    cameras, bodies = dict(seen_by or {}), {}
+    cameras = require_lists("seen_by", seen_by, "{'wall': ['left']}")
+    bodies: Mapping[str, Sequence[str]] = {}
     if board is None:
         boards = {}
     elif isinstance(board, str | Path):

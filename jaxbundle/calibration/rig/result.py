@@ -39,6 +39,8 @@ from jaxbundle.types import AnyArray, present
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from jaxbundle.calibration.several import Calibrations
+
 POSE = Pose.width
 DEGREES = np.array([1, 1, 1, *[180 / np.pi] * 3])
 
@@ -319,6 +321,14 @@ class RigCalibration(TableMethods):
     def advice(self) -> list[str]:
         """What would determine the mountings better, in words."""
         return advise_rig(self)
+
+    @property
+    def calibrations(self) -> "Calibrations":
+        """The rig with the separate calibrations of its cameras: what the command writes
+        (`jaxbundle.calibration.write_calibrations`), and `convert` reads."""
+        from jaxbundle.calibration.several import Calibrations
+
+        return Calibrations(self.cameras, self)
 
     def camera(self, name: str) -> Camera:
         """A camera with the parameters of the common adjustment, held."""

@@ -101,6 +101,10 @@ def collect_boards(
                     f"body {name!r}: no camera has seen a board {board!r}"
                     f"{did_you_mean(board, boards)}"
                 )
+            if body[board] != board:
+                raise InputError(
+                    f"board {board!r} is of two bodies, {body[board]!r} and {name!r}; expected one"
+                )
             body[board] = name
     return RigBoards(boards, body)
 
