@@ -117,10 +117,35 @@ def motions(kind="any", epochs=16):
     return found
 
 
-def back_to_back(seed=0, noise=0.05, kind="any", epochs=16):
-    """Two cameras that look away from each other, each at a board of its own on a wall."""
+def back_to_back(seed=0, noise=0.05, kind="any", epochs=16, moved=()):
+    """Two cameras that look away from each other, each at a board of its own on a wall; at the
+    epochs `moved` the rear board is elsewhere."""
     rng = np.random.default_rng(seed)
     front = dict(enumerate(motions(kind, epochs)))
     rear = {e: BACK @ pose @ REAR for e, pose in front.items()}
+    for e in moved:
+        rear[e] = rear[e] @ matrix(rotation(0, 0, 4), (0, 0, 0.01))  # lateral shifts show least
     poses = {"a": {"front": front}, "b": {"rear": rear}}
     return views(poses, BOARDS, rng, noise)
+
+
+PAGE = matrix(rotation(0, -35, 1), (0.235, 0.0, 0.01))
+"""The second page of an open book: its frame → that of the first."""
+PAIR = {"a": mounted((0, 0, 0)), "b": mounted((0.2, 0.01, -0.02), 1, 20, 2)}
+
+
+def book(seed=0, noise=0.05, epochs=14):
+    """Two boards fixed to each other at an angle, moved before two cameras; at the first epochs
+    one camera sees only one of them."""
+    rng, shapes = np.random.default_rng(seed), np.random.default_rng(4)
+    poses = {name: {"first": {}, "second": {}} for name in PAIR}
+    for e in range(epochs):
+        R = rotation(*shapes.uniform(-20, 20, 2), (0, 90, 180, 270)[e % 4])
+        shift = matrix(R, [0.08, *shapes.uniform(-0.03, 0.03, 1), -shapes.uniform(0.6, 0.8)])
+        other = PAGE[:3, :3] @ OTHER.points.mean(0) + PAGE[:3, 3]
+        body = shift @ matrix(np.eye(3), -(BOARD.points.mean(0) + other) / 2)
+        for name, mounting in PAIR.items():
+            poses[name]["first"][e] = mounting @ body
+            if e >= 4 or name == "b":
+                poses[name]["second"][e] = mounting @ body @ PAGE
+    return views(poses, {"first": BOARD, "second": OTHER}, rng, noise)

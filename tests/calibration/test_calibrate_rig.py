@@ -69,6 +69,31 @@ def test_cameras_back_to_back_are_tied_by_motion(back_to_back):
 
 
 @pytest.mark.further
+def test_epochs_that_contradict_the_motion_are_left_out():
+    """The rear board was moved at two epochs."""
+    found = jaxbundle.calibrate_rig(scenes.back_to_back(moved=(3, 10)), fixed=True, **OPTIONS)
+    assert {epoch for epoch, _ in found.left_out} == {"3", "10"} and len(found.epochs) == 14
+    assert np.abs(error_of(found.mountings["b"], BACK)).max() < 3.5
+
+
+@pytest.mark.further
+@pytest.mark.parametrize("together", [True, False])
+def test_several_boards_in_a_photograph(together):
+    """Two boards fixed to each other and moved; or each with poses of its own."""
+    bodies = {"book": ["first", "second"]} if together else None
+    found = jaxbundle.calibrate_rig(scenes.book(), bodies=bodies, **OPTIONS)
+    assert len(found.epochs) == 14 and len(found.rig.epochs) == (14 if together else 28)
+    assert np.abs(error_of(found.mountings["b"], scenes.PAIR["b"])).max() < 3.5
+    assert list(found.placements) == ["second"] * together
+    for place in found.placements.values():
+        assert np.abs((place.base - scenes.PAGE[:3, 3]) / place.sigma[:3]).max() < 3.5
+        np.testing.assert_allclose(place.rotation, scenes.PAGE[:3, :3].T, atol=1e-3)
+    assert "Board second  charuco" in found.cameras["a"].report()
+    with pytest.raises(jaxbundle.InputError, match="points of 2 boards cannot be free"):
+        jaxbundle.calibrate_rig(found.cameras, board_free=True)
+
+
+@pytest.mark.further
 def test_what_is_known_closes_what_a_motion_leaves_open():
     """The rig turns about one axis only, as on a floor: the height of the other camera is given."""
     views = scenes.back_to_back(kind="axis")
@@ -142,6 +167,7 @@ def calibrate_rig(command):
     return lambda *arguments: command("calibrate-rig", *arguments)
 
 
+@pytest.mark.further
 def test_photographs_to_a_rig(calibrate_rig, folders, tmp_path):
     """By the command: two chessboards on walls, and what it writes for other programs."""
     code, told, error = calibrate_rig(

@@ -95,6 +95,8 @@ def collect_boards(
         boards["board" if len(different) == 1 and not boards else f"board {number}"] = board
     body = {name: "all boards" if fixed else name for name in boards}
     for name, members in (bodies or {}).items():
+        if name in boards and name not in members:
+            raise InputError(f"body {name!r}: board {name!r} is not of it; choose another name")
         for board in members:
             if board not in boards:
                 raise InputError(
