@@ -37,7 +37,8 @@ if TYPE_CHECKING:
     from jaxbundle.calibration.mapping_error import MappingError
     from jaxbundle.calibration.quality import Coverage, UncertaintyMap
     from jaxbundle.calibration.result import Calibration
-    from jaxbundle.calibration.rig.result import Mounting, RigCalibration
+    from jaxbundle.calibration.rig.mounting import Mounting
+    from jaxbundle.calibration.rig.result import RigCalibration
     from jaxbundle.calibration.several import Calibrations
 
 MAPS_HEADER = ("point held in", "middle", "corners")

@@ -131,7 +131,7 @@ def calibrate_rig(  # noqa: PLR0913 - the options of the command
             object_unit=unit,
             progress=progress,
         )
-        return rig.calibrations, None
+        return Calibrations(rig.cameras, rig), None
 
     CalibrationOutputs(
         COMMAND, [*cameras], files, settings, json, out, html, force, brief, quiet, plots

@@ -37,6 +37,7 @@ from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.leastsquares import Result
 from jaxbundle.leastsquares.quality.snooping import check_test
 from jaxbundle.measure.boards import Board
+from jaxbundle.measure.views import BoardViews
 from jaxbundle.network.columns import list_some
 from jaxbundle.types import Progress
 
@@ -94,23 +95,7 @@ def calibrate_rig(
         raise InputError("fixed: all boards are one body; give either fixed or bodies")
     views, declared = views_of_camera(photographs, board, seen_by, progress)
 
-    def calibrate_one(name: str, given: Any, tell: Progress | None) -> Calibration:
-        if isinstance(given, Calibration):
-            return given
-        return calibrate(given, camera=name, progress=tell, **options)
-
-    if all(isinstance(one, Calibration) for one in views.values()):
-        unused = {*options} - {*SHARED, "robust"}
-        if unused:
-            raise InputError(
-                f"{', '.join(sorted(unused))}: for the calibration of each camera, but all of them "
-                "are calibrated already; omit it"
-            )
-    calibrations = calibrate_each(views, calibrate_one, progress)
-    for name, one in calibrations.items():
-        if not one.converged:
-            why = one.adjustment.termination
-            raise NotSolvedError(f"not solved: camera {name} by itself: {why}")
+    calibrations = _calibrate_cameras(views, options, progress)
     given = {name: options[name] for name in SHARED if name in options}
     if options.get("robust") and not given.get("snooping"):
         # Points downweighted in a camera have full weight in the rig.
@@ -118,6 +103,33 @@ def calibrate_rig(
     bodies = declared if bodies is None else bodies
     rig, connections = start_rig(calibrations, bodies, fixed, known)
     return _adjust_together(calibrations, rig, connections, **given)
+
+
+def _calibrate_cameras(
+    views: Mapping[str, BoardViews | Calibration],
+    options: Mapping[str, Any],
+    progress: Progress | None,
+) -> dict[str, Calibration]:
+    """The calibration of every camera by itself."""
+    if all(isinstance(one, Calibration) for one in views.values()):
+        unused = {*options} - {*SHARED, "robust"}
+        if unused:
+            raise InputError(
+                f"{', '.join(sorted(unused))}: for the calibration of each camera, but all of them "
+                "are calibrated already; omit it"
+            )
+
+    def calibrate_one(name: str, given: Any, tell: Progress | None) -> Calibration:
+        if isinstance(given, Calibration):
+            return given
+        return calibrate(given, camera=name, progress=tell, **options)
+
+    found = calibrate_each(views, calibrate_one, progress)
+    for name, one in found.items():
+        if not one.converged:
+            why = one.adjustment.termination
+            raise NotSolvedError(f"not solved: camera {name} by itself: {why}")
+    return found
 
 
 def _adjust_together(

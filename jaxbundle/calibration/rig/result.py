@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -20,16 +19,12 @@ from jaxbundle.calibration.result import Calibration
 from jaxbundle.calibration.rig.advice import advise_rig
 from jaxbundle.calibration.rig.connections import Connections
 from jaxbundle.calibration.rig.declare import Rig, used_rays
+from jaxbundle.calibration.rig.mounting import POSE, Mounting, mounting_of, placement_of
 from jaxbundle.calibration.rig.quality import rig_coverage, rig_points, rig_uncertainty
 from jaxbundle.cameras import get_model
-from jaxbundle.display import print_in_one_screen
-from jaxbundle.geometry import (
-    matrix_from_quaternion,
-    omega_phi_kappa_from_matrix,
-    omega_phi_kappa_near,
-)
+from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.io.networks.rig_result import network_of_rig
-from jaxbundle.leastsquares import Pose, PoseValue, Result
+from jaxbundle.leastsquares import Result
 from jaxbundle.network.blunders import Removed, either_of
 from jaxbundle.network.tables import EXTERIOR, Camera, Network, units_of
 from jaxbundle.results import TableMethods
@@ -38,47 +33,6 @@ from jaxbundle.types import AnyArray, present
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-    from jaxbundle.calibration.several import Calibrations
-
-POSE = Pose.width
-DEGREES = np.array([1, 1, 1, *[180 / np.pi] * 3])
-
-
-@print_in_one_screen
-@dataclasses.dataclass(frozen=True)
-class Mounting:
-    """The mounting of a camera in the frame of the reference camera; or the place of a board in
-    that of another one.
-
-    **Fields:** `base`: its projection centre, object unit; `rotation`: R, from the reference's
-    frame to its own; `angles`: ω, φ, κ of R, degrees; `covariance` [6, 6] of base and angles, a
-    posteriori; `length` of the base and its σ.
-    """
-
-    base: Float[np.ndarray, "3"]
-    rotation: Float[np.ndarray, "3 3"]
-    angles: Float[np.ndarray, "3"]
-    covariance: Float[np.ndarray, "6 6"]
-    length: float
-    length_sigma: float
-
-    @property
-    def sigma(self) -> Float[np.ndarray, "6"]:
-        """σ of base (object unit) and ω, φ, κ (degrees)."""
-        return np.sqrt(np.diagonal(self.covariance))
-
-    @property
-    def correlation(self) -> Float[np.ndarray, "6 6"]:
-        """Correlations of base and ω, φ, κ; 0 of a σ of 0."""
-        over = np.maximum(self.sigma, 1e-300)
-        return self.covariance / over[:, None] / over
-
-    @property
-    def weakest(self) -> tuple[float, Float[np.ndarray, "3"]]:
-        """The largest σ of the base in any direction, and this direction."""
-        size, axes = np.linalg.eigh(self.covariance[:3, :3])
-        return float(np.sqrt(max(size[2], 0.0))), axes[:, 2]
 
 
 class RigCalibration(TableMethods):
@@ -285,7 +239,7 @@ class RigCalibration(TableMethods):
         found = {}
         for k, name in enumerate(self.names[1:], 1):
             at = jax.tree.map(lambda x, k=k: x[k], self.values("mounting"))
-            found[name] = _mounting(at, self.covariance(name)[:POSE, :POSE])
+            found[name] = mounting_of(at, self.covariance(name)[:POSE, :POSE])
         return found
 
     @functools.cached_property
@@ -298,7 +252,7 @@ class RigCalibration(TableMethods):
         centroids = present(self.rig.centroids)
         covariance, values = self.result["board"].covariance, self.values("board")
         return {
-            name: _placement(
+            name: placement_of(
                 jax.tree.map(lambda x, j=j: x[j], values),
                 covariance[j],
                 centroids[j],
@@ -321,14 +275,6 @@ class RigCalibration(TableMethods):
     def advice(self) -> list[str]:
         """What would determine the mountings better, in words."""
         return advise_rig(self)
-
-    @property
-    def calibrations(self) -> "Calibrations":
-        """The rig with the separate calibrations of its cameras: what the command writes
-        (`jaxbundle.calibration.write_calibrations`), and `convert` reads."""
-        from jaxbundle.calibration.several import Calibrations
-
-        return Calibrations(self.cameras, self)
 
     def camera(self, name: str) -> Camera:
         """A camera with the parameters of the common adjustment, held."""
@@ -440,56 +386,3 @@ class RigCalibration(TableMethods):
 @partial(compile_once, static=())
 def _matrices(rotation: Float[AnyArray, "n 4"]) -> Float[Array, "n 3 3"]:
     return jax.vmap(matrix_from_quaternion)(rotation)
-
-
-@partial(compile_once, static=0)
-def _to_angles(
-    placed: bool, pose: PoseValue, own: Float[AnyArray, "3"], frame: Float[AnyArray, "3"]
-) -> tuple[Array, Array, Array, Array]:
-    """Base, R, ω, φ, κ, and derivatives of base and angles by (δb, δθ).
-
-    Of a camera the pose is its mounting: base and R. A board is `placed` by its pose, from its
-    frame to that of its body, relative to the centroids of both, `own` and `frame`: the inverse
-    says where it is.
-    """
-    block = Pose().prepare(pose)
-
-    def place(block: Any) -> tuple[Array, Array]:
-        R = block.rotation.matrix()
-        if not placed:
-            return jnp.stack(block.centre), R
-        return frame - R @ (own + jnp.stack(block.centre)), R.T
-
-    base, R = place(block)
-    # angles near the given ones, so that κ does not jump by a full turn in the derivatives
-    given = omega_phi_kappa_from_matrix(R)
-
-    def change(d: Float[Array, "6"]) -> Float[Array, "6"]:
-        base, R = place(Pose().move(block, tuple(d)))
-        return jnp.concatenate([base, omega_phi_kappa_near(R, given)])
-
-    return base, R, given, jax.jacfwd(change)(jnp.zeros(POSE))
-
-
-def _mounting(at: PoseValue, C: Float[np.ndarray, "6 6"]) -> Mounting:
-    return _with_covariance(_to_angles(False, at, np.zeros(3), np.zeros(3)), C)
-
-
-def _placement(
-    at: PoseValue,
-    C: Float[np.ndarray, "6 6"],
-    own: Float[np.ndarray, "3"],
-    frame: Float[np.ndarray, "3"],
-) -> Mounting:
-    return _with_covariance(_to_angles(True, at, own, frame), C)
-
-
-def _with_covariance(found: tuple, C: Float[np.ndarray, "6 6"]) -> Mounting:
-    base, R, angles, J = map(np.asarray, found)
-    J, length = DEGREES[:, None] * J, float(np.linalg.norm(base))
-    # σ of |b|: the variance along b
-    along = base / length if length else np.zeros(3)
-    C = J @ C @ J.T
-    return Mounting(
-        base, R, np.degrees(angles), C, length, float(np.sqrt(along @ C[:3, :3] @ along))
-    )

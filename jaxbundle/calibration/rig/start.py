@@ -159,12 +159,7 @@ def start_rig(
     given = known.positions(list(calibrations))
     found = connect(list(calibrations), names, numbers, views, given)
     reference = [next(g[0] for g in found.bodies if j in g) for j in range(len(names))]
-    # an epoch of each body, by the view of it with most points
-    rows: dict[tuple[int, int], BoardView] = {}
-    for view in views:
-        key = view.epoch, reference[view.board]
-        if key not in rows or view.points > rows[key].points:
-            rows[key] = view
+    rows = _best_views(views, reference)
     poses = [body_pose(view, found) for view in rows.values()]
     alone = len(found.bodies) == 1
     labels = [epochs[e] if alone else f"{epochs[e]} {boards.body[names[j]]}" for e, j in rows]
@@ -198,6 +193,18 @@ def start_rig(
         known=known,
     )
     return rig, found
+
+
+def _best_views(
+    views: Sequence[BoardView], reference: Sequence[int]
+) -> dict[tuple[int, int], BoardView]:
+    """By epoch and body (its first board) the view with most points."""
+    found: dict[tuple[int, int], BoardView] = {}
+    for view in views:
+        key = view.epoch, reference[view.board]
+        if key not in found or view.points > found[key].points:
+            found[key] = view
+    return found
 
 
 def _board_views(
