@@ -106,7 +106,7 @@ def test_what_is_known_closes_what_a_motion_leaves_open():
     # σ of the height is that given, times σ0; the others follow from the motion
     assert mounting.sigma[1] == pytest.approx(0.001 * found.sigma0, rel=0.1)
     # of a σ that says nothing the position stays unknown, which the verdict says
-    known["b"]["sigma_position"] = 10.0
+    known["b"]["sigma_position"] = 2.0
     vague = jaxbundle.calibrate_rig(found.cameras, fixed=True, mountings=known)
     both = jaxbundle.calibration.Calibrations(vague.cameras, vague)
     assert "positions not determined: b" in both.report()[:1000]

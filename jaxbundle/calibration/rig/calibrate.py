@@ -26,7 +26,7 @@ from jaxbundle.calibration.calibrate import calibrate
 from jaxbundle.calibration.each_camera import calibrate_each
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.result import Calibration
-from jaxbundle.calibration.rig.connections import Connections
+from jaxbundle.calibration.rig.connections import Connections, MotionTie
 from jaxbundle.calibration.rig.declare import Rig, adjust_rig, leave_out, snoop_rig, used_rays
 from jaxbundle.calibration.rig.known_mountings import known_mountings
 from jaxbundle.calibration.rig.photographs import RigPhotographs, require_lists, views_of_camera
@@ -152,7 +152,7 @@ def _adjust_together(
     rig = dataclasses.replace(rig, point_sigma=board_sigma, points_free=board_free)
     cameras = [one.camera for one in calibrations.values()]
     size = np.array([unit_size(get_model(one.model), one.pixel_size) for one in cameras])
-    left_out, found = [], require_solved(adjust_rig(rig, max_iterations))
+    left_out, found = [], require_solved(adjust_rig(rig, max_iterations), connections.ties)
     # each time from the start values: a wrong epoch may have led the adjustment far away
     while (bad := _contradictions(rig, found, size)) and snooping:
         why = "does not fit the mounting (RMS {:.1f} px): photographs not simultaneous?"
@@ -175,16 +175,23 @@ def _check(photographs: Any) -> None:
         raise InputError("a rig has at least two cameras: give the photographs of each")
 
 
-def require_solved(found: Result) -> Result:
-    """The result of an adjustment that converged.
+def require_solved(found: Result, ties: Sequence[MotionTie] = ()) -> Result:
+    """The result of an adjustment that converged; `ties`: by motion, for the message.
 
     **Raises:** `NotSolvedError` for another one."""
     if not found.converged:
         names = found.undetermined
         what = f"; not determined: {list_some(names, 8, str)}" if names else ""
+        advice = (
+            "look for cameras that share too few epochs, or photographs that are not simultaneous"
+        )
+        if any(tie.open for tie in ties):
+            advice = (
+                "what is given of the mountings hardly determines what the motion of the rig leaves "
+                "open: give it with a smaller σ, or rotate the rig about a second axis"
+            )
         raise NotSolvedError(
-            f"not solved: the rig did not converge ({found.termination}){what}; look for cameras "
-            "that share too few epochs, or photographs that are not simultaneous",
+            f"not solved: the rig did not converge ({found.termination}){what}; {advice}",
             list(names),
         )
     return found
