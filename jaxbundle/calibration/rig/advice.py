@@ -103,4 +103,5 @@ def _remedy(rig: "RigCalibration", name: str) -> str:
 def _direction(along: Float[np.ndarray, "3"]) -> str:
     # the sign of an axis is arbitrary: its largest part is positive
     along = along * np.sign(along[np.abs(along).argmax()])
-    return f"({', '.join(f'{x + 0.0:.2f}' for x in along)})"
+    # no negative zeros
+    return f"({', '.join(f'{x + 0.0:.2f}' for x in along.round(2))})"
