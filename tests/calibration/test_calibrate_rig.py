@@ -111,14 +111,18 @@ def test_what_is_known_closes_what_a_motion_leaves_open():
     both = jaxbundle.calibration.Calibrations(vague.cameras, vague)
     assert "positions not determined: b" in both.report()[:1000]
     assert "the position of 'b' is not determined along (0.00, 1.00, 0.00)" in vague.advice[0]
-    # held, and a base
+    # held
     known["b"] = {"position": [0.02, 0.03, 0.12]}
     held = jaxbundle.calibrate_rig(found.cameras, fixed=True, mountings=known).mountings["b"]
     assert not held.sigma[:3].any() and (held.base == [0.02, 0.03, 0.12]).all()
-    known["b"] |= {"sigma_position": 0.1}
-    bases = [{"cameras": ["a", "b"], "length": 0.125, "sigma": 1e-7}]
-    based = jaxbundle.calibrate_rig(found.cameras, fixed=True, mountings=known, bases=bases)
-    assert based.mountings["b"].length == pytest.approx(0.125, abs=1e-6)
+
+
+@pytest.mark.further
+def test_a_given_base(chain):
+    bases = [{"cameras": ["c0", "c3"], "length": 0.842, "sigma": 1e-6}]
+    found = jaxbundle.calibrate_rig(chain.cameras, bases=bases)
+    assert found.mountings["c3"].length == pytest.approx(0.842, abs=1e-5)
+    assert found.mountings["c3"].length_sigma < 1e-6 < found.mountings["c2"].length_sigma
 
 
 def test_what_is_given_is_checked(chain):

@@ -183,13 +183,12 @@ def require_solved(found: Result, ties: Sequence[MotionTie] = ()) -> Result:
         names = found.undetermined
         what = f"; not determined: {list_some(names, 8, str)}" if names else ""
         advice = (
-            "look for cameras that share too few epochs, or photographs that are not simultaneous"
+            "what is given of the mountings hardly determines what the motion of the rig leaves "
+            "open: give it with a smaller σ, or rotate the rig about a second axis"
+            if any(tie.open for tie in ties)
+            else "look for cameras that share too few epochs, or photographs that are not "
+            "simultaneous"
         )
-        if any(tie.open for tie in ties):
-            advice = (
-                "what is given of the mountings hardly determines what the motion of the rig leaves "
-                "open: give it with a smaller σ, or rotate the rig about a second axis"
-            )
         raise NotSolvedError(
             f"not solved: the rig did not converge ({found.termination}){what}; {advice}",
             list(names),
