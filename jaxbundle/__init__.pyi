@@ -48,8 +48,10 @@ from jaxbundle.batches.calibrate_rigs import calibrate_rigs as calibrate_rigs
 from jaxbundle.calibration import Board as Board
 from jaxbundle.calibration import BoardViews as BoardViews
 from jaxbundle.calibration import Calibration as Calibration
+from jaxbundle.calibration import RigCalibration as RigCalibration
 from jaxbundle.calibration import calibrate as calibrate
 from jaxbundle.calibration import calibrate_cameras as calibrate_cameras
+from jaxbundle.calibration import calibrate_rig as calibrate_rig
 from jaxbundle.calibration.stability import Stability as Stability
 from jaxbundle.cameras import CameraModel as CameraModel
 from jaxbundle.commands.batch_run import BatchRun as BatchRun
@@ -132,6 +134,7 @@ __all__ = [
     "Reconstruction",
     "Replication",
     "RigBatch",
+    "RigCalibration",
     "Stability",
     "Surface",
     "Values",
@@ -142,6 +145,7 @@ __all__ = [
     "calibrate",
     "calibrate_batch",
     "calibrate_cameras",
+    "calibrate_rig",
     "calibrate_rigs",
     "camera",
     "check_gradients",

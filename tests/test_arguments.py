@@ -79,6 +79,17 @@ def calls(result):
             camera=[3, ""], max_iterations=[0, 1.5], object_unit=[3],
         )),
         "calibrate_cameras": (jaxbundle.calibrate_cameras, dict(photographs=[None, [views()], {}])),
+        "calibrate_rig": (
+            lambda **given: jaxbundle.calibrate_rig(
+                **{"photographs": {"a": views(), "b": views()}} | given
+            ),
+            dict(
+                photographs=[None, 3, [views()], {}, {"a": views()}, {"a": views(), "b": 3}],
+                board=[3, {}, {"a:b": 3}, {"wall": 3}], seen_by=[{"x": ["a"]}, 3],
+                bodies=[3, {"x": "y"}, {"x": [3]}], mountings=[{"a": 3}, 3], bases=[[3], "a"],
+                snooping=["x"], significance=[2, "a"],
+            ),
+        ),
         "check_gradients": (
             lambda function=jnp.sin, **given: jaxbundle.check_gradients(function, 1.0, **given),
             dict(function=[3], directions=[0, 1.5], step=["a", 0], tolerance=[NAN]),
@@ -143,7 +154,7 @@ def calls(result):
 
 
 SPELLED = {"pixel_size": "pixel", "residuals": "residuals", "camera_of_station": "camera_of",
-           "photographs": "photograph"}  # fmt: skip
+           "photographs": "photograph", "mountings": "mounting"}  # fmt: skip
 
 
 def test_what_cannot_be_used_is_refused_by_name(convergent4):

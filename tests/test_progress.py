@@ -19,8 +19,8 @@ from jaxbundle.surfaces.reconstruct import reconstruct_surface
 
 LONG = [
     jaxbundle.adjust, jaxbundle.calibrate, jaxbundle.calibrate_cameras, jaxbundle.calibrate_batch,
-    jaxbundle.calibrate_rigs, compare_models, run_batch, reconstruct, reconstruct_surface,
-    write_corrected,
+    jaxbundle.calibrate_rig, jaxbundle.calibrate_rigs, compare_models, run_batch, reconstruct,
+    reconstruct_surface, write_corrected,
 ]  # fmt: skip
 
 

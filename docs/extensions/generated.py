@@ -114,7 +114,7 @@ def list_commands(_) -> str:
 def whole_program():
     """The parser of all commands, and its context."""
     for command in cli.COMMANDS:
-        importlib.import_module(f"jaxbundle.cli.{command}")
+        cli.import_command(command)
     group = typer.main.get_command(application)
     return group, typer.Context(group, info_name="jaxbundle")
 

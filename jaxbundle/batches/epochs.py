@@ -35,8 +35,13 @@ def contradicting(
     return np.flatnonzero(rms > max(limit, 0.5 * rms.max()))
 
 
-def epoch_keys(names: Mapping[str, tuple[str, ...]]) -> dict[str, list[str]]:
+def epoch_keys(
+    names: Mapping[str, tuple[str, ...]], connected: bool = True
+) -> dict[str, list[str]]:
     """The epoch of every photograph of every camera: equal file names, or equal last numbers.
+
+    **Arguments:** `connected`: whether every camera must share epochs with the first, if through
+    others; otherwise it suffices that any two do.
 
     **Raises:** `InputError` if neither pairs them.
     """
@@ -47,6 +52,7 @@ def epoch_keys(names: Mapping[str, tuple[str, ...]]) -> dict[str, list[str]]:
         return found[-1].lstrip("0") or "0" if found else ""
 
     # equal names first: numbers of two cameras may be equal by chance
+    some = None
     for key in (whole, number):
         keys = {camera: [key(name) for name in given] for camera, given in names.items()}
         once = all("" not in k and len({*k}) == len(k) for k in keys.values())
@@ -57,11 +63,21 @@ def epoch_keys(names: Mapping[str, tuple[str, ...]]) -> dict[str, list[str]]:
             return keys
         if once and len(keys) > 2 and _connected(keys):
             return keys
+        if once and some is None and not connected and _any_shared(keys):
+            some = keys
+    if some is not None:
+        return some
     shown = "; ".join(f"{camera}: {list_some(given, 2)}" for camera, given in names.items())
     raise InputError(
         f"the photographs of the cameras cannot be paired by their names ({shown}): name "
         "simultaneous ones alike, or give them the same last number"
     )
+
+
+def _any_shared(keys: Mapping[str, Sequence[str]]) -> bool:
+    """Whether any two cameras share an epoch."""
+    each = [{*k} for k in keys.values()]
+    return len(set().union(*each)) < sum(map(len, each))
 
 
 def _connected(keys: Mapping[str, Sequence[str]]) -> bool:

@@ -51,7 +51,7 @@ ADVICE = AdviceSettings()
 def advice(
     position: Float[np.ndarray, "views 3"],
     rotation: Float[np.ndarray, "views 3 3"],
-    middle: Float[np.ndarray, "3"],
+    middle: Float[np.ndarray, "*views 3"],
     unit: str,
     covered: Coverage,
     rms: float,
@@ -63,8 +63,9 @@ def advice(
     """Warnings in words, the most serious first; empty if there are none.
 
     **Arguments:** X0 and M of the views of a board in the plane Z = const, whose centre is
-    `middle`; `covered`: the part of the image with points; `rms` of the residuals in pixels; `t` =
-    |value|/σ by parameter of the `model`; `validation`: by halves of the photographs.
+    `middle`, of every view if there are several boards; `covered`: the part of the image with
+    points; `rms` of the residuals in pixels; `t` = |value|/σ by parameter of the `model`;
+    `validation`: by halves of the photographs.
     """
     found = [
         f"{name} is known only to {100 / max(t[name], 1e-9):.0f} %: the photographs do not "
@@ -114,7 +115,7 @@ def tilts(rotation: Float[np.ndarray, "views 3 3"]) -> Float[np.ndarray, " views
 def _geometry(
     position: Float[np.ndarray, "views 3"],
     rotation: Float[np.ndarray, "views 3 3"],
-    middle: Float[np.ndarray, "3"],
+    middle: Float[np.ndarray, "*views 3"],
     unit: str,
     settings: AdviceSettings,
 ) -> Iterator[str]:

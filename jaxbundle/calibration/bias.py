@@ -138,18 +138,18 @@ class CalibrationBias:
 
 
 def find_bias(
-    adjustment: Adjustment, grid: tuple[int, int], settings: BiasSettings | None = None
+    adjustment: Adjustment, *grids: tuple[int, int], settings: BiasSettings | None = None
 ) -> CalibrationBias | None:
-    """Test the calibration of one camera from photographs of a board.
+    """Test the calibration of one camera from photographs of boards.
 
-    **Arguments:** the adjustment; `grid`: rows and columns of the board, whose points follow each
-    other row by row.
+    **Arguments:** the adjustment; `grids`: rows and columns of each board, whose points follow each
+    other row by row, board by board.
 
     **Returns:** None if there are too few complete cells, or no redundancy.
     """
     settings = settings or BiasSettings()
     problem = adjustment.problem
-    cells = cells_of_four(problem, grid)
+    cells = cells_of_four(problem, *grids)
     if len(cells) < settings.min_cells or not adjustment.sigma0 > 0:
         return None
     found = linearise_image_points(problem, adjustment.values)
@@ -241,17 +241,21 @@ def _board_fields(
     )
 
 
-def cells_of_four(problem: NetworkProblem, grid: tuple[int, int]) -> Int[np.ndarray, "cells 4"]:
-    """The image points of every complete cell of 2 × 2 points, in all photographs."""
-    rows, columns = grid
+def cells_of_four(problem: NetworkProblem, *grids: tuple[int, int]) -> Int[np.ndarray, "cells 4"]:
+    """The image points of every complete cell of 2 × 2 points of the boards, in all photographs."""
     used = np.flatnonzero(used_rays(problem))
-    place = np.full((len(problem.network.images), rows * columns), -1)
+    sizes = [rows * columns for rows, columns in grids]
+    place = np.full((len(problem.network.images), sum(sizes)), -1)
     place[problem.image[used], problem.point[used]] = used
-    # cells share no corner, so that their t are independent; an odd last row or column is not used
-    place = place.reshape(-1, rows, columns)[:, : rows // 2 * 2, : columns // 2 * 2]
-    corners = [place[:, i::2, j::2].ravel() for i in (0, 1) for j in (0, 1)]
-    place = np.stack(corners, 1)
-    return place[(place >= 0).all(1)]
+    cells = []
+    for (rows, columns), own in zip(grids, np.split(place, np.cumsum(sizes)[:-1], axis=1)):
+        # cells share no corner, so that their t are independent; an odd last row or column is not
+        # used
+        whole = own.reshape(-1, rows, columns)[:, : rows // 2 * 2, : columns // 2 * 2]
+        corners = [whole[:, i::2, j::2].ravel() for i in (0, 1) for j in (0, 1)]
+        cells.append(np.stack(corners, 1))
+    found = np.concatenate(cells)
+    return found[(found >= 0).all(1)]
 
 
 def _equations(

@@ -43,7 +43,7 @@ from jaxbundle.network.build import make_network
 from jaxbundle.network.tables import STATED, UNIT, UNSTATED_BOARD_SIGMA, Camera, Network
 from jaxbundle.orientation.pose import CameraPose
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray, Progress, Scalar, present
+from jaxbundle.types import AnyArray, Progress
 
 
 def calibrate(  # noqa: PLR0913 keyword arguments of a public function
@@ -105,7 +105,6 @@ def calibrate(  # noqa: PLR0913 keyword arguments of a public function
     check_options(**options)
     check_test(snooping, options.get("significance", 0.001))
     views = views_of(photographs, board, progress)
-    board = views.board
     start = start_values(views, camera_model, free, pixel_size, given)
     columns, rows = views.image_size
     # held parameters need no prior
@@ -128,7 +127,7 @@ def calibrate(  # noqa: PLR0913 keyword arguments of a public function
         object_unit=object_unit,
     )
     result = adjust(network, **options)
-    if board.diameter is not None and board.kind != "chessboard" and result.converged:
+    if views.board.diameters.any() and result.converged:
         # twice: the shifts depend on the poses, and these change by the shifts, by a small part
         for _ in range(2):
             centred = _without_eccentricity(start, result, made)
@@ -237,9 +236,10 @@ def _without_eccentricity(
     p = np.asarray(result.values["camera"])[0]
     M = jax.vmap(matrix_from_quaternion)(result.values["image"].rotation)
     poses = CameraPose(jnp.asarray(result.image_values[:, :3]), M)
-    radius = present(views.board.diameter) / 2
-    shift = _shifts(model, p, poses, views.board.points, radius)
-    xy = in_model_units(views.xy, model, views.image_size, camera.pixel_size) - np.asarray(shift)
+    radius = views.board.diameters / 2
+    shift = np.asarray(_shifts(model, p, poses, views.board.points, radius))
+    shift = np.where(radius[:, None] > 0, shift, 0.0)  # corners beside circles
+    xy = in_model_units(views.xy, model, views.image_size, camera.pixel_size) - shift
     return dataclasses.replace(views, xy=in_pixels(xy, model, views.image_size, camera.pixel_size))
 
 
@@ -249,11 +249,11 @@ def _shifts(
     p: Float[AnyArray, " parameters"],
     poses: CameraPose,
     centres: Float[AnyArray, "points 3"],
-    radius: Scalar,
+    radius: Float[AnyArray, " points"],
 ) -> Float[Array, "views points 2"]:
     up = jnp.array([0.0, 0.0, 1.0])
-    shift = lambda pose, X: rim_centre_shift(model, p, pose, X, up, radius)
-    return jax.vmap(jax.vmap(shift, (None, 0)), (0, None))(poses, centres)
+    shift = lambda pose, X, r: rim_centre_shift(model, p, pose, X, up, r)
+    return jax.vmap(jax.vmap(shift, (None, 0, 0)), (0, None, None))(poses, centres, radius)
 
 
 def check_model(name: str | CameraModel) -> CameraModel:

@@ -9,11 +9,13 @@ from jaxbundle.calibration.quality import Coverage, UncertaintyMap
 from jaxbundle.calibration.report import (
     MAPS_HEADER,
     MODELS_HEADER,
+    MOUNTED,
+    correlation_rows,
     map_rows,
     model_rows,
     models_legend,
     mounting_rows,
-    mounting_title,
+    mounting_titles,
     photograph_facts,
     rig_facts,
     rig_parameter_rows,
@@ -203,11 +205,13 @@ def _describe_several(found: "Calibrations", origin: Origin) -> Page:
 
 def _rig(rig: "RigCalibration", unit: str) -> Section:
     parts = [facts(rig_facts(rig, unit))]
-    for name, m in rig.mountings.items():
+    for title, m in mounting_titles(rig).items():
         parts += [
-            f"<h3>{text(mounting_title(rig, name))}</h3>\n",
+            f"<h3>{text(title)}</h3>\n",
             grid(("", "value", "σ", "unit"), mounting_rows(m, unit)),
+            grid(("", *MOUNTED), correlation_rows(m)),
         ]
+    parts.append(list_messages("Advice on the mountings", rig.advice))
     for name in rig.names:
         parts += [
             f"<h3>{text(f'Camera {name} in the rig')}</h3>\n",

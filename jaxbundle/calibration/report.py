@@ -1,5 +1,6 @@
 """The report of a calibration and its JSON: photographs, camera, quality, adjustment."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,9 @@ from jaxbundle.calibration.verdict import (
 )
 from jaxbundle.io.results.result_json import result_dict, verdict_dict
 from jaxbundle.io.text.csv_tables import table_rows
+from jaxbundle.measure.boards import Board, BoardSet
 from jaxbundle.measure.views import BoardViews
+from jaxbundle.network.columns import count
 from jaxbundle.report import observations
 from jaxbundle.report.layout import (
     WITHOUT_SIGMA,
@@ -34,7 +37,8 @@ if TYPE_CHECKING:
     from jaxbundle.calibration.mapping_error import MappingError
     from jaxbundle.calibration.quality import Coverage, UncertaintyMap
     from jaxbundle.calibration.result import Calibration
-    from jaxbundle.calibration.rig.result import Mounting, RigCalibration
+    from jaxbundle.calibration.rig.mounting import Mounting
+    from jaxbundle.calibration.rig.result import RigCalibration
     from jaxbundle.calibration.several import Calibrations
 
 MAPS_HEADER = ("point held in", "middle", "corners")
@@ -64,10 +68,12 @@ def _photographs(calibration: "Calibration") -> list[str]:
 def photograph_facts(views: BoardViews) -> list[tuple[str, str]]:
     """The board, the number of photographs and of detected points."""
     size = " × ".join(map(str, views.image_size))
+    boards = views.board.items if isinstance(views.board, BoardSet) else [("", views.board)]
+    used = len({*views.photographs})
     return [
-        ("Board", str(views.board)),
-        ("Photographs", f"{len(views)} used, {len(views.failed)} not; {size} pixels"),
-        ("Points", f"{int(views.visible.sum())} of {views.visible.size} image points found"),
+        *((f"Board {clean(name)}".strip(), str(board)) for name, board in boards),
+        ("Photographs", f"{used} used, {len(views.failed)} not; {size} pixels"),
+        ("Points", f"{int(views.visible.sum())} of {views.possible} image points found"),
         *(("Note", note) for note in views.notes),
     ]
 
@@ -159,16 +165,12 @@ def as_dict(calibration: "Calibration", brief: bool = False) -> dict:
     views, adjustment = calibration.views, calibration.adjustment
     about = {
         "camera": calibration.name,
-        "board": {
-            "kind": views.board.kind,
-            "columns": views.board.columns,
-            "rows": views.board.rows,
-            "square": views.board.square,
-            "row_spacing": views.board.spacing[1],
-            "first_marker": views.board.first_marker,
-        },
+        **_boards_dict(views.board),
         "image_size": list(views.image_size),
-        "photographs": {"used": list(views.names), "failed": dict(views.failed)},
+        "photographs": {
+            "used": list(dict.fromkeys(views.photographs)),
+            "failed": dict(views.failed),
+        },
     }
     if calibration.converged:
         about |= _quality_dict(calibration)
@@ -176,6 +178,22 @@ def as_dict(calibration: "Calibration", brief: bool = False) -> dict:
     if "verdict" in found:
         found["verdict"] = verdict_dict(conclude_calibration(calibration))
     return found
+
+
+def _boards_dict(board: Board | BoardSet) -> dict:
+    """The board, or several by name."""
+    if isinstance(board, BoardSet):
+        return {"boards": {name: _boards_dict(one)["board"] for name, one in board.items}}
+    return {
+        "board": {
+            "kind": board.kind,
+            "columns": board.columns,
+            "rows": board.rows,
+            "square": board.square,
+            "row_spacing": board.spacing[1],
+            "first_marker": board.first_marker,
+        }
+    }
 
 
 def _quality_dict(calibration: "Calibration") -> dict:
@@ -366,9 +384,13 @@ def rig_text(rig: "RigCalibration") -> str:
     unit = clean(rig.object_unit)
     lines = [f"Rig of {len(rig.cameras)} cameras, reference {clean(rig.names[0])}", "=" * 100]
     lines += facts(rig_facts(rig, unit))
-    for name, m in rig.mountings.items():
-        lines += heading(mounting_title(rig, name))
+    for title, m in mounting_titles(rig).items():
+        lines += heading(title)
         lines += table(("", "value", "σ", "unit"), mounting_rows(m, unit), "lrrl")
+        lines += ["", "Correlations", *table(("", *MOUNTED), correlation_rows(m), "l" + "r" * 6)]
+    lines += heading("Advice on the mountings")
+    for item in rig.advice:
+        lines += paragraph(f"- {item}", hanging=2)
     for name in rig.names:
         lines += heading(f"Camera {clean(name)} in the rig")
         lines += table(("parameter", "value", "σ"), rig_parameter_rows(rig, name), "lrr")
@@ -399,13 +421,52 @@ def rig_facts(rig: "RigCalibration", unit: str) -> list[tuple[str, str]]:
             if rig.rig.point_sigma is None
             else f"known with σ {rig.rig.point_sigma:g} {unit}",
         ),
+        *_tied_facts(rig),
         *((clean(epoch), clean(why)) for epoch, why in odd),
     ]
 
 
-def mounting_title(rig: "RigCalibration", name: str) -> str:
-    """Whose mounting, in whose frame."""
-    return f"Mounting of {clean(name)} in the frame of {clean(rig.names[0])}"
+def _tied_facts(rig: "RigCalibration") -> list[tuple[str, str]]:
+    """Which boards are fixed to each other, and which cameras only the motion of the rig ties."""
+    words = lambda names: ", ".join(map(clean, names))
+    found = [("Fixed to each other", words(body)) for body in rig.bodies if len(body) > 1]
+    for tie in rig.ties:
+        (one, other), (first, second) = tie.cameras, tie.boards
+        left = f"; {count(tie.open, 'direction')} left open" if tie.open else ""
+        found.append(
+            (
+                "Tied by motion",
+                f"{words(one)} ({words(first)}) and {words(other)} ({words(second)}), "
+                f"{tie.epochs} epochs{left}",
+            )
+        )
+    return found
+
+
+# Base and angles of a mounting.
+MOUNTED = ("bx", "by", "bz", "ω", "φ", "κ")
+
+
+def mounting_titles(rig: "RigCalibration") -> dict[str, "Mounting"]:
+    """The mountings and the places of the boards by whose they are, and in whose frame."""
+    found = {
+        f"Mounting of {clean(name)} in the frame of {clean(rig.names[0])}": mounting
+        for name, mounting in rig.mountings.items()
+    }
+    first = {name: body[0] for body in rig.bodies for name in body}
+    return found | {
+        f"Board {clean(name)} in the frame of board {clean(first[name])}": place
+        for name, place in rig.placements.items()
+    }
+
+
+def correlation_rows(m: "Mounting") -> list[tuple[str, ...]]:
+    """Correlations of base and angles, below the diagonal."""
+    return [
+        (name, *(fixed(x, 2) for x in row[:k]), *[""] * (6 - k))
+        for k, (name, row) in enumerate(zip(MOUNTED, m.correlation))
+        if k
+    ]
 
 
 def mounting_rows(m: "Mounting", unit: str) -> list[tuple[str, str, str, str]]:
@@ -413,9 +474,7 @@ def mounting_rows(m: "Mounting", unit: str) -> list[tuple[str, str, str, str]]:
     units = [unit] * 3 + ["deg"] * 3
     rows = [
         (label, *estimate(value, sigma), what)
-        for label, value, sigma, what in zip(
-            ("bx", "by", "bz", "ω", "φ", "κ"), [*m.base, *m.angles], m.sigma, units
-        )
+        for label, value, sigma, what in zip(MOUNTED, [*m.base, *m.angles], m.sigma, units)
     ]
     return [*rows, ("length", *estimate(m.length, m.length_sigma), unit)]
 
@@ -423,6 +482,20 @@ def mounting_rows(m: "Mounting", unit: str) -> list[tuple[str, str, str, str]]:
 def rig_parameter_rows(rig: "RigCalibration", name: str) -> list[tuple[str, str, str]]:
     """The free parameters of a camera in the rig: name, value, σ."""
     return [(n, *estimate(rig.parameters[name][n], s)) for n, s in rig.sigma[name].items()]
+
+
+def _mounting_dict(m: "Mounting") -> dict:
+    return {
+        "base": m.base.tolist(),
+        "sigma_base": m.sigma[:3].tolist(),
+        "angles": m.angles.tolist(),
+        "sigma_angles": m.sigma[3:].tolist(),
+        "rotation": m.rotation.tolist(),
+        "covariance": m.covariance.tolist(),
+        "correlation": m.correlation.tolist(),
+        "length": m.length,
+        "sigma_length": m.length_sigma,
+    }
 
 
 def rig_dict(rig: "RigCalibration", brief: bool = False) -> dict:
@@ -441,19 +514,14 @@ def rig_dict(rig: "RigCalibration", brief: bool = False) -> dict:
         "redundancy": rig.redundancy,
         "removed": [{"kind": r.kind, "name": r.name, "test": r.test} for r in rig.removed],
         "rms": rig.rms,
-        "mountings": {
-            name: {
-                "base": m.base.tolist(),
-                "sigma_base": m.sigma[:3].tolist(),
-                "angles": m.angles.tolist(),
-                "sigma_angles": m.sigma[3:].tolist(),
-                "rotation": m.rotation.tolist(),
-                "covariance": m.covariance.tolist(),
-                "length": m.length,
-                "sigma_length": m.length_sigma,
-            }
-            for name, m in rig.mountings.items()
+        "mountings": {name: _mounting_dict(m) for name, m in rig.mountings.items()},
+        "boards": {
+            "bodies": [list(body) for body in rig.bodies],
+            "places": {name: _mounting_dict(m) for name, m in rig.placements.items()},
         },
+        "ties_by_motion": [dataclasses.asdict(tie) for tie in rig.ties],
+        "separate_boards": [list(names) for names in rig.separate],
+        "advice": rig.advice,
         "cameras": {
             name: {
                 n: {"value": value, "sigma": rig.sigma[name].get(n)}

@@ -109,13 +109,13 @@ class Calibration(TableMethods):
 
     @property
     def position(self) -> Float[np.ndarray, "views 3"]:
-        """X0 of every view in the system of the board, object unit."""
+        """X0 of every view in the system of its board, object unit."""
         return self.adjustment.image_values[:, :3]
 
     @property
     def distances(self) -> Float[np.ndarray, " views"]:
-        """Distance of every view from the centre of the board, object unit."""
-        return np.linalg.norm(self.position - self.views.board.points.mean(0), axis=1)
+        """Distance of every view from the centre of its board, object unit."""
+        return np.linalg.norm(self.position - self.views.centres, axis=1)
 
     @functools.cached_property
     def coverage(self) -> Coverage:
@@ -133,7 +133,7 @@ class Calibration(TableMethods):
     @functools.cached_property
     def bias(self) -> CalibrationBias | None:
         """The bias test of camera model and board; None with too few cells of four corners."""
-        return find_bias(self.adjustment, self.views.board.grid)
+        return find_bias(self.adjustment, *self.views.board.grids)
 
     @functools.cached_property
     def mapping_error(self) -> MappingError:
@@ -162,7 +162,7 @@ class Calibration(TableMethods):
         found = advice(
             self.position,
             self.rotation,
-            self.views.board.points.mean(0),
+            self.views.centres,
             self._unit,
             self.coverage,
             self.rms,

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from jaxbundle.arguments import show
 from jaxbundle.calibration.calibrate import calibrate
+from jaxbundle.calibration.each_camera import calibrate_each
 from jaxbundle.calibration.result import Calibration
-from jaxbundle.calibration.rig.calibrate import calibrate_rig
+from jaxbundle.calibration.rig.calibrate import SHARED, calibrate_rig
 from jaxbundle.calibration.rig.result import RigCalibration
-from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.errors import InputError
 from jaxbundle.measure.boards import Board
 from jaxbundle.measure.views import BoardViews
 from jaxbundle.results import TableMethods
@@ -78,32 +78,14 @@ def calibrate_cameras(
 
     **Raises:** `InputError`, `NotSolvedError`, naming the camera if there are several.
     """
-    if not isinstance(photographs, Mapping) or not photographs:
-        raise InputError(
-            "photographs must be by the name of the camera, such as {'left': ['left/*.jpg']}, but "
-            f"is {show(photographs)}"
-        )
-    if rig and len(photographs) < 2:
+    if isinstance(photographs, Mapping) and rig and len(photographs) < 2:
         raise InputError("a rig has at least two cameras: give --camera NAME=PATTERN for each")
-    found = {}
-    for name, given in photographs.items():
-        tell = (
-            progress
-            if progress is None or len(photographs) == 1
-            else lambda stage, *numbers, name=name: progress(f"{stage} of {name}", *numbers)
-        )
-        try:
-            found[name] = calibrate(given, board, camera=name, progress=tell, **options)
-        except (InputError, NotSolvedError) as error:
-            if len(photographs) == 1:
-                raise
-            raise type(error)(f"camera {name}: {error}") from None
+    calibrate_one = lambda name, given, tell: calibrate(
+        given, board, camera=name, progress=tell, **options
+    )
+    found = calibrate_each(photographs, calibrate_one, progress)
     together = None
     if rig and all(one.converged for one in found.values()):
-        names = ("board_sigma", "board_free", "snooping", "significance")
-        given = {name: options[name] for name in names if name in options}
-        if options.get("robust") and not given.get("snooping"):
-            # Points downweighted in a camera have full weight in the rig.
-            given["snooping"] = "pope"
+        given = {name: options[name] for name in (*SHARED, "robust") if name in options}
         together = calibrate_rig(found, **given)
     return Calibrations(found, together)

@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING
 
 from jaxbundle.calibration.advice import ADVICE
+from jaxbundle.calibration.rig.advice import undetermined_mountings
 from jaxbundle.report.verdict import BAD, DOUBTFUL, GOOD, Finding, Verdict, conclude, in_words
 
 if TYPE_CHECKING:
@@ -38,8 +39,11 @@ def _judge_camera(name: str, calibration: "Calibration") -> Finding:
 
 
 def _judge_rig(rig: "RigCalibration") -> Finding:
-    doubtful = rig.left_out or rig.contradicting or not rig.converged
     words = f"{len(rig.epochs)} epochs, {len(rig.left_out)} left out, σ0 {rig.sigma0:.4f}"
+    if weak := undetermined_mountings(rig):
+        names = ", ".join(weak)
+        return Finding("Rig", BAD, f"{words}; positions not determined: {names}")
+    doubtful = rig.left_out or rig.contradicting or rig.separate or not rig.converged
     return Finding("Rig", DOUBTFUL if doubtful else GOOD, words)
 
 

@@ -22,6 +22,7 @@ COMMANDS = (
     "orient",
     "adjust",
     "calibrate",
+    "calibrate-rig",
     "batch",
     "design",
     "plan",
@@ -39,6 +40,11 @@ COMMANDS = (
 )
 
 
+def import_command(command: str) -> None:
+    """Import the file of a command, with which it registers."""
+    importlib.import_module(f"jaxbundle.cli.{command.replace('-', '_')}")
+
+
 def main(prepare: Callable[[], object] | None = None) -> None:
     """Run the command line. Only the requested command is imported; all of them for the help.
 
@@ -46,5 +52,5 @@ def main(prepare: Callable[[], object] | None = None) -> None:
     """
     asked = sys.argv[1:2]
     for command in asked if asked and asked[0] in COMMANDS else COMMANDS:
-        importlib.import_module(f"jaxbundle.cli.{command}")
+        import_command(command)
     run(prepare)

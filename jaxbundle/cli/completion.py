@@ -1,13 +1,12 @@
 """`jaxbundle completion`: what a shell needs to complete the command line, from the parsers."""
 
-import importlib
 import shlex
 from collections.abc import Iterator
 from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from jaxbundle.cli import COMMANDS
+from jaxbundle.cli import COMMANDS, import_command
 from jaxbundle.cli.app import app, choice
 
 SHELLS = ("bash", "zsh", "fish")
@@ -35,7 +34,7 @@ def completion(shell: Annotated[str, choice(SHELLS, argument=True)]) -> None:
     """
     # a command registers itself when its file is imported
     for command in COMMANDS:
-        importlib.import_module(f"jaxbundle.cli.{command}")
+        import_command(command)
     parser = typer.main.get_command(app)
     nodes = list(walk(parser, typer.Context(parser, info_name="jaxbundle"), ("jaxbundle",)))
     print(for_fish(nodes) if shell == "fish" else for_bash(nodes, shell == "zsh"), end="")

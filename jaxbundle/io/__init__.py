@@ -4,6 +4,7 @@ from jaxbundle.lazy import import_on_use
 
 # By module; __init__.pyi has their types, for editors and type checkers: `make stubs` writes it.
 _HOME = {
+    "jaxbundle.io.boards.board_sets": ("BoardFile", "read_boards"),
     "jaxbundle.io.boards.corners": ("read_corners", "write_corners"),
     "jaxbundle.io.boards.targets": ("read_target", "write_target"),
     "jaxbundle.io.cameras.camera_files": ("read_cameras", "write_cameras"),

@@ -8,6 +8,8 @@ from jaxbundle.io import results as results
 from jaxbundle.io import scanner as scanner
 from jaxbundle.io import text as text
 from jaxbundle.io import writing as writing
+from jaxbundle.io.boards.board_sets import BoardFile as BoardFile
+from jaxbundle.io.boards.board_sets import read_boards as read_boards
 from jaxbundle.io.boards.corners import read_corners as read_corners
 from jaxbundle.io.boards.corners import write_corners as write_corners
 from jaxbundle.io.boards.targets import read_target as read_target
@@ -57,6 +59,7 @@ from jaxbundle.io.scanner.rpc import read_rpc as read_rpc
 from jaxbundle.io.scanner.rpc import write_rpc as write_rpc
 
 __all__ = [
+    "BoardFile",
     "Converted",
     "FORMATS",
     "FlightFile",
@@ -69,6 +72,7 @@ __all__ = [
     "adjusted_network",
     "convert",
     "map_of",
+    "read_boards",
     "read_cameras",
     "read_corners",
     "read_flight",

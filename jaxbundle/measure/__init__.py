@@ -5,7 +5,7 @@ Pixel (0, 0) is the centre of the upper-left pixel, u to the right, v down; a ph
 """
 
 from jaxbundle.measure.board_points import BoardPoints
-from jaxbundle.measure.boards import Board
+from jaxbundle.measure.boards import Board, BoardSet
 from jaxbundle.measure.corners import find_board, find_board_points
 from jaxbundle.measure.cube_filter import filter_cloud
 from jaxbundle.measure.ellipses import Ellipse, circle_centre_shift, fit_ellipse, rim_centre_shift
@@ -32,6 +32,7 @@ from jaxbundle.photographs import read_photograph
 __all__ = [
     "Board",
     "BoardPoints",
+    "BoardSet",
     "BoardViews",
     "Ellipse",
     "LeastSquaresMatch",

@@ -22,7 +22,7 @@ does not matter for a board with known points, but for one with estimated points
 import dataclasses
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from jaxbundle.arguments import integer, number, show
 from jaxbundle.choices import BOARDS, DICTIONARIES
@@ -135,6 +135,17 @@ class Board:
         return self.rows - less, self.columns - less
 
     @property
+    def grids(self) -> tuple[tuple[int, int], ...]:
+        """The grids of points: one, that of a `BoardSet` has one for each board."""
+        return (self.grid,)
+
+    @property
+    def diameters(self) -> Float[np.ndarray, " points"]:
+        """Diameters of the circles, object unit; 0 for corners and where none is given."""
+        circles = self.diameter if "circles" in self.kind else None
+        return np.full(len(self.ids), circles or 0.0)
+
+    @property
     def ids(self) -> tuple[str, ...]:
         """Names of the points, row after row from the top: "row-column"."""
         rows, columns = self.grid
@@ -165,6 +176,60 @@ class Board:
         sides = " × ".join(f"{side:g}" for side in dict.fromkeys(self.spacing))
         first = f", markers from {self.first_marker}" if self.first_marker else ""
         return f"{self.kind} {self.columns}x{self.rows}, square {sides}{first}"
+
+
+@dataclasses.dataclass(frozen=True)
+class BoardSet:
+    """Boards by name, as one object of many points. It has what a `Board` has of points; boards do
+    not share a frame: X and Y of each begin at its own origin.
+
+    **Fields:** `names`, `boards`: in the same order.
+    """
+
+    names: tuple[str, ...]
+    boards: tuple[Board, ...]
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """Names of the points, "BOARD:row-column"."""
+        return tuple(f"{name}:{id}" for name, one in self.items for id in one.ids)
+
+    @property
+    def points(self) -> Float[np.ndarray, "points 3"]:
+        """Coordinates in the frame of the own board, object unit, in the order of `ids`."""
+        return np.concatenate([one.points for one in self.boards])
+
+    @property
+    def items(self) -> tuple[tuple[str, Board], ...]:
+        """Names and boards."""
+        return tuple(zip(self.names, self.boards))
+
+    @property
+    def number(self) -> Int[np.ndarray, " points"]:
+        """The index of the board of each point."""
+        return np.repeat(np.arange(len(self.boards)), [len(one.ids) for one in self.boards])
+
+    @property
+    def grids(self) -> tuple[tuple[int, int], ...]:
+        """Rows and columns of points of each board."""
+        return tuple(one.grid for one in self.boards)
+
+    @property
+    def diameters(self) -> Float[np.ndarray, " points"]:
+        """Diameters of the circles, object unit; 0 for corners and where none is given."""
+        return np.concatenate([one.diameters for one in self.boards])
+
+    @property
+    def unique(self) -> bool:
+        """Whether the points of every board are identified even after a half turn of it."""
+        return all(one.unique for one in self.boards)
+
+    def seen(self, visible: Bool[np.ndarray, "views points"]) -> Int[np.ndarray, " views"]:
+        """The index of the board of each view."""
+        return self.number[visible.argmax(1)]
+
+    def __str__(self) -> str:
+        return "; ".join(f"{name}: {one}" for name, one in self.items)
 
 
 def find_dictionary(name: str) -> str:

@@ -16,13 +16,14 @@ from jaxbundle.arguments import numeric_array
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import enable_x64
-from jaxbundle.measure.boards import Board, require_board
+from jaxbundle.measure.boards import Board, BoardSet, require_board
 from jaxbundle.measure.corners import (
     find_board_points,
     largest_chessboard,
     memory_of_search,
     other_sizes,
 )
+from jaxbundle.network.columns import count
 from jaxbundle.photographs.concurrent import photographs_at_once
 from jaxbundle.photographs.folders import list_photographs
 from jaxbundle.photographs.formats import SUFFIXES
@@ -51,24 +52,33 @@ class BoardViews:
 
     **Fields:** `names` of the views; `image_size` (columns, rows); `xy` pixels, NaN for missing
     points; `failed`: name and reason of every photograph not used; `warnings`: probable
-    mistakes; `notes`: what was found otherwise than usual.
+    mistakes; `notes`: what was found otherwise than usual; `photographs`: of several boards (a
+    `BoardSet`) the photograph of every view, otherwise `names`.
     """
 
-    board: Board
+    board: Board | BoardSet
     names: tuple[str, ...]
     image_size: tuple[int, int]
     xy: Float[np.ndarray, "views points 2"]
     failed: tuple[tuple[str, str], ...] = ()
     warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    photographs: tuple[str, ...] = ()
 
     def __post_init__(self):
-        require_board(self.board)
+        if not isinstance(self.board, BoardSet):
+            require_board(self.board)
         if isinstance(self.names, str) or not isinstance(self.names, Sequence | np.ndarray):
             raise InputError(f"names must be a list, one for each view, but is {self.names!r:.60}")
         object.__setattr__(self, "names", tuple(map(str, self.names)))
         if len({*self.names}) < len(self.names):
             raise InputError("names of the views must differ, but some occur twice")
+        object.__setattr__(self, "photographs", tuple(self.photographs) or self.names)
+        if len(self.photographs) != len(self.names):
+            raise InputError(
+                f"photographs: {len(self.photographs)} are given for {len(self.names)} views; "
+                "expected one for each view, or none"
+            )
         xy = numeric_array("xy", self.xy, "pixels [views, points, 2]").astype(float)
         object.__setattr__(self, "xy", xy)
         points = len(self.board.ids)
@@ -93,6 +103,22 @@ class BoardViews:
         """Which points were found."""
         return np.all(np.isfinite(self.xy), axis=2)
 
+    @property
+    def possible(self) -> int:
+        """Number of points of the boards of all views, found or not."""
+        if isinstance(self.board, BoardSet):
+            sizes = np.bincount(self.board.number)
+            return int(sizes[self.board.seen(self.visible)].sum())
+        return self.visible.size
+
+    @property
+    def centres(self) -> Float[np.ndarray, "views 3"]:
+        """The centre of the board of every view, in the frame of its board, object unit."""
+        if isinstance(self.board, BoardSet):
+            middle = np.array([one.points.mean(0) for one in self.board.boards])
+            return middle[self.board.seen(self.visible)]
+        return np.broadcast_to(self.board.points.mean(0), (len(self), 3))
+
     def take(
         self, rows: Bool[np.ndarray, " views"] | Int[np.ndarray, " rows"], why: str = ""
     ) -> "BoardViews":
@@ -101,8 +127,14 @@ class BoardViews:
         keep[rows] = True
         out = [(name, why) for name, kept in zip(self.names, keep) if not kept and why]
         names = tuple(name for name, kept in zip(self.names, keep) if kept)
-        failed = (*self.failed, *out)
-        return dataclasses.replace(self, names=names, xy=self.xy[keep], failed=failed)
+        photographs = tuple(name for name, kept in zip(self.photographs, keep) if kept)
+        return dataclasses.replace(
+            self,
+            names=names,
+            xy=self.xy[keep],
+            failed=(*self.failed, *out),
+            photographs=photographs,
+        )
 
 
 def photographs(given: Sequence[str | Path]) -> list[Path]:
@@ -131,10 +163,12 @@ def measure_boards(
     paths: Sequence[str | Path],
     board: Board,
     progress: Progress | None = None,
+    one_size: bool = False,
 ) -> BoardViews:
     """Find a board in photographs.
 
-    **Arguments:** `paths`: files, patterns, folders; `progress(stage, done, total)`.
+    **Arguments:** `paths`: files, patterns, folders; `progress(stage, done, total)`; `one_size`:
+    refuse photographs of several sizes.
 
     **Returns:** the views of the board with the most frequent image size.
 
@@ -158,6 +192,8 @@ def measure_boards(
     found = map_in_threads(search, file_of, searches_at_once(files, board), tell)
     for name, (look, negative) in zip(file_of, found):
         looks[name], negatives[name] = look, negative
+    if one_size:
+        refuse_sizes({name: look[0] for name, look in looks.items() if not isinstance(look, str)})
     views = collect_views(file_of, looks, board)
     of_negatives = sum(negatives[name] for name in views.names)
     notes = (
@@ -202,6 +238,27 @@ def collect_views(
         size,
         np.array([xy for _, xy in used]),
         tuple(sorted(failed.items(), key=lambda item: order[item[0]])),
+    )
+
+
+def refuse_sizes(sizes: Mapping[str, tuple[int, int]]) -> None:
+    """Refuse photographs of more than one size, such as of two cameras in one folder.
+
+    **Arguments:** columns and rows by the name of the photograph.
+
+    **Raises:** `InputError` naming a photograph of each size.
+    """
+    numbers = Counter(sizes.values())
+    if len(numbers) < 2:
+        return
+    first = {size: next(name for name, of in sizes.items() if of == size) for size in numbers}
+    shown = ", ".join(
+        f"{count(number, 'photograph')} of {columns} × {rows} pixels ({first[columns, rows]})"
+        for (columns, rows), number in numbers.most_common()
+    )
+    raise InputError(
+        f"photographs have different sizes: {shown}; expected those of one camera, all of one "
+        "size: move the others to a folder of their own"
     )
 
 

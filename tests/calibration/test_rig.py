@@ -12,10 +12,11 @@ import pytest
 import render
 from test_calibrate import VIEWS
 
+from jaxbundle.batches.epochs import epoch_keys
 from jaxbundle.calibration import BoardViews, calibrate_cameras, calibrate_rig
 from jaxbundle.calibration.files import calibrations_dict, fill_rig, json_text, save_rig_plots
 from jaxbundle.calibration.report import rig_dict, rig_text
-from jaxbundle.calibration.rig.calibrate import epoch_keys, require_solved
+from jaxbundle.calibration.rig.calibrate import require_solved
 from jaxbundle.calibration.rig.declare import Rig, adjust_rig, declare_rig, leave_out
 from jaxbundle.cameras import get_model, image_ray, project
 from jaxbundle.errors import InputError, NotSolvedError
@@ -376,7 +377,9 @@ def test_what_is_no_rig_is_refused(rig):
         calibrate_cameras({"right": views.take([0]), "left": views}, rig=True)
     with pytest.raises(InputError, match="a rig has at least two cameras"):
         calibrate_rig({"left": rig.cameras["left"]})
-    with pytest.raises(InputError, match="'left' is BoardViews.*expected the Calibration"):
-        calibrate_rig(pair())
+    with pytest.raises(InputError, match="camera left: photographs must be files.*but are 3"):
+        calibrate_rig({"left": 3, "right": 4})
+    with pytest.raises(InputError, match="model: for the calibration of each camera"):
+        calibrate_rig(rig.cameras, model="brown")
     with pytest.raises(InputError, match="snooping must be one of pope, baarda or None"):
         calibrate_rig(rig.cameras, snooping="tau")

@@ -1,6 +1,5 @@
 """--quiet and --verbose: every command has them, and they do the same everywhere."""
 
-import importlib
 import inspect
 import json
 import re
@@ -33,7 +32,7 @@ def commands(command, name="jaxbundle"):
 
 def test_every_command_has_both():
     for name in cli.COMMANDS:
-        importlib.import_module(f"jaxbundle.cli.{name}")
+        cli.import_command(name)
     found = dict(commands(typer.main.get_command(application)))
     assert len(found) > 20
     for name, command in found.items():

@@ -22,6 +22,7 @@ from PIL import Image
 
 from jaxbundle.batches.stacks import read_camera_stack
 from jaxbundle.io import read_cameras, read_network
+from jaxbundle.io.boards.board_sets import read_boards
 from jaxbundle.io.boards.corners import read_corners
 from jaxbundle.io.boards.kept_corners import KeptCorners
 from jaxbundle.io.boards.targets import read_target, write_target
@@ -161,6 +162,12 @@ def _(folder):
             enumerate((x, y) for y in range(3) for x in range(4))]  # fmt: skip
     text = "\n".join(["## by hand", "# filename x y level", *rows, "c.jpg - - -"])
     (folder / "corners.vnl").write_text(text + "\n")
+
+
+@reader("boards", lambda f: read_boards(f / "boards.toml"))
+def _(folder):
+    text = "[board.front]\ncolumns = 9\nrows = 6\nsquare = 0.03\nbody = \"room\"\n"
+    (folder / "boards.toml").write_text(f'{text}cameras = ["left"]\n')
 
 
 for board in (Board(6, 7, 0.06), Board(6, 5, 0.088 * 1.3, "aprilgrid", marker=0.088)):

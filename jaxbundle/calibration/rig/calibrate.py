@@ -3,42 +3,139 @@
     ray of camera k = R_k·(Y − b_k)      Y: point in the frame of the reference camera
 
 Simultaneous photographs are an epoch; they are matched by equal file names, or else equal last
-numbers in them (left_017.jpg, right_017.jpg). Start values of the mounting come from the epochs two
-cameras share: M_k·Mᵣᵀ and Mᵣ·(X0_k − X0_r) should be the same in all of them, and the one nearest
-to all others is used. Epochs that contradict the mounting (the board moved in between) are
-excluded, or only listed without snooping. The board is known, weighted or free, as in the
-calibration of one camera. Gross errors are removed camera by camera, then those that only the
-mounting reveals.
+numbers in them (left_017.jpg, right_017.jpg). Each camera may see other boards than the others:
+boards that move by themselves have a pose at every epoch, boards that are fixed to each other have
+one common pose and unknown relations. What ties the cameras, by boards seen simultaneously, by
+other cameras, or by the motion of the rig, is found by `connections`, which gives the start values.
+Epochs that contradict the mounting (the board moved in between) are excluded, or only listed
+without snooping. The boards are known, weighted or free, as in the calibration of one camera.
+Gross errors are removed camera by camera, then those that only the mounting reveals.
 """
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from functools import partial
+from pathlib import Path
+from typing import Any
 
-import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbundle.arguments import show
-from jaxbundle.batches.epochs import MIN_SHARED_EPOCHS, contradicting, epoch_keys
-from jaxbundle.calibration import quality
+from jaxbundle.batches.epochs import contradicting
+from jaxbundle.calibration.calibrate import calibrate
+from jaxbundle.calibration.each_camera import calibrate_each
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.result import Calibration
+from jaxbundle.calibration.rig.connections import Connections, MotionTie
 from jaxbundle.calibration.rig.declare import Rig, adjust_rig, leave_out, snoop_rig, used_rays
+from jaxbundle.calibration.rig.known_mountings import known_mountings
+from jaxbundle.calibration.rig.photographs import RigPhotographs, require_lists, views_of_camera
 from jaxbundle.calibration.rig.result import RigCalibration
+from jaxbundle.calibration.rig.start import start_rig
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError, NotSolvedError
-from jaxbundle.geometry import quaternion_from_matrix
 from jaxbundle.leastsquares import Result
 from jaxbundle.leastsquares.quality.snooping import check_test
-from jaxbundle.leastsquares.spaces import PoseValue
+from jaxbundle.measure.boards import Board
+from jaxbundle.measure.views import BoardViews
 from jaxbundle.network.columns import list_some
-from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray
+from jaxbundle.types import Progress
+
+# Options of a camera that are those of its rig, too.
+SHARED = ("board_sigma", "board_free", "snooping", "significance", "max_iterations")
 
 
 def calibrate_rig(
+    photographs: Mapping[str, RigPhotographs],
+    board: Board | Mapping[str, Board] | str | Path | None = None,
+    *,
+    fixed: bool = False,
+    bodies: Mapping[str, Sequence[str]] | None = None,
+    seen_by: Mapping[str, Sequence[str]] | None = None,
+    mountings: Mapping[str, Any] | str | Path | None = None,
+    bases: Sequence[Mapping[str, Any]] = (),
+    progress: Progress | None = None,
+    **options: Any,
+) -> RigCalibration:
+    """Calibrate cameras on one rigid mounting, from simultaneous photographs of any boards.
+
+        boards = {"front": Board(9, 6, 0.03), "back": Board(8, 5, 0.03)}
+        found = calibrate_rig({"a": ["a/"], "b": ["b/"]}, boards, fixed=True)
+        found.mountings["b"].base, found.mountings["b"].sigma
+
+    **Arguments:**
+
+    - `photographs` by the name of the camera, the first is the reference: files, patterns, folders;
+      `BoardViews`, of several boards by their names; or the `Calibration` of the camera by itself.
+    - `board`: the board in the photographs, or several by name, or a file of them
+      (`jaxbundle.io.read_boards`), whose `bodies` and `seen_by` count as well.
+    - `fixed`: all boards are fixed to each other, as on walls around a rig that moves; their
+      relations are estimated. `bodies`: by any name, the boards that are fixed to each other. Other
+      boards move by themselves.
+    - `seen_by`: by the name of a board, the cameras in whose photographs it is searched; all by
+      default.
+    - `mountings`, `bases`: what is known of the mountings, held or with σ, as in the section
+      `[rig]` of a project (degrees), such as `{"b": {"position": [0, 0, 0.1], "sigma_position":
+      0.01}}`; or a file with that section.
+    - `board_sigma` (object unit), `board_free` (one board only), `snooping`, `significance`,
+      `max_iterations` of cameras and rig, and further `options` of the cameras: as in `calibrate`.
+      Without snooping, epochs that contradict the mounting are kept and listed in `contradicting`.
+    - `progress(stage, done, total)`: photographs searched, a stage for every camera.
+
+    **Raises:** `InputError` if photographs cannot be paired, or cameras do not hang together, with
+    what would join them; `NotSolvedError` if an adjustment does not converge, or the motion of the
+    rig does not determine a mounting that nothing else does.
+    """
+    check_test(options.get("snooping", "pope"), options.get("significance", 0.001))
+    _check(photographs)
+    known = known_mountings(mountings, bases, list(photographs))
+    if bodies is not None:
+        bodies = require_lists("bodies", bodies, "{'room': ['front', 'rear']}")
+    if fixed and bodies:
+        raise InputError("fixed: all boards are one body; give either fixed or bodies")
+    views, declared = views_of_camera(photographs, board, seen_by, progress)
+
+    calibrations = _calibrate_cameras(views, options, progress)
+    given = {name: options[name] for name in SHARED if name in options}
+    if options.get("robust") and not given.get("snooping"):
+        # Points downweighted in a camera have full weight in the rig.
+        given["snooping"] = "pope"
+    bodies = declared if bodies is None else bodies
+    rig, connections = start_rig(calibrations, bodies, fixed, known)
+    return _adjust_together(calibrations, rig, connections, **given)
+
+
+def _calibrate_cameras(
+    views: Mapping[str, BoardViews | Calibration],
+    options: Mapping[str, Any],
+    progress: Progress | None,
+) -> dict[str, Calibration]:
+    """The calibration of every camera by itself."""
+    if all(isinstance(one, Calibration) for one in views.values()):
+        unused = {*options} - {*SHARED, "robust"}
+        if unused:
+            raise InputError(
+                f"{', '.join(sorted(unused))}: for the calibration of each camera, but all of them "
+                "are calibrated already; omit it"
+            )
+
+    def calibrate_one(name: str, given: Any, tell: Progress | None) -> Calibration:
+        if isinstance(given, Calibration):
+            return given
+        return calibrate(given, camera=name, progress=tell, **options)
+
+    found = calibrate_each(views, calibrate_one, progress)
+    for name, one in found.items():
+        if not one.converged:
+            why = one.adjustment.termination
+            raise NotSolvedError(f"not solved: camera {name} by itself: {why}")
+    return found
+
+
+def _adjust_together(
     calibrations: Mapping[str, Calibration],
+    rig: Rig,
+    connections: Connections,
     *,
     board_sigma: float | None = None,
     board_free: bool = False,
@@ -46,31 +143,16 @@ def calibrate_rig(
     significance: float = 0.001,
     max_iterations: int = 50,
 ) -> RigCalibration:
-    """The common calibration of separately calibrated cameras, from simultaneous photographs of one
-    board; the first is the reference.
-
-    **Arguments:** `board_sigma` (object unit), `board_free`, `snooping`, `significance`: as in
-    `calibrate`; without snooping, epochs that contradict the mounting are kept and listed
-    in `contradicting`.
-
-    **Raises:** `InputError` if the photographs of two cameras cannot be paired;
-    `NotSolvedError` if an adjustment does not converge.
-    """
-    check_test(snooping, significance)
-    _check(calibrations)
-    keys = epoch_keys({name: one.views.names for name, one in calibrations.items()})
-    epochs = list(dict.fromkeys(key for name in calibrations for key in keys[name]))
-    # M and X0 of every camera at every epoch it saw
-    poses = {
-        name: {key: (M, X0) for key, M, X0 in zip(keys[name], one.rotation, one.position)}
-        for name, one in calibrations.items()
-    }
-    base, turn = _start_of_mountings(list(calibrations), poses)
-    rig = _start(calibrations, keys, poses, base, turn, epochs)
+    """The common adjustment of separately calibrated cameras."""
+    if board_free and len(rig.boards) > 1:
+        raise InputError(
+            f"the points of {len(rig.boards)} boards cannot be free: each would have a frame of "
+            "its own; give the σ of their coordinates instead (--board-sigma)"
+        )
     rig = dataclasses.replace(rig, point_sigma=board_sigma, points_free=board_free)
     cameras = [one.camera for one in calibrations.values()]
     size = np.array([unit_size(get_model(one.model), one.pixel_size) for one in cameras])
-    left_out, found = [], require_solved(adjust_rig(rig, max_iterations))
+    left_out, found = [], require_solved(adjust_rig(rig, max_iterations), connections.ties)
     # each time from the start values: a wrong epoch may have led the adjustment far away
     while (bad := _contradictions(rig, found, size)) and snooping:
         why = "does not fit the mounting (RMS {:.1f} px): photographs not simultaneous?"
@@ -80,150 +162,53 @@ def calibrate_rig(
         found = snoop_rig(found, snooping, significance, max_iterations)
     why = "kept, but does not fit the mounting (RMS {:.1f} px)"
     tolerated = [(rig.epochs[e], why.format(rms)) for e, rms in bad.items()]
-    return RigCalibration(dict(calibrations), rig, found, left_out, tolerated)
+    return RigCalibration(dict(calibrations), rig, found, left_out, tolerated, connections)
 
 
-def _check(calibrations: Mapping[str, Calibration]) -> None:
-    if not isinstance(calibrations, Mapping):
+def _check(photographs: Any) -> None:
+    if not isinstance(photographs, Mapping):
         raise InputError(
-            f"calibrations are {show(calibrations)}; expected a mapping from the "
-            "name of each camera to its Calibration"
+            "photographs must be by the name of the camera, such as {'left': ['left/*.jpg']}, but "
+            f"is {show(photographs)}"
         )
-    if len(calibrations) < 2:
-        raise InputError("a rig has at least two cameras: give --camera NAME=PATTERN for each")
-    for name, one in calibrations.items():
-        if not isinstance(one, Calibration):
-            raise InputError(
-                f"calibrations: {name!r} is {show(one)}; expected the Calibration "
-                "that calibrate returns for this camera"
-            )
-        if not one.converged:
-            why = one.adjustment.termination
-            raise NotSolvedError(f"not solved: camera {name} by itself: {why}")
+    if len(photographs) < 2:
+        raise InputError("a rig has at least two cameras: give the photographs of each")
 
 
-def require_solved(found: Result) -> Result:
-    """The result of an adjustment that converged.
+def require_solved(found: Result, ties: Sequence[MotionTie] = ()) -> Result:
+    """The result of an adjustment that converged; `ties`: by motion, for the message.
 
     **Raises:** `NotSolvedError` for another one."""
     if not found.converged:
         names = found.undetermined
         what = f"; not determined: {list_some(names, 8, str)}" if names else ""
+        advice = (
+            "what is given of the mountings hardly determines what the motion of the rig leaves "
+            "open: give it with a smaller σ, or rotate the rig about a second axis"
+            if any(tie.open for tie in ties)
+            else "look for cameras that share too few epochs, or photographs that are not "
+            "simultaneous"
+        )
         raise NotSolvedError(
-            f"not solved: the rig did not converge ({found.termination}){what}; look for cameras "
-            "that share too few epochs, or photographs that are not simultaneous",
+            f"not solved: the rig did not converge ({found.termination}){what}; {advice}",
             list(names),
         )
     return found
 
 
-def _start_of_mountings(
-    names: Sequence[str], poses: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]]
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """b and R of every camera, from the epochs it shares with one that has them already."""
-    base, turn = {names[0]: np.zeros(3)}, {names[0]: np.eye(3)}
-    while len(base) < len(names):
-        pairs = [(placed, name) for placed in base for name in names if name not in base]
-        common = lambda pair: poses[pair[0]].keys() & poses[pair[1]].keys()
-        # the pair with most common epochs next (a maximal spanning tree): the start values of a
-        # camera may come through another one
-        best = max(pairs, key=lambda pair: len(common(pair)))
-        shared = [key for key in poses[best[0]] if key in common(best)]
-        if len(shared) < min(MIN_SHARED_EPOCHS, len(poses[best[1]])) or not shared:
-            raise InputError(
-                f"camera {best[1]!r} shares {len(shared)} epochs with the others; "
-                f"{MIN_SHARED_EPOCHS} photographs must be simultaneous"
-            )
-        placed, name = best
-        both = [(poses[placed][key], poses[name][key]) for key in shared]
-        R = np.array([M2 @ M1.T for (M1, _), (M2, _) in both])
-        b = np.array([M1 @ (X2 - X1) for (M1, X1), (_, X2) in both])
-        # the medoid, not a mean: a wrong epoch does not move it, and it needs no mean of rotations
-        size = np.median(np.linalg.norm(b, axis=1)) + 1e-12
-        apart = np.linalg.norm(R[:, None] - R, axis=(2, 3))
-        apart += np.linalg.norm(b[:, None] - b, axis=2) / size
-        k = int(np.median(apart, axis=1).argmin())
-        base[name] = base[placed] + turn[placed].T @ b[k]
-        turn[name] = R[k] @ turn[placed]
-    return base, turn
-
-
-def _start(
-    calibrations: Mapping[str, Calibration],
-    keys: Mapping[str, Sequence[str]],
-    poses: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]],
-    base: Mapping[str, np.ndarray],
-    turn: Mapping[str, np.ndarray],
-    epochs: Sequence[str],
-) -> Rig:
-    """The rig with start values, and the image points that the calibration of each camera kept."""
-    names, board = list(calibrations), next(iter(calibrations.values())).views.board
-    middle = board.points.mean(0)
-    rotation, centre = [], []
-    for key in epochs:
-        name = next(name for name in names if key in poses[name])
-        M, X0 = poses[name][key]
-        # ray = R·(Y − b) = M·(X − X0)
-        rotation.append(turn[name].T @ M)
-        centre.append(X0 - M.T @ turn[name] @ base[name] - middle)
-    place = lambda b, R: PoseValue(np.array(b), np.asarray(_quaternions(np.array(R))))
-    # points that the calibration of a camera removed as gross stay out: data snooping of the rig
-    # finds only what the mounting reveals
-    rays = [_rays(one, keys[name], epochs) for name, one in calibrations.items()]
-    epoch, point, xy, sigma = (np.concatenate(column) for column in zip(*rays))
-    free = {
-        name: one.adjustment.problem.network.cameras[0].free for name, one in calibrations.items()
-    }
-    return Rig(
-        tuple(
-            dataclasses.replace(one.camera, id=name, free=free[name])
-            for name, one in calibrations.items()
-        ),
-        place([base[n] for n in names], [turn[n] for n in names]),
-        tuple(epochs),
-        place(centre, rotation),
-        board.ids,
-        board.points - middle,
-        epoch,
-        np.repeat(np.arange(len(names)), [len(ray[0]) for ray in rays]),
-        point,
-        xy,
-        sigma,
-    )
-
-
-@partial(compile_once, static=())
-def _quaternions(matrices: Float[AnyArray, "n 3 3"]) -> Float[Array, "n 4"]:
-    return jax.vmap(quaternion_from_matrix)(matrices)
-
-
-def _rays(
-    calibration: Calibration, keys: Sequence[str], epochs: Sequence[str]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Epoch, point, xy and σ of the image points that the calibration of a camera kept."""
-    network, views = calibration.adjustment.problem.network, calibration.views
-    rays, used = network.observations, quality.used_rays(calibration.adjustment.problem)
-    row, point = ({key: i for i, key in enumerate(ids)} for ids in (epochs, views.board.ids))
-    epoch_of = {name: row[key] for name, key in zip(views.names, keys)}
-    epoch = np.array([epoch_of[id] for id in network.images.id])[rays.image[used]]
-    return (
-        epoch,
-        np.array([point[id] for id in network.points.id])[rays.point[used]],
-        rays.xy[used],
-        rays.sigma[used],
-    )
-
-
 def _contradictions(
     rig: Rig, found: Result, size: Float[np.ndarray, "cameras 2"]
 ) -> dict[int, float]:
-    """Epochs seen by several cameras that do not fit, with their RMS in pixels; `size` of a pixel,
+    """Epochs of several views that do not fit, with their RMS in pixels; `size` of a pixel,
     [cameras, 2]."""
     v = rig.in_order(found.solution.residuals) * rig.sigma / size[rig.camera]
-    number = np.zeros((len(rig.epochs), len(size)))
-    np.add.at(number, (rig.epoch, rig.camera), used_rays(rig, found.problem))
+    # views of each pose: a board by a camera
+    number = np.zeros((len(rig.epochs), len(size), len(rig.boards)))
+    board = rig.board_of_points[rig.point]
+    np.add.at(number, (rig.epoch, rig.camera, board), used_rays(rig, found.problem))
+    number = number.reshape(len(number), -1)
     rays = number.sum(1)
     rms = np.sqrt(np.bincount(rig.epoch, (v**2).sum(1), len(rays)) / np.maximum(rays, 1))
-    # only epochs that several cameras saw can contradict the mounting
+    # only epochs of several views can contradict the mounting, or the relations of boards
     bad = contradicting(rms, rays > 0, (number > 0).sum(1) > 1)
     return {int(e): float(rms[e]) for e in bad}

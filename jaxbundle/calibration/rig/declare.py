@@ -1,14 +1,17 @@
-"""Several cameras on one rigid mounting, adjusted together from views of one object.
+"""Several cameras on one rigid mounting, adjusted together from views of boards.
 
-    Y = M_e·(X − X0_e)               a point at the epoch e in the frame of the reference camera
+    X' = P_j·(X − c_j)               a point of board j in the frame of its body
+    Y = M_e·(X' − X0_e)              at the epoch e in the frame of the reference camera
     ray = R_k·(Y − b_k)              camera k, its projection centre at b_k there
     v = image of the ray − measured  (by the camera's own model)
 
-The unknowns are the pose of the reference camera at every epoch, the mounting b_k, R_k of every
-other camera, the free parameters of every camera, and the points X unless known: with a σ they are
-weighted; free ones carry the datum by inner constraints (7, including scale). The mounting is the
-same at all epochs. The poses of the epochs are eliminated; the reduced system has a few tens of
-unknowns, plus three per unknown point.
+A body is a board, or several that are fixed to each other. The unknowns are the pose of the
+reference camera relative to every body at every epoch, the mounting b_k, R_k of every other camera,
+the place c_j, P_j of every board on its body (but the first of a body, which is its frame), the
+free parameters of every camera, and the points X unless known: with a σ they are weighted; free
+ones, of one board only, carry the datum by inner constraints (7, including scale). Mountings and
+places are the same at all epochs. The poses of the epochs are eliminated; the reduced system has a
+few tens of unknowns, plus three per unknown point.
 
 Source: Luhmann, Robson, Kyle and Boehm (2014), Close-Range Photogrammetry and 3D Imaging, section
 4.4; King (1994), Bundle adjustment of constrained stereo pairs, Geomatics Research Australasia.
@@ -22,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxbundle.calibration.rig.known_mountings import NOTHING_KNOWN, KnownMountings
 from jaxbundle.leastsquares import Result, adjust
 from jaxbundle.leastsquares.datum.motions import similarity
 from jaxbundle.leastsquares.declarations import Motions, ObservationSet, Table
@@ -32,9 +36,13 @@ from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network.declare import CameraTable, camera_tables
 from jaxbundle.network.kinds.control_points import CONTROL_POINTS
 from jaxbundle.network.kinds.image_points import image_points
+from jaxbundle.network.kinds.mountings import BASES, MOUNTING, observe_mountings
 from jaxbundle.network.tables import EXTERIOR, Camera
 
 POSES = ("epoch", "mounting")
+# The tables of poses on the way from a point to the camera: of boards that are bodies of their own,
+# and of boards on bodies.
+ON_BODIES = ("board", *POSES)
 
 
 def _scale(motion: Float[Array, "7"], mounting: PoseValue) -> PoseValue:
@@ -51,10 +59,19 @@ FLOATING = Motions(_OF_OBJECT.names, (*_OF_OBJECT.actions, ("mounting", _scale))
 class Rig:
     """The input of the rig adjustment, with start values.
 
-    **Fields:** `cameras`, the first is the reference; `mounting`: b_k and R_k, 0 and 1 of the
-    first; `epochs`: their names; `pose`: X0_e and M_e; `ids` and `points` of the object relative to
-    their centroid (exact, unless they have `point_sigma`, or `points_free`); for every image point
-    the rows `epoch`, `camera`, `point` it belongs to, `xy` in the unit of the camera's model and σ.
+    **Fields:**
+
+    - `cameras`, the first is the reference; `mounting`: b_k and R_k, 0 and 1 of the first.
+    - `epochs`: their names, of several bodies one for each body at each epoch; `pose`: X0_e and
+      M_e; `times`: of every row of these the epoch (empty: they are the same).
+    - `ids` and `points` of the boards, relative to the centroid of each; exact, unless they have
+      `point_sigma`, or `points_free`.
+    - For every image point the rows `epoch`, `camera`, `point` it belongs to, `xy` in the unit of
+      the camera's model, and σ.
+    - `boards`: their names; `board`: of every point the index of its board; `centroids` of the
+      boards, in their own frames; `place`: c_j and P_j of every board, None if every board is a
+      body of its own; `body`: of every board the index of the first board of its body.
+    - `known`: what is given of the mountings.
     """
 
     cameras: tuple[Camera, ...]
@@ -70,6 +87,23 @@ class Rig:
     sigma: Float[np.ndarray, "n 2"]
     point_sigma: float | None = None
     points_free: bool = False
+    times: tuple[str, ...] = ()
+    boards: tuple[str, ...] = ("board",)
+    board: Int[np.ndarray, " points"] | None = None
+    centroids: Float[np.ndarray, "boards 3"] | None = None
+    place: PoseValue | None = None
+    body: tuple[int, ...] = (0,)
+    known: KnownMountings = NOTHING_KNOWN
+
+    @property
+    def epoch_of_rows(self) -> tuple[str, ...]:
+        """The epoch of every pose."""
+        return self.times or self.epochs
+
+    @property
+    def board_of_points(self) -> Int[np.ndarray, " points"]:
+        """The index of the board of every point."""
+        return np.zeros(len(self.points), int) if self.board is None else self.board
 
     @property
     def sets(self) -> list[tuple[CameraTable, Int[np.ndarray, " rows"]]]:
@@ -77,7 +111,7 @@ class Rig:
         tables = camera_tables(self.cameras)
         return [(t, np.flatnonzero(np.isin(self.camera, t.cameras))) for t in tables]
 
-    def place(self, k: int) -> tuple[str, int]:
+    def row_of(self, k: int) -> tuple[str, int]:
         """The table of a camera and its row there."""
         table = next(t for t in camera_tables(self.cameras) if k in t.cameras)
         return table.name, int(np.flatnonzero(table.cameras == k)[0])
@@ -99,28 +133,65 @@ def declare_rig(rig: Rig) -> tuple[list[Table], list[ObservationSet]]:
     tables = [
         Table("epoch", rig.pose, labels=rig.epochs, parameters=EXTERIOR),
         Table(
-            "mounting",
+            MOUNTING,
             rig.mounting,
-            free=np.arange(len(names)) > 0,
+            free=_free_mountings(rig),
             labels=names,
             parameters=("bx", "by", "bz", "omega", "phi", "kappa"),
         ),
         *(t.unknowns(rig.cameras) for t, _ in rig.sets),
         Table("point", rig.points, free=free, labels=rig.ids, parameters=("X", "Y", "Z")),
     ]
+    if rig.place is not None:
+        tables.append(
+            Table(
+                "board",
+                rig.place,
+                # the first board of a body is its frame
+                free=np.array(rig.body) != np.arange(len(rig.boards)),
+                labels=rig.boards,
+                parameters=EXTERIOR,
+            )
+        )
     observations = []
     for table, rows in rig.sets:
         k = rig.camera[rows]
         touched = rig.epoch[rows], k, np.searchsorted(table.cameras, k), rig.point[rows]
-        kind = image_points(table.model, "measured", table.name, POSES)
+        if rig.place is not None:
+            touched = rig.board_of_points[rig.point[rows]], *touched
+        poses = POSES if rig.place is None else ON_BODIES
+        kind = image_points(table.model, "measured", table.name, poses)
         observations.append(
             kind(touched, rig.xy[rows], sigma=rig.sigma[rows], name=table.image_set)
         )
+    observations += _given_mountings(rig)
     if rig.point_sigma is not None:
         every = np.arange(len(rig.points))
         control = CONTROL_POINTS((every,), rig.points, sigma=rig.point_sigma, name="control")
         observations.append(control)
     return tables, observations
+
+
+def _free_mountings(rig: Rig) -> Float[np.ndarray, "cameras 6"]:
+    """The free columns of the mountings: not of the reference, nor what is held."""
+    free = np.ones((len(rig.cameras), 6))
+    free[0] = 0
+    for k, camera in enumerate(rig.cameras):
+        if camera.id in rig.known.mountings:
+            free[k] = ~np.repeat(rig.known.mountings[camera.id].held, 3)
+    return free
+
+
+def _given_mountings(rig: Rig) -> list[ObservationSet]:
+    """The observations of what is given of mountings and bases."""
+    row = {camera.id: k for k, camera in enumerate(rig.cameras)}
+    known = rig.known.mountings
+    found = observe_mountings([row[name] for name in known], [*known.values()])
+    if rig.known.bases:
+        ends = np.array([[row[name] for name in base.cameras] for base in rig.known.bases])
+        length, sigma = np.array([(base.length, base.sigma) for base in rig.known.bases]).T
+        found.append(BASES(tuple(ends.T), length, sigma=sigma))
+    return found
 
 
 def adjust_rig(rig: Rig, max_iterations: int = 50, **options: Any) -> Result:

@@ -84,7 +84,7 @@ def rig_uncertainty(
     if not distance > 0:
         raise InputError(f"distance {distance:g}: a positive distance is expected")
     k = _index(rig, name)
-    given, space = rig.camera(name), rig.result.problem.table(rig.rig.place(k)[0]).vector
+    given, space = rig.camera(name), rig.result.problem.table(rig.rig.row_of(k)[0]).vector
     model = get_model(given.model)
     p = np.array(list(given.parameters.values()))
     uv = grid_of(present(given.image_size), *grid)

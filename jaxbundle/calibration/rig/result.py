@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -17,59 +16,39 @@ from jaxbundle.adjustment import result_tables
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.quality import DRAWN, GRID, Coverage, UncertaintyMap
 from jaxbundle.calibration.result import Calibration
+from jaxbundle.calibration.rig.advice import advise_rig
+from jaxbundle.calibration.rig.connections import Connections
 from jaxbundle.calibration.rig.declare import Rig, used_rays
+from jaxbundle.calibration.rig.mounting import POSE, Mounting, mounting_of, placement_of
 from jaxbundle.calibration.rig.quality import rig_coverage, rig_points, rig_uncertainty
 from jaxbundle.cameras import get_model
-from jaxbundle.display import print_in_one_screen
-from jaxbundle.geometry import omega_phi_kappa_from_matrix
+from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.io.networks.rig_result import network_of_rig
-from jaxbundle.leastsquares import Pose, PoseValue, Result
+from jaxbundle.leastsquares import Result
 from jaxbundle.network.blunders import Removed, either_of
-from jaxbundle.network.kinds.exterior_orientation import exterior
 from jaxbundle.network.tables import EXTERIOR, Camera, Network, units_of
 from jaxbundle.results import TableMethods
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import present
+from jaxbundle.types import AnyArray, present
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-POSE = Pose.width
-DEGREES = np.array([1, 1, 1, *[180 / np.pi] * 3])
-
-
-@print_in_one_screen
-@dataclasses.dataclass(frozen=True)
-class Mounting:
-    """The mounting of a camera in the frame of the reference camera.
-
-    **Fields:** `base`: its projection centre, object unit; `rotation`: R, from the reference's
-    frame to its own; `angles`: ω, φ, κ of R, degrees; `covariance` [6, 6] of base and angles, a
-    posteriori; `length` of the base and its σ.
-    """
-
-    base: Float[np.ndarray, "3"]
-    rotation: Float[np.ndarray, "3 3"]
-    angles: Float[np.ndarray, "3"]
-    covariance: Float[np.ndarray, "6 6"]
-    length: float
-    length_sigma: float
-
-    @property
-    def sigma(self) -> Float[np.ndarray, "6"]:
-        """σ of base (object unit) and ω, φ, κ (degrees)."""
-        return np.sqrt(np.diagonal(self.covariance))
 
 
 class RigCalibration(TableMethods):
     """Cameras of a rig, calibrated together.
 
-    **Attributes:** `cameras`: their separate calibrations; `mountings`, `parameters`,
-    `sigma` of the common adjustment, by camera; `board`: its points [points, 3]; `epochs`; `rig`:
-    the input, `result`: that of the engine (`jaxbundle.leastsquares.Result`); `left_out`, and
-    `contradicting` ones that were kept: epoch and reason; `removed` by data snooping; `residuals`:
-    a table like that of an `Adjustment`; `rms` (pixels) by camera; `sigma0`, `redundancy`,
-    `converged`.
+    **Attributes:**
+
+    - `cameras`: their separate calibrations; `mountings`, `parameters`, `sigma` of the common
+      adjustment, by camera;
+    - `board`: its points [points, 3]; of several boards `bodies` and `placements`;
+    - `ties`: cameras that only the motion of the rig ties (`MotionTie`); `separate`: boards of a
+      body that nothing relates; `advice`;
+    - `epochs`; `left_out`, and `contradicting` ones that were kept: epoch and reason; `removed` by
+      data snooping; `residuals`: a table like that of an `Adjustment`; `rms` (pixels) by camera;
+    - `rig`: the input, `result`: that of the engine (`jaxbundle.leastsquares.Result`); `sigma0`,
+      `redundancy`, `converged`.
     """
 
     weights = None
@@ -82,11 +61,14 @@ class RigCalibration(TableMethods):
         result: Result,
         left_out: Sequence[tuple[str, str]],
         contradicting: Sequence[tuple[str, str]] = (),
+        connections: Connections | None = None,
     ):
         self.cameras, self.rig, self.result = cameras, rig, result
         self._maps: dict[tuple, UncertaintyMap] = {}
         self._covariances: dict[tuple[str, ...], np.ndarray] = {}
         self.left_out, self.contradicting = tuple(left_out), tuple(contradicting)
+        self.ties = () if connections is None else connections.ties
+        self.separate = () if connections is None else connections.separate
 
     @property
     def names(self) -> list[str]:
@@ -94,8 +76,14 @@ class RigCalibration(TableMethods):
 
     @property
     def epochs(self) -> tuple[str, ...]:
+        stay = zip(self.rig.epoch_of_rows, self._stays)
+        return tuple(dict.fromkeys(epoch for epoch, stays in stay if stays))
+
+    @property
+    def _stays(self) -> list[bool]:
+        """Which poses were not excluded."""
         gone = dict(self.left_out)
-        return tuple(epoch for epoch in self.rig.epochs if epoch not in gone)
+        return [epoch not in gone for epoch in self.rig.epochs]
 
     @property
     def converged(self) -> bool:
@@ -196,9 +184,9 @@ class RigCalibration(TableMethods):
 
     @property
     def board(self) -> Float[np.ndarray, "points 3"]:
-        """Adjusted coordinates of the board, object unit."""
-        nominal = next(iter(self.cameras.values())).views.board.points
-        return self.values("point") + nominal.mean(0)
+        """Adjusted coordinates of the board, object unit; of several boards those of all, each in
+        the frame of its own."""
+        return self.values("point") + present(self.rig.centroids)[self.rig.board_of_points]
 
     def values(self, table: str) -> Any:
         """The adjusted rows of a table of unknowns."""
@@ -209,7 +197,7 @@ class RigCalibration(TableMethods):
         """Parameters of every camera by name."""
         found = {}
         for k, name in enumerate(self.names):
-            table, row = self.rig.place(k)
+            table, row = self.rig.row_of(k)
             names = get_model(self.rig.cameras[k].model).parameters
             found[name] = dict(zip(names, self.values(table)[row].tolist()))
         return found
@@ -219,7 +207,7 @@ class RigCalibration(TableMethods):
         """σ of the free parameters of every camera, a posteriori."""
         found = {}
         for k, name in enumerate(self.names):
-            table = self.result.problem.table(self.rig.place(k)[0])
+            table = self.result.problem.table(self.rig.row_of(k)[0])
             sigma = np.sqrt(np.clip(np.diagonal(self.covariance(name))[POSE:], 0, None)).tolist()
             free = self.rig.cameras[k].free
             found[name] = {n: s for n, s in zip(table.parameters, sigma) if n in free}
@@ -231,7 +219,7 @@ class RigCalibration(TableMethods):
         if names not in self._covariances:
             problem = self.result.problem
             places = [
-                (self.names.index(name), *self.rig.place(self.names.index(name))) for name in names
+                (self.names.index(name), *self.rig.row_of(self.names.index(name))) for name in names
             ]
             widths = [POSE + problem.table(table).space.width for _, table, _ in places]
             number, starts = sum(widths), np.cumsum([0, *widths])
@@ -251,8 +239,42 @@ class RigCalibration(TableMethods):
         found = {}
         for k, name in enumerate(self.names[1:], 1):
             at = jax.tree.map(lambda x, k=k: x[k], self.values("mounting"))
-            found[name] = _mounting(at, self.covariance(name)[:POSE, :POSE])
+            found[name] = mounting_of(at, self.covariance(name)[:POSE, :POSE])
         return found
+
+    @functools.cached_property
+    def placements(self) -> dict[str, Mounting]:
+        """The place of every board in the frame of the first board of its body, by name: its
+        origin, and the rotation from that frame to its own; none for boards that are bodies of
+        their own."""
+        if self.rig.place is None:
+            return {}
+        centroids = present(self.rig.centroids)
+        covariance, values = self.result["board"].covariance, self.values("board")
+        return {
+            name: placement_of(
+                jax.tree.map(lambda x, j=j: x[j], values),
+                covariance[j],
+                centroids[j],
+                centroids[first],
+            )
+            for j, (name, first) in enumerate(zip(self.rig.boards, self.rig.body))
+            if first != j
+        }
+
+    @property
+    def bodies(self) -> list[tuple[str, ...]]:
+        """The boards that are fixed to each other, of one body each; the first is its frame."""
+        boards = self.rig.boards
+        return [
+            tuple(name for name, of in zip(boards, self.rig.body) if of == first)
+            for first in dict.fromkeys(self.rig.body)
+        ]
+
+    @functools.cached_property
+    def advice(self) -> list[str]:
+        """What would determine the mountings better, in words."""
+        return advise_rig(self)
 
     def camera(self, name: str) -> Camera:
         """A camera with the parameters of the common adjustment, held."""
@@ -272,9 +294,22 @@ class RigCalibration(TableMethods):
 
     @property
     def distance(self) -> float:
-        """The median distance of the board from the reference camera, object unit."""
-        stays = np.isin(self.rig.epochs, self.epochs)
-        return float(np.median(np.linalg.norm(self.values("epoch").position[stays], axis=1)))
+        """The median distance of the boards from the reference camera, object unit."""
+        stays = np.flatnonzero(self._stays)
+        if self.rig.place is None:
+            away = self.values("epoch").position[stays]
+        else:
+            rows = np.stack([self.rig.epoch, self.rig.board_of_points[self.rig.point]], 1)
+            epoch, board = np.unique(rows[np.isin(self.rig.epoch, stays)], axis=0).T
+            away = self.values("epoch").position[epoch] - self._centres[board]
+        return float(np.median(np.linalg.norm(away, axis=1)))
+
+    @property
+    def _centres(self) -> Float[np.ndarray, "boards 3"]:
+        """The centroids of the boards in the frames of their bodies."""
+        place = self.values("board")
+        P = np.asarray(_matrices(place.rotation))
+        return -np.einsum("nij,nj->ni", P, place.position)
 
     def coverage(self, name: str) -> Coverage:
         """Where in the image of a camera the rig has points."""
@@ -349,27 +384,5 @@ class RigCalibration(TableMethods):
 
 
 @partial(compile_once, static=())
-def _to_angles(mounting: PoseValue) -> tuple[Array, Array, Array]:
-    """R, ω, φ, κ, and derivatives of base and angles by (δb, δθ)."""
-    block = Pose().prepare(mounting)
-    R = block.rotation.matrix()
-    # angles near the given ones, so that κ does not jump by a full turn in the derivatives
-    given = jnp.concatenate([mounting.position, omega_phi_kappa_from_matrix(R)])
-    change = lambda d: exterior(Pose().move(block, tuple(d)), given)
-    return R, given[3:], jax.jacfwd(change)(jnp.zeros(POSE))
-
-
-def _mounting(at: PoseValue, C: Float[np.ndarray, "6 6"]) -> Mounting:
-    R, angles, J = map(np.asarray, _to_angles(at))
-    base = np.asarray(at.position)
-    J, length = DEGREES[:, None] * J, float(np.linalg.norm(base))
-    # σ of |b|: the variance along b
-    along = base / length if length else np.zeros(3)
-    return Mounting(
-        base,
-        R,
-        np.degrees(angles),
-        J @ C @ J.T,
-        length,
-        float(np.sqrt(along @ C[:3, :3] @ along)),
-    )
+def _matrices(rotation: Float[AnyArray, "n 4"]) -> Float[Array, "n 3 3"]:
+    return jax.vmap(matrix_from_quaternion)(rotation)

@@ -1,0 +1,359 @@
+"""What ties the cameras of a rig together, and start values of mountings and boards from it.
+
+A view is one board in one photograph; of a calibrated camera it has a pose,
+
+    board → camera:   T = C_k·P_e·B_j
+
+with C_k the mounting of the camera (rig → camera), P_e the pose of the body of the board at the
+epoch (body → rig), and B_j the place of the board on its body (board → body). Boards that are fixed
+to each other, to walls for instance, are one body; a board that moves by itself is a body of its
+own.
+
+Views of one board by two cameras at the same epoch give their relative mounting, views of two
+boards of a body at the same epoch the relation of these. Cameras and boards that hang together so
+are groups. They are joined along the relation with most epochs first (a maximal spanning tree), by
+the medoid over its epochs; a camera may so come in through other cameras. Where two groups of
+cameras see different boards of one body at the same epochs, the motion of the rig ties them
+(`motion`).
+"""
+
+import dataclasses
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.batches.epochs import MIN_SHARED_EPOCHS
+from jaxbundle.calibration.rig.motion import (
+    MIN_MOTION_EPOCHS,
+    Motion,
+    medoid,
+    tie_by_motion,
+)
+from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.network.columns import count, list_some
+
+Matrix = Float[np.ndarray, "4 4"]
+
+
+class BoardView(NamedTuple):
+    """A board in a photograph.
+
+    `camera`, `board`, `epoch`: their indices; `pose`: board to camera, [4, 4]; `points`: number of
+    its measured points.
+    """
+
+    camera: int
+    board: int
+    epoch: int
+    pose: Matrix
+    points: int
+
+
+@dataclasses.dataclass(frozen=True)
+class MotionTie:
+    """Two groups of cameras that only the motion of the rig ties.
+
+    **Fields:** `cameras`: the names in both groups; `boards`: those that each sees; `epochs`:
+    number of them; `open`: number of directions along which the motion leaves the position open,
+    and only what is given of a mounting determines it.
+    """
+
+    cameras: tuple[tuple[str, ...], tuple[str, ...]]
+    boards: tuple[tuple[str, ...], tuple[str, ...]]
+    epochs: int
+    open: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Connections:
+    """Start values of a rig.
+
+    **Fields:** `mountings`: by camera, from the frame of the first camera to its own; `bodies`:
+    the boards, by index, that hang together, the first is the reference of each; `places`: by board
+    its transformation to the frame of that; `ties`: by motion; `separate`: names of boards of one
+    body that nothing relates.
+    """
+
+    mountings: list[Matrix]
+    bodies: list[list[int]]
+    places: list[Matrix]
+    ties: tuple[MotionTie, ...] = ()
+    separate: tuple[tuple[str, ...], ...] = ()
+
+
+class _Groups:
+    """Members with their transformations from or to the frame of their group."""
+
+    def __init__(self, number: int):
+        self.of = np.arange(number)
+        self.place = [np.eye(4) for _ in range(number)]
+
+    def members(self, group: int) -> list[int]:
+        return np.flatnonzero(self.of == group).tolist()
+
+    def all(self) -> list[list[int]]:
+        return [self.members(g) for g in dict.fromkeys(self.of.tolist())]
+
+
+# By group of cameras and group of boards, by epoch: boards' frame → cameras' frame.
+Poses = dict[tuple[int, int], dict[int, Matrix]]
+
+
+def connect(
+    cameras: Sequence[str],
+    boards: Sequence[str],
+    bodies: Sequence[int],
+    views: Iterable[BoardView],
+    given: Mapping[int, Float[np.ndarray, "3"]] | None = None,
+) -> Connections:
+    """The mountings of the cameras and the places of the boards.
+
+    **Arguments:** names of cameras and boards; `bodies`: of each board the number of its body;
+    `given`: positions of cameras in the frame of the first, by index, for what a motion leaves
+    open.
+
+    **Raises:** `InputError` if the cameras do not hang together: which ones do, and what would join
+    them; `NotSolvedError` if the motion of the rig, which alone could tie them, does not.
+    """
+    views, body = list(views), np.asarray(bodies)
+    rigs, walls, ties, open_motions = _Groups(len(cameras)), _Groups(len(boards)), [], []
+    while True:
+        poses = _poses(views, rigs, walls)
+        if _join_cameras(poses, views, rigs) or _join_boards(poses, walls, body):
+            continue
+        found, open_motions = _find_motion(poses, body, rigs, given or {})
+        if found is None:
+            break
+        (g1, h1), (g2, h2), motion, number = found
+        named = lambda names, rows: tuple(names[i] for i in rows)
+        ties.append(
+            MotionTie(
+                (named(cameras, rigs.members(g1)), named(cameras, rigs.members(g2))),
+                (named(boards, walls.members(h1)), named(boards, walls.members(h2))),
+                number,
+                motion.open.shape[1],
+            )
+        )
+        _merge_cameras(rigs, g1, g2, np.linalg.inv(motion.X))
+        _merge_boards(walls, h1, h2, np.linalg.inv(motion.Z))
+    if len(rigs.all()) > 1:
+        raise _describe_separate(cameras, boards, body, views, rigs, open_motions)
+    groups = walls.all()
+    separate = [
+        tuple(boards[group[0]] for group in groups if body[group[0]] == one)
+        for one in dict.fromkeys(body.tolist())
+    ]
+    first = np.linalg.inv(rigs.place[0])
+    references = [walls.members(int(group))[0] for group in walls.of]
+    return Connections(
+        [place @ first for place in rigs.place],
+        groups,
+        [np.linalg.inv(walls.place[r]) @ place for r, place in zip(references, walls.place)],
+        tuple(ties),
+        tuple(names for names in separate if len(names) > 1),
+    )
+
+
+def body_pose(view: BoardView, found: Connections) -> Matrix:
+    """The pose of a body (frame of its first board → frame of the first camera) that a view of one
+    of its boards gives."""
+    rig = np.linalg.inv(found.mountings[view.camera]) @ view.pose
+    return rig @ np.linalg.inv(found.places[view.board])
+
+
+def _poses(views: Iterable[BoardView], rigs: _Groups, walls: _Groups) -> Poses:
+    """Of each pair of groups the pose at every epoch: by the view with most points."""
+    best: dict[tuple[int, int, int], BoardView] = {}
+    for view in views:
+        key = int(rigs.of[view.camera]), int(walls.of[view.board]), view.epoch
+        if key not in best or view.points > best[key].points:
+            best[key] = view
+    found: Poses = defaultdict(dict)
+    for (g, h, epoch), view in best.items():
+        pose = np.linalg.inv(rigs.place[view.camera]) @ view.pose
+        found[g, h][epoch] = pose @ np.linalg.inv(walls.place[view.board])
+    return found
+
+
+def _join_cameras(poses: Poses, views: Sequence[BoardView], rigs: _Groups) -> bool:
+    """Join the two groups of cameras that share most epochs; False if none share enough."""
+    shared: dict[tuple[int, int], dict[int, Matrix]] = defaultdict(dict)
+    for ((g1, h1), one), ((g2, h2), other) in combinations(sorted(poses.items()), 2):
+        if h1 == h2:
+            for e in one.keys() & other.keys():
+                shared[g1, g2][e] = other[e] @ np.linalg.inv(one[e])
+    epochs = defaultdict(set)
+    for view in views:
+        epochs[int(rigs.of[view.camera])].add(view.epoch)
+    enough = {
+        pair: relations
+        for pair, relations in shared.items()
+        if len(relations) >= min(MIN_SHARED_EPOCHS, *(len(epochs[g]) for g in pair))
+    }
+    if not enough:
+        return False
+    pair = max(enough, key=lambda pair: len(enough[pair]))
+    _merge_cameras(rigs, *pair, medoid([*enough[pair].values()]))
+    return True
+
+
+def _join_boards(poses: Poses, walls: _Groups, body: np.ndarray) -> bool:
+    """Join the two groups of boards of one body that are seen together at most epochs."""
+    shared: dict[tuple[int, int], dict[int, Matrix]] = defaultdict(dict)
+    for ((g1, h1), one), ((g2, h2), other) in combinations(sorted(poses.items()), 2):
+        if g1 == g2 and h1 != h2 and body[h1] == body[h2]:
+            for e in one.keys() & other.keys():
+                shared[h1, h2][e] = np.linalg.inv(one[e]) @ other[e]
+    if not shared:
+        return False
+    pair = max(shared, key=lambda pair: len(shared[pair]))
+    _merge_boards(walls, *pair, medoid([*shared[pair].values()]))
+    return True
+
+
+def _merge_cameras(rigs: _Groups, one: int, other: int, change: Matrix) -> None:
+    """Give the cameras of a group the frame of another; `change`: from that to theirs."""
+    for k in rigs.members(other):
+        rigs.place[k], rigs.of[k] = rigs.place[k] @ change, one
+
+
+def _merge_boards(walls: _Groups, one: int, other: int, change: Matrix) -> None:
+    """Give the boards of a group the frame of another; `change`: from theirs to that."""
+    for j in walls.members(other):
+        walls.place[j], walls.of[j] = change @ walls.place[j], one
+
+
+class _OpenMotion(NamedTuple):
+    """Two pairs of groups, the motion that does not tie them (None: too few epochs), and its
+    epochs."""
+
+    one: tuple[int, int]
+    other: tuple[int, int]
+    motion: Motion | None
+    epochs: int
+
+
+def _find_motion(
+    poses: Poses, body: np.ndarray, rigs: _Groups, given: Mapping[int, Float[np.ndarray, "3"]]
+) -> tuple[tuple | None, list[_OpenMotion]]:
+    """The motion over most epochs that ties two groups of cameras, if with what is given; those
+    that do not."""
+    candidates = []
+    for one, other in combinations(sorted(poses), 2):
+        if one[0] == other[0] or one[1] == other[1] or body[one[1]] != body[other[1]]:
+            continue
+        epochs = sorted(poses[one].keys() & poses[other].keys())
+        if epochs:
+            candidates.append((one, other, epochs))
+    open_motions = []
+    for one, other, epochs in sorted(candidates, key=lambda item: -len(item[2])):
+        motion = None
+        if len(epochs) >= MIN_MOTION_EPOCHS:
+            motion = tie_by_motion(*(np.array([poses[p][e] for e in epochs]) for p in (one, other)))
+            known = [k for k in rigs.members(other[0]) if k in given and rigs.of[0] == one[0]]
+            if known and not motion.determined:
+                motion = _shift_to(motion, rigs, known[0], given[known[0]])
+            if known or motion.determined:
+                return (one, other, motion, len(epochs)), open_motions
+        open_motions.append(_OpenMotion(one, other, motion, len(epochs)))
+    return None, open_motions
+
+
+def _shift_to(
+    motion: Motion, rigs: _Groups, camera: int, position: Float[np.ndarray, "3"]
+) -> Motion:
+    """A motion with its open part such that a camera is at a position in the frame of the first."""
+    place = np.linalg.inv(rigs.place[camera])  # its centre in the frame of its group
+    now = rigs.place[0] @ motion.X @ place[:, 3]
+    return motion.shifted(rigs.place[0][:3, :3].T @ (position - now[:3]))
+
+
+def _describe_separate(
+    cameras: Sequence[str],
+    boards: Sequence[str],
+    body: np.ndarray,
+    views: Sequence[BoardView],
+    rigs: _Groups,
+    open_motions: Sequence[_OpenMotion],
+) -> InputError | NotSolvedError:
+    """Which cameras hang together, and what would join them."""
+    groups = rigs.all()
+    seen = [{v.board for v in views if v.camera in group} for group in groups]
+    named = [list_some([cameras[k] for k in group], 6) for group in groups]
+    parts = "; ".join(
+        f"{names}, which {'sees' if len(group) == 1 else 'see'} {_boards(boards, of)}"
+        for names, group, of in zip(named, groups, seen)
+    )
+    said = f"the cameras are in {len(groups)} groups that nothing ties together: {parts}"
+    number = {int(rigs.of[group[0]]): i for i, group in enumerate(groups)}
+    for found in open_motions:
+        if found.motion is not None:
+            one, other = (named[number[pair[0]]] for pair in (found.one, found.other))
+            reference = cameras[rigs.members(found.one[0])[0]]
+            why = _why_open(found.motion, found.epochs, one, other, reference)
+            return NotSolvedError(f"not solved: {said}. {why}")
+    first, second = _nearest(groups, seen)
+    shared = _common_epochs(views, groups[first], groups[second])
+    if shared:
+        why = f"; they see one board at the same time at {count(shared, 'epoch')} only"
+    else:
+        why = ""
+    common = seen[first] & seen[second]
+    target = boards[min(common or seen[first])]
+    pair = cameras[groups[first][0]], cameras[groups[second][0]]
+    board = "the board" if len(boards) == 1 else f"board {target!r}"
+    advice = (
+        f"photograph {board} with {pair[0]!r} and {pair[1]!r} at the same time, at "
+        f"{MIN_SHARED_EPOCHS} epochs or more"
+    )
+    moved = {int(body[j]) for j in seen[first]} & {int(body[j]) for j in seen[second]}
+    if len(boards) > 1 and not common:
+        advice += (
+            "; or move the rig so that both see their boards at the same time, with rotations "
+            "about two axes"
+            if moved
+            else "; or, if their boards are fixed to each other, say so (body of the boards, "
+            "--fixed)"
+        )
+    return InputError(f"{said}{why}; {advice}")
+
+
+def _boards(names: Sequence[str], seen: Iterable[int]) -> str:
+    if len(names) == 1:
+        return "the board"
+    own = sorted(seen)
+    listed = list_some([names[j] for j in own], 6)
+    return f"board {listed}" if len(own) == 1 else f"boards {listed}"
+
+
+def _why_open(motion: Motion, epochs: int, one: str, other: str, reference: str) -> str:
+    """What a motion leaves open, and which would not."""
+    common = f"Over the {epochs} epochs that {one} and {other} have in common"
+    if motion.open.shape[1] > 1:
+        return (
+            f"{common} the rig is only shifted, not rotated: the position of {other} is not "
+            "determined; rotate the rig about two axes as well, or give what is known of the "
+            "position (--mountings)"
+        )
+    axis = ", ".join(f"{x + 0.0:.2f}" for x in motion.open[:, 0].round(2))
+    return (
+        f"{common} all rotations of the rig are about one axis, ({axis}) in the frame of "
+        f"{reference!r}: the position of {other} along it is not determined; rotate the rig about "
+        "a second axis as well, or give what is known of the position (--mountings)"
+    )
+
+
+def _nearest(groups: Sequence[Sequence[int]], seen: Sequence[set[int]]) -> tuple[int, int]:
+    """The two groups that most boards have in common."""
+    pairs = combinations(range(len(groups)), 2)
+    return max(pairs, key=lambda pair: len(seen[pair[0]] & seen[pair[1]]))
+
+
+def _common_epochs(views: Sequence[BoardView], one: Sequence[int], other: Sequence[int]) -> int:
+    """Number of epochs at which both groups see the same board."""
+    at = [{(v.board, v.epoch) for v in views if v.camera in group} for group in (one, other)]
+    return len({epoch for _, epoch in at[0] & at[1]})

@@ -1,0 +1,275 @@
+"""The rig of calibrated cameras, with start values: which view is which board at which epoch."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbundle.batches.epochs import epoch_keys
+from jaxbundle.calibration import quality
+from jaxbundle.calibration.result import Calibration
+from jaxbundle.calibration.rig.connections import BoardView, Connections, body_pose, connect
+from jaxbundle.calibration.rig.declare import Rig
+from jaxbundle.calibration.rig.known_mountings import NOTHING_KNOWN, KnownMountings
+from jaxbundle.calibration.rig.motion import transformation
+from jaxbundle.errors import InputError
+from jaxbundle.geometry import matrix_from_omega_phi_kappa, quaternion_from_matrix
+from jaxbundle.leastsquares.spaces import PoseValue
+from jaxbundle.measure.boards import Board, BoardSet
+from jaxbundle.network.columns import did_you_mean
+from jaxbundle.system.programs import compile_once
+from jaxbundle.types import AnyArray, present
+
+
+@dataclasses.dataclass(frozen=True)
+class RigBoards:
+    """The boards of a rig.
+
+    **Fields:** `boards` by name; `body`: of each the name of its body, its own name if it is one.
+    """
+
+    boards: dict[str, Board]
+    body: dict[str, str]
+
+    @property
+    def points(self) -> Float[np.ndarray, "points 3"]:
+        """The points of all, relative to the centroid of each."""
+        return np.concatenate([b.points - b.points.mean(0) for b in self.boards.values()])
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """Their names: "BOARD:row-column", without the board if there is only one."""
+        if len(self.boards) == 1:
+            return next(iter(self.boards.values())).ids
+        return BoardSet(tuple(self.boards), tuple(self.boards.values())).ids
+
+    def rows_of(self, name: str) -> np.ndarray:
+        """The rows of the points of a board among all."""
+        sizes = [len(one.ids) for one in self.boards.values()]
+        first = int(np.sum(sizes[: list(self.boards).index(name)], initial=0))
+        return first + np.arange(len(self.boards[name].ids))
+
+
+class CameraViews(NamedTuple):
+    """The views of one camera.
+
+    `calibration`; `board`: of each view the name; `epoch`: of each view the key; `rows`: of each
+    point of its board or boards the row among the points of all.
+    """
+
+    calibration: Calibration
+    board: list[str]
+    epoch: list[str]
+    rows: np.ndarray
+
+
+def collect_boards(
+    calibrations: Mapping[str, Calibration],
+    bodies: Mapping[str, Sequence[str]] | None,
+    fixed: bool,
+) -> RigBoards:
+    """The boards that the cameras have seen; a board without a name is one with all its equals.
+
+    **Raises:** `InputError` if boards of one name differ, or a body has a board that there is not.
+    """
+    boards: dict[str, Board] = {}
+    for camera, one in calibrations.items():
+        if isinstance(one.views.board, BoardSet):
+            for name, board in one.views.board.items:
+                if boards.setdefault(name, board) != board:
+                    raise InputError(
+                        f"camera {camera!r}: board {name!r} is {board}, of another camera "
+                        f"{boards[name]}; give boards that differ different names"
+                    )
+    alone = [
+        one.views.board
+        for one in calibrations.values()
+        if isinstance(one.views.board, Board) and one.views.board not in boards.values()
+    ]
+    different = list(dict.fromkeys(alone))
+    for number, board in enumerate(different, 1):
+        boards["board" if len(different) == 1 and not boards else f"board {number}"] = board
+    body = {name: "all boards" if fixed else name for name in boards}
+    for name, members in (bodies or {}).items():
+        if name in boards and name not in members:
+            raise InputError(f"body {name!r}: board {name!r} is not of it; choose another name")
+        for board in members:
+            if board not in boards:
+                raise InputError(
+                    f"body {name!r}: no camera has seen a board {board!r}"
+                    f"{did_you_mean(board, boards)}"
+                )
+            if body[board] != board:
+                raise InputError(
+                    f"board {board!r} is of two bodies, {body[board]!r} and {name!r}; expected one"
+                )
+            body[board] = name
+    return RigBoards(boards, body)
+
+
+def sort_views(calibrations: Mapping[str, Calibration], boards: RigBoards) -> list[CameraViews]:
+    """Board and epoch of every view of every camera.
+
+    **Raises:** `InputError` if the photographs cannot be paired by their names.
+    """
+    photographs = {
+        name: tuple(dict.fromkeys(one.views.photographs)) for name, one in calibrations.items()
+    }
+    keys = {
+        name: dict(zip(photographs[name], own))
+        for name, own in epoch_keys(photographs, connected=False).items()
+    }
+    found = []
+    for name, one in calibrations.items():
+        views = one.views
+        if isinstance(views.board, BoardSet):
+            named = [views.board.names[b] for b in views.board.seen(views.visible)]
+            rows = np.concatenate([boards.rows_of(board) for board in views.board.names])
+        else:
+            board = next(n for n, known in boards.boards.items() if known == views.board)
+            named, rows = [board] * len(views), boards.rows_of(board)
+        found.append(CameraViews(one, named, [keys[name][p] for p in views.photographs], rows))
+    return found
+
+
+def start_rig(
+    calibrations: Mapping[str, Calibration],
+    bodies: Mapping[str, Sequence[str]] | None = None,
+    fixed: bool = False,
+    known: KnownMountings = NOTHING_KNOWN,
+) -> tuple[Rig, Connections]:
+    """The rig with start values, and the image points that the calibration of each camera kept.
+
+    **Arguments:** `bodies`: by name, boards that are fixed to each other; `fixed`: all are;
+    `known`: what is given of the mountings.
+
+    **Raises:** `InputError`, `NotSolvedError` if the cameras do not hang together
+    (`connections.connect`).
+    """
+    boards = collect_boards(calibrations, bodies, fixed)
+    cameras = sort_views(calibrations, boards)
+    epochs = list(dict.fromkeys(key for camera in cameras for key in camera.epoch))
+    names, views = list(boards.boards), _board_views(cameras, boards, epochs)
+    body = list(dict.fromkeys(boards.body.values()))
+    numbers = [body.index(boards.body[name]) for name in names]
+    given = known.positions(list(calibrations))
+    found = connect(list(calibrations), names, numbers, views, given)
+    reference = [next(g[0] for g in found.bodies if j in g) for j in range(len(names))]
+    rows = _best_views(views, reference)
+    poses = [body_pose(view, found) for view in rows.values()]
+    alone = len(found.bodies) == 1
+    labels = [epochs[e] if alone else f"{epochs[e]} {boards.body[names[j]]}" for e, j in rows]
+    row_of = {key: row for row, key in enumerate(rows)}
+    rays = [_rays(camera, epochs, boards, reference, row_of) for camera in cameras]
+    epoch, point, xy, sigma = (np.concatenate(column) for column in zip(*rays))
+    free = {
+        name: one.adjustment.problem.network.cameras[0].free for name, one in calibrations.items()
+    }
+    rig = Rig(
+        tuple(
+            dataclasses.replace(one.camera, id=name, free=free[name])
+            for name, one in calibrations.items()
+        ),
+        _hold(_pose_values(found.mountings), list(calibrations), known),
+        tuple(labels),
+        _pose_values(poses),
+        boards.ids,
+        boards.points,
+        epoch,
+        np.repeat(np.arange(len(cameras)), [len(ray[0]) for ray in rays]),
+        point,
+        xy,
+        sigma,
+        times=tuple(epochs[e] for e, _ in rows),
+        boards=tuple(names),
+        board=np.repeat(np.arange(len(names)), [len(b.ids) for b in boards.boards.values()]),
+        centroids=np.array([one.points.mean(0) for one in boards.boards.values()]),
+        place=None if len(found.bodies) == len(names) else _pose_values(found.places),
+        body=tuple(reference),
+        known=known,
+    )
+    return rig, found
+
+
+def _best_views(
+    views: Sequence[BoardView], reference: Sequence[int]
+) -> dict[tuple[int, int], BoardView]:
+    """By epoch and body (its first board) the view with most points."""
+    found: dict[tuple[int, int], BoardView] = {}
+    for view in views:
+        key = view.epoch, reference[view.board]
+        if key not in found or view.points > found[key].points:
+            found[key] = view
+    return found
+
+
+def _board_views(
+    cameras: Sequence[CameraViews], boards: RigBoards, epochs: Sequence[str]
+) -> list[BoardView]:
+    """The poses of all views, boards relative to their centroids."""
+    names, found = list(boards.boards), []
+    number = {key: e for e, key in enumerate(epochs)}
+    for k, camera in enumerate(cameras):
+        one = camera.calibration
+        seen = one.views.visible.sum(1)
+        for i, (board, key) in enumerate(zip(camera.board, camera.epoch)):
+            M, X0 = one.rotation[i], one.position[i]
+            pose = transformation(M, M @ (boards.boards[board].points.mean(0) - X0))
+            found.append(BoardView(k, names.index(board), number[key], pose, int(seen[i])))
+    return found
+
+
+def _pose_values(matrices: Sequence[Float[np.ndarray, "4 4"]]) -> PoseValue:
+    """Centre and quaternion of poses: R·x + t = R·(x − X0)."""
+    found = np.array(matrices)
+    R, t = found[:, :3, :3], found[:, :3, 3]
+    return PoseValue(-np.einsum("nji,nj->ni", R, t), np.asarray(_quaternions(R)))
+
+
+def _hold(mounting: PoseValue, cameras: Sequence[str], known: KnownMountings) -> PoseValue:
+    """Mountings with those parts that are held as they are given."""
+    position, rotation = np.array(mounting.position), np.array(mounting.rotation)
+    for name, one in known.mountings.items():
+        k = cameras.index(name)
+        if one.held[0]:
+            position[k] = one.position
+        if one.held[1]:
+            M = matrix_from_omega_phi_kappa(present(one.angles))
+            rotation[k] = quaternion_from_matrix(M)
+    return PoseValue(position, rotation)
+
+
+@partial(compile_once, static=())
+def _quaternions(matrices: Float[AnyArray, "n 3 3"]) -> Float[Array, "n 4"]:
+    return jax.vmap(quaternion_from_matrix)(matrices)
+
+
+def _rays(
+    camera: CameraViews,
+    epochs: Sequence[str],
+    boards: RigBoards,
+    reference: Sequence[int],
+    row_of: Mapping[tuple[int, int], int],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Epoch row, point, xy and σ of the image points that the calibration of a camera kept.
+
+    Points that it removed as gross stay out: data snooping of the rig finds only what the mounting
+    reveals."""
+    network, views = camera.calibration.adjustment.problem.network, camera.calibration.views
+    rays, used = network.observations, quality.used_rays(camera.calibration.adjustment.problem)
+    names = list(boards.boards)
+    at = {
+        view: row_of[epochs.index(key), reference[names.index(board)]]
+        for view, board, key in zip(views.names, camera.board, camera.epoch)
+    }
+    point = dict(zip(views.board.ids, camera.rows))
+    return (
+        np.array([at[id] for id in network.images.id])[rays.image[used]],
+        np.array([point[id] for id in network.points.id])[rays.point[used]],
+        rays.xy[used],
+        rays.sigma[used],
+    )

@@ -1,0 +1,186 @@
+"""`jaxbundle calibrate-rig`: cameras on one mounting, from photographs of any boards."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from jaxbundle.cli import calibration_options as options
+from jaxbundle.cli.app import Correlated, Force, Html, Json, Quiet, app
+from jaxbundle.errors import InputError
+
+COMMAND = "calibrate-rig"
+
+
+@app.command(COMMAND, example="left/ right/ --board 9x6 --square 0.03 --out out/rig")
+def calibrate_rig(  # noqa: PLR0913 - the options of the command
+    folders: Annotated[
+        list[str],
+        typer.Argument(
+            help="a folder of photographs for each camera, FOLDER or NAME=FOLDER; the first camera "
+            "is the reference"
+        ),
+    ],
+    board: Annotated[
+        str,
+        typer.Option(
+            help="COLUMNSxROWS: inner corners, circles, or squares of charuco; a Kalibr target, "
+            "FILE.yaml; or several boards, FILE.toml"
+        ),
+    ] = "",
+    square: options.Square = "",
+    kind: options.Kind = "chessboard",
+    fixed: Annotated[
+        bool,
+        typer.Option("--fixed", help="the boards are fixed to each other, to walls for instance"),
+    ] = False,
+    mountings: Annotated[
+        str,
+        typer.Option(
+            help="FILE.toml with a section [rig], as of a project: what is known of the mountings"
+        ),
+    ] = "",
+    model: options.Model = "opencv",
+    free: options.Free = "",
+    given: options.Given = None,
+    pixel_size: options.PixelSize = None,
+    diameter: options.Diameter = None,
+    marker: options.Marker = None,
+    dictionary: options.Dictionary = "DICT_4X4_50",
+    first_marker: options.FirstMarker = 0,
+    board_sigma: options.BoardSigma = None,
+    board_free: options.BoardFree = False,
+    sigma_image: options.SigmaImage = None,
+    snooping: options.Snooping = "pope",
+    significance: options.Significance = 0.001,
+    robust: options.Robust = None,
+    cross_validation: options.CrossValidation = True,
+    correlated: Correlated = True,
+    unit: options.Unit = "m",
+    json: Json = "",
+    out: Annotated[
+        Path | None, typer.Option(help="folder for report, page, JSON, cameras, rig files, plots")
+    ] = None,
+    html: Html = "",
+    force: Force = False,
+    brief: options.Brief = False,
+    quiet: Quiet = False,
+    plots: options.Plots = True,
+) -> None:
+    """Calibrate cameras on one rigid mounting, from simultaneous photographs of any boards.
+
+    Photographs of equal names, or equal last numbers in them, are simultaneous. Cameras are tied by
+    boards that they see at the same time, through other cameras, or by the motion of the rig
+    between boards that are fixed to each other.
+    """
+    from jaxbundle.calibration import Calibrations
+    from jaxbundle.calibration import calibrate_rig as calibrate_together
+    from jaxbundle.cli.board_options import board_given
+    from jaxbundle.cli.calibration_outputs import CalibrationOutputs, values, words
+    from jaxbundle.leastsquares.quality.snooping import check_test
+    from jaxbundle.measure.views import photographs
+    from jaxbundle.photographs.opencv import need_opencv
+
+    test = None if snooping == "none" else snooping
+    check_test(test, significance, "--")
+    known: Any = board
+    if board.endswith(".toml"):
+        _check_alone(square, diameter, marker, first_marker, board)
+    else:
+        known = board_given(board, square, kind, diameter, marker, dictionary, first_marker)
+    cameras = name_cameras(folders)
+    need_opencv()
+    files = [path for folder in cameras.values() for path in photographs([folder])]
+    settings = {
+        "--board": board,
+        "--square": square,
+        "--kind": kind,
+        "--fixed": fixed,
+        "--mountings": mountings,
+        "--model": model,
+        "--free": free,
+        "--given": ", ".join(given or ()),
+        "--board-sigma": board_sigma,
+        "--board-free": board_free,
+        "--sigma-image": sigma_image,
+        "--snooping": snooping,
+        "--significance": significance,
+        "--robust": robust,
+        "--no-correlated": True if not correlated else None,
+    }
+
+    def compute(progress: Callable) -> tuple[Calibrations, None]:
+        rig = calibrate_together(
+            {name: [folder] for name, folder in cameras.items()},
+            known,
+            fixed=fixed,
+            mountings=mountings or None,
+            model=model,
+            free=words(free) or None,
+            given=values(given),
+            pixel_size=pixel_size,
+            board_sigma=board_sigma,
+            board_free=board_free,
+            sigma_image=sigma_image,
+            snooping=test,
+            significance=significance,
+            robust=robust,
+            cross_validation=cross_validation,
+            correlated=correlated,
+            object_unit=unit,
+            progress=progress,
+        )
+        return Calibrations(rig.cameras, rig), None
+
+    CalibrationOutputs(
+        COMMAND, [*cameras], files, settings, json, out, html, force, brief, quiet, plots
+    ).compute(compute)  # fmt: skip
+
+
+def name_cameras(folders: Sequence[str]) -> dict[str, str]:
+    """Folders by the name of the camera: that given, or that of the folder, with as many of the
+    folders above it as make the names unique."""
+    given: list[tuple[str, str]] = []
+    for item in folders:
+        name, equals, folder = item.partition("=")
+        named = equals and name and folder and not Path(item).exists()
+        given.append((name, folder) if named else ("", item))
+    for _, folder in given:
+        if not Path(folder).exists():
+            raise InputError(
+                f"{folder}: no such folder; expected a folder of photographs for each camera"
+            )
+    if len(given) < 2:
+        raise InputError(
+            "a rig has at least two cameras: give a folder of photographs for each; for one camera "
+            "use jaxbundle calibrate"
+        )
+    paths = [Path(folder).resolve() for name, folder in given if not name]
+    parts = next(
+        (n for n in range(1, 100) if len({p.parts[-n:] for p in paths}) == len({*paths})), 1
+    )
+    found: dict[str, str] = {}
+    for name, folder in given:
+        own = name or "_".join(Path(folder).resolve().parts[-parts:])
+        if own in found:
+            raise InputError(
+                f"{folder}: camera {own!r} is given twice, the other is {found[own]}; expected a "
+                "folder and a name of its own for each camera"
+            )
+        found[own] = folder
+    return found
+
+
+def _check_alone(
+    square: str, diameter: float | None, marker: float | None, first_marker: int, board: str
+) -> None:
+    """Refuse options of one board beside a file of boards."""
+    for value, option in (
+        (square, "--square"),
+        (diameter, "--diameter"),
+        (marker, "--marker"),
+        (first_marker, "--first-marker"),
+    ):
+        if value:
+            raise InputError(f"{option}: {board} gives the sizes of the boards; omit it")

@@ -1,0 +1,191 @@
+"""What the commands for calibrations check before they compute, and write after it."""
+
+import dataclasses
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from jaxbundle.calibration import Calibrations, ModelComparison
+from jaxbundle.calibration.files import (
+    COMPARED,
+    calibrations_dict,
+    file_name,
+    files_of,
+    fill_calibrations,
+    fill_comparison,
+    json_text,
+)
+from jaxbundle.calibration.page import KIND, compose_calibrations
+from jaxbundle.cli.common_options import is_in_file
+from jaxbundle.cli.outputs import can_plot, check_writable, name_inside, trace_files, write_result
+from jaxbundle.cli.progress import counting
+from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.io.results.result_json import unsolved_text
+from jaxbundle.network.columns import count
+from jaxbundle.report.page import UNKNOWN, Origin, compose_failure, head_line
+
+
+@dataclasses.dataclass(frozen=True)
+class CalibrationOutputs:
+    """Where a command writes its calibration.
+
+    **Fields:** `command` whose folder it is; `names` of the cameras; `photographs` searched;
+    `settings`: options and their values, for the page; the options of the command.
+    """
+
+    command: str
+    names: Sequence[str]
+    photographs: Sequence[Path]
+    settings: Mapping[str, Any]
+    json: str = ""
+    out: Path | None = None
+    html: str = ""
+    force: bool = False
+    brief: bool = False
+    quiet: bool = False
+    plots: bool = True
+    compared: bool = False
+
+    def check(self) -> Origin:
+        """Check the files; what the result is from, for its page."""
+        for path in self.photographs:
+            if not path.exists():
+                raise InputError(f"{path}: no such file or folder")
+        check_names(self.names)
+        inputs = self.photographs
+        check_writable(self.json, self.out, self.command, self.files, inputs, self.force, self.html)
+        if self.html or self.out is not None:
+            return trace_files(inputs, self.settings)
+        return UNKNOWN
+
+    @property
+    def files(self) -> list[str]:
+        """The files that may be in the folder."""
+        return files_of([*self.names]) + (COMPARED if self.compared else [])
+
+    def compute(
+        self, calibrate: Callable[[Callable], tuple[Calibrations, ModelComparison | None]]
+    ) -> None:
+        """Calibrate, write, and print the report; `calibrate(progress)` gives the result and the
+        comparison of models, if any.
+
+        **Raises:** `NotSolvedError` for cameras without a solution, after all is written.
+        """
+        origin = self.check()
+        with counting(self.quiet or self.json == "-") as bar:
+            task = bar.add_task("searching the board", total=len(self.photographs))
+
+            def tell(*_: object) -> None:
+                bar.advance(task)
+                if bar.tasks[task].finished:
+                    bar.update(task, description="adjusting")
+
+            with self._written_if_unsolved(origin):
+                found, compared = calibrate(tell)
+            bar.update(task, description="assessing accuracy")
+            report = self._write(
+                found,
+                compared,
+                origin,
+                lambda stage, done, total: bar.update(
+                    task, description=stage, completed=done, total=total
+                ),
+            )
+        if report:
+            print(report)
+        require_solved(found)
+
+    @contextmanager
+    def _written_if_unsolved(self, origin: Origin) -> Iterator[None]:
+        """Write the failure of what raises `NotSolvedError`."""
+        try:
+            yield
+        except NotSolvedError as error:
+            # a failure makes no folder, unless a file that was asked for belongs in it
+            inside = name_inside(self.json, self.out) or name_inside(self.html, self.out)
+            place = self.out if inside else None
+            page = partial(compose_failure, error, origin, KIND)
+            with write_result(
+                self.json, unsolved_text(error), place, self.command, self.files, self.force,
+                self.html, page,
+            ):  # fmt: skip
+                pass
+            raise
+
+    def _write(
+        self,
+        found: Calibrations,
+        compared: ModelComparison | None,
+        origin: Origin,
+        show: Callable[[str, int, int], object],
+    ) -> str:
+        """Write the result; the report, unless nobody is to see it."""
+        document = calibrations_dict(found, self.brief) if self.json else {}
+        if compared is not None and self.json:
+            document["models"] = compared.to_dict()
+        text = json_text(document) if self.json else ""
+        written = is_in_file(self.json, self.out, self.html)
+        silent = self.json == "-" or (self.quiet and written)
+        report = "" if silent else head_line(origin) + (compared or found).report()
+        show("writing", 0, 1)
+        page = partial(compose_calibrations, found, origin, compared)
+        plots = self.plots and self.out is not None and can_plot()
+        with write_result(
+            self.json, text, self.out, self.command, self.files, self.force, self.html, page
+        ) as new:
+            if new is not None:
+                fill_calibrations(found, new, plots, origin, compared, show)
+                if compared is not None:
+                    fill_comparison(compared, new, plots, show)
+        return report
+
+
+def require_solved(found: Calibrations) -> None:
+    """Refuse calibrations of which one has no solution.
+
+    **Raises:** `NotSolvedError`."""
+    failed = [name for name, one in found.cameras.items() if not one.converged]
+    if failed:
+        names = found.cameras[failed[0]].adjustment.undetermined
+        what = f"; not determined: {', '.join(names[:12])}" if names else ""
+        others = count(len(failed) - 1, "other camera")
+        more = f"; {others} not solved either: {', '.join(failed[1:])}"
+        raise NotSolvedError(
+            f"not solved: camera {failed[0]}: {found.cameras[failed[0]].adjustment.termination}"
+            f"{what}; free fewer parameters (--free), or take photographs from more directions"
+            f"{more if len(failed) > 1 else ''}"
+        )
+
+
+def check_names(cameras: Iterable[str]) -> None:
+    """Refuse cameras that would share an output folder."""
+    folders: dict[str, str] = {}
+    for name in cameras:
+        # some systems do not tell the letters of a name from capitals
+        other = folders.setdefault(file_name(name).casefold(), name)
+        if other != name:
+            raise InputError(
+                f"--camera: {other!r} and {name!r} would have the same folder {file_name(name)!r}; "
+                "choose other names"
+            )
+
+
+def words(text: str) -> list[str]:
+    """Words separated by commas."""
+    return [word.strip() for word in text.split(",") if word.strip()]
+
+
+def values(given: Sequence[str] | None) -> dict[str, float]:
+    """Values by name, of NAME=VALUE."""
+    found = {}
+    for item in given or ():
+        name, equals, text = (part.strip() for part in item.partition("="))
+        try:
+            found[name] = float(text)
+        except ValueError:
+            equals = ""
+        if not equals:
+            raise InputError(f"--given {item}: NAME=VALUE is expected, such as fx=1200")
+    return found

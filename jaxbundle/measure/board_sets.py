@@ -1,0 +1,134 @@
+"""Several boards in the photographs of one camera: each photograph shows any of them.
+
+The views of one board are independent images of it (`BoardViews`); those of several are joined into
+the views of one `BoardSet`, whose points are those of all boards, each in the frame of its own. A
+view is one board in one photograph: a photograph of two boards has two views.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxbundle.arguments import show
+from jaxbundle.errors import InputError
+from jaxbundle.measure.boards import Board, BoardSet, require_board
+from jaxbundle.measure.views import (
+    SEARCHING,
+    BoardViews,
+    Look,
+    collect_views,
+    name_photographs,
+    photographs,
+    refuse_sizes,
+    search_board,
+    searches_at_once,
+)
+from jaxbundle.network.columns import list_some
+from jaxbundle.system.threads import map_in_threads
+from jaxbundle.types import Progress
+
+
+def join_views(views: Mapping[str, BoardViews]) -> BoardViews:
+    """The views of several boards by one camera as views of a `BoardSet`.
+
+    **Arguments:** by the name of the board its views, which are named as their photographs.
+
+    **Returns:** views "PHOTOGRAPH:BOARD" in the order of the photographs, `photographs` their
+    photographs; `failed`: the photographs without any board.
+
+    **Raises:** `InputError` if image sizes differ.
+    """
+    sizes = {name: one.image_size for name, one in views.items()}
+    if len({*sizes.values()}) > 1:
+        shown = ", ".join(f"{c} × {r} of {name!r}" for name, (c, r) in sizes.items())
+        raise InputError(
+            f"views of boards have different image sizes: {shown}; expected photographs of one "
+            "camera, all of one size"
+        )
+    known = require_boards({name: one.board for name, one in views.items()})
+    boards = BoardSet(tuple(known), tuple(known.values()))
+    rows, number = [], boards.number
+    for b, one in enumerate(views.values()):
+        for name, xy in zip(one.names, one.xy):
+            whole = np.full((len(number), 2), np.nan)
+            whole[number == b] = xy
+            rows.append((name, b, whole))
+    rows.sort(key=lambda row: row[0])  # stable: the boards of a photograph in their order
+    seen, failed = {name for name, _, _ in rows}, {}
+    for board, one in views.items():
+        for name, why in one.failed:
+            if name not in seen:
+                failed.setdefault(name, f"{board}: {why}")
+    return BoardViews(
+        boards,
+        tuple(f"{name}:{boards.names[b]}" for name, b, _ in rows),
+        next(iter(sizes.values())),
+        np.array([xy for _, _, xy in rows]).reshape(-1, len(number), 2),
+        tuple(failed.items()),
+        tuple(warning for one in views.values() for warning in one.warnings),
+        tuple(note for one in views.values() for note in one.notes),
+        photographs=tuple(name for name, _, _ in rows),
+    )
+
+
+def measure_board_set(
+    paths: Sequence[str | Path], boards: Mapping[str, Board], progress: Progress | None = None
+) -> BoardViews:
+    """Find any of several boards in the photographs of one camera.
+
+    **Arguments:** `paths`: files, patterns, folders; `boards` by name; `progress(stage, done,
+    total)`.
+
+    **Returns:** the views of a `BoardSet` of those boards that were found.
+
+    **Raises:** `InputError` if photographs have different sizes, or none shows a board.
+    """
+    file_of = name_photographs(photographs(paths))
+    if not file_of:
+        raise InputError("no photographs are given")
+    tasks = [(name, board) for name in file_of for board in boards]
+
+    def search(task: tuple[str, str]) -> Look:
+        name, board = task
+        return search_board(file_of[name], boards[board])
+
+    def tell(done: int) -> None:
+        if progress is not None and done % len(boards) == 0:
+            progress(SEARCHING, done // len(boards), len(file_of))
+
+    # as many at once as of the board whose search takes most memory
+    at_once = min(searches_at_once([*file_of.values()], one) for one in boards.values())
+    looks = dict(zip(tasks, map_in_threads(search, tasks, at_once, tell)))
+    refuse_sizes({name: look[0] for (name, _), look in looks.items() if not isinstance(look, str)})
+    views, missed = {}, []
+    for board, one in boards.items():
+        own = {name: looks[name, board] for name in file_of}
+        if all(isinstance(look, str) for look in own.values()):
+            missed.append(board)
+            continue
+        views[board] = collect_views(file_of, own, one, hints=False)
+    if not views:
+        name = next(iter(file_of))
+        why = "; ".join(f"{board}: {looks[name, board]}" for board in boards)
+        raise InputError(
+            f"no photograph of {len(file_of)} shows one of the boards {list_some(boards, 6)}: "
+            f"{file_of[name]}: {why}"
+        )
+    return join_views(views)
+
+
+def require_boards(boards: Any) -> dict[str, Board]:
+    """Boards by name.
+
+    **Raises:** `InputError` about another argument.
+    """
+    if not isinstance(boards, Mapping) or not boards:
+        raise InputError(
+            f"boards must be by name, such as {{'wall': Board(9, 6, 0.03)}}, but is {show(boards)}"
+        )
+    for name in boards:
+        if not isinstance(name, str) or not name or ":" in name:
+            raise InputError(f"board {show(name)}: expected a name without a colon")
+    return {name: require_board(one) for name, one in boards.items()}
