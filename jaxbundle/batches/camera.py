@@ -119,7 +119,7 @@ def solve_camera(
     meaning = jnp.array([MEANING[code] for code in range(len(MEANING))])
     status = jnp.where(few, TOO_FEW, meaning[loop.termination])
     lost = (status == CONVERGED) & ~(weakest > INDETERMINATE)
-    # A settled step is taken without being tried, as by the engine; another one may yet be rejected.
+    # A settled step is taken without being tried, as by the engine; another may yet be rejected.
     settled = loop.termination == stopping.SETTLED
     return CameraSolution(
         jax.tree.map(lambda one, other: jnp.where(settled, one, other), loop.trial, loop.at),

@@ -187,7 +187,7 @@ def whiten(v: Change, weight: Weight) -> Change:
     """L⁻¹·v, or v/σ; 0 if the weight is 0, whatever v is."""
     if isinstance(weight[0], tuple):
         used = [row[i] > 0 for i, row in enumerate(weight)]
-        v = [jnp.where(u, x, 0.0) for u, x in zip(used, v)]
+        v = tuple(jnp.where(u, x, 0.0) for u, x in zip(used, v))
         # L⁻¹ is lower triangular.
         rows = [sum(w * x for w, x in zip(row[: i + 1], v)) for i, row in enumerate(weight)]
         return tuple(jnp.where(u, r, 0.0) for u, r in zip(used, rows))
