@@ -108,7 +108,7 @@ def fit_bias(
     sigma = np.broadcast_to(np.asarray(sigma, float), (n, 2))
     if (bad := ~(sigma > 0).all(1)).any():
         raise InputError(f"{source(int(bad.argmax()))}: σ must be positive, in pixels")
-    computed, G = (np.asarray(a) for a in _images(rpc, earth, *control[:3]))
+    computed, G = (np.asarray(a) for a in images_and_slopes(rpc, earth, *control[:3]))
     if (bad := ~np.isfinite(computed).all(1)).any():
         raise InputError(
             f"{source(int(bad.argmax()))}: the coefficients have no image of this point; check "
@@ -239,7 +239,7 @@ _compensated = compile_once(jax.vmap(project_compensated, (None, None, 0, 0, 0))
 
 
 @partial(compile_once, static=())
-def _images(
+def images_and_slopes(
     rpc: Rpc,
     earth: Ellipsoid,
     longitude: Float[AnyArray, " n"],

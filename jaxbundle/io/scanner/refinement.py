@@ -225,8 +225,7 @@ def _points(table: Columns, earth: Ellipsoid | None, radians: float) -> GroundPo
         )
         known = np.isfinite(X).all(1)
         # an unknown place has no east and north: its σ are of the axes
-        for k in np.flatnonzero(known):
-            axes[k] = east_north_up(earth, X[k])
+        axes[known] = east_north_up(earth, X[known])
     return GroundPoints(
         table.ids("id"),
         table.ids("role"),

@@ -8,6 +8,7 @@ import numpy as np
 from jaxbundle.cameras import get_model
 from jaxbundle.network.columns import count
 from jaxbundle.refinement import Refinement, point_rows
+from jaxbundle.refinement.declare import PHOTOGRAPH
 from jaxbundle.report.layout import estimate
 from jaxbundle.report.page.columns import Column, numbers
 from jaxbundle.report.page.document import Listing, Page, Section, write
@@ -63,11 +64,11 @@ def _words(values: Iterable[object]) -> np.ndarray:
 def _image_points(result: Refinement) -> list[ImagePoint]:
     """The rows of `Refinement.image_points`, with what was measured and the names of the axes."""
     declared, given = result.inspection.declared, result.inspection.declared.inputs
-    xy = lambda of_scanner: np.asarray(
-        given.observations.xy if of_scanner else present(given.frames).observations.xy
+    xy = lambda table: np.asarray(
+        present(given.frames).observations.xy if table == PHOTOGRAPH else given.observations.xy
     )
     # the parts of the equations are in another order than the images
-    measured = declared.image_by_image(xy(p.of_scanner)[p.rows] for p in declared.parts)
+    measured = declared.image_by_image(xy(p.table)[p.rows] for p in declared.parts)
     scanners = {one.id for one in result.images}
     return [
         row | {"measured": at, "axes": SCANNER_AXES if row["image"] in scanners else ("x", "y")}
