@@ -11,7 +11,7 @@ from jaxbundle import cameras
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.geometry.vectors import rotate
-from jaxbundle.leastsquares.indexing.indices import round_up
+from jaxbundle.leastsquares.indexing.indices import fill_up
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import Network, Observations
 from jaxbundle.orientation.intersection import intersection
@@ -107,17 +107,17 @@ _meet = compile_once(jax.vmap(intersection), ())
 def _sights(inputs: RefinementInput, rays: Rays) -> Iterator[tuple[np.ndarray, ...]]:
     """Origins, directions and points of the rays; image by image."""
     observations, frames = inputs.observations, inputs.frames
-    for i, one in enumerate(inputs.images):
-        rows = rays.scanner[observations.image[rays.scanner] == i]
-        if not len(rows):
-            continue
-        # padded by the last one: images with similar numbers of points share a program
-        padded = observations.xy[rows[np.minimum(np.arange(round_up(len(rows))), len(rows) - 1)]]
-        rigorous = isinstance(one, ScannerImage)
-        sights = (
-            _scanner_sights(one.image, padded) if rigorous else lines_of_sight(one.image.rpc, padded)
-        )
-        yield *(np.asarray(x)[: len(rows)] for x in sights), observations.point[rows]
+    image = observations.image[rays.scanner]
+    for i, one in enumerate(inputs.rigorous):
+        rows = rays.scanner[image == i]
+        if len(rows):
+            found = _scanner_sights(one.image, observations.xy[rows[fill_up(len(rows))]])
+            yield *(np.asarray(x)[: len(rows)] for x in found), observations.point[rows]
+    first = len(inputs.rigorous)
+    rows = rays.scanner[image >= first]
+    if len(rows):
+        rpcs, of_rpc = [one.image.rpc for one in inputs.rpc], observations.image[rows] - first
+        yield *lines_of_sight(rpcs, of_rpc, observations.xy[rows]), observations.point[rows]
     if frames is None:
         return
     for j in range(len(frames.images)):

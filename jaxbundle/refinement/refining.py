@@ -5,6 +5,7 @@ equations of `kinds`, statistics, blunders, check points, warnings, and the refi
 """
 
 import dataclasses
+import functools
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -118,6 +119,17 @@ class Refinement(TableMethods):
         """σ0 a posteriori."""
         return self.inspection.sigma0
 
+    def rays(self) -> dict[int, int]:
+        """The number of points used by their number of rays."""
+        declared = self.inspection.declared
+        n, rows = len(declared.rays.points), declared.parts
+        number = np.zeros(n, int)
+        for part in rows:
+            used = self.inspection.has_weight[part.set].any(1)
+            number += np.bincount(part.point[used], minlength=n)
+        rays, points = np.unique(number, return_counts=True)
+        return dict(zip(rays.tolist(), points.tolist()))
+
     @property
     def robust_sigma0(self) -> float:
         """σ0 by the median of the residuals of image points (MAD), which blunders hardly change;
@@ -183,14 +195,13 @@ class Refinement(TableMethods):
 
     def image(self, id: str) -> PushbroomImage | RpcImage:
         """A refined scanner image, for `locate`, `project` and the correction; of an image with
-        RPC one with compensated coefficients (`compensate` tells how well these contain the
-        bias)."""
+        RPC one with coefficients that contain its bias (`compensated`)."""
         at = {one.id: k for k, one in enumerate(self.images)}
         if id not in at:
             raise InputError(f"no scanner image {id!r}; there are {', '.join(at)}")
         k, inputs = at[id], self.inputs
         if k >= len(inputs.rigorous):
-            return self.compensate(id)[0]
+            return self.compensated[id][0]
         values, form = self.inspection.solution.values, inputs.forms[k]
         p = np.concatenate([values[IMAGE][k], values[SENSOR][inputs.sensor[k]]])
         return refined_image(inputs.rigorous[k].image, form, change_of(form.sizes, p))
@@ -204,13 +215,15 @@ class Refinement(TableMethods):
         bias = np.asarray(self.inspection.solution.values[RPC_IMAGE].bias)[at[id]]
         return RpcBias(*bias[:, :terms])
 
-    def compensate(self, id: str) -> tuple[RpcImage, RpcCheck | None]:
-        """An image with RPC that contain its bias, and the residuals of their fit (None for a
-        shift, which is exact)."""
-        bias = self.bias(id)
-        one = next(one for one in self.inputs.rpc if one.id == id)
-        rpc, check = apply_bias(one.image.rpc, bias)
-        return dataclasses.replace(one.image, rpc=rpc), check
+    @functools.cached_property
+    def compensated(self) -> dict[str, tuple[RpcImage, RpcCheck | None]]:
+        """By id the images with RPC that contain their biases, and the residuals of their fit (None
+        for a shift, which is exact)."""
+        found = {}
+        for one in self.inputs.rpc:
+            rpc, check = apply_bias(one.image.rpc, self.bias(one.id))
+            found[one.id] = dataclasses.replace(one.image, rpc=rpc), check
+        return found
 
     def image_points(self) -> list[dict]:
         """One row per image point used, image by image: ids, v, r and w of both

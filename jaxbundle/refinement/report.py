@@ -22,7 +22,10 @@ def to_json(result: "Refinement") -> dict:
     sigma = found.sigma
     document = {
         "sigma0": result.sigma0,
+        "robust_sigma0": result.robust_sigma0,
         "redundancy": result.redundancy,
+        "counts": result.counts(),
+        "rays": {str(k): n for k, n in result.rays().items()},
         "steps": found.steps,
         "global_test": result.global_test(),
         "warnings": list(result.warnings),
@@ -61,6 +64,8 @@ def to_json(result: "Refinement") -> dict:
         ],
         "removed": [{"observation": b.name, "test": b.test} for b in result.removed],
     }
+    if heights := result.terrain_heights():
+        document["terrain_heights"] = heights
     if result.distances():
         document["distances"] = result.distances()
     if result.check is not None:
@@ -88,23 +93,37 @@ def report(
     roles = [result.points.role[k] for k in result.inspection.declared.rays.points]
     counts = ", ".join(f"{roles.count(role)} {role}" for role in ("control", "tie"))
     frames = 0 if result.frames is None else len(result.frames.images)
+    rpc = len(result.inputs.rpc)
+    rays = ", ".join(f"{n} with {k}" for k, n in result.rays().items())
+    sums = result.counts()
+    redundancy = sums.pop("redundancy")
     lines = [
         "Refinement of scanner images",
         "",
         *([f"verdict          {verdict}"] if verdict else []),
-        f"scanner images   {len(result.images)}, photographs {frames}",
+        f"scanner images   {len(result.images)}{f', {rpc} with RPC' if rpc else ''}, "
+        f"photographs {frames}",
         f"points           {counts}; {len(used)} image points",
-        f"sigma0           {result.sigma0:.4f}   redundancy {result.redundancy}, "
-        f"{found.steps} steps",
+        f"points by rays   {rays}",
+        f"counts           {', '.join(f'{word} {n}' for word, n in sums.items() if n)}",
+        f"sigma0           {result.sigma0:.4f} (robust {result.robust_sigma0:.4f})   redundancy "
+        f"{redundancy}, {found.steps} steps",
         f"chi2 test        {describe_test(result.global_test(), UNIT_OF_WEIGHT)}",
     ]
     scanner_ids = [image.id for image in result.images]
-    for id in result.inspection.declared.inputs.ids:
-        v = np.array([row["v"] for row in used if row["image"] == id])
-        if len(v):
+    by_image = {id: [] for id in result.inputs.ids}
+    for row in used:
+        by_image[row["image"]].append(row["v"])
+    for id, v in by_image.items():
+        if v:
+            v = np.array(v)
             unit = "lines, pixels" if id in scanner_ids else "camera's unit"
             rms = np.sqrt((v**2).mean(0))
             lines.append(f"RMS of image {id}: {rms[0]:.3f} {rms[1]:.3f} ({unit})")
+    heights = [row for row in result.terrain_heights() if not row["removed"]]
+    if heights:
+        v = np.array([row["v"] for row in heights])
+        lines.append(f"RMS of {len(v)} terrain heights: {np.sqrt((v**2).mean()):.3f} m")
     if result.warnings:
         lines += ["", "Warnings", *(f"  {warning}" for warning in result.warnings)]
     lines += ["", "Unknowns", *_unknowns(result)]

@@ -28,7 +28,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, geodetic
 from jaxbundle.geometry.vectors import along
 from jaxbundle.leastsquares.declarations import Kind
-from jaxbundle.leastsquares.indexing.indices import round_up
+from jaxbundle.leastsquares.indexing.indices import fill_up
 from jaxbundle.leastsquares.spaces import Change, WithoutChart
 from jaxbundle.pushbroom.rpc import ABOVE_DOMAIN, Rpc, domain, fit_inverse, sight
 from jaxbundle.pushbroom.rpc_bias import (
@@ -180,8 +180,7 @@ def misclosures(
     """v of measured places of points X in the rows `image` of the table of RPC images, and the
     `RpcStatus` of the points."""
     n, images = len(image), jax.tree.map(np.asarray, images)
-    # padded by the last one: similar numbers of points share a program
-    padded = np.minimum(np.arange(round_up(n)), n - 1)
+    padded = fill_up(n)
     space = BiasSpace(images.bias.shape[-1])
     at = np.asarray(image)[padded], np.asarray(X)[padded], np.asarray(places)[padded]
     v, status = _misclosures(space, images, *at)
@@ -189,15 +188,24 @@ def misclosures(
 
 
 @compile_once
-def lines_of_sight(
-    rpc: Rpc, places: Float[AnyArray, "n 2"]
+def _lines_of_sight(
+    rpc: Rpc, image: Int[AnyArray, " n"], places: Float[AnyArray, "n 2"]
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
-    """A point on the line of sight of each place, above all terrain, and the direction downwards;
-    Earth-fixed, without the bias."""
-    inverse = fit_inverse(rpc)
+    images = rpc, jax.vmap(fit_inverse)(rpc)
 
-    def line_of_sight(place: Float[Array, "2"]) -> tuple[Array, Array]:
-        top, d = sight(rpc, place[0], place[1], inverse=inverse)
+    def line_of_sight(row: Int[Array, ""], place: Float[Array, "2"]) -> tuple[Array, Array]:
+        one, inverse = jax.tree.map(lambda x: x[row], images)
+        top, d = sight(one, place[0], place[1], inverse=inverse)
         return jnp.stack(along(top, d, -ABOVE_DOMAIN)), jnp.stack(d)
 
-    return jax.vmap(line_of_sight)(places)
+    return jax.vmap(line_of_sight)(image, places)
+
+
+def lines_of_sight(
+    rpcs: list[Rpc], image: Int[np.ndarray, " n"], places: Float[np.ndarray, "n 2"]
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """A point on the line of sight of each place in the images `image`, above all terrain, and the
+    direction downwards; Earth-fixed, without a bias."""
+    padded = fill_up(len(image))
+    found = _lines_of_sight(stack_images(rpcs, 1).rpc, image[padded], places[padded])
+    return tuple(np.asarray(x)[: len(image)] for x in found)

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.leastsquares.declarations import Kind
-from jaxbundle.leastsquares.indexing.indices import round_up
+from jaxbundle.leastsquares.indexing.indices import fill_up
 from jaxbundle.pushbroom.terrain import Cell, Terrain, cell_at, grid_place, height_in_cell
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, Scalar
@@ -89,8 +89,7 @@ def find_cells(
 ) -> tuple[Cell, Float[np.ndarray, " n"]]:
     """The cells that points are in, and v there; NaN where the model has no height."""
     n = len(X)
-    # padded by the last one: similar numbers of points share a program
-    padded = np.asarray(X)[np.minimum(np.arange(round_up(n)), n - 1)]
+    padded = np.asarray(X)[fill_up(n)]
     found = _cells(terrain_height(terrain), np.asarray(terrain.heights), padded)
     return jax.tree.map(lambda x: np.asarray(x)[:n], found)
 
