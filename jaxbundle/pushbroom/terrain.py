@@ -210,7 +210,10 @@ def _first_hit(path: Path, heights: Float[AnyArray, "rows columns"], over_voids:
         middle = (tau + out) / 2
         x, y = value(px, middle), value(py, middle)
         cell = cell_at(heights, jnp.floor(x), jnp.floor(y))
-        f = [value(ph, t) - height_in_cell(cell, value(px, t), value(py, t)) for t in (tau, middle, out)]
+        f = [
+            value(ph, t) - height_in_cell(cell, value(px, t), value(py, t))
+            for t in (tau, middle, out)
+        ]
         part = _first_root(*f)
         # below the terrain where heights begin again: it was met in the void
         under = void & (f[0] < 0)

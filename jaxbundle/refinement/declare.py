@@ -409,7 +409,9 @@ def _biases(images: list[RpcScannerImage]) -> tuple[CorrectionTable, list[Shared
         for i, k in np.argwhere(free).tolist()
     ]
     prior = np.where(free, sigma, np.inf)
-    priors = [BIAS_PRIORS((np.arange(len(images)),), sigma=prior)] if np.isfinite(prior).any() else []
+    priors = (
+        [BIAS_PRIORS((np.arange(len(images)),), sigma=prior)] if np.isfinite(prior).any() else []
+    )
     return CorrectionTable(table, priors), columns
 
 

@@ -154,9 +154,9 @@ def _unknowns(result: "Refinement") -> Iterator[str]:
 
 
 def _tests(rows: list[dict], most: int) -> Iterator[str]:
-    worst = lambda row: np.nan_to_num(np.abs(row["w"])).max()
+    worst = np.nan_to_num(np.abs([row["w"] for row in rows]).reshape(-1, 2)).max(1)
     yield f"  {'image':12s} {'point':12s} {'v':>17s} {'r':>11s} {'w':>15s} {'MDB/σ':>13s}"
-    for row in sorted(rows, key=worst, reverse=True)[:most]:
+    for row in (rows[k] for k in np.argsort(-worst, kind="stable")[:most]):
         pair = lambda values, form: " ".join(
             format(x, form) if np.isfinite(x) else f"{'–':>{form.split('.')[0]}}" for x in values
         )

@@ -100,7 +100,7 @@ def rpc_image(place, k, rng):
 @dataclasses.dataclass
 class Block:
     """A block and its truth: images, ground points [n, 3], and by image the places without bias of
-    all points."""
+    all points and the terms of these; attitudes of the line scanners [images, 3]."""
 
     images: list
     X: np.ndarray
@@ -108,6 +108,7 @@ class Block:
     places: np.ndarray
     seen: np.ndarray
     terms: np.ndarray
+    attitudes: np.ndarray
 
     def draw(self, rng, noise=1.0):
         """Arguments of `refine`, and the bias of every RPC image [images, 2, terms]."""
@@ -149,15 +150,10 @@ def block(rpc=12, scanner=6, points=60, control=8, checks=4, degree=1, rays=4, s
         line, sample, _ = (np.asarray(v) for v in project_rpc(image.rpc, *ground))
         places.append(np.stack([line, sample], 1))
         terms.append(np.stack(bias_terms(image.rpc, line, sample)))
-    true = [
-        dataclasses.replace(
-            image, offsets=dataclasses.replace(
-                image.offsets, attitude=jnp.asarray(30 * ARCSEC * rng.normal(size=3))
-            )
-        )
-        for image in rigorous
-    ]  # fmt: skip
-    for image in true:
+    attitudes = 30 * ARCSEC * rng.normal(size=(scanner, 3))
+    for image, attitude in zip(rigorous, attitudes):
+        offsets = dataclasses.replace(image.offsets, attitude=jnp.asarray(attitude))
+        image = dataclasses.replace(image, offsets=offsets)
         found = project_points(image, make_search(image), X.T, most=1)
         assert (np.asarray(found.count) == 1).all()
         places.append(np.stack([np.ravel(found.line), np.ravel(found.pixel)], 1))
@@ -176,7 +172,7 @@ def block(rpc=12, scanner=6, points=60, control=8, checks=4, degree=1, rays=4, s
     for p in np.flatnonzero(seen.sum(0) < 3):
         seen[np.flatnonzero(on[:, p])[:3], p] = True
     roles = ("control",) * control + ("check",) * checks + ("tie",) * (points - control - checks)
-    return Block(images, X, roles, places, seen, np.array(terms))
+    return Block(images, X, roles, places, seen, np.array(terms), attitudes)
 
 
 def moved(observations, row, by):

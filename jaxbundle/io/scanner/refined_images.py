@@ -21,9 +21,7 @@ def names_of_images(file: RefineFile) -> list[str]:
         name
         for one in file.images
         for name in (
-            [f"{one.id}{file.rpc_ending}"]
-            if isinstance(one, RpcScannerImage)
-            else names_of(one.id)
+            [f"{one.id}{file.rpc_ending}"] if isinstance(one, RpcScannerImage) else names_of(one.id)
         )
     ]
 

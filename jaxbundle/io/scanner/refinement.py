@@ -312,7 +312,9 @@ def _read_rpc_image(
             raise InputError(
                 f'{section.where}bias = "stated", but {said}; give σ in pixels, or "free"'
             )
-        warnings += (f"{said}: the bias of image {id!r} is free; give bias in [unknowns] a prior σ",)
+        warnings += (
+            f"{said}: the bias of image {id!r} is free; give bias in [unknowns] a prior σ",
+        )
         return RpcScannerImage(id, found.image, prior_of_bias(degree)), warnings
     values = given if isinstance(given, list) else [given, given]
     if len(values) != 2:

@@ -43,6 +43,7 @@ def _describe(result: Refinement, origin: Origin) -> Page:
         "points": Listing("Points", _points(result), "points.csv"),
         "checks": Listing("Check points, computed − given", _checks(result), "result.json"),
         "observations": Listing("Image points", _observations(used), "result.json"),
+        "heights": Listing("Terrain heights", _terrain_heights(result), "result.json"),
         "removed": Listing(
             "Removed as blunders",
             {
@@ -80,14 +81,16 @@ def _list_numbers(result: Refinement, used: Sequence[ImagePoint]) -> str:
     roles = [result.points.role[k] for k in result.inspection.declared.rays.points]
     frames = 0 if result.frames is None else len(result.frames.images)
     rows = [
-        ("Scanner images", len(result.images)),
+        ("Scanner images", f"{len(result.images)}, {len(result.inputs.rpc)} with RPC"),
         ("Photographs", frames),
         ("Points", ", ".join(f"{roles.count(role)} {role}" for role in ("control", "tie"))),
+        ("Points by rays", ", ".join(f"{n} with {k}" for k, n in result.rays().items())),
         ("Image points", len(used)),
+        ("Counts", ", ".join(f"{word} {n}" for word, n in result.counts().items() if n)),
         (
             "σ0",
-            f"{result.sigma0:.4f}, redundancy {result.redundancy}, "
-            f"{count(result.inspection.steps, 'step')}",
+            f"{result.sigma0:.4f} (robust {result.robust_sigma0:.4f}), redundancy "
+            f"{result.redundancy}, {count(result.inspection.steps, 'step')}",
         ),
     ]
     return f"<h3>Result</h3>\n{facts(rows)}"
@@ -151,6 +154,18 @@ def _checks(result: Refinement) -> Columns:
         found[f"d{k}"] = Column(check.difference[:, k], f"d {axis} [m]")
         found[f"s{k}"] = Column(check.sigma[:, k], f"σ {axis} [m]")
     return found | {"rays": Column(np.asarray(check.rays), "rays")}
+
+
+def _terrain_heights(result: Refinement) -> Columns:
+    rows = [row for row in result.terrain_heights() if not row["removed"]]
+    if not rows:
+        return {}
+    return {
+        "point": Column(_words(row["point"] for row in rows), "point"),
+        "v": Column(numbers(row["v"] for row in rows), "v [m]"),
+        "r": Column(numbers(row["r"] for row in rows), "r", 3),
+        "tau": Column(numbers(row["w"] for row in rows), "w", 2),
+    }
 
 
 def _observations(used: Sequence[ImagePoint]) -> Columns:
