@@ -110,7 +110,8 @@ def main() -> int:
                 wrong.append(f"errors of {name} have an RMS of {rms:.3f} σ, not 0.9 to 1.1")
     if given.json != "-":
         print(machine.in_words(figures["machine"]))
-        print(f"{given.images} images, {given.points} points, {figures['image_points']} image points")
+        print(f"{given.images} images, {given.points} points, "
+              f"{figures['image_points']} image points")  # fmt: skip
         for name in ("refine", "snoop", "report"):
             print(f"{name:8s} first call {figures[f'{name}_first_s']:.2f} s, further ones "
                   f"{figures[f'{name}_further_s']:.2f} s")  # fmt: skip

@@ -8,7 +8,7 @@ import numpy as np
 from jaxbundle import cameras
 from jaxbundle.geometry import matrix_from_quaternion, omega_phi_kappa_from_matrix
 from jaxbundle.network.tables import Images, Network, Points
-from jaxbundle.refinement.declare import PHOTOGRAPH
+from jaxbundle.refinement.inputs import PHOTOGRAPH
 from jaxbundle.refinement.refining import Refinement
 
 COLUMNS = ("id", "role", "X", "Y", "Z", "sX", "sY", "sZ")

@@ -17,7 +17,7 @@ from jaxbundle.network.tables import Network, Observations
 from jaxbundle.orientation.intersection import intersection
 from jaxbundle.orientation.status import Status
 from jaxbundle.pushbroom.image import PushbroomImage, pose_at
-from jaxbundle.refinement.declare import Rays, RefinementInput
+from jaxbundle.refinement.inputs import Rays, RefinementInput
 from jaxbundle.refinement.rpc_points import lines_of_sight
 from jaxbundle.refinement.spline import MIN_INTERVALS
 from jaxbundle.refinement.tables import (

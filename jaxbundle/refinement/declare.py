@@ -6,7 +6,6 @@ network.
 """
 
 import dataclasses
-import math
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -20,135 +19,23 @@ from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.problem import Problem, make_problem, with_data
 from jaxbundle.network.declare import DeclaredNetwork
 from jaxbundle.network.declare import declare as declare_network
-from jaxbundle.network.tables import EXTERIOR, Distances, Network, Observations, Points
+from jaxbundle.network.tables import Distances, Network, Points
 from jaxbundle.refinement import kinds
-from jaxbundle.refinement.freedom import (
-    ARCSECONDS_PER_RADIAN,
-    Form,
-    UnknownName,
-    make_form,
-    names,
-    pad_forms,
-    priors,
+from jaxbundle.refinement.correction_tables import (
+    SharedUnknown,
+    columns_of_photographs,
+    declare_corrections,
 )
-from jaxbundle.refinement.rpc_points import (
-    BIAS_PRIORS,
-    RPC_IMAGE,
-    RPC_POINTS,
-    BiasSpace,
-    misclosures,
-    names_of_terms,
-    stack_images,
-)
-from jaxbundle.refinement.tables import (
-    AnyScannerImage,
-    GroundPoints,
-    RpcScannerImage,
-    ScannerImage,
-)
+from jaxbundle.refinement.inputs import IMAGE, PHOTOGRAPH, Rays, RefinementInput
+from jaxbundle.refinement.rpc_points import RPC_IMAGE, RPC_POINTS, misclosures
+from jaxbundle.refinement.start_checks import check_columns, check_near
 from jaxbundle.refinement.terrain_heights import (
     TERRAIN_HEIGHTS,
-    HeightModel,
     choose_covered,
     terrain_heights,
     update_cells,
 )
-from jaxbundle.types import Index, present
-
-IMAGE, SENSOR, PHOTOGRAPH = "scanner image", "sensor", "image"
-"""Tables of the engine; `RPC_IMAGE` is the one of RPC images."""
-
-
-class Rays(NamedTuple):
-    """Which measurements an adjustment uses: rows of the two tables, and the points of them."""
-
-    scanner: Int[np.ndarray, " rows"]
-    frame: Int[np.ndarray, " rows"]
-    points: Int[np.ndarray, " points"]
-
-
-@dataclasses.dataclass(frozen=True)
-class RefinementInput:
-    """The input of a refinement: scanner images, the `rigorous` ones with the forms of their
-    unknowns and the rows of their sensors before those with RPC; points, measurements, photographs,
-    and the rows of their points; a terrain model; the `origin` [3] of all coordinates of the
-    engine."""
-
-    rigorous: list[ScannerImage]
-    rpc: list[RpcScannerImage]
-    points: GroundPoints
-    observations: Observations
-    frames: Network | None
-    terrain: HeightModel | None
-    forms: list[Form]
-    sensor: Int[np.ndarray, " images"]
-    frame_point: Int[np.ndarray, " points"]
-    origin: Float[np.ndarray, "3"]
-
-    @property
-    def images(self) -> list[AnyScannerImage]:
-        """All scanner images, in the order of their rows in `observations`."""
-        return [*self.rigorous, *self.rpc]
-
-    @property
-    def ids(self) -> list[str]:
-        """The ids of all images, photographs after scanner images."""
-        frames = () if self.frames is None else self.frames.images.id
-        return [*(one.id for one in self.images), *frames]
-
-    def kind(self, i: Index) -> kinds.ScannerPoint:
-        """The equations of a rigorous image."""
-        one = self.rigorous[i]
-        return kinds.ScannerPoint(one.image.corrections, one.earth, self.forms[i].sizes)
-
-    def lines(
-        self,
-        i: Index,
-        values: Values,
-        X: Float[np.ndarray, "n 3"],
-        rows: Int[np.ndarray, " n"],
-    ) -> tuple[kinds.MeasuredLine, Float[np.ndarray, "n 2"]]:
-        """Of rows of the measurements in image i, of points X: what belongs to their places, and
-        v."""
-        p = values[IMAGE][i], values[SENSOR][self.sensor[i]]
-        one, places = self.rigorous[i].image, self.observations.xy[rows]
-        return kinds.lines_of(self.kind(i), one, self.forms[i], self.origin, *p, X, places)
-
-
-def gather(
-    images: list[AnyScannerImage],
-    points: GroundPoints,
-    observations: Observations,
-    frames: Network | None,
-    terrain: HeightModel | None = None,
-) -> RefinementInput:
-    """The input with rigorous images before those with RPC; the forms of the unknowns, the sensors,
-    the origin."""
-    rigorous = [one for one in images if isinstance(one, ScannerImage)]
-    rpc = [one for one in images if isinstance(one, RpcScannerImage)]
-    row = {one.id: k for k, one in enumerate([*rigorous, *rpc])}
-    rows = np.array([row[one.id] for one in images])[observations.image]
-    observations = dataclasses.replace(observations, image=rows)
-    forms = pad_forms([make_form(one.image, one.earth, one.freedom) for one in rigorous])
-    sensors = list(dict.fromkeys(map(sensor_of, rigorous)))
-    sensor = np.array([sensors.index(sensor_of(one)) for one in rigorous], int)
-    at = {id: k for k, id in enumerate(points.id)}
-    of_frames = [] if frames is None else [at[id] for id in frames.points.id]
-    # Coordinates relative to a point near by lose fewer digits; but corrections, polynomials and
-    # terrain need Earth-fixed positions.
-    absolute = bool(rpc) or terrain is not None
-    absolute |= any(one.image.corrections.any for one in rigorous)
-    known = points.X[np.isfinite(points.X).all(1)]
-    origin = np.zeros(3) if absolute or not len(known) else np.round(known.mean(0))
-    frame_point = np.array(of_frames, int)
-    return RefinementInput(
-        rigorous, rpc, points, observations, frames, terrain, forms, sensor, frame_point, origin
-    )
-
-
-def sensor_of(one: ScannerImage) -> str:
-    """The name of the sensor of an image, its own if it shares none."""
-    return one.sensor or one.id
+from jaxbundle.types import present
 
 
 class ImagePointSet(NamedTuple):
@@ -161,17 +48,6 @@ class ImagePointSet(NamedTuple):
     rows: Int[np.ndarray, " n"]
     image: Int[np.ndarray, " n"]
     point: Int[np.ndarray, " n"]
-
-
-class SharedUnknown(NamedTuple):
-    """An unknown that points share: its name, the σ of its prior (inf: none), and where it is among
-    the changes of the tables."""
-
-    name: UnknownName
-    sigma: float
-    table: str
-    row: int
-    direction: int
 
 
 @dataclasses.dataclass(frozen=True)
@@ -258,7 +134,7 @@ def declare(
     index = np.full(len(points), -1)  # of every point among those used
     index[chosen] = np.arange(n)
     X = X - inputs.origin
-    corrections, columns = _corrections(inputs)
+    corrections, columns = declare_corrections(inputs)
     tables = [one.table for one in corrections]
     # S of the scanner points is evaluated here, at the start, and again in `rescale`
     values = values or {t.name: t.value for t in tables}
@@ -269,7 +145,7 @@ def declare(
         more, of_cameras = _photographs(inputs, rays, network, parts)
         observed += more.observations
         tables += [t for t in more.tables if t.name != "point"]
-        columns += _columns_of_photographs(network, tables, of_cameras)
+        columns += columns_of_photographs(network, tables, of_cameras)
     seen = np.bincount(np.concatenate([part.point for part in parts]), minlength=n)
     table, control, at = _points(inputs, chosen, X, seen)
     levelled, uncovered = np.zeros(0, int), np.zeros(0, int)
@@ -365,91 +241,9 @@ def _scanner_points(
         observed.append(given)
     if away:
         rows, v = map(np.concatenate, zip(*away))
-        _check_columns(inputs, rows, v)
-        _check_near(inputs, rows, v)
+        check_columns(inputs, rows, v)
+        check_near(inputs, rows, v)
     return observed, parts
-
-
-class CorrectionTable(NamedTuple):
-    """A table of unknowns of images, and the observations that are their priors (none: all free or
-    held)."""
-
-    table: Table
-    priors: list[ObservationSet]
-
-
-def _corrections(inputs: RefinementInput) -> tuple[list[CorrectionTable], list[SharedUnknown]]:
-    """The tables of unknowns of scanner images with their priors, and the unknowns."""
-    tables, columns = [], []
-    if inputs.rigorous:
-        tables, columns = _rigorous_corrections(inputs)
-    if inputs.rpc:
-        table, of_rpc = _biases(inputs.rpc)
-        tables, columns = [*tables, table], columns + of_rpc
-    return tables, columns
-
-
-def _biases(images: list[RpcScannerImage]) -> tuple[CorrectionTable, list[SharedUnknown]]:
-    """The table of RPC images with the terms of the highest degree, those of others held."""
-    terms = max(np.shape(one.bias_sigma)[1] for one in images)
-    widen = lambda s: np.pad(np.asarray(s, float), ((0, 0), (0, terms - np.shape(s)[1])))
-    sigma = np.stack([widen(one.bias_sigma).ravel() for one in images])
-    free, names = sigma > 0, names_of_terms(terms)
-    start = stack_images([one.image.rpc for one in images], terms)
-    labels = [one.id for one in images]
-    table = Table(RPC_IMAGE, start, BiasSpace(terms), free, labels, tuple(names))
-    columns = [
-        SharedUnknown(
-            UnknownName(f"image {images[i].id}", names[k], "pixel", 1.0, names[k]),
-            float(sigma[i, k]),
-            RPC_IMAGE,
-            i,
-            k,
-        )
-        for i, k in np.argwhere(free).tolist()
-    ]
-    prior = np.where(free, sigma, np.inf)
-    priors = (
-        [BIAS_PRIORS((np.arange(len(images)),), sigma=prior)] if np.isfinite(prior).any() else []
-    )
-    return CorrectionTable(table, priors), columns
-
-
-def _rigorous_corrections(
-    inputs: RefinementInput,
-) -> tuple[list[CorrectionTable], list[SharedUnknown]]:
-    """The corrections of rigorous images, and of their sensors."""
-    images, own = inputs.rigorous, inputs.forms[0].image_unknowns
-    sigma = np.stack([priors(form, one.freedom) for form, one in zip(inputs.forms, images)])
-    # The unknowns of a sensor have the σ of its first image, or of the first that states one (NaN:
-    # no such unknown).
-    first = np.unique(inputs.sensor, return_index=True)[1]
-    of_sensor = sigma[first, own:]
-    for i, row in enumerate(inputs.sensor):
-        absent = np.isnan(of_sensor[row])
-        of_sensor[row, absent] = sigma[i, own:][absent]
-    named = [names(f.sizes, one.id, sensor_of(one)) for f, one in zip(inputs.forms, images)]
-    tables, columns = [], [[] for _ in images]
-    # The vector of an image is its own unknowns, then those of its sensor: two tables, so that
-    # images of one sensor touch the same row. Columns that are held in all rows leave the space.
-    own_part = (IMAGE, sigma[:, :own], range(len(images)), 0)
-    for title, sigma, of, start in (own_part, (SENSOR, of_sensor, first, own)):
-        sigma = np.nan_to_num(sigma, nan=0.0, posinf=np.inf)
-        moving = np.flatnonzero((sigma > 0).any(0)).tolist()
-        space, free = kinds.VectorRow(sigma.shape[1], tuple(moving)), sigma[:, moving] > 0
-        labels = [images[i].id if title == IMAGE else sensor_of(images[i]) for i in of]
-        words = tuple(named[0][start + k].parameter for k in moving)
-        table = Table(title, np.zeros(sigma.shape), space, free, labels, words)
-        prior, rows = np.where(sigma > 0, sigma, np.inf), (np.arange(table.rows),)
-        given = [kinds.priors(title)(rows, sigma=prior)] if np.isfinite(prior).any() else []
-        tables.append(CorrectionTable(table, given))
-        for row, i in enumerate(of):
-            columns[i] += [
-                SharedUnknown(named[i][start + k], float(sigma[row, k]), title, row, d)
-                for d, k in enumerate(moving)
-                if free[row, d]
-            ]
-    return tables, [column for of_image in columns for column in of_image]
 
 
 def _points(
@@ -501,74 +295,4 @@ def _network_of(
         points=Points(ids, ("tie",) * n, X, np.full((n, 3), np.nan)),
         observations=dataclasses.replace(seen, point=index[inputs.frame_point[seen.point]]),
         distances=Distances(ends[kept], d.value[kept], d.sigma[kept]),
-    )
-
-
-def _columns_of_photographs(
-    network: Network, tables: list[Table], of_cameras: dict[str, tuple[str, int]]
-) -> list[SharedUnknown]:
-    """Their unknowns: of every image, and of its camera for the first image."""
-    columns, called = [], {t.name: t for t in tables}
-    for i, id in enumerate(network.images.id):
-        for k in np.flatnonzero(called["image"].free[i]).tolist():
-            word = EXTERIOR[k]
-            unit = ("m", 1.0) if k < 3 else ("arcsec", ARCSECONDS_PER_RADIAN)
-            name = UnknownName(f"photograph {id}", word, *unit, word)
-            columns.append(SharedUnknown(name, math.inf, "image", i, k))
-        c = network.images.camera[i]
-        camera, (title, row) = network.cameras[c], of_cameras[network.cameras[c].id]
-        if c in network.images.camera[:i]:  # named with its first image
-            continue
-        for d in np.flatnonzero(called[title].free[row]).tolist():
-            word = called[title].parameters[d]
-            name = UnknownName(f"camera {camera.id}", word, "", 1.0, word)
-            columns.append(SharedUnknown(name, camera.sigma.get(word, math.inf), title, row, d))
-    return columns
-
-
-def _check_columns(
-    inputs: RefinementInput, rows: Int[np.ndarray, " n"], v: Float[np.ndarray, "n 2"]
-) -> None:
-    """Refuse measurements whose line and pixel are exchanged, where points with given coordinates
-    show it."""
-    points, observations = inputs.points, inputs.observations
-    given = np.isin(np.array(points.role, dtype=object)[observations.point[rows]],
-                    ("control", "check"))  # fmt: skip
-    xy = observations.xy[rows][given]
-    off, other = (
-        np.median(np.linalg.norm(xy + v[given] - places, axis=1)) if len(xy) else 0.0
-        for places in (xy, xy[:, ::-1])
-    )
-    # An order of magnitude: start values explain a hundred pixels, but not that these vanish. Three
-    # points are not all on the diagonal, or near another's place, by chance.
-    if len(xy) >= 3 and off > 10 * other:
-        raise InputError(
-            f"{observations.source.name}: line and pixel seem to be exchanged: the points with "
-            f"given coordinates are {off:.0f} pixels from their measurements (median), and "
-            f"{other:.0f} from them with line and pixel exchanged; check the names of the columns"
-        )
-
-
-def _check_near(
-    inputs: RefinementInput, rows: Int[np.ndarray, " n"], v: Float[np.ndarray, "n 2"]
-) -> None:
-    """Refuse points far from their measurement: swapped or wrong."""
-    points, observations = inputs.points, inputs.observations
-    size = np.array([(one.image.lines, one.image.pixels) for one in inputs.images])
-    # Farther than two images off no start values are so bad: coordinates in another order, frame or
-    # unit are; `~(… <=)` also catches NaN.
-    far = (~(np.abs(v) <= 2.0 * size[observations.image[rows]])).any(1)
-    if not far.any():
-        return
-    row, away = int(rows[far.argmax()]), v[far.argmax()]
-    p, id = observations.point[row], inputs.images[observations.image[row]].id
-    said = (
-        f"{away[0]:.0f} lines and {away[1]:.0f} pixels away"
-        if np.isfinite(away).all()
-        else "where the camera does not look"
-    )
-    raise InputError(
-        f"{observations.source(row)}: {points.role[p]} point {points.id[p]!r} of "
-        f"{points.source(p)} is off image {id!r}: its coordinates are {said}; check "
-        "their order, frame and units, and at the id"
     )

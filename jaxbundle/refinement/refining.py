@@ -17,10 +17,10 @@ from jaxbundle.float64 import require_x64
 from jaxbundle.geometry.ellipsoid import Ellipsoid, geodetic
 from jaxbundle.leastsquares.quality.correlation import correlation_matrix
 from jaxbundle.leastsquares.quality.global_test import chi_squared_test
+from jaxbundle.leastsquares.quality.robust import residual_lengths, robust_scale
 from jaxbundle.network.blunders import Removed
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import STATED, Network, Observations
-from jaxbundle.leastsquares.quality.robust import residual_lengths, robust_scale
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.rpc import RpcStatus
 from jaxbundle.pushbroom.rpc_bias import RpcBias, apply_bias
@@ -28,8 +28,9 @@ from jaxbundle.pushbroom.rpc_fit import RpcCheck
 from jaxbundle.pushbroom.rpc_image import RpcImage
 from jaxbundle.refinement.build import check_input, choose_rays, start_points
 from jaxbundle.refinement.check_points import RefinementCheckPoints, intersect
-from jaxbundle.refinement.declare import IMAGE, SENSOR, RefinementInput, declare, gather
+from jaxbundle.refinement.declare import declare
 from jaxbundle.refinement.freedom import UnknownName, change_of
+from jaxbundle.refinement.inputs import IMAGE, SENSOR, RefinementInput, gather
 from jaxbundle.refinement.inspection import RefinementInspection, adjust
 from jaxbundle.refinement.refined_image import refined_image
 from jaxbundle.refinement.report import report as describe_refinement
@@ -320,8 +321,8 @@ def _without_terrain(found: RefinementInspection) -> Iterator[str]:
     if len(uncovered):
         ids = np.array(inputs.points.id)[found.declared.rays.points[uncovered]]
         yield (
-            f"{present(inputs.terrain).name} has no height at {count(len(ids), 'tie point')}, which "
-            f"are adjusted without: {list_some(ids)}"
+            f"{present(inputs.terrain).name} has no height at {count(len(ids), 'tie point')}, "
+            f"adjusted without one: {list_some(ids)}"
         )
 
 

@@ -208,8 +208,8 @@ def _check_on_image(
     which = f"which has {size}" if sized else "as far as its coefficients hold"
     raise InputError(
         f"{observations.source(row)}: point {points.id[observations.point[row]]!r} in image "
-        f"{one.id!r}: {('line', 'pixel')[k]} {observations.xy[row, k]:g} is off the image, {which}; "
-        f"{low:g} to {high:g} is expected{hint}"
+        f"{one.id!r}: {('line', 'pixel')[k]} {observations.xy[row, k]:g} is off the image, "
+        f"{which}; {low:g} to {high:g} is expected{hint}"
     )
 
 

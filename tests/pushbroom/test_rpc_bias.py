@@ -27,7 +27,9 @@ def control(bias, noise=0.0, rng=None):
     return RpcTable(*PLACES, *noisy)
 
 
-@pytest.mark.parametrize("model, bias", [("shift", SHIFT), ("affine", BIAS), ("quadratic", QUADRATIC)])
+@pytest.mark.parametrize(
+    "model, bias", [("shift", SHIFT), ("affine", BIAS), ("quadratic", QUADRATIC)]
+)
 def test_an_injected_bias_is_found_and_put_into_the_coefficients(model, bias):
     fit = fit_bias(RPC, control(bias), model=model)
     np.testing.assert_allclose(fit.bias.line, bias.line, atol=1e-9)

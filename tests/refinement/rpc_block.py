@@ -25,8 +25,8 @@ from jaxbundle.pushbroom.scanner import FocalLine, LineTimes
 from jaxbundle.pushbroom.surfaces import Height
 from jaxbundle.pushbroom.trajectory import Trajectory
 from jaxbundle.refinement import Freedom, RpcScannerImage, ScannerImage, local_points
-from jaxbundle.refinement.rpc_points import prior_of_bias
 from jaxbundle.refinement.refining import east_north_up
+from jaxbundle.refinement.rpc_points import prior_of_bias
 
 RPC_SIZE = 4000
 SHIFT, VARIATION = 6.0, 0.8

@@ -37,12 +37,12 @@ def refine(
     from jaxbundle.cli.pushbroom.shared import warn
     from jaxbundle.io.networks.project import FILES, fill_project
     from jaxbundle.io.results.result_json import verdict_dict, without_nan
-    from jaxbundle.io.scanner.refinement import read_refinement
     from jaxbundle.io.scanner.refined_images import (
         describe_refits,
         names_of_images,
         write_images,
     )
+    from jaxbundle.io.scanner.refinement import read_refinement
     from jaxbundle.io.text.csv_tables import write_csv, write_text
     from jaxbundle.io.writing.fingerprints import files_read
     from jaxbundle.refinement import adjusted_photographs, point_rows, report, to_json

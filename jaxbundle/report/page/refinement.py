@@ -8,7 +8,7 @@ import numpy as np
 from jaxbundle.cameras import get_model
 from jaxbundle.network.columns import count
 from jaxbundle.refinement import Refinement, point_rows
-from jaxbundle.refinement.declare import PHOTOGRAPH
+from jaxbundle.refinement.inputs import PHOTOGRAPH
 from jaxbundle.report.layout import estimate
 from jaxbundle.report.page.columns import Column, numbers
 from jaxbundle.report.page.document import Listing, Page, Section, write
