@@ -41,8 +41,8 @@ class RpcBias(eqx.Module):
     """a₀, a₁, … and b₀, b₁, …, in pixels: as many of each as the degree of the bias needs, 1, 3 or
     6; terms that are left out are 0."""
 
-    line: Float[AnyArray, " terms"]
-    sample: Float[AnyArray, " terms"]
+    line: Float[AnyArray, " terms"] | tuple[Scalar, ...]
+    sample: Float[AnyArray, " terms"] | tuple[Scalar, ...]
 
 
 class BiasFit(eqx.Module):

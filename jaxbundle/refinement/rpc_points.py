@@ -26,7 +26,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, geodetic
-from jaxbundle.geometry.vectors import along
+from jaxbundle.geometry.vectors import Triple, along
 from jaxbundle.leastsquares.declarations import Kind
 from jaxbundle.leastsquares.indexing.indices import fill_up
 from jaxbundle.leastsquares.spaces import Change, WithoutChart
@@ -55,6 +55,13 @@ class BiasedRpc(NamedTuple):
     rpc: Rpc
 
 
+class RpcBlock(NamedTuple):
+    """A row of `BiasedRpc` as scalars, which blocks of observations are (`leastsquares.spaces`)."""
+
+    bias: tuple[tuple[Scalar, ...], ...]
+    rpc: Rpc
+
+
 @dataclasses.dataclass(frozen=True)
 class BiasSpace(WithoutChart):
     """The space of `BiasedRpc`: its bias changes, all terms of lines before those of samples."""
@@ -65,12 +72,11 @@ class BiasSpace(WithoutChart):
     def width(self) -> int:
         return 2 * self.terms
 
-    def prepare(self, value: BiasedRpc) -> BiasedRpc:
-        # scalars instead of arrays, as blocks of observations are (`leastsquares.spaces`)
+    def prepare(self, value: BiasedRpc) -> RpcBlock:
         unpacked = jax.tree.map(lambda x: tuple(x) if jnp.ndim(x) else x, value.rpc)
-        return BiasedRpc(tuple(map(tuple, value.bias)), unpacked)
+        return RpcBlock(tuple(map(tuple, value.bias)), unpacked)
 
-    def move(self, block: BiasedRpc, change: Change) -> BiasedRpc:
+    def move(self, block: RpcBlock, change: Change) -> RpcBlock:
         if not change:
             return block
         parts = change[: self.terms], change[self.terms :]
@@ -81,7 +87,7 @@ class BiasSpace(WithoutChart):
         return value._replace(bias=value.bias + change.reshape(2, self.terms))
 
     def difference(self, value: BiasedRpc, origin: BiasedRpc) -> Float[Array, " width"]:
-        return (value.bias - origin.bias).ravel()
+        return jnp.ravel(value.bias - origin.bias)
 
     def hold(
         self, value: BiasedRpc, given: BiasedRpc, free: Float[AnyArray, " width"]
@@ -97,14 +103,14 @@ class RpcPoint:
     earth: Ellipsoid
 
     def __call__(
-        self, image: BiasedRpc, X: tuple[Scalar, ...], measured: tuple[Scalar, ...]
+        self, image: RpcBlock, X: Triple, measured: tuple[Scalar, ...]
     ) -> tuple[Scalar, ...]:
         place = geodetic(self.earth, X)
         computed = project_compensated(image.rpc, RpcBias(*image.bias), *place)
         return tuple(value - given for value, given in zip(computed, measured))
 
 
-def _bias_itself(image: BiasedRpc, _: None) -> tuple[Scalar, ...]:
+def _bias_itself(image: RpcBlock, _: None) -> tuple[Scalar, ...]:
     return (*image.bias[0], *image.bias[1])
 
 
@@ -162,7 +168,7 @@ def _misclosures(
     places: Float[AnyArray, "n 2"],
 ) -> tuple[Float[Array, "n 2"], Int[Array, " n"]]:
     def of_one(
-        row: Int[Array, ""], X: Float[Array, "3"], place: Float[Array, "2"]
+        row: Int[AnyArray, ""], X: Float[AnyArray, "3"], place: Float[AnyArray, "2"]
     ) -> tuple[Array, Array]:
         block = jax.tree.map(lambda x: x[row], images)
         v = RPC_POINTS.residual(space.prepare(block), tuple(X), tuple(place))
@@ -193,7 +199,7 @@ def _lines_of_sight(
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
     images = rpc, jax.vmap(fit_inverse)(rpc)
 
-    def line_of_sight(row: Int[Array, ""], place: Float[Array, "2"]) -> tuple[Array, Array]:
+    def line_of_sight(row: Int[AnyArray, ""], place: Float[AnyArray, "2"]) -> tuple[Array, Array]:
         one, inverse = jax.tree.map(lambda x: x[row], images)
         top, d = sight(one, place[0], place[1], inverse=inverse)
         return jnp.stack(along(top, d, -ABOVE_DOMAIN)), jnp.stack(d)
@@ -208,4 +214,5 @@ def lines_of_sight(
     direction downwards; Earth-fixed, without a bias."""
     padded = fill_up(len(image))
     found = _lines_of_sight(stack_images(rpcs, 1).rpc, image[padded], places[padded])
-    return tuple(np.asarray(x)[: len(image)] for x in found)
+    centre, direction = (np.asarray(x)[: len(image)] for x in found)
+    return centre, direction

@@ -171,7 +171,7 @@ def is_same_earth(one: Ellipsoid | None, other: Ellipsoid | None) -> bool:
     if one is None or other is None:
         return one is other
     # a millimetre in the axes is a millimetre in height
-    return bool(np.allclose(one, other, rtol=0.0, atol=1e-3))
+    return all(abs(float(a) - float(b)) < 1e-3 for a, b in zip(one, other))
 
 
 def _limits(one: AnyScannerImage) -> tuple[tuple[float, float], ...]:
@@ -219,7 +219,7 @@ def check_observations(
     """Refuse measurements outside the image or the tables, duplicates, and invalid σ."""
     where = lambda row: (
         f"{observations.source(row)}: point {points.id[observations.point[row]]!r} in image "
-        f"{images[observations.image[row]].id!r}"
+        f"{images[int(observations.image[row])].id!r}"
     )
     _check_on_image(images, points, observations)
     wrong = ~(observations.sigma > 0).all(1)

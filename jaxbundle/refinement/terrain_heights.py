@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid
+from jaxbundle.geometry.vectors import Triple, Vector
 from jaxbundle.leastsquares.declarations import Kind
 from jaxbundle.leastsquares.indexing.indices import fill_up
 from jaxbundle.pushbroom.terrain import Cell, Terrain, cell_at, grid_place, height_in_cell
@@ -47,11 +48,11 @@ class TerrainHeight:
     step: tuple[float, float]
     columns: int
 
-    def place(self, X: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
+    def place(self, X: Vector) -> Triple:
         """(column, row, height) of a point."""
         return grid_place(X, self.earth, self.origin, self.step, self.columns)
 
-    def __call__(self, X: tuple[Scalar, ...], cell: Cell) -> tuple[Scalar]:
+    def __call__(self, X: Vector, cell: Cell) -> tuple[Scalar]:
         column, row, h = self.place(X)
         return (h - height_in_cell(cell, column, row),)
 
@@ -73,13 +74,13 @@ def terrain_heights(terrain: Terrain) -> Kind:
 def _cells(
     equation: TerrainHeight, heights: Float[AnyArray, "rows columns"], X: Float[AnyArray, "n 3"]
 ) -> tuple[Cell, Float[Array, " n"]]:
-    def of_one(X: Float[Array, "3"]) -> tuple[Cell, Scalar]:
-        column, row, h = equation.place(tuple(X))
+    def of_one(X: Float[AnyArray, "3"]) -> tuple[Cell, Array]:
+        column, row, h = equation.place(X)
         # a point on the last line of the grid is in the last cell
         last = [jnp.where(at == n - 1, n - 2.0, jnp.floor(at))
                 for at, n in zip((column, row), heights.shape[::-1])]  # fmt: skip
         cell = cell_at(heights, *last)
-        return cell, h - height_in_cell(cell, column, row)
+        return cell, jnp.asarray(h - height_in_cell(cell, column, row))
 
     return jax.vmap(of_one)(X)
 
@@ -133,4 +134,4 @@ def update_cells(
 def _at_cells(
     equation: TerrainHeight, X: Float[AnyArray, "n 3"], cells: Cell
 ) -> Float[Array, " n"]:
-    return jax.vmap(lambda X, cell: equation(tuple(X), cell)[0])(X, cells)
+    return jnp.asarray(jax.vmap(lambda X, cell: equation(X, cell)[0])(X, cells))
