@@ -187,6 +187,9 @@ def _read_terrain(section: TomlSection, images: Sequence[AnyScannerImage]) -> He
             f"{section.where}dem_sigma is missing; the σ of a height of {path.name} is expected, "
             "metres: the LE90 of its producer, divided by 1.645"
         )
+    sigma = section.number("dem_sigma")
+    if sigma <= 0:
+        raise InputError(f"{section.where}dem_sigma is {sigma:g}; expected metres above 0")
     extents = [
         image_extent(one.image, one.earth) if isinstance(one, ScannerImage) else
         rpc_extent(one.image.rpc)
@@ -198,7 +201,7 @@ def _read_terrain(section: TomlSection, images: Sequence[AnyScannerImage]) -> He
         name = section.text("geoid")
         beside = section.beside(name)
         terrain = add_geoid(terrain, beside if beside.exists() else Path(name))
-    return HeightModel(terrain, section.number("dem_sigma"), str(path))
+    return HeightModel(terrain, sigma, str(path))
 
 
 def _points(table: Columns, earth: Ellipsoid | None, radians: float) -> GroundPoints:

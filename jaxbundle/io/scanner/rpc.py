@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.rasters.reading import open_raster, rasterio
+from jaxbundle.io.rasters.reading import open_plain, open_raster, rasterio
 from jaxbundle.io.scanner.rpc_vendor_files import from_geom, from_xml
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.xml_fields import number_in
@@ -243,7 +243,7 @@ def _to_raster(path: Path, rpc: Rpc) -> None:
         with replace_file(path) as temporary:
             # the tags of the copy change: after a failure the raster is as it was
             shutil.copyfile(path, temporary)
-            with package.open(temporary, "r+") as target:
+            with open_plain(temporary, "r+") as target:
                 target.rpcs = RPC(**given)
             with package.open(temporary) as target:  # errors at closing are not reported
                 if target.rpcs is None:
