@@ -279,7 +279,8 @@ class Solution:
     def propagate_rows(
         self, rows: Mapping[str, Float[AnyArray, "n rows width"]]
     ) -> Float[np.ndarray, "n n"]:
-        """F·Q·Fᵀ of linear functions F of the changes of tables, [n, rows, width] each."""
+        """F·Q·Fᵀ of linear functions F of the changes of tables, [n, rows, width] each. A problem
+        without open motions needs no rows of the eliminated table where they are zero."""
         declared, plan, values = self.arguments[:3]
         size = self.problem.sizes
         wide = {

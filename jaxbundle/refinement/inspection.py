@@ -96,7 +96,10 @@ class RefinementInspection:
     @functools.cached_property
     def cofactor(self) -> Float[np.ndarray, "m m"]:
         """Cofactors of the shared unknowns."""
-        return self.solution.propagate(self.shared_unknowns)
+        slopes = self.solution.slopes(self.shared_unknowns)
+        # They are no functions of the points, whose zeros would take most of the time and memory.
+        points = self.solution.problem.plan.eliminated
+        return self.solution.propagate_rows({t: x for t, x in slopes.items() if t != points})
 
     @property
     def sigma(self) -> Float[np.ndarray, " m"]:
