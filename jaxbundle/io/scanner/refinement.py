@@ -4,7 +4,8 @@
 [refine]
 points = "points.csv"               # id,role,X,Y,Z[,sX,sY,sZ], or
                                     # id,role,longitude,latitude,height[,sE,sN,sh]
-observations = "observations.csv"   # image,point,line,pixel[,sline,spixel]
+observations = "observations.csv"   # image,point,line,pixel[,sline,spixel]; or a list of such
+                                    # files, and .match and .gcp of Ames Stereo Pipeline
 frames = "photographs"              # a project of photographs that share points
 dem = "terrain.tif"                 # a terrain model, whose heights are observations of tie points
 dem_sigma = 5.0                     # of these, metres
@@ -47,31 +48,24 @@ attitude_rate = "held"
 ```
 """
 
-import math
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
 from jaxbundle.errors import InputError
-from jaxbundle.geometry.ellipsoid import Ellipsoid, earth_fixed
 from jaxbundle.io.formats import read_network
 from jaxbundle.io.rasters.extent import image_extent, joint_extent, rpc_extent
 from jaxbundle.io.rasters.geoid import add_geoid
 from jaxbundle.io.rasters.reading import read_terrain
 from jaxbundle.io.scanner.refinement_images import read_images
+from jaxbundle.io.scanner.refinement_points import read_points
 from jaxbundle.io.text.sections import TomlSection, read_sections
-from jaxbundle.network.columns import Columns, did_you_mean
-from jaxbundle.network.tables import STATED, UNIT, Network, Observations
+from jaxbundle.network.columns import did_you_mean
+from jaxbundle.network.tables import Network, Observations
 from jaxbundle.network.units import ANGLE_UNITS
-from jaxbundle.refinement.refining import TESTS, east_north_up
-from jaxbundle.refinement.tables import (
-    AnyScannerImage,
-    GroundPoints,
-    ScannerImage,
-    check_points_table,
-)
+from jaxbundle.refinement.refining import TESTS
+from jaxbundle.refinement.tables import AnyScannerImage, GroundPoints, ScannerImage
 from jaxbundle.refinement.terrain_heights import HeightModel
 
 SECTIONS = {
@@ -129,21 +123,12 @@ def read_refinement(path: str | Path) -> RefineFile:
     frames = None
     if "frames" in section:
         frames = read_network(section.path("frames", "a project of photographs", folder=True))
-    points = _points(section.table("points"), images[0].earth, radians)
-    # checked first: the ids of observations are looked up in it
-    check_points_table(points)
-    ids = {id: k for k, id in enumerate(points.id)}
-    if frames is not None:
-        # points that only photographs show follow those of the table
-        more = (id for id in frames.points.id if id not in ids)
-        ids |= {id: k for k, id in enumerate(more, len(ids))}
-    observations = _observations(
-        section.table("observations"),
-        ids,
-        [image.id for image in images],
-        section,
-        str(path),
-    )
+    # other programs name an image by its file, without folder and suffix
+    stem = lambda id: file.section("images").path(id, "an image").stem
+    names = {re.sub("(?i)_rpc$", "", stem(one.id)): one.id for one in images}
+    names |= {one.id: one.id for one in images}
+    points, observations, said = read_points(section, names, images, frames, radians)
+    warnings += said
     snooping = section.text("snooping", "none")
     if snooping not in TESTS:
         raise InputError(f"{section.where}snooping {snooping!r}{did_you_mean(snooping, TESTS)}")
@@ -202,71 +187,3 @@ def _read_terrain(section: TomlSection, images: Sequence[AnyScannerImage]) -> He
         beside = section.beside(name)
         terrain = add_geoid(terrain, beside if beside.exists() else Path(name))
     return HeightModel(terrain, sigma, str(path))
-
-
-def _points(table: Columns, earth: Ellipsoid | None, radians: float) -> GroundPoints:
-    geographic = "longitude" in table.values
-    names = ("longitude", "latitude", "height") if geographic else ("X", "Y", "Z")
-    sigmas = ("sE", "sN", "sh") if geographic else ("sX", "sY", "sZ")
-    table.check_names(("id", "role", *names), sigmas)
-    X = np.stack([table.numbers(n) for n in names], 1)
-    words = {"free": math.inf, "held": 0.0}
-    sigma = np.stack([table.numbers(n, words=words) for n in sigmas], 1)
-    axes = np.tile(np.eye(3), (len(X), 1, 1))
-    if geographic:
-        if earth is None or earth.a != earth.b:
-            raise InputError(
-                f"{table.source.name}: longitudes need an ellipsoid of revolution as [scanner] "
-                "earth; give X, Y, Z"
-            )
-        beyond = np.abs(X[:, 1] * radians) > np.pi / 2 + 1e-12  # some thousand eps, as of 100 gon
-        if beyond.any():
-            row = int(beyond.argmax())
-            raise InputError(
-                f"{table.source(row)}: latitude {X[row, 1]:g} is beyond the pole; look at the "
-                "order of columns and at angle_unit"
-            )
-        X = np.stack(
-            [
-                np.asarray(v)
-                for v in earth_fixed(earth, (radians * X[:, 0], radians * X[:, 1], X[:, 2]))
-            ],
-            1,
-        )
-        known = np.isfinite(X).all(1)
-        # an unknown place has no east and north: its σ are of the axes
-        axes[known] = east_north_up(earth, X[known])
-    return GroundPoints(
-        table.ids("id"),
-        table.ids("role"),
-        X,
-        np.nan_to_num(sigma, nan=0.0, posinf=np.inf),
-        axes,
-        ("east", "north", "up") if geographic else ("X", "Y", "Z"),
-        table.source,
-    )
-
-
-def _observations(
-    table: Columns, ids: Mapping[str, int], images: Sequence[str], section: TomlSection, where: str
-) -> Observations:
-    table.check_names(("image", "point", "line", "pixel"), ("sline", "spixel"))
-    sigma, stated = section.number("sigma", 1.0), "sigma" in section.values
-    if sigma <= 0:
-        raise InputError(f"{section.where}sigma is {sigma:g}; positive, in lines and pixels")
-    stated_sigma = np.stack([table.numbers(n) for n in ("sline", "spixel")], 1)
-    lacking = np.isnan(stated_sigma)
-    if not stated and lacking.any() and not lacking.all():
-        row = int(lacking.any(1).argmax())
-        raise InputError(
-            f"{table.source(row)}: sline or spixel is missing, which other rows have; give it, or "
-            f"sigma in [refine] for those without"
-        )
-    return Observations(
-        table.indices("image", "image", {id: k for k, id in enumerate(images)}, where),
-        table.indices("point", "point", ids, section.text("points")),
-        np.stack([table.numbers(n, required=True) for n in ("line", "pixel")], 1),
-        np.where(lacking, sigma, stated_sigma),
-        table.source,
-        STATED if stated or not lacking.any() else UNIT,
-    )

@@ -142,6 +142,16 @@ class TomlSection:
             return path
         raise InputError(f"{self.where}{key} = {show(name)}: {got}; expected {expected}")
 
+    def paths(self, key: str, expected: str) -> list[Path]:
+        """The files that a key names, one or a list of them."""
+        given = self.values.get(key)
+        if not isinstance(given, list):
+            return [self.path(key, expected)]
+        if not given:
+            raise InputError(f"{self.where}{key} is an empty list; {expected} is expected")
+        one = lambda name: TomlSection(self.file, self.where, {key: name})
+        return [one(name).path(key, expected) for name in given]
+
     def beside(self, name: str) -> Path:
         """The path of a name beside the file of the section."""
         if self.file is None:
