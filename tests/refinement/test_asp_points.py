@@ -40,7 +40,8 @@ def match_file(first, second):
     for k, (line, pixel) in enumerate([*first, *second]):
         length = 3 if k % 2 else 0
         numbers = pixel, line, round(pixel), round(line), 0.5, 1.0, 2.0, True, 1, 2, length
-        records += struct.pack("<ffiifff?IIQ", *numbers) + struct.pack(f"<{length}f", *range(length))
+        records += struct.pack("<ffiifff?IIQ", *numbers)
+        records += struct.pack(f"<{length}f", *range(length))
     return struct.pack("<QQ", len(first), len(second)) + records
 
 

@@ -7,9 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from rpc_block import SIGMA_CONTROL, SIGMA_RPC, block, moved
+from test_with_photographs import photograph
 
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.geometry.ellipsoid import WGS84, earth_fixed, geodetic
+from jaxbundle.network.tables import Distances
 from jaxbundle.pushbroom.rpc import project_points
 from jaxbundle.pushbroom.rpc_bias import RpcBias, project_compensated
 from jaxbundle.pushbroom.terrain import make_terrain
@@ -229,3 +231,17 @@ def test_together_with_rigorous_images():
     # rigorous images first, and everything by id
     assert [one.id for one in result.images][:6] == [f"S{k}" for k in range(6)]
     assert type(result.image("R3")) is not type(result.image("S3"))
+
+
+@pytest.mark.further
+def test_together_with_a_photograph():
+    """Images with RPC, line scanners and a photograph that share their points."""
+    scene = block(rpc=4, scanner=2, points=40, control=6, checks=0, rays=3)
+    arguments, bias = scene.draw(np.random.default_rng(3))
+    frames = photograph(scene.X, np.random.default_rng(1))
+    frames = dataclasses.replace(frames, distances=Distances.none())
+    result = refine(*arguments, frames)
+    of_rpc = [k for k, n in enumerate(result.names) if n.owner.startswith("image R")]
+    error = (result.estimate[of_rpc] - bias.ravel()) / result.inspection.sigma[of_rpc]
+    assert np.abs(error).max() < 3 and result.global_test()["passed"]
+    assert result.inputs.ids[-1] == "F" and min(result.rays()) >= 4
