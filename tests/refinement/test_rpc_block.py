@@ -231,6 +231,24 @@ def test_together_with_rigorous_images():
     # rigorous images first, and everything by id
     assert [one.id for one in result.images][:6] == [f"S{k}" for k in range(6)]
     assert type(result.image("R3")) is not type(result.image("S3"))
+    # a blunder in a control point, and in a tie point of an image of each type
+    images, points, observations = arguments
+    ties = np.array([role == "tie" for role in scene.roles])[observations.point]
+    of_rpc = observations.image < 12
+    rpc, rigorous = (int(np.flatnonzero(ties & which)[5]) for which in (of_rpc, ~of_rpc))
+    X = points.X.copy()
+    X[2] += 15.0 * points.axes[2, 0]
+    wrong = moved(moved(observations, rpc, [6.0, 0.0]), rigorous, [0.0, -5.0])
+    found = refine(images, dataclasses.replace(points, X=X), wrong, snooping="pope")
+    named = [blunder.name for blunder in found.removed]
+    told = [f"point P{observations.point[k]} in image {images[observations.image[k]].id}"
+            for k in (rpc, rigorous)]  # fmt: skip
+    assert set(named) == {"east of control point P2", *told}
+    # an image that nothing is measured in
+    free = [dataclasses.replace(one, bias_sigma=prior_of_bias(1)) if one.id == "R7" else one
+            for one in images]  # fmt: skip
+    with pytest.raises(NotSolvedError, match="do not determine the .* of image R7"):
+        refine(free, points, observations.take(observations.image != 7))
 
 
 @pytest.mark.further
