@@ -96,10 +96,12 @@ class RefinementInspection:
     @functools.cached_property
     def cofactor(self) -> Float[np.ndarray, "m m"]:
         """Cofactors of the shared unknowns."""
-        slopes = self.solution.slopes(self.shared_unknowns)
-        # They are no functions of the points, whose zeros would take most of the time and memory.
-        points = self.solution.problem.plan.eliminated
-        return self.solution.propagate_rows({t: x for t, x in slopes.items() if t != points})
+        slopes, problem = self.solution.slopes(self.shared_unknowns), self.solution.problem
+        if not problem.kept_rows.any():
+            # They are no functions of the points, whose zeros would take most of the time and
+            # memory; only points with distances are in the system that remains.
+            slopes = {t: x for t, x in slopes.items() if t != problem.plan.eliminated}
+        return self.solution.propagate_rows(slopes)
 
     @property
     def sigma(self) -> Float[np.ndarray, " m"]:

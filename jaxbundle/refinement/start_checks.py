@@ -13,21 +13,25 @@ def check_columns(
     """Refuse measurements whose line and pixel are exchanged, where points with given coordinates
     show it."""
     points, observations = inputs.points, inputs.observations
-    given = np.isin(np.array(points.role, dtype=object)[observations.point[rows]],
-                    ("control", "check"))  # fmt: skip
-    xy = observations.xy[rows][given]
-    off, other = (
-        np.median(np.linalg.norm(xy + v[given] - places, axis=1)) if len(xy) else 0.0
-        for places in (xy, xy[:, ::-1])
-    )
-    # An order of magnitude: start values explain a hundred pixels, but not that these vanish. Three
-    # points are not all on the diagonal, or near another's place, by chance.
-    if len(xy) >= 3 and off > 10 * other:
-        raise InputError(
-            f"{observations.source.name}: line and pixel seem to be exchanged: the points with "
-            f"given coordinates are {off:.0f} pixels from their measurements (median), and "
-            f"{other:.0f} from them with line and pixel exchanged; check the names of the columns"
+    role = np.array(points.role, dtype=object)[observations.point[rows]]
+    image = observations.image[rows]
+    for i in np.unique(image):
+        mine = (image == i) & (role != "tie")
+        xy = observations.xy[rows][mine]
+        # Three points are not all on the diagonal, or near another's place, by chance.
+        if len(xy) < 3:
+            continue
+        off, other = (
+            np.median(np.linalg.norm(xy + v[mine] - places, axis=1)) for places in (xy, xy[:, ::-1])
         )
+        # An order of magnitude: start values explain a hundred pixels, but not that these vanish.
+        if off > 10 * other:
+            raise InputError(
+                f"{observations.source.name}: line and pixel seem to be exchanged in image "
+                f"{inputs.ids[i]!r}: points with given coordinates are {off:.0f} pixels from their "
+                f"measurements (median), and {other:.0f} with line and pixel exchanged; check the "
+                "names of the columns"
+            )
 
 
 def check_near(
