@@ -141,7 +141,7 @@ def images_of_match(path: Path, names: Sequence[str]) -> tuple[str, str]:
     )
 
 
-class Tracks(NamedTuple):
+class JoinedMatches(NamedTuple):
     """Tie points of several images: of every measurement the image, the point, line and pixel;
     `contradicting`: points left out because they are twice in an image."""
 
@@ -153,7 +153,7 @@ class Tracks(NamedTuple):
 
 def join_matches(
     pairs: Sequence[tuple[int, int, Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]],
-) -> Tracks:
+) -> JoinedMatches:
     """The points of pairs of images, joined where a place of an image is in several pairs.
 
     **Arguments:** `pairs`: two images, and lines and pixels of the same points in both.
@@ -177,4 +177,4 @@ def join_matches(
     _, renumbered = np.unique(point[kept], return_inverse=True)
     order = np.argsort(image[kept], kind="stable")
     left_out = len(np.unique(twice))
-    return Tracks(image[kept][order], renumbered[order], places[kept, 1:][order], left_out)
+    return JoinedMatches(image[kept][order], renumbered[order], places[kept, 1:][order], left_out)
