@@ -118,8 +118,8 @@ RESAMPLINGS: tuple[Resampling, ...] = get_args(Resampling)
 AttitudeError = Literal["bias", "white"]
 # One error per image, or one per record of the attitude table.
 ATTITUDE_ERRORS: tuple[AttitudeError, ...] = get_args(AttitudeError)
-# Bias models of coefficients, in the image.
-RPC_BIASES = ("shift", "affine")
+# Bias models of coefficients, in the image: polynomials of degree 0, 1, 2.
+RPC_BIASES = ("shift", "affine", "quadratic")
 
 # Inputs of the explorer.
 EXPLORED = ("network", "camera", "scanner")

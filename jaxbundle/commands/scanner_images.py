@@ -238,8 +238,8 @@ def simulate(
 
 
 def refine(input: str | Path | RefineFile) -> Refinement:
-    """Refine attitude, position and optics of scanner images with control and tie points. Of
-    tables: `jaxbundle.refinement.refine`.
+    """Refine scanner images with control and tie points: attitude, position and optics of rigorous
+    ones, the bias of those with RPC. Of tables: `jaxbundle.refinement.refine`.
 
     **Arguments:** `input`: refine file (docs/pushbroom.md).
 
@@ -251,6 +251,7 @@ def refine(input: str | Path | RefineFile) -> Refinement:
         file.points,
         file.observations,
         file.frames,
+        terrain=file.terrain,
         snooping=file.snooping,
         significance=file.significance,
     )

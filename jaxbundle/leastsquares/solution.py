@@ -279,7 +279,9 @@ class Solution:
     def propagate_rows(
         self, rows: Mapping[str, Float[AnyArray, "n rows width"]]
     ) -> Float[np.ndarray, "n n"]:
-        """F·Q·Fᵀ of linear functions F of the changes of tables, [n, rows, width] each."""
+        """F·Q·Fᵀ of linear functions F of the changes of tables, [n, rows, width] each. Of the
+        eliminated table they may be left out where they are zero, if the problem has no open
+        motions and no row of the table is kept."""
         declared, plan, values = self.arguments[:3]
         size = self.problem.sizes
         wide = {

@@ -18,7 +18,7 @@ from operator import index
 from typing import Any, SupportsIndex
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 
 from jaxbundle.arguments import show
 from jaxbundle.cameras import CameraModel, get_model, key_of
@@ -48,10 +48,11 @@ def row_indices(rows: Rows) -> Int[np.ndarray, " k"]:
 
 @dataclasses.dataclass(frozen=True)
 class Source:
-    """The source of a table: a name, and the number of each row in it (None: counted from 1)."""
+    """The source of a table: a name, and the number of each row in it (None: counted from 1), or
+    its place in words."""
 
     name: str
-    numbers: Int[np.ndarray, " rows"] | None = None
+    numbers: Shaped[np.ndarray, " rows"] | None = None
     word: str = "row"
 
     def __call__(self, row: SupportsIndex) -> str:

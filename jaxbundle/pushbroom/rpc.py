@@ -49,6 +49,11 @@ TERMS = 20
 DOMAIN_MARGIN = 0.1
 
 
+# Metres above the highest height of the domain at which lines of sight begin: higher than the
+# terrain of any planet reaches above its mean. Only its order of magnitude counts.
+ABOVE_DOMAIN = 20e3
+
+
 class RpcStatus(IntEnum):
     """Validity of the polynomials at a position."""
 
@@ -240,8 +245,8 @@ def locate_on(
         return (along(o, difference(seen, X), 1.0), (longitude, latitude, h, status)), None
 
     nothing = (jnp.zeros(()), jnp.zeros(()), jnp.zeros(()), jnp.zeros((), int))
-    # 20 km above the domain: also of a surface that rises above its heights the first point is met
-    start = (along(top, d, -20e3), nothing)
+    # also of a surface that rises above the heights of the domain the first point is met
+    start = (along(top, d, -ABOVE_DOMAIN), nothing)
     # The ray is nearly parallel to the line of sight: a round leaves of the distance between both
     # only its product with the angle between them.
     (_, (longitude, latitude, h, status)), _ = jax.lax.scan(shift, start, length=3)

@@ -1,10 +1,10 @@
 """Bias compensation of RPCs with control points, in the image (Grodecki, Dial, 2003, PE&RS 69(1)).
 
-    line   + v = l + a₀ + a₁·l̂ + a₂·ŝ,        sample + v = s + b₀ + b₁·l̂ + b₂·ŝ
+    line   + v = l + a₀ + a₁·l̂ + a₂·ŝ + a₃·l̂² + a₄·l̂ŝ + a₅·ŝ²,        sample + v = s + b₀ + b₁·l̂ + …
 
 (l, s) the image of a control point by the coefficients, (l̂, ŝ) the same minus offset, divided by
-scale. `"shift"` estimates only a₀, b₀. With the σ of the measurement and of the control point, G =
-∂(l, s)/∂(east, north, up), the weights of a point are
+scale. `"shift"` estimates only a₀, b₀, `"affine"` three of each, `"quadratic"` all. With the σ of
+the measurement and of the control point, G = ∂(l, s)/∂(east, north, up), the weights of a point are
 
     P = (diag(σ²) + G·Σ·Gᵀ)⁻¹.
 
@@ -32,16 +32,17 @@ from jaxbundle.pushbroom.rpc_fit import RpcCheck, RpcTable, check_rpc, fit_rpc
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
-# Unknowns of each axis.
-MODELS = dict(zip(RPC_BIASES, (1, 3), strict=True))
+# Unknowns of each axis: the terms of a polynomial of degree 0, 1, 2 in (l̂, ŝ).
+MODELS = dict(zip(RPC_BIASES, (1, 3, 6), strict=True))
 CONTROL = Source("control points")
 
 
 class RpcBias(eqx.Module):
-    """a₀, a₁, a₂ and b₀, b₁, b₂, in pixels."""
+    """a₀, a₁, … and b₀, b₁, …, in pixels: as many of each as the degree of the bias needs, 1, 3 or
+    6; terms that are left out are 0."""
 
-    line: Float[AnyArray, "3"]
-    sample: Float[AnyArray, "3"]
+    line: Float[AnyArray, " terms"] | tuple[Scalar, ...]
+    sample: Float[AnyArray, " terms"] | tuple[Scalar, ...]
 
 
 class BiasFit(eqx.Module):
@@ -68,8 +69,12 @@ def project_compensated(
 ) -> tuple[Scalar, Scalar]:
     """Line and sample of one point, radians and metres, with the bias."""
     line, sample = project(rpc, longitude, latitude, height)
-    terms = _terms(rpc, line, sample)
-    return line + jnp.dot(bias.line, terms), sample + jnp.dot(bias.sample, terms)
+    terms = bias_terms(rpc, line, sample)
+    # scalars, as in `rpc`: `terms` are more than the coefficients of a lower degree
+    return (
+        line + sum(a * term for a, term in zip(bias.line, terms)),
+        sample + sum(b * term for b, term in zip(bias.sample, terms)),
+    )
 
 
 def fit_bias(
@@ -92,7 +97,7 @@ def fit_bias(
     """
     require_x64()
     if model not in MODELS:
-        raise InputError(f"unknown bias {model!r}; 'shift' or 'affine' is expected")
+        raise InputError(f"unknown bias {model!r}; one of {', '.join(MODELS)} is expected")
     control = RpcTable(*(np.asarray(column, float) for column in control))
     n, k = len(control.line), MODELS[model]
     for name, column in zip(control._fields, control):
@@ -103,18 +108,22 @@ def fit_bias(
     sigma = np.broadcast_to(np.asarray(sigma, float), (n, 2))
     if (bad := ~(sigma > 0).all(1)).any():
         raise InputError(f"{source(int(bad.argmax()))}: σ must be positive, in pixels")
-    computed, G = (np.asarray(a) for a in _images(rpc, earth, *control[:3]))
+    computed, G = (np.asarray(a) for a in images_and_slopes(rpc, earth, *control[:3]))
     if (bad := ~np.isfinite(computed).all(1)).any():
         raise InputError(
             f"{source(int(bad.argmax()))}: the coefficients have no image of this point; check "
             "longitude, latitude, height and their order"
         )
     _check_domain(rpc, control, source)
-    terms = np.asarray(_terms(rpc, computed[:, 0], computed[:, 1])).T[:, :k]
+    terms = np.stack(bias_terms(rpc, computed[:, 0], computed[:, 1]), 1)[:, :k]
     singular = np.linalg.svd(terms, compute_uv=False)
     # 1e-6 of 10 000 pixels is a hundredth of a pixel: points so near a line do not fix its sides
     if singular[-1] < 1e-6 * singular[0]:
-        raise InputError(f"{source.name}: all points on one line; give others, or use 'shift'")
+        curve = "line" if model == "affine" else "conic section"
+        raise InputError(
+            f"{source.name}: all points on one {curve}, which leaves {model!r} undetermined; give "
+            "others, or use 'shift'"
+        )
     ground = np.zeros((n, 3)) if ground_sigma is None else np.asarray(ground_sigma, float)
     cofactors = np.einsum("nij,nj,nkj->nik", G, ground**2, G)
     cofactors = cofactors + sigma[:, :, None] ** 2 * np.eye(2)
@@ -151,7 +160,7 @@ def _adjust(
     redundancy = 2 * n - 2 * k
     vtpv = float(v.ravel() @ P @ v.ravel())
     sigma0 = float(np.sqrt(vtpv / redundancy)) if redundancy else np.nan
-    full = lambda a: jnp.asarray(np.r_[a, np.zeros(3 - k)])
+    full = lambda a: jnp.asarray(np.r_[a, np.zeros(max(3 - k, 0))])
     return BiasFit(
         RpcBias(full(x[:k]), full(x[k:])),
         Q,
@@ -167,7 +176,7 @@ def apply_bias(rpc: Rpc, bias: RpcBias) -> tuple[Rpc, RpcCheck | None]:
     """Coefficients including the bias, and the residuals of a fit (None for a shift, which is
     exact).
 
-    A shift changes the offsets. An affine bias mixes two fractions of different denominators: the
+    A shift changes the offsets. Any other bias mixes two fractions of different denominators: the
     coefficients are refitted over the domain of the old ones.
     """
     if not np.any(np.r_[bias.line[1:], bias.sample[1:]]):
@@ -181,13 +190,16 @@ def apply_bias(rpc: Rpc, bias: RpcBias) -> tuple[Rpc, RpcCheck | None]:
         np.radians(float(rpc.latitude_offset) + float(rpc.latitude_scale) * P),
         float(rpc.height_offset) + float(rpc.height_scale) * H,
     )
-    line, sample, _ = (np.asarray(a) for a in project_points(rpc, *place))
-    terms = np.asarray(_terms(rpc, line, sample))
+    l, s, _ = (np.asarray(a) for a in project_points(rpc, *place))
+    line, sample = (np.asarray(a) for a in _compensated(rpc, bias, *place))
+    _, l_hat, s_hat, *_ = bias_terms(rpc, l, s)
     reach = 1 + DOMAIN_MARGIN
     # corners of the box of ground coordinates may be outside the image
-    inside = (np.abs(terms[1]) <= reach) & (np.abs(terms[2]) <= reach)
-    columns = (*place, line + bias.line @ terms, sample + bias.sample @ terms)
-    table = RpcTable(*(np.asarray(column)[inside] for column in columns))
+    inside = np.flatnonzero((abs(l_hat) <= reach) & (abs(s_hat) <= reach))
+    # a multiple of 128 of the 1000 to 1728 points: most images share a compiled fit
+    number = max(len(inside) // 128 * 128, min(len(inside), 128))
+    rows = inside[np.linspace(0, len(inside) - 1, number).astype(int)]
+    table = RpcTable(*(np.asarray(column)[rows] for column in (*place, line, sample)))
     fitted = fit_rpc(table).rpc
     return fitted, check_rpc(fitted, table)
 
@@ -218,19 +230,18 @@ def _check_domain(rpc: Rpc, control: RpcTable, source: Source) -> None:
             )
 
 
-def _terms(rpc: Rpc, line: Scalar, sample: Scalar) -> Float[Array, "3 ..."]:
-    """1, l̂, ŝ."""
-    return jnp.stack(
-        [
-            1.0 + 0 * line,
-            (line - rpc.line_offset) / rpc.line_scale,
-            (sample - rpc.sample_offset) / rpc.sample_scale,
-        ]
-    )
+def bias_terms(rpc: Rpc, line: Scalar, sample: Scalar) -> tuple[Scalar, ...]:
+    """1, l̂, ŝ, l̂², l̂ŝ, ŝ²: what the coefficients of a bias are multiplied by."""
+    l = (line - rpc.line_offset) / rpc.line_scale
+    s = (sample - rpc.sample_offset) / rpc.sample_scale
+    return 1.0 + 0 * l, l, s, l * l, l * s, s * s
+
+
+_compensated = compile_once(jax.vmap(project_compensated, (None, None, 0, 0, 0)), ())
 
 
 @partial(compile_once, static=())
-def _images(
+def images_and_slopes(
     rpc: Rpc,
     earth: Ellipsoid,
     longitude: Float[AnyArray, " n"],

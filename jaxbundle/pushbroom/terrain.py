@@ -77,13 +77,8 @@ class Terrain(GroundSurface):
 
     def grid(self, X: Vector) -> Triple:
         """(column, row, height) of a point."""
-        x, y, h = X if self.earth is None else geodetic(self.earth, X)
-        dx = x - self.origin[0]
-        if self.earth is not None:
-            # a turn more or less: the grid may cross the date line
-            middle = self.step[0] * (self.heights.shape[1] - 1) / 2
-            dx = dx - 2 * np.pi * jnp.round((dx - middle) / (2 * np.pi))
-        return dx / self.step[0], (y - self.origin[1]) / self.step[1], h
+        columns = self.heights.shape[1]
+        return grid_place(X, self.earth, self.origin, self.step, columns)
 
     def _slab(self, o: Vector, d: Vector) -> tuple[Scalar, Scalar]:
         """Where the ray enters and leaves the slab of all heights."""
@@ -104,6 +99,19 @@ class Terrain(GroundSurface):
         ends = [self.grid(along(o, d, top + tau * (bottom - top))) for tau in (0.0, 0.5, 1.0)]
         x, y, h = ((a, 4 * b - 3 * a - c, 2 * (a + c) - 4 * b) for a, b, c in zip(*ends))
         return x, y, h
+
+
+def grid_place(
+    X: Vector, earth: Ellipsoid | None, origin: Numbers, step: Numbers, columns: int
+) -> Triple:
+    """(column, row, height) of a point in a grid of so many `columns`; see `Terrain`."""
+    x, y, h = X if earth is None else geodetic(earth, X)
+    dx = x - origin[0]
+    if earth is not None:
+        # a turn more or less: the grid may cross the date line
+        middle = step[0] * (columns - 1) / 2
+        dx = dx - 2 * np.pi * jnp.round((dx - middle) / (2 * np.pi))
+    return dx / step[0], (y - origin[1]) / step[1], h
 
 
 def make_terrain(
@@ -149,11 +157,11 @@ def _above_ground(s: Scalar, _: None, data: tuple[Terrain, Vector, Vector]) -> S
 
 def bilinear(heights: Float[AnyArray, "rows columns"], x: Scalar, y: Scalar) -> Scalar:
     """The height at column x and row y; NaN outside the grid and where a corner has none."""
-    cell = _cell(heights, jnp.floor(x), jnp.floor(y))
-    return _in_cell(cell, x, y)
+    cell = cell_at(heights, jnp.floor(x), jnp.floor(y))
+    return height_in_cell(cell, x, y)
 
 
-def _cell(heights: Float[AnyArray, "rows columns"], x: AnyArray, y: AnyArray) -> Cell:
+def cell_at(heights: Float[AnyArray, "rows columns"], x: AnyArray, y: AnyArray) -> Cell:
     """The heights at the corners of the cell that begins at column x, row y; NaN off the grid."""
     rows, columns = heights.shape
     i, j = y.astype(int), x.astype(int)
@@ -163,8 +171,8 @@ def _cell(heights: Float[AnyArray, "rows columns"], x: AnyArray, y: AnyArray) ->
     return x, y, tuple(jnp.where(inside, z, jnp.nan) for z in corners)
 
 
-def _in_cell(cell: Cell, x: Scalar, y: Scalar) -> Scalar:
-    """The bilinear surface of a cell."""
+def height_in_cell(cell: Cell, x: Scalar, y: Scalar) -> Scalar:
+    """The bilinear surface of a cell at column x and row y, continued beyond the cell."""
     x0, y0, (z00, z01, z10, z11) = cell
     u, v = x - x0, y - y0
     return (1 - v) * ((1 - u) * z00 + u * z01) + v * ((1 - u) * z10 + u * z11)
@@ -173,7 +181,7 @@ def _in_cell(cell: Cell, x: Scalar, y: Scalar) -> Scalar:
 def _rate(path: Path, tau: Scalar, heights: Float[AnyArray, "rows columns"]) -> Scalar:
     """∂(h − bilinear)/∂τ."""
     (x, dx), (y, dy), (h, dh) = (value_and_rate(p, tau) for p in path)
-    x0, y0, (z00, z01, z10, z11) = _cell(heights, jnp.floor(x), jnp.floor(y))
+    x0, y0, (z00, z01, z10, z11) = cell_at(heights, jnp.floor(x), jnp.floor(y))
     u, v = x - x0, y - y0
     along_x = (1 - v) * (z01 - z00) + v * (z11 - z10)
     along_y = (1 - u) * (z10 - z00) + u * (z11 - z01)
@@ -201,8 +209,11 @@ def _first_hit(path: Path, heights: Float[AnyArray, "rows columns"], over_voids:
         out = jnp.clip(jnp.minimum(border(px, tau), border(py, tau)), tau + least, 1.0)
         middle = (tau + out) / 2
         x, y = value(px, middle), value(py, middle)
-        cell = _cell(heights, jnp.floor(x), jnp.floor(y))
-        f = [value(ph, t) - _in_cell(cell, value(px, t), value(py, t)) for t in (tau, middle, out)]
+        cell = cell_at(heights, jnp.floor(x), jnp.floor(y))
+        f = [
+            value(ph, t) - height_in_cell(cell, value(px, t), value(py, t))
+            for t in (tau, middle, out)
+        ]
         part = _first_root(*f)
         # below the terrain where heights begin again: it was met in the void
         under = void & (f[0] < 0)

@@ -8,6 +8,7 @@ import numpy as np
 from jaxbundle import cameras
 from jaxbundle.geometry import matrix_from_quaternion, omega_phi_kappa_from_matrix
 from jaxbundle.network.tables import Images, Network, Points
+from jaxbundle.refinement.inputs import PHOTOGRAPH
 from jaxbundle.refinement.refining import Refinement
 
 COLUMNS = ("id", "role", "X", "Y", "Z", "sX", "sY", "sZ")
@@ -49,7 +50,7 @@ def adjusted_photographs(result: Refinement) -> Network | None:
             parameters[camera.id] |= {k: v for k, v in interior.items() if k in camera.free}
     kept = np.zeros(len(network.observations), bool)
     for part in declared.parts:
-        if not part.of_scanner:
+        if part.table == PHOTOGRAPH:
             # a point whose two coordinates were both removed by snooping is left out
             kept[part.rows] = found.has_weight[part.set].any(1)
     adjusted = dict(zip(result.point_ids, result.positions))

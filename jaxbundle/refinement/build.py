@@ -11,16 +11,20 @@ from jaxbundle import cameras
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.geometry.vectors import rotate
+from jaxbundle.leastsquares.indexing.indices import fill_up
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import Network, Observations
 from jaxbundle.orientation.intersection import intersection
 from jaxbundle.orientation.status import Status
 from jaxbundle.pushbroom.image import PushbroomImage, pose_at
-from jaxbundle.refinement.declare import Rays, RefinementInput
+from jaxbundle.refinement.inputs import Rays, RefinementInput
+from jaxbundle.refinement.rpc_points import lines_of_sight
 from jaxbundle.refinement.spline import MIN_INTERVALS
 from jaxbundle.refinement.tables import (
+    AnyScannerImage,
     GroundPoints,
     ScannerImage,
+    check_images,
     check_observations,
     check_points_table,
 )
@@ -103,10 +107,17 @@ _meet = compile_once(jax.vmap(intersection), ())
 def _sights(inputs: RefinementInput, rays: Rays) -> Iterator[tuple[np.ndarray, ...]]:
     """Origins, directions and points of the rays; image by image."""
     observations, frames = inputs.observations, inputs.frames
-    for i, one in enumerate(inputs.images):
-        rows = rays.scanner[observations.image[rays.scanner] == i]
-        found = _scanner_sights(one.image, jnp.asarray(observations.xy[rows]))
-        yield *map(np.asarray, found), observations.point[rows]
+    image = observations.image[rays.scanner]
+    for i, one in enumerate(inputs.rigorous):
+        rows = rays.scanner[image == i]
+        if len(rows):
+            found = _scanner_sights(one.image, observations.xy[rows[fill_up(len(rows))]])
+            yield *(np.asarray(x)[: len(rows)] for x in found), observations.point[rows]
+    first = len(inputs.rigorous)
+    rows = rays.scanner[image >= first]
+    if len(rows):
+        rpcs, of_rpc = [one.image.rpc for one in inputs.rpc], observations.image[rows] - first
+        yield *lines_of_sight(rpcs, of_rpc, observations.xy[rows]), observations.point[rows]
     if frames is None:
         return
     for j in range(len(frames.images)):
@@ -134,16 +145,13 @@ def _scanner_sights(
 
 
 def check_input(
-    images: list[ScannerImage],
+    images: list[AnyScannerImage],
     points: GroundPoints,
     observations: Observations,
     frames: Network | None,
 ) -> None:
     """Checks before any computation."""
-    if not images:
-        raise InputError("refine: no scanner image; photographs alone are adjusted by `adjust`")
-    if len({one.id for one in images}) < len(images):
-        raise InputError("refine: two scanner images have the same id; give each its own")
+    check_images(images)
     if frames is not None:
         table = frames.images
         lacking = ~np.isfinite(np.c_[table.position, table.angles]).all(1)
@@ -153,13 +161,11 @@ def check_input(
                 f"{table.source(row)}: photograph {table.id[row]!r} has no start values; give "
                 "X0, Y0, Z0, omega, phi, kappa, or find them by `jaxbundle orient`"
             )
-    for one in images:
-        if one.freedom.knot_spacing <= 0:
-            raise InputError(f"image {one.id!r}: knot_spacing must be positive, in seconds")
     check_points_table(points)
     check_observations(images, points, observations)
     for i, one in enumerate(images):
-        _check_knots(one, int((observations.image == i).sum()))
+        if isinstance(one, ScannerImage):
+            _check_knots(one, int((observations.image == i).sum()))
 
 
 def _check_knots(one: ScannerImage, measured: int) -> None:

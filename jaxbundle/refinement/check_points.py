@@ -27,7 +27,8 @@ from jaxbundle.leastsquares.indexing.rows import (
     restore_order,
 )
 from jaxbundle.leastsquares.solution import Solution
-from jaxbundle.refinement.declare import Rays, declare
+from jaxbundle.refinement.declare import declare
+from jaxbundle.refinement.inputs import Rays
 from jaxbundle.refinement.inspection import RefinementInspection, SharedUnknowns
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray

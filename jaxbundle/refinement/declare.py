@@ -1,11 +1,11 @@
 """A refinement as tables of unknowns and sets of observations for the engine.
 
-Corrections of scanner images are one table, those of their sensors another; the photographs with
-their cameras, priors and distances are declared as in a network.
+Corrections of scanner images are one table, those of their sensors another, the biases of RPC
+images a third; the photographs with their cameras, priors and distances are declared as in a
+network.
 """
 
 import dataclasses
-import math
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -17,126 +17,45 @@ from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.declarations import ObservationSet, Table
 from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.problem import Problem, make_problem, with_data
+from jaxbundle.network.declare import DeclaredNetwork
 from jaxbundle.network.declare import declare as declare_network
-from jaxbundle.network.tables import EXTERIOR, Distances, Network, Observations, Points
+from jaxbundle.network.tables import Distances, Network, Points
 from jaxbundle.refinement import kinds
-from jaxbundle.refinement.freedom import (
-    ARCSECONDS_PER_RADIAN,
-    Form,
-    UnknownName,
-    make_form,
-    names,
-    pad_forms,
-    priors,
+from jaxbundle.refinement.correction_tables import (
+    SharedUnknown,
+    columns_of_photographs,
+    declare_corrections,
 )
-from jaxbundle.refinement.tables import GroundPoints, ScannerImage
-from jaxbundle.types import Index, present
-
-IMAGE, SENSOR = "scanner image", "sensor"
-
-
-class Rays(NamedTuple):
-    """Which measurements an adjustment uses: rows of the two tables, and the points of them."""
-
-    scanner: Int[np.ndarray, " rows"]
-    frame: Int[np.ndarray, " rows"]
-    points: Int[np.ndarray, " points"]
-
-
-@dataclasses.dataclass(frozen=True)
-class RefinementInput:
-    """The input of a refinement: scanner images with the forms of their unknowns and the rows of
-    their sensors; points, measurements, photographs, and the rows of their points; the `origin` [3]
-    of all coordinates of the engine."""
-
-    images: list[ScannerImage]
-    points: GroundPoints
-    observations: Observations
-    frames: Network | None
-    forms: list[Form]
-    sensor: Int[np.ndarray, " images"]
-    frame_point: Int[np.ndarray, " points"]
-    origin: Float[np.ndarray, "3"]
-
-    @property
-    def ids(self) -> list[str]:
-        """The ids of all images, photographs after scanner images."""
-        frames = () if self.frames is None else self.frames.images.id
-        return [*(one.id for one in self.images), *frames]
-
-    def kind(self, i: Index) -> kinds.ScannerPoint:
-        """The equations of an image."""
-        one = self.images[i]
-        return kinds.ScannerPoint(one.image.corrections, one.earth, self.forms[i].sizes)
-
-    def lines(
-        self,
-        i: Index,
-        values: Values,
-        X: Float[np.ndarray, "n 3"],
-        rows: Int[np.ndarray, " n"],
-    ) -> tuple[kinds.MeasuredLine, Float[np.ndarray, "n 2"]]:
-        """Of rows of the measurements in image i, of points X: what belongs to their places, and
-        v."""
-        p = values[IMAGE][i], values[SENSOR][self.sensor[i]]
-        one, places = self.images[i].image, self.observations.xy[rows]
-        return kinds.lines_of(self.kind(i), one, self.forms[i], self.origin, *p, X, places)
-
-
-def gather(
-    images: list[ScannerImage],
-    points: GroundPoints,
-    observations: Observations,
-    frames: Network | None,
-) -> RefinementInput:
-    """The forms of the unknowns, the sensors, the origin."""
-    forms = pad_forms([make_form(one.image, one.earth, one.freedom) for one in images])
-    sensors = list(dict.fromkeys(map(sensor_of, images)))
-    sensor = np.array([sensors.index(sensor_of(one)) for one in images])
-    at = {id: k for k, id in enumerate(points.id)}
-    of_frames = [] if frames is None else [at[id] for id in frames.points.id]
-    # Coordinates relative to a point near by lose fewer digits; but corrections need Earth-fixed
-    # positions.
-    absolute = any(one.image.corrections.any for one in images)
-    known = points.X[np.isfinite(points.X).all(1)]
-    origin = np.zeros(3) if absolute or not len(known) else np.round(known.mean(0))
-    return RefinementInput(
-        images, points, observations, frames, forms, sensor, np.array(of_frames, int), origin
-    )
-
-
-def sensor_of(one: ScannerImage) -> str:
-    """The name of the sensor of an image, its own if it shares none."""
-    return one.sensor or one.id
+from jaxbundle.refinement.inputs import IMAGE, PHOTOGRAPH, Rays, RefinementInput
+from jaxbundle.refinement.rpc_points import RPC_IMAGE, RPC_POINTS, misclosures
+from jaxbundle.refinement.start_checks import check_columns, check_near
+from jaxbundle.refinement.terrain_heights import (
+    TERRAIN_HEIGHTS,
+    choose_covered,
+    terrain_heights,
+    update_cells,
+)
+from jaxbundle.types import present
 
 
 class ImagePointSet(NamedTuple):
-    """Image points: the name of their set; whether it is of scanner images; of each the row
-    in its table of measurements, the image (as in `RefinementInput.ids`), the point among those
-    used."""
+    """Image points: the name of their set; the table of their images (`IMAGE`, `RPC_IMAGE`,
+    `PHOTOGRAPH`); of each the row in its table of measurements, the image (as in
+    `RefinementInput.ids`), the point among those used."""
 
     set: str
-    of_scanner: bool
+    table: str
     rows: Int[np.ndarray, " n"]
     image: Int[np.ndarray, " n"]
     point: Int[np.ndarray, " n"]
 
 
-class SharedUnknown(NamedTuple):
-    """An unknown that points share: its name, the σ of its prior (inf: none), and where it is among
-    the changes of the tables."""
-
-    name: UnknownName
-    sigma: float
-    table: str
-    row: int
-    direction: int
-
-
 @dataclasses.dataclass(frozen=True)
 class DeclaredRefinement:
     """A refinement as the engine's problem, with the rays it uses. `control`: of the rows of
-    control points, the point among those used; `cameras`: by id, the table and row of each."""
+    control points, the point among those used; `levelled`: likewise of terrain heights; `uncovered`
+    tie points, which the terrain model does not have; `cameras`: by id, the table and row of
+    each."""
 
     inputs: RefinementInput
     rays: Rays
@@ -144,6 +63,8 @@ class DeclaredRefinement:
     parts: tuple[ImagePointSet, ...]
     columns: tuple[SharedUnknown, ...]
     control: Int[np.ndarray, " control"]
+    levelled: Int[np.ndarray, " heights"]
+    uncovered: Int[np.ndarray, " points"]
     cameras: dict[str, tuple[str, int]]
 
     @property
@@ -162,15 +83,20 @@ class DeclaredRefinement:
         return np.bincount(points, minlength=len(self.rays.points))
 
     def rescale(self, problem: Problem, values: Values) -> tuple[Problem, float]:
-        """The problem with S at these values, and the largest relative change of S."""
+        """The problem with S and the cells of terrain heights at these values, and the largest
+        relative change: of S, or of a height in units of its σ."""
         measured, X, change = dict(problem.data.measured), np.asarray(values["point"].position), 0.0
         for part in self.parts:
-            if part.of_scanner:
+            if part.table == IMAGE:
                 lines, _ = _lines(self.inputs, values, X, part.rows, part.image, part.point)
                 before, measured[part.set] = np.asarray(measured[part.set].scale), lines
                 # relative to the largest element: those off the diagonal are nearly zero
                 size = np.abs(before).max((1, 2), keepdims=True)
                 change = max(change, float((np.abs(lines.scale - before) / size).max()))
+        if len(self.levelled):
+            model, cells = present(self.inputs.terrain), measured[TERRAIN_HEIGHTS]
+            measured[TERRAIN_HEIGHTS], off = update_cells(model, cells, X[self.levelled])
+            change = max(change, off)
         data = dataclasses.replace(problem.data, measured=measured)
         return with_data(problem, data), change
 
@@ -199,8 +125,8 @@ def declare(
     """The tables and observations of a refinement.
 
     **Arguments:** `X`: start values of the points of the rays; `values`: of all other tables, if
-    already adjusted and points are to be compared with them: then there is no control and
-    no distance, and points with one ray keep their height.
+    already adjusted and points are to be compared with them: then there is no control, no distance
+    and no terrain height, and points with one ray keep their height.
 
     **Raises:** `InputError` for points far from their measurement."""
     points, chosen, n = inputs.points, rays.points, len(rays.points)
@@ -208,45 +134,75 @@ def declare(
     index = np.full(len(points), -1)  # of every point among those used
     index[chosen] = np.arange(n)
     X = X - inputs.origin
-    corrections, columns = _corrections(inputs)
-    tables = [table for table, _ in corrections]
+    corrections, columns = declare_corrections(inputs)
+    tables = [one.table for one in corrections]
     # S of the scanner points is evaluated here, at the start, and again in `rescale`
     values = values or {t.name: t.value for t in tables}
     observed, parts = _scanner_points(inputs, rays, values, X, index)
     of_cameras = {}
     if inputs.frames is not None:
         network = _network_of(inputs, rays, index, X + inputs.origin, checking)
-        photographs = declare_network(network, inputs.origin)
-        # the network has a set of image points for every camera model
-        for set_name, rows in photographs.image_rows.items():
-            image, point = network.observations.image[rows], network.observations.point[rows]
-            image = image + len(inputs.images)
-            parts.append(ImagePointSet(set_name, False, rays.frame[rows], image, point))
-        observed += photographs.observations
-        tables += [t for t in photographs.tables if t.name != "point"]
-        of_cameras = {
-            network.cameras[c].id: (t.name, row)
-            for t in photographs.cameras
-            for row, c in enumerate(t.cameras)
-        }
-        columns += _columns_of_photographs(network, tables, of_cameras)
+        more, of_cameras = _photographs(inputs, rays, network, parts)
+        observed += more.observations
+        tables += [t for t in more.tables if t.name != "point"]
+        columns += columns_of_photographs(network, tables, of_cameras)
     seen = np.bincount(np.concatenate([part.point for part in parts]), minlength=n)
     table, control, at = _points(inputs, chosen, X, seen)
+    levelled, uncovered = np.zeros(0, int), np.zeros(0, int)
     if not checking:
-        observed += control
-        for t, prior in corrections:
-            if np.isfinite(prior).any():
-                observed.append(kinds.priors(t.name)((np.arange(t.rows),), sigma=prior))
+        observed += [*control, *(prior for one in corrections for prior in one.priors)]
         if not columns:
             raise InputError(
                 'refine: every unknown is held; free some, such as attitude = "free" in [unknowns]'
             )
+        heights, levelled, uncovered = _terrain_heights(inputs, chosen, X)
+        observed += heights
     tables = [dataclasses.replace(t, value=values.get(t.name, t.value)) for t in tables]
     # A point is touched by few observations, so that its 3 × 3 block is eliminated before the
     # unknowns that points share are solved for.
     eliminate = "point" if table.free.any() else None
     problem = make_problem([*tables, table], observed, eliminate)
-    return DeclaredRefinement(inputs, rays, problem, tuple(parts), tuple(columns), at, of_cameras)
+    parts, columns = tuple(parts), tuple(columns)
+    return DeclaredRefinement(
+        inputs, rays, problem, parts, columns, at, levelled, uncovered, of_cameras
+    )
+
+
+def _photographs(
+    inputs: RefinementInput, rays: Rays, network: Network, parts: list[ImagePointSet]
+) -> tuple[DeclaredNetwork, dict[str, tuple[str, int]]]:
+    """The photographs as declared, and by the id of a camera its table and row; their image points
+    are added to `parts`."""
+    photographs = declare_network(network, inputs.origin)
+    # the network has a set of image points for every camera model
+    for set_name, rows in photographs.image_rows.items():
+        image, point = network.observations.image[rows], network.observations.point[rows]
+        image = image + len(inputs.images)
+        parts.append(ImagePointSet(set_name, PHOTOGRAPH, rays.frame[rows], image, point))
+    of_cameras = {
+        network.cameras[c].id: (t.name, row)
+        for t in photographs.cameras
+        for row, c in enumerate(t.cameras)
+    }
+    return photographs, of_cameras
+
+
+def _terrain_heights(
+    inputs: RefinementInput,
+    chosen: Int[np.ndarray, " points"],
+    X: Float[np.ndarray, "points 3"],
+) -> tuple[list[ObservationSet], Int[np.ndarray, " heights"], Int[np.ndarray, " points"]]:
+    """Heights of tie points by the terrain model, the points that have one, and those that have
+    none."""
+    role = np.array(inputs.points.role, dtype=object)[chosen]
+    ties = np.flatnonzero(role == "tie")
+    if inputs.terrain is None or not len(ties):
+        return [], np.zeros(0, int), np.zeros(0, int)
+    model = inputs.terrain
+    cells, covered = choose_covered(model, X[ties])
+    cells = jax.tree.map(lambda x: x[covered], cells)
+    kind = terrain_heights(model.terrain)
+    return [kind((ties[covered],), cells, sigma=model.sigma)], ties[covered], ties[~covered]
 
 
 def _scanner_points(
@@ -258,10 +214,11 @@ def _scanner_points(
 ) -> tuple[list[ObservationSet], list[ImagePointSet]]:
     """Observations of the rays of scanner images, one set for all images with the same equations,
     and what their rows are. `index`: of the points among those used."""
-    observed, parts = [], []
+    observed, parts, away = [], [], []
     measured, sigma = inputs.observations, inputs.observations.sigma
     # images differ in their equations by corrections and ellipsoid; their sizes were padded alike
-    kind_of_image = [inputs.kind(i) for i in range(len(inputs.images))]
+    kind_of_image: list = [inputs.kind(i) for i in range(len(inputs.rigorous))]
+    kind_of_image += [RPC_POINTS] * len(inputs.rpc)
     for kind in dict.fromkeys(kind_of_image):
         mine = np.array([other == kind for other in kind_of_image])
         rows = rays.scanner[mine[measured.image[rays.scanner]]]
@@ -269,48 +226,24 @@ def _scanner_points(
         if not len(rows):
             continue
         image, point = measured.image[rows], index[measured.point[rows]]
-        lines, v = _lines(inputs, values, X, rows, image, point)
-        _check_near(inputs, rows, v)
         name = f"scanner points {len(parts) + 1}"
-        parts.append(ImagePointSet(name, True, rows, image, point))
-        touched = image, inputs.sensor[image], point
-        observed.append(kinds.scanner_points(kind)(touched, lines, sigma=sigma[rows], name=name))
+        if kind is RPC_POINTS:
+            of_table, xy = image - len(inputs.rigorous), measured.xy[rows]
+            v, _ = misclosures(values[RPC_IMAGE], of_table, X[point], xy)
+            parts.append(ImagePointSet(name, RPC_IMAGE, rows, image, point))
+            given = RPC_POINTS((of_table, point), xy, sigma=sigma[rows], name=name)
+        else:
+            lines, v = _lines(inputs, values, X, rows, image, point)
+            parts.append(ImagePointSet(name, IMAGE, rows, image, point))
+            touched = image, inputs.sensor[image], point
+            given = kinds.scanner_points(kind)(touched, lines, sigma=sigma[rows], name=name)
+        away.append((rows, v))
+        observed.append(given)
+    if away:
+        rows, v = map(np.concatenate, zip(*away))
+        check_columns(inputs, rows, v)
+        check_near(inputs, rows, v)
     return observed, parts
-
-
-def _corrections(
-    inputs: RefinementInput,
-) -> tuple[list[tuple[Table, Float[np.ndarray, "rows k"]]], list[SharedUnknown]]:
-    """The tables of corrections, each with the σ of its priors (inf: none), and their unknowns."""
-    images, own = inputs.images, inputs.forms[0].image_unknowns
-    sigma = np.stack([priors(form, one.freedom) for form, one in zip(inputs.forms, images)])
-    # The unknowns of a sensor have the σ of its first image, or of the first that states one (NaN:
-    # no such unknown).
-    first = np.unique(inputs.sensor, return_index=True)[1]
-    of_sensor = sigma[first, own:]
-    for i, row in enumerate(inputs.sensor):
-        absent = np.isnan(of_sensor[row])
-        of_sensor[row, absent] = sigma[i, own:][absent]
-    named = [names(f.sizes, one.id, sensor_of(one)) for f, one in zip(inputs.forms, images)]
-    tables, columns = [], [[] for _ in images]
-    # The vector of an image is its own unknowns, then those of its sensor: two tables, so that
-    # images of one sensor touch the same row. Columns that are held in all rows leave the space.
-    own_part = (IMAGE, sigma[:, :own], range(len(images)), 0)
-    for title, sigma, of, start in (own_part, (SENSOR, of_sensor, first, own)):
-        sigma = np.nan_to_num(sigma, nan=0.0, posinf=np.inf)
-        moving = np.flatnonzero((sigma > 0).any(0)).tolist()
-        space, free = kinds.VectorRow(sigma.shape[1], tuple(moving)), sigma[:, moving] > 0
-        labels = [images[i].id if title == IMAGE else sensor_of(images[i]) for i in of]
-        words = tuple(named[0][start + k].parameter for k in moving)
-        table = Table(title, np.zeros(sigma.shape), space, free, labels, words)
-        tables.append((table, np.where(sigma > 0, sigma, np.inf)))
-        for row, i in enumerate(of):
-            columns[i] += [
-                SharedUnknown(named[i][start + k], float(sigma[row, k]), title, row, d)
-                for d, k in enumerate(moving)
-                if free[row, d]
-            ]
-    return tables, [column for of_image in columns for column in of_image]
 
 
 def _points(
@@ -362,51 +295,4 @@ def _network_of(
         points=Points(ids, ("tie",) * n, X, np.full((n, 3), np.nan)),
         observations=dataclasses.replace(seen, point=index[inputs.frame_point[seen.point]]),
         distances=Distances(ends[kept], d.value[kept], d.sigma[kept]),
-    )
-
-
-def _columns_of_photographs(
-    network: Network, tables: list[Table], of_cameras: dict[str, tuple[str, int]]
-) -> list[SharedUnknown]:
-    """Their unknowns: of every image, and of its camera for the first image."""
-    columns, called = [], {t.name: t for t in tables}
-    for i, id in enumerate(network.images.id):
-        for k in np.flatnonzero(called["image"].free[i]).tolist():
-            word = EXTERIOR[k]
-            unit = ("m", 1.0) if k < 3 else ("arcsec", ARCSECONDS_PER_RADIAN)
-            name = UnknownName(f"photograph {id}", word, *unit, word)
-            columns.append(SharedUnknown(name, math.inf, "image", i, k))
-        c = network.images.camera[i]
-        camera, (title, row) = network.cameras[c], of_cameras[network.cameras[c].id]
-        if c in network.images.camera[:i]:  # named with its first image
-            continue
-        for d in np.flatnonzero(called[title].free[row]).tolist():
-            word = called[title].parameters[d]
-            name = UnknownName(f"camera {camera.id}", word, "", 1.0, word)
-            columns.append(SharedUnknown(name, camera.sigma.get(word, math.inf), title, row, d))
-    return columns
-
-
-def _check_near(
-    inputs: RefinementInput, rows: Int[np.ndarray, " n"], v: Float[np.ndarray, "n 2"]
-) -> None:
-    """Refuse points far from their measurement: swapped or wrong."""
-    points, observations = inputs.points, inputs.observations
-    size = np.array([(one.image.lines, one.image.pixels) for one in inputs.images])
-    # Farther than two images off no start values are so bad: coordinates in another order, frame or
-    # unit are; `~(… <=)` also catches NaN.
-    far = (~(np.abs(v) <= 2.0 * size[observations.image[rows]])).any(1)
-    if not far.any():
-        return
-    row, away = int(rows[far.argmax()]), v[far.argmax()]
-    p, id = observations.point[row], inputs.images[observations.image[row]].id
-    said = (
-        f"{away[0]:.0f} lines and {away[1]:.0f} pixels away"
-        if np.isfinite(away).all()
-        else "where the camera does not look"
-    )
-    raise InputError(
-        f"{observations.source(row)}: {points.role[p]} point {points.id[p]!r} of "
-        f"{points.source(p)} is off image {id!r}: its coordinates are {said}; check "
-        "their order, frame and units, and at the id"
     )

@@ -19,6 +19,7 @@ from jaxbundle.leastsquares.solution import Solution, find_minimum
 from jaxbundle.leastsquares.spaces import Space
 from jaxbundle.network.blunders import Removed, either_of
 from jaxbundle.refinement.declare import DeclaredRefinement
+from jaxbundle.refinement.terrain_heights import TERRAIN_HEIGHTS
 from jaxbundle.refinement.weakness import weaknesses
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, present
@@ -95,7 +96,12 @@ class RefinementInspection:
     @functools.cached_property
     def cofactor(self) -> Float[np.ndarray, "m m"]:
         """Cofactors of the shared unknowns."""
-        return self.solution.propagate(self.shared_unknowns)
+        slopes, problem = self.solution.slopes(self.shared_unknowns), self.solution.problem
+        if not problem.kept_rows.any():
+            # They are no functions of the points, whose zeros would take most of the time and
+            # memory; only points with distances are in the system that remains.
+            slopes = {t: x for t, x in slopes.items() if t != problem.plan.eliminated}
+        return self.solution.propagate_rows(slopes)
 
     @property
     def sigma(self) -> Float[np.ndarray, " m"]:
@@ -213,5 +219,9 @@ def _describe_removed(declared: DeclaredRefinement, blunder: RemovedRow) -> Remo
         p, axis = int(declared.control[blunder.row]), present(blunder.residual)
         name = f"{points.axis_names[axis]} of control point {points.id[chosen[p]]}"
         return Removed("control", 3 * p + axis, name, blunder.test)
+    if blunder.set == TERRAIN_HEIGHTS:
+        p = int(declared.levelled[blunder.row])
+        name = f"terrain height of point {points.id[chosen[p]]}"
+        return Removed("terrain height", blunder.row, name, blunder.test)
     a, b = (points.id[chosen[r[blunder.row]]] for r in set.rows)
     return Removed("distance", blunder.row, f"distance {a}–{b}", blunder.test)

@@ -36,7 +36,7 @@ from jaxtyping import Array, Float
 
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.leastsquares.declarations import Kind
-from jaxbundle.leastsquares.indexing.indices import round_up
+from jaxbundle.leastsquares.indexing.indices import fill_up
 from jaxbundle.leastsquares.spaces import Change, Vector
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.ground_to_image import misclosure_of
@@ -194,8 +194,7 @@ def lines_of(
     """What belongs to the measured places of points X [n, 3] of an image, S where its corrections
     are `own` and `sensor`; and v."""
     n = len(places)
-    # padded by the last one: images with similar numbers of points share a program
-    padded = np.minimum(np.arange(round_up(n)), n - 1)
+    padded = fill_up(n)
     at_places = np.asarray(X)[padded], np.asarray(places)[padded]
     found = _lines_of(kind, image, form, origin, own, sensor, *at_places)
     return jax.tree.map(lambda x: np.asarray(x)[:n], found)

@@ -5,7 +5,8 @@ equations of `kinds`, statistics, blunders, check points, warnings, and the refi
 """
 
 import dataclasses
-from collections.abc import Sequence
+import functools
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,20 +17,30 @@ from jaxbundle.float64 import require_x64
 from jaxbundle.geometry.ellipsoid import Ellipsoid, geodetic
 from jaxbundle.leastsquares.quality.correlation import correlation_matrix
 from jaxbundle.leastsquares.quality.global_test import chi_squared_test
+from jaxbundle.leastsquares.quality.robust import residual_lengths, robust_scale
 from jaxbundle.network.blunders import Removed
+from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import STATED, Network, Observations
 from jaxbundle.pushbroom.image import PushbroomImage
+from jaxbundle.pushbroom.rpc import RpcStatus
+from jaxbundle.pushbroom.rpc_bias import RpcBias, apply_bias
+from jaxbundle.pushbroom.rpc_fit import RpcCheck
+from jaxbundle.pushbroom.rpc_image import RpcImage
 from jaxbundle.refinement.build import check_input, choose_rays, start_points
 from jaxbundle.refinement.check_points import RefinementCheckPoints, intersect
-from jaxbundle.refinement.declare import IMAGE, SENSOR, declare, gather
+from jaxbundle.refinement.declare import declare
 from jaxbundle.refinement.freedom import UnknownName, change_of
+from jaxbundle.refinement.inputs import IMAGE, SENSOR, RefinementInput, gather
 from jaxbundle.refinement.inspection import RefinementInspection, adjust
 from jaxbundle.refinement.refined_image import refined_image
 from jaxbundle.refinement.report import report as describe_refinement
 from jaxbundle.refinement.report import to_json
-from jaxbundle.refinement.tables import GroundPoints, ScannerImage, with_frames
+from jaxbundle.refinement.rpc_points import RPC_IMAGE, misclosures
+from jaxbundle.refinement.tables import AnyScannerImage, GroundPoints, with_frames
+from jaxbundle.refinement.terrain_heights import TERRAIN_HEIGHTS, HeightModel
 from jaxbundle.refinement.weakness import weaknesses
 from jaxbundle.results import TableMethods, finite
+from jaxbundle.types import present
 
 TESTS = ("none", "baarda", "pope")
 
@@ -65,19 +76,24 @@ class Refinement(TableMethods):
         }
 
     @property
-    def images(self) -> list[ScannerImage]:
-        """The given scanner images."""
-        return self.inspection.declared.inputs.images
+    def inputs(self) -> RefinementInput:
+        """What was given."""
+        return self.inspection.declared.inputs
+
+    @property
+    def images(self) -> list[AnyScannerImage]:
+        """The given scanner images, rigorous ones before those with RPC."""
+        return self.inputs.images
 
     @property
     def frames(self) -> Network | None:
         """The given photographs."""
-        return self.inspection.declared.inputs.frames
+        return self.inputs.frames
 
     @property
     def points(self) -> GroundPoints:
         """All given points, including those of the photographs."""
-        return self.inspection.declared.inputs.points
+        return self.inputs.points
 
     @property
     def point_ids(self) -> list[str]:
@@ -103,6 +119,45 @@ class Refinement(TableMethods):
     def sigma0(self) -> float:
         """σ0 a posteriori."""
         return self.inspection.sigma0
+
+    def rays(self) -> dict[int, int]:
+        """The number of points used by their number of rays."""
+        declared = self.inspection.declared
+        n, rows = len(declared.rays.points), declared.parts
+        number = np.zeros(n, int)
+        for part in rows:
+            used = self.inspection.has_weight[part.set].any(1)
+            number += np.bincount(part.point[used], minlength=n)
+        rays, points = np.unique(number, return_counts=True)
+        return dict(zip(rays.tolist(), points.tolist()))
+
+    @property
+    def robust_sigma0(self) -> float:
+        """σ0 by the median of the residuals of image points (MAD), which blunders hardly change;
+        1 without redundancy."""
+        found = self.inspection.solution
+        if self.redundancy <= 0:
+            return 1.0
+        return robust_scale(found.problem, residual_lengths(found))
+
+    def counts(self) -> dict[str, int]:
+        """Observations with weight by their type, unknowns and redundancy: the first ones minus
+        the second ones."""
+        declared, found = self.inspection.declared, self.inspection.solution
+        images = {part.set for part in declared.parts}
+        words = {"control points": "control coordinates", "distances": "distances"}
+        words |= {TERRAIN_HEIGHTS: "terrain heights"}
+        number = dict.fromkeys(("image coordinates", *words.values(), "priors"), 0)
+        for given in found.problem.observations:
+            word = "image coordinates" if given.name in images else words.get(given.kind.name)
+            number[word or "priors"] += int(self.inspection.has_weight[given.name].sum())
+        free = {t.name: int((t.free > 0).sum()) for t in found.problem.tables}
+        of_points = free.pop("point")
+        return number | {
+            "point coordinates": of_points,
+            "shared unknowns": sum(free.values()),
+            "redundancy": self.redundancy,
+        }
 
     @property
     def redundancy(self) -> int:
@@ -139,27 +194,63 @@ class Refinement(TableMethods):
         """Adjusted coordinates of the points used."""
         return self.inspection.positions
 
-    def image(self, id: str) -> PushbroomImage:
-        """A refined scanner image, for `locate`, `project` and the correction."""
+    def image(self, id: str) -> PushbroomImage | RpcImage:
+        """A refined scanner image, for `locate`, `project` and the correction; of an image with
+        RPC one with coefficients that contain its bias (`compensated`)."""
         at = {one.id: k for k, one in enumerate(self.images)}
         if id not in at:
             raise InputError(f"no scanner image {id!r}; there are {', '.join(at)}")
-        k, inputs = at[id], self.inspection.declared.inputs
+        k, inputs = at[id], self.inputs
+        if k >= len(inputs.rigorous):
+            return self.compensated[id][0]
         values, form = self.inspection.solution.values, inputs.forms[k]
         p = np.concatenate([values[IMAGE][k], values[SENSOR][inputs.sensor[k]]])
-        return refined_image(self.images[k].image, form, change_of(form.sizes, p))
+        return refined_image(inputs.rigorous[k].image, form, change_of(form.sizes, p))
+
+    def bias(self, id: str) -> RpcBias:
+        """The estimated bias of an image with RPC, pixels."""
+        at = {one.id: k for k, one in enumerate(self.inputs.rpc)}
+        if id not in at:
+            raise InputError(f"no image with RPC {id!r}; there are {', '.join(at) or 'none'}")
+        terms = np.shape(self.inputs.rpc[at[id]].bias_sigma)[1]
+        bias = np.asarray(self.inspection.solution.values[RPC_IMAGE].bias)[at[id]]
+        return RpcBias(*bias[:, :terms])
+
+    @functools.cached_property
+    def compensated(self) -> dict[str, tuple[RpcImage, RpcCheck | None]]:
+        """By id the images with RPC that contain their biases, and the residuals of their fit (None
+        for a shift, which is exact)."""
+        found = {}
+        for one in self.inputs.rpc:
+            rpc, check = apply_bias(one.image.rpc, self.bias(one.id))
+            found[one.id] = dataclasses.replace(one.image, rpc=rpc), check
+        return found
 
     def image_points(self) -> list[dict]:
         """One row per image point used, image by image: ids, v, r and w of both
         coordinates, whether it was removed."""
         declared, points = self.inspection.declared, self.point_ids
-        images = declared.inputs.ids
+        images = self.inputs.ids
         rows = [
             {"image": images[i], "point": points[p], "v": v, "r": r, "w": w, "removed": bool(gone)}
             for part in declared.parts
             for i, p, v, r, w, gone in zip(part.image, part.point, *self.inspection.rows(part.set))
         ]
         return [rows[k] for k in np.argsort(declared.image, kind="stable")]
+
+    def terrain_heights(self) -> list[dict]:
+        """One row per height of the terrain model used: id of the point, v (m), r, w, whether it
+        was removed."""
+        levelled, ids = self.inspection.declared.levelled, self.point_ids
+        if not len(levelled):
+            return []
+        return [
+            {"point": ids[p], "v": v, "r": r, "w": w, "removed": gone}
+            for p, v, r, w, gone in zip(
+                levelled.tolist(),
+                *(x.ravel().tolist() for x in self.inspection.rows(TERRAIN_HEIGHTS)),
+            )
+        ]
 
     def distances(self) -> list[dict]:
         """One row per distance used: ids of both points, v, r, w, whether it was
@@ -182,21 +273,25 @@ class Refinement(TableMethods):
 
 
 def refine(
-    images: Sequence[ScannerImage],
+    images: Sequence[AnyScannerImage],
     points: GroundPoints,
     observations: Observations,
     frames: Network | None = None,
     *,
+    terrain: HeightModel | None = None,
     snooping: str = "none",
     significance: float = 0.001,
 ) -> Refinement:
-    """Adjust scanner images, and photographs that share points with them.
+    """Adjust scanner images, rigorous ones and those with RPC, and photographs that share points
+    with them.
 
     **Arguments:**
 
+    - `images`: `ScannerImage` and `RpcScannerImage` in any order.
     - `observations` of the scanner images: `xy` are line and pixel, `sigma` theirs.
     - `frames`: a network in the same object frame; its points are joined by their ids to `points`,
       its exterior orientations have priors, are held (σ 0) or free (NaN).
+    - `terrain`: a terrain model whose heights are observations of tie points.
     - `snooping`: `"none"`, `"baarda"` (σ a priori, every observation separately) or `"pope"` (σ a
       posteriori, the largest of all), with the `significance` α, two-sided.
 
@@ -211,12 +306,43 @@ def refine(
     check_input(images, points, observations, frames)
     points = _checks_upright(points, images[0].earth)
     rays, check_rays, warnings = choose_rays(points, observations, frames)
-    inputs = gather(images, points, observations, frames)
+    inputs = gather(images, points, observations, frames, terrain)
     found = adjust(declare(inputs, rays, start_points(inputs, rays)), snooping, significance)
+    warnings += [*_without_terrain(found), *_outside_domains(found)]
     for weak in weaknesses(found.declared, found.solution):
         warnings.append(f"{weak.sentence}; only priors, if any, separate them")
     check = intersect(found, check_rays) if len(check_rays.points) else None
     return Refinement(found, check, tuple(warnings))
+
+
+def _without_terrain(found: RefinementInspection) -> Iterator[str]:
+    """Tie points that the terrain model does not have, as a warning."""
+    inputs, uncovered = found.declared.inputs, found.declared.uncovered
+    if len(uncovered):
+        ids = np.array(inputs.points.id)[found.declared.rays.points[uncovered]]
+        yield (
+            f"{present(inputs.terrain).name} has no height at {count(len(ids), 'tie point')}, "
+            f"adjusted without one: {list_some(ids)}"
+        )
+
+
+def _outside_domains(found: RefinementInspection) -> Iterator[str]:
+    """Images with RPC that have points outside the domain of their coefficients, as warnings."""
+    inputs, positions = found.declared.inputs, found.positions
+    for part in found.declared.parts:
+        if part.table != RPC_IMAGE:
+            continue
+        row, xy = part.image - len(inputs.rigorous), inputs.observations.xy[part.rows]
+        X, values = positions[part.point], found.solution.values[RPC_IMAGE]
+        outside = misclosures(values, row, X, xy)[1] != RpcStatus.INSIDE
+        for i in np.unique(row[outside]):
+            mine = outside & (row == i)
+            ids = np.array(inputs.points.id)[found.declared.rays.points[part.point[mine]]]
+            yield (
+                f"image {inputs.rpc[i].id!r}: {count(int(mine.sum()), 'point')} of "
+                f"{int((row == i).sum())} outside the domain of its coefficients, which are "
+                f"extrapolated there: {list_some(ids)}"
+            )
 
 
 def _checks_upright(points: GroundPoints, earth: Ellipsoid | None) -> GroundPoints:
@@ -224,15 +350,17 @@ def _checks_upright(points: GroundPoints, earth: Ellipsoid | None) -> GroundPoin
     if earth is None or earth.a != earth.b:
         return points
     # one ray at a given height leaves two unknowns, which must be along the surface of that height
-    axes = points.axes.copy()
-    for k, role in enumerate(points.role):
-        if role == "check":
-            axes[k] = east_north_up(earth, points.X[k])
+    axes, checks = points.axes.copy(), np.array(points.role, dtype=object) == "check"
+    axes[checks] = east_north_up(earth, points.X[checks])
     return dataclasses.replace(points, axes=axes)
 
 
-def east_north_up(earth: Ellipsoid, X: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """The axes east, north and up at a point, as rows."""
-    longitude, latitude, _ = (float(v) for v in geodetic(earth, tuple(X)))
+def east_north_up(
+    earth: Ellipsoid, X: Float[np.ndarray, "points 3"]
+) -> Float[np.ndarray, "points 3 3"]:
+    """The axes east, north and up at points, as rows."""
+    longitude, latitude, _ = (np.asarray(v) for v in geodetic(earth, tuple(X.T)))
     s, c, z, k = np.sin(longitude), np.cos(longitude), np.sin(latitude), np.cos(latitude)
-    return np.array([[-s, c, 0], [-z * c, -z * s, k], [k * c, k * s, z]])
+    nil = np.zeros_like(s)
+    rows = (-s, c, nil), (-z * c, -z * s, k), (k * c, k * s, z)
+    return np.stack([np.stack(row, -1) for row in rows], -2)

@@ -17,31 +17,16 @@ if TYPE_CHECKING:
 def to_json(result: "Refinement") -> dict:
     """The result as plain values: unknowns, correlations, points, image points, checks."""
     found = result.inspection
-    names, prior = result.names, result.prior_sigma
-    factor = np.array([name.factor for name in names])
-    sigma = found.sigma
     document = {
         "sigma0": result.sigma0,
+        "robust_sigma0": result.robust_sigma0,
         "redundancy": result.redundancy,
+        "counts": result.counts(),
+        "rays": {str(k): n for k, n in result.rays().items()},
         "steps": found.steps,
         "global_test": result.global_test(),
         "warnings": list(result.warnings),
-        "unknowns": [
-            {
-                "of": n.owner,
-                "name": n.parameter,
-                "unit": n.unit,
-                "change": value,
-                "sigma": s,
-                "prior_sigma": None if np.isinf(p) else p,
-            }
-            for n, value, s, p in zip(
-                names,
-                (factor * result.estimate).tolist(),
-                (factor * sigma).tolist(),
-                (factor * prior).tolist(),
-            )
-        ],
+        "unknowns": _unknowns_as_rows(result),
         "correlation": result.correlation.tolist(),
         "points": [
             {
@@ -61,6 +46,8 @@ def to_json(result: "Refinement") -> dict:
         ],
         "removed": [{"observation": b.name, "test": b.test} for b in result.removed],
     }
+    if heights := result.terrain_heights():
+        document["terrain_heights"] = heights
     if result.distances():
         document["distances"] = result.distances()
     if result.check is not None:
@@ -73,6 +60,27 @@ def to_json(result: "Refinement") -> dict:
     return document
 
 
+def _unknowns_as_rows(result: "Refinement") -> list[dict]:
+    """The unknowns that points share, with their changes and σ in the units of reports."""
+    factor = np.array([name.factor for name in result.names])
+    return [
+        {
+            "of": n.owner,
+            "name": n.parameter,
+            "unit": n.unit,
+            "change": value,
+            "sigma": s,
+            "prior_sigma": None if np.isinf(p) else p,
+        }
+        for n, value, s, p in zip(
+            result.names,
+            (factor * result.estimate).tolist(),
+            (factor * result.inspection.sigma).tolist(),
+            (factor * result.prior_sigma).tolist(),
+        )
+    ]
+
+
 def report(
     result: "Refinement", verdict: str = "", *, min_correlation: float = 0.9, most: int = 12
 ) -> str:
@@ -82,29 +90,8 @@ def report(
     Correlations above `min_correlation` (the σ of one unknown is 1/√(1 − 0.9²) = 2.3 times what it
     would be with the other known) and image points are listed, the `most` largest.
     """
-    found = result.inspection
-    rows = result.image_points()
-    used = [row for row in rows if not row["removed"]]
-    roles = [result.points.role[k] for k in result.inspection.declared.rays.points]
-    counts = ", ".join(f"{roles.count(role)} {role}" for role in ("control", "tie"))
-    frames = 0 if result.frames is None else len(result.frames.images)
-    lines = [
-        "Refinement of scanner images",
-        "",
-        *([f"verdict          {verdict}"] if verdict else []),
-        f"scanner images   {len(result.images)}, photographs {frames}",
-        f"points           {counts}; {len(used)} image points",
-        f"sigma0           {result.sigma0:.4f}   redundancy {result.redundancy}, "
-        f"{found.steps} steps",
-        f"chi2 test        {describe_test(result.global_test(), UNIT_OF_WEIGHT)}",
-    ]
-    scanner_ids = [image.id for image in result.images]
-    for id in result.inspection.declared.inputs.ids:
-        v = np.array([row["v"] for row in used if row["image"] == id])
-        if len(v):
-            unit = "lines, pixels" if id in scanner_ids else "camera's unit"
-            rms = np.sqrt((v**2).mean(0))
-            lines.append(f"RMS of image {id}: {rms[0]:.3f} {rms[1]:.3f} ({unit})")
+    used = [row for row in result.image_points() if not row["removed"]]
+    lines = [*_summary(result, verdict), *_fits(result, used)]
     if result.warnings:
         lines += ["", "Warnings", *(f"  {warning}" for warning in result.warnings)]
     lines += ["", "Unknowns", *_unknowns(result)]
@@ -123,6 +110,49 @@ def report(
     return "\n".join(lines) + "\n"
 
 
+def _summary(result: "Refinement", verdict: str) -> list[str]:
+    """The lines that say what was adjusted, and how well it fits."""
+    found = result.inspection
+    roles = [result.points.role[k] for k in result.inspection.declared.rays.points]
+    counts = ", ".join(f"{roles.count(role)} {role}" for role in ("control", "tie"))
+    frames = 0 if result.frames is None else len(result.frames.images)
+    rpc = len(result.inputs.rpc)
+    rays = ", ".join(f"{n} with {k}" for k, n in result.rays().items())
+    sums = result.counts()
+    redundancy = sums.pop("redundancy")
+    return [
+        "Refinement of scanner images",
+        "",
+        *([f"verdict          {verdict}"] if verdict else []),
+        f"scanner images   {len(result.images)}{f', {rpc} with RPC' if rpc else ''}, "
+        f"photographs {frames}",
+        f"points           {counts}; {sum(k * n for k, n in result.rays().items())} image points",
+        f"points by rays   {rays}",
+        f"counts           {', '.join(f'{word} {n}' for word, n in sums.items() if n)}",
+        f"sigma0           {result.sigma0:.4f} (robust {result.robust_sigma0:.4f})   redundancy "
+        f"{redundancy}, {found.steps} steps",
+        f"chi2 test        {describe_test(result.global_test(), UNIT_OF_WEIGHT)}",
+    ]
+
+
+def _fits(result: "Refinement", used: list[dict]) -> Iterator[str]:
+    """The residuals of every image, and of the terrain model."""
+    scanner_ids = [image.id for image in result.images]
+    by_image = {id: [] for id in result.inputs.ids}
+    for row in used:
+        by_image[row["image"]].append(row["v"])
+    for id, v in by_image.items():
+        if v:
+            v = np.array(v)
+            unit = "lines, pixels" if id in scanner_ids else "camera's unit"
+            rms = np.sqrt((v**2).mean(0))
+            yield (f"RMS of image {id}: {rms[0]:.3f} {rms[1]:.3f} ({unit})")
+    heights = [row for row in result.terrain_heights() if not row["removed"]]
+    if heights:
+        v = np.array([row["v"] for row in heights])
+        yield (f"RMS of {len(v)} terrain heights: {np.sqrt((v**2).mean()):.3f} m")
+
+
 def _unknowns(result: "Refinement") -> Iterator[str]:
     sigma = result.inspection.sigma
     yield f"  {'':46s} {'change':>13s} {'sigma':>11s} {'prior':>10s}"
@@ -135,9 +165,9 @@ def _unknowns(result: "Refinement") -> Iterator[str]:
 
 
 def _tests(rows: list[dict], most: int) -> Iterator[str]:
-    worst = lambda row: np.nan_to_num(np.abs(row["w"])).max()
+    worst = np.nan_to_num(np.abs([row["w"] for row in rows]).reshape(-1, 2)).max(1)
     yield f"  {'image':12s} {'point':12s} {'v':>17s} {'r':>11s} {'w':>15s} {'MDB/σ':>13s}"
-    for row in sorted(rows, key=worst, reverse=True)[:most]:
+    for row in (rows[k] for k in np.argsort(-worst, kind="stable")[:most]):
         pair = lambda values, form: " ".join(
             format(x, form) if np.isfinite(x) else f"{'–':>{form.split('.')[0]}}" for x in values
         )

@@ -5,14 +5,17 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxbundle.errors import InputError
-from jaxbundle.geometry.ellipsoid import Ellipsoid
+from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid
 from jaxbundle.network.tables import Network, Observations, Source
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.interpolation import covers, interval
+from jaxbundle.pushbroom.rpc import DOMAIN_MARGIN
+from jaxbundle.pushbroom.rpc_image import RpcImage
 from jaxbundle.refinement.freedom import Freedom
+from jaxbundle.refinement.rpc_points import BIAS_TERMS
 
 ROLES = ("control", "tie", "check")
 
@@ -33,6 +36,27 @@ class ScannerImage:
     earth: Ellipsoid | None
     freedom: Freedom
     sensor: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class RpcScannerImage:
+    """An image with rational polynomials, and the polynomial of its bias as unknowns.
+
+    `bias_sigma`: the prior σ of every term of lines and of samples in pixels, 0 held, infinite free
+    (`rpc_points.prior_of_bias`, `prior_of_errors`).
+    """
+
+    id: str
+    image: RpcImage
+    bias_sigma: Float[np.ndarray, "2 terms"]
+
+    @property
+    def earth(self) -> Ellipsoid:
+        """The ellipsoid that the coefficients hold for."""
+        return WGS84
+
+
+AnyScannerImage = ScannerImage | RpcScannerImage
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,43 +137,125 @@ def check_points_table(points: GroundPoints) -> None:
             raise InputError(f"{points.source(row)}: a σ of point {id!r} is negative; 0 holds it")
 
 
+def check_images(images: Sequence[AnyScannerImage]) -> None:
+    """Refuse images without ids of their own, in different frames, or with invalid unknowns."""
+    if not images:
+        raise InputError("refine: no scanner image; photographs alone are adjusted by `adjust`")
+    if len({one.id for one in images}) < len(images):
+        raise InputError("refine: two scanner images have the same id; give each its own")
+    for one in images:
+        if not is_same_earth(one.earth, images[0].earth):
+            raise InputError(
+                f"refine: images {images[0].id!r} and {one.id!r} have different ellipsoids or "
+                "frames; points can be in one only (images with RPC are in WGS84)"
+            )
+        if isinstance(one, ScannerImage):
+            if one.freedom.knot_spacing <= 0:
+                raise InputError(f"image {one.id!r}: knot_spacing must be positive, in seconds")
+            continue
+        shape = np.shape(one.bias_sigma)
+        if len(shape) != 2 or shape[0] != 2 or shape[1] not in BIAS_TERMS:
+            raise InputError(
+                f"image {one.id!r}: σ of its bias have the shape {list(shape)}; expected [2, 1], "
+                "[2, 3] or [2, 6], of lines and of samples"
+            )
+        if not (np.asarray(one.bias_sigma) >= 0).all():
+            raise InputError(
+                f"image {one.id!r}: a σ of its bias is negative or NaN; expected pixels, 0 to hold "
+                "it, inf to free it"
+            )
+
+
+def is_same_earth(one: Ellipsoid | None, other: Ellipsoid | None) -> bool:
+    """Whether two ellipsoids are the same but for digits of their axes in files."""
+    if one is None or other is None:
+        return one is other
+    # a millimetre in the axes is a millimetre in height
+    return all(abs(float(a) - float(b)) < 1e-3 for a, b in zip(one, other))
+
+
+def _limits(one: AnyScannerImage) -> tuple[tuple[float, float], ...]:
+    """The first and last line and pixel that a measurement can have."""
+    image = one.image
+    if isinstance(image, RpcImage) and not image.sized:
+        # a size that nobody stated is that of the domain
+        offsets = image.rpc.line_offset, image.rpc.sample_offset
+        scales = image.rpc.line_scale, image.rpc.sample_scale
+        reach = [(1 + DOMAIN_MARGIN) * abs(float(scale)) for scale in scales]
+        return tuple((float(o) - r, float(o) + r) for o, r in zip(offsets, reach))
+    # pixels are areas about integers, so that the image ends half a pixel beyond the last
+    return (-0.5, image.lines - 0.5), (-0.5, image.pixels - 0.5)
+
+
+def _check_on_image(
+    images: Sequence[AnyScannerImage], points: GroundPoints, observations: Observations
+) -> None:
+    """Refuse measurements outside their images."""
+    limits = np.array([_limits(one) for one in images])[observations.image]
+    inside = lambda xy: (limits[:, :, 0] <= xy) & (xy <= limits[:, :, 1])
+    off = ~inside(observations.xy)
+    if not off.any():
+        return
+    row = int(off.any(1).argmax())
+    k, i = int(off[row].argmax()), observations.image[row]
+    one, (low, high) = images[i], limits[row, k]
+    rows = observations.image == i
+    hint = ""
+    if len(rows) > 1 and inside(observations.xy[:, ::-1])[rows].all():
+        hint = "; exchanged, line and pixel of all its points would be on it: check the columns"
+    size = (one.image.lines, one.image.pixels)[k]
+    sized = not isinstance(one.image, RpcImage) or one.image.sized
+    which = f"which has {size}" if sized else "as far as its coefficients hold"
+    raise InputError(
+        f"{observations.source(row)}: point {points.id[observations.point[row]]!r} in image "
+        f"{one.id!r}: {('line', 'pixel')[k]} {observations.xy[row, k]:g} is off the image, "
+        f"{which}; {low:g} to {high:g} is expected{hint}"
+    )
+
+
 def check_observations(
-    images: list[ScannerImage], points: GroundPoints, observations: Observations
+    images: Sequence[AnyScannerImage], points: GroundPoints, observations: Observations
 ) -> None:
     """Refuse measurements outside the image or the tables, duplicates, and invalid σ."""
+    where = lambda row: (
+        f"{observations.source(row)}: point {points.id[observations.point[row]]!r} in image "
+        f"{images[int(observations.image[row])].id!r}"
+    )
+    _check_on_image(images, points, observations)
+    wrong = ~(observations.sigma > 0).all(1)
+    if wrong.any():
+        raise InputError(f"{where(int(wrong.argmax()))}: σ must be positive, in lines and pixels")
     seen = {}
-    for row, (i, p) in enumerate(zip(observations.image, observations.point)):
-        one = images[i]
-        where = f"{observations.source(row)}: point {points.id[p]!r} in image {one.id!r}"
-        sizes = (one.image.lines, one.image.pixels)
-        for name, value, size in zip(("line", "pixel"), observations.xy[row], sizes):
-            # pixels are areas about integers, so that the image ends half a pixel beyond the last
-            if not -0.5 <= value <= size - 0.5:
-                raise InputError(
-                    f"{where}: {name} {value:g} is off the image, which has {size}; -0.5 to "
-                    f"{size - 0.5:g} is expected"
-                )
-        if not (observations.sigma[row] > 0).all():
-            raise InputError(f"{where}: σ must be positive, in lines and pixels")
-        if (i, p) in seen:
+    for row, at in enumerate(zip(observations.image.tolist(), observations.point.tolist())):
+        if at in seen:
             raise InputError(
-                f"{where} is measured twice, also at {observations.source(seen[i, p])}; keep one"
+                f"{where(row)} is measured twice, also at {observations.source(seen[at])}; keep one"
             )
-        seen[i, p] = row
+        seen[at] = row
     for i, one in enumerate(images):
-        rows = np.flatnonzero(observations.image == i)
-        t = jnp.asarray(one.image.times.time(observations.xy[rows, 0]))
-        trajectory = one.image.trajectory
-        tables = {"positions": trajectory.position, "attitude": trajectory.attitude.table}
-        for what, table in tables.items():
-            out = ~np.asarray(covers(table, interval(table, t), t))
-            if out.any():
-                row, at = rows[out.argmax()], float(t[out.argmax()])
-                first, last = float(table.times[0]), float(table.times[-1])
-                wrong = "in a gap of" if first <= at <= last else "outside"
-                raise InputError(
-                    f"{observations.source(row)}: point {points.id[observations.point[row]]!r} in "
-                    f"image {one.id!r}: its line is at {at:.9g} s, {wrong} the table of {what}, "
-                    f"{first:.9g} to {last:.9g} s; give ancillary data for the whole image, or "
-                    "leave the point out"
-                )
+        if isinstance(one, ScannerImage):
+            _check_times(one, np.flatnonzero(observations.image == i), points, observations)
+
+
+def _check_times(
+    one: ScannerImage,
+    rows: Int[np.ndarray, " n"],
+    points: GroundPoints,
+    observations: Observations,
+) -> None:
+    """Refuse measurements at times that the ancillary data of their image do not have."""
+    t = jnp.asarray(one.image.times.time(observations.xy[rows, 0]))
+    trajectory = one.image.trajectory
+    tables = {"positions": trajectory.position, "attitude": trajectory.attitude.table}
+    for what, table in tables.items():
+        out = ~np.asarray(covers(table, interval(table, t), t))
+        if out.any():
+            row, at = rows[out.argmax()], float(t[out.argmax()])
+            first, last = float(table.times[0]), float(table.times[-1])
+            wrong = "in a gap of" if first <= at <= last else "outside"
+            raise InputError(
+                f"{observations.source(row)}: point {points.id[observations.point[row]]!r} in "
+                f"image {one.id!r}: its line is at {at:.9g} s, {wrong} the table of {what}, "
+                f"{first:.9g} to {last:.9g} s; give ancillary data for the whole image, or "
+                "leave the point out"
+            )

@@ -36,6 +36,7 @@ from jaxbundle.io.networks.orientation_covariance import (
     write_orientation_covariance,
 )
 from jaxbundle.io.results.json_lines import JsonLines
+from jaxbundle.io.scanner.asp_points import read_gcp, read_match
 from jaxbundle.io.writing.folders import check_folder, read_marker, replace_folder
 from jaxbundle.measure.boards import Board
 
@@ -567,3 +568,23 @@ for suffix in ("tif", "png", "jpg", "jp2"):
 @reader("grey values of 16 bits", _grey)
 def _(folder):
     _dem(folder, None, dtype="uint16", compress="deflate", nodata=0)
+
+
+# --- tie points of scanner images ---------------------------------------------------------------
+
+
+@reader("asp match", lambda f: read_match(f / "run-a__b.match"))
+def _(folder):
+    records = b"".join(
+        struct.pack("<ffiifff?IIQff", x, y, 3, 4, 0.5, 1.0, 2.0, True, 1, 2, 2, 0.5, 0.25)
+        for x, y in ((3.25, 4.5), (30.0, 4.0), (3.5, 5.0), (31.0, 4.25))
+    )
+    (folder / "run-a__b.match").write_bytes(struct.pack("<QQ", 2, 2) + records)
+
+
+@reader("asp gcp", lambda f: read_gcp(f / "control.gcp"))
+def _(folder):
+    (folder / "control.gcp").write_text(
+        "# id lat lon height\n1 23.7 160.1 427.1 1 1 1 a.tif 124.5 19.7 1 1 b.tif 254.3 73.9 1 1\n"
+        "2, 23.8, 160.2, 400.0, 1, 1, 2, a.tif, 10.5, 90.25, 0.5, 0.5\n"
+    )

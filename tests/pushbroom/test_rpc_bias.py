@@ -16,6 +16,8 @@ RPC = made_up()
 PLACES = places(RPC, 12)
 BIAS = RpcBias(jnp.array([3.0, 0.5, -0.8]), jnp.array([-7.0, 0.2, 0.4]))
 SHIFT = RpcBias(jnp.array([3.0, 0, 0]), jnp.array([-7.0, 0, 0]))
+QUADRATIC = RpcBias(jnp.array([3.0, 0.5, -0.8, 0.3, 0.2, -0.4]),
+                    jnp.array([-7.0, 0.2, 0.4, -0.1, 0.5, 0.3]))  # fmt: skip
 image = jax.jit(jax.vmap(project_compensated, (None, None, 0, 0, 0)))
 
 
@@ -25,7 +27,9 @@ def control(bias, noise=0.0, rng=None):
     return RpcTable(*PLACES, *noisy)
 
 
-@pytest.mark.parametrize("model, bias", [("shift", SHIFT), ("affine", BIAS)])
+@pytest.mark.parametrize(
+    "model, bias", [("shift", SHIFT), ("affine", BIAS), ("quadratic", QUADRATIC)]
+)
 def test_an_injected_bias_is_found_and_put_into_the_coefficients(model, bias):
     fit = fit_bias(RPC, control(bias), model=model)
     np.testing.assert_allclose(fit.bias.line, bias.line, atol=1e-9)

@@ -1,5 +1,6 @@
 """`jaxbundle pushbroom refine`: adjust scanner images with control and tie points."""
 
+import dataclasses
 import json as json_
 from functools import partial
 from pathlib import Path
@@ -23,7 +24,7 @@ def refine(
     force: Force = False,
     json: Json = "",
 ) -> None:
-    """Refine attitude, position and optics of scanner images with control and tie points."""
+    """Refine scanner images, rigorous or with RPC, with control and tie points."""
     from jaxbundle import pushbroom as line_scanners
     from jaxbundle.cli.outputs import (
         PAGE,
@@ -36,8 +37,12 @@ def refine(
     from jaxbundle.cli.pushbroom.shared import warn
     from jaxbundle.io.networks.project import FILES, fill_project
     from jaxbundle.io.results.result_json import verdict_dict, without_nan
+    from jaxbundle.io.scanner.refined_images import (
+        describe_refits,
+        names_of_images,
+        write_images,
+    )
     from jaxbundle.io.scanner.refinement import read_refinement
-    from jaxbundle.io.scanner.writing import names_of, write_scanner_image
     from jaxbundle.io.text.csv_tables import write_csv, write_text
     from jaxbundle.io.writing.fingerprints import files_read
     from jaxbundle.refinement import adjusted_photographs, point_rows, report, to_json
@@ -47,7 +52,7 @@ def refine(
 
     file = read_refinement(input)
     names = [REPORT, PAGE, RESULT, "points.csv", *(f"{PHOTOGRAPHS}/{name}" for name in FILES)]
-    names += [name for one in file.images for name in names_of(one.id)]
+    names += names_of_images(file)
     files = files_read(input)
     check_writable(json, out, "pushbroom refine", names, files, force, html)
     origin = UNKNOWN
@@ -60,6 +65,9 @@ def refine(
             },
         )
     result = line_scanners.refine(file)
+    if out is not None:
+        refits = describe_refits(result)
+        result = dataclasses.replace(result, warnings=(*result.warnings, *refits))
     verdict = conclude_refinement(result)
     text = head_line(origin) + report(result, verdict.words)
     document = without_nan({"verdict": verdict_dict(verdict), **to_json(result)})
@@ -67,8 +75,7 @@ def refine(
     page = partial(compose_refinement, result, origin)
     with write_result(json, as_json, out, "pushbroom refine", names, force, html, page) as new:
         if new is not None:
-            for one in file.images:
-                write_scanner_image(new, one.id, result.image(one.id), one.earth)
+            write_images(new, file, result)
             rows = point_rows(result)
             write_csv(new / "points.csv", list(rows[0]), [list(row.values()) for row in rows])
             photographs = adjusted_photographs(result)

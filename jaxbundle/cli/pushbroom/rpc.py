@@ -14,7 +14,7 @@ rpc = Application(help="Rational polynomial coefficients (RPC00B).")
 pushbroom.add_typer(rpc, name="rpc")
 
 GROUND_SIGMA = ("seast", "snorth", "sheight")
-TERMS = ("shift", "by_line", "by_sample")
+TERMS = ("shift", "by_line", "by_sample", "by_line_line", "by_line_sample", "by_sample_sample")
 
 RpcFile = Annotated[
     Path,

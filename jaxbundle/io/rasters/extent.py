@@ -4,6 +4,7 @@ A ray meets the ground between the highest and the lowest possible height of the
 the extent contains both ends of the rays of a lattice over the image.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -65,6 +66,21 @@ def rpc_extent(rpc: Rpc) -> Extent | None:
     return _around(
         float(rpc.longitude_offset) + abs(float(rpc.longitude_scale)) * ends,
         float(rpc.latitude_offset) + abs(float(rpc.latitude_scale)) * ends,
+    )
+
+
+def joint_extent(extents: Sequence[Extent | None]) -> Extent | None:
+    """The extent of several images; None if one has none."""
+    known = [extent for extent in extents if extent is not None]
+    if len(known) < len(extents) or not known:
+        return None
+    # the turn that brings each nearest to the first
+    turns = [360 * round((known[0].west - extent.west) / 360) for extent in known]
+    return Extent(
+        min(extent.west + turn for extent, turn in zip(known, turns)),
+        min(extent.south for extent in known),
+        max(extent.east + turn for extent, turn in zip(known, turns)),
+        max(extent.north for extent in known),
     )
 
 

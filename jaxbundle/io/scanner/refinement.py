@@ -4,16 +4,25 @@
 [refine]
 points = "points.csv"               # id,role,X,Y,Z[,sX,sY,sZ], or
                                     # id,role,longitude,latitude,height[,sE,sN,sh]
-observations = "observations.csv"   # image,point,line,pixel[,sline,spixel]
+observations = "observations.csv"   # image,point,line,pixel[,sline,spixel]; or a list of such
+                                    # files, and .match and .gcp of Ames Stereo Pipeline
 frames = "photographs"              # a project of photographs that share points
+dem = "terrain.tif"                 # a terrain model, whose heights are observations of tie points
+dem_sigma = 5.0                     # of these, metres
+geoid = "egm96.gtx"                 # as of the commands: for heights above the geoid
+rpc_format = "text"                 # text | rpb, of the compensated coefficients in --out
 sigma = 0.5                         # of line and pixel, where the table has none; default 1, a unit
 angle_unit = "deg"                  # rad | deg | gon, of this file and of longitude, latitude
 snooping = "pope"                   # none | baarda | pope
 significance = 0.001
 
-[images]                            # scanner files, by the image's id
+[images]                            # scanner files, or images with RPC, by the image's id
 A = "a/scanner.toml"
 B = "b/scanner.toml"
+C = "c.tif"
+
+[models]                            # rigorous | rpc, of products that have both
+B = "rigorous"
 
 [sensors]                           # images of one sensor share focal length, mounting, look angles
 A = "imager"
@@ -30,62 +39,72 @@ focal_length = 1e-4                 # relative
 mounting = "held"
 look_across = [0, 1e-6]             # σ of the coefficients of 1, û, û², … (tangents)
 look_along = []
+bias_degree = 1                     # of images with RPC: 0, 1 or 2
+bias = [5.0, 0.5]                   # σ of its shift and of its other terms, pixels; "stated": by
+                                    # the errors in the file
 
 [unknowns.B]                        # of one image, in place of the above
 attitude_rate = "held"
 ```
 """
 
-import dataclasses
-import math
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import NamedTuple
 
 from jaxbundle.errors import InputError
-from jaxbundle.geometry.ellipsoid import Ellipsoid, earth_fixed
 from jaxbundle.io.formats import read_network
-from jaxbundle.io.scanner.read import read_scanner
-from jaxbundle.io.text.sections import TomlFile, TomlSection, read_sections
-from jaxbundle.network.columns import Columns, did_you_mean, show
-from jaxbundle.network.tables import STATED, UNIT, Network, Observations
+from jaxbundle.io.rasters.extent import image_extent, joint_extent, rpc_extent
+from jaxbundle.io.rasters.geoid import add_geoid
+from jaxbundle.io.rasters.reading import read_terrain
+from jaxbundle.io.scanner.refinement_images import read_images
+from jaxbundle.io.scanner.refinement_points import read_points
+from jaxbundle.io.text.sections import TomlSection, read_sections
+from jaxbundle.network.columns import did_you_mean
+from jaxbundle.network.tables import Network, Observations
 from jaxbundle.network.units import ANGLE_UNITS
-from jaxbundle.refinement.freedom import Freedom
-from jaxbundle.refinement.refining import TESTS, east_north_up
-from jaxbundle.refinement.tables import GroundPoints, ScannerImage, check_points_table
+from jaxbundle.refinement.refining import TESTS
+from jaxbundle.refinement.tables import AnyScannerImage, GroundPoints, ScannerImage
+from jaxbundle.refinement.terrain_heights import HeightModel
 
 SECTIONS = {
     "refine": (
         "points",
         "observations",
         "frames",
+        "dem",
+        "dem_sigma",
+        "geoid",
+        "rpc_format",
         "sigma",
         "angle_unit",
         "snooping",
         "significance",
     ),
     "images": (),
+    "models": (),
     "sensors": (),
     "unknowns": (),
 }
-REQUIRED_FIELDS = ("refine", "images", "unknowns")
-WORDS = {"free": math.inf, "held": 0.0}
-ANGULAR_UNKNOWNS = ("attitude", "attitude_rate", "jitter", "mounting")
-LISTED_UNKNOWNS = ("look_across", "look_along")
+REQUIRED_FIELDS = ("refine", "images")
+# Of compensated coefficients, by rpc_format.
+RPC_ENDINGS = {"text": "_RPC.TXT", "rpb": ".RPB"}
 
 
 class RefineFile(NamedTuple):
-    """The arguments of `jaxbundle.refinement.refine`."""
+    """The arguments of `jaxbundle.refinement.refine`; `rpc_ending`: of the names of files with
+    compensated coefficients."""
 
-    images: list[ScannerImage]
+    images: list[AnyScannerImage]
     points: GroundPoints
     observations: Observations
     frames: Network | None
     snooping: str
     significance: float
     warnings: tuple[str, ...] = ()
+    terrain: HeightModel | None = None
+    rpc_ending: str = RPC_ENDINGS["text"]
 
 
 def read_refinement(path: str | Path) -> RefineFile:
@@ -100,25 +119,16 @@ def read_refinement(path: str | Path) -> RefineFile:
     if unit not in ANGLE_UNITS:
         raise InputError(f"{section.where}angle_unit {unit!r}{did_you_mean(unit, ANGLE_UNITS)}")
     radians = ANGLE_UNITS[unit]
-    images, warnings = _read_images(file, radians)
+    images, warnings = read_images(file, radians)
     frames = None
     if "frames" in section:
         frames = read_network(section.path("frames", "a project of photographs", folder=True))
-    points = _points(section.table("points"), images[0].earth, radians)
-    # checked first: the ids of observations are looked up in it
-    check_points_table(points)
-    ids = {id: k for k, id in enumerate(points.id)}
-    if frames is not None:
-        # points that only photographs show follow those of the table
-        more = (id for id in frames.points.id if id not in ids)
-        ids |= {id: k for k, id in enumerate(more, len(ids))}
-    observations = _observations(
-        section.table("observations"),
-        ids,
-        [image.id for image in images],
-        section,
-        str(path),
-    )
+    # other programs name an image by its file, without folder and suffix
+    stem = lambda id: file.section("images").path(id, "an image").stem
+    names = {re.sub("(?i)_rpc$", "", stem(one.id)): one.id for one in images}
+    names |= {one.id: one.id for one in images}
+    points, observations, said = read_points(section, names, images, frames, radians)
+    warnings += said
     snooping = section.text("snooping", "none")
     if snooping not in TESTS:
         raise InputError(f"{section.where}snooping {snooping!r}{did_you_mean(snooping, TESTS)}")
@@ -127,137 +137,53 @@ def read_refinement(path: str | Path) -> RefineFile:
         raise InputError(
             f"{section.where}significance is {significance}; a number between 0 and 1 is expected"
         )
-    return RefineFile(images, points, observations, frames, snooping, significance, tuple(warnings))
-
-
-def _read_images(file: TomlFile, radians: float) -> tuple[list[ScannerImage], list[str]]:
-    """The images with their unknowns, and warnings of their readers."""
-    path, scanners = file.path, file.section("images")
-    if not scanners.values:
-        raise InputError(f'{path}, [images]: no image; give id = "scanner.toml"')
-    sensors, unknowns = file.section("sensors"), file.section("unknowns")
-    sensors.check_keys(tuple(scanners.values))
-    own = {k: v for k, v in unknowns.values.items() if isinstance(v, dict)}
-    common = {k: v for k, v in unknowns.values.items() if k not in own}
-    for id in own:
-        if id not in scanners.values:
-            raise InputError(
-                f"{path}, [unknowns.{id}]: no such image{did_you_mean(id, scanners.values)}"
-            )
-    images, warnings = [], []
-    for id in scanners.values:
-        scanner = read_scanner(scanners.path(id, "a scanner file, or the file of a product"))
-        warnings += scanner.warnings
-        where = f"{path}, [unknowns{'.' + id if id in own else ''}]: "
-        freedom = _read_freedom(TomlSection(file, where, common | own.get(id, {})), radians)
-        # without an entry an image is a sensor of its own
-        images.append(ScannerImage(id, scanner.image, scanner.earth, freedom, sensors.text(id, id)))
-    for image in images:
-        if image.earth != images[0].earth:
-            raise InputError(
-                f"{path}, [images]: {images[0].id!r} and {image.id!r} have different ellipsoids or "
-                "frames; points can be in one only"
-            )
-    return images, warnings
-
-
-def _read_freedom(section: TomlSection, radians: float) -> Freedom:
-    fields = {f.name for f in dataclasses.fields(Freedom)}
-    section.check_keys(tuple(sorted(fields)))
-    values_read: dict[str, Any] = {}
-    for key, value in section.values.items():
-        factor = radians if key in ANGULAR_UNKNOWNS else 1.0
-        if key == "knot_spacing":
-            values_read[key] = section.number(key)
-            if values_read[key] <= 0:
-                raise InputError(f"{section.where}{key} must be positive, in seconds")
-        elif key == "focal_length":
-            values_read[key] = _sigma(section, key, value)
-        elif key in LISTED_UNKNOWNS:
-            values = value if isinstance(value, list) else [value]
-            values_read[key] = tuple(_sigma(section, key, v) for v in values)
-        else:
-            values = value if isinstance(value, list) else [value] * 3
-            if len(values) != 3:
-                raise InputError(f"{section.where}{key} is {show(value)}; one value or three")
-            values_read[key] = tuple(factor * _sigma(section, key, v) for v in values)
-    return Freedom(**values_read)
-
-
-def _sigma(section: TomlSection, key: str, value: Any) -> float:
-    if isinstance(value, str) and value in WORDS:
-        return WORDS[value]
-    if isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < math.inf:
-        return float(value)
-    raise InputError(
-        f'{section.where}{key} is {show(value)}; "free", "held" or a prior σ is expected'
-    )
-
-
-def _points(table: Columns, earth: Ellipsoid | None, radians: float) -> GroundPoints:
-    geographic = "longitude" in table.values
-    names = ("longitude", "latitude", "height") if geographic else ("X", "Y", "Z")
-    sigmas = ("sE", "sN", "sh") if geographic else ("sX", "sY", "sZ")
-    table.check_names(("id", "role", *names), sigmas)
-    X = np.stack([table.numbers(n) for n in names], 1)
-    words = {"free": math.inf, "held": 0.0}
-    sigma = np.stack([table.numbers(n, words=words) for n in sigmas], 1)
-    axes = np.tile(np.eye(3), (len(X), 1, 1))
-    if geographic:
-        if earth is None or earth.a != earth.b:
-            raise InputError(
-                f"{table.source.name}: longitudes need an ellipsoid of revolution as [scanner] "
-                "earth; give X, Y, Z"
-            )
-        beyond = np.abs(X[:, 1] * radians) > np.pi / 2 + 1e-12  # some thousand eps, as of 100 gon
-        if beyond.any():
-            row = int(beyond.argmax())
-            raise InputError(
-                f"{table.source(row)}: latitude {X[row, 1]:g} is beyond the pole; look at the "
-                "order of columns and at angle_unit"
-            )
-        X = np.stack(
-            [
-                np.asarray(v)
-                for v in earth_fixed(earth, (radians * X[:, 0], radians * X[:, 1], X[:, 2]))
-            ],
-            1,
-        )
-        known = np.isfinite(X).all(1)
-        # an unknown place has no east and north: its σ are of the axes
-        for k in np.flatnonzero(known):
-            axes[k] = east_north_up(earth, X[k])
-    return GroundPoints(
-        table.ids("id"),
-        table.ids("role"),
-        X,
-        np.nan_to_num(sigma, nan=0.0, posinf=np.inf),
-        axes,
-        ("east", "north", "up") if geographic else ("X", "Y", "Z"),
-        table.source,
-    )
-
-
-def _observations(
-    table: Columns, ids: Mapping[str, int], images: Sequence[str], section: TomlSection, where: str
-) -> Observations:
-    table.check_names(("image", "point", "line", "pixel"), ("sline", "spixel"))
-    sigma, stated = section.number("sigma", 1.0), "sigma" in section.values
-    if sigma <= 0:
-        raise InputError(f"{section.where}sigma is {sigma:g}; positive, in lines and pixels")
-    stated_sigma = np.stack([table.numbers(n) for n in ("sline", "spixel")], 1)
-    lacking = np.isnan(stated_sigma)
-    if not stated and lacking.any() and not lacking.all():
-        row = int(lacking.any(1).argmax())
+    rpc_format = section.text("rpc_format", "text")
+    if rpc_format not in RPC_ENDINGS:
         raise InputError(
-            f"{table.source(row)}: sline or spixel is missing, which other rows have; give it, or "
-            f"sigma in [refine] for those without"
+            f"{section.where}rpc_format {rpc_format!r}{did_you_mean(rpc_format, RPC_ENDINGS)}"
         )
-    return Observations(
-        table.indices("image", "image", {id: k for k, id in enumerate(images)}, where),
-        table.indices("point", "point", ids, section.text("points")),
-        np.stack([table.numbers(n, required=True) for n in ("line", "pixel")], 1),
-        np.where(lacking, sigma, stated_sigma),
-        table.source,
-        STATED if stated or not lacking.any() else UNIT,
+    return RefineFile(
+        images,
+        points,
+        observations,
+        frames,
+        snooping,
+        significance,
+        tuple(warnings),
+        _read_terrain(section, images),
+        RPC_ENDINGS[rpc_format],
     )
+
+
+def _read_terrain(section: TomlSection, images: Sequence[AnyScannerImage]) -> HeightModel | None:
+    """The terrain model whose heights are observed, where the images look."""
+    if "dem" not in section:
+        for key in ("dem_sigma", "geoid"):
+            if key in section:
+                raise InputError(f"{section.where}{key}: needs a terrain model; give dem")
+        return None
+    path, earth = section.path("dem", "a raster of heights"), images[0].earth
+    if earth is not None and earth.a != earth.b:
+        raise InputError(
+            f"{section.where}dem: heights need an ellipsoid of revolution as [scanner] earth"
+        )
+    if "dem_sigma" not in section:
+        raise InputError(
+            f"{section.where}dem_sigma is missing; the σ of a height of {path.name} is expected, "
+            "metres: the LE90 of its producer, divided by 1.645"
+        )
+    sigma = section.number("dem_sigma")
+    if sigma <= 0:
+        raise InputError(f"{section.where}dem_sigma is {sigma:g}; expected metres above 0")
+    extents = [
+        image_extent(one.image, one.earth) if isinstance(one, ScannerImage) else
+        rpc_extent(one.image.rpc)
+        for one in images if one.earth is not None
+    ]  # fmt: skip
+    terrain = read_terrain(path, earth, joint_extent(extents), above_geoid="geoid" in section)
+    if "geoid" in section:
+        # a file beside this one, or the name of a grid of PROJ
+        name = section.text("geoid")
+        beside = section.beside(name)
+        terrain = add_geoid(terrain, beside if beside.exists() else Path(name))
+    return HeightModel(terrain, sigma, str(path))

@@ -8,20 +8,20 @@ products (`rpc_vendor_files`).
     lineNumCoef = ( -1.2E-03, …);
 
 In all of them line 0, sample 0 is the centre of the first pixel, degrees and metres, as in `Rpc`.
-Errors and limits in a file (ERR_BIAS, ERR_RAND, MIN_LONG, …) are ignored,
-and none are written. Scales may be negative, as from some providers.
+Scales may be negative, as from some providers. Errors in a file (ERR_BIAS, ERR_RAND) are read by
+`read_stated_errors`, limits (MIN_LONG, …) are ignored, and none of them are written.
 """
 
 import re
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.rasters.reading import open_raster, rasterio
+from jaxbundle.io.rasters.reading import open_plain, open_raster, rasterio
 from jaxbundle.io.scanner.rpc_vendor_files import from_geom, from_xml
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.xml_fields import number_in
@@ -58,6 +58,22 @@ FIELDS = {
     "sample_denominator": ("SAMP_DEN_COEFF", "sampDenCoef"),
 }
 RPB = re.compile(r"\s*(\w+)\s*=\s*(.*?)\s*;?\s*$")
+# The errors of RPC00B in XML, RPB, text and keyword lists of OSSIM.
+ERRORS = {
+    name: re.compile(rf"(?i)(?:<{word}>|\b{word}\s*=|\b{long}\s*:|\b{ossim}\s*:)\s*([-+.\de]+)")
+    for name, word, long, ossim in (
+        ("bias", "errbias", "err_bias", "bias_error"),
+        ("random", "errrand", "err_rand", "rand_error"),
+    )
+}
+
+
+class StatedErrors(NamedTuple):
+    """Errors that coefficients state of themselves: RMS in metres for each horizontal axis, of what
+    is common to all points of an image (ERR_BIAS) and of what is not (ERR_RAND); 0: not stated."""
+
+    bias: float = 0.0
+    random: float = 0.0
 
 
 def read_rpc(path: str | Path) -> Rpc:
@@ -84,6 +100,25 @@ def read_rpc(path: str | Path) -> Rpc:
         if values[name][0] == 0:
             raise InputError(f"{path}: the {name.replace('_', ' ')} begins with 0; 1 is usual")
     return Rpc(**{name: jnp.asarray(value, float) for name, value in values.items()})
+
+
+def read_stated_errors(path: str | Path) -> StatedErrors:
+    """The errors that a file of coefficients states, in any format that `read_rpc` reads.
+
+    **Raises:** `InputError` if it cannot be read.
+    """
+    path = Path(path)
+    if path.suffix.lower() in RASTERS:
+        with open_raster(path) as source, foreign_parser(f"{path}: its RPC", "those of a raster"):
+            tags = source.rpcs
+        said = {name: getattr(tags, f"err_{name[:4]}", None) for name in ERRORS}
+    else:
+        text = read_text(path, fallback="latin-1")
+        found = {name: pattern.search(text) for name, pattern in ERRORS.items()}
+        said = {name: match and match[1] for name, match in found.items()}
+    # a negative number stands for an unknown one in RPC00B
+    number = lambda word: max(number_in(str(word), f"{path}: its stated error"), 0.0)
+    return StatedErrors(**{name: number(word) for name, word in said.items() if word is not None})
 
 
 def write_rpc(path: str | Path, rpc: Rpc) -> None:
@@ -208,7 +243,7 @@ def _to_raster(path: Path, rpc: Rpc) -> None:
         with replace_file(path) as temporary:
             # the tags of the copy change: after a failure the raster is as it was
             shutil.copyfile(path, temporary)
-            with package.open(temporary, "r+") as target:
+            with open_plain(temporary, "r+") as target:
                 target.rpcs = RPC(**given)
             with package.open(temporary) as target:  # errors at closing are not reported
                 if target.rpcs is None:

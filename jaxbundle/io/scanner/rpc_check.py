@@ -14,13 +14,12 @@ else those that do. The difference is reported whenever none agree, or others th
 
 import dataclasses
 import glob
-import re
 from pathlib import Path
 
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.scanner.rpc import read_rpc
+from jaxbundle.io.scanner.rpc import read_rpc, read_stated_errors
 from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.pushbroom.corrections import Corrections
@@ -33,8 +32,6 @@ from jaxbundle.pushbroom.rpc_agreement import (
     compare_with_rpc,
 )
 
-RANDOM_ERROR = re.compile(r"(?i)<ERRRAND>\s*([-+.\de]+)|\berrRand\s*=\s*([-+.\de]+)")
-
 
 def check_against_rpc(scanner: ScannerInput, path: Path, choose: bool = True) -> ScannerInput:
     """The image of a product, compared with its RPC if there are any: with corrections that agree
@@ -44,9 +41,7 @@ def check_against_rpc(scanner: ScannerInput, path: Path, choose: bool = True) ->
         return scanner
     try:
         rpc = read_rpc(file)
-        # σ of the positions per axis, metres; 0 if the file has none (DigitalGlobe writes −1)
-        match = RANDOM_ERROR.search(read_text(file, fallback="latin-1"))
-        random_error = max(float(match[1] or match[2]), 0.0) if match else 0.0
+        random_error = read_stated_errors(file).random
     except InputError as error:
         return _warn(scanner, f"not compared with its RPC: {error}")
     image = scanner.image

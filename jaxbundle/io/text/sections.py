@@ -133,9 +133,7 @@ class TomlSection:
         """The file that a key names, beside the file of the section; also a folder, if it may be
         one."""
         name = self.text(key)
-        if self.file is None:
-            raise InputError(f"{self.where}{key} = {show(name)}: not in a file")
-        path = self.file.path.parent / name
+        path = self.beside(name)
         if not name or not os.path.exists(path):
             got = f"no such file {path}" if name else "the name of a file is missing"
         elif not folder and os.path.isdir(path):
@@ -143,6 +141,22 @@ class TomlSection:
         else:
             return path
         raise InputError(f"{self.where}{key} = {show(name)}: {got}; expected {expected}")
+
+    def paths(self, key: str, expected: str) -> list[Path]:
+        """The files that a key names, one or a list of them."""
+        given = self.values.get(key)
+        if not isinstance(given, list):
+            return [self.path(key, expected)]
+        if not given:
+            raise InputError(f"{self.where}{key} is an empty list; {expected} is expected")
+        one = lambda name: TomlSection(self.file, self.where, {key: name})
+        return [one(name).path(key, expected) for name in given]
+
+    def beside(self, name: str) -> Path:
+        """The path of a name beside the file of the section."""
+        if self.file is None:
+            raise InputError(f"{self.where}{show(name)}: not in a file")
+        return self.file.path.parent / name
 
     def table(self, key: str = "table") -> Columns:
         """The CSV table of a name, beside the file."""

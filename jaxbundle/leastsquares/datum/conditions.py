@@ -84,9 +84,11 @@ def generators(declared: Declared, values: Values) -> Tangent:
 
 def of_groups(plan: Plan, of_tables: Mapping[str, Float[AnyArray, "rows width ..."]]) -> Tangent:
     """Quantities by table directions, [rows, width, …], rearranged by groups; zero for held
-    unknowns."""
+    unknowns. Those of the eliminated table may be left out, and are missing then."""
     found = {}
     for name, group in plan.groups.items():
+        if name == plan.eliminated and all(m.table not in of_tables for m in group.members):
+            continue
         parts = [
             of_tables[m.table] if m.rows is None else of_tables[m.table][m.rows]
             for m in group.members

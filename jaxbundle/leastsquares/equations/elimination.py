@@ -174,8 +174,10 @@ def eliminate(normal: Normal) -> tuple[Reduced, Float[Array, "rows w w"] | None,
 
 
 def solve(factor: NormalFactor, right: Tangent) -> Tangent:
-    """N⁻¹·b for one right-hand side, linear and transposable in b."""
-    plan, e, Z = factor.plan, factor.plan.eliminated, factor.Z
+    """N⁻¹·b for one right-hand side, linear and transposable in b. Without eliminated rows in b,
+    which are zero then, the solution has none either: passes over all incidences are saved."""
+    plan, Z = factor.plan, factor.Z
+    e = plan.eliminated if plan.eliminated in right else None
     # free: held unknowns do not change, whatever a right-hand side has along them.
     kept = {g: right[g] * plan.groups[g].free * s for g, s in factor.scale.items()}
     if e is not None:

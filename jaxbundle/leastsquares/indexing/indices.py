@@ -72,6 +72,13 @@ def common(all_sizes: Iterable[Sizes], rounder: Callable[[Hashable, int], int]) 
     return {key: rounder(key, size) for key, size in largest.items()}
 
 
+def fill_up(n: int, least: int = 64) -> np.ndarray:
+    """The numbers of n rows, the last one repeated up to the next power of two: many small arrays
+    of all sizes share few compiled programs. `least`: a size that takes no time anyway."""
+    size = max(1 << max(n - 1, 0).bit_length(), least)
+    return np.minimum(np.arange(size), max(n - 1, 0))
+
+
 def round_up(number: int, steps: int = 8) -> int:
     """The next number of the form m·2ⁿ with `steps` ≤ m < 2·`steps`; small ones as they are.
     `steps` is a power of two.

@@ -8,6 +8,7 @@ import numpy as np
 from jaxbundle.cameras import get_model
 from jaxbundle.network.columns import count
 from jaxbundle.refinement import Refinement, point_rows
+from jaxbundle.refinement.inputs import PHOTOGRAPH
 from jaxbundle.report.layout import estimate
 from jaxbundle.report.page.columns import Column, numbers
 from jaxbundle.report.page.document import Listing, Page, Section, write
@@ -42,6 +43,7 @@ def _describe(result: Refinement, origin: Origin) -> Page:
         "points": Listing("Points", _points(result), "points.csv"),
         "checks": Listing("Check points, computed − given", _checks(result), "result.json"),
         "observations": Listing("Image points", _observations(used), "result.json"),
+        "heights": Listing("Terrain heights", _terrain_heights(result), "result.json"),
         "removed": Listing(
             "Removed as blunders",
             {
@@ -63,11 +65,11 @@ def _words(values: Iterable[object]) -> np.ndarray:
 def _image_points(result: Refinement) -> list[ImagePoint]:
     """The rows of `Refinement.image_points`, with what was measured and the names of the axes."""
     declared, given = result.inspection.declared, result.inspection.declared.inputs
-    xy = lambda of_scanner: np.asarray(
-        given.observations.xy if of_scanner else present(given.frames).observations.xy
+    xy = lambda table: np.asarray(
+        present(given.frames).observations.xy if table == PHOTOGRAPH else given.observations.xy
     )
     # the parts of the equations are in another order than the images
-    measured = declared.image_by_image(xy(p.of_scanner)[p.rows] for p in declared.parts)
+    measured = declared.image_by_image(xy(p.table)[p.rows] for p in declared.parts)
     scanners = {one.id for one in result.images}
     return [
         row | {"measured": at, "axes": SCANNER_AXES if row["image"] in scanners else ("x", "y")}
@@ -79,14 +81,16 @@ def _list_numbers(result: Refinement, used: Sequence[ImagePoint]) -> str:
     roles = [result.points.role[k] for k in result.inspection.declared.rays.points]
     frames = 0 if result.frames is None else len(result.frames.images)
     rows = [
-        ("Scanner images", len(result.images)),
+        ("Scanner images", f"{len(result.images)}, {len(result.inputs.rpc)} with RPC"),
         ("Photographs", frames),
         ("Points", ", ".join(f"{roles.count(role)} {role}" for role in ("control", "tie"))),
+        ("Points by rays", ", ".join(f"{n} with {k}" for k, n in result.rays().items())),
         ("Image points", len(used)),
+        ("Counts", ", ".join(f"{word} {n}" for word, n in result.counts().items() if n)),
         (
             "σ0",
-            f"{result.sigma0:.4f}, redundancy {result.redundancy}, "
-            f"{count(result.inspection.steps, 'step')}",
+            f"{result.sigma0:.4f} (robust {result.robust_sigma0:.4f}), redundancy "
+            f"{result.redundancy}, {count(result.inspection.steps, 'step')}",
         ),
     ]
     return f"<h3>Result</h3>\n{facts(rows)}"
@@ -150,6 +154,18 @@ def _checks(result: Refinement) -> Columns:
         found[f"d{k}"] = Column(check.difference[:, k], f"d {axis} [m]")
         found[f"s{k}"] = Column(check.sigma[:, k], f"σ {axis} [m]")
     return found | {"rays": Column(np.asarray(check.rays), "rays")}
+
+
+def _terrain_heights(result: Refinement) -> Columns:
+    rows = [row for row in result.terrain_heights() if not row["removed"]]
+    if not rows:
+        return {}
+    return {
+        "point": Column(_words(row["point"] for row in rows), "point"),
+        "v": Column(numbers(row["v"] for row in rows), "v [m]"),
+        "r": Column(numbers(row["r"] for row in rows), "r", 3),
+        "tau": Column(numbers(row["w"] for row in rows), "w", 2),
+    }
 
 
 def _observations(used: Sequence[ImagePoint]) -> Columns:

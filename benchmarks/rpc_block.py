@@ -1,0 +1,127 @@
+"""A block of RPC images: seconds of a large one; σ of a mixed one against draws.
+
+    python benchmarks/rpc_block.py [--images N] [--points N] [--repeat N] [--draws N] [--json FILE]
+
+The large block has `--images` images with polynomials and `--points` points, each in about four of
+them: start values, adjustment, σ of all biases, check points, warnings; with data snooping; and the
+redundancy numbers and report. The mixed block, of twelve such images and six line scanners, is
+adjusted `--draws` times with new biases, measurements and control coordinates (0: not at all): the
+errors of biases, attitudes and tie points divided by their σ a priori have an RMS of 1.
+
+The scene is that of `tests/refinement` next to the imported package: with PYTHONPATH the same
+command measures an earlier version. σ0 of the large block must be 1 within 4 of its σ, the RMS
+between 0.9 and 1.1; otherwise the exit status is 1.
+"""
+
+import os
+import sys
+import time
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import machine
+import numpy as np
+
+import jaxbundle
+
+sys.path.insert(0, str(Path(jaxbundle.__file__).parents[1] / "tests" / "refinement"))
+
+
+def measure(images: int, points: int, repeat: int) -> dict:
+    """Seconds of a block of RPC images."""
+    from rpc_block import block
+
+    from jaxbundle.refinement import refine
+
+    scene = block(rpc=images, scanner=0, points=points, control=12, checks=8)
+    arguments, _ = scene.draw(np.random.default_rng(3))
+    seconds = {"refine": [], "snoop": [], "report": []}
+    for _ in range(repeat + 1):
+        for name, options in (("refine", {}), ("snoop", {"snooping": "pope"})):
+            begin = time.perf_counter()
+            found = refine(*arguments, **options)
+            seconds[name].append(time.perf_counter() - begin)
+        begin = time.perf_counter()
+        found.report()
+        seconds["report"].append(time.perf_counter() - begin)
+    figures = {f"{name}_first_s": values[0] for name, values in seconds.items()}
+    figures |= {f"{name}_further_s": min(values[1:]) for name, values in seconds.items()}
+    return figures | {
+        "images": images, "points": points, "image_points": len(arguments[2]),
+        "sigma0": found.sigma0, "redundancy": found.redundancy, "removed": len(found.removed),
+    }  # fmt: skip
+
+
+def cover(draws: int) -> dict:
+    """RMS of errors divided by σ a priori, by type of unknown, over draws of a mixed block."""
+    from rpc_block import block
+
+    from jaxbundle.refinement import refine
+
+    scene, rng, errors, sigma0 = block(), np.random.default_rng(11), {}, []
+    for _ in range(draws):
+        arguments, bias = scene.draw(rng)
+        found = refine(*arguments)
+        at, sigma = found.inspection, found.inspection.sigma / found.sigma0
+        truth = np.concatenate([scene.attitudes.ravel(), bias.ravel()])
+        ratio = (found.estimate - truth) / sigma
+        of_rpc = np.array([name.owner.startswith("image R") for name in found.names])
+        chosen = at.declared.rays.points
+        off = np.einsum("pij,pj->pi", found.points.axes[chosen], found.positions - scene.X[chosen])
+        ties = np.array([scene.roles[k] == "tie" for k in chosen])
+        of_points = (off / (at.point_sigma / found.sigma0))[ties]
+        check = found.check
+        parts = {
+            "biases": ratio[of_rpc], "attitudes": ratio[~of_rpc], "tie points": of_points.ravel(),
+            "check points": (check.difference / check.sigma * found.sigma0).ravel(),
+        }  # fmt: skip
+        for name, values in parts.items():
+            errors.setdefault(name, []).append(values)
+        sigma0.append(found.sigma0)
+    rms = {name: float(np.sqrt(np.mean(np.square(values)))) for name, values in errors.items()}
+    largest = {name: float(np.abs(values).max()) for name, values in errors.items()}
+    return {
+        "draws": draws, "rms_of_errors_by_sigma": rms, "largest_error_by_sigma": largest,
+        "mean_square_sigma0": float(np.mean(np.square(sigma0))),
+    }  # fmt: skip
+
+
+def main() -> int:
+    """Run, print, check."""
+    parser = machine.parser_of(__doc__)
+    parser.add_argument("--images", type=machine.positive, default=40)
+    parser.add_argument("--points", type=machine.positive, default=20_000)
+    parser.add_argument("--repeat", type=machine.positive, default=2)
+    parser.add_argument("--draws", type=int, default=0)
+    parser.add_argument("--json", type=machine.target, metavar="FILE",
+                        help="write the figures as JSON (-: to standard output)")  # fmt: skip
+    given = parser.parse_args()
+    jaxbundle.enable_x64()
+    figures = measure(given.images, given.points, given.repeat)
+    figures |= {"peak_mb": machine.peak_mb(), "machine": machine.machine()}
+    wrong = []
+    if abs(figures["sigma0"] - 1) > 4 / np.sqrt(2 * figures["redundancy"]):
+        wrong.append(f"σ0 is {figures['sigma0']:.4f}, not 1")
+    if given.draws:
+        figures |= cover(given.draws)
+        for name, rms in figures["rms_of_errors_by_sigma"].items():
+            if not 0.9 < rms < 1.1:
+                wrong.append(f"errors of {name} have an RMS of {rms:.3f} σ, not 0.9 to 1.1")
+    if given.json != "-":
+        print(machine.in_words(figures["machine"]))
+        print(f"{given.images} images, {given.points} points, "
+              f"{figures['image_points']} image points")  # fmt: skip
+        for name in ("refine", "snoop", "report"):
+            print(f"{name:8s} first call {figures[f'{name}_first_s']:.2f} s, further ones "
+                  f"{figures[f'{name}_further_s']:.2f} s")  # fmt: skip
+        print(f"peak {figures['peak_mb']:.0f} MB, σ0 {figures['sigma0']:.4f}")
+        for name, rms in figures.get("rms_of_errors_by_sigma", {}).items():
+            print(f"{name}: errors by σ, RMS of {given.draws} draws {rms:.3f}, largest "
+                  f"{figures['largest_error_by_sigma'][name]:.2f}")  # fmt: skip
+    machine.write_json(figures, given.json)
+    return machine.verdict(wrong)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

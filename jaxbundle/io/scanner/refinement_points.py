@@ -1,0 +1,261 @@
+"""Points and measurements of a refine file: CSV tables, and files of Ames Stereo Pipeline."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.ellipsoid import Ellipsoid, earth_fixed
+from jaxbundle.io.scanner.asp_points import (
+    ControlFile,
+    images_of_match,
+    join_matches,
+    read_gcp,
+    read_match,
+)
+from jaxbundle.io.text.csv_tables import read_csv
+from jaxbundle.io.text.sections import TomlSection
+from jaxbundle.network.columns import Columns, count
+from jaxbundle.network.tables import STATED, UNIT, Network, Observations, Source
+from jaxbundle.refinement.refining import east_north_up
+from jaxbundle.refinement.tables import AnyScannerImage, GroundPoints, check_points_table
+
+GCP, MATCH = ".gcp", ".match"
+MEASURED = ("image", "point", "line", "pixel", "sline", "spixel")
+
+
+def read_points(
+    section: TomlSection,
+    names: Mapping[str, str],
+    images: Sequence[AnyScannerImage],
+    frames: Network | None,
+    radians: float,
+) -> tuple[GroundPoints, Observations, list[str]]:
+    """Points, measurements and warnings of [refine].
+
+    **Arguments:** `names`: ids of images by the names that other programs know them by.
+    """
+    files = section.paths("observations", "a CSV table, .match or .gcp")
+    by_suffix = {s: [f for f in files if f.suffix.lower() == s] for s in (GCP, MATCH)}
+    tables = [read_csv(f) for f in files if f.suffix.lower() not in by_suffix]
+    for table in tables:
+        table.check_names(MEASURED[:4], MEASURED[4:])
+    parts, warnings = [], []
+    if "points" in section or not (by_suffix[GCP] or by_suffix[MATCH]):
+        parts.append(_points_of(section.table("points"), images[0].earth, radians))
+    for path in by_suffix[GCP]:
+        control = read_gcp(path)
+        parts.append(_control_points(control, path, images[0].earth))
+        table, unknown = _measured_control(control, path, names)
+        tables.append(table)
+        if unknown:
+            warnings.append(f"{path}: measurements in images that are not in [images]: {unknown}")
+    if by_suffix[MATCH]:
+        table, ties, said = _matched(by_suffix[MATCH], names, [one.id for one in images])
+        tables.append(table)
+        parts.append(ties)
+        warnings += said
+    points = _join_points(parts)
+    # checked first: the ids of observations are looked up in it
+    check_points_table(points)
+    ids = {id: k for k, id in enumerate(points.id)}
+    if frames is not None:
+        # points that only photographs show follow those of the table
+        more = (id for id in frames.points.id if id not in ids)
+        ids |= {id: k for k, id in enumerate(more, len(ids))}
+    known = [image.id for image in images]
+    table = _join_tables(tables)
+    return points, _observations(table, ids, known, section, points.source.name), warnings
+
+
+def _control_points(control: ControlFile, path: Path, earth: Ellipsoid | None) -> GroundPoints:
+    """The control points of a `.gcp` file: σ along X, Y, Z, or, where these are equal, along any
+    axes."""
+    if earth is None or earth.a != earth.b:
+        raise InputError(
+            f"{path}: longitudes need an ellipsoid of revolution as [scanner] earth; give X, Y, Z "
+            "in a CSV table"
+        )
+    longitude, latitude, height = control.place.T
+    ground = np.radians(longitude), np.radians(latitude), height
+    X = np.stack([np.asarray(v) for v in earth_fixed(earth, ground)], 1)
+    source = Source(str(path), control.row, "line")
+    for row, sigma in enumerate(control.sigma):
+        if not (sigma > 0).all():
+            raise InputError(f"{source(row)}: σ must be positive, in metres")
+    role, names = ("control",) * len(X), ("X", "Y", "Z")
+    axes = np.tile(np.eye(3), (len(X), 1, 1))
+    if (control.sigma == control.sigma[:, :1]).all():
+        axes, names = east_north_up(earth, X), ("east", "north", "up")
+    return GroundPoints(tuple(control.id), role, X, control.sigma, axes, names, source)
+
+
+def _measured_control(
+    control: ControlFile, path: Path, names: Mapping[str, str]
+) -> tuple[Columns, str]:
+    """The measurements of a `.gcp` file as a table, and its images that nobody knows, in words."""
+    images = [names.get(name) or names.get(Path(name).stem) for name in control.image]
+    unknown = {name for name, id in zip(control.image, images) if id is None}
+    kept = np.array([k for k, id in enumerate(images) if id is not None], int)
+    point = control.point[kept]
+    values = {
+        "image": [images[k] for k in kept],
+        "point": [control.id[p] for p in point],
+        **dict(zip(("line", "pixel"), control.xy[kept].T.tolist())),
+        **dict(zip(("sline", "spixel"), control.xy_sigma[kept].T.tolist())),
+    }
+    return Columns(values, Source(str(path), control.row[point], "line")), ", ".join(
+        sorted(unknown)
+    )
+
+
+def _matched(
+    files: Sequence[Path], names: Mapping[str, str], ids: Sequence[str]
+) -> tuple[Columns, GroundPoints, list[str]]:
+    """The tie points of `.match` files: their measurements, themselves, and warnings."""
+    pairs, at = [], {id: k for k, id in enumerate(ids)}
+    for path in files:
+        first, second = (at[names[name]] for name in images_of_match(path, list(names)))
+        pairs.append((first, second, *read_match(path)))
+    found = join_matches(pairs)
+    number = int(found.point.max(initial=-1)) + 1
+    labels = [f"M{k + 1}" for k in range(number)]
+    values = {
+        "image": [ids[i] for i in found.image],
+        "point": [labels[p] for p in found.point],
+        **dict(zip(("line", "pixel"), found.xy.T.tolist())),
+    }
+    source = Source("match files")
+    unknown = np.full((number, 3), np.nan)
+    axes = np.tile(np.eye(3), (number, 1, 1))
+    ties = GroundPoints(
+        tuple(labels), ("tie",) * number, unknown, np.zeros((number, 3)), axes, source=source
+    )
+    warnings = []
+    if found.contradicting:
+        warnings.append(
+            f"match files: {count(found.contradicting, 'tie point')} with two places in one image, "
+            "left out"
+        )
+    return Columns(values, source), ties, warnings
+
+
+def _join_points(parts: Sequence[GroundPoints]) -> GroundPoints:
+    """The points of several files as one table."""
+    if len(parts) == 1:
+        return parts[0]
+    controlled = [part for part in parts if "control" in part.role]
+    axes = {part.axis_names for part in controlled}
+    if len(axes) > 1:
+        files = " and ".join(part.source.name for part in controlled)
+        raise InputError(
+            f"{files}: σ of control points are along X, Y, Z in one and along east, north, up in "
+            "another; give all along the same axes"
+        )
+    joined = lambda name: np.concatenate([getattr(part, name) for part in parts])
+    return GroundPoints(
+        tuple(id for part in parts for id in part.id),
+        tuple(role for part in parts for role in part.role),
+        joined("X"),
+        joined("sigma"),
+        joined("axes"),
+        axes.pop() if axes else parts[0].axis_names,
+        _join_sources([(part.source, len(part)) for part in parts], "points"),
+    )
+
+
+def _join_tables(tables: Sequence[Columns]) -> Columns:
+    """Tables of measurements as one."""
+    if len(tables) == 1:
+        return tables[0]
+    nothing = lambda table: [None] * len(table)
+    values = {
+        name: [v for table in tables for v in table.values.get(name, nothing(table))]
+        for name in MEASURED
+    }
+    sources = [(table.source, len(table)) for table in tables]
+    return Columns(values, _join_sources(sources, "observations"))
+
+
+def _join_sources(sources: Sequence[tuple[Source, int]], name: str) -> Source:
+    """The source of rows of several sources."""
+    places = [
+        f"{n + 1 if source.numbers is None else source.numbers[n]} of {source.name}"
+        for source, number in sources
+        for n in range(number)
+    ]
+    return Source(name, np.array(places, object), sources[0][0].word)
+
+
+def _points_of(table: Columns, earth: Ellipsoid | None, radians: float) -> GroundPoints:
+    geographic = "longitude" in table.values
+    names = ("longitude", "latitude", "height") if geographic else ("X", "Y", "Z")
+    sigmas = ("sE", "sN", "sh") if geographic else ("sX", "sY", "sZ")
+    table.check_names(("id", "role", *names), sigmas)
+    X = np.stack([table.numbers(n) for n in names], 1)
+    words = {"free": math.inf, "held": 0.0}
+    sigma = np.stack([table.numbers(n, words=words) for n in sigmas], 1)
+    axes = np.tile(np.eye(3), (len(X), 1, 1))
+    if geographic:
+        if earth is None or earth.a != earth.b:
+            raise InputError(
+                f"{table.source.name}: longitudes need an ellipsoid of revolution as [scanner] "
+                "earth; give X, Y, Z"
+            )
+        beyond = np.abs(X[:, 1] * radians) > np.pi / 2 + 1e-12  # some thousand eps, as of 100 gon
+        if beyond.any():
+            row = int(beyond.argmax())
+            raise InputError(
+                f"{table.source(row)}: latitude {X[row, 1]:g} is beyond the pole; look at the "
+                "order of columns and at angle_unit"
+            )
+        X = np.stack(
+            [
+                np.asarray(v)
+                for v in earth_fixed(earth, (radians * X[:, 0], radians * X[:, 1], X[:, 2]))
+            ],
+            1,
+        )
+        known = np.isfinite(X).all(1)
+        # an unknown place has no east and north: its σ are of the axes
+        axes[known] = east_north_up(earth, X[known])
+    return GroundPoints(
+        table.ids("id"),
+        table.ids("role"),
+        X,
+        np.nan_to_num(sigma, nan=0.0, posinf=np.inf),
+        axes,
+        ("east", "north", "up") if geographic else ("X", "Y", "Z"),
+        table.source,
+    )
+
+
+def _observations(
+    table: Columns,
+    ids: Mapping[str, int],
+    images: Sequence[str],
+    section: TomlSection,
+    where_points: str,
+) -> Observations:
+    table.check_names(("image", "point", "line", "pixel"), ("sline", "spixel"))
+    sigma, stated = section.number("sigma", 1.0), "sigma" in section.values
+    if sigma <= 0:
+        raise InputError(f"{section.where}sigma is {sigma:g}; positive, in lines and pixels")
+    stated_sigma = np.stack([table.numbers(n) for n in ("sline", "spixel")], 1)
+    lacking = np.isnan(stated_sigma)
+    if not stated and lacking.any() and not lacking.all():
+        row = int(lacking.any(1).argmax())
+        raise InputError(
+            f"{table.source(row)}: sline or spixel is missing, which other rows have; give it, or "
+            f"sigma in [refine] for those without"
+        )
+    return Observations(
+        table.indices("image", "image", {id: k for k, id in enumerate(images)}, section.where),
+        table.indices("point", "point", ids, where_points),
+        np.stack([table.numbers(n, required=True) for n in ("line", "pixel")], 1),
+        np.where(lacking, sigma, stated_sigma),
+        table.source,
+        STATED if stated or not lacking.any() else UNIT,
+    )

@@ -1,0 +1,59 @@
+"""Measurements that contradict the start values: exchanged columns, points in another place."""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxbundle.errors import InputError
+from jaxbundle.refinement.inputs import RefinementInput
+
+
+def check_columns(
+    inputs: RefinementInput, rows: Int[np.ndarray, " n"], v: Float[np.ndarray, "n 2"]
+) -> None:
+    """Refuse measurements whose line and pixel are exchanged, where points with given coordinates
+    show it."""
+    points, observations = inputs.points, inputs.observations
+    role = np.array(points.role, dtype=object)[observations.point[rows]]
+    image = observations.image[rows]
+    for i in np.unique(image):
+        mine = (image == i) & (role != "tie")
+        xy = observations.xy[rows][mine]
+        # Three points are not all on the diagonal, or near another's place, by chance.
+        if len(xy) < 3:
+            continue
+        off, other = (
+            np.median(np.linalg.norm(xy + v[mine] - places, axis=1)) for places in (xy, xy[:, ::-1])
+        )
+        # An order of magnitude: start values explain a hundred pixels, but not that these vanish.
+        if off > 10 * other:
+            raise InputError(
+                f"{observations.source.name}: line and pixel seem to be exchanged in image "
+                f"{inputs.ids[i]!r}: points with given coordinates are {off:.0f} pixels from their "
+                f"measurements (median), and {other:.0f} with line and pixel exchanged; check the "
+                "names of the columns"
+            )
+
+
+def check_near(
+    inputs: RefinementInput, rows: Int[np.ndarray, " n"], v: Float[np.ndarray, "n 2"]
+) -> None:
+    """Refuse points far from their measurement: swapped or wrong."""
+    points, observations = inputs.points, inputs.observations
+    size = np.array([(one.image.lines, one.image.pixels) for one in inputs.images])
+    # Farther than two images off no start values are so bad: coordinates in another order, frame or
+    # unit are; `~(… <=)` also catches NaN.
+    far = (~(np.abs(v) <= 2.0 * size[observations.image[rows]])).any(1)
+    if not far.any():
+        return
+    row, away = int(rows[far.argmax()]), v[far.argmax()]
+    p, id = observations.point[row], inputs.images[observations.image[row]].id
+    said = (
+        f"{away[0]:.0f} lines and {away[1]:.0f} pixels away"
+        if np.isfinite(away).all()
+        else "where the camera does not look"
+    )
+    raise InputError(
+        f"{observations.source(row)}: {points.role[p]} point {points.id[p]!r} of "
+        f"{points.source(p)} is off image {id!r}: its coordinates are {said}; check "
+        "their order, frame and units, and at the id"
+    )
