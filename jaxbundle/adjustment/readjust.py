@@ -183,8 +183,8 @@ def eliminate_parameters(
 def _without_parameter(
     problem: NetworkProblem, values: Values, name: Name
 ) -> tuple[NetworkProblem, Values]:
-    """The problem with a parameter held at its default, and all parameters tied to it; a prior of
-    it has no weight any more, or it would count as an observation of a constant."""
+    """The problem with a parameter held at its default, and all parameters tied to it; priors of
+    these have no weight any more, or they would count as observations of a constant."""
     c = [camera.id for camera in problem.network.cameras].index(name.id)
     model = get_model(problem.network.cameras[c].model)
     column = model.parameters.index(name.parameter)
@@ -198,7 +198,7 @@ def _without_parameter(
     if table.interior_set in weight:
         (prior,) = np.nonzero(problem.observations_of(table.interior_set).rows[0] == row)
         given = jnp.asarray(weight[table.interior_set])
-        weight[table.interior_set] = given.at[prior, column].set(0.0)
+        weight[table.interior_set] = given.at[np.ix_(prior, columns)].set(0.0)
     data = dataclasses.replace(problem.data, start=reset(problem.data.start), weight=weight)
     moving = problem.table(table.name).vector.moving.index(column)
     return hold(with_data(problem, data), table.name, row, [moving]), reset(values)

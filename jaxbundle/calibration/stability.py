@@ -54,9 +54,12 @@ class Homogeneity:
 
     @property
     def probability(self) -> float:
-        return chi2_tail(self.chi2, self.degrees)
+        """1 where nothing is left to be tested."""
+        return chi2_tail(self.chi2, self.degrees) if self.degrees else 1.0
 
     def __str__(self) -> str:
+        if not self.degrees:
+            return "nothing is left to be tested"
         return f"χ² = {self.chi2:.1f} ({self.degrees}), p = {self.probability:.2g}"
 
 
@@ -188,9 +191,17 @@ def stability(
     mean, mean_sigma, tau, probability = np.array(columns).T
     model = get_model(cameras[0].model)
     # the derivatives of the image at the mean camera
-    whole = {**default_parameters(model), **cameras[0].parameters, **dict(zip(names, mean))}
+    every, changes = _changes_of_tied(cameras[0], names)
+    whole = {
+        **default_parameters(model),
+        **cameras[0].parameters,
+        **dict(zip(every, changes @ mean)),
+    }
     given = np.array([whole[name] for name in model.parameters])
-    G, H = (mapping_form(cameras[0], given, names, frame=f) for f in ("camera", "rotation"))
+    G, H = (
+        changes.T @ mapping_form(cameras[0], given, every, frame=f) @ changes
+        for f in ("camera", "rotation")
+    )
     # images by H, without rotation: what matters to a user who orients each photograph anew
     F = _without_rotation(G, H, sigma.mean(0))
     d = p - p.mean(0)
@@ -232,17 +243,38 @@ def _check(
             f"stability: {len(at)} numbers for {len(calibrations)} calibrations; one for each is "
             "expected, and three different ones at least"
         )
-    first, (names, _) = calibrations[0]
+    first, (free, _) = calibrations[0]
+    names = _first_of_tied(first, free)
     if first.image_size is None:
         raise InputError(f"camera {first.id!r}: its image_size in pixels is needed")
+    every, _ = _changes_of_tied(first, names)
     for number, (camera, (free, _)) in enumerate(calibrations, 1):
-        held = {n: v for n, v in camera.parameters.items() if n not in names}
-        same = {n: v for n, v in first.parameters.items() if n not in names}
+        held = {n: v for n, v in camera.parameters.items() if n not in every}
+        same = {n: v for n, v in first.parameters.items() if n not in every}
         if (camera.model, camera.image_size) != (first.model, first.image_size):
             raise InputError(f"calibration {number} is of another camera model or image size")
-        if {*free} != {*names} or any(held.get(n, 0.0) != same.get(n, 0.0) for n in held | same):
+        if {*_first_of_tied(camera, free)} != {*names} or any(
+            held.get(n, 0.0) != same.get(n, 0.0) for n in held | same
+        ):
             raise InputError(f"calibration {number} has other free parameters, or held values")
-    return tuple(names)
+    return names
+
+
+def _first_of_tied(camera: Camera, names: Sequence[str]) -> tuple[str, ...]:
+    """Free parameters, of equal ones (`Camera.tie`) the first: they are one unknown, and their
+    covariance is singular."""
+    others = {name for group in camera.tie for name in [n for n in group if n in names][1:]}
+    return tuple(name for name in names if name not in others)
+
+
+def _changes_of_tied(
+    camera: Camera, names: Sequence[str]
+) -> tuple[tuple[str, ...], Float[np.ndarray, "every k"]]:
+    """All parameters that change with those of `names`, themselves and equal ones, and by how
+    much."""
+    equal = {name: next((g for g in camera.tie if name in g), (name,)) for name in names}
+    every = tuple(dict.fromkeys(other for group in equal.values() for other in group))
+    return every, np.array([[float(n in equal[name]) for name in names] for n in every])
 
 
 def _homogeneity(

@@ -137,3 +137,33 @@ def test_the_command_reads_results(command, tmp_path):
     told = command("stability", *files, "--at", dates, "--json", "-")
     assert np.diff(json.loads(told.out)["at"]).tolist() == [92, -62]
     assert "a number or a date" in command("stability", *files, "--at", "1,x,3").err
+
+
+def test_equal_parameters_are_one_unknown():
+    """Given by one of them, or by all, as in files, where their covariance is singular; the images
+    move as if both were given."""
+    apart = epochs(np.zeros((4, 6)))
+    values = [(camera.parameters | {"fy": camera.parameters["fx"]}) for camera, _ in apart]
+    cameras = [
+        dataclasses.replace(camera, parameters=p, tie=(("fx", "fy"),))
+        for (camera, _), p in zip(apart, values)
+    ]
+    one = [0, 2, 3, 4, 5]
+    C = covariance()[np.ix_(one, one)]
+    names, every = tuple(NAMES[k] for k in one), [0, 0, 1, 2, 3, 4]
+    found = stability([(camera, (names, C)) for camera in cameras])
+    by_all = stability([(camera, (NAMES, C[np.ix_(every, every)])) for camera in cameras])
+    assert found.names == by_all.names == names
+    assert found.all_parameters.degrees == 3 * 5
+    assert by_all.all_parameters == found.all_parameters
+    untied = [dataclasses.replace(camera, tie=()) for camera in cameras]
+    both = stability([(camera, (NAMES, covariance())) for camera in untied])
+    assert found.image_found == pytest.approx(both.image_found)
+
+
+def test_a_principal_point_alone_leaves_nothing_beside_rotations():
+    camera, C = epochs(np.zeros((1, 6)))[0][0], np.diag(SIGMA[2:4] ** 2)
+    found = stability([(camera, (("cx", "cy"), C))] * 2)
+    assert found.rotation_removed.degrees == 0 and found.rotation_removed.probability == 1
+    assert "nothing is left" in str(found)
+    assert found.to_dict()["rotation_removed"]["probability"] == 1

@@ -1,16 +1,22 @@
 """Parameters that are one unknown: as the model with one focal length, and refused by name."""
 
+import dataclasses
+from pathlib import Path
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxbundle
 from jaxbundle.adjustment.quality.inspection import Inspection
+from jaxbundle.adjustment.readjust import _without_parameter
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.quality.names import Name
 from jaxbundle.leastsquares.spaces import Vector
 from jaxbundle.network.build import make_further
 
+PROJECT = Path(__file__).parents[2] / "examples" / "convergent4" / "project.toml"
 FREE = ("fx", "fy", "cx", "cy", "k1")
 SIZE = {"image_size": (1000, 800), "pixel_size": (0.01, 0.01)}
 
@@ -189,3 +195,18 @@ def test_ties_are_written_and_read(tmp_path):
     (again,) = jaxbundle.read_network(tmp_path).further
     (given,) = network.further
     assert again.columns(1.0) == given.columns(1.0)
+
+
+@pytest.mark.parametrize("prior", ["b1", "b2"])
+def test_a_prior_of_a_tied_parameter_goes_with_it(prior):
+    """Held at 0, all parameters of a tie are constants: a prior of any of them observes nothing."""
+    given = jaxbundle.read_network(PROJECT)
+    camera = dataclasses.replace(given.cameras[0], free=("c", "b1", "b2"), tie=(("b1", "b2"),))
+    counts = []
+    for sigma in ({}, {prior: 1e-4}):
+        cameras = (dataclasses.replace(camera, sigma=sigma),)
+        problem = jaxbundle.make_problem(given.replace(cameras=cameras))
+        held, _ = _without_parameter(problem, problem.data.start, Name("camera", camera.id, "b1"))
+        counts.append(held.counts)
+    assert counts[0].unknowns == counts[1].unknowns
+    assert counts[0].observations == counts[1].observations
