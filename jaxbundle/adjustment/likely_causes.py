@@ -59,7 +59,9 @@ def likely_causes(
     accepted = np.asarray(minimum.history.accepted)[:tried]
     vtpv = 2 * np.asarray(minimum.history.cost)[:tried][accepted][-1:]
     largest = largest_sigma0(network)
-    if inspection and not (vtpv > largest**2 * problem.counts.redundancy).any():
+    # Without redundancy vᵀPv is rounding, and no misfit.
+    poor_fit = (vtpv > largest**2 * problem.counts.redundancy).any()
+    if inspection and not (poor_fit and problem.counts.redundancy > 0):
         # A good fit may still be wrong: settled far from its start it may be a mirror image, and
         # σ in a larger unit fit everything.
         start_misfit = np.sqrt(

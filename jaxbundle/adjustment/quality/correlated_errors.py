@@ -242,13 +242,13 @@ def _along_tracks(found: Solution, rays: ImageRows, reach: float) -> ErrorCompon
     depth = float(np.nanmedian(np.linalg.norm(X[rays.point] - station[rays.image], axis=1)))
     if not (np.isfinite(depth) and depth > 0):
         return None
-    K = wendland(np.linalg.norm(station[:, None] - station, axis=2) / (reach * depth))
     rows, columns, values, first = [], [], [], 0
     for k in np.unique(count[count > 1]):
         of = order[start[count == k][:, None] + np.arange(k)]
         image = rays.image[of]
         # a root of each block by its eigenvalues: two images of one station are one
-        w, E = np.linalg.eigh(K[image[:, :, None], image[:, None, :]])
+        apart = np.linalg.norm(station[image][:, :, None] - station[image][:, None], axis=3)
+        w, E = np.linalg.eigh(wendland(apart / (reach * depth)))
         root = E * np.sqrt(np.clip(w, 0, None))[:, None, :]
         column = first + np.arange(of.size).reshape(of.shape)
         rows.append(np.broadcast_to(of[:, :, None], root.shape).ravel())

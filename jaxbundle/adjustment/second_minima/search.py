@@ -286,7 +286,7 @@ class _State:
         seen: list[Found] = []
         for candidate in self.candidates():
             found = self._adjust(candidate)
-            if found is None or any(_are_same(found, other) for other in seen):
+            if found is None or any(_are_same(found, other, self.rounding) for other in seen):
                 continue
             seen.append(found)
             yield found
@@ -403,12 +403,13 @@ def _cost(minimum: Minimum) -> float:
     return float(2 * cost[accepted][-1]) if accepted.any() else np.inf
 
 
-def _are_same(found: Found, other: Found) -> bool:
-    """Whether two candidates led to one minimum."""
+def _are_same(found: Found, other: Found, rounding: float) -> bool:
+    """Whether two candidates led to one minimum; `rounding`: of vᵀPv."""
     one, two = (scene_of(f.inspection.adjusted) for f in (found, other))
     vtpv = found.inspection.vtpv
-    near = abs(vtpv - other.inspection.vtpv) <= 1e-6 * max(vtpv, 1.0)
-    return bool(near and turns(one, two).max() < 0.01 * min(found.turn, other.turn))
+    # `<=`: minima that differ in points alone are not turned at all.
+    near = abs(vtpv - other.inspection.vtpv) <= max(1e-6 * vtpv, rounding)
+    return bool(near and turns(one, two).max() <= 0.01 * min(found.turn, other.turn))
 
 
 def _common_rays(
