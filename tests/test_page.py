@@ -10,7 +10,6 @@ import shutil
 import subprocess
 import tomllib
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,13 +18,14 @@ from page_reader import Page, column, decode
 
 import jaxbundle
 from jaxbundle.adjustment.result import Adjustment
+from jaxbundle.adjustment.result_tables import measured_values
 from jaxbundle.cli.outputs import check_targets
 from jaxbundle.leastsquares.problem import with_data
 from jaxbundle.report.head import NO_RESULT
 from jaxbundle.report.page import InputFile, Origin, compose, compose_failure, fingerprint_files
 from jaxbundle.report.page.columns import Column, encode_table, encode_values
 from jaxbundle.report.page.document import SCRIPTS, STYLE
-from jaxbundle.report.page.tables import choose_largest, measured_values
+from jaxbundle.report.page.tables import choose_largest
 from jaxbundle.report.verdict import BAD, DOUBTFUL, GOOD, NOTED, Finding, in_words, judge
 
 ROOT = Path(__file__).parent.parent
@@ -123,7 +123,7 @@ def test_what_was_measured_stands_beside_residuals_of_every_kind():
     points = dataclasses.replace(network.points, role=tuple(role), sigma=sigma)
     problem = jaxbundle.make_problem(network.replace(points=points))
     rays = 2 * len(network.observations)
-    measured = measured_values(SimpleNamespace(problem=problem))
+    measured = measured_values(problem)
     assert_array_equal(measured[:rays].reshape(-1, 2), network.observations.xy)
     assert_allclose(np.sort(measured[rays:]), np.sort([*X[2], 61.5, 1.25]), atol=1e-12)
 

@@ -715,9 +715,15 @@ class Adjustment:
 
     @functools.cached_property
     def residuals(self) -> dict[str, np.ndarray]:
-        """One row per observation: kind, image, point, axis, v, sigma (a priori), r, w (Baarda),
-        tau (Pope), mdb, external; image observations first, in the given order."""
+        """One row per observation: kind, image, point, axis, unit, v, sigma (a priori), r, w
+        (Baarda), tau (Pope), mdb, external; image observations first, in the given order."""
         return result_tables.residuals(self)
+
+    @property
+    def measured(self) -> Float[np.ndarray, " rows"]:
+        """What was measured, by row of `residuals`, in its unit; NaN of priors, and of kinds that
+        measure something else than one number for each residual."""
+        return result_tables.measured_values(self.problem)
 
     def table(self, name: str) -> dict[str, np.ndarray]:
         """A table by name: images, points, residuals, cameras (one row per parameter), checks,

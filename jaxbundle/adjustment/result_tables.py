@@ -6,6 +6,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -154,6 +155,24 @@ def residuals(adjustment: "Adjustment") -> dict[str, np.ndarray]:
     found = adjustment.reliability
     parts = observations(adjustment.problem, *(getattr(found, name) for name in TESTED))
     return concatenate([residual_rows(adjustment, part) for part in parts])
+
+
+def measured_values(problem: NetworkProblem) -> np.ndarray:
+    """By row of `residuals`, what was measured; NaN of priors, and of kinds that measure something
+    else than one number for each residual."""
+    blank = lambda name: np.full(problem.weights(name).shape, np.nan)
+    measured = {o.name: blank(o.name) for o in problem.observations}
+    for name in ("control", "distance", *problem.further_sets):
+        given = problem.data.measured.get(name)
+        if isinstance(given, jax.Array | np.ndarray) and given.size == measured[name].size:
+            origin = problem.origin if name == "control" else 0.0
+            measured[name] = np.reshape(given, measured[name].shape) + origin
+    columns = []
+    for part in observations(problem, measured):
+        values = problem.image_coordinates() if part.kind == "image" else part.quantities[0]
+        unit = np.array([factor for factor, _ in part.units])
+        columns.append((values * unit)[part.inverse_sigma > 0])
+    return np.concatenate(columns)
 
 
 BySet = Mapping[str, Float[np.ndarray, "n r"]]

@@ -3,11 +3,9 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.adjustment.result_tables import observations as observation_rows
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.report.correlated import stated_sigma, stated_sigma_of
 from jaxbundle.report.layout import clean, coordinate_decimals
@@ -152,7 +150,7 @@ def checks(adjustment: "Adjustment") -> Columns:
 def observations(adjustment: "Adjustment") -> Columns:
     """All observations, of very many those with the largest |τ|, and what was measured."""
     return table_of_residuals(
-        adjustment.residuals | {"measured": measured_values(adjustment)}, adjustment.sigma0
+        adjustment.residuals | {"measured": adjustment.measured}, adjustment.sigma0
     )
 
 
@@ -182,25 +180,6 @@ def table_of_residuals(found: Mapping[str, np.ndarray], sigma0: float) -> Column
         for name, label in labels.items()
         if name in found
     }
-
-
-def measured_values(adjustment: "Adjustment") -> np.ndarray:
-    """By row of the table of residuals, what was measured; NaN of priors, and of kinds that measure
-    something else than one number for each residual."""
-    problem = adjustment.problem
-    blank = lambda name: np.full(problem.weights(name).shape, np.nan)
-    measured = {o.name: blank(o.name) for o in problem.observations}
-    for name in ("control", "distance", *problem.further_sets):
-        given = problem.data.measured.get(name)
-        if isinstance(given, jax.Array | np.ndarray) and given.size == measured[name].size:
-            origin = problem.origin if name == "control" else 0.0
-            measured[name] = np.reshape(given, measured[name].shape) + origin
-    columns = []
-    for part in observation_rows(problem, measured):
-        values = problem.image_coordinates() if part.kind == "image" else part.quantities[0]
-        unit = np.array([factor for factor, _ in part.units])
-        columns.append((values * unit)[part.inverse_sigma > 0])
-    return np.concatenate(columns)
 
 
 def choose_largest(tau: np.ndarray, most: int) -> np.ndarray:
