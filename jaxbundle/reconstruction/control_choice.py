@@ -167,11 +167,10 @@ def _settle_by_coordinates(
     if np.isinf(control.sigma[k, 2]):
         heights = [block.X[row, 2] for row in block.determined.values()]
         X[2] = np.median(heights) if heights else X[2]
-    distance = np.linalg.norm(X - block.X0[point.image], axis=1)
     spread = np.sqrt((np.where(np.isfinite(choice.sigma[k]), choice.sigma[k], 0.0) ** 2).sum())
     off = block.misses(point, X)
     # σ of the measurement and, in pixels, of the coordinates
-    sigma = np.hypot(point.sigma, spread / (distance * point.pixel))
+    sigma = np.hypot(point.sigma, spread / block.pixel_length(point, X))
     agree = off < block.settings.wrong_ray * sigma
     # if exactly one of several rays that do not meet passes the coordinates, that one is right
     if control.role[k] == "check" or (len(point.rows) > 1 and agree.sum() != 1):
@@ -185,10 +184,10 @@ def _settle_by_coordinates(
         choice.points[id] = dataclasses.replace(point, good=agree)
         choice.used[k] = True
     else:
-        ground = off[0] * point.pixel[0] * distance[0]
+        passes = block.distances(point, X)[0]
         choice.reasons[id] = (
             f"its only ray, in {block.name_of(point, 0)}, misses its coordinates by "
-            f"{off[0]:.0f} px, {ground:.1f} m"
+            f"{off[0]:.0f} px, {passes:.1f} m"
         )
 
 
@@ -198,13 +197,12 @@ def _name_wrong(block: OrientedBlock, choice: ControlChoice, id: str) -> None:
     X = point.position
     if not np.isfinite(X).all():
         return
-    off = block.misses(point, X)
+    off, passes = block.misses(point, X), block.distances(point, X)
     for n in np.flatnonzero(~point.good).tolist():
-        passes = np.linalg.norm(np.cross(X - block.X0[point.image[n]], point.rays[n]))
         said = (
             f"{block.name_of(point, n)} is a wrong measurement and not used: {off[n]:.0f} px "
             "from where the other photographs see it, and its ray misses the point by "
-            f"{passes:.2f} m"
+            f"{passes[n]:.2f} m"
         )
         other = block.seen_there(point, n, id, choice.points)
         choice.errors.setdefault(id, []).append(
