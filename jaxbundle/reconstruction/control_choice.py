@@ -6,7 +6,7 @@ that ends at another control point of its photograph is a wrong name.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -137,7 +137,7 @@ def choose_control(
             _settle_by_coordinates(block, choice, k, control, shift)
         if choice.points[id].good.any() or id not in choice.reasons:
             _name_wrong(block, choice, id)
-    _name_exchanged(block, control, choice, [k for k, n in row.items() if not assessed.used[n]])
+    _name_exchanged(block, control, choice, {k: n for k, n in row.items() if not assessed.used[n]})
     return choice
 
 
@@ -211,14 +211,21 @@ def _name_wrong(block: OrientedBlock, choice: ControlChoice, id: str) -> None:
 
 
 def _name_exchanged(
-    block: OrientedBlock, control: Points, choice: ControlChoice, bad: Sequence[int]
+    block: OrientedBlock, control: Points, choice: ControlChoice, bad: Mapping[int, int]
 ) -> None:
-    """Pairs of contradictory points whose coordinates fit if they are exchanged."""
-    for i in bad:
+    """Pairs of contradictory points whose coordinates fit if they are exchanged.
+
+    **Arguments:** `bad`: rows of the contradictory points, and in the assessment."""
+    assessed, fitting = choice.assessment, block.settings.wrong_ray
+    for i, n in bad.items():
+        # from the others: the offset of satellite positions is that of the points that agree
+        predicted = control.position[i] + assessed.error[n]
+        # σ² of the prediction without that of the coordinates of this point
+        of_prediction = np.maximum(assessed.error_sigma[n] ** 2 - choice.sigma[i] ** 2, 0.0)
         for j in bad:
-            X = block.X[block.determined[control.id[i]]]
-            off = X - control.position[j]
-            sigma = np.where(np.isfinite(choice.sigma[j]), choice.sigma[j], np.inf)
-            limit = block.settings.wrong_ray * np.hypot(sigma, block.offset_sigma)
-            if i != j and np.all(np.abs(off) < limit):
+            off, sigma = predicted - control.position[j], choice.sigma[j]
+            # axes that are not controlled at both points tell nothing
+            told = np.isfinite(off) & np.isfinite(sigma)
+            within = np.abs(off) < fitting * np.sqrt(of_prediction + sigma**2)
+            if i != j and told.any() and within[told].all():
                 choice.reasons[control.id[i]] += f"; it fits the coordinates of {control.id[j]}"

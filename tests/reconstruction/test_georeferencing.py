@@ -145,6 +145,20 @@ def test_exchanged_coordinates_are_named(drone, handheld, monkeypatch):
     assert "it fits the coordinates of gcp07" in points["gcp02"].verdict
 
 
+def test_two_wrong_points_are_no_exchange(drone, handheld, monkeypatch):
+    """36 m apart, with errors of 8 m: within what satellite positions may be shifted, but this
+    shift is known from the other points."""
+    X = handheld.copy()
+    X[2] += [6.0, -5.0, 0.0]
+    X[7] += [-7.0, 3.0, 4.0]
+    block = drone.block()
+    monkeypatch.setattr(georeferencing, "adjust_determined",
+                        lambda network, **_: (block.adjustment, network, None))  # fmt: skip
+    _, points, table = controlled(drone, drone.given(X))
+    assert table.left_out == ["gcp02", "gcp07"]
+    assert not any("it fits" in point.verdict for point in points.values())
+
+
 def test_heights_of_zero_are_unknown(drone, handheld):
     X = handheld * [1, 1, 0]
     result, points, table = controlled(drone, drone.given(X))
