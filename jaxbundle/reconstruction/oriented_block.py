@@ -243,10 +243,13 @@ class OrientedBlock:
         return X
 
     def move(self, places: Sequence[int], points: Points) -> None:
-        """Move the block by the similarity that fits most of the control points."""
-        ids = [points.id[k] for k in places]
-        target = points.position[list(places)]
-        if len(ids) < MIN_CONTROL or np.isinf(points.sigma[list(places)]).any():
+        """Move the block by the similarity that fits most of the control points that are controlled
+        on all axes.
+
+        **Raises:** `InputError` if there are fewer than three of them, or on a line."""
+        places = [k for k in places if not np.isinf(points.sigma[k]).any()]
+        ids, target = [points.id[k] for k in places], points.position[places]
+        if len(ids) < MIN_CONTROL:
             raise InputError(
                 f"control points with heights in at least two photographs: expected "
                 f"{MIN_CONTROL}, got {len(ids)} in this part; without satellite positions they "

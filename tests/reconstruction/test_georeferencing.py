@@ -18,6 +18,7 @@ from jaxbundle.photographs.exif import Exif
 from jaxbundle.reconstruction import georeferencing
 from jaxbundle.reconstruction.block import CameraPositions, describe_block
 from jaxbundle.reconstruction.georeferencing import georeference
+from jaxbundle.reconstruction.oriented_block import OrientedBlock
 from jaxbundle.reconstruction.result import ReconstructedPart, Reconstruction
 
 SIGMA = 0.5
@@ -198,6 +199,23 @@ def test_control_that_cannot_give_a_frame_is_refused(drone, handheld):
     roles = ("control", "control", *["check"] * (CONTROL - 2))
     with pytest.raises(InputError, match="expected 3, got 2"):
         controlled(drone, drone.given(handheld, roles=roles, positions=False))
+
+
+def test_a_point_without_height_leaves_the_others_to_give_the_frame(drone, monkeypatch):
+    """A free height of one point of nine, without satellite positions: the block gets to the truth
+    by the others; with two that have heights it is refused, and these are counted."""
+    X = drone.truth + 0.05 * np.random.default_rng(8).standard_normal((CONTROL, 3))
+    sigma = np.full((CONTROL, 3), 0.05)
+    sigma[0, 2] = np.inf
+    weighted, given = drone.block(False), drone.given(X, sigma, positions=False)
+    block = OrientedBlock(weighted.adjustment, given)
+    block.move(range(CONTROL), given.points)
+    moved = np.array([block.X[block.determined[name]] for name in NAMES])
+    # of coordinates by eight points, and of intersections by photographs of 40 mm a pixel
+    assert np.sqrt(np.mean((moved - drone.truth) ** 2)) < 0.1
+    sigma[2:, 2] = np.inf
+    with pytest.raises(InputError, match="heights .* expected 3, got 1 "):
+        controlled(drone, drone.given(X, sigma, positions=False))
 
 
 def test_report_page_and_json_show_control_and_block(drone, spoilt, tmp_path):
