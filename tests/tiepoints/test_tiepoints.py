@@ -20,7 +20,12 @@ from jaxbundle.tiepoints.closure import (
 from jaxbundle.tiepoints.coplanarity import CoplanaritySettings, estimate_interior
 from jaxbundle.tiepoints.features import Detection, Features, find_features
 from jaxbundle.tiepoints.loops import split_contradicted
-from jaxbundle.tiepoints.matching import FeatureMatches, distances_within, match_features
+from jaxbundle.tiepoints.matching import (
+    FeatureMatches,
+    count_matches_of_largest,
+    distances_within,
+    match_features,
+)
 from jaxbundle.tiepoints.pairs import candidate_pairs
 from jaxbundle.tiepoints.still import MarkSettings, without_marks
 from jaxbundle.tiepoints.store import Store
@@ -330,6 +335,23 @@ def test_matches_are_those_of_both_sides():
     rows, ratio = match_features(one, other)
     assert len(rows) == 80 and np.all(order[rows[:, 1]] == rows[:, 0])
     assert np.all(np.diff(ratio) >= 0) and ratio.max() < 0.8
+
+
+@pytest.mark.parametrize("length", [32, 128])
+def test_two_features_equal_to_one_of_the_other_photograph_match_nothing(length):
+    """Binary descriptors and those of SIFT, in both directions: neither is the right one."""
+    rng = np.random.default_rng(5)
+    once = rng.integers(0, 256, (20, length), np.uint8)
+    twice = np.concatenate([once[:10], once[:5], once[10:15]])
+    one, other = (
+        Features(rng.uniform(0, 900, (20, 2)), np.ones(20), np.zeros(20), descriptor)
+        for descriptor in (twice, once)
+    )
+    expected = [[k, k] for k in range(5, 10)] + [[15 + k, 10 + k] for k in range(5)]
+    for a, b, order in ((one, other, 1), (other, one, -1)):
+        rows, _ = match_features(a, b)
+        assert sorted(rows[:, ::order].tolist()) == expected
+        assert count_matches_of_largest(a, b, 20) == 10
 
 
 def test_residuals_are_correlated_over_less_than_half_the_window():
