@@ -263,7 +263,7 @@ def _cut_out(
     n, is_template = len(rays.image), rays.is_template
     window, side = settings.window, settings.search_window
     # one pixel for interpolation and one for the last step, beyond the window that moves within
-    margins = {window: window // 2, side: side // 2 - window // 2 - 2}
+    margins = {window: window // 2, side: window // 2 + 2}
     windows = np.zeros((int(is_template.sum()), window, window), np.uint8)
     row_of_window = np.cumsum(is_template) - 1
     pieces = np.zeros((n, side, side), np.uint8)
