@@ -92,6 +92,26 @@ def test_principal_distance_and_distortion_from_pairs(cloud):
 
 
 @pytest.mark.further
+def test_distortion_of_a_known_long_lens_from_pairs():
+    """A principal distance of 15 longer sides, 540 mm of full frame, as the files state it."""
+    rng, f, k1 = np.random.default_rng(4), 15.0 * SIZE[0], 0.3
+    X, views = rng.uniform(-2.2, 2.2, (160, 3)), list(stations(5, rng))
+    uv = []
+    for X0, M in views:
+        xy = seen(X, X0 * f / F, M) * [1, -1]
+        uv.append(f * xy * (1 + k1 * (xy**2).sum(1, keepdims=True))
+                  + 0.05 * rng.normal(size=xy.shape))  # fmt: skip
+    pairs = list(combinations(uv, 2))
+    camera = jaxbundle.Camera(
+        "c", "opencv", {"fx": f, "fy": f, "cx": 0.0, "cy": 0.0}, image_size=SIZE
+    )
+    found = estimate_interior(camera, pairs, known=True).camera.parameters
+    # K1 moves points of the corners, at r = 0.03, by 0.2 px; it is no more than a start value
+    assert found["fx"] == pytest.approx(f, rel=0.02)
+    assert found["k1"] == pytest.approx(k1, abs=0.1)
+
+
+@pytest.mark.further
 def test_rotations_close_with_the_right_principal_distance_and_distortion():
     """A flat object, EXIF 20 % wrong, a fifth of the matches and one pair wrong: the coplanarity
     condition alone leaves the principal distance undecided."""
