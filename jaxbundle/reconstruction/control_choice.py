@@ -80,22 +80,44 @@ def assess_control(
     block: OrientedBlock, control: Points, usable: Sequence[int], assumed: float
 ) -> tuple[list[int], Assessment]:
     """The usable points in the order of their assessment: very many in groups that spread over all
-    of them, since time grows with the cube of their number. Redundancy, and whether σ was assumed,
-    are then those of the first group; the factor of stated σ is the largest."""
+    of them, since time grows with the cube of their number. Estimated σ are then the mean of those
+    of the groups by their redundancy, σ² = Σ r·σ²/Σ r, and assumed if those of all groups are; the
+    factor of stated σ is the largest."""
     number = max(1, -(-len(usable) // block.settings.compared_together))
     groups = [list(usable[first::number]) for first in range(number)]
     of_groups = [assess(block.compare(group, control), assumed) for group in groups]
     join = lambda name: np.concatenate([getattr(of_group, name) for of_group in of_groups])
-    return [k for group in groups for k in group], Assessment(
+    order, sigma = [k for group in groups for k in group], join("sigma")
+    redundancy = np.sum([of_group.redundancy for of_group in of_groups], axis=0)
+    for part, axes in enumerate(([0, 1], [2])):
+        estimated = _is_estimated(control, axes)
+        total = sum(
+            # one σ for all of them in a group
+            of_group.redundancy[part] * of_group.sigma[:, axes][estimated[group]][0] ** 2
+            for group, of_group in zip(groups, of_groups)
+            if of_group.redundancy[part]
+        )
+        if redundancy[part]:
+            sigma[:, axes] = np.where(
+                estimated[order], np.sqrt(total / redundancy[part]), sigma[:, axes]
+            )
+    lacking = np.all([of_group.assumed for of_group in of_groups], axis=0)
+    return order, Assessment(
         join("used"),
-        join("sigma"),
-        of_groups[0].redundancy,
+        sigma,
+        (float(redundancy[0]), float(redundancy[1])),
         join("error"),
         join("error_sigma"),
         join("probability"),
-        of_groups[0].assumed,
+        (bool(lacking[0]), bool(lacking[1])),
         max(of_group.factor for of_group in of_groups),
     )
+
+
+def _is_estimated(control: Points, axes: Sequence[int]) -> Bool[np.ndarray, "n axes"]:
+    """Whether σ of points on some axes is to be estimated: it is not stated, nor 0 of fixed ones."""
+    fixed = np.array([role == "fixed" for role in control.role], bool)
+    return np.isnan(control.sigma[:, axes]) & ~fixed[:, None]
 
 
 def choose_control(
@@ -110,7 +132,7 @@ def choose_control(
     sigma = control.sigma.copy()
     for k in range(3):
         unknown = np.isnan(sigma[:, k])
-        estimated = np.isnan(control.sigma[list(usable), k])
+        estimated = _is_estimated(control, [k])[list(usable), 0]
         sigma[unknown, k] = assessed.sigma[estimated, k][0] if estimated.any() else assumed
     # stated σ that most points contradict are multiplied by one factor, estimated ones fit already
     sigma[np.isfinite(control.sigma)] *= assessed.factor
