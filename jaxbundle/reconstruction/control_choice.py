@@ -115,7 +115,7 @@ def assess_control(
 
 
 def _is_estimated(control: Points, axes: Sequence[int]) -> Bool[np.ndarray, "n axes"]:
-    """Whether σ of points on some axes is to be estimated: it is not stated, nor 0 of fixed ones."""
+    """Whether σ of points on some axes is to be estimated: not stated, and not 0 of fixed ones."""
     fixed = np.array([role == "fixed" for role in control.role], bool)
     return np.isnan(control.sigma[:, axes]) & ~fixed[:, None]
 

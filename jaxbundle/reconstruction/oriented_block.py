@@ -298,18 +298,15 @@ class OrientedBlock:
     def _joint_covariance(self, rows: Sequence[int]) -> Float[np.ndarray, "n 3 n 3"]:
         """The covariance of the coordinates of some points among each other."""
         problem, n = self.result.problem, len(rows)
-        tables = {t.name: np.zeros((3 * n, t.rows, t.space.width)) for t in problem.tables}
-        lengths = problem.lengths
-        for k, row in enumerate(rows):
-            D = np.eye(3)
-            # far points are unknowns by direction and inverse distance: D of X by them
-            if lengths is not None:
-                unknowns = np.append(np.asarray(coordinates(self.result.values))[row], lengths[row])
-                D = np.asarray(derivative(jnp.asarray(unknowns)))
-            tables["point"][3 * k : 3 * k + 3, row] = self.A @ D
-        # A·D·Q·Dᵀ·Aᵀ of these points, row by row, without the covariance matrix of the network
-        Q = self.result.cofactors.solution.propagate_rows(tables)
-        return self.result.sigma0**2 * np.asarray(Q).reshape(n, 3, n, 3)
+        D, lengths = np.tile(np.eye(3), (n, 1, 1)), problem.lengths
+        # far points are unknowns by direction and inverse distance: D of X by them
+        if lengths is not None:
+            table = np.asarray(coordinates(self.result.values))
+            for k, row in enumerate(rows):
+                D[k] = derivative(jnp.asarray(np.append(table[row], lengths[row])))
+        AD = self.A @ D
+        Q = self.result.cofactors.solution.joint_cofactors("point", rows)
+        return self.result.sigma0**2 * np.einsum("nij,njmk,mlk->niml", AD, Q, AD)
 
     def removed(self) -> list[tuple[str, str]]:
         """Image and point, by id, of the image points without weight."""

@@ -33,8 +33,8 @@ def test_positions_may_be_shifted_against_the_control_that_agrees(monkeypatch, a
 
 
 def many_points(compared_together, role="control"):
-    """120 points, determined by the block to a millimetre, with errors of 0.3 m in the plane and 0.6 m in
-    height, of unknown σ; the first of the given role."""
+    """120 points, determined by the block to a millimetre, with errors of 0.3 m in the plane and
+    0.6 m in height, of unknown σ; the first of the given role."""
     n, errors = 120, np.random.default_rng(1).normal(size=(120, 3)) * [0.3, 0.3, 0.6]
     roles = (role, *["control"] * (n - 1))
     control = Points(tuple(map(str, range(n))), roles, np.zeros((n, 3)), np.full((n, 3), np.nan))
@@ -56,8 +56,8 @@ def many_points(compared_together, role="control"):
 
 @pytest.mark.parametrize("assumed", [0.01, 0.45])
 def test_sigma_of_control_in_groups_is_that_of_all_points(assumed):
-    """Σd²/n of all used points, and as many redundancies, also when they are assessed in three groups;
-    at the assumed σ, which is the least, where it is smaller than this."""
+    """Σd²/n of all used points, and as many redundancies, also when they are assessed in three
+    groups; at the assumed σ, which is the least, where it is smaller than this."""
     block, control, errors = many_points(40)
     order, found = control_choice.assess_control(block, control, range(120), assumed)
     assert sorted(order) == list(range(120)) and found.used.sum() > 115  # 5 % suspect one by chance
