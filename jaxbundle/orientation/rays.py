@@ -26,7 +26,7 @@ from jaxbundle.types import Index
 MIN_COSINE = 0.15
 # Largest unknown lens distortion, relative to the image extent, the angle to the axis that 95 % of
 # the rays do not exceed: that of wide-angle lenses of consumer cameras, whose parameters are not
-# known before the adjustment; 43 pixels of a photograph of 3000, of 3 × 2 with c of its longer side.
+# known before the adjustment; 43 pixels of a photograph of 3000 × 2000 whose c is its longer side.
 # Smaller: such images are not oriented; larger: blunders of that size are accepted as start values.
 TOLERANCE = 0.03
 
@@ -37,8 +37,9 @@ class Sights:
     camera frame) and its σ (radians, a priori).
 
     `tolerance`: by image, the allowed misclosure of start values: `TOLERANCE` times the extent of
-    the image, the angle to the axis that 95 % of its camera's rays do not exceed, radians. `row` is the row among the observations of the network. Image points outside
-    the range of their camera have no ray and are not among these.
+    the image, the angle to the axis that 95 % of its camera's rays do not exceed, radians. `row` is
+    the row among the observations of the network. Image points outside the range of their camera
+    have no ray and are not among these.
     """
 
     image: Int[np.ndarray, " n"]
