@@ -58,7 +58,7 @@ def without_unknown_heights(block: OrientedBlock) -> tuple[Points, str]:
             "the heights of all control points are 0: used as the file states them; "
             "their residuals show how far the ground is from this plane"
         )
-    rows = [block.determined[id] for id in points.id if id in block.determined]
+    rows = [block.row_of_determined[id] for id in points.id if id in block.row_of_determined]
     spread = block.network.images.sigma[:, 2]
     sigma = float(np.nanmedian(spread[np.isfinite(spread)]))
     middle = float(np.median(block.X[rows, 2])) if rows else 0.0
@@ -142,7 +142,7 @@ def choose_control(
     shift = np.zeros(3)
     agreed = [k for k, n in row.items() if assessed.used[n]]
     if agreed:
-        X = block.X[[block.determined[control.id[k]] for k in agreed]]
+        X = block.X[[block.row_of_determined[control.id[k]] for k in agreed]]
         shift = np.median(X - control.position[agreed], axis=0)
     for k, id in enumerate(control.id):
         point = measured[id]
@@ -187,7 +187,7 @@ def _settle_by_coordinates(
     X = control.position[k] + shift
     # without a height, that of the points around
     if np.isinf(control.sigma[k, 2]):
-        heights = [block.X[row, 2] for row in block.determined.values()]
+        heights = [block.X[row, 2] for row in block.row_of_determined.values()]
         X[2] = np.median(heights) if heights else X[2]
     spread = np.sqrt((np.where(np.isfinite(choice.sigma[k]), choice.sigma[k], 0.0) ** 2).sum())
     off = block.misses(point, X)

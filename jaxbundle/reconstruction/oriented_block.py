@@ -110,10 +110,10 @@ class OrientedBlock:
         points = self.network.points.id
         known = np.all(np.isfinite(self.X), axis=1)
         named = set(frame.points.id)
-        self.determined = {id: k for k, id in enumerate(points) if id in named and known[k]}
+        self.row_of_determined = {id: k for k, id in enumerate(points) if id in named and known[k]}
         observed = np.all(np.isfinite(self.network.images.sigma[:, :3]), axis=1)
         self.has_positions = int(observed.sum()) > 2  # two leave a rotation open
-        self.of_id = {id: k for k, id in enumerate(points)}
+        self.row_of_point = {id: k for k, id in enumerate(points)}
 
     def measure(self, id: str) -> MeasuredPoint:
         """The measurements of a point; all of them agree for now."""
@@ -141,7 +141,7 @@ class OrientedBlock:
         pixels = np.full((len(rows), 2, 3), np.nan)
         T = np.stack([in_plane[1] - in_plane[2], in_plane[3] - in_plane[4]], 2)
         # NaN: at the end of the range of the camera
-        known = np.isfinite(T).all((1, 2))
+        known = np.isfinite(T.reshape(-1, 6)).all(1)
         pixels[known] = np.linalg.pinv(T[known])
         rays = np.where(known[:, None], d[0], np.nan)
         sigma = named.sigma[rows].mean(1)
@@ -255,7 +255,7 @@ class OrientedBlock:
                 f"{MIN_CONTROL}, got {len(ids)} in this part; without satellite positions they "
                 "alone give the frame"
             )
-        similarity = similarity_of_most(self.X[[self.determined[id] for id in ids]], target)
+        similarity = similarity_of_most(self.X[[self.row_of_determined[id] for id in ids]], target)
         if similarity is None:
             raise InputError("the control points are on a line: they leave a rotation open")
         A, t = similarity
@@ -267,7 +267,8 @@ class OrientedBlock:
     def ground_sample_distance(self) -> float:
         """The length of a pixel at the named points, the median."""
         lengths = [
-            self.pixel_length(self.measure(id), self.X[k]) for id, k in self.determined.items()
+            self.pixel_length(self.measure(id), self.X[k])
+            for id, k in self.row_of_determined.items()
         ]
         # NaN of measurements outside the range of their camera
         known = [x for of_point in lengths for x in of_point if np.isfinite(x)]
@@ -275,7 +276,7 @@ class OrientedBlock:
 
     def compare(self, places: Sequence[int], points: Points) -> Discrepancies:
         """Coordinates from the block minus given ones, and their joint covariance."""
-        rows = [self.determined[points.id[k]] for k in places]
+        rows = [self.row_of_determined[points.id[k]] for k in places]
         if not rows:
             none = np.zeros((0, 3))
             return Discrepancies(none, np.zeros((0, 3, 0, 3)), none, np.zeros((0, 3, 0)))
@@ -308,7 +309,7 @@ class OrientedBlock:
         Q = self.result.cofactors.solution.joint_cofactors("point", rows)
         return self.result.sigma0**2 * np.einsum("nij,njmk,mlk->niml", AD, Q, AD)
 
-    def removed(self) -> list[tuple[str, str]]:
+    def removed_image_points(self) -> list[tuple[str, str]]:
         """Image and point, by id, of the image points without weight."""
         problem = self.result.problem
         gone = ~problem.used
@@ -320,9 +321,9 @@ class OrientedBlock:
 
     def is_determined(self, id: str, point: MeasuredPoint) -> bool:
         """Whether a point was adjusted with the block, from the measurements that agree."""
-        if id not in self.determined or point.good.sum() < 2:
+        if id not in self.row_of_determined or point.good.sum() < 2:
             return False
-        off = self.misses(point, self.X[self.determined[id]])[point.good]
+        off = self.misses(point, self.X[self.row_of_determined[id]])[point.good]
         return bool((off < self.settings.wrong_ray * point.sigma[point.good]).all())
 
     def name_of(self, point: MeasuredPoint, n: int) -> str:

@@ -96,7 +96,7 @@ def match_features(
     return np.stack([rows, best[rows]], 1), distance_ratio[mutual]
 
 
-def unique_matches(
+def are_unique(
     rows: Int[np.ndarray, "n 2"],
     within: tuple[Float[np.ndarray, " a"], Float[np.ndarray, " b"]],
     settings: FeatureMatchingSettings = FeatureMatchingSettings(),

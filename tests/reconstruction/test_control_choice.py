@@ -17,7 +17,7 @@ def test_positions_may_be_shifted_against_the_control_that_agrees(monkeypatch, a
     position = np.array([[0.0, 0, 0], [10, 0, 0], [5, 5, 0]])
     control = Points(("A", "B", "C"), ("control",) * 3, position, np.full((3, 3), 0.02))
     shift = np.array([1.0, -2.0, 0.5])
-    block = SimpleNamespace(X=position[:2] + shift, determined={"A": 0, "B": 1})
+    block = SimpleNamespace(X=position[:2] + shift, row_of_determined={"A": 0, "B": 1})
     rays = lambda good: SimpleNamespace(rows=[0, 1], good=np.full(2, good))
     measured = {"A": rays(True), "B": rays(True), "C": rays(False)}
     assessed = SimpleNamespace(sigma=np.full((2, 3), 0.02), factor=1.0, used=np.full(2, agree))
@@ -49,8 +49,9 @@ def many_points(compared_together, role="control"):
 
     settings = ControlSettings(compared_together=compared_together)
     block = SimpleNamespace(
-        settings=settings, compare=compare, X=errors, determined={id: int(id) for id in control.id}
-    )
+        settings=settings, compare=compare, X=errors,
+        row_of_determined={id: int(id) for id in control.id},
+    )  # fmt: skip
     return block, control, errors
 
 

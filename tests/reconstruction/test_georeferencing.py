@@ -210,7 +210,7 @@ def test_a_point_without_height_leaves_the_others_to_give_the_frame(drone, monke
     weighted, given = drone.block(False), drone.given(X, sigma, positions=False)
     block = OrientedBlock(weighted.adjustment, given)
     block.move(range(CONTROL), given.points)
-    moved = np.array([block.X[block.determined[name]] for name in NAMES])
+    moved = np.array([block.X[block.row_of_determined[name]] for name in NAMES])
     # of coordinates by eight points, and of intersections by photographs of 40 mm a pixel
     assert np.sqrt(np.mean((moved - drone.truth) ** 2)) < 0.1
     sigma[2:, 2] = np.inf

@@ -18,7 +18,7 @@ from jaxbundle.tiepoints.closure import (
     find_loops,
 )
 from jaxbundle.tiepoints.coplanarity import CoplanaritySettings, estimate_interior
-from jaxbundle.tiepoints.features import Detection, Features, find_features
+from jaxbundle.tiepoints.features import Features, FeatureSettings, find_features
 from jaxbundle.tiepoints.loops import split_contradicted
 from jaxbundle.tiepoints.matching import (
     FeatureMatches,
@@ -391,16 +391,16 @@ def test_candidates():
 
 def test_what_is_kept_is_found_again_for_the_same_content_only(tmp_path):
     found = features_at(np.arange(12.0).reshape(6, 2))
-    store = Store(tmp_path / "kept", Detection())
+    store = Store(tmp_path / "kept", FeatureSettings())
     store.save_features("one", found)
-    again = Store(tmp_path / "kept", Detection())
+    again = Store(tmp_path / "kept", FeatureSettings())
     np.testing.assert_array_equal(again.load_features("one").descriptor, found.descriptor)
     assert again.load_features("changed") is None
-    assert Store(tmp_path / "kept", Detection(number=7)).load_features("one") is None
+    assert Store(tmp_path / "kept", FeatureSettings(number=7)).load_features("one") is None
     file = next((tmp_path / "kept").glob("*.npz"))
     file.write_bytes(file.read_bytes()[:100])
     assert again.load_features("one") is None
-    Store(tmp_path / "kept", Detection()).drop_unused()
+    Store(tmp_path / "kept", FeatureSettings()).drop_unused()
     assert not list((tmp_path / "kept").glob("*.npz"))
 
 
