@@ -141,7 +141,7 @@ class OrientedBlock:
         pixels = np.full((len(rows), 2, 3), np.nan)
         T = np.stack([in_plane[1] - in_plane[2], in_plane[3] - in_plane[4]], 2)
         # NaN: at the end of the range of the camera
-        known = np.isfinite(T.reshape(-1, 6)).all(1)
+        known = np.all(np.isfinite(T), axis=(1, 2))
         pixels[known] = np.linalg.pinv(T[known])
         rays = np.where(known[:, None], d[0], np.nan)
         sigma = named.sigma[rows].mean(1)
