@@ -159,13 +159,15 @@ class OrientedBlock:
 
     def misses(self, point: MeasuredPoint, X: Float[np.ndarray, "3"]) -> Float[np.ndarray, " n"]:
         """Distances of the projections of X from its measurements, pixels: infinite behind the
-        camera, otherwise of the image without distortion, in pixels at the measurement."""
+        camera and of measurements without a ray, otherwise of the image without distortion, in
+        pixels at the measurement."""
         away = X - self.X0[point.image]
         depth = np.einsum("ni,ni->n", away, point.normal)
         in_plane = point.rays / np.einsum("ni,ni->n", point.rays, point.normal)[:, None]
         with np.errstate(divide="ignore", invalid="ignore"):
             off = np.einsum("nki,ni->nk", point.pixels, away / depth[:, None] - in_plane)
-            return np.where(depth > 0, np.linalg.norm(off, axis=1), np.inf)
+            length = np.nan_to_num(np.linalg.norm(off, axis=1), nan=np.inf)
+            return np.where(depth > 0, length, np.inf)
 
     def distances(self, point: MeasuredPoint, X: Float[np.ndarray, "3"]) -> Float[np.ndarray, " n"]:
         """Distances of X from the rays of its measurements, object units."""
@@ -176,9 +178,9 @@ class OrientedBlock:
     ) -> Float[np.ndarray, " n"]:
         """The length of a pixel at X, parallel to the planes of its measurements."""
         depth = np.einsum("ni,ni->n", X - self.X0[point.image], point.normal)
-        # the side of a square as large as the pixel: √det(P·Pᵀ) pixels cover an area of 1
-        gram = np.einsum("nki,nli->nkl", point.pixels, point.pixels)
-        return depth / np.linalg.det(gram) ** 0.25
+        # the side of a square as large as the pixel: |∂u × ∂v| pixels cover an area of 1
+        cover = np.linalg.norm(np.cross(point.pixels[:, 0], point.pixels[:, 1]), axis=1)
+        return depth / np.sqrt(cover)
 
     def resolve(self) -> dict[str, MeasuredPoint]:
         """By point, the measurements that agree on one position of it, and that position.

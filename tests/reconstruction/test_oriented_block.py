@@ -71,3 +71,14 @@ def test_the_ground_sample_distance_is_that_of_the_depth():
         X = X0 + M.T @ [50 * away, 0.0, -50.0]
         block = block_of(PERSPECTIVE, image_of(PERSPECTIVE, X)[None], X)
         assert block.ground_sample_distance == pytest.approx(50.0 / F, rel=1e-6)
+
+
+def test_a_measurement_outside_the_range_of_its_camera_has_no_ray():
+    """Nor a share of the ground sample distance; with K1 of −0.1 the image ends at r = 1.22."""
+    X = X0 + M.T @ [5.0, 0.0, -50.0]
+    xy = np.stack([image_of(DISTORTED, X), [3000.0, 599.5]])
+    block = block_of(DISTORTED, xy, X)
+    point = block.measure("p")
+    assert point.good.tolist() == [True, False] and np.isnan(point.rays[1]).all()
+    assert block.misses(point, X)[0] < 1e-6 and np.isinf(block.misses(point, X)[1])
+    assert block.ground_sample_distance == pytest.approx(50.0 / F, rel=0.02)
