@@ -14,7 +14,7 @@ from full_disk import files_end_at
 from jaxbundle.errors import InputError
 from jaxbundle.io.results.json_lines import JsonLines
 from jaxbundle.io.text.csv_tables import write_text
-from jaxbundle.tiepoints.features import Detection, Features
+from jaxbundle.tiepoints.features import Features, FeatureSettings
 from jaxbundle.tiepoints.store import Store
 
 FULL = "/dev/full"
@@ -82,7 +82,7 @@ def test_no_part_of_a_line_stays(tmp_path):
 
 
 def test_stored_features_on_a_full_disk(tmp_path):
-    store = Store(tmp_path, Detection())
+    store = Store(tmp_path, FeatureSettings())
     features = Features(np.zeros((1000, 2)), np.zeros(1000), np.zeros(1000), np.zeros((1000, 128)))
     with files_end_at(4096):
         with pytest.raises(InputError, match=r"\.npz: cannot be written: File too large"):

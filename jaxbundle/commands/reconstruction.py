@@ -16,7 +16,7 @@ from jaxbundle.reconstruction.reconstruct import DEFAULT
 from jaxbundle.reconstruction.reconstruct import reconstruct as reconstruct_photographs
 from jaxbundle.reconstruction.result import Reconstruction
 from jaxbundle.reconstruction.settings import ReconstructionSettings
-from jaxbundle.tiepoints.features import Detection
+from jaxbundle.tiepoints.features import FeatureSettings
 from jaxbundle.types import Progress
 
 
@@ -67,7 +67,7 @@ def reconstruct(  # noqa: PLR0913 (public: the options of the command, all but o
         check_kind(targets)
         settings = replace(settings, targets=targets)
     if features is not None:
-        settings = replace(settings, detection=Detection(features))
+        settings = replace(settings, detection=FeatureSettings(features))
     if pairs is not None:
         settings = replace(settings, pairs=pairs)
     if points is not None:

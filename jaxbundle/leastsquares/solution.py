@@ -5,16 +5,21 @@ The padding that lets problems of similar size share compiled programs is remove
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxbundle.leastsquares.datum.by_table import directions_of_motions, move_into_datum
-from jaxbundle.leastsquares.datum.conditions import move_to_datum, of_groups
+from jaxbundle.leastsquares.datum.conditions import (
+    move_to_datum,
+    of_groups,
+    s_transform,
+    s_transform_transposed,
+)
 from jaxbundle.leastsquares.equations.elimination import PIVOT, NormalFactor, factorise, solve
 from jaxbundle.leastsquares.equations.linearise import differentiate
 from jaxbundle.leastsquares.equations.normal import Normal, Tangent, normal_equations
@@ -28,6 +33,7 @@ from jaxbundle.leastsquares.indexing.rows import (
     residuals,
     restore_order,
 )
+from jaxbundle.leastsquares.iterations.retraction import changes_of_tables
 from jaxbundle.leastsquares.iterations.solver import LeastSquares, Minimum, find
 from jaxbundle.leastsquares.iterations.stopping import converged
 from jaxbundle.leastsquares.problem import (
@@ -290,6 +296,18 @@ class Solution:
         }
         return np.asarray(_propagate(declared, values, self.factor, wide, self.moves))
 
+    def joint_cofactors(
+        self, table: str, rows: Sequence[int]
+    ) -> Float[np.ndarray, "n width n width"]:
+        """The cofactors of some rows of a table among each other; zero for held unknowns."""
+        declared, _, values = self.arguments[:3]
+        blank = {
+            t.name: np.zeros((self.problem.sizes["table", t.name], t.space.width))
+            for t in self.problem.tables
+        }
+        given = (np.asarray(rows, int), blank, self.moves)
+        return np.asarray(_joint_cofactors(table, declared, values, self.factor, *given))
+
     @property
     def arguments(self) -> tuple[Declared, Plan, Values, Data]:
         """What compiled functions of a solution take first; arrays in the sizes of the plan."""
@@ -354,6 +372,32 @@ def _rows_of(
         return jnp.atleast_1d(function(moved))
 
     return jax.jacrev(of_change)(still)
+
+
+@compile_once
+def _joint_cofactors(
+    table: str,
+    declared: Declared,
+    values: Values,
+    factor: NormalFactor,
+    rows: Int[Array, " n"],
+    blank: Values,
+    moves: Tangent | None,
+) -> Float[Array, "n width n width"]:
+    """Columns of Q, of which only the rows wanted are kept."""
+    plan, width = factor.plan, blank[table].shape[1]
+
+    def column(row: Int[Array, ""], axis: Int[Array, ""]) -> Float[Array, "n width"]:
+        one = of_groups(plan, blank | {table: blank[table].at[row, axis].set(1.0)})
+        change = solve(factor, s_transform_transposed(declared, plan, values, one, moves))
+        change = s_transform(declared, plan, values, change, moves)
+        return (blank | changes_of_tables(plan, values, change))[table][rows]
+
+    # Sixteen columns at once: products of matrices in the reduced system, of 38 MB for 100 000
+    # points. 50 of 30 000 points take 110 MB; all columns together took 2.4 GB, in the same time.
+    places = jnp.repeat(rows, width), jnp.tile(jnp.arange(width), len(rows))
+    columns = jax.lax.map(lambda place: column(*place), places, batch_size=16)
+    return columns.reshape(len(rows), width, len(rows), width)
 
 
 @compile_once

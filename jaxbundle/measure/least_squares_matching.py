@@ -226,8 +226,11 @@ def _status(
     )
 
 
-def spline_coefficients(image: Float[AnyArray, "rows columns"]) -> Float[Array, "rows columns"]:
-    """Coefficients of the cubic spline through the pixels of an image, linear beyond its edge."""
+def spline_coefficients(
+    image: Float[AnyArray, "rows columns"],
+) -> Float[Array, "rows+2 columns+2"]:
+    """Coefficients of the cubic spline through the pixels of an image, without curvature at its
+    edge (the natural spline): from one before the first pixel to one after the last."""
     down, along = (jnp.asarray(_prefilter(n), image.dtype) for n in image.shape)
     return down @ image @ along.T
 
@@ -238,8 +241,9 @@ def grey_value(
     """The grey value of an image at (u, v), by its `spline_coefficients`."""
     rows, columns = coefficients.shape
     i, j = (jnp.floor(jax.lax.stop_gradient(a)) for a in (v, u))
-    row = [jnp.clip(i.astype(int) + k, 0, rows - 1) for k in (-1, 0, 1, 2)]
-    column = [jnp.clip(j.astype(int) + k, 0, columns - 1) for k in (-1, 0, 1, 2)]
+    # from the pixel before: the first coefficient is before the first pixel
+    row = [jnp.clip(i.astype(int) + k, 0, rows - 1) for k in (0, 1, 2, 3)]
+    column = [jnp.clip(j.astype(int) + k, 0, columns - 1) for k in (0, 1, 2, 3)]
     down, along = _spline_weights(v - i), _spline_weights(u - j)
     # sums written out: one loop over the window, whereas small products are one call each
     nil = jnp.zeros((), coefficients.dtype)
@@ -257,14 +261,17 @@ def _spline_weights(t: Scalar) -> tuple[Scalar, Scalar, Scalar, Scalar]:
     )
 
 
-def _prefilter(n: int) -> Float[np.ndarray, "n n"]:
-    """From n values to the coefficients of the spline through them.
+def _prefilter(n: int) -> Float[np.ndarray, "m n"]:
+    """From n values to the m = n + 2 coefficients of the spline through them, with one beyond each
+    end.
 
     The inverse of the banded matrix of ⅙, ⅔, ⅙, dense: windows are small, and two products with it
     are one call for all of a batch, where the recursive filter of Unser is a loop over the rows."""
     B = (np.eye(n, k=-1) + 4 * np.eye(n) + np.eye(n, k=1)) / 6
+    # second derivatives c₋₁ − 2·c₀ + c₁ of 0 at the ends: there c₀ is the value itself
     B[[0, -1]] = np.eye(n)[[0, -1]]
-    return np.linalg.inv(B)
+    c = np.linalg.inv(B)
+    return np.concatenate([2 * c[:1] - c[1:2], c, 2 * c[-1:] - c[-2:-1]])
 
 
 def _remaining_noise(t: Pixels) -> Pixels:

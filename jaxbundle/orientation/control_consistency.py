@@ -41,12 +41,12 @@ MIN_REDUNDANCY = 3.0
 class Discrepancies:
     """Determined minus given coordinates of control points.
 
-    **Fields:** `difference` [n, 3]; `cofactor` [n, 3, n, 3], their covariance without that of
+    **Fields:** `difference` [n, 3]; `covariance` [n, 3, n, 3] of it, without that of
     control; `sigma` [n, 3] of control: NaN where it is to be estimated, infinite on axes that are
     not controlled; `open` [n, 3, k], what the block leaves open."""
 
     difference: Float[np.ndarray, "n 3"]
-    cofactor: Float[np.ndarray, "n 3 n 3"]
+    covariance: Float[np.ndarray, "n 3 n 3"]
     sigma: Float[np.ndarray, "n 3"]
     open: Float[np.ndarray, "n 3 k"]
 
@@ -233,7 +233,7 @@ def _weight_matrix(
     """W and d of the controlled axes of the used points; their rows among all axes."""
     rows = np.flatnonzero((used[:, None] & np.isfinite(sigma)).ravel())
     n = 3 * len(found)
-    S = found.cofactor.reshape(n, n)[np.ix_(rows, rows)] + np.diag(sigma.ravel()[rows] ** 2)
+    S = found.covariance.reshape(n, n)[np.ix_(rows, rows)] + np.diag(sigma.ravel()[rows] ** 2)
     W = np.linalg.inv(S)
     G = found.open.reshape(n, -1)[rows]
     if G.shape[1]:

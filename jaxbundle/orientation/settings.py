@@ -62,9 +62,9 @@ class StartValueSettings:
       by 1/2000 from the direction, far below the tolerance. Larger: less well conditioned. Half and
       double make no difference here, where no point is far.
     - `extent_to_misfit`: control agrees with start values, or with a mirror image, to its extent
-      divided by this number. It belongs to the tolerance (3 % of the image): cameras may have an
-      unknown distortion of that size, which a model inherits. Half and double make no difference
-      here, where control is right.
+      divided by this number. It belongs to the tolerance, 3 % of the angle from the axis to the
+      edge of an image (`rays.TOLERANCE`): cameras may have an unknown distortion of that size,
+      which a model inherits. Half and double make no difference here, where control is right.
     - `contradicted_share`: of rays that miss their control points, or of points whose rays do not
       meet, above which a mirror image is tested. Larger: mirrored networks are not recognised;
       smaller: a test for nothing, which costs a model from a pair. Half and double make no

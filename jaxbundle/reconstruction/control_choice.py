@@ -6,7 +6,7 @@ that ends at another control point of its photograph is a wrong name.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -58,7 +58,7 @@ def without_unknown_heights(block: OrientedBlock) -> tuple[Points, str]:
             "the heights of all control points are 0: used as the file states them; "
             "their residuals show how far the ground is from this plane"
         )
-    rows = [block.determined[id] for id in points.id if id in block.determined]
+    rows = [block.row_of_determined[id] for id in points.id if id in block.row_of_determined]
     spread = block.network.images.sigma[:, 2]
     sigma = float(np.nanmedian(spread[np.isfinite(spread)]))
     middle = float(np.median(block.X[rows, 2])) if rows else 0.0
@@ -80,22 +80,44 @@ def assess_control(
     block: OrientedBlock, control: Points, usable: Sequence[int], assumed: float
 ) -> tuple[list[int], Assessment]:
     """The usable points in the order of their assessment: very many in groups that spread over all
-    of them, since time grows with the cube of their number. Redundancy, and whether σ was assumed,
-    are then those of the first group; the factor of stated σ is the largest."""
+    of them, since time grows with the cube of their number. Estimated σ are then the mean of those
+    of the groups by their redundancy, σ² = Σ r·σ²/Σ r, and assumed if those of all groups are; the
+    factor of stated σ is the largest."""
     number = max(1, -(-len(usable) // block.settings.compared_together))
     groups = [list(usable[first::number]) for first in range(number)]
     of_groups = [assess(block.compare(group, control), assumed) for group in groups]
     join = lambda name: np.concatenate([getattr(of_group, name) for of_group in of_groups])
-    return [k for group in groups for k in group], Assessment(
+    order, sigma = [k for group in groups for k in group], join("sigma")
+    redundancy = np.sum([of_group.redundancy for of_group in of_groups], axis=0)
+    for part, axes in enumerate(([0, 1], [2])):
+        estimated = _is_estimated(control, axes)
+        total = sum(
+            # one σ for all of them in a group
+            of_group.redundancy[part] * of_group.sigma[:, axes][estimated[group]][0] ** 2
+            for group, of_group in zip(groups, of_groups)
+            if of_group.redundancy[part]
+        )
+        if redundancy[part]:
+            sigma[:, axes] = np.where(
+                estimated[order], np.sqrt(total / redundancy[part]), sigma[:, axes]
+            )
+    lacking = np.all([of_group.assumed for of_group in of_groups], axis=0)
+    return order, Assessment(
         join("used"),
-        join("sigma"),
-        of_groups[0].redundancy,
+        sigma,
+        (float(redundancy[0]), float(redundancy[1])),
         join("error"),
         join("error_sigma"),
         join("probability"),
-        of_groups[0].assumed,
+        (bool(lacking[0]), bool(lacking[1])),
         max(of_group.factor for of_group in of_groups),
     )
+
+
+def _is_estimated(control: Points, axes: Sequence[int]) -> Bool[np.ndarray, "n axes"]:
+    """Whether σ of points on some axes is to be estimated: not stated, and not 0 of fixed ones."""
+    fixed = np.array([role == "fixed" for role in control.role], bool)
+    return np.isnan(control.sigma[:, axes]) & ~fixed[:, None]
 
 
 def choose_control(
@@ -110,7 +132,7 @@ def choose_control(
     sigma = control.sigma.copy()
     for k in range(3):
         unknown = np.isnan(sigma[:, k])
-        estimated = np.isnan(control.sigma[list(usable), k])
+        estimated = _is_estimated(control, [k])[list(usable), 0]
         sigma[unknown, k] = assessed.sigma[estimated, k][0] if estimated.any() else assumed
     # stated σ that most points contradict are multiplied by one factor, estimated ones fit already
     sigma[np.isfinite(control.sigma)] *= assessed.factor
@@ -120,7 +142,7 @@ def choose_control(
     shift = np.zeros(3)
     agreed = [k for k, n in row.items() if assessed.used[n]]
     if agreed:
-        X = block.X[[block.determined[control.id[k]] for k in agreed]]
+        X = block.X[[block.row_of_determined[control.id[k]] for k in agreed]]
         shift = np.median(X - control.position[agreed], axis=0)
     for k, id in enumerate(control.id):
         point = measured[id]
@@ -137,7 +159,7 @@ def choose_control(
             _settle_by_coordinates(block, choice, k, control, shift)
         if choice.points[id].good.any() or id not in choice.reasons:
             _name_wrong(block, choice, id)
-    _name_exchanged(block, control, choice, [k for k, n in row.items() if not assessed.used[n]])
+    _name_exchanged(block, control, choice, {k: n for k, n in row.items() if not assessed.used[n]})
     return choice
 
 
@@ -165,13 +187,12 @@ def _settle_by_coordinates(
     X = control.position[k] + shift
     # without a height, that of the points around
     if np.isinf(control.sigma[k, 2]):
-        heights = [block.X[row, 2] for row in block.determined.values()]
+        heights = [block.X[row, 2] for row in block.row_of_determined.values()]
         X[2] = np.median(heights) if heights else X[2]
-    distance = np.linalg.norm(X - block.X0[point.image], axis=1)
     spread = np.sqrt((np.where(np.isfinite(choice.sigma[k]), choice.sigma[k], 0.0) ** 2).sum())
     off = block.misses(point, X)
     # σ of the measurement and, in pixels, of the coordinates
-    sigma = np.hypot(point.sigma, spread / (distance * point.pixel))
+    sigma = np.hypot(point.sigma, spread / block.pixel_length(point, X))
     agree = off < block.settings.wrong_ray * sigma
     # if exactly one of several rays that do not meet passes the coordinates, that one is right
     if control.role[k] == "check" or (len(point.rows) > 1 and agree.sum() != 1):
@@ -185,10 +206,10 @@ def _settle_by_coordinates(
         choice.points[id] = dataclasses.replace(point, good=agree)
         choice.used[k] = True
     else:
-        ground = off[0] * point.pixel[0] * distance[0]
+        passes = block.distances(point, X)[0]
         choice.reasons[id] = (
             f"its only ray, in {block.name_of(point, 0)}, misses its coordinates by "
-            f"{off[0]:.0f} px, {ground:.1f} m"
+            f"{off[0]:.0f} px, {passes:.1f} m"
         )
 
 
@@ -198,13 +219,12 @@ def _name_wrong(block: OrientedBlock, choice: ControlChoice, id: str) -> None:
     X = point.position
     if not np.isfinite(X).all():
         return
-    off = block.misses(point, X)
+    off, passes = block.misses(point, X), block.distances(point, X)
     for n in np.flatnonzero(~point.good).tolist():
-        passes = np.linalg.norm(np.cross(X - block.X0[point.image[n]], point.rays[n]))
         said = (
             f"{block.name_of(point, n)} is a wrong measurement and not used: {off[n]:.0f} px "
             "from where the other photographs see it, and its ray misses the point by "
-            f"{passes:.2f} m"
+            f"{passes[n]:.2f} m"
         )
         other = block.seen_there(point, n, id, choice.points)
         choice.errors.setdefault(id, []).append(
@@ -213,14 +233,21 @@ def _name_wrong(block: OrientedBlock, choice: ControlChoice, id: str) -> None:
 
 
 def _name_exchanged(
-    block: OrientedBlock, control: Points, choice: ControlChoice, bad: Sequence[int]
+    block: OrientedBlock, control: Points, choice: ControlChoice, bad: Mapping[int, int]
 ) -> None:
-    """Pairs of contradictory points whose coordinates fit if they are exchanged."""
-    for i in bad:
+    """Pairs of contradictory points whose coordinates fit if they are exchanged.
+
+    **Arguments:** `bad`: rows of the contradictory points, and in the assessment."""
+    assessed, fitting = choice.assessment, block.settings.wrong_ray
+    for i, n in bad.items():
+        # from the others: the offset of satellite positions is that of the points that agree
+        predicted = control.position[i] + assessed.error[n]
+        # σ² of the prediction without that of the coordinates of this point
+        of_prediction = np.maximum(assessed.error_sigma[n] ** 2 - choice.sigma[i] ** 2, 0.0)
         for j in bad:
-            X = block.X[block.determined[control.id[i]]]
-            off = X - control.position[j]
-            sigma = np.where(np.isfinite(choice.sigma[j]), choice.sigma[j], np.inf)
-            limit = block.settings.wrong_ray * np.hypot(sigma, block.offset_sigma)
-            if i != j and np.all(np.abs(off) < limit):
+            off, sigma = predicted - control.position[j], choice.sigma[j]
+            # axes that are not controlled at both points tell nothing
+            told = np.isfinite(off) & np.isfinite(sigma)
+            within = np.abs(off) < fitting * np.sqrt(of_prediction + sigma**2)
+            if i != j and told.any() and within[told].all():
                 choice.reasons[control.id[i]] += f"; it fits the coordinates of {control.id[j]}"

@@ -44,7 +44,7 @@ def network_with_control(block: OrientedBlock, control: Points, choice: ControlC
     xy, sigma = from_image_unit(
         block.cameras, whole.images.camera[added.image], added.xy, added.spread, "px"
     )
-    images, moved = network.images, [block.of_id[id] for id in network.points.id]
+    images, moved = network.images, [block.row_of_point[id] for id in network.points.id]
     # check points are no points of the network, and distances to them are left out
     row |= {id: len(row) + k for k, id in enumerate(added.id) if added.role[k] != "check"}
     here = np.array([a in row and b in row for a, b in ends], bool)

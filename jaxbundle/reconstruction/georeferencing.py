@@ -82,7 +82,7 @@ def georeference(
             + list_some((f"{id}: {why}" for id, why in choice.reasons.items()), 5, str)
         )
     # snooping begins without what was removed before; control is judged anew
-    doubtful = [pair for pair in block.removed() if pair[1] not in control.id]
+    doubtful = [pair for pair in block.removed_image_points() if pair[1] not in control.id]
     result, _, _ = adjust_determined(
         network_with_control(block, control, choice),
         snooping="pope",
@@ -116,8 +116,8 @@ def _tabulate(
         X, residual = np.full(3, np.nan), np.full(3, np.nan)
         if id in compared:
             X = present(checks).position[compared[id]]
-        elif id in final.of_id:
-            X = final.X[final.of_id[id]]
+        elif id in final.row_of_point:
+            X = final.X[final.row_of_point[id]]
         if np.isfinite(X).all():
             residual = np.where(np.isinf(choice.sigma[k]), np.nan, X - control.position[k])
         away = final.misses(measured, X)

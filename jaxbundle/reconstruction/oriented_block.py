@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxbundle.adjustment.problem import coordinates
 from jaxbundle.adjustment.result import Adjustment
+from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.any_distance import derivative
 from jaxbundle.network.tables import Network, Points
@@ -21,7 +22,7 @@ from jaxbundle.network.units import from_image_unit
 from jaxbundle.orientation import batched
 from jaxbundle.orientation.alignment import similarity_of_most
 from jaxbundle.orientation.control_consistency import Discrepancies
-from jaxbundle.orientation.rays import ideal_points
+from jaxbundle.orientation.rays import MIN_COSINE, rays_of
 from jaxbundle.reconstruction.named import NamedMeasurements
 
 # Minimum control points of a block without satellite positions: a similarity has 7 parameters, two
@@ -73,13 +74,17 @@ class FrameData:
 @dataclasses.dataclass(frozen=True)
 class MeasuredPoint:
     """The measurements of one point in oriented photographs: rows of the named ones, of the
-    network's images; directions as unit vectors in object space; the angle of a pixel along each;
-    σ, pixels; whether each agrees with the point, and the point intersected from those."""
+    network's images; directions as unit vectors in object space; the `normal` of a plane at
+    distance 1 from the projection centre, in which differences from the ray are measured: that of
+    the image of perspective cameras, of others the plane across the ray; `pixels` per unit of this
+    plane, along columns and rows; σ, pixels; whether each agrees with the point, and the point
+    intersected from those."""
 
     rows: Int[np.ndarray, " n"]
     image: Int[np.ndarray, " n"]
     rays: Float[np.ndarray, "n 3"]
-    pixel: Float[np.ndarray, " n"]
+    normal: Float[np.ndarray, "n 3"]
+    pixels: Float[np.ndarray, "n 2 3"]
     sigma: Float[np.ndarray, " n"]
     good: Bool[np.ndarray, " n"]
     position: Float[np.ndarray, "3"]
@@ -105,10 +110,10 @@ class OrientedBlock:
         points = self.network.points.id
         known = np.all(np.isfinite(self.X), axis=1)
         named = set(frame.points.id)
-        self.determined = {id: k for k, id in enumerate(points) if id in named and known[k]}
+        self.row_of_determined = {id: k for k, id in enumerate(points) if id in named and known[k]}
         observed = np.all(np.isfinite(self.network.images.sigma[:, :3]), axis=1)
         self.has_positions = int(observed.sum()) > 2  # two leave a rotation open
-        self.of_id = {id: k for k, id in enumerate(points)}
+        self.row_of_point = {id: k for k, id in enumerate(points)}
 
     def measure(self, id: str) -> MeasuredPoint:
         """The measurements of a point; all of them agree for now."""
@@ -120,37 +125,62 @@ class OrientedBlock:
         ]
         rows = np.array(rows, int)
         image = np.array([self.row[names[named.image[k]]] for k in rows], int)
-        if not len(rows):
-            none, no_ray = np.zeros(0), np.zeros((0, 3))
-            return MeasuredPoint(rows, image, no_ray, none, none, none > 0, np.full(3, np.nan))
         camera = self.network.images.camera[image]
-        # half a pixel in both directions, as a difference quotient
-        ends = [self._ideal(camera, named.xy[rows] + shift) for shift in ([0, 0], [0.5, 0.5])]
-        pixel = np.linalg.norm(ends[1] - ends[0], axis=1) / np.hypot(0.5, 0.5)
-        rays = np.einsum(
-            "nij,ni->nj", self.M[image], np.pad(ends[0], ((0, 0), (0, 1)), constant_values=-1.0)
-        )
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        good = np.isfinite(rays).all(1)
+        # the measurements, and half a pixel to each side, for a central difference quotient
+        shifts = np.array([[0, 0], [0.5, 0], [-0.5, 0], [0, 0.5], [0, -0.5]])
+        xy = named.xy[rows] + shifts[:, None]
+        d = self._camera_rays(np.tile(camera, len(shifts)), xy.reshape(-1, 2))
+        d = np.einsum("nij,sni->snj", self.M[image], d.reshape(len(shifts), -1, 3))
+        # the ideal image of other cameras is not flat: the plane across the ray fits it best, and
+        # there is one beyond 90° from the axis, too
+        flat = np.array([get_model(c.model).image == "perspective" for c in self.cameras], bool)
+        axis = -self.M[image, 2]
+        before = np.einsum("ni,ni->n", axis, d[0]) > MIN_COSINE
+        normal = np.where((flat[camera] & before)[:, None], axis, d[0])
+        in_plane = d / np.einsum("ni,sni->sn", normal, d)[:, :, None]
+        pixels = np.full((len(rows), 2, 3), np.nan)
+        T = np.stack([in_plane[1] - in_plane[2], in_plane[3] - in_plane[4]], 2)
+        # NaN: at the end of the range of the camera
+        known = np.all(np.isfinite(T), axis=(1, 2))
+        pixels[known] = np.linalg.pinv(T[known])
+        rays = np.where(known[:, None], d[0], np.nan)
         sigma = named.sigma[rows].mean(1)
-        return MeasuredPoint(rows, image, rays, pixel, sigma, good, np.full(3, np.nan))
+        return MeasuredPoint(rows, image, rays, normal, pixels, sigma, known, np.full(3, np.nan))
 
-    def _ideal(
+    def _camera_rays(
         self, camera: Int[np.ndarray, " n"], xy: Float[np.ndarray, "n 2"]
-    ) -> Float[np.ndarray, "n 2"]:
-        xy, _ = from_image_unit(self.cameras, camera, xy, np.ones_like(xy), "px")
-        ideal = np.full_like(xy, np.nan)
+    ) -> Float[np.ndarray, "n 3"]:
+        """Unit rays in the camera frame of points in pixels, NaN outside the range of a camera."""
+        xy, sigma = from_image_unit(self.cameras, camera, xy, np.ones_like(xy), "px")
+        d = np.full((len(xy), 3), np.nan)
         for c in np.unique(camera):
-            ideal[camera == c] = ideal_points(self.cameras[c], xy[camera == c])
-        return ideal
+            d[camera == c], _ = rays_of(self.cameras[c], xy[camera == c], sigma[camera == c])
+        return d
 
     def misses(self, point: MeasuredPoint, X: Float[np.ndarray, "3"]) -> Float[np.ndarray, " n"]:
-        """Distances of the projections of X from its measurements, pixels."""
+        """Distances of the projections of X from its measurements, pixels: infinite behind the
+        camera and of measurements without a ray, otherwise of the image without distortion, in
+        pixels at the measurement."""
         away = X - self.X0[point.image]
-        along = np.einsum("ni,ni->n", away, point.rays)
-        across = np.linalg.norm(np.cross(away, point.rays), axis=1)
+        depth = np.einsum("ni,ni->n", away, point.normal)
+        in_plane = point.rays / np.einsum("ni,ni->n", point.rays, point.normal)[:, None]
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(along > 0, across / along / point.pixel, np.inf)
+            off = np.einsum("nki,ni->nk", point.pixels, away / depth[:, None] - in_plane)
+            length = np.nan_to_num(np.linalg.norm(off, axis=1), nan=np.inf)
+            return np.where(depth > 0, length, np.inf)
+
+    def distances(self, point: MeasuredPoint, X: Float[np.ndarray, "3"]) -> Float[np.ndarray, " n"]:
+        """Distances of X from the rays of its measurements, object units."""
+        return np.linalg.norm(np.cross(X - self.X0[point.image], point.rays), axis=1)
+
+    def pixel_length(
+        self, point: MeasuredPoint, X: Float[np.ndarray, "3"]
+    ) -> Float[np.ndarray, " n"]:
+        """The length of a pixel at X, parallel to the planes of its measurements."""
+        depth = np.einsum("ni,ni->n", X - self.X0[point.image], point.normal)
+        # the side of a square as large as the pixel: |∂u × ∂v| pixels cover an area of 1
+        cover = np.linalg.norm(np.cross(point.pixels[:, 0], point.pixels[:, 1]), axis=1)
+        return depth / np.sqrt(cover)
 
     def resolve(self) -> dict[str, MeasuredPoint]:
         """By point, the measurements that agree on one position of it, and that position.
@@ -215,16 +245,19 @@ class OrientedBlock:
         return X
 
     def move(self, places: Sequence[int], points: Points) -> None:
-        """Move the block by the similarity that fits most of the control points."""
-        ids = [points.id[k] for k in places]
-        target = points.position[list(places)]
-        if len(ids) < MIN_CONTROL or np.isinf(points.sigma[list(places)]).any():
+        """Move the block by the similarity that fits most of the control points that are controlled
+        on all axes.
+
+        **Raises:** `InputError` if there are fewer than three of them, or on a line."""
+        places = [k for k in places if not np.isinf(points.sigma[k]).any()]
+        ids, target = [points.id[k] for k in places], points.position[places]
+        if len(ids) < MIN_CONTROL:
             raise InputError(
                 f"control points with heights in at least two photographs: expected "
                 f"{MIN_CONTROL}, got {len(ids)} in this part; without satellite positions they "
                 "alone give the frame"
             )
-        similarity = similarity_of_most(self.X[[self.determined[id] for id in ids]], target)
+        similarity = similarity_of_most(self.X[[self.row_of_determined[id] for id in ids]], target)
         if similarity is None:
             raise InputError("the control points are on a line: they leave a rotation open")
         A, t = similarity
@@ -236,14 +269,16 @@ class OrientedBlock:
     def ground_sample_distance(self) -> float:
         """The length of a pixel at the named points, the median."""
         lengths = [
-            point.pixel * np.linalg.norm(X - self.X0[point.image], axis=1)
-            for point, X in ((self.measure(id), self.X[k]) for id, k in self.determined.items())
+            self.pixel_length(self.measure(id), self.X[k])
+            for id, k in self.row_of_determined.items()
         ]
-        return float(np.median(np.concatenate(lengths))) if lengths else 1.0
+        # NaN of measurements outside the range of their camera
+        known = [x for of_point in lengths for x in of_point if np.isfinite(x)]
+        return float(np.median(known)) if known else 1.0
 
     def compare(self, places: Sequence[int], points: Points) -> Discrepancies:
         """Coordinates from the block minus given ones, and their joint covariance."""
-        rows = [self.determined[points.id[k]] for k in places]
+        rows = [self.row_of_determined[points.id[k]] for k in places]
         if not rows:
             none = np.zeros((0, 3))
             return Discrepancies(none, np.zeros((0, 3, 0, 3)), none, np.zeros((0, 3, 0)))
@@ -266,20 +301,17 @@ class OrientedBlock:
     def _joint_covariance(self, rows: Sequence[int]) -> Float[np.ndarray, "n 3 n 3"]:
         """The covariance of the coordinates of some points among each other."""
         problem, n = self.result.problem, len(rows)
-        tables = {t.name: np.zeros((3 * n, t.rows, t.space.width)) for t in problem.tables}
-        lengths = problem.lengths
-        for k, row in enumerate(rows):
-            D = np.eye(3)
-            # far points are unknowns by direction and inverse distance: D of X by them
-            if lengths is not None:
-                unknowns = np.append(np.asarray(coordinates(self.result.values))[row], lengths[row])
-                D = np.asarray(derivative(jnp.asarray(unknowns)))
-            tables["point"][3 * k : 3 * k + 3, row] = self.A @ D
-        # A·D·Q·Dᵀ·Aᵀ of these points, row by row, without the covariance matrix of the network
-        Q = self.result.cofactors.solution.propagate_rows(tables)
-        return self.result.sigma0**2 * np.asarray(Q).reshape(n, 3, n, 3)
+        D, lengths = np.tile(np.eye(3), (n, 1, 1)), problem.lengths
+        # far points are unknowns by direction and inverse distance: D of X by them
+        if lengths is not None:
+            table = np.asarray(coordinates(self.result.values))
+            for k, row in enumerate(rows):
+                D[k] = derivative(jnp.asarray(np.append(table[row], lengths[row])))
+        AD = self.A @ D
+        Q = self.result.cofactors.solution.joint_cofactors("point", rows)
+        return self.result.sigma0**2 * np.einsum("nij,njmk,mlk->niml", AD, Q, AD)
 
-    def removed(self) -> list[tuple[str, str]]:
+    def removed_image_points(self) -> list[tuple[str, str]]:
         """Image and point, by id, of the image points without weight."""
         problem = self.result.problem
         gone = ~problem.used
@@ -291,9 +323,9 @@ class OrientedBlock:
 
     def is_determined(self, id: str, point: MeasuredPoint) -> bool:
         """Whether a point was adjusted with the block, from the measurements that agree."""
-        if id not in self.determined or point.good.sum() < 2:
+        if id not in self.row_of_determined or point.good.sum() < 2:
             return False
-        off = self.misses(point, self.X[self.determined[id]])[point.good]
+        off = self.misses(point, self.X[self.row_of_determined[id]])[point.good]
         return bool((off < self.settings.wrong_ray * point.sigma[point.good]).all())
 
     def name_of(self, point: MeasuredPoint, n: int) -> str:

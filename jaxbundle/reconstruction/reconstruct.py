@@ -485,7 +485,7 @@ class _ReconstructionRun:
                 failed = failed or error
                 continue
             result = weighted.adjustment
-            if not is_plausible(result, settings):
+            if not is_plausible(result, guessed, settings):
                 failed = failed or _not_solved(result)
                 continue
             # once more with the adjusted camera, if that orients more photographs
@@ -495,7 +495,7 @@ class _ReconstructionRun:
                     better, other_note = self._adjust(again, measured)
                 except NotSolvedError:
                     return oriented, weighted, note
-                if is_plausible(better.adjustment, settings):
+                if is_plausible(better.adjustment, guessed, settings):
                     return again, better, other_note
             return oriented, weighted, note
         assert failed is not None, "start values are there, or an error says why not"

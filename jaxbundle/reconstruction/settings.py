@@ -11,7 +11,7 @@ from jaxbundle.reconstruction.oriented_block import ControlSettings
 from jaxbundle.reconstruction.starting import BlockStartSettings
 from jaxbundle.tiepoints.camera_starts import CameraStartSettings
 from jaxbundle.tiepoints.duplicates import DuplicateSettings
-from jaxbundle.tiepoints.features import Detection
+from jaxbundle.tiepoints.features import FeatureSettings
 from jaxbundle.tiepoints.loops import LoopSettings
 from jaxbundle.tiepoints.matching import FeatureMatchingSettings
 from jaxbundle.tiepoints.pairs import CandidateSettings
@@ -25,7 +25,7 @@ from jaxbundle.tiepoints.verification import VerificationSettings
 class ReconstructionSettings:
     """Settings of a reconstruction; those of its stages in the order in which they are used."""
 
-    detection: Detection = Detection()
+    detection: FeatureSettings = FeatureSettings()
     """Features of a photograph."""
     pairs: str = "auto"
     """Which photographs are matched: `auto`, `all`, `sequence`, `place` or `alike`."""

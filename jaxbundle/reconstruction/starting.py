@@ -38,10 +38,15 @@ class BlockStartSettings:
     by chance; smaller: photographs with much distortion are left out (and tried with the tolerance
     of an unknown lens)."""
     min_distance: float = 0.35
-    """Smallest plausible adjusted principal distance, relative to the longer side: 110° of view."""
+    """Smallest plausible principal distance that only photographs determine, relative to the longer
+    side: 110° of view."""
     max_distance: float = 12.0
     """Largest plausible one: 5° of view, 430 mm of full frame. Adjustments that fail end in 0 or
     infinity."""
+    stated_ratio: float = 1.5
+    """Ratio to a principal distance from files or a calibration below which the adjusted one is
+    plausible, whatever the lens: files are wrong by more only if a photograph was cropped
+    (`CameraStartSettings.believed_ratio`)."""
     other_distances: tuple[float, ...] = (0.7, 0.9, 1.2, 1.6, 2.2)
     """Other principal distances to try, relative to the longer side, in steps of 1.29 to 1.375, so
     that one lies within 17 % of the right one, from telephones and drones (0.7) to beyond normal
@@ -166,11 +171,21 @@ def _with_distances(network: Network, distances: Mapping[str, float]) -> Network
     return with_observed(network, dataclasses.replace(observed, value=value, sigma=sigma))
 
 
-def is_plausible(result: Adjustment, settings: BlockStartSettings = BlockStartSettings()) -> bool:
-    """Whether an adjustment converged to plausible principal distances."""
-    low, high = settings.min_distance, settings.max_distance
+def is_plausible(
+    result: Adjustment,
+    guessed: Sequence[str] = (),
+    settings: BlockStartSettings = BlockStartSettings(),
+) -> bool:
+    """Whether an adjustment converged to plausible principal distances.
+
+    **Arguments:** `guessed`: ids of cameras with a principal distance unknown from files."""
+    low, high, ratio = settings.min_distance, settings.max_distance, settings.stated_ratio
+
+    def as_stated(camera: Camera, f: float) -> bool:
+        return camera.id not in guessed and 1 / ratio < f / camera.parameters["fx"] < ratio
+
     return bool(result.converged) and all(
-        low < adjusted["fx"] / max(camera.image_size) < high
+        low < adjusted["fx"] / max(camera.image_size) < high or as_stated(camera, adjusted["fx"])
         for camera in result.network.cameras
         if camera.image_size and "fx" in (adjusted := _parameters(result, camera))
     )

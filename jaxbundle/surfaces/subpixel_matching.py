@@ -52,7 +52,8 @@ class WindowSettings:
 
 class SubpixelMatches(NamedTuple):
     """Positions [n, 2] in the other image, A [n, 2, 2], covariance [n, 2, 2] of the position
-    relative to the window, pixels²; ρ; σ0 of a grey value; statuses, `MatchingStatus`."""
+    relative to the window, pixels²; ρ; σ0 of a residual, which has the noise of both windows, grey
+    values; statuses, `MatchingStatus`."""
 
     uv: Float[np.ndarray, "n 2"]
     A: Float[np.ndarray, "n 2 2"]

@@ -127,9 +127,9 @@ def estimate_interior(
     if not len(use):
         return CoplanarityResult(_with(camera, f), 0, np.nan)
     f, k1, e = _adjust(_with(camera, f), [(xy1[k], xy2[k]) for k in use], M[use], b[use], limit)
-    # 0.3 and 12 longer sides: 118° and 5° of view, lenses of 11 and 430 mm of full frame
-    sane = np.isfinite(f) and 0.3 * size < f < 12 * size and abs(k1) < settings.max_k1
-    sane &= 1 / settings.max_ratio < f / tried[best] < settings.max_ratio
+    # relative to what was known or tried: the files know lenses of any length
+    sane = 1 / settings.max_ratio < f / tried[best] < settings.max_ratio
+    sane &= abs(k1) < settings.max_k1
     better = _with(camera, f, k1) if sane else _with(camera, tried[best])
     return CoplanarityResult(better, len(use), float(np.median(np.abs(e))))
 

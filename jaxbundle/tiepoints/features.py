@@ -1,6 +1,6 @@
 """Features of a photograph: points recognisable from other positions, with descriptors.
 
-A photograph is first reduced to `Detection.side` pixels; OpenCV's SIFT (Lowe, 2004) begins
+A photograph is first reduced to `FeatureSettings.side` pixels; OpenCV's SIFT (Lowe, 2004) begins
 by doubling it, so that the finest features are those of a photograph of twice that side; least
 squares matching measures in the original afterwards. The most distinct features are kept, equally
 many in each cell of a grid as far as it has them: they cover photographs evenly, including parts
@@ -30,7 +30,7 @@ TILE_MARGIN = 64
 
 
 @dataclasses.dataclass(frozen=True)
-class Detection:
+class FeatureSettings:
     """Settings of the search for features."""
 
     kind: str = "sift"
@@ -81,7 +81,7 @@ class Features:
 
 
 def find_features(
-    grey: UInt8[np.ndarray, "rows columns"], settings: Detection = Detection()
+    grey: UInt8[np.ndarray, "rows columns"], settings: FeatureSettings = FeatureSettings()
 ) -> Features:
     """The features of a photograph, evenly distributed."""
     cv2 = need_opencv()
@@ -109,7 +109,7 @@ def find_features(
     return Features(xy, size[chosen] * scale.mean(), np.deg2rad(angle[chosen]), descriptor)
 
 
-def memory_of_features(rows: int, columns: int, settings: Detection) -> float:
+def memory_of_features(rows: int, columns: int, settings: FeatureSettings) -> float:
     """Bytes that the search takes in a photograph, beside its grey values."""
     factor = min(1.0, settings.side / max(rows, columns)) if settings.side else 1.0
     tall, wide = (min(factor * side, TILE + 2 * TILE_MARGIN) for side in (rows, columns))
@@ -119,7 +119,10 @@ def memory_of_features(rows: int, columns: int, settings: Detection) -> float:
 
 
 def _search(
-    cv2: ModuleType, grey: UInt8[np.ndarray, "rows columns"], settings: Detection, contrast: float
+    cv2: ModuleType,
+    grey: UInt8[np.ndarray, "rows columns"],
+    settings: FeatureSettings,
+    contrast: float,
 ) -> tuple[list[Any], list[np.ndarray]]:
     """Key points of OpenCV and their descriptors, by tiles."""
     detector = _make_detector(cv2, settings, contrast)
@@ -128,7 +131,7 @@ def _search(
     return points, [d for _, d in parts if d is not None and len(d)]
 
 
-def _make_detector(cv2: ModuleType, settings: Detection, contrast: float) -> Any:
+def _make_detector(cv2: ModuleType, settings: FeatureSettings, contrast: float) -> Any:
     ample = int(settings.search_factor * settings.number)
     if settings.kind == "sift":
         # without precise upscaling, features are a quarter of a pixel too far right and down
@@ -185,7 +188,7 @@ def _choose_evenly(
     size: Float[np.ndarray, " n"],
     response: Float[np.ndarray, " n"],
     shape: tuple[int, ...],
-    settings: Detection,
+    settings: FeatureSettings,
 ) -> Int[np.ndarray, " m"]:
     """The rows to keep, the largest features first: the most distinct ones of each cell."""
     if len(xy) <= settings.number:

@@ -84,7 +84,11 @@ def match_features(
         return np.zeros((0, 2), int), np.zeros(0)
     back, _, second_back = nearest(b[best[rows]], a)
     # descriptors closer than 1e-3 are equal: three times √ε of float32, the rounding of √(1 − a·b)
-    distance_ratio = distance[rows] / np.maximum(np.minimum(second[rows], second_back), 1e-3)
+    # also the matched ones: two features equal to one of the other photograph have the ratio 1
+    equal = 1e-3
+    distance_ratio = np.maximum(distance[rows], equal) / np.maximum(
+        np.minimum(second[rows], second_back), equal
+    )
     mutual = np.flatnonzero((back == rows) & (distance_ratio < settings.max_ratio))
     # stable: equal ratios keep their order on every machine
     mutual = mutual[np.argsort(distance_ratio[mutual], kind="stable")]
@@ -92,7 +96,7 @@ def match_features(
     return np.stack([rows, best[rows]], 1), distance_ratio[mutual]
 
 
-def unique_matches(
+def are_unique(
     rows: Int[np.ndarray, "n 2"],
     within: tuple[Float[np.ndarray, " a"], Float[np.ndarray, " b"]],
     settings: FeatureMatchingSettings = FeatureMatchingSettings(),

@@ -17,7 +17,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.text.archives import read_arrays
 from jaxbundle.io.writing.replacing import unwritable
 from jaxbundle.system.temporaries import temporary
-from jaxbundle.tiepoints.features import Detection, Features
+from jaxbundle.tiepoints.features import Features, FeatureSettings
 from jaxbundle.tiepoints.matching import FeatureMatchingSettings
 
 # Version of features and matches: files of others are not used. To be raised with every change of
@@ -31,7 +31,7 @@ class Store:
     """Files of features and matches in a folder; without a folder nothing is stored. `settings`:
     all that features and matches depend on, beside the photographs."""
 
-    def __init__(self, folder: Path | None, *settings: Detection | FeatureMatchingSettings):
+    def __init__(self, folder: Path | None, *settings: FeatureSettings | FeatureMatchingSettings):
         self.folder, self.settings = folder, "\n".join(map(repr, settings))
         self.used: set[str] = set()
         if folder is not None:

@@ -111,7 +111,7 @@ class Measurements:
 
 
 @dataclasses.dataclass(frozen=True)
-class _TrackRays:
+class _TrackFeatures:
     """The features of all tracks, by measurement; `is_template`, `level` as of `Measurements`;
     `template`: the measurement that gives the window of its track; `corner`: the first column and
     row of its window or search window, and `start`: A, from pixels about the centre of the window
@@ -156,22 +156,27 @@ def measure_tracks(
 
     **Arguments:** `read(k)`: colours of a photograph; `advance`: called after each of them.
     """
-    rays = _place_windows(tracks, features, settings)
-    cutouts = _cut_out(rays, len(features), read, advance, settings)
+    track_features = _place_windows(tracks, features, settings)
+    cutouts = _cut_out(track_features, len(features), read, advance, settings)
     inside = cutouts.inside
     # the window inside its own photograph, and a place for it in the other
-    others = np.flatnonzero(~rays.is_template & inside & inside[rays.template])
+    others = np.flatnonzero(~track_features.is_template & inside & inside[track_features.template])
     half = settings.window // 2
-    bend = settings.second_order_sigma * half**2 * rays.scale / cutouts.longer[rays.image]
+    bend = (
+        settings.second_order_sigma
+        * half**2
+        * track_features.scale
+        / cutouts.longer[track_features.image]
+    )
     matches = _match_in_chunks(
-        cutouts.windows[rays.track[others]],
+        cutouts.windows[track_features.track[others]],
         cutouts.pieces,
         others,
-        rays.start[others].astype(np.float32),
+        track_features.start[others].astype(np.float32),
         bend[others].astype(np.float32),
         settings.correlation_length,
     )
-    return _collect(rays, others, matches, cutouts.colour, settings)
+    return _collect(track_features, others, matches, cutouts.colour, settings)
 
 
 def prepare(settings: TrackMatchingSettings = TrackMatchingSettings()) -> None:
@@ -187,7 +192,7 @@ def _place_windows(
     tracks: Sequence[Sequence[tuple[int, int]]],
     features: Sequence[Features],
     settings: TrackMatchingSettings,
-) -> _TrackRays:
+) -> _TrackFeatures:
     """Where the windows of all tracks are cut out, and where they are expected in the others."""
     track, image, feature = flatten(tracks)
     n = len(track)
@@ -204,7 +209,7 @@ def _place_windows(
     corner = np.rint(start[:, :, 2]) - settings.search_window // 2
     corner[is_template] = centre[is_template] - settings.window // 2
     start[:, :, 2] -= corner
-    return _TrackRays(track, image, xy, size, is_template, level, template, corner, start)
+    return _TrackFeatures(track, image, xy, size, is_template, level, template, corner, start)
 
 
 def _choose_templates(
@@ -252,7 +257,7 @@ def _predict_affine(
 
 
 def _cut_out(
-    rays: _TrackRays,
+    track_features: _TrackFeatures,
     photographs: int,
     read: Callable[[int], UInt8[np.ndarray, "rows columns 3"]],
     advance: Callable[[], object],
@@ -260,34 +265,34 @@ def _cut_out(
 ) -> _TrackWindows:
     """Windows and search windows of all photographs, each of which is in memory only once."""
     cv2 = need_opencv()
-    n, is_template = len(rays.image), rays.is_template
+    n, is_template = len(track_features.image), track_features.is_template
     window, side = settings.window, settings.search_window
     # one pixel for interpolation and one for the last step, beyond the window that moves within
-    margins = {window: window // 2, side: side // 2 - window // 2 - 2}
+    margins = {window: window // 2, side: window // 2 + 2}
     windows = np.zeros((int(is_template.sum()), window, window), np.uint8)
     row_of_window = np.cumsum(is_template) - 1
     pieces = np.zeros((n, side, side), np.uint8)
     inside, colour = np.zeros(n, bool), np.zeros((n, 3), np.uint8)
     longer = np.ones(photographs)
-    order = np.argsort(rays.image, kind="stable")
+    order = np.argsort(track_features.image, kind="stable")
     for k in range(photographs):
-        rows = order[slice(*np.searchsorted(rays.image[order], [k, k + 1]))]
+        rows = order[slice(*np.searchsorted(track_features.image[order], [k, k + 1]))]
         if len(rows):
             picture = read(k)
             longer[k] = max(picture.shape[:2])
             last = np.array(picture.shape[1::-1]) - 1
-            u, v = np.clip(np.rint(rays.xy[rows]), 0, last).astype(int).T
+            u, v = np.clip(np.rint(track_features.xy[rows]), 0, last).astype(int).T
             colour[rows] = picture[v, u]
             pyramid = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
-            for step in range(rays.level[rows].max() + 1):
+            for step in range(track_features.level[rows].max() + 1):
                 pyramid = cv2.pyrDown(pyramid) if step else pyramid
-                here = rows[rays.level[rows] == step]
+                here = rows[track_features.level[rows] == step]
                 first, other = here[is_template[here]], here[~is_template[here]]
                 windows[row_of_window[first]], inside[first] = _cut_squares(
-                    pyramid, rays.corner[first].astype(int), window, margins[window]
+                    pyramid, track_features.corner[first].astype(int), window, margins[window]
                 )
                 pieces[other], inside[other] = _cut_squares(
-                    pyramid, rays.corner[other].astype(int), side, margins[side]
+                    pyramid, track_features.corner[other].astype(int), side, margins[side]
                 )
         advance()
     return _TrackWindows(windows, pieces, inside, colour, longer)
@@ -363,7 +368,7 @@ def _match_in_chunks(
 
 
 def _collect(
-    rays: _TrackRays,
+    track_features: _TrackFeatures,
     others: Int[np.ndarray, " m"],
     matches: Matched,
     colour: UInt8[np.ndarray, "n 3"],
@@ -371,24 +376,24 @@ def _collect(
 ) -> Measurements:
     """Measurements by the good matches, and by the positions of features without one."""
     affine, covariance, rho, status = matches
-    track, scale, corner = rays.track, rays.scale, rays.corner
+    track, scale, corner = track_features.track, track_features.scale, track_features.corner
     place = affine[:, :, 2] + corner[others]
-    away = np.linalg.norm(place - rays.xy[others] / scale[others, None], axis=1)
+    away = np.linalg.norm(place - track_features.xy[others] / scale[others, None], axis=1)
     # half of the variance of a match belongs to each of its two windows
     sigma = np.sqrt(np.maximum(covariance[:, [0, 1], [0, 1]], 0) / 2)
     good = (status == int(MatchingStatus.CONVERGED)) & (rho > settings.min_correlation)
     good &= (away < settings.max_shift) & (sigma < settings.max_sigma).all(1)
     sigma = np.hypot(sigma, settings.added_sigma)
     rows = others[good]
-    sigma_of = np.repeat(settings.feature_sigma * rays.size[:, None], 2, 1)
+    sigma_of = np.repeat(settings.feature_sigma * track_features.size[:, None], 2, 1)
     sigma_of[rows] = sigma[good] * scale[rows, None]
     matched = np.zeros(len(track), bool)
     matched[rows] = True
-    templates = np.flatnonzero(rays.is_template)
+    templates = np.flatnonzero(track_features.is_template)
     number = np.bincount(track[rows], minlength=len(templates))
     # the point is the centre of the window, if that is matched, else the feature
-    from_window = (rays.start[:, :, 2] + corner) * scale[:, None]
-    xy = np.where(number[track, None] > 0, from_window, rays.xy)
+    from_window = (track_features.start[:, :, 2] + corner) * scale[:, None]
+    xy = np.where(number[track, None] > 0, from_window, track_features.xy)
     xy[rows] = place[good] * scale[rows, None]
     # the share of the window, from each of its matches, and their mean
     sums = [np.bincount(track[rows], sigma[good, i] ** 2, len(templates)) for i in (0, 1)]
@@ -398,5 +403,7 @@ def _collect(
     xy[w] = (corner[w] + settings.window // 2) * scale[w, None]
     sigma_of[w] = np.sqrt(square[use] / number[use, None]) * scale[w, None]
     matched[w] = True
-    level = np.where(matched, rays.level, -1)
-    return Measurements(track, rays.image, xy, sigma_of, level, rays.is_template, colour)
+    level = np.where(matched, track_features.level, -1)
+    return Measurements(
+        track, track_features.image, xy, sigma_of, level, track_features.is_template, colour
+    )

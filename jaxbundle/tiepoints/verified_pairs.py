@@ -13,14 +13,14 @@ from jaxbundle.orientation.rays import ideal_points
 from jaxbundle.photographs.reading import image_errors
 from jaxbundle.system.threads import map_in_threads
 from jaxbundle.tiepoints import coplanarity, verification
-from jaxbundle.tiepoints.features import Detection, Features, find_features
+from jaxbundle.tiepoints.features import Features, FeatureSettings, find_features
 from jaxbundle.tiepoints.loops import LoopSettings, split_contradicted
 from jaxbundle.tiepoints.matching import (
     FeatureMatches,
     FeatureMatchingSettings,
+    are_unique,
     distances_within,
     match_features,
-    unique_matches,
 )
 from jaxbundle.tiepoints.pairs import CandidateSettings, candidate_pairs
 from jaxbundle.tiepoints.store import Store
@@ -38,7 +38,7 @@ def detect(
     paths: Sequence[Path],
     read: Sequence[Callable[[], UInt8[np.ndarray, "rows columns"]]],
     fingerprints: list[str],
-    settings: Detection,
+    settings: FeatureSettings,
     store: Store,
     workers: int,
     tell: Progress,
@@ -86,7 +86,7 @@ def match(
             i, j = pair
             both = within[i], within[j]
             rows, distance_ratio = match_features(features[i], features[j], settings, both)
-            columns = rows, distance_ratio, unique_matches(rows, both, settings)
+            columns = rows, distance_ratio, are_unique(rows, both, settings)
             store.save_matches(*names(pair), *columns)
         return FeatureMatches(pair, *columns)
 

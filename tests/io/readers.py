@@ -275,10 +275,10 @@ def _(folder):
 
 
 def _store(folder: Path):
-    from jaxbundle.tiepoints.features import Detection
+    from jaxbundle.tiepoints.features import FeatureSettings
     from jaxbundle.tiepoints.store import Store
 
-    return Store(folder, Detection())
+    return Store(folder, FeatureSettings())
 
 
 def _kept_features(folder: Path):

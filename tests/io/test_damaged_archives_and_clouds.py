@@ -21,7 +21,7 @@ from jaxbundle.reconstruction.control import read_control_measurements
 from jaxbundle.surfaces.cloud import Cloud
 from jaxbundle.surfaces.dsm import make_dsm
 from jaxbundle.surfaces.point_files import read_cloud, write_cloud
-from jaxbundle.tiepoints.features import Detection, Features
+from jaxbundle.tiepoints.features import Features, FeatureSettings
 from jaxbundle.tiepoints.store import Store
 
 EVLR_COUNT, RECORDS, TABLE = 243, 100, 96
@@ -242,7 +242,7 @@ def test_a_damaged_member_of_an_archive(tmp_path, case):
     archive(path, image_size=bad, head=bad, xy=bad, **arrays)
     refused(read_camera_stack, path)
     refused(lambda p: read_tree(p, (), "a result"), path)
-    store = Store(tmp_path, Detection())
+    store = Store(tmp_path, FeatureSettings())
     archive(tmp_path / f"{store.name('photograph')}.npz", xy=bad, size=bad, angle=bad,
             descriptor=bad)  # fmt: skip
     assert store.load_features("photograph") is None  # searched again
@@ -277,7 +277,7 @@ def test_archives_of_other_than_plain_arrays(tmp_path, case):
 
 def test_kept_features_with_a_changed_number_are_computed_again(tmp_path):
     """The archive is whole; what was kept before a version with digests is computed again, too."""
-    store, ones = Store(tmp_path, Detection()), np.ones((3, 2))
+    store, ones = Store(tmp_path, FeatureSettings()), np.ones((3, 2))
     features = Features(ones, np.ones(3), np.zeros(3), np.zeros((3, 128), np.uint8))
     store.save_features("photograph", features)
     assert (store.load_features("photograph").xy == ones).all()

@@ -5,7 +5,7 @@ from functools import partial
 import jax
 import numpy as np
 import pytest
-from scipy import ndimage
+from scipy import interpolate, ndimage
 
 from jaxbundle.measure.least_squares_matching import (
     MatchingStatus,
@@ -138,6 +138,16 @@ def test_grey_values_of_a_cubic_surface_are_exact_away_from_the_edge():
         assert np.allclose(value, surface(a, b), atol=1e-9)
         expected = (2 + 0.3 * b + 0.4 * a, -1 + 0.3 * a - 0.03 * b**2)
         assert np.allclose(slope, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("u", [0.0, 0.4, 5.6, 10.3, 11.0])
+def test_grey_values_are_those_of_the_natural_spline_up_to_the_edge(u):
+    """Of scipy, along rows and then along columns."""
+    image = np.random.default_rng(0).normal(size=(9, 12))
+    along = interpolate.CubicSpline(np.arange(12), image, axis=1, bc_type="natural")(u)
+    down = interpolate.CubicSpline(np.arange(9), along, bc_type="natural")
+    for v in (0.0, 0.7, 4.0, 7.2, 8.0):
+        assert grey_value(spline_coefficients(image), u, v) == pytest.approx(down(v), abs=1e-12)
 
 
 def test_smoothed_noise_draws_no_place_towards_the_middle_between_pixels(texture):

@@ -29,7 +29,7 @@ def test_prediction_is_that_of_an_adjustment_without_the_point(open_columns):
     _, found = block(6, 1, open_columns=open_columns, stated=0.5)
     e, s, _ = _predict(found, np.ones(6, bool), [2], ASSUMED)
     keep = [k for k in range(6) if k != 2]
-    S = (found.cofactor.reshape(18, 18) + 0.25 * np.eye(18)).reshape(6, 3, 6, 3)
+    S = (found.covariance.reshape(18, 18) + 0.25 * np.eye(18)).reshape(6, 3, 6, 3)
     A = S[keep][:, :, keep].reshape(15, 15)
     d = found.difference[keep].ravel()
     c = S[2][:, keep].reshape(3, 15)

@@ -8,7 +8,7 @@ import pytest
 from rendered_photographs import CAMERA, scene, stations
 
 from jaxbundle.planning.rendering import Sensor, render
-from jaxbundle.tiepoints.features import Detection, find_features
+from jaxbundle.tiepoints.features import FeatureSettings, find_features
 from jaxbundle.tiepoints.matching import FeatureMatchingSettings
 from jaxbundle.tiepoints.pairs import CandidateSettings
 from jaxbundle.tiepoints.store import Store
@@ -32,7 +32,8 @@ def test_faint_photographs_are_oriented_relatively():
         for k, view in enumerate(views)
     ]
     nothing = lambda *_: None
-    store, settings = Store(None, Detection()), (FeatureMatchingSettings(), CandidateSettings())
+    store = Store(None, FeatureSettings())
+    settings = FeatureMatchingSettings(), CandidateSettings()
     found = match(features, list("abc"), "all", None, store, 1, nothing, *settings)
     verified = verify([CAMERA], [0] * 3, features, found, nothing, VerificationSettings())
     pairs = {p.images: p for p in verified}

@@ -18,6 +18,7 @@ from jaxbundle.photographs.exif import Exif
 from jaxbundle.reconstruction import georeferencing
 from jaxbundle.reconstruction.block import CameraPositions, describe_block
 from jaxbundle.reconstruction.georeferencing import georeference
+from jaxbundle.reconstruction.oriented_block import OrientedBlock
 from jaxbundle.reconstruction.result import ReconstructedPart, Reconstruction
 
 SIGMA = 0.5
@@ -145,6 +146,20 @@ def test_exchanged_coordinates_are_named(drone, handheld, monkeypatch):
     assert "it fits the coordinates of gcp07" in points["gcp02"].verdict
 
 
+def test_two_wrong_points_are_no_exchange(drone, handheld, monkeypatch):
+    """36 m apart, with errors of 8 m: within what satellite positions may be shifted, but this
+    shift is known from the other points."""
+    X = handheld.copy()
+    X[2] += [6.0, -5.0, 0.0]
+    X[7] += [-7.0, 3.0, 4.0]
+    block = drone.block()
+    monkeypatch.setattr(georeferencing, "adjust_determined",
+                        lambda network, **_: (block.adjustment, network, None))  # fmt: skip
+    _, points, table = controlled(drone, drone.given(X))
+    assert table.left_out == ["gcp02", "gcp07"]
+    assert not any("it fits" in point.verdict for point in points.values())
+
+
 def test_heights_of_zero_are_unknown(drone, handheld):
     X = handheld * [1, 1, 0]
     result, points, table = controlled(drone, drone.given(X))
@@ -184,6 +199,23 @@ def test_control_that_cannot_give_a_frame_is_refused(drone, handheld):
     roles = ("control", "control", *["check"] * (CONTROL - 2))
     with pytest.raises(InputError, match="expected 3, got 2"):
         controlled(drone, drone.given(handheld, roles=roles, positions=False))
+
+
+def test_a_point_without_height_leaves_the_others_to_give_the_frame(drone, monkeypatch):
+    """A free height of one point of nine, without satellite positions: the block gets to the truth
+    by the others; with two that have heights it is refused, and these are counted."""
+    X = drone.truth + 0.05 * np.random.default_rng(8).standard_normal((CONTROL, 3))
+    sigma = np.full((CONTROL, 3), 0.05)
+    sigma[0, 2] = np.inf
+    weighted, given = drone.block(False), drone.given(X, sigma, positions=False)
+    block = OrientedBlock(weighted.adjustment, given)
+    block.move(range(CONTROL), given.points)
+    moved = np.array([block.X[block.row_of_determined[name]] for name in NAMES])
+    # of coordinates by eight points, and of intersections by photographs of 40 mm a pixel
+    assert np.sqrt(np.mean((moved - drone.truth) ** 2)) < 0.1
+    sigma[2:, 2] = np.inf
+    with pytest.raises(InputError, match="heights .* expected 3, got 1 "):
+        controlled(drone, drone.given(X, sigma, positions=False))
 
 
 def test_report_page_and_json_show_control_and_block(drone, spoilt, tmp_path):

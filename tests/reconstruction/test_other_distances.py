@@ -23,3 +23,26 @@ def test_other_distances_of_cameras_that_files_do_not_tell(monkeypatch):
     for one, distances in zip(found, expected, strict=True):
         np.testing.assert_allclose([*one.values()], [*distances.values()])
     assert list(starting._try_other_distances(network, [], settings)) == []
+
+
+def adjusted_to(ratio, stated, side=4000):
+    """An adjustment from a principal distance of `stated` longer sides to `ratio` times it."""
+    camera = Camera("c", "opencv", {"fx": stated * side, "fy": stated * side},
+                    image_size=(3000, side))  # fmt: skip
+    parameters = {"fx": {"value": ratio * stated * side}}
+    return SimpleNamespace(
+        converged=True, network=SimpleNamespace(cameras=(camera,)),
+        cameras={"c": {"parameters": parameters}},
+    )  # fmt: skip
+
+
+def test_a_stated_principal_distance_is_plausible_of_any_lens():
+    """600 mm of full frame are 17 longer sides, a fisheye in the plane 0.2: as stated, or a tenth
+    off; not if nothing is known of the lens, nor where adjustments end that fail."""
+    plausible = lambda ratio, stated, guessed=(): starting.is_plausible(
+        adjusted_to(ratio, stated), guessed
+    )
+    for stated in (0.2, 1.0, 17.0):
+        assert plausible(1.0, stated) and plausible(1.1, stated) and plausible(0.9, stated)
+        assert plausible(1.0, stated, ["c"]) == (stated == 1.0)
+        assert not any(plausible(ratio, stated) for ratio in (0.0, 1e-4, 1e4, np.inf, np.nan))

@@ -18,12 +18,12 @@ from jaxbundle.reconstruction.parts import group_connected
 from jaxbundle.reconstruction.photographs import assign_cameras, find_photographs
 from jaxbundle.reconstruction.reconstruct import reconstruct
 from jaxbundle.reconstruction.settings import ReconstructionSettings
-from jaxbundle.tiepoints.features import Detection
+from jaxbundle.tiepoints.features import FeatureSettings
 from jaxbundle.tiepoints.verification import Pair
 
 BAR = 0.001
 """σ of scale bars."""
-SETTINGS = ReconstructionSettings(Detection(number=1500), points=250)
+SETTINGS = ReconstructionSettings(FeatureSettings(number=1500), points=250)
 
 
 @pytest.fixture(scope="module")

@@ -70,6 +70,21 @@ def test_propagation_to_any_function(name):
     assert_close(found.solution.propagate_rows(tables), expected, sigma, sigma)
 
 
+@pytest.mark.parametrize("name", ["everything given", "free"])
+def test_joint_cofactors_of_some_rows(name):
+    found, dense, Q = both(name)
+    sigma = standard_deviations(Q)
+    for table, rows in (("point", [3, 0, 4]), ("image", [1, 0])):
+        columns = dense.columns[table][rows]
+        joint = found.solution.joint_cofactors(table, rows)
+        assert joint.shape == columns.shape * 2
+        columns = columns.ravel()
+        assert_close(
+            joint.reshape(len(columns), -1), Q[np.ix_(columns, columns)], sigma[columns],
+            sigma[columns],
+        )  # fmt: skip
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_redundancy_numbers(name):
     found, dense, Q = both(name)

@@ -18,9 +18,14 @@ from jaxbundle.tiepoints.closure import (
     find_loops,
 )
 from jaxbundle.tiepoints.coplanarity import CoplanaritySettings, estimate_interior
-from jaxbundle.tiepoints.features import Detection, Features, find_features
+from jaxbundle.tiepoints.features import Features, FeatureSettings, find_features
 from jaxbundle.tiepoints.loops import split_contradicted
-from jaxbundle.tiepoints.matching import FeatureMatches, distances_within, match_features
+from jaxbundle.tiepoints.matching import (
+    FeatureMatches,
+    count_matches_of_largest,
+    distances_within,
+    match_features,
+)
 from jaxbundle.tiepoints.pairs import candidate_pairs
 from jaxbundle.tiepoints.still import MarkSettings, without_marks
 from jaxbundle.tiepoints.store import Store
@@ -84,6 +89,26 @@ def test_principal_distance_and_distortion_from_pairs(cloud):
     assert found.camera.parameters["fx"] == pytest.approx(F, rel=0.02)
     assert found.camera.parameters["k1"] == pytest.approx(K1, abs=0.03)
     assert found.misclosure < 0.5
+
+
+@pytest.mark.further
+def test_distortion_of_a_known_long_lens_from_pairs():
+    """A principal distance of 15 longer sides, 540 mm of full frame, as the files state it."""
+    rng, f, k1 = np.random.default_rng(4), 15.0 * SIZE[0], 0.3
+    X, views = rng.uniform(-2.2, 2.2, (160, 3)), list(stations(5, rng))
+    uv = []
+    for X0, M in views:
+        xy = seen(X, X0 * f / F, M) * [1, -1]
+        uv.append(f * xy * (1 + k1 * (xy**2).sum(1, keepdims=True))
+                  + 0.05 * rng.normal(size=xy.shape))  # fmt: skip
+    pairs = list(combinations(uv, 2))
+    camera = jaxbundle.Camera(
+        "c", "opencv", {"fx": f, "fy": f, "cx": 0.0, "cy": 0.0}, image_size=SIZE
+    )
+    found = estimate_interior(camera, pairs, known=True).camera.parameters
+    # K1 moves points of the corners, at r = 0.03, by 0.2 px; it is no more than a start value
+    assert found["fx"] == pytest.approx(f, rel=0.02)
+    assert found["k1"] == pytest.approx(k1, abs=0.1)
 
 
 @pytest.mark.further
@@ -332,6 +357,23 @@ def test_matches_are_those_of_both_sides():
     assert np.all(np.diff(ratio) >= 0) and ratio.max() < 0.8
 
 
+@pytest.mark.parametrize("length", [32, 128])
+def test_two_features_equal_to_one_of_the_other_photograph_match_nothing(length):
+    """Binary descriptors and those of SIFT, in both directions: neither is the right one."""
+    rng = np.random.default_rng(5)
+    once = rng.integers(0, 256, (20, length), np.uint8)
+    twice = np.concatenate([once[:10], once[:5], once[10:15]])
+    one, other = (
+        Features(rng.uniform(0, 900, (20, 2)), np.ones(20), np.zeros(20), descriptor)
+        for descriptor in (twice, once)
+    )
+    expected = [[k, k] for k in range(5, 10)] + [[15 + k, 10 + k] for k in range(5)]
+    for a, b, order in ((one, other, 1), (other, one, -1)):
+        rows, _ = match_features(a, b)
+        assert sorted(rows[:, ::order].tolist()) == expected
+        assert count_matches_of_largest(a, b, 20) == 10
+
+
 def test_residuals_are_correlated_over_less_than_half_the_window():
     """Over the whole window the sum of the gradients, and so the covariance, would vanish."""
     TrackMatchingSettings(window=17, correlation_length=8)
@@ -349,16 +391,16 @@ def test_candidates():
 
 def test_what_is_kept_is_found_again_for_the_same_content_only(tmp_path):
     found = features_at(np.arange(12.0).reshape(6, 2))
-    store = Store(tmp_path / "kept", Detection())
+    store = Store(tmp_path / "kept", FeatureSettings())
     store.save_features("one", found)
-    again = Store(tmp_path / "kept", Detection())
+    again = Store(tmp_path / "kept", FeatureSettings())
     np.testing.assert_array_equal(again.load_features("one").descriptor, found.descriptor)
     assert again.load_features("changed") is None
-    assert Store(tmp_path / "kept", Detection(number=7)).load_features("one") is None
+    assert Store(tmp_path / "kept", FeatureSettings(number=7)).load_features("one") is None
     file = next((tmp_path / "kept").glob("*.npz"))
     file.write_bytes(file.read_bytes()[:100])
     assert again.load_features("one") is None
-    Store(tmp_path / "kept", Detection()).drop_unused()
+    Store(tmp_path / "kept", FeatureSettings()).drop_unused()
     assert not list((tmp_path / "kept").glob("*.npz"))
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from jaxbundle.tiepoints import track_measurement
 from jaxbundle.tiepoints.features import Features
 from jaxbundle.tiepoints.track_measurement import TrackMatchingSettings, measure_tracks
 
@@ -100,3 +101,27 @@ def test_sigma_has_a_floor_in_quadrature(scene):
     np.testing.assert_allclose(difference, np.tile((0.05 * scale) ** 2, 2), rtol=1e-6)
     default = measure(scene)
     assert (default.sigma >= 0.01 * scale).all() and (without.sigma < 0.02).any()
+
+
+@pytest.mark.parametrize(("window", "search_window"), [(17, 41), (25, 41), (17, 61)])
+def test_features_are_matched_where_the_window_fits_into_the_photograph(
+    window, search_window, monkeypatch
+):
+    """With two pixels around it, for interpolation and the last step, however large the part in
+    which it is searched."""
+    found = lambda windows, pieces, others, start, *_: (
+        start, np.zeros((len(others), 2, 2)), np.ones(len(others)), np.zeros(len(others), int)
+    )  # fmt: skip
+    monkeypatch.setattr(track_measurement, "_match_in_chunks", found)
+    away = np.arange(30)
+    xy = np.concatenate([np.stack([away, away + 100], 1), np.stack([away + 100, 399 - away], 1)])
+    n = len(xy)
+    of = lambda xy: Features(xy.astype(float), np.full(n, 7.0), np.zeros(n), np.zeros((n, 128)))
+    features = [of(xy), of(np.full((n, 2), 200))]
+    photograph = np.zeros((SIDE, SIDE, 3), np.uint8)
+    settings = TrackMatchingSettings(window=window, search_window=search_window)
+    tracks = [[(0, k), (1, k)] for k in range(n)]
+    measured = measure_tracks(tracks, features, lambda k: photograph, settings=settings)
+    np.testing.assert_array_equal(
+        measured.level[measured.image == 0] >= 0, np.tile(away >= window // 2 + 2, 2)
+    )
