@@ -17,8 +17,8 @@ from jaxbundle.batches.camera import (
 )
 from jaxbundle.batches.input import Portion
 from jaxbundle.batches.normal import POSE, CameraUnknowns, Sightings, residual_lengths
-from jaxbundle.batches.start import start_values
 from jaxbundle.batches.pope_tests import point_tests
+from jaxbundle.batches.start import start_values
 from jaxbundle.cameras import CameraModel
 from jaxbundle.geometry import (
     matrix_from_quaternion,
