@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from surface_scenes import CAMERA, F, hills, photographs, two_shapes
 
-from jaxbundle.surfaces.correlation import find_peaks, slide
+from jaxbundle.surfaces.correlation import find_peaks, make_pyramid, slide
 from jaxbundle.surfaces.dense_cloud import combine
 from jaxbundle.surfaces.reconstruct import find_bounds, reconstruct_surface
 from jaxbundle.surfaces.rectification import rectify
@@ -113,6 +113,41 @@ def test_correlation_along_a_strip_is_that_of_every_window():
     peak, best, second = find_peaks(np.array([[0.1, 0.5, 0.9, 0.5, 0.1, 0.3], [np.nan] * 6]))
     np.testing.assert_allclose([peak[0], best[0], second[0]], [0.9, 2.0, 0.3])
     assert np.isnan([peak[1], best[1], second[1]]).all()
+
+
+@pytest.mark.parametrize("unit, level", [(1.0, 128.0), (1e-3, 0.128), (1e-6, 0.0), (1e4, 1e6)])
+def test_correlation_has_no_unit_of_grey_values(unit, level):
+    """Rasters of floating point may be reflectances; a flat window is flat in any unit."""
+    rng = np.random.default_rng(1)
+    strip = 0.3 * rng.standard_normal((1, 5, 30))
+    strip[..., 15:25] = 0.0
+    template = strip[..., 3:8]
+    rho = slide(*(np.float32(level + unit * a) for a in (template, strip)))[0]
+    assert rho[3] > 0.999 and (rho[15:21] == -1).all()
+    windows = np.lib.stride_tricks.sliding_window_view(strip[0], (5, 5))[0, :15]
+    expected = [np.corrcoef(template.ravel(), a.ravel())[0, 1] for a in windows]
+    np.testing.assert_allclose(rho[:15], expected, atol=2e-3)
+
+
+def test_grey_values_between_pixels():
+    """Also in the last row and column, and in images longer than OpenCV's 15 bits; none outside,
+    and none of positions that are not known."""
+    plane = lambda u, v: 2.0 * u + 3.0 * v
+    images = ((20, 30), [[29.0, 5.5], [28.5, 19.0], [29.0, 19.0], [0.0, 0.0], [0.25, 18.75]]), (
+        (8, 40_000), [[10.0, 3.0], [39_000.5, 4.5], [20_000.0, 7.0], [39_999.0, 0.5], [0.0, 1.0]],
+    )  # fmt: skip
+    for (rows, columns), places in images:
+        v, u = np.indices((rows, columns))
+        pyramid = make_pyramid(np.float32(plane(u, v)), 1)
+        outside = [[columns - 0.9, 3.0], [-0.1, 2.0], [4.0, rows + 50.0], [np.nan, 2.0], [1e7, 1.0]]
+        grid = np.array([places, outside, places[::-1]])
+        found = pyramid.sample(0, grid)
+        expected = np.float32(plane(*np.moveaxis(grid, 2, 0)))
+        np.testing.assert_array_equal(found[[0, 2]], expected[[0, 2]])
+        assert np.isnan(found[1]).all()
+        # means of 2 × 2 pixels are those of their middle
+        inner = np.array([[[2.5, 4.5], [columns / 2, 3.0]]])
+        np.testing.assert_allclose(pyramid.sample(1, inner), plane(*np.moveaxis(inner, 2, 0)))
 
 
 def test_hidden_points_are_not_found(pair):
