@@ -129,3 +129,20 @@ def test_only_small_separate_surfaces_are_repetitions(disparity):
     np.testing.assert_array_equal(
         find_repetitions(stripes, small, span, settings), np.isfinite(small)
     )
+
+
+def test_pieces_do_not_matter_after_any_number_of_rounds():
+    """To rounding: no shape and no window reaches beyond the margin of a piece."""
+    rng, shape = np.random.default_rng(6), (150, 260)
+    texture = 128 + 90 * ndimage.gaussian_filter(rng.standard_normal(shape), 2.0)
+    # much noise, so that every round changes the shape
+    left, right = (np.float32(texture + 4 * rng.standard_normal(shape)) for _ in range(2))
+    found = [
+        refine_disparities(
+            left, right, np.zeros(shape, np.float32),
+            DisparityRefinementSettings(piece=piece, rounds=4, min_weak_share=1.0),
+        ).disparity
+        for piece in ((256, 512), (120, 200))
+    ]  # fmt: skip
+    np.testing.assert_allclose(found[0], found[1], atol=1e-5)
+    assert np.nanstd(found[0]) > 0.1
