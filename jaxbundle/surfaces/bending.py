@@ -161,15 +161,15 @@ def sharpen(
         shift = uv[k] - node_uv[k]
         slope = bend_at(rough, uv[k], settings).derivatives[:, :2]
         here = here + np.sum(slope * shift, 1)
-        shape = windows(base, other, base.points(uv[k], here), normal)
+        window = windows(base, other, base.points(uv[k], here), normal)
         # pixels of this image per pixel of the guide's rate, by a step of a thousandth
         ends = here[:, None] + [0.0, 1e-3] / guide.rate[row[k], column[k]][:, None]
         places = positions(base, other, uv[k], ends)
         start, rate = places[:, 0], (places[:, 1] - places[:, 0]) * 1e3
-        match = refine(base, other, uv[k], start, shape.A, half, window_settings)
+        match = refine(base, other, uv[k], start, window.A, half, window_settings)
         with np.errstate(invalid="ignore", divide="ignore"):
             change = np.sum((match.uv - start) * rate, 1) / np.sum(rate**2, 1)
-            good = (match.status == int(MatchingStatus.CONVERGED)) & shape.usable
+            good = (match.status == int(MatchingStatus.CONVERGED)) & window.usable
             good &= np.abs(change) < settings.max_node_shift
             good &= match.rho > settings.min_node_correlation
         moved = k[good]

@@ -103,7 +103,7 @@ def correlate(
     pyramids: tuple[Pyramid, Pyramid],
     uv: Float[np.ndarray, "n 2"],
     segment: Segments,
-    shape: Windows,
+    window: Windows,
     *,
     level: int,
     half: int,
@@ -116,14 +116,14 @@ def correlate(
     of the window pixels. ρ is NaN outside the other image.
     """
     scale = 2.0**level
-    spacing = scale * np.linalg.norm(shape.other_axis, axis=1)
+    spacing = scale * np.linalg.norm(window.other_axis, axis=1)
     k = np.arange(steps) - (steps - 1) / 2
     with np.errstate(invalid="ignore", divide="ignore"):
         # in the order of q, though the epipolar axis may be opposite
         length = segment.length[:, None] / 2 + k * spacing[:, None]
         q = segment.parameter(length)
     place = positions(*pair, uv, q)
-    forward = np.sum((place[:, -1] - place[:, 0]) * shape.other_axis, axis=1) >= 0
+    forward = np.sum((place[:, -1] - place[:, 0]) * window.other_axis, axis=1) >= 0
     sign = np.where(forward, 1.0, -1.0)[:, None]
 
     # the strips of 256 points fit into a processor's cache
@@ -132,13 +132,13 @@ def correlate(
     def correlate_rows(first: int) -> Float[np.ndarray, "m steps"]:
         rows = slice(first, first + together)
         template = _sample_templates(
-            pyramids[0], uv[rows], sign[rows] * shape.axis[rows], sign[rows], half, level
+            pyramids[0], uv[rows], sign[rows] * window.axis[rows], sign[rows], half, level
         )
         strip = _sample_strips(
             pyramids[1],
             place[rows],
-            sign[rows] * scale * shape.other_axis[rows],
-            scale * shape.other_cross_axis[rows],
+            sign[rows] * scale * window.other_axis[rows],
+            scale * window.other_cross_axis[rows],
             half,
             level,
         )
@@ -147,7 +147,7 @@ def correlate(
     with ThreadPoolExecutor(available_cores()) as pool:
         parts = list(pool.map(correlate_rows, range(0, len(uv), together)))
     rho = np.concatenate(parts) if parts else np.zeros((0, steps), np.float32)
-    return np.where(shape.usable[:, None], rho, np.nan), q
+    return np.where(window.usable[:, None], rho, np.nan), q
 
 
 def slide(

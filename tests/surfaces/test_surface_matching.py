@@ -206,3 +206,16 @@ def test_pairs_that_disagree_are_left_out_where_no_third_decides():
     assert number.tolist()[0] == 2 and number.tolist()[2:] == [2, 1]
     # one pair: its σ; of two, the half that is the base image's stays
     np.testing.assert_allclose(variance[[0, 3]], [0.75e-4, 1e-4])
+
+
+def test_points_that_no_other_image_shows_are_said(pair):
+    """Their windows of 9 × 9 pixels are not in the other image; they are not badly correlated."""
+    views, truth, found = pair
+    every = truth[0][::4, ::4].reshape(-1, 3)
+    inner = is_inside(views[0], views[0].project(every), 8)
+    unseen = inner & ~is_inside(views[1], views[1].project(every), 4)
+    said = found.bases[0]["rejected"]
+    assert said["at the edge"] == (~inner).sum()
+    # the search continues beyond the surface, as far as the guide is uncertain
+    assert said["in no other image at a similar scale"] == pytest.approx(unseen.sum(), rel=0.05)
+    assert said["low correlation"] < 0.1 * inner.sum()
