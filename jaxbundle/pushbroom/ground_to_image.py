@@ -289,7 +289,7 @@ def _search(
 
     # The first passages may be beside the line of detectors, and later ones in the image: the
     # search goes on after them until the places are full or no passage is left.
-    none = jnp.zeros(X[0].shape, int)
+    none = jnp.zeros(jnp.shape(X[0]), int)
     unknown, never = jnp.full((most, none.size), jnp.nan), none > 0
     state = unknown, unknown, none, never, none, none + 1, never, never, never
     state = jax.lax.while_loop(is_open, search_on, state)

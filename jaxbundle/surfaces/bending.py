@@ -260,7 +260,7 @@ def correct_bending(
     found[rows] = response(
         base.grey, uv[rows], match.A[rows], second[rows], half, settings.max_correction
     )
-    corrected = np.isfinite(found).all(1)
+    corrected = np.isfinite(found[:, 0])  # both components or none
     off = np.where(corrected[:, None], found, 0.0)
     squares = off[:, :, None] * off[:, None]
     # without a fitting polynomial the effect of bending may be as large as elsewhere

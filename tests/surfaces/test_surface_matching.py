@@ -1,14 +1,19 @@
 """Rendered pairs: matches agree with the truth, heights with their σ, and nothing is found where
 nothing is visible."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+from scipy import ndimage
 from surface_scenes import CAMERA, F, hills, photographs, two_shapes
 
+from jaxbundle.measure.least_squares_matching import MatchingStatus
 from jaxbundle.surfaces.correlation import find_peaks, make_pyramid, slide
 from jaxbundle.surfaces.dense_cloud import combine
 from jaxbundle.surfaces.reconstruct import find_bounds, reconstruct_surface
 from jaxbundle.surfaces.rectification import rectify
+from jaxbundle.surfaces.subpixel_matching import refine
 from jaxbundle.surfaces.views import FrameView, is_inside, line_of_sight, steps_on_plane
 from jaxbundle.types import present
 
@@ -150,6 +155,28 @@ def test_grey_values_between_pixels():
         np.testing.assert_allclose(pyramid.sample(1, inner), plane(*np.moveaxis(inner, 2, 0)))
 
 
+def test_windows_in_an_image_of_three_times_the_scale():
+    """Its pixels are the means of 3 × 3 of the other: all are matched, within their σ."""
+    rng = np.random.default_rng(0)
+    fine = 128 + 480 * ndimage.gaussian_filter(rng.standard_normal((480, 480)), 6.0)
+    grey = fine.reshape(160, 3, 160, 3).mean((1, 3)), fine
+    base, other = (
+        SimpleNamespace(grey=np.float32(a + rng.standard_normal(a.shape)), size=a.shape)
+        for a in grey
+    )
+    uv = rng.integers(30, 130, (60, 2)).astype(float)
+    true = 3 * uv + 1
+    start = true + rng.uniform(-0.7, 0.7, true.shape)
+    found = refine(base, other, uv, start, np.tile(3 * np.eye(2), (60, 1, 1)), 6)
+    good = found.status == int(MatchingStatus.CONVERGED)
+    assert good.mean() > 0.9
+    w = (found.uv - true)[good] / np.sqrt(np.einsum("nii->ni", found.covariance[good]))
+    assert 0.7 < np.sqrt(np.mean(w**2)) < 1.2
+    # in other windows than those of four times the scale nothing is looked for
+    apart = refine(base, other, uv, start, np.tile(9 * np.eye(2), (60, 1, 1)), 6)
+    assert (apart.status == int(MatchingStatus.OUTSIDE)).all()
+
+
 def test_hidden_points_are_not_found(pair):
     """Ground that the roof hides from the second photograph."""
     views, truth, found = pair
@@ -212,7 +239,8 @@ def test_points_that_no_other_image_shows_are_said(pair):
     """Their windows of 9 × 9 pixels are not in the other image; they are not badly correlated."""
     views, truth, found = pair
     every = truth[0][::4, ::4].reshape(-1, 3)
-    inner = is_inside(views[0], views[0].project(every), 8)
+    v, u = 4.0 * np.indices((48, 64))
+    inner = is_inside(views[0], np.stack([u, v], -1).reshape(-1, 2), 8)
     unseen = inner & ~is_inside(views[1], views[1].project(every), 4)
     said = found.bases[0]["rejected"]
     assert said["at the edge"] == (~inner).sum()
