@@ -1,14 +1,19 @@
 """Rendered pairs: matches agree with the truth, heights with their σ, and nothing is found where
 nothing is visible."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+from scipy import ndimage
 from surface_scenes import CAMERA, F, hills, photographs, two_shapes
 
-from jaxbundle.surfaces.correlation import find_peaks, slide
+from jaxbundle.measure.least_squares_matching import MatchingStatus
+from jaxbundle.surfaces.correlation import find_peaks, make_pyramid, slide
 from jaxbundle.surfaces.dense_cloud import combine
 from jaxbundle.surfaces.reconstruct import find_bounds, reconstruct_surface
 from jaxbundle.surfaces.rectification import rectify
+from jaxbundle.surfaces.subpixel_matching import refine
 from jaxbundle.surfaces.views import FrameView, is_inside, line_of_sight, steps_on_plane
 from jaxbundle.types import present
 
@@ -115,6 +120,63 @@ def test_correlation_along_a_strip_is_that_of_every_window():
     assert np.isnan([peak[1], best[1], second[1]]).all()
 
 
+@pytest.mark.parametrize("unit, level", [(1.0, 128.0), (1e-3, 0.128), (1e-6, 0.0), (1e4, 1e6)])
+def test_correlation_has_no_unit_of_grey_values(unit, level):
+    """Rasters of floating point may be reflectances; a flat window is flat in any unit."""
+    rng = np.random.default_rng(1)
+    strip = 0.3 * rng.standard_normal((1, 5, 30))
+    strip[..., 15:25] = 0.0
+    template = strip[..., 3:8]
+    rho = slide(*(np.float32(level + unit * a) for a in (template, strip)))[0]
+    assert rho[3] > 0.999 and (rho[15:21] == -1).all()
+    windows = np.lib.stride_tricks.sliding_window_view(strip[0], (5, 5))[0, :15]
+    expected = [np.corrcoef(template.ravel(), a.ravel())[0, 1] for a in windows]
+    np.testing.assert_allclose(rho[:15], expected, atol=2e-3)
+
+
+def test_grey_values_between_pixels():
+    """Also in the last row and column, and in images longer than OpenCV's 15 bits; none outside,
+    and none of positions that are not known."""
+    plane = lambda u, v: 2.0 * u + 3.0 * v
+    images = ((20, 30), [[29.0, 5.5], [28.5, 19.0], [29.0, 19.0], [0.0, 0.0], [0.25, 18.75]]), (
+        (8, 40_000), [[10.0, 3.0], [39_000.5, 4.5], [20_000.0, 7.0], [39_999.0, 0.5], [0.0, 1.0]],
+    )  # fmt: skip
+    for (rows, columns), places in images:
+        v, u = np.indices((rows, columns))
+        pyramid = make_pyramid(np.float32(plane(u, v)), 1)
+        outside = [[columns - 0.9, 3.0], [-0.1, 2.0], [4.0, rows + 50.0], [np.nan, 2.0], [1e7, 1.0]]
+        grid = np.array([places, outside, places[::-1]])
+        found = pyramid.sample(0, grid)
+        expected = np.float32(plane(*np.moveaxis(grid, 2, 0)))
+        np.testing.assert_array_equal(found[[0, 2]], expected[[0, 2]])
+        assert np.isnan(found[1]).all()
+        # means of 2 × 2 pixels are those of their middle
+        inner = np.array([[[2.5, 4.5], [columns / 2, 3.0]]])
+        np.testing.assert_allclose(pyramid.sample(1, inner), plane(*np.moveaxis(inner, 2, 0)))
+
+
+def test_windows_in_an_image_of_three_times_the_scale():
+    """Its pixels are the means of 3 × 3 of the other: all are matched, within their σ."""
+    rng = np.random.default_rng(0)
+    fine = 128 + 480 * ndimage.gaussian_filter(rng.standard_normal((480, 480)), 6.0)
+    grey = fine.reshape(160, 3, 160, 3).mean((1, 3)), fine
+    base, other = (
+        SimpleNamespace(grey=np.float32(a + rng.standard_normal(a.shape)), size=a.shape)
+        for a in grey
+    )
+    uv = rng.integers(30, 130, (60, 2)).astype(float)
+    true = 3 * uv + 1
+    start = true + rng.uniform(-0.7, 0.7, true.shape)
+    found = refine(base, other, uv, start, np.tile(3 * np.eye(2), (60, 1, 1)), 6)
+    good = found.status == int(MatchingStatus.CONVERGED)
+    assert good.mean() > 0.9
+    w = (found.uv - true)[good] / np.sqrt(np.einsum("nii->ni", found.covariance[good]))
+    assert 0.7 < np.sqrt(np.mean(w**2)) < 1.2
+    # in other windows than those of four times the scale nothing is looked for
+    apart = refine(base, other, uv, start, np.tile(9 * np.eye(2), (60, 1, 1)), 6)
+    assert (apart.status == int(MatchingStatus.OUTSIDE)).all()
+
+
 def test_hidden_points_are_not_found(pair):
     """Ground that the roof hides from the second photograph."""
     views, truth, found = pair
@@ -171,3 +233,17 @@ def test_pairs_that_disagree_are_left_out_where_no_third_decides():
     assert number.tolist()[0] == 2 and number.tolist()[2:] == [2, 1]
     # one pair: its σ; of two, the half that is the base image's stays
     np.testing.assert_allclose(variance[[0, 3]], [0.75e-4, 1e-4])
+
+
+def test_points_that_no_other_image_shows_are_said(pair):
+    """Their windows of 9 × 9 pixels are not in the other image; they are not badly correlated."""
+    views, truth, found = pair
+    every = truth[0][::4, ::4].reshape(-1, 3)
+    v, u = 4.0 * np.indices((48, 64))
+    inner = is_inside(views[0], np.stack([u, v], -1).reshape(-1, 2), 8)
+    unseen = inner & ~is_inside(views[1], views[1].project(every), 4)
+    said = found.bases[0]["rejected"]
+    assert said["at the edge"] == (~inner).sum()
+    # the search continues beyond the surface, as far as the guide is uncertain
+    assert said["in no other image at a similar scale"] == pytest.approx(unseen.sum(), rel=0.05)
+    assert said["low correlation"] < 0.1 * inner.sum()
