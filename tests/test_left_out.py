@@ -81,6 +81,13 @@ def test_distant_points_and_near_ones_are_not_of_one_line():
     assert not have_one_line(seen, model, np.ones(120, bool))[0].any()
 
 
+def test_rays_that_fit_exactly_are_not_tested():
+    """σ0 = 0, of exact measurements: every deviation would be significant, and p infinite."""
+    seen, model = random_rays(np.array([[0.0, 0, 0], [1, 0, 0]]), np.array([[3.0, 0, 0]]))
+    for found in have_one_line(seen, model, np.ones(1, bool), factor=0.0):
+        assert not found.any()
+
+
 def test_images_from_one_place_are_named_as_such_for_their_points_only():
     centres = np.array([[0.0, 0, 0], [0, 0, 0], [1, 0, 0]])
     points = np.random.default_rng(2).uniform(-1, 1, (40, 3)) + [0, 0, -10]

@@ -222,6 +222,13 @@ def test_neighbours_tell_velocities(flown, result):
     check_jacobians(found.problem, found.values, skip=("control points", "image coordinates"))
 
 
+def test_free_parameters_are_a_list(flown):
+    """Not a word, of which every letter would be one."""
+    xy = flown[0].network.observations.xy
+    with pytest.raises(InputError, match=r"\[rolling_shutter\]: free is 'vX'; a list of names is"):
+        moving(flown[0].network, xy, free="vX")
+
+
 def test_neighbours_need_times(flown, tmp_path):
     made, _ = flown
     with pytest.raises(InputError, match="row 1: t, the time of exposure, is missing"):
@@ -246,6 +253,7 @@ def test_the_line_is_needed(flown):
 
 @pytest.mark.parametrize("images, line_time, message", [
     (["1", "2", "1"], LINE, "row 3: .*image '1'.* row 1"),
+    (["1"], {"cam": "fast"}, "line_time is 'fast'; a number is expected"),
     (["1"], {"cam": LINE, "carn": LINE}, "line_time names no camera 'carn'; known: cam"),
 ])  # fmt: skip
 def test_what_is_wrong_is_named(flown, images, line_time, message):
