@@ -125,10 +125,9 @@ def test_as_many_points_determine_a_figure_as_it_has_unknowns():
 
 
 def test_the_axis_of_a_cylinder_is_found_where_no_principal_axis_is_near():
-    """As long as wide: the principal axes of its points may have any direction."""
-    turn, along = np.meshgrid(np.linspace(0, 5, 6), np.linspace(-1.2, 1.2, 5))
-    X = np.cos(turn)[..., None] * TILT[0] + np.sin(turn)[..., None] * TILT[1]
-    X = (X + along[..., None] * AXIS).reshape(-1, 3)
+    """Points along a helix of one turn, as long as wide."""
+    turn = np.linspace(0, 6, 12)
+    X = np.outer(np.cos(turn), TILT[0]) + np.outer(np.sin(turn), TILT[1]) + np.outer(turn / 3, AXIS)
     _, M, radius = fit("cylinder", X)
     assert np.abs(np.linalg.svd(X - X.mean(0))[2] @ AXIS).max() < np.cos(np.radians(10))
     assert np.abs(M[2] @ AXIS) > np.cos(np.radians(7)) and radius == pytest.approx(1.0, rel=0.05)

@@ -247,13 +247,16 @@ def test_the_line_is_needed(flown):
     camera = dataclasses.replace(network.cameras[0], image_size=None)
     with pytest.raises(InputError, match="camera 'cam': image_size is needed for the exp"):
         jaxbundle.make_problem(network.replace(cameras=(camera,)))
+    for given, said in ("fast", "'fast'"), ({"cam": True}, "True"):
+        network = moving(made.network, made.network.observations.xy, line_time=given)
+        with pytest.raises(InputError, match=f"line_time is {said}; a number is expected"):
+            jaxbundle.make_problem(network)
     with pytest.raises(InputError, match=r"\[rolling_shutter\]: line_time is missing"):
         make_further({"velocities": {"image": ["IMG 1"]}}, 1.0)
 
 
 @pytest.mark.parametrize("images, line_time, message", [
     (["1", "2", "1"], LINE, "row 3: .*image '1'.* row 1"),
-    (["1"], {"cam": "fast"}, "line_time is 'fast'; a number is expected"),
     (["1"], {"cam": LINE, "carn": LINE}, "line_time names no camera 'carn'; known: cam"),
 ])  # fmt: skip
 def test_what_is_wrong_is_named(flown, images, line_time, message):
