@@ -151,7 +151,7 @@ def test_points_seen_only_from_one_place_are_left_out_by_name(twins):
     (left,) = result_dict(result, brief=True)["left_out"]
     assert left == {"kind": "tie point", "names": ["24", "25"], "reason": note.why}
     page = "".join(compose(result))
-    assert "2 tie points" in page and "no distance" in page
+    assert "2 tie points" in page and "their distance is undetermined" in page
 
 
 def test_what_is_left_out_is_kept_in_a_file(twins, tmp_path):
@@ -250,7 +250,7 @@ def test_image_points_beyond_the_side_of_a_fisheye_give_start_values(good_start)
 def test_what_poor_start_values_exclude_comes_back(good_start):
     given = fisheye((0.9, 0.15))
     first = jaxbundle.orient(given)
-    assert len(first.left_out) + len(first.points) > 20
+    assert len(first.left_out) + len(first.points_not_placed) > 20
     result = jaxbundle.adjust(given)
     assert result.converged and not result.problem.network.left_out
     assert result.counts == good_start.counts

@@ -1,12 +1,14 @@
 """What is held has no σ, and what has no weight no value: neither is seen in anything else."""
 
 import numpy as np
+import pytest
 
 from jaxbundle import leastsquares as ls
 from jaxbundle.leastsquares.indexing.layout import chunk_length
 from jaxbundle.leastsquares.indexing.rows import whiten
 from jaxbundle.leastsquares.indexing.settings import PLANNING, PlanningSettings
 from jaxbundle.leastsquares.problem import make_problem
+from jaxbundle.leastsquares.quality import weakness
 from jaxbundle.leastsquares.quality.weakness import find_weak
 from jaxbundle.leastsquares.solution import Solution, find_minimum
 
@@ -27,6 +29,21 @@ def test_a_held_direction_of_an_eliminated_row_has_no_sigma():
     solution = Solution(problem, {table.name: table.value for table in problem.tables})
     weak = find_weak(solution, {"point": np.full(points, 5.0)}, 1.0)
     assert weak.rows == () and weak.judged == points
+
+
+def test_the_weakest_unknown_of_a_large_system_is_found_without_its_cofactors(monkeypatch):
+    """By subspace iteration; it is connected with no other unknown, and beyond the directions that
+    it follows at a time. Held unknowns have no σ."""
+    of, sigma = np.arange(12), np.full((12, 1), 1e-3)
+    free = of[:, None] % 4 != 1
+    sigma[[1, 10]] = 10.0
+    level = ls.Kind("level", lambda x, m: x - m, of=("height",))
+    heights = ls.Table("height", np.zeros((12, 1)), free=free, labels=list("abcdefghijkl"))
+    problem = make_problem([heights], [level((of,), np.zeros((12, 1)), sigma=sigma)])
+    monkeypatch.setattr(weakness, "SMALL_SYSTEM", 0)
+    found = Solution(problem, {"height": heights.value})
+    weak = find_weak(found, {"height": np.full((12, 1), 1.0)}, 1.0)
+    assert weak.names == ("1 of height k",) and weak.worst == pytest.approx(10.0, rel=1e-6)
 
 
 def test_rows_of_a_held_table_vary_within_a_chunk():

@@ -16,7 +16,7 @@ from jaxbundle.leastsquares.iterations.stopping import converged
 from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.network.check import check_network
 from jaxbundle.network.undetermined import keep_images
-from jaxbundle.orientation.network import lacks_start_values
+from jaxbundle.orientation.network import find_start_values, lacks_start_values
 from jaxbundle.planning.stations import Stations
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -214,6 +214,18 @@ def test_what_is_given_stays(solid):
     found = orient(without.replace(images=given)).network
     np.testing.assert_array_equal(found.images.position[two], network.images.position[two])
     assert np.abs(found.images.position - network.images.position).max() < 0.5
+
+
+def test_rays_that_miss_by_more_than_any_distortion_are_left_out(solid):
+    """Three times 3 % of the radius of the image, the distortion that a wide-angle lens may have:
+    the adjustment decides about a ray that is off by 7 %, not about one that is off by 15 %."""
+    rays = solid.observations
+    xy, radius = rays.xy.copy(), np.quantile(np.hypot(*rays.xy.T), 0.95)
+    xy[[3, 500]] += np.array([[0.0, 0.07], [0.15, 0.0]]) * radius
+    spoilt = solid.replace(observations=dataclasses.replace(rays, xy=xy))
+    (left,) = find_start_values(spoilt).left_out
+    image, point = solid.images.id[rays.image[500]], solid.points.id[rays.point[500]]
+    assert image in left and point in left
 
 
 def test_approximate_points_are_enough(solid):
