@@ -168,13 +168,20 @@ def test_huber_minimises_his_function(network):
     assert abs(slope) < 0.02 * curvature
 
 
-@pytest.mark.parametrize(
-    ("weight", "k", "efficiency"), [(robust.cauchy, 2.5486, 0.95), (robust.tukey, 5.1230, 0.95)]
-)
-def test_efficiency_in_the_plane(weight, k, efficiency):
-    """E[ψ' + ψ/t]²/(2·E[ψ²]) for t² ~ χ²₂, by numerical integration (Maronna, 1976)."""
+def test_huber_touches_one_good_image_point_in_ninety():
+    """P(t > k) = exp(−k²/2) for t² ~ χ²₂."""
+    length = lambda number: np.sqrt(2 * np.log(number))  # exceeded by one in this many
+    rarer, more_often = robust.huber(np.array([length(91.0), length(89.0)]))
+    assert rarer < 1 == more_often
+
+
+@pytest.mark.parametrize(("weight", "k"), [(robust.cauchy, 2.5486), (robust.tukey, 5.1230)])
+def test_efficiency_in_the_plane_is_95_percent(weight, k):
+    """E[ψ' + ψ/t]²/(2·E[ψ²]) for t² ~ χ²₂, by numerical integration (Maronna, 1976), of the weights
+    as they are used; k: where ψ is not smooth."""
+    efficiency = 0.95
     density = lambda t: t * np.exp(-t * t / 2)
-    psi = lambda t: t * float(weight(np.array(t), k))
+    psi = lambda t: t * float(weight(np.array(t)))
     slope = lambda t: (psi(t + 1e-5) - psi(t - 1e-5)) / 2e-5
     mean = lambda f: integrate.quad(lambda t: f(t) * density(t), 1e-4, 12, points=[k], limit=200)[0]
     found = mean(lambda t: slope(t) + psi(t) / t) ** 2 / (2 * mean(lambda t: psi(t) ** 2))

@@ -81,6 +81,13 @@ def test_distant_points_and_near_ones_are_not_of_one_line():
     assert not have_one_line(seen, model, np.ones(120, bool))[0].any()
 
 
+def test_rays_that_fit_exactly_are_not_tested():
+    """σ0 = 0, of exact measurements: every deviation would be significant, and p infinite."""
+    seen, model = random_rays(np.array([[0.0, 0, 0], [1, 0, 0]]), np.array([[3.0, 0, 0]]))
+    for found in have_one_line(seen, model, np.ones(1, bool), factor=0.0):
+        assert not found.any()
+
+
 def test_images_from_one_place_are_named_as_such_for_their_points_only():
     centres = np.array([[0.0, 0, 0], [0, 0, 0], [1, 0, 0]])
     points = np.random.default_rng(2).uniform(-1, 1, (40, 3)) + [0, 0, -10]
@@ -144,7 +151,7 @@ def test_points_seen_only_from_one_place_are_left_out_by_name(twins):
     (left,) = result_dict(result, brief=True)["left_out"]
     assert left == {"kind": "tie point", "names": ["24", "25"], "reason": note.why}
     page = "".join(compose(result))
-    assert "2 tie points" in page and "no distance" in page
+    assert "2 tie points" in page and "their distance is undetermined" in page
 
 
 def test_what_is_left_out_is_kept_in_a_file(twins, tmp_path):
@@ -243,7 +250,7 @@ def test_image_points_beyond_the_side_of_a_fisheye_give_start_values(good_start)
 def test_what_poor_start_values_exclude_comes_back(good_start):
     given = fisheye((0.9, 0.15))
     first = jaxbundle.orient(given)
-    assert len(first.left_out) + len(first.points) > 20
+    assert len(first.left_out) + len(first.points_not_placed) > 20
     result = jaxbundle.adjust(given)
     assert result.converged and not result.problem.network.left_out
     assert result.counts == good_start.counts

@@ -84,10 +84,20 @@ def test_control_in_degrees_is_said_and_not_adjusted(tmp_path):
     TARGETS * [1, 1, 0] + [12.0, 48.0, 0.0],  # flat
     TARGETS * 200 + [4.5e6, 5.3e6, 500.0],  # a projection
     TARGETS * 1e5 * [1, 1, 0.01],  # metres about 0
+    TARGETS * [0.01, 0.01, 1.0] + [500.0, 50.0, 0.0],  # a pole; no longitude is 500
 ])  # fmt: skip
 def test_metric_coordinates_are_not_taken_for_degrees(X):
     points = network(control=range(25)).points
     assert name_degrees(dataclasses.replace(points, position=X)) == ""
+
+
+def test_degrees_are_named_beside_a_point_without_coordinates():
+    """A check point that is only measured in images has none."""
+    points = network(control=(0, 4, 20, 24), check=(12,)).points
+    position = points.position.copy()
+    position[[0, 4, 20, 24]], position[12] = list(DEGREES.values()), np.nan
+    said = name_degrees(dataclasses.replace(points, position=position))
+    assert said.startswith("X and Y of the 4 known points look like longitude and latitude")
 
 
 def test_control_that_fits_no_similarity_is_named_with_its_residuals(tmp_path):

@@ -262,6 +262,10 @@ def test_what_repeats_another_is_named():
     other = given.replace(observations=dataclasses.replace(rays, xy=twin))
     (line,) = warn_of_repetitions(other).warnings
     assert "'8' repeats '4'" in line
+    # Of many only the first few are named.
+    same = given.replace(observations=dataclasses.replace(rays, xy=0 * rays.xy))
+    line, *_ = warn_of_repetitions(same).warnings
+    assert line.count("repeats") == 5 and " and " in line
 
 
 def test_an_observation_without_derivatives_is_named():

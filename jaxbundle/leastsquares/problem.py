@@ -234,7 +234,8 @@ def with_motions_at(problem: AnyProblem, values: Values) -> AnyProblem:
         return problem
     data = pad_data(problem, dataclasses.replace(problem.data, start=values))
     real = {t.name: np.arange(problem.sizes["table", t.name]) < t.rows for t in problem.tables}
-    floating = dataclasses.replace(problem.plan, datum=None)  # As in `make_problem`.
+    # Without its datum, which a survey does not use, the plan has the program of `make_problem`.
+    floating = dataclasses.replace(problem.plan, datum=None)
     gauge = find_open_motions(survey_motions(problem.declared, floating, data, real))
     # The defect is that of the start values, whatever it is by chance elsewhere.
     if gauge.shape != datum.gauge.shape:

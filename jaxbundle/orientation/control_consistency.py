@@ -218,8 +218,8 @@ def _predict(
             if unknown[part].any()
             else chi2_tail(T, len(part))
         )
-    # Bonferroni: the smaller of two probabilities counts twice.
-    p = min(1.0, len(p) * min(p, default=1.0))
+    # Bonferroni: the smaller of two probabilities counts twice. Nothing tested: chance explains it.
+    p = min(1.0, len(p) * min(p)) if p else 1.0
     error, spread = np.full(3, np.nan), np.full(3, np.nan)
     first = rows[mine] // 3 == tested[0]
     axes = rows[mine][first] % 3

@@ -75,7 +75,7 @@ def test_a_prior_observes_its_value_whatever_the_start(convergent4, tmp_path):
     values = found.camera_parameters("cam")
     assert abs(values["c"] - camera.parameters["c"]) > 1e-4
     restarted = with_start(camera, values)
-    assert restarted.observed == {"c": camera.parameters["c"]}
+    assert restarted.parameters == values and restarted.observed == {"c": camera.parameters["c"]}
     back = read_network(write_project(network.replace(cameras=(restarted,)), tmp_path))
     again = jaxbundle.adjust(back)
     assert again.sigma0 == pytest.approx(found.sigma0, rel=1e-9)

@@ -50,9 +50,13 @@ PROBLEMS = {
 }
 
 
-def solve(problem):
-    """The minimum as lists."""
-    minimum = solution.find_minimum(problem, atol=1e-7)
+def solve(problem, start=None):
+    """The minimum as lists; `start`: the values of another one."""
+    if start is not None:
+        leaves, structure = jax.tree.flatten(problem.data.start)
+        start = [np.array(x, a.dtype) for x, a in zip(start["values"], leaves, strict=True)]
+        start = jax.tree.unflatten(structure, start)
+    minimum = solution.find_minimum(problem, start, atol=1e-7)
     return {
         "termination": int(minimum.termination),
         "cost": np.asarray(minimum.history.cost)[: int(minimum.iterations)].tolist(),
@@ -64,7 +68,6 @@ def main(names, processes=1, rank=0, port=0, signal=0):
     jax.config.update("jax_enable_x64", True)
     if processes > 1:
         jaxbundle.join_processes(f"127.0.0.1:{port}", processes, rank, lost_after_seconds=10)
-    solution.MIN_SHARED_OBSERVATIONS = 0
     if signal:
         solution.distribute = lambda _: (os.kill(os.getpid(), signal), time.sleep(10))
     compiled = []
@@ -72,11 +75,15 @@ def main(names, processes=1, rank=0, port=0, signal=0):
         lambda event, *_, **__: compiled.append(event) if "backend_compile" in event else None
     )
     problems = {name: PROBLEMS[name]() for name in names}
+    worth = lambda: [solution._worth_sharing(p, p.data.start) for p in problems.values()]
+    before, solution.MIN_SHARED_OBSERVATIONS = worth(), 0
+    shared = {"small": before, "large": worth()}
     found = {name: solve(problem) for name, problem in problems.items()}
-    first = len(compiled)
+    first, again = len(compiled), None
     if processes == 1:
-        solve(problems[names[0]])
-    print(json.dumps(found | {"compiled": [first, len(compiled) - first]}))
+        again = solve(problems[names[0]], found[names[0]])
+    compiled = [first, len(compiled) - first]
+    print(json.dumps(found | {"compiled": compiled, "again": again, "shared": shared}))
 
 
 if __name__ == "__main__":

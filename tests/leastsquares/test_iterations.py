@@ -8,6 +8,7 @@ import pytest
 
 from jaxbundle import leastsquares as ls
 from jaxbundle.leastsquares.datum.conditions import DATUM_MOTION, moves_on
+from jaxbundle.leastsquares.iterations.search import TRUST_REGION, RegionState
 from jaxbundle.leastsquares.iterations.stopping import (
     LIMIT,
     SETTLED,
@@ -65,6 +66,19 @@ def test_a_rejected_undamped_step_was_tried_too_early(last_size, again):
     _, approach = approach.choose_step(**sizes, **(step | rejected))
     assert approach.choose_step(**sizes, **step)[0] == again
     assert approach.choose_step(**sizes, **(step | {"predicted": jnp.asarray(0.009)}))[0] == jnp.inf
+
+
+def test_the_trust_region_follows_nielsen():
+    """Radius 1/λ: steps rejected in a row divide it by 2, 4, 8; an accepted one multiplies it by
+    1/max(1/3, 1 − (2ρ − 1)³), and the next rejected one divides by 2 again (Nielsen 1999, 3.3)."""
+    region, step = RegionState.begin(TRUST_REGION), jnp.asarray(False)
+    ratios = [-1.0, 0.0, -0.5, 0.9, -1.0, 0.5, 1.0, 0.1]
+    factors = [1 / 2, 1 / 4, 1 / 8, 1 / (1 - 0.8**3), 1 / 2, 1.0, 3.0, 1 / (1 + 0.8**3)]
+    for ratio, factor in zip(ratios, factors, strict=True):
+        accepted, after = region.after(step, jnp.asarray(ratio))
+        assert accepted == (ratio > 0)
+        assert after.radius == pytest.approx(float(region.radius) * factor, rel=1e-12)
+        region = after
 
 
 def test_a_motion_to_the_datum_ends():

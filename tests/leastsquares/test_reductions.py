@@ -253,6 +253,8 @@ def test_the_way_is_chosen_by_size_and_fill():
     place = dataclasses.replace(full.place, rows=np.zeros(10_000, np.int32))
     everywhere = dataclasses.replace(full, place=place, width=9999, blocks=2)
     assert way(everywhere, 10_000, 2_000_000) == "iterative"
+    # A dense factor of 14 400 unknowns fits into memory, but costs ten times more than iteration.
+    assert way(None, 1600, 100_000, ("dense", "iterative")) == "iterative"
     # Where a factor is needed and none fits into memory, there is none.
     assert way(everywhere, 10_000, 2_000_000, FACTORS) is None
     with pytest.raises(InputError, match="sparse"):

@@ -63,6 +63,19 @@ def test_a_problem_solved_again_compiles_nothing():
     assert first > 0 and again == 0
 
 
+def test_devices_share_a_problem_if_it_is_large():
+    """The figure that says how large is 0 for these runs."""
+    assert on_two_devices()["shared"] == {"small": [False, False], "large": [True, True]}
+
+
+def test_shared_iterations_begin_at_the_given_values():
+    """From the minimum: there the cost is the last one, and no step is left."""
+    found = on_two_devices()
+    first, *_ = found["again"]["cost"]
+    assert first == pytest.approx(found["network"]["cost"][-1], rel=1e-9)
+    assert first < 0.99 * found["network"]["cost"][0]
+
+
 @pytest.mark.further
 def test_in_two_processes():
     port, name = free_port(), "traverse, banded"

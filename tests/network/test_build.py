@@ -232,6 +232,13 @@ def test_names_are_listed_only_where_they_are_few():
     assert did_you_mean("i10", []) == ""
 
 
+def test_a_distance_keeps_the_row_of_its_file():
+    """For what is found later, such as a distance of a check point."""
+    rows = {"from": ["p"], "to": ["q"], "value": [2.0], "sigma": [0.1]}
+    network = build(distances=Columns(rows, Source("tape.csv", np.array([7]))))
+    assert network.distances.source(0) == "tape.csv, row 7"
+
+
 def test_unknown_images_of_priors_are_named_with_their_row():
     given = make_network(
         [{"id": "cam", "c": 100.0}],

@@ -106,6 +106,16 @@ def test_a_bad_value_is_refused_with_its_place(table, k, change, said):
         assert words in str(error.value)
 
 
+@pytest.mark.parametrize("missing, more", [(1, ""), (2, " (and 1 more)")])
+def test_the_other_images_without_a_start_value_are_counted(missing, more):
+    given = tables()
+    for image in given["images"][:missing]:
+        image["phi"] = None
+    with pytest.raises(InputError) as error:
+        check_network(make_network(**given))
+    assert f"image 'i0': phi has no start value{more}; give start values" in str(error.value)
+
+
 @pytest.mark.parametrize("camera, said", [
     (Camera("cam", "browm", {"c": 1.0}), ["'cam'", "browm", "did you mean 'brown'"]),
     (Camera("cam", "brown", {"c": 0.0}), ["'cam'", "c must be positive"]),
@@ -234,7 +244,12 @@ def test_distances_between_fixed_points_are_left_out():
     given["points"][0]["role"] = given["points"][1]["role"] = "fixed"
     checked = check_network(make_network(**given))
     assert len(checked.distances) == 0
-    assert "1 distance between fixed points: 'p0' to 'p1'" in checked.notes[0]
+    assert checked.notes[0].endswith("1 distance between fixed points: 'p0' to 'p1'")
+    given["points"][2]["role"] = "fixed"
+    given["distances"] *= 2
+    given["distances"][1] = given["distances"][1] | {"to": "p2"}
+    (note,) = check_network(make_network(**given)).notes
+    assert note.endswith("2 distances between fixed points: 'p0' to 'p1' …")
 
 
 def test_cameras_without_images_are_left_out():

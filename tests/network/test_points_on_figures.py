@@ -8,7 +8,7 @@ import jaxbundle
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.network.build import make_further
-from jaxbundle.network.kinds.fit_figures import fit
+from jaxbundle.network.kinds.fit_figures import FEWEST, fit
 
 random = np.random.default_rng(11)
 AXIS = np.array([0.2, -0.3, 0.93]) / np.linalg.norm([0.2, -0.3, 0.93])
@@ -115,6 +115,22 @@ def test_figures_are_found(simulated, result):
     report = result.report()
     for words in ("Plane", "Radius of cylinder", "the sphere", "known shapes", "angles"):
         assert words in report
+
+
+def test_as_many_points_determine_a_figure_as_it_has_unknowns():
+    """Plane 3, line 4, circle 3 + 3, sphere 4, cylinder 4 + 1, by the conditions of a point."""
+    unknowns = {"plane": (3, 1), "line": (4, 2), "circle": (6, 2), "sphere": (4, 1),
+                "cylinder": (5, 1)}  # fmt: skip
+    assert FEWEST == {type: -(-n // of_point) for type, (n, of_point) in unknowns.items()}
+
+
+def test_the_axis_of_a_cylinder_is_found_where_no_principal_axis_is_near():
+    """Points along a helix of one turn, as long as wide."""
+    turn = np.linspace(0, 6, 12)
+    X = np.outer(np.cos(turn), TILT[0]) + np.outer(np.sin(turn), TILT[1]) + np.outer(turn / 3, AXIS)
+    _, M, radius = fit("cylinder", X)
+    assert np.abs(np.linalg.svd(X - X.mean(0))[2] @ AXIS).max() < np.cos(np.radians(10))
+    assert np.abs(M[2] @ AXIS) > np.cos(np.radians(7)) and radius == pytest.approx(1.0, rel=0.05)
 
 
 def test_known_shapes_start_where_their_points_are(simulated):

@@ -222,6 +222,13 @@ def test_neighbours_tell_velocities(flown, result):
     check_jacobians(found.problem, found.values, skip=("control points", "image coordinates"))
 
 
+def test_free_parameters_are_a_list(flown):
+    """Not a word, of which every letter would be one."""
+    xy = flown[0].network.observations.xy
+    with pytest.raises(InputError, match=r"\[rolling_shutter\]: free is 'vX'; a list of names is"):
+        moving(flown[0].network, xy, free="vX")
+
+
 def test_neighbours_need_times(flown, tmp_path):
     made, _ = flown
     with pytest.raises(InputError, match="row 1: t, the time of exposure, is missing"):
@@ -240,6 +247,10 @@ def test_the_line_is_needed(flown):
     camera = dataclasses.replace(network.cameras[0], image_size=None)
     with pytest.raises(InputError, match="camera 'cam': image_size is needed for the exp"):
         jaxbundle.make_problem(network.replace(cameras=(camera,)))
+    for given, said in ("fast", "'fast'"), ({"cam": True}, "True"):
+        network = moving(made.network, made.network.observations.xy, line_time=given)
+        with pytest.raises(InputError, match=f"line_time is {said}; a number is expected"):
+            jaxbundle.make_problem(network)
     with pytest.raises(InputError, match=r"\[rolling_shutter\]: line_time is missing"):
         make_further({"velocities": {"image": ["IMG 1"]}}, 1.0)
 

@@ -1,5 +1,7 @@
 """Leave-one-out prediction of control points, against dense elimination and on simulated blocks."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -88,6 +90,33 @@ def test_sigma_that_nothing_agrees_with_is_multiplied():
     _, found = block(8, 3, sigma=1.0, stated=0.02)
     result = assess(found, ASSUMED)
     assert result.used.sum() >= 7 and result.factor > 20
+
+
+@pytest.mark.parametrize("plane, least", [(np.inf, 1.0), (0.5, 0.05)])
+def test_an_assumed_sigma_tests_nothing(plane, least):
+    """Of five heights σ cannot be estimated without one of them: four, less one for the shift. None
+    is improbable, whatever its error; X and Y, where they have a σ, are tested alone."""
+    _, found = block(5, 2)
+    found.difference[1, 2] += 1e3
+    sigma = np.full((5, 3), [plane, plane, np.nan])
+    result = assess(dataclasses.replace(found, sigma=sigma), ASSUMED)
+    assert result.used.all() and least <= result.probability.min() <= result.probability.max() <= 1
+
+
+def test_a_probability_is_at_most_one():
+    """Also where points fit in the plane and in height better than half of all."""
+    for seed in range(3):
+        _, found = block(9, seed, stated=0.5)
+        found = dataclasses.replace(found, difference=0.3 * found.difference)
+        assert 0.9 < assess(found, ASSUMED).probability.max() <= 1
+
+
+def test_a_sigma_that_is_not_given_is_not_multiplied():
+    """Half of the points contradict the others: only a given σ could be wrong."""
+    _, found = block(8, 3, sigma=0.01)
+    found.difference[:4] += [[30, 0, 0], [0, 50, 10], [-60, 20, 0], [0, -80, -30]]
+    result = assess(found, ASSUMED)
+    assert np.flatnonzero(~result.used).tolist() == [0, 1, 2, 3] and result.factor == 1
 
 
 def test_few_points_have_an_assumed_sigma():

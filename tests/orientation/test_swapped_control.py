@@ -48,6 +48,32 @@ def test_the_corners_of_a_square_have_two_explanations():
     assert not found.together and {(0, 1), (2, 3)} <= set(found.exchanges)
 
 
+def test_five_of_seven_points_agree_in_threes():
+    """Two of seven are wrong: of six points at a time one is always wrong."""
+    source, target = lists(7, wrong=[2])
+    target[5] += [-0.8, 0.3, 0.9]
+    found = contradiction(source, target)
+    assert found.together and found.wrong == [2, 5] and not found.exchanges
+
+
+def test_a_wrong_point_of_four_is_one_explanation():
+    """The other three have two conditions left, and fit."""
+    found = contradiction(*lists(4, wrong=[3]))
+    assert not found.together and 3 in found.wrong
+    # Three always have a similarity that nearly fits two of them: no point of these is left out.
+    three = contradiction(*lists(3, wrong=[1]))
+    assert three is None or not three.wrong
+
+
+@pytest.mark.parametrize("off, wrong", [(3.0, []), (7.0, [4])])
+def test_four_sigma_of_control_are_chance(off, wrong):
+    """One of twenty points is off by so many σ, and by an eighth less after the similarity."""
+    sigma, target = 0.5, POINTS.copy()
+    target[4, 2] += off * sigma
+    found = contradiction(POINTS, target, np.full((20, 3), sigma))
+    assert (found.wrong if found else []) == wrong
+
+
 def test_points_of_another_object_have_no_explanation():
     assert contradiction(POINTS[:8], POINTS[8:16]) is None
 
@@ -85,5 +111,12 @@ def test_the_similarity_of_most_points_is_not_spoilt_by_a_third_of_wrong_ones():
     A, t = similarity_of_most(source, target)
     off = np.linalg.norm(source @ A.T + t - target, axis=1)
     assert np.all(np.delete(off, [1, 4, 8]) < 0.01) and np.all(off[[1, 4, 8]] > 0.5)
+    # A point off by four robust σ takes no part: chance exceeds 2.5 of one coordinate once in 80.
+    noise = 0.001 * np.random.default_rng(2).standard_normal((20, 3))
+    noise[9] = [0.004, -0.004, 0.002]
+    A, t = similarity_of_most(POINTS, POINTS + noise)
+    others = np.arange(20) != 9
+    expected = similarity(POINTS[others], (POINTS + noise)[others])
+    np.testing.assert_allclose(POINTS @ A.T + t, POINTS @ expected[0].T + expected[1], atol=1e-12)
     on_a_line = np.arange(5.0)[:, None] * [1.0, 2.0, 3.0]
     assert similarity_of_most(on_a_line, on_a_line) is None

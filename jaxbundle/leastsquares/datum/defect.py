@@ -188,7 +188,7 @@ def _choose_pins(
     # Coordinates of a large block move by kilometres in a rotation, its angles by radians: without
     # this all pins would be coordinates.
     size = {name: np.sqrt((G[name] ** 2).mean((0, 2), keepdims=True)) for name in plan.kept}
-    least = max(1e-300, MAX_OPEN_EFFECT * max(x.max(initial=0) for x in size.values()))
+    least = max(1e-300, MAX_OPEN_EFFECT * max(x.max() for x in size.values()))
     for name in plan.kept:
         sized = G[name] / np.maximum(size[name], least)
         rows.append(sized.reshape(-1, sized.shape[2]))

@@ -41,8 +41,8 @@ def chi_squared_test(
     if redundancy > 0:
         ends = significance / 2, 1 - significance / 2
         low, high = (chi2_quantile(p, redundancy) for p in ends)
-    if low is not None and high is not None and is_tested(redundancy, origin):
-        passed = low <= vtpv <= high
+        if is_tested(redundancy, origin):
+            passed = low <= vtpv <= high
     return {"vtpv": vtpv, "low": low, "high": high, "passed": passed, "sigma_origin": origin}
 
 

@@ -102,7 +102,7 @@ def pull_back(
 def _require_converged(left: Float[AnyArray, " k"], max_residual: float = 1e-6) -> None:
     """Refuse equations that were not solved: six digits are more than anyone reads of a
     derivative, and a problem that is no clear minimum does not come near them."""
-    worst = float(np.max(np.asarray(left), initial=0.0))
+    worst = float(np.max(np.asarray(left)))
     if not worst < max_residual:
         raise NotSolvedError(
             "derivatives of the solution were not found: its residuals are so large, or so curved, "

@@ -34,7 +34,7 @@ from jaxbundle.leastsquares.quality.distributions import critical_w, normal_quan
 from jaxbundle.leastsquares.quality.names import eliminated_rows
 from jaxbundle.leastsquares.solution import Solution, take_step
 from jaxbundle.leastsquares.whitening import used, without_residual
-from jaxbundle.types import AnyArray
+from jaxbundle.types import AnyArray, present
 
 # Observations are removed together with the worst if their test is at least this fraction of its.
 # Larger: more rounds of adjustments; smaller: good observations are removed for the blunders of
@@ -400,4 +400,4 @@ def without(
             weight[o][np.isin(own, lone)] = 0.0
     data = dataclasses.replace(problem.data, weight=weight)
     problem = with_data(problem, data)
-    return problem if e is None or not lone else hold(problem, e, lone)
+    return hold(problem, present(e), lone) if lone else problem

@@ -178,7 +178,6 @@ def _sigma_of_weakest(
     # whole. The last of the 8 products is that of Rayleigh and Ritz; in the directions after the 7
     # before it, the part of those with σ of less than half is below 1/4⁷.
     directions = np.random.default_rng(0).standard_normal((6, len(per_extent)))
-    directions *= per_extent > 0
     for _ in range(8):
         directions = np.linalg.qr(directions.T)[0].T
         previous = directions

@@ -210,12 +210,12 @@ def among(network: Network) -> list[Further]:
 
 
 def positive_sigma(
-    table: Columns, name: str, *, required: bool = True, words: Mapping[str, float] | None = None
+    table: Columns, name: str, *, required: bool = True
 ) -> Float[np.ndarray, " rows"]:
     """A column of σ; NaN if missing.
 
     **Raises:** `InputError` for one that is not positive, or is missing but required."""
-    sigma = table.numbers(name, required=required, words=words)
+    sigma = table.numbers(name, required=required)
     for row in np.flatnonzero(~(sigma > 0) & ~np.isnan(sigma))[:1]:
         raise InputError(f"{table.source(row)}: {name} is {sigma[row]:g}; it must be positive")
     return sigma

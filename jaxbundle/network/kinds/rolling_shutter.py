@@ -162,10 +162,10 @@ class RollingShutter(Further):
             "read-out of camera",
         )
         priors = list(parameters.priors(read_out, ["line_time"]))
-        weighted = np.flatnonzero((np.isfinite(sigma) & (free > 0)).any(1))
+        sigma = np.where(free > 0, sigma, np.inf)
+        weighted = np.flatnonzero(np.isfinite(sigma).any(1))
         if len(weighted):
-            sigma = np.where(free > 0, sigma, np.inf)[weighted]
-            priors.append(PRIOR((weighted,), velocity[weighted], sigma=sigma))
+            priors.append(PRIOR((weighted,), velocity[weighted], sigma=sigma[weighted]))
         priors += self._from_neighbours(network, free)
         return Contribution((moves, read_out), priors, ((VELOCITIES, _move_velocity),))
 
