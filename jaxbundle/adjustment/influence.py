@@ -3,7 +3,7 @@
 One σ of a measurement l changes the result f by σ·∂f/∂l = −σ·λᵀ·∂g/∂l, H·λ = ∂f/∂y, exactly to
 first order (`leastsquares/quality/sensitivity.py`): one solution for each result, whatever the
 number of measurements. To the order of the residuals these are the rows of N⁻¹JᵀP, and the squares
-of the influences, in the σ of the result, add up to 1: each is the share of a measurement. """
+of the influences, in the σ of the result, add up to 1: each is the share of a measurement."""
 
 import dataclasses
 from typing import Any
