@@ -84,6 +84,16 @@ def test_a_large_pair_is_matched_at_half_its_size_first(levels):
     assert (np.abs(w) < 3).mean() > 0.98
 
 
+def test_beside_a_step_the_nearer_surface_is_found_up_to_its_edge():
+    """By windows that correlate highly in spite of the other surface in them: the surface that ends
+    at column 410 hides nothing there."""
+    pair, true = wavy_pair()
+    start = (np.rint(4 * true) / 4).astype(np.float32)
+    found = refine_disparities(pair.left, pair.right, start)
+    beside = np.s_[160:390, 406:415]
+    assert (np.abs(found.disparity - true)[beside] < 0.2).mean() > 0.95
+
+
 def test_pieces_do_not_matter():
     pair, true = wavy_pair()
     start = np.where(true > 0, np.rint(4 * true) / 4, np.nan).astype(np.float32)

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from surface_scenes import CAMERA, F, hills, photographs, two_shapes
 
+from jaxbundle.surfaces import correlation
 from jaxbundle.surfaces.correlation import find_peaks, slide
 from jaxbundle.surfaces.dense_cloud import combine
 from jaxbundle.surfaces.reconstruct import find_bounds, reconstruct_surface
@@ -115,6 +116,20 @@ def test_correlation_along_a_strip_is_that_of_every_window():
     assert np.isnan([peak[1], best[1], second[1]]).all()
 
 
+def test_a_peak_is_the_vertex_of_the_parabola_through_its_neighbours():
+    """At either end, where a neighbour is missing, the largest value itself."""
+    k = np.arange(6.0)
+    rho = np.stack([0.9 - 0.05 * (k - 2.3) ** 2, 0.9 - 0.05 * (k - 5.2) ** 2, 0.9 - 0.1 * k])
+    np.testing.assert_allclose(find_peaks(rho)[1], [2.3, 5.0, 0.0])
+
+
+def test_correlations_of_several_images_are_the_mean_of_the_better_half():
+    """Of n the best ⌊n/2⌋ + 1: an image in which the point is hidden does not spoil the others."""
+    nan = np.nan
+    rho = np.array([[[0.9, 0.9, nan, 0.7]], [[-0.5, nan, nan, nan]], [[0.8, 0.1, nan, nan]]])
+    np.testing.assert_allclose(correlation.combine(rho), [[0.85, 0.5, nan, 0.7]])
+
+
 def test_hidden_points_are_not_found(pair):
     """Ground that the roof hides from the second photograph."""
     views, truth, found = pair
@@ -171,3 +186,10 @@ def test_pairs_that_disagree_are_left_out_where_no_third_decides():
     assert number.tolist()[0] == 2 and number.tolist()[2:] == [2, 1]
     # one pair: its σ; of two, the half that is the base image's stays
     np.testing.assert_allclose(variance[[0, 3]], [0.75e-4, 1e-4])
+
+
+def test_a_value_without_sigma_is_no_value_of_the_only_pair():
+    """Beside a step a disparity may be known and its σ not."""
+    mean, variance, number = combine(np.array([[1.0, 2.0]]), np.array([[0.1, np.nan]]))
+    assert mean[0] == 1.0 and np.isnan(mean[1]) and number.tolist() == [1, 0]
+    np.testing.assert_allclose(variance[0], 0.01)
