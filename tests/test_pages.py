@@ -12,7 +12,7 @@ from page_reader import Page, column
 
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.batches.page import compose_batch
-from jaxbundle.batches.run import result_rows
+from jaxbundle.batches.run_on_files import result_rows
 from jaxbundle.reconstruction.adjusting import WeightedAdjustment
 from jaxbundle.reconstruction.block import BlockFacts
 from jaxbundle.reconstruction.page import compose_part

@@ -1,10 +1,9 @@
 """The influence of every measurement on a result.
 
 One σ of a measurement l changes the result f by σ·∂f/∂l = −σ·λᵀ·∂g/∂l, H·λ = ∂f/∂y, exactly to
-first order (`leastsquares/quality/response.py`): one solution for each result, whatever the number
-of measurements. To the order of the residuals these are the rows of N⁻¹JᵀP, and the squares of the
-influences, in the σ of the result, add up to 1: each is the share of a measurement.
-"""
+first order (`leastsquares/quality/sensitivity.py`): one solution for each result, whatever the
+number of measurements. To the order of the residuals these are the rows of N⁻¹JᵀP, and the squares
+of the influences, in the σ of the result, add up to 1: each is the share of a measurement. """
 
 import dataclasses
 from typing import Any
@@ -19,7 +18,7 @@ from jaxbundle.adjustment.result_tables import observations
 from jaxbundle.adjustment.sensitivity import inspection_of
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
-from jaxbundle.leastsquares.quality.response import pull_back
+from jaxbundle.leastsquares.quality.sensitivity import pull_back
 from jaxbundle.report.layout import significant, table
 from jaxbundle.results import ResultMethods, data_frame, rows_of
 

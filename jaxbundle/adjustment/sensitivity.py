@@ -2,7 +2,7 @@
 
 An error of one σ in a held quantity (a K3 fixed at 0, a lever arm, the flatness of a board, a fixed
 control point) moves the solution by dx = −H⁻¹·(∂g/∂θ)·σ, exactly to first order
-(`leastsquares/quality/response.py`). Independent errors add in squares, with each other and with
+(`leastsquares/quality/sensitivity.py`). Independent errors add in squares, with each other and with
 the σ of the result, which contains only the measurements:
 
     total² = σ² + Σ effect²
@@ -32,7 +32,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.results.budget_json import budget_dict
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
 from jaxbundle.leastsquares.problem import with_data, with_factor
-from jaxbundle.leastsquares.quality.response import follow
+from jaxbundle.leastsquares.quality.sensitivity import follow
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.report.budget import HEADER
 from jaxbundle.report.layout import significant, table

@@ -8,6 +8,6 @@ _HOME = {
         "Population",
         "PopulationSettings",
     ),
-    "jaxbundle.batches.run": ("result_rows",),
+    "jaxbundle.batches.run_on_files": ("result_rows",),
 }
 __getattr__, __dir__, __all__ = import_on_use(globals(), _HOME)

@@ -15,12 +15,9 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Int
 
 from jaxbundle.arguments import integer, one_of
 from jaxbundle.batches.camera import (
@@ -31,53 +28,26 @@ from jaxbundle.batches.camera import (
     SINGULAR,
     STATUS,
     WEAK,
-    CameraSolution,
-    solve_camera,
 )
+from jaxbundle.batches.compiled import ProgramKey, Rows, in_double, solve_portion, tests_of_points
 from jaxbundle.batches.input import Batch, Portion
 from jaxbundle.batches.misfit import far_outside, misfits, remarks
-from jaxbundle.batches.normal import POSE, CameraUnknowns, Sightings, residual_lengths
+from jaxbundle.batches.normal import CameraUnknowns
 from jaxbundle.batches.result import BatchCalibration as BatchCalibration
 from jaxbundle.batches.snooping import MAX_ROUNDS, TESTS, Snooping
-from jaxbundle.batches.start import start_values
-from jaxbundle.batches.test_values import point_tests
 from jaxbundle.batches.weakness import is_vague, vanishing, weak_geometry
 from jaxbundle.cameras import CameraModel, get_model, key_of
 from jaxbundle.float64 import require_x64
-from jaxbundle.geometry import (
-    matrix_from_quaternion,
-    matrix_from_rotation_vector,
-    omega_phi_kappa_from_matrix,
-)
 from jaxbundle.leastsquares.quality.snooping import check_test
 from jaxbundle.system.cores import available_cores
 from jaxbundle.system.devices import on_accelerator
-from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray, Progress
+from jaxbundle.types import Progress
 
 # Poses in the form of the solver, only for data snooping.
 OF_A_START = ("quaternion", "shift")
 OF_A_VIEW = ("position", "angles", "sigma_position", "sigma_angles", "rotation")
-# Fields of a `BatchCalibration`, and what it is made of, by name.
-Rows = dict[str, Shaped[np.ndarray, "cameras *axes"]]
-
 # Statuses of cameras with residuals that data snooping can test.
 TESTED = (CONVERGED, LIMIT, SINGULAR)
-
-
-class ProgramKey(NamedTuple):
-    """What is compiled into the programs of a call: the camera model, the columns of its free
-    parameters, whether the start values have focal lengths, and whether the cameras of a portion
-    come one after the other or all at once."""
-
-    model: CameraModel
-    free: tuple[int, ...]
-    known: bool
-    on_cpu: bool
-
-    def for_every(self, function: Callable[[Any], Any]) -> Callable[[Any], Any]:
-        """The function of one camera for all of a portion (see the module)."""
-        return partial(jax.lax.map, function) if self.on_cpu else jax.vmap(function)
 
 
 def calibrate_batch(  # noqa: PLR0913 keyword arguments of a public function
@@ -139,7 +109,7 @@ def calibrate_batch(  # noqa: PLR0913 keyword arguments of a public function
     key = ProgramKey(camera_model, batch.free, batch.known, on_cpu)
 
     def run(portion: Portion) -> Rows:
-        solve = partial(_solve_portion, key, max_iterations, batch.size)
+        solve = partial(solve_portion, key, max_iterations, batch.size)
         rows = solve(portion)
         return (
             rows if snooping is None else _snoop(key, solve, portion, rows, snooping, significance)
@@ -247,7 +217,7 @@ def _snoop(
     for _ in range(MAX_ROUNDS):
         used = np.stack([camera.used for camera in cameras]).astype(float)
         at = CameraUnknowns(rows["interior"], rows["quaternion"], rows["shift"])
-        tests = np.asarray(_tests_program(key, _in_double(portion.seen), used, at, rows["views"]))
+        tests = np.asarray(tests_of_points(key, in_double(portion.seen), used, at, rows["views"]))
         tested = np.isin(rows["status"], TESTED) & np.isfinite(rows["sigma0"])
         failed += rows["status"] != CONVERGED
         # A camera without a solution goes on for 60 rounds, in each of which it loses at most a
@@ -279,107 +249,3 @@ def _snoop(
         cameras[i].used = cameras[i].seen
     rows["removed"] = np.stack([camera.seen & ~camera.used for camera in cameras])
     return rows
-
-
-@partial(compile_once, static=0)
-def _tests_program(
-    key: ProgramKey,
-    seen: Sightings,
-    used: Float[AnyArray, "cameras views points"],
-    at: CameraUnknowns,
-    views: Bool[AnyArray, "cameras views"],
-) -> Float[Array, "cameras views points"]:
-    def test(
-        arguments: tuple[Sightings, Array, CameraUnknowns, Array],
-    ) -> Float[AnyArray, "views points"]:
-        seen, used, at, views = arguments
-        seen = Sightings(seen.point, seen.xy, seen.weight * views[:, None])
-        return point_tests(key.model, key.free, seen, seen.weight * used, at)
-
-    return key.for_every(test)((seen, used, at, views))
-
-
-def _solve_portion(key: ProgramKey, max_steps: int, size: float, portion: Portion) -> Rows:
-    """The rows of a `BatchCalibration`, with the status as its number."""
-    data = _in_double(portion.seen), portion.interior, portion.axes, portion.middle
-    result = _portion_program(key, portion.flat, max_steps, size, *data)
-    return jax.tree.map(np.array, result)
-
-
-def _in_double(seen: Sightings) -> Sightings:
-    """On the device, in double precision: one program for measurements in either."""
-    return jax.tree.map(lambda x: jnp.asarray(x).astype(float), seen)
-
-
-@partial(compile_once, static=(0, 1))
-def _portion_program(
-    key: ProgramKey,
-    flat: bool,
-    max_steps: int,
-    size: float,
-    seen: Sightings,
-    interior: Float[AnyArray, "cameras parameters"],
-    axes: Float[AnyArray, "cameras 3 3"],
-    middle: Float[AnyArray, "cameras 3"],
-) -> dict[str, Array]:
-    model, free = key.model, key.free
-
-    def calibrate(arguments: tuple[Sightings, Array]) -> tuple[CameraSolution, Float[Array, ""]]:
-        seen, interior = arguments
-        usable, start = start_values(model, flat, key.known, seen, interior, size)
-        solved = solve_camera(model, free, max_steps, size, usable, start)
-        return solved, jnp.sum(residual_lengths(model, usable, solved.at))
-
-    solved, lengths = key.for_every(calibrate)((seen, interior))
-    # A posteriori, since nobody stated a σ: Σ = σ0²·Q. The number of points follows from the
-    # redundancy, 2·points − k − 6·views.
-    variance = 2 * solved.cost / solved.redundancy
-    covariance = variance[:, None, None] * solved.interior_cofactors
-    points = 0.5 * (solved.redundancy + len(free) + POSE * solved.views.sum(1))
-    rotation, position, angles, pose_sigma = jax.vmap(
-        jax.vmap(_exterior_orientation, (0, 0, 0, None, None))
-    )(solved.at.rotation, solved.at.shift, solved.pose_cofactors, axes, middle)
-    pose_sigma = jnp.sqrt(variance)[:, None, None] * pose_sigma
-    return dict(
-        status=solved.status,
-        values=solved.at.interior[:, jnp.array(free)],
-        sigma=jnp.sqrt(jnp.diagonal(covariance, axis1=1, axis2=2)),
-        covariance=covariance,
-        reduced=solved.reduced,
-        interior=solved.at.interior,
-        sigma0=jnp.sqrt(variance),
-        rms=jnp.sqrt(2 * solved.cost / points),
-        mean_length=lengths / points,
-        quaternion=solved.at.rotation,
-        shift=solved.at.shift,
-        redundancy=solved.redundancy,
-        iterations=solved.steps,
-        views=solved.views,
-        position=position,
-        angles=angles,
-        sigma_position=pose_sigma[..., :3],
-        sigma_angles=pose_sigma[..., 3:],
-        rotation=rotation,
-    )
-
-
-def _exterior_orientation(
-    quaternion: Float[Array, "4"],
-    shift: Float[Array, "3"],
-    Q: Float[Array, "6 6"],
-    axes: Float[AnyArray, "3 3"],
-    middle: Float[AnyArray, "3"],
-) -> tuple[Array, Array, Array, Array]:
-    """M, X0, (ω, φ, κ) and their σ for σ₀ = 1 of one view, from the cofactors Q of (δt, δθ).
-
-    ray = M'·A·(X − X̄) + t, so that M = M'·A and X0 = X̄ − Mᵀ·t; A: the object's principal axes.
-    """
-
-    def pose(change: Float[Array, "6"]) -> tuple[Array, Array]:
-        M = matrix_from_rotation_vector(change[3:]) @ matrix_from_quaternion(quaternion) @ axes
-        X0 = middle - M.T @ (shift + change[:3])
-        return jnp.concatenate([X0, omega_phi_kappa_from_matrix(M)]), M
-
-    J, _ = jax.jacfwd(pose, has_aux=True)(jnp.zeros(6))
-    orientation, M = pose(jnp.zeros(6))
-    return M, orientation[:3], orientation[3:], jnp.sqrt(jnp.diagonal(J @ Q @ J.T))

@@ -24,7 +24,7 @@ import jax
 import numpy as np
 from jax.experimental.multihost_utils import broadcast_one_to_all
 
-from jaxbundle.batches.run import run_batch
+from jaxbundle.batches.run_on_files import run_batch
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.results.json_lines import JsonLines
 from jaxbundle.io.writing.locks import hold_lock

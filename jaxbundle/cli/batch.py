@@ -125,7 +125,7 @@ def batch(  # noqa: PLR0913 - the options of the command
     from jaxbundle.batches.photographs import is_photograph_folder
     from jaxbundle.batches.population import read_against
     from jaxbundle.batches.processes import add_parts, run_joined
-    from jaxbundle.batches.run import run_batch
+    from jaxbundle.batches.run_on_files import run_batch
     from jaxbundle.batches.stacks import is_camera_stack
     from jaxbundle.cli.batch_outputs import check_outputs, write_outputs
     from jaxbundle.cli.board_options import board_given
@@ -259,7 +259,7 @@ def _made_of_lines(outputs: Mapping[str, object], json_lines: str) -> list[str]:
 
 def _print_reasons(inputs: Sequence[str], json_lines: str, max_reasons: int = 5) -> None:
     """The first errors of a file of results, if it is one that can be read again."""
-    from jaxbundle.batches.run import result_rows
+    from jaxbundle.batches.run_on_files import result_rows
 
     if not os.path.isfile(json_lines):
         return
@@ -272,7 +272,7 @@ def _print_reasons(inputs: Sequence[str], json_lines: str, max_reasons: int = 5)
 def _name_unsearched(inputs: Sequence[str], json_lines: str, most: int = 5) -> None:
     """Warn of photographs that results lack by a fault of the machine, with the reason."""
     from jaxbundle.batches.photographs import NOT_SEARCHED
-    from jaxbundle.batches.run import result_rows
+    from jaxbundle.batches.run_on_files import result_rows
 
     rows = result_rows(inputs, json_lines) if os.path.isfile(json_lines) else ()
     lost = [

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxbundle.batches.camera import SOLVED
 from jaxbundle.batches.population import Population
-from jaxbundle.batches.run import result_rows, run_batch
+from jaxbundle.batches.run_on_files import result_rows, run_batch
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.measure.boards import Board

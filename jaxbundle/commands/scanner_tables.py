@@ -49,6 +49,7 @@ from jaxbundle.types import Column
 GAP_REASON = "found beyond a place without height"
 # Lines that see one point: several do where they overlap, as of a platform that sways.
 MAX_IMAGES = 4
+NO_RAY = "no ray meets the surface: check attitude, mounting and height"
 # The RMS of n draws is uncertain by up to 1/√n, here 22 %.
 MIN_DRAWS = 20
 
@@ -319,7 +320,7 @@ def accuracy(  # noqa: PLR0913 (public: the options of the command, all but one 
             "error": rms(by_cell(length)),
         }
         if not np.isfinite(length).any():
-            raise InputError("no ray meets the surface: check attitude, mounting and height")
+            raise InputError(NO_RAY)
         figures = {
             "rms": float(np.sqrt(np.nanmean(length**2))),
             "ce90": float(np.nanquantile(length, 0.9)),
@@ -341,6 +342,8 @@ def accuracy(  # noqa: PLR0913 (public: the options of the command, all but one 
         found = propagate_accuracy(file.image, surface, line, pixel, noise)
         columns |= {"rms": rms(by_cell(found.rms)), "ce90": mean(by_cell(found.ce90))}
         figures = {"rms": found.overall, "ce90": found.overall_ce90}
+        if np.isnan(found.overall):
+            raise InputError(NO_RAY)
         if draws:
             drawn = simulate_accuracy(file.image, surface, line, pixel, noise, draws, seed)
             columns |= {

@@ -64,8 +64,8 @@ def spread_positions(
 class GroundAccuracy(eqx.Module):
     """Errors east and north (X and Y in a local frame) at image positions, metres.
 
-    `covariance` [n, 2, 2]; `rms` [n] of the length; `ce90` [n]; `overall_ce90` of the errors at
-    all positions together.
+    `covariance` [n, 2, 2]; `rms` [n] of the length; `ce90` [n], all NaN where a ray misses the
+    surface; `overall_ce90` of the errors at all other positions together, NaN if there are none.
     """
 
     covariance: Float[np.ndarray, "n 2 2"]
@@ -75,8 +75,9 @@ class GroundAccuracy(eqx.Module):
 
     @property
     def overall(self) -> float:
-        """The RMS over all positions."""
-        return float(np.sqrt(np.mean(self.rms**2)))
+        """The RMS over all positions whose rays meet the surface; NaN if there are none."""
+        known = self.rms[np.isfinite(self.rms)]
+        return float(np.sqrt(np.mean(known**2))) if len(known) else np.nan
 
 
 def propagate_accuracy(
@@ -92,10 +93,14 @@ def propagate_accuracy(
         for name, values in sigmas(image, noise)._asdict().items()
         if np.any(getattr(noise, name))
     }
+    # without errors: one kind of σ 0, so that accuracies are 0 where rays meet the surface
+    sigma = sigma or {"position_bias": np.zeros(3)}
     covariance = np.asarray(_covariances(image, surface, lines, pixels, sigma))
     rms = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
     ce90 = np.array([circular_error(c) for c in covariance])
-    return GroundAccuracy(covariance, rms, ce90, circular_error(covariance))
+    known = np.isfinite(rms)
+    overall_ce90 = circular_error(covariance[known]) if known.any() else np.nan
+    return GroundAccuracy(covariance, rms, ce90, overall_ce90)
 
 
 def simulate_accuracy(
@@ -112,11 +117,13 @@ def simulate_accuracy(
     errors = np.asarray(_draws(image, surface, lines, pixels, sigmas(image, noise), keys))
     covariance = np.einsum("dni,dnj->nij", errors, errors) / draws
     length = np.linalg.norm(errors, axis=2)
+    rms = np.sqrt(np.mean(length**2, 0))
+    known = np.isfinite(rms)
     return GroundAccuracy(
         covariance,
-        np.sqrt(np.mean(length**2, 0)),
+        rms,
         np.quantile(length, 0.9, axis=0),
-        float(np.quantile(length, 0.9)),
+        float(np.quantile(length[:, known], 0.9)) if known.any() else np.nan,
     )
 
 
@@ -190,7 +197,9 @@ def _covariances(
         )
         J = jax.jacrev(move)(zero)
         parts = [(J[name] * sigma[name]).reshape(2, -1) for name in sigma]
-        return sum((part @ part.T for part in parts), jnp.zeros((2, 2)))
+        covariance = sum((part @ part.T for part in parts), jnp.zeros((2, 2)))
+        # a ray that misses has no point; the derivative of "not a number" may still be 0
+        return jnp.where(jnp.isnan(jnp.stack([*X0])).any(), jnp.nan, covariance)
 
     places = jnp.asarray(lines), jnp.asarray(pixels)
     # each position of a batch needs its own copy of the tables and of their derivatives

@@ -71,7 +71,7 @@ _MEANING = {
 class Projected(eqx.Module):
     """Lines and pixels that see the points, in order of time; NaN for unused places.
 
-    `count`: their number, with passages beyond the places, which were not refined and may be
+    `count`: their number, with passages after the last place, which were not refined and may be
     outside the image. `status`: the `ProjectionStatus` of the point.
     """
 
@@ -257,27 +257,45 @@ def _search(
     image: ScannerGeometry, search: Search, X: Vector, most: int, margin: float | Array
 ) -> Projected:
     """The positions of arbitrary points."""
-    starts, count, ahead, behind, hidden = find_passages(image, search, X, most, margin)
-    there = count > jnp.arange(most)[:, None]
 
-    def refine_passage(args: tuple[Array, Array]) -> tuple[Array, Array, Array]:
+    def refine_passage(
+        found: tuple[Array, ...], args: tuple[Array, Array]
+    ) -> tuple[tuple[Array, ...], None]:
+        line, pixel, number, lost = found
         start, there = args
         middle = jnp.zeros_like(start) + (image.pixels - 1) / 2
-        return jax.lax.cond(
+        t, u, settled = jax.lax.cond(
             jnp.any(there),
             lambda: refine(image, search, X, start, middle),
             lambda: (start, start, start != start),
         )
+        seen = there & settled & _inside(image, t, u, margin)
+        here = seen & (number == jnp.arange(most)[:, None])
+        line = jnp.where(here, image.times.line(t), line)
+        return (line, jnp.where(here, u, pixel), number + seen, lost | (there & ~settled)), None
 
-    # a loop: all passages share one compiled Newton's method
-    t, u, settled = jax.lax.map(refine_passage, (starts, there))
-    seen = there & settled & _inside(image, t, u, margin)
-    lost = jnp.any(there & ~settled, axis=0)
-    # places inside the image first, in order of time
-    order = jnp.argsort(~seen, axis=0, stable=True)
-    sorted_ = lambda v: jnp.take_along_axis(jnp.where(seen, v, jnp.nan), order, 0)
-    # passages beyond the first `most` were not refined: they may be outside the image
-    number = seen.sum(0) + jnp.maximum(count - most, 0)
+    def search_on(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        *found, tried, _, _, _, _ = state
+        starts, count, *where = find_passages(image, search, X, most, margin, tried)
+        wanted = found[2] < most
+        there = (count > tried + jnp.arange(most)[:, None]) & wanted
+        # a loop: all passages share one compiled Newton's method
+        found, _ = jax.lax.scan(refine_passage, tuple(found), (starts, there))
+        return *found, jnp.where(wanted, tried + most, tried), count, *where
+
+    def is_open(state: tuple[Array, ...]) -> Bool[Array, ""]:
+        _, _, number, _, tried, count, *_ = state
+        return jnp.any((number < most) & (tried < count))
+
+    # The first passages may be beside the line of detectors, and later ones in the image: the
+    # search goes on after them until the places are full or no passage is left.
+    none = jnp.zeros(jnp.shape(X[0]), int)
+    unknown, never = jnp.full((most, none.size), jnp.nan), none > 0
+    state = unknown, unknown, none, never, none, none + 1, never, never, never
+    state = jax.lax.while_loop(is_open, search_on, state)
+    line, pixel, number, lost, tried, count, ahead, behind, hidden = state
+    # passages after the last place were not refined: they may be outside the image
+    number = number + jnp.maximum(count - tried, 0)
     # in the order of what explains most: hidden before lost, lost before beside
     status = jnp.select(
         [number > 0, hidden, lost, count > 0, ahead, behind],
@@ -294,7 +312,7 @@ def _search(
         ],
         int(ProjectionStatus.HIDDEN),
     )
-    return Projected(sorted_(image.times.line(t)), sorted_(u), number, status)
+    return Projected(line, pixel, number, status)
 
 
 def _inside(

@@ -10,7 +10,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxbundle.geometry.ellipsoid import normal
 from jaxbundle.geometry.vectors import Vector, difference, dot
@@ -21,20 +21,26 @@ from jaxbundle.pushbroom.prepared import ScannerGeometry, Search
 # start times [most, n]; their number, and whether the point is ahead of the last line, behind the
 # first, never above the horizon [n]
 Passages = tuple[Array, Array, Array, Array, Array]
-# F, its rate and the time of the previous step; the number of passages and their start times; F of
-# the first step; whether the camera has been above the horizon
+# F, its rate and the time of the previous step; the number of passages, less those passed over, and
+# their start times; F of the first step; whether the camera has been above the horizon
 PassagesState = tuple[Array, Array, Array, Array, tuple[Array, ...], Array, Array]
 # number and time of a step, twelve numbers and their rates there, (P, V)
 SearchStep = tuple[Array, Array, Array, Array, tuple[Vector, Vector]]
 
 
 def find_passages(
-    image: ScannerGeometry, search: Search, X: Vector, most: int, margin: float | Array
+    image: ScannerGeometry,
+    search: Search,
+    X: Vector,
+    most: int,
+    margin: float | Array,
+    passed_over: Int[Array, " n"],
 ) -> Passages:
     """Approximate times of passages over the points, and their number; whether points are
     ahead of the last line, behind the first, or never above the horizon.
 
-    The search begins and ends one line outside the image, to include its edges.
+    The times are those of the first `most` passages after `passed_over` ones; the number is that
+    of all. The search begins and ends one line outside the image, to include its edges.
     """
     step = (1 + margin) * image.line_period
     samples = jnp.asarray(search.samples).at[0].add(-step).at[-1].add(step)
@@ -70,7 +76,7 @@ def find_passages(
         nowhere,
         zero,
         samples[0],
-        zero.astype(int),
+        -passed_over,
         (zero,) * most,
         nowhere,
         never if up is not None else ~never,
@@ -78,11 +84,11 @@ def find_passages(
     # Four steps of plain sights a turn hide the cost of the loop; steps with corrections are long
     # enough, and four of them only take longer to compile.
     unroll = 1 if image.corrections.any else 4
-    (final, _, _, count, starts, first, risen), _ = jax.lax.scan(
+    (final, _, _, further, starts, first, risen), _ = jax.lax.scan(
         step_to, state, (jnp.arange(len(samples)), samples, numbers, rates, motions), unroll=unroll
     )
     # NaN at an end, where the point is behind the camera, is neither ahead nor behind
-    return jnp.stack(starts), count, final > 0, first < 0, ~risen
+    return jnp.stack(starts), further + passed_over, final > 0, first < 0, ~risen
 
 
 def _find_zeros(

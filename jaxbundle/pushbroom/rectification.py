@@ -103,7 +103,7 @@ def block_places(
     seen = np.isfinite(starts[0])
     if not seen.any():
         return None
-    starts = _fill(starts.reshape(2, *nodes.X.shape[1:]))
+    starts = _fill_unseen_nodes(starts.reshape(2, *nodes.X.shape[1:]))
     scanner = scanner_of(image)
     line, pixel, ground = map(np.asarray, _places(scanner, search, surface, nodes, starts))
     lost = np.isnan(line)
@@ -112,7 +112,8 @@ def block_places(
         line, pixel = line.copy(), pixel.copy()
         line[lost], pixel[lost] = _search(image, search, ground[:, lost], starts[0].size)
     if occlusion and isinstance(surface, Terrain):
-        hidden = np.asarray(_are_occluded(scanner, search, surface, line, pixel, ground))
+        positions = line, pixel, ground, _half_pixel(nodes)
+        hidden = np.asarray(_are_occluded(scanner, search, surface, *positions))
         line = np.where(hidden, np.nan, line)
     return _keep_inside(image, line, pixel)
 
@@ -135,7 +136,7 @@ def _rpc_places(
     ground = _ground(surface, nodes)
     line, pixel = project_to_rpc(rpc, surface, ground)
     if occlusion:
-        hidden = are_occluded_in_rpc(rpc, surface, line, pixel, ground)
+        hidden = are_occluded_in_rpc(rpc, surface, line, pixel, ground, _half_pixel(nodes))
         line = jnp.where(hidden, jnp.nan, line)
     return line, pixel
 
@@ -199,24 +200,30 @@ def _are_occluded(
     line: Float[AnyArray, "rows columns"],
     pixel: Float[AnyArray, "rows columns"],
     ground: Float[AnyArray, "3 rows columns"],
+    half_pixel: Scalar,
 ) -> Bool[Array, "rows columns"]:
     """Whether the rays of image positions end before their points [3, rows, columns].
 
-    A ray without heights on its way to the point hides nothing. Half a pixel of the map is what
-    the interpolation between nodes and of the terrain may differ by without a shadow.
+    A ray without heights on its way to the point hides nothing. Half a pixel of the map, metres, is
+    what the interpolation between nodes and of the terrain may differ by without a shadow.
     """
-    half = length(ground[:, 0, 1] - ground[:, 0, 0]) / 2
 
     def is_occluded(line: Scalar, pixel: Scalar, X: Float[Array, "3"]) -> bool | Bool[AnyArray, ""]:
         _, _, (P, _) = sample(search.pieces, image.times.time(line))
         gap = difference(X, _locate(image, search, surface, line, pixel))
-        return (dot(gap, difference(X, P)) > 0) & (length(gap) > half)
+        return (dot(gap, difference(X, P)) > 0) & (length(gap) > half_pixel)
 
     row_is_occluded = lambda row: jax.vmap(is_occluded)(*row)
     return jax.lax.map(row_is_occluded, (line, pixel, jnp.moveaxis(ground, 0, -1)))
 
 
-def _fill(starts: Float[np.ndarray, "2 n n"]) -> Float[np.ndarray, "2 n n"]:
+def _half_pixel(nodes: MapNodes) -> Scalar:
+    """Half the distance of neighbouring pixels, metres: on the ellipsoid, where it does not depend
+    on the heights of the terrain and its gaps."""
+    return length(nodes.X[:, 0, 1] - nodes.X[:, 0, 0]) / NODE_STEP / 2
+
+
+def _fill_unseen_nodes(starts: Float[np.ndarray, "2 n n"]) -> Float[np.ndarray, "2 n n"]:
     """Positions of unseen nodes, from a plane through the others: sufficient as start values.
 
     Were they left out, pixels beside the outermost seen node would have no start at all.

@@ -11,7 +11,7 @@ halved until the sum decreases and no denominator vanishes at a point.
 The unknowns are nearly dependent, so τ keeps them small (Tikhonov), except the constant and the
 three linear terms of the numerator, for which D is a thousand times smaller. τ is the largest that
 predicts each point from all others about as well as the best τ (PRESS, Allen, 1974;
-`RpcFitSettings`):
+`RpcFitSettings`), or the next larger one with which the steps converge:
 
     PRESS(τ) = mean (vᵢ/(1 − hᵢ))²,        h = diag J·(N + τ²D²)⁻¹·Jᵀ,    N = Jᵀ·J.
 
@@ -71,8 +71,8 @@ class RpcFitSettings:
     - `start_ridge`: of the linear start, in units of the largest singular value. Not critical.
     - `ridge_steps`: Gauss–Newton steps in which the ridge is chosen anew; then it stays, so that
       the sum that is minimised stays the same. Two or six change nothing in these cases.
-    - `max_steps`: of all. An image whose oscillations polynomials cannot follow needs up to 60;
-      that it does not converge tells so.
+    - `max_steps`: of all with one ridge. An image whose oscillations polynomials cannot follow
+      needs up to 60, or a larger ridge.
     - `max_halvings`: of a step; 30 leave a billionth of it. Not critical.
     - `relative_change`, `absolute_change`: converged if the last full step moves no point by more
       than this fraction of the RMS residual plus so many pixels. Not critical.
@@ -144,12 +144,14 @@ def fit_rpc(
     **Arguments:** `ridge` τ in units of the normalised equations, automatic if None; `sigma` of the
     table's lines and samples in pixels, a posteriori if None; `source` names rows in messages.
 
-    **Raises:** `InputError` for fewer than 40 points, invalid numbers, points at one height.
+    **Raises:** `InputError` for fewer than 40 points, invalid numbers, points at one height, or
+    of one longitude, latitude, line or sample.
     """
     require_x64()
     table = RpcTable(*(np.asarray(column, float) for column in table))
     _check_table(table, source)
     offsets = _offsets(table)
+    _check_ranges(offsets, source)
     places = _normalise(table, offsets)
     T = np.stack(np.broadcast_arrays(*monomials(*places[:3])), 1)
     (line, *of_line), (sample, *of_sample) = (
@@ -242,11 +244,17 @@ def _check_table(table: RpcTable, source: Source) -> None:
             f"{source.name}: {n} points for {UNKNOWNS} coefficients of each axis; give at least "
             f"{MIN_POINTS}, over the whole image and several heights"
         )
-    for name in ("height", "line", "sample"):
-        if np.ptp(getattr(table, name)) == 0:
+
+
+def _check_ranges(offsets: dict[str, float], source: Source) -> None:
+    for name in RpcTable._fields:
+        middle, half_range = offsets[f"{name}_offset"], offsets[f"{name}_scale"]
+        # of equal numbers no more than rounding is left, as of longitudes by whole turns
+        if half_range <= 1e-12 * max(abs(middle), 1.0):
+            degrees = "°" if name in ("longitude", "latitude") else ""
             raise InputError(
-                f"{source.name}: every {name} is {getattr(table, name)[0]:g}; give points at "
-                f"several {name}s"
+                f"{source.name}: every {name} is {middle + 0.0:g}{degrees}; give points at several "
+                f"{name}s"
             )
 
 
@@ -296,9 +304,37 @@ def _fit_axis(
     D = np.r_[np.full(4, settings.linear_damping), np.ones(UNKNOWNS - 4)]
     U, s, Vt = np.linalg.svd(np.hstack([T, -y[:, None] * T[:, 1:]]) / D, full_matrices=False)
     # strongly damped: the linear equations weigh points by their denominators and may be far off
-    tau = max(s[0] * settings.start_ridge, ridge or 0.0)
-    c, settled = _solve_with_ridge(U, s, Vt, D, y, tau), False
-    tau = tau if ridge is None else ridge
+    start_tau = max(s[0] * settings.start_ridge, ridge or 0.0)
+    start = _solve_with_ridge(U, s, Vt, D, y, start_tau)
+    c, tau, settled = found = _iterate(start, T, y, D, scale, ridge, settings)
+    while ridge is None and not settled and tau < s[0] * CANDIDATE_RIDGES[0]:
+        # chosen by its linear prediction, it may be too small for the iteration to come to an end
+        tau *= CANDIDATE_RIDGES[0] / CANDIDATE_RIDGES[1]
+        c, _, settled = _iterate(start, T, y, D, scale, tau, settings)
+    if not settled:
+        c, tau, settled = found
+    v, J = map(np.asarray, _value_and_jacobian(c, T, y))
+    U, s, Vt = np.linalg.svd(J / D, full_matrices=False)
+    # n − Σh, the effective number of unknowns of a ridge regression
+    redundancy = len(y) - float(np.sum(s**2 / (s**2 + tau**2)))
+    if sigma is None:
+        sigma = scale * float(np.sqrt(np.sum(v**2) / redundancy))
+    # (N + τ²D²)⁻¹·Jᵀ = D⁻¹·V·diag(s/(s² + τ²))·Uᵀ, and UᵀU = I
+    half = Vt.T * (s / (s**2 + tau**2)) / D[:, None]
+    return c, (sigma / scale) ** 2 * half @ half.T, sigma, redundancy, tau, settled
+
+
+def _iterate(
+    c: Float[np.ndarray, "39"],
+    T: Float[np.ndarray, "n 20"],
+    y: Float[np.ndarray, " n"],
+    D: Float[np.ndarray, "39"],
+    scale: float,
+    ridge: float | None,
+    settings: RpcFitSettings,
+) -> tuple[Float[np.ndarray, "39"], float, bool]:
+    """Gauss-Newton steps from c: c, τ, and whether it has settled."""
+    settled, tau = False, ridge or 0.0
     for k in range(settings.max_steps):
         v, J = map(np.asarray, _value_and_jacobian(c, T, y))
         U, s, Vt = np.linalg.svd(J / D, full_matrices=False)
@@ -309,18 +345,10 @@ def _fit_axis(
         step = _solve_with_ridge(U, s, Vt, D, target, tau) - c
         c = c + _shorten(c, step, T, y, tau * D, settings.max_halvings)
         limit = settings.relative_change * np.sqrt(np.mean(v**2)) + settings.absolute_change / scale
-        settled = np.abs(J @ step).max() < limit
+        settled = bool(np.abs(J @ step).max() < limit)
         if settled and k >= settings.ridge_steps:
             break
-    v, J = map(np.asarray, _value_and_jacobian(c, T, y))
-    U, s, Vt = np.linalg.svd(J / D, full_matrices=False)
-    # n − Σh, the effective number of unknowns of a ridge regression
-    redundancy = len(y) - float(np.sum(s**2 / (s**2 + tau**2)))
-    if sigma is None:
-        sigma = scale * float(np.sqrt(np.sum(v**2) / redundancy))
-    # (N + τ²D²)⁻¹·Jᵀ = D⁻¹·V·diag(s/(s² + τ²))·Uᵀ, and UᵀU = I
-    half = Vt.T * (s / (s**2 + tau**2)) / D[:, None]
-    return c, (sigma / scale) ** 2 * half @ half.T, sigma, redundancy, tau, settled
+    return c, tau, settled
 
 
 def _shorten(

@@ -98,16 +98,16 @@ def are_occluded_in_rpc(
     line: Float[AnyArray, "rows columns"],
     pixel: Float[AnyArray, "rows columns"],
     ground: Float[AnyArray, "3 rows columns"],
+    half_pixel: Scalar,
 ) -> Bool[Array, "rows columns"]:
-    """Whether the rays of image positions end before their points, by more than half the distance
-    of neighbouring points (see `rectification`)."""
-    half = length(ground[:, 0, 1] - ground[:, 0, 0]) / 2
+    """Whether the rays of image positions end before their points, by more than half a pixel of the
+    map, metres (see `rectification`)."""
     inverse, at = fit_inverse(rpc), _point_at(rpc, surface)
 
     def is_occluded(line: Scalar, pixel: Scalar, X: Float[Array, "3"]) -> Array:
         _, downwards = sight(rpc, line, pixel, surface.earth or WGS84, inverse)
         gap = difference(X, at(line, pixel)[0])
-        return jnp.asarray((dot(gap, downwards) > 0) & (length(gap) > half))
+        return jnp.asarray((dot(gap, downwards) > 0) & (length(gap) > half_pixel))
 
     of_row = lambda row: jax.vmap(is_occluded)(*row)
     return jax.lax.map(of_row, (line, pixel, jnp.moveaxis(ground, 0, -1)))

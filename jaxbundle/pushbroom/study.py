@@ -110,8 +110,12 @@ def accuracy_table(
             image = measured_image(dataclasses.replace(varied, attitude_interpolation=method))
             errors = ground_errors(image, truth, surface, all_lines, all_pixels)
             length = np.linalg.norm(errors, axis=1)
-            rms, ce90 = np.sqrt(np.mean(length**2)), np.quantile(length, 0.9)
-            error_free.append(ErrorFree(name, method, float(rms), float(ce90)))
+            # where a ray meets the surface, as of `GroundAccuracy`
+            known = length[np.isfinite(length)]
+            rms, ce90 = np.nan, np.nan
+            if len(known):
+                rms, ce90 = float(np.sqrt(np.mean(known**2))), float(np.quantile(known, 0.9))
+            error_free.append(ErrorFree(name, method, rms, ce90))
         image = measured_image(varied)
         for sigma in sigmas:
             noise = Noise(**{f"attitude_{kind}": sigma})

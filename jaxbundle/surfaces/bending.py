@@ -161,15 +161,15 @@ def sharpen(
         shift = uv[k] - node_uv[k]
         slope = bend_at(rough, uv[k], settings).derivatives[:, :2]
         here = here + np.sum(slope * shift, 1)
-        shape = windows(base, other, base.points(uv[k], here), normal)
+        window = windows(base, other, base.points(uv[k], here), normal)
         # pixels of this image per pixel of the guide's rate, by a step of a thousandth
         ends = here[:, None] + [0.0, 1e-3] / guide.rate[row[k], column[k]][:, None]
         places = positions(base, other, uv[k], ends)
         start, rate = places[:, 0], (places[:, 1] - places[:, 0]) * 1e3
-        match = refine(base, other, uv[k], start, shape.A, half, window_settings)
+        match = refine(base, other, uv[k], start, window.A, half, window_settings)
         with np.errstate(invalid="ignore", divide="ignore"):
             change = np.sum((match.uv - start) * rate, 1) / np.sum(rate**2, 1)
-            good = (match.status == int(MatchingStatus.CONVERGED)) & shape.usable
+            good = (match.status == int(MatchingStatus.CONVERGED)) & window.usable
             good &= np.abs(change) < settings.max_node_shift
             good &= match.rho > settings.min_node_correlation
         moved = k[good]
@@ -213,7 +213,7 @@ def response(
     half: int,
     max_correction: float,
 ) -> Float[np.ndarray, "n 2"]:
-    """A·c: the error of matching with windows of 2·`half` + 1 pixels; 0 if it is not
+    """A·c: the error of matching with windows of 2·`half` + 1 pixels; NaN if it is not
     determined, or larger than the maximum."""
     out = np.zeros((len(uv), 2))
     k = np.arange(-half, half + 1, dtype=float)
@@ -235,7 +235,7 @@ def response(
         c = np.linalg.solve(N, np.einsum("npi,np->ni", G, away)[:, :, None])[:, :, 0] * scale
         found = np.einsum("nij,nj->ni", A[part], c[:, :2])
         small = np.isfinite(found).all(1) & (np.linalg.norm(found, axis=1) < max_correction)
-        out[part] = np.where(small[:, None], found, 0.0)
+        out[part] = np.where(small[:, None], found, np.nan)
     return out
 
 
@@ -256,15 +256,19 @@ def correct_bending(
     # an area in the other image of a fiftieth: a window seen from its side, or a failed match
     good &= np.abs(np.linalg.det(np.where(good[:, None, None], match.A, np.eye(2)))) > 0.02
     rows = np.flatnonzero(good)
-    off = np.zeros((len(uv), 2))
-    off[rows] = response(
+    found = np.full((len(uv), 2), np.nan)
+    found[rows] = response(
         base.grey, uv[rows], match.A[rows], second[rows], half, settings.max_correction
     )
+    corrected = np.isfinite(found[:, 0])  # both components or none
+    off = np.where(corrected[:, None], found, 0.0)
     squares = off[:, :, None] * off[:, None]
     # without a fitting polynomial the effect of bending may be as large as elsewhere
-    unknown = squares[rows].mean(0) if len(rows) else np.zeros((2, 2))
+    unknown = squares[corrected].mean(0) if corrected.any() else np.zeros((2, 2))
     doubt = np.where(
-        good[:, None, None], settings.relative_sigma**2 * squares, settings.unknown_factor * unknown
+        corrected[:, None, None],
+        settings.relative_sigma**2 * squares,
+        settings.unknown_factor * unknown,
     )
     return match.uv - off, match.covariance + doubt
 

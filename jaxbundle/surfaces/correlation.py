@@ -14,12 +14,18 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, Shaped
+from jaxtyping import Float, Float32, Shaped
 
 from jaxbundle.photographs.opencv import need_opencv
 from jaxbundle.surfaces.segments import Segments, Windows, positions
 from jaxbundle.surfaces.views import Grey, OrientedImage, Places
 from jaxbundle.system.cores import available_cores
+
+# OpenCV's remap takes images of sides below this.
+MAX_REMAP_SIDE = 2**15 - 1
+# Standard deviation of a window, relative to the largest grey value, below which it has no texture:
+# 0.001 of 255, some thirty roundings of 32 bits. Half and double: no difference.
+MIN_CONTRAST = 4e-6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,21 +38,32 @@ class Pyramid:
         self, level: int, uv: Float[np.ndarray, "rows columns 2"]
     ) -> Float32[np.ndarray, "rows columns"]:
         """Grey values at positions in pixels of the full image; NaN outside."""
-        cv2 = need_opencv()
-        place = (uv + 0.5) / 2**level - 0.5
-        grey = self.levels[level]
-        # only a part of large images: OpenCV's remap has coordinates of 15 bits
-        low, high = _find_extent(place, grey.shape)
-        part = grey[low[1] : high[1], low[0] : high[0]].astype(np.float32)
-        place = (place - low).astype(np.float32)
-        return cv2.remap(
-            part,
-            place[..., 0],
-            place[..., 1],
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_CONSTANT,
-            borderValue=float("nan"),
-        )
+        return _interpolate(self.levels[level], (uv + 0.5) / 2**level - 0.5)
+
+
+def _interpolate(
+    grey: Grey, place: Float[np.ndarray, "rows columns 2"]
+) -> Float32[np.ndarray, "rows columns"]:
+    """Grey values between the pixels of an image; NaN beyond the centres of the outermost."""
+    cv2 = need_opencv()
+    u, v = place[..., 0], place[..., 1]
+    rows, columns = grey.shape
+    # (NaN compares as outside)
+    all_inside = u.min() >= 0 and u.max() <= columns - 1 and v.min() >= 0 and v.max() <= rows - 1
+    inside = None if all_inside else (u >= 0) & (u <= columns - 1) & (v >= 0) & (v <= rows - 1)
+    known_places = (u, v) if inside is None else (u[inside], v[inside])
+    # only a part of large images: OpenCV's remap has coordinates of 15 bits
+    (left, right), (top, bottom) = map(_find_extent, known_places, (columns, rows))
+    if max(right - left, bottom - top) >= MAX_REMAP_SIDE:
+        # by halves of the rows, or of the columns of a single one: a place alone needs four pixels
+        axis = 0 if len(place) > 1 else 1
+        halves = np.array_split(place, 2, axis)
+        return np.concatenate([_interpolate(grey, half) for half in halves], axis)
+    part = grey[top:bottom, left:right].astype(np.float32)
+    u, v = (u - left).astype(np.float32), (v - top).astype(np.float32)
+    # repeated beyond the edge: a place in the last row has four neighbours, two of weight 0
+    found = cv2.remap(part, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return found if inside is None else np.where(inside, found, np.float32(np.nan))
 
 
 def make_pyramid(grey: Shaped[np.ndarray, "rows columns"], levels: int) -> Pyramid:
@@ -72,15 +89,13 @@ def _halve(a: Grey) -> Float32[np.ndarray, "half_rows half_columns"]:
     return out
 
 
-def _find_extent(
-    place: Float[np.ndarray, "*n 2"], shape: tuple[int, ...]
-) -> tuple[Int[np.ndarray, "2"], Int[np.ndarray, "2"]]:
-    """The first pixel (u, v) of the used part of an image, and the one after its last."""
-    finite = np.where(np.isfinite(place), place, 0.0).reshape(-1, 2)
-    size = np.array(shape[::-1])
-    low = np.clip(np.floor(finite.min(0)).astype(int) - 1, 0, size - 1)
-    high = np.clip(np.ceil(finite.max(0)).astype(int) + 2, low + 1, size)
-    return low, high
+def _find_extent(known_places: Float[np.ndarray, "*n"], size: int) -> tuple[int, int]:
+    """The first pixel of the part of a row or column around places within it, and the one after its
+    last; of no places one pixel."""
+    if not known_places.size:
+        return 0, 1
+    low, high = int(np.floor(known_places.min())) - 1, int(np.ceil(known_places.max())) + 2
+    return max(low, 0), min(high, size)
 
 
 def correlate(
@@ -88,7 +103,7 @@ def correlate(
     pyramids: tuple[Pyramid, Pyramid],
     uv: Float[np.ndarray, "n 2"],
     segment: Segments,
-    shape: Windows,
+    window: Windows,
     *,
     level: int,
     half: int,
@@ -101,14 +116,14 @@ def correlate(
     of the window pixels. ρ is NaN outside the other image.
     """
     scale = 2.0**level
-    spacing = scale * np.linalg.norm(shape.other_axis, axis=1)
+    spacing = scale * np.linalg.norm(window.other_axis, axis=1)
     k = np.arange(steps) - (steps - 1) / 2
     with np.errstate(invalid="ignore", divide="ignore"):
         # in the order of q, though the epipolar axis may be opposite
         length = segment.length[:, None] / 2 + k * spacing[:, None]
         q = segment.parameter(length)
     place = positions(*pair, uv, q)
-    forward = np.sum((place[:, -1] - place[:, 0]) * shape.other_axis, axis=1) >= 0
+    forward = np.sum((place[:, -1] - place[:, 0]) * window.other_axis, axis=1) >= 0
     sign = np.where(forward, 1.0, -1.0)[:, None]
 
     # the strips of 256 points fit into a processor's cache
@@ -117,13 +132,13 @@ def correlate(
     def correlate_rows(first: int) -> Float[np.ndarray, "m steps"]:
         rows = slice(first, first + together)
         template = _sample_templates(
-            pyramids[0], uv[rows], sign[rows] * shape.axis[rows], sign[rows], half, level
+            pyramids[0], uv[rows], sign[rows] * window.axis[rows], sign[rows], half, level
         )
         strip = _sample_strips(
             pyramids[1],
             place[rows],
-            sign[rows] * scale * shape.other_axis[rows],
-            scale * shape.other_cross_axis[rows],
+            sign[rows] * scale * window.other_axis[rows],
+            scale * window.other_cross_axis[rows],
             half,
             level,
         )
@@ -132,7 +147,7 @@ def correlate(
     with ThreadPoolExecutor(available_cores()) as pool:
         parts = list(pool.map(correlate_rows, range(0, len(uv), together)))
     rho = np.concatenate(parts) if parts else np.zeros((0, steps), np.float32)
-    return np.where(shape.usable[:, None], rho, np.nan), q
+    return np.where(window.usable[:, None], rho, np.nan), q
 
 
 def slide(
@@ -158,9 +173,9 @@ def slide(
             cross += product
     total, square = (_sliding_sum(np.asarray(a.sum(1, dtype=np.float64)), w) for a in (s, s * s))
     spread = np.sqrt(np.maximum(square - total**2 / w**2, 0))
-    # below a standard deviation of 0.001 grey values there is no texture (float32 resolves 255 to
-    # 1.5e-5); half and double: no difference
-    flat = (norm[:, None] <= 1e-3 * w) | (spread <= 1e-3 * w)
+    largest, of_strip = np.abs(template).max((1, 2)), np.fmax.reduce(np.abs(strip), (1, 2))
+    flat = (norm <= MIN_CONTRAST * w * largest)[:, None]
+    flat = flat | (spread <= MIN_CONTRAST * w * of_strip[:, None])
     with np.errstate(invalid="ignore", divide="ignore"):
         rho = np.where(flat, -1.0, cross / (norm[:, None] * spread))
     return np.where(lost | ~np.isfinite(norm)[:, None], np.nan, rho)

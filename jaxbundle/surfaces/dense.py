@@ -22,6 +22,7 @@ from jaxbundle.surfaces.disparity_refinement import (
     refine_disparities,
 )
 from jaxbundle.surfaces.disparity_search import (
+    MAX_SPAN,
     DisparitySearchSettings,
     RowImage,
     RowMask,
@@ -94,9 +95,9 @@ def _search(
     span: int,
     settings: DenseSettings,
 ) -> RowImage:
-    """Disparities to about a quarter of a pixel, NaN where none was found; a large pair at half
-    its size."""
-    if left.size * (span + 1) <= settings.max_searched:
+    """Disparities to about a quarter of a pixel, NaN where none was found; a large pair, or one of
+    a range beyond OpenCV's, at half its size."""
+    if left.size * (span + 1) <= settings.max_searched and span <= MAX_SPAN:
         left, right = equalise_exposures(left, right, inside, right_inside, settings.search)
         found = semi_global(left, right, span, settings.search)
     else:

@@ -170,11 +170,13 @@ def _refine_with_windows(
     """Disparities by windows of 2·`half` + 1 pixels, with the factor of those wanted in σ; which
     windows have a step of the surface in them."""
     rows, columns = left.shape
-    # In two rounds a pixel depends on two smooth shapes and two windows of least squares, `half`
-    # each, and on two pixels each for the median and the gradients of both rounds. Two pixels of
-    # these are left out: they change a disparity by less than 1e-6 pixel.
-    margin = 4 * (half + 1)
-    height, width = (n - 2 * margin for n in settings.piece)
+    # In each round a pixel depends on a smooth shape and a window of least squares, `half` each,
+    # and on two pixels for the gradients. The two pixels of the first median are left out: they
+    # change a disparity by less than 1e-6 pixel.
+    margin = 2 * settings.rounds * (half + 1)
+    # many rounds have larger pieces: a third of one side, at least, is not margin
+    sides = tuple(max(n, 3 * margin) for n in settings.piece)
+    height, width = (n - 2 * margin for n in sides)
     d, sigma, rho, across = (np.full(left.shape, np.nan, np.float32) for _ in range(4))
 
     def refine(corner: tuple[int, int]) -> None:
@@ -183,7 +185,7 @@ def _refine_with_windows(
             return
         v, u = (
             _reflect(np.arange(n) + k - margin, size)
-            for k, n, size in zip(corner, settings.piece, left.shape)
+            for k, n, size in zip(corner, sides, left.shape)
         )
         found = _refine_piece(left, spline, start, v, u, half, settings)
         for out, piece in zip((d, sigma, rho, across), found):

@@ -18,6 +18,10 @@ from jaxbundle.system.cores import available_cores
 RowImage = Float[np.ndarray, "rows columns"]
 RowMask = Bool[np.ndarray, "rows columns"]
 
+MAX_INT16 = 2**15 - 1
+# OpenCV's disparities are whole sixteenths of a pixel of 16 bits.
+MAX_SPAN = MAX_INT16 // 16
+
 
 @dataclasses.dataclass(frozen=True)
 class DisparitySearchSettings:
@@ -147,11 +151,14 @@ def find_repetitions(
         cv2.resize(repeated.astype(np.uint8), left.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
     )
     known = np.isfinite(disparity)
-    whole = np.where(known, 16 * np.nan_to_num(disparity), -16).astype(np.int16)
-    largest = int(settings.min_repetitive_share * left.size)
-    # neighbours of one surface differ by up to a pixel, 16 of OpenCV's units
-    remaining, _ = cv2.filterSpeckles(whole, -16, largest, 16)
-    return known & repeated & (remaining < 0)
+    # units of a sixteenth of a pixel, OpenCV's, or larger ones for ranges beyond its 16 bits
+    per_pixel = max(1, min(16, MAX_INT16 // (span + 1)))
+    unknown = -MAX_INT16
+    whole = np.where(known, per_pixel * np.nan_to_num(disparity), unknown).astype(np.int16)
+    min_surface_pixels = int(settings.min_repetitive_share * left.size)
+    # neighbours of one surface differ by up to a pixel
+    remaining, _ = cv2.filterSpeckles(whole, unknown, min_surface_pixels, per_pixel)
+    return known & repeated & (remaining == unknown)
 
 
 def _autocorrelate_rows(a: RowImage, farthest: int) -> RowImage:
@@ -168,7 +175,7 @@ def _autocorrelate_rows(a: RowImage, farthest: int) -> RowImage:
     m = mean(a)
     spread = np.sqrt(np.maximum(mean(a * a) - m * m, 1e-3))
     best = np.full(a.shape, -1.0, np.float32)
-    for lag in range(half, farthest + 1):
+    for lag in range(half, min(farthest, a.shape[1] - 1) + 1):
         rho = mean(a[:, lag:] * a[:, :-lag]) - m[:, lag:] * m[:, :-lag]
         rho /= spread[:, lag:] * spread[:, :-lag]
         np.maximum(best[:, lag:], rho, out=best[:, lag:])

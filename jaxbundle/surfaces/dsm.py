@@ -168,11 +168,11 @@ def _average_cells(
     spread = NORMAL_SIGMA_BY_MAD * _sorted_medians(away[again], first, count)
     least = settings.min_spread * size
     keep = away <= settings.max_deviation * np.maximum(spread, least)[group]
-    # a point without σ, or of a σ of 0, which no measurement has, counts as one of the median σ
+    # a point without σ, or of a σ that no measurement has, 0 or ∞, counts as one of the median σ
     with np.errstate(divide="ignore", over="ignore", under="ignore"):
         weight = np.where(sigma > 0, 1 / sigma**2, np.nan)
-    known = np.isfinite(weight)
-    weight = np.where(known, weight, np.nanmedian(weight) if known.any() else 1.0) * keep
+    known = np.isfinite(weight) & (weight > 0)
+    weight = np.where(known, weight, np.median(weight[known]) if known.any() else 1.0) * keep
     total = np.bincount(group, weight)
     mean = np.bincount(group, weight * Z) / total
     n = np.bincount(group, keep)

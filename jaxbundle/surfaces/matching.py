@@ -97,8 +97,7 @@ class MatchingSettings:
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class SurfaceMatches:
-    """Points of a base image: pixels in it, object points with covariance, numbers of rays, widest
-    angle between them, smallest ρ of a match, positions in the other images (NaN: not used).
+    """Points of a base image: pixels in it, object points with covariance, numbers of rays.
 
     `factor`: the variance factor of the covariances; `rejected`: numbers of points by reason.
     """
@@ -107,9 +106,6 @@ class SurfaceMatches:
     X: Float[np.ndarray, "n 3"]
     covariance: Float[np.ndarray, "n 3 3"]
     rays: Int[np.ndarray, " n"]
-    angle: Float[np.ndarray, " n"]
-    rho: Float[np.ndarray, " n"]
-    places: Float[np.ndarray, "n others 2"]
     factor: float
     rejected: dict[str, int]
 
@@ -136,7 +132,8 @@ def match_points(
     with np.errstate(invalid="ignore"):
         found = np.isfinite(q) & (rho >= settings.min_correlation)
         ambiguous = found & (second > settings.max_second_ratio * rho)
-    lost["low correlation"] += int((~found).sum())
+    lost["in no other image at a similar scale"] += int((~np.isfinite(rho)).sum())
+    lost["low correlation"] += int((~found & np.isfinite(rho)).sum())
     lost["not unique"] += int(ambiguous.sum())
     rows = np.flatnonzero(found & ~ambiguous)
     uv, q, normal = uv[rows], q[rows], normal[rows]
@@ -145,7 +142,7 @@ def match_points(
     enough = matches.is_used.sum(1) + 1 >= settings.min_rays
     lost["not confirmed by least squares matching"] += int((~enough).sum())
     uv, X = uv[enough], X[enough]
-    places, used, covariance, in_base, rhos = (a[enough] for a in matches)
+    places, used, covariance, in_base = (a[enough] for a in matches)
     mean = in_base.sum(1) / np.maximum(used.sum(1), 1)[:, None, None]
     table = _Rays(
         (base, *others),
@@ -154,18 +151,17 @@ def match_points(
         np.concatenate([mean[:, None], covariance], 1) / 2,
         np.concatenate([np.ones((len(uv), 1), bool), used], 1),
     )
-    return _accept(table, X, rhos, settings, lost)
+    return _accept(table, X, settings, lost)
 
 
 class WindowMatches(NamedTuple):
     """Positions of points in the other images; which are used; their covariances, and these carried
-    over to the base image; ρ."""
+    over to the base image."""
 
     places: Float[np.ndarray, "n others 2"]
     is_used: Bool[np.ndarray, "n others"]
     covariance: Float[np.ndarray, "n others 2 2"]
     in_base: Float[np.ndarray, "n others 2 2"]
-    rho: Float[np.ndarray, "n others"]
 
 
 def _match_windows(
@@ -186,7 +182,6 @@ def _match_windows(
         np.zeros((n, m), bool),
         np.zeros((n, m, 2, 2)),
         np.zeros((n, m, 2, 2)),
-        np.full((n, m), np.nan),
     )
     for k, other in enumerate(others):
         window = windows(base, other, X, normal)
@@ -201,7 +196,7 @@ def _match_windows(
         back = np.linalg.inv(np.where(good[:, None, None], match.A, np.eye(2)))
         safe = np.where(good[:, None, None], uncertain, 0)
         shifted = back @ safe @ np.swapaxes(back, 1, 2)
-        out.places[:, k], out.is_used[:, k], out.rho[:, k] = place, good, match.rho
+        out.places[:, k], out.is_used[:, k] = place, good
         out.covariance[:, k] = uncertain
         out.in_base[:, k] = np.where(good[:, None, None], shifted, 0)
     return out
@@ -235,7 +230,6 @@ class _Rays:
 def _accept(
     table: _Rays,
     X: Float[np.ndarray, "n 3"],
-    rhos: Float[np.ndarray, "n others"],
     settings: MatchingSettings,
     lost: Counter[str],
 ) -> SurfaceMatches:
@@ -258,11 +252,6 @@ def _accept(
     lost["narrow angle"] += int((narrow & ~undetermined).sum())
     lost["rays do not meet"] += int((bad & ~narrow & ~undetermined).sum())
     good = ~(bad | narrow | undetermined)
-    matched = table.is_used[good][:, 1:]
-    with np.errstate(invalid="ignore"):
-        rho = (
-            np.nanmin(np.where(matched, rhos[good], np.nan), axis=1) if good.any() else np.zeros(0)
-        )
     covariance = factor * found.covariance[good] + shape[good]
     covariance += orientation_covariance(table.views, found.X[good], table.is_used[good])
     return SurfaceMatches(
@@ -270,9 +259,6 @@ def _accept(
         found.X[good],
         covariance,
         found.rays[good],
-        found.angle[good],
-        rho,
-        np.where(matched[..., None], table.uv[good][:, 1:], np.nan),
         factor,
         {reason: number for reason, number in lost.items() if number},
     )
@@ -304,11 +290,15 @@ def _shape_variance(
     # along the line of sight d: σ of each point, and the length that moves it by one pixel in the
     # other image where it moves most
     d = line_of_sight(base.derivative(X))
-    along = np.sqrt(factor * np.einsum("ni,nij,nj->n", d, found.covariance[good], d))
-    moved = [np.linalg.norm(o.derivative(X) @ d[:, :, None], axis=(1, 2)) for o in others]
-    pixel = 1 / np.max(np.where(table.is_used[good, 1:], np.stack(moved, 1), 0), 1)
+    sigma_along = np.sqrt(factor * np.einsum("ni,nij,nj->n", d, found.covariance[good], d))
+    pixels_per_length = [
+        np.linalg.norm(o.derivative(X) @ d[:, :, None], axis=(1, 2)) for o in others
+    ]
+    length_of_pixel = 1 / np.max(
+        np.where(table.is_used[good, 1:], np.stack(pixels_per_length, 1), 0), 1
+    )
     q = base.parameter(X)
-    rate = np.abs(base.parameter(X + along[:, None] * d) - q) / along
+    rate = np.abs(base.parameter(X + sigma_along[:, None] * d) - q) / sigma_along
 
     def on_grid(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, "r c"]:
         grid = np.full((row.max() + 1, column.max() + 1), np.nan)
@@ -319,8 +309,8 @@ def _shape_variance(
     apart = -(-(2 * settings.half_fine_window + 1) // step)
     missing = missing_sigma(
         on_grid(q),
-        on_grid(rate * along),
-        on_grid(rate * pixel),
+        on_grid(rate * sigma_along),
+        on_grid(rate * length_of_pixel),
         apart,
         settings.block_side,
         settings.scatter_quantile,
@@ -328,9 +318,9 @@ def _shape_variance(
     if missing is None:
         return None
     # scatter beyond the σ that the matches have without the factor is the shape of the surface
-    missing = min(missing, np.sqrt(1 / factor - 1) * np.median(along / pixel))
+    missing = min(missing, np.sqrt(1 / factor - 1) * np.median(sigma_along / length_of_pixel))
     C = np.zeros_like(found.covariance)
-    C[good] = ((missing * pixel) ** 2)[:, None, None] * d[:, :, None] * d[:, None]
+    C[good] = ((missing * length_of_pixel) ** 2)[:, None, None] * d[:, :, None] * d[:, None]
     return C
 
 

@@ -25,6 +25,9 @@ from jaxbundle.surfaces.views import (
     steps_on_plane,
 )
 
+# Windows of scales that differ by more show different details.
+MAX_SCALE = 4.0
+
 
 @dataclasses.dataclass(frozen=True)
 class Windows:
@@ -143,8 +146,7 @@ def windows(
         along = np.einsum("nij,nj->ni", A, e)
         beside = np.einsum("nij,nj->ni", A, np.stack([-e[:, 1], e[:, 0]], 1))
         singular = np.linalg.svd(np.nan_to_num(A), compute_uv=False)
-        # windows of scales that differ by more than 4 show different details
-        usable = (singular[:, 1] > 1 / 4) & (singular[:, 0] < 4)
+        usable = (singular[:, 1] > 1 / MAX_SCALE) & (singular[:, 0] < MAX_SCALE)
     usable &= np.isfinite(e).all(1)
     return Windows(e, along, beside, A, usable)
 

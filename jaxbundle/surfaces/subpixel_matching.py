@@ -18,6 +18,7 @@ from jaxbundle.measure.least_squares_matching import (
     MatchingStatus,
     match_least_squares,
 )
+from jaxbundle.surfaces.segments import MAX_SCALE
 from jaxbundle.surfaces.views import Grey, OrientedImage, is_inside
 from jaxbundle.system.programs import compile_once
 
@@ -43,7 +44,8 @@ class WindowSettings:
     move in it. Half: 65 points more, near the edge of the other image; double: 150 fewer."""
     max_stretch: float = 1.4
     """Maximum ratio of lengths of a window in the other image, for the size of that part: √2, a
-    window turned by 45°. Half: 77 points more, near the edge; double: 227 fewer, and more time."""
+    window turned by 45°; windows that are not in it with their margin have a larger part. Half: 77
+    points more, near the edge; double: 227 fewer, and more time."""
     min_texture: float = 1.5
     """Minimum ratio of the squared gradients of half a window to those of noise: three standard
     deviations above 1, √(2/78) for the 78 pixels of a side of 13 × 13. Half: 0.31 % of the points
@@ -77,11 +79,7 @@ def refine(
     **Arguments:** `start`: positions in the other image, within a few pixels; `A`: start of the
     affine transformation, from the base to the other image.
     """
-    n, margin = len(uv), int(np.ceil(settings.max_stretch * half)) + settings.search_margin
-    usable = is_inside(base, uv, half)
-    usable &= is_inside(other, start, margin + 1)
-    usable &= np.isfinite(A).all((1, 2))
-    rows = np.flatnonzero(usable)
+    n = len(uv)
     out = SubpixelMatches(
         start.astype(float),
         A.astype(float),
@@ -90,6 +88,32 @@ def refine(
         np.full(n, np.nan),
         np.full(n, int(MatchingStatus.OUTSIDE)),
     )
+    known = is_inside(base, uv, half) & np.isfinite(A).all((1, 2))
+    # how far the corners of the windows are from their middle, along the rows or the columns; half
+    # a pixel more, as pieces begin at whole pixels
+    reach = half * np.abs(np.where(known[:, None, None], A, 0.0)).sum(2).max(1) + 0.5
+    held = -1.0
+    for stretch in (settings.max_stretch, max(settings.max_stretch, np.sqrt(2) * MAX_SCALE)):
+        margin = int(np.ceil(stretch * half)) + settings.search_margin
+        rows = known & (reach > held) & (reach <= margin) & is_inside(other, start, margin + 1)
+        _refine_rows(base, other, uv, out, np.flatnonzero(rows), half, margin)
+        # few windows are larger: in pieces of their own, which take more time
+        held = float(margin)
+    return out
+
+
+def _refine_rows(
+    base: OrientedImage,
+    other: OrientedImage,
+    uv: Float[np.ndarray, "n 2"],
+    out: SubpixelMatches,
+    rows: Int[np.ndarray, " k"],
+    half: int,
+    margin: int,
+) -> None:
+    """Match some of the windows from their starts in `out`, which is changed, in pieces of the
+    other image with so many pixels around the start."""
+    start, A = out.uv.copy(), out.A.copy()
     # 256 windows a call: all iterate until the last has converged
     together = 256
     for first in range(0, len(rows), together):
@@ -108,7 +132,6 @@ def refine(
         out.rho[part] = np.asarray(found.correlation)[:k]
         out.sigma0[part] = np.asarray(found.sigma0)[:k]
         out.status[part] = np.asarray(found.status)[:k]
-    return out
 
 
 def has_texture(

@@ -10,7 +10,7 @@ import pytest
 import jaxbundle
 from jaxbundle.batches.misfit import NORMAL, axes_remark, far_outside, misfits
 from jaxbundle.batches.normal import CameraUnknowns, Sightings, design
-from jaxbundle.batches.test_values import point_tests
+from jaxbundle.batches.pope_tests import point_tests
 from jaxbundle.batches.weakness import weak_geometry
 from jaxbundle.cameras import get_model
 

@@ -13,7 +13,7 @@ from test_calibrate import VIEWS
 from test_rig import ANGLES, BASE, RIGHT, pair, right_of
 
 import jaxbundle
-from jaxbundle.batches.run import run_batch
+from jaxbundle.batches.run_on_files import run_batch
 from jaxbundle.calibration import calibrate_cameras
 from jaxbundle.errors import InputError
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from batch_cameras import images_of, write_cameras
 
-from jaxbundle.batches.run import run_batch
+from jaxbundle.batches.run_on_files import run_batch
 from jaxbundle.errors import InputError
 
 ROOT = Path(__file__).parents[2]

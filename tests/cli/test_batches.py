@@ -12,7 +12,7 @@ from batch_cameras import images_of, write_cameras
 from pyarrow.parquet import read_table
 
 from jaxbundle.batches import work
-from jaxbundle.batches.run import key_of, run_batch
+from jaxbundle.batches.run_on_files import key_of, run_batch
 from jaxbundle.errors import InputError
 from jaxbundle.io.writing.fingerprints import of_input
 

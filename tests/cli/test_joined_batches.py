@@ -10,7 +10,7 @@ import pytest
 from batch_cameras import images_of, write_cameras
 
 from jaxbundle.batches.processes import add_parts
-from jaxbundle.batches.run import run_batch
+from jaxbundle.batches.run_on_files import run_batch
 
 ROOT = Path(__file__).parents[2]
 CAMERAS = 9

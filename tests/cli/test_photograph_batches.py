@@ -13,7 +13,7 @@ import render
 from board_photographs import poses
 
 from jaxbundle.batches import work as batches
-from jaxbundle.batches.run import run_batch
+from jaxbundle.batches.run_on_files import run_batch
 from jaxbundle.errors import InputError
 from jaxbundle.io.boards.kept_corners import KeptCorners
 from jaxbundle.measure.boards import Board

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxbundle import leastsquares as ls
-from jaxbundle.leastsquares.quality.response import pull_back
+from jaxbundle.leastsquares.quality.sensitivity import pull_back
 
 LEVELLED = ls.Kind("levelled difference", lambda a, b, dh: b - a - dh, of=("height", "height"))
 EQUAL = ls.Kind("equal heights", lambda a, b, _: b - a, of=("height", "height"))

@@ -1,5 +1,7 @@
 """Accuracy on the ground: closed form, propagation and Monte Carlo against each other."""
 
+import itertools
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -53,6 +55,23 @@ def test_propagation_against_drawing(name):
     np.testing.assert_allclose(found.ce90, exact.ce90, rtol=0.04)
     scale = np.sqrt(np.einsum("nii,njj->nij", exact.covariance, exact.covariance))
     assert (np.abs(found.covariance - exact.covariance) / scale).max() < 4 * np.sqrt(2 / draws)
+
+
+def test_rays_that_miss_are_left_out_of_the_overall_accuracy():
+    """A camera rolled by 87° sees the sky on one side: what is known of the others stands. Without
+    errors the accuracy is 0."""
+    image = above_a_plane((0.0, 1.52, 0.0), c=20.0)
+    places = np.full(2, 100.0), np.array([3.0, 396.0])
+    for accuracy, noise in itertools.product(
+        (propagate_accuracy, simulate_accuracy), (Noise(position_bias=1e-3), Noise())
+    ):
+        found = accuracy(image, Plane(), *places, noise)
+        np.testing.assert_array_equal(np.isnan([found.rms, found.ce90]), [[True, False]] * 2)
+        np.testing.assert_allclose(found.overall, found.rms[1])
+        np.testing.assert_allclose(found.overall_ce90, found.ce90[1])
+        assert (found.overall > 0) == (found.overall_ce90 > 0) == any(noise)
+    missed = propagate_accuracy(image, Plane(), *(np.repeat(a[:1], 2) for a in places), Noise())
+    assert np.isnan([missed.overall, missed.overall_ce90]).all()
 
 
 @pytest.mark.further

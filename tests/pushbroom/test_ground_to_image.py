@@ -189,6 +189,39 @@ def test_all_lines_that_see_a_point():
     assert set(np.unique(found.count)) >= {1, 3} and len(turn) == 6
 
 
+def test_a_point_is_found_though_its_first_passages_are_beside_it():
+    """The camera looks to the left, then down: of each point the first line that sees it, against
+    pitch and roll over 100 000 times, in numpy."""
+    roll = lambda t: 0.2 / (1 + np.exp(8 * (t - 2.2)))
+    t = np.arange(-0.1, 6.2, 0.02)
+    angles = np.stack([0.06 * np.sin(np.pi * t), roll(t), 0 * t], 1)
+    image = eqx.tree_at(
+        lambda i: i.trajectory.attitude, above_a_plane(), attitude_table(t, angles, method="spline")
+    )
+    X = np.array([[0.0, Y, 0.0] for Y in (70.0, 120.0, 150.0, 170.0, 200.0)]).T
+    found = jax.tree.map(np.asarray, project_points(image, make_search(image, None), X, most=1))
+    t = np.linspace(0, (LINES - 1) * 0.01, 100_001)
+    # the ray to the point in the camera: slopes ahead and across, pitch turned first
+    pitch, row = 0.06 * np.sin(np.pi * t), 0.3 / 120
+    half = 0.05 * PIXELS / 2 / 120
+    places = (3,), (3, 1), (3, 1), (3, 0), (1, 0)
+    for k in range(X.shape[1]):
+        ahead, down = X[1, k] - 50 * t, -1000.0
+        forward = np.cos(pitch) * ahead + np.sin(pitch) * down
+        depth = np.cos(pitch) * down - np.sin(pitch) * ahead
+        across, depth = -np.sin(roll(t)) * depth, np.cos(roll(t)) * depth
+        passages = np.flatnonzero(np.diff(np.sign(-forward / depth - row)))
+        seen = passages[np.abs(across / depth)[passages] < half]
+        # none of three, the second, the first
+        assert (len(passages), *(list(passages).index(v) for v in seen[:1])) == places[k]
+        assert (found.status[k] == ProjectionStatus.SEEN) == (len(seen) > 0)
+        if len(seen):
+            np.testing.assert_allclose(found.line[0, k], t[seen[0]] / 0.01, atol=0.02)
+        else:
+            assert found.status[k] == ProjectionStatus.BESIDE and found.count[k] == 0
+            assert np.isnan(found.line[0, k])
+
+
 def test_nothing_is_seen_through_the_earth():
     """In a whole orbit every point has the Earth between it and the camera half of the time."""
     t = np.arange(-30.0, 5700.0, 10.0)

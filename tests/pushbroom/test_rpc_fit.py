@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.pushbroom.rpc import Rpc, project_points
-from jaxbundle.pushbroom.rpc_fit import check_rpc, fit_image, fit_rpc, image_table
+from jaxbundle.pushbroom.rpc_fit import RpcTable, check_rpc, fit_image, fit_rpc, image_table
 
 TRUE = made_up()
 
@@ -108,6 +108,15 @@ def test_the_chosen_ridge_predicts_about_as_well_as_any():
     assert chosen < 1.1 * min(every) and chosen < 0.9 * max(every)
 
 
+def test_few_points_end_with_a_ridge_that_converges():
+    """Sixty random points of a noise of 0.3 pixel: σ is that noise, to four of its deviations."""
+    table, rng = table_of(TRUE, (8, 8, 6), noise=0.3), np.random.default_rng(0)
+    draws = [rng.choice(len(table.line), 60, replace=False) for _ in range(29)]
+    fit = fit_rpc(RpcTable(*(column[draws[28]] for column in table)))
+    assert fit.converged
+    assert (np.abs(fit.sigma / 0.3 - 1) < 4 / np.sqrt(2 * fit.redundancy)).all()
+
+
 def broken(**columns):
     table = table_of(TRUE, (4, 4, 3))
     return table._replace(**{k: f(getattr(table, k).copy()) for k, f in columns.items()})
@@ -121,9 +130,12 @@ def with_nan(column):
 @pytest.mark.parametrize("table, words", [
     (broken(line=with_nan), ["row 7", "line", "finite"]),
     (broken(height=lambda h: 0 * h + 250), ["every height is 250", "several heights"]),
+    (broken(longitude=lambda a: 0 * a + 0.3), ["every longitude is 17.1887°", "longitudes"]),
+    (broken(longitude=lambda a: 0 * a + np.pi * (-1) ** np.arange(len(a))), ["180°"]),
+    (broken(latitude=lambda a: 0 * a), ["every latitude is 0°", "several latitudes"]),
     (broken(sample=lambda s: s[:-1]), ["sample", "shape"]),
     (table_of(TRUE, (3, 3, 3)), ["27 points", "at least 40"]),
-], ids=["nan", "one height", "lengths", "few"])  # fmt: skip
+], ids=["nan", "height", "longitude", "date line", "latitude", "lengths", "few"])  # fmt: skip
 def test_what_is_refused(table, words):
     with pytest.raises(InputError) as refused:
         fit_rpc(table)

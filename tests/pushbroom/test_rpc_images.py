@@ -176,6 +176,13 @@ def test_hidden_terrain_is_hidden_for_both(scene):
     assert 0.005 < own_hidden[own_seen].mean() < 0.5
     # pixels at the edge of a shadow may fall on either side
     assert (hidden != own_hidden).sum() < 0.03 * own_hidden.sum()
+    # a gap of the terrain under the first pixel of the block changes its surroundings only
+    gap = heights.copy()
+    gap[998:1003, 498:503] = np.nan
+    terrain = make_terrain(gap, corner, np.radians([0.3 / n, 0.3 / n]), WGS84)
+    shown = np.isfinite(block_places(*both, terrain, nodes, True).line)
+    assert not shown[0, 0]
+    np.testing.assert_array_equal(shown[20:], (seen & ~hidden)[20:])
 
 
 def test_info_says_the_same_of_both(folder):

@@ -150,6 +150,14 @@ def test_terrain_that_hides_terrain():
     assert 0.05 < hidden.mean() < 0.6 and len(chosen) > 500
     places = np.isfinite(seen.line)
     np.testing.assert_array_equal(seen.line[places], all_.line[places])
+    # a gap of the terrain under the first pixel of the block hides nothing, and shows nothing
+    with_gap = heights.copy()
+    with_gap[18, 2] = np.nan
+    surface = make_terrain(with_gap, (x[0], y[0]), (10.0, 10.0), None)
+    of_gap = block_places(image, search, surface, nodes, True)
+    assert np.isnan(of_gap.line[0, 0])
+    far = np.add.outer(every, every) > 60  # pixels of 0.7 m: beyond the cells of the gap
+    np.testing.assert_array_equal(np.isnan(of_gap.line)[far], np.isnan(seen.line)[far])
 
 
 @pytest.mark.further

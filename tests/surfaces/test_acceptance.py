@@ -27,7 +27,7 @@ def test_every_rejected_point_has_one_reason():
     table = SimpleNamespace(views=(), uv=np.zeros((6, 2, 2)), is_used=np.ones((6, 2), bool),
                             intersect=lambda X: found)  # fmt: skip
     lost: Counter[str] = Counter()
-    matched = _accept(table, np.zeros((6, 3)), np.ones((6, 1)), MatchingSettings(), lost)
+    matched = _accept(table, np.zeros((6, 3)), MatchingSettings(), lost)
     assert len(matched.X) == 2
     assert lost == {"undetermined": 1, "narrow angle": 2, "rays do not meet": 1}
 

@@ -108,6 +108,20 @@ def test_a_drawing_passes_the_audit(plane, tmp_path):
     np.testing.assert_allclose(found, few.X, rtol=1e-12)
 
 
+@pytest.mark.parametrize("sigma", [np.nan, np.inf, 0.0])
+def test_points_without_sigma_count_as_those_of_the_median(plane, sigma):
+    """Also where all points of a cell are without."""
+    ordinary = np.tile(0.25**2 * np.eye(3), (len(plane), 1, 1))
+    without = ordinary.copy()
+    without[plane.X[:, 0] < plane.X[:, 0].mean()] = np.diag([sigma**2] * 3)
+    dsm, expected = (
+        make_dsm(dataclasses.replace(plane, covariance=c), 2.0, 0) for c in (without, ordinary)
+    )
+    assert np.isfinite(expected.height).all()
+    np.testing.assert_allclose(dsm.height, expected.height)
+    np.testing.assert_allclose(dsm.sigma, expected.sigma)
+
+
 def test_heights_of_a_dsm_are_as_good_as_its_sigma_says(plane, tmp_path):
     dsm = make_dsm(plane, 2.0)
     x, y = dsm.centres()

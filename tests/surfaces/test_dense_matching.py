@@ -12,7 +12,11 @@ from jaxbundle.surfaces.disparity_refinement import (
     DisparityRefinementSettings,
     refine_disparities,
 )
-from jaxbundle.surfaces.disparity_search import DisparitySearchSettings, semi_global
+from jaxbundle.surfaces.disparity_search import (
+    DisparitySearchSettings,
+    find_repetitions,
+    semi_global,
+)
 
 SHAPE, SHIFT, SPAN = (160, 460), 50, 90
 
@@ -106,3 +110,49 @@ def test_pieces_do_not_matter():
     off = np.abs(one.disparity - other.disparity)
     # OpenCV tabulates the weights of means by the range of disparities in a piece
     assert np.nanpercentile(off, 99.5) < 0.02
+
+
+@pytest.mark.further
+def test_disparities_beyond_sixteen_bits_of_sixteenths():
+    """OpenCV's largest disparity is 2048 pixels."""
+    shift = 2060
+    texture = np.random.default_rng(8).standard_normal((40, 2 * shift + 300))
+    texture = np.float32(128 + 60 * ndimage.gaussian_filter(texture, 1.2))
+    columns = shift + 300
+    pair = SimpleNamespace(left=texture[:, :columns], right=texture[:, shift : shift + columns])
+    found = match_dense(pair, 2100).disparity[5:-5, shift + 10 : -10]
+    assert (np.abs(found - shift) < 0.2).mean() > 0.95
+
+
+@pytest.mark.parametrize("disparity", [10.0, 2000.0, 2100.0, 20_000.0])
+def test_only_small_separate_surfaces_are_repetitions(disparity):
+    """Stripes of 40 columns: all are kept on one large surface, none on a small one, however far
+    both images are apart."""
+    shape = (200, 800)
+    noise = ndimage.gaussian_filter(np.random.default_rng(0).standard_normal(shape), 1.5)
+    stripes = np.float32(128 + 50 * np.sin(2 * np.pi * np.arange(shape[1]) / 40) + 5 * noise)
+    large = np.full(shape, disparity, np.float32)
+    small = np.full(shape, np.nan, np.float32)
+    small[50:60, 100:120] = disparity
+    span, settings = int(disparity) + 100, DisparitySearchSettings()
+    assert not find_repetitions(stripes, large, span, settings).any()
+    np.testing.assert_array_equal(
+        find_repetitions(stripes, small, span, settings), np.isfinite(small)
+    )
+
+
+def test_pieces_do_not_matter_after_any_number_of_rounds():
+    """To rounding: no shape and no window reaches beyond the margin of a piece."""
+    rng, shape = np.random.default_rng(6), (150, 260)
+    texture = 128 + 90 * ndimage.gaussian_filter(rng.standard_normal(shape), 2.0)
+    # much noise, so that every round changes the shape
+    left, right = (np.float32(texture + 4 * rng.standard_normal(shape)) for _ in range(2))
+    found = [
+        refine_disparities(
+            left, right, np.zeros(shape, np.float32),
+            DisparityRefinementSettings(piece=piece, rounds=4, min_weak_share=1.0),
+        ).disparity
+        for piece in ((256, 512), (120, 200))
+    ]  # fmt: skip
+    np.testing.assert_allclose(found[0], found[1], atol=1e-5)
+    assert np.nanstd(found[0]) > 0.1

@@ -1,15 +1,20 @@
 """Rendered pairs: matches agree with the truth, heights with their σ, and nothing is found where
 nothing is visible."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+from scipy import ndimage
 from surface_scenes import CAMERA, F, hills, photographs, two_shapes
 
+from jaxbundle.measure.least_squares_matching import MatchingStatus
 from jaxbundle.surfaces import correlation
-from jaxbundle.surfaces.correlation import find_peaks, slide
+from jaxbundle.surfaces.correlation import find_peaks, make_pyramid, slide
 from jaxbundle.surfaces.dense_cloud import combine
 from jaxbundle.surfaces.reconstruct import find_bounds, reconstruct_surface
 from jaxbundle.surfaces.rectification import rectify
+from jaxbundle.surfaces.subpixel_matching import refine
 from jaxbundle.surfaces.views import FrameView, is_inside, line_of_sight, steps_on_plane
 from jaxbundle.types import present
 
@@ -130,6 +135,63 @@ def test_correlations_of_several_images_are_the_mean_of_the_better_half():
     np.testing.assert_allclose(correlation.combine(rho), [[0.85, 0.5, nan, 0.7]])
 
 
+@pytest.mark.parametrize("unit, level", [(1.0, 128.0), (1e-3, 0.128), (1e-6, 0.0), (1e4, 1e6)])
+def test_correlation_has_no_unit_of_grey_values(unit, level):
+    """Rasters of floating point may be reflectances; a flat window is flat in any unit."""
+    rng = np.random.default_rng(1)
+    strip = 0.3 * rng.standard_normal((1, 5, 30))
+    strip[..., 15:25] = 0.0
+    template = strip[..., 3:8]
+    rho = slide(*(np.float32(level + unit * a) for a in (template, strip)))[0]
+    assert rho[3] > 0.999 and (rho[15:21] == -1).all()
+    windows = np.lib.stride_tricks.sliding_window_view(strip[0], (5, 5))[0, :15]
+    expected = [np.corrcoef(template.ravel(), a.ravel())[0, 1] for a in windows]
+    np.testing.assert_allclose(rho[:15], expected, atol=2e-3)
+
+
+def test_grey_values_between_pixels():
+    """Also in the last row and column, and in images longer than OpenCV's 15 bits; none outside,
+    and none of positions that are not known."""
+    plane = lambda u, v: 2.0 * u + 3.0 * v
+    images = ((20, 30), [[29.0, 5.5], [28.5, 19.0], [29.0, 19.0], [0.0, 0.0], [0.25, 18.75]]), (
+        (8, 40_000), [[10.0, 3.0], [39_000.5, 4.5], [20_000.0, 7.0], [39_999.0, 0.5], [0.0, 1.0]],
+    )  # fmt: skip
+    for (rows, columns), places in images:
+        v, u = np.indices((rows, columns))
+        pyramid = make_pyramid(np.float32(plane(u, v)), 1)
+        outside = [[columns - 0.9, 3.0], [-0.1, 2.0], [4.0, rows + 50.0], [np.nan, 2.0], [1e7, 1.0]]
+        grid = np.array([places, outside, places[::-1]])
+        found = pyramid.sample(0, grid)
+        expected = np.float32(plane(*np.moveaxis(grid, 2, 0)))
+        np.testing.assert_array_equal(found[[0, 2]], expected[[0, 2]])
+        assert np.isnan(found[1]).all()
+        # means of 2 × 2 pixels are those of their middle
+        inner = np.array([[[2.5, 4.5], [columns / 2, 3.0]]])
+        np.testing.assert_allclose(pyramid.sample(1, inner), plane(*np.moveaxis(inner, 2, 0)))
+
+
+def test_windows_in_an_image_of_three_times_the_scale():
+    """Its pixels are the means of 3 × 3 of the other: all are matched, within their σ."""
+    rng = np.random.default_rng(0)
+    fine = 128 + 480 * ndimage.gaussian_filter(rng.standard_normal((480, 480)), 6.0)
+    grey = fine.reshape(160, 3, 160, 3).mean((1, 3)), fine
+    base, other = (
+        SimpleNamespace(grey=np.float32(a + rng.standard_normal(a.shape)), size=a.shape)
+        for a in grey
+    )
+    uv = rng.integers(30, 130, (60, 2)).astype(float)
+    true = 3 * uv + 1
+    start = true + rng.uniform(-0.7, 0.7, true.shape)
+    found = refine(base, other, uv, start, np.tile(3 * np.eye(2), (60, 1, 1)), 6)
+    good = found.status == int(MatchingStatus.CONVERGED)
+    assert good.mean() > 0.9
+    w = (found.uv - true)[good] / np.sqrt(np.einsum("nii->ni", found.covariance[good]))
+    assert 0.7 < np.sqrt(np.mean(w**2)) < 1.2
+    # in other windows than those of four times the scale nothing is looked for
+    apart = refine(base, other, uv, start, np.tile(9 * np.eye(2), (60, 1, 1)), 6)
+    assert (apart.status == int(MatchingStatus.OUTSIDE)).all()
+
+
 def test_hidden_points_are_not_found(pair):
     """Ground that the roof hides from the second photograph."""
     views, truth, found = pair
@@ -170,6 +232,15 @@ def test_rectified_points_are_where_they_are(pair):
     row, column = np.rint(place[:, 1]).astype(int), np.rint(place[:, 0]).astype(int)
     assert present(rectify(*views[::-1], X))[0].base == found.base
     assert np.isfinite(found.left[row, column]).all()
+    # and only what the photograph shows, up to half a pixel from the centres of those at its edge
+    rows, columns = found.left.shape
+    cells = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1).reshape(-1, 2)
+    uv = views[0].project(found.points(1.0 * cells, np.full(len(cells), d.mean())))
+    size = np.array(views[0].size)
+    away = np.minimum(uv + 0.5, size - 0.5 - uv).min(1)
+    sure = np.abs(away) > 1e-3
+    np.testing.assert_array_equal(np.isfinite(found.left).ravel()[sure], away[sure] > 0)
+    assert (np.abs(away) < 0.5).any()
 
 
 def test_one_camera_before_the_other_cannot_be_rectified(pair):
@@ -193,3 +264,17 @@ def test_a_value_without_sigma_is_no_value_of_the_only_pair():
     mean, variance, number = combine(np.array([[1.0, 2.0]]), np.array([[0.1, np.nan]]))
     assert mean[0] == 1.0 and np.isnan(mean[1]) and number.tolist() == [1, 0]
     np.testing.assert_allclose(variance[0], 0.01)
+
+
+def test_points_that_no_other_image_shows_are_said(pair):
+    """Their windows of 9 × 9 pixels are not in the other image; they are not badly correlated."""
+    views, truth, found = pair
+    every = truth[0][::4, ::4].reshape(-1, 3)
+    v, u = 4.0 * np.indices((48, 64))
+    inner = is_inside(views[0], np.stack([u, v], -1).reshape(-1, 2), 8)
+    unseen = inner & ~is_inside(views[1], views[1].project(every), 4)
+    said = found.bases[0]["rejected"]
+    assert said["at the edge"] == (~inner).sum()
+    # the search continues beyond the surface, as far as the guide is uncertain
+    assert said["in no other image at a similar scale"] == pytest.approx(unseen.sum(), rel=0.05)
+    assert said["low correlation"] < 0.1 * inner.sum()

@@ -22,7 +22,7 @@ from jaxbundle.geometry import (
 from jaxbundle.leastsquares.declarations import Table
 from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.quality.names import Name
-from jaxbundle.leastsquares.quality.response import Change
+from jaxbundle.leastsquares.quality.sensitivity import Change
 from jaxbundle.leastsquares.spaces import Pose, PoseValue, Rotation, Vector
 from jaxbundle.network.columns import did_you_mean, list_some
 from jaxbundle.network.kinds.base import ANGLES
