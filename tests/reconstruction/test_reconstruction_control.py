@@ -84,6 +84,8 @@ def test_scale_bars_and_control_that_no_photograph_shows(tmp_path):
     assert name_unused(seen, None, [], 3) == []
     with pytest.raises(InputError, match="no scale bar has both ends in two .*45 to 51"):
         name_unused(seen, None, [bar("45", "51")], 3)
+    with pytest.raises(InputError, match=r"\(1 to 2, 2 to 3, 3 to 4 and 2 more\)"):
+        name_unused(seen, None, [bar(str(k), str(k + 1)) for k in range(1, 6)], 3)
     both = dataclasses.replace(seen, image=np.array([0, 1, 0, 1]), name=("45", "45", "51", "51"))
     (note,) = name_unused(both, None, [bar("45", "51"), bar("45", "7")], 3)
     assert "45 to 7" in note and "51" not in note

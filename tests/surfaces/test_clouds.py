@@ -122,6 +122,17 @@ def test_points_without_sigma_count_as_those_of_the_median(plane, sigma):
     np.testing.assert_allclose(dsm.sigma, expected.sigma)
 
 
+def test_a_drawing_of_too_many_points_is_refused(tmp_path, monkeypatch):
+    """At once, with a way out: its objects would take gigabytes, and no CAD program reads it."""
+    monkeypatch.setattr("ezdxf.filemanagement.new", lambda _: pytest.fail("it is drawn"))
+    n = 5_000_001
+    many = lambda *shape: np.broadcast_to(0, (n, *shape))
+    cloud = Cloud(many(3), many(3, 3), many(), many(), many(2), ("a",))
+    with pytest.raises(InputError, match="5000001 points are too many for a drawing; thin"):
+        write_cloud(cloud, tmp_path / "cloud.dxf")
+    assert not list(tmp_path.iterdir())
+
+
 def test_heights_of_a_dsm_are_as_good_as_its_sigma_says(plane, tmp_path):
     dsm = make_dsm(plane, 2.0)
     x, y = dsm.centres()
