@@ -211,7 +211,7 @@ def _choose_loops(
     # each loop has at least a photograph in common with chosen ones, so that they can share pairs:
     # k loops of k + 2 photographs with 2k + 1 pairs are independent, those apart need 3k pairs. To
     # demand a common pair chose the same 60 pairs of three rendered sets of 24 photographs.
-    while new.any() and chosen.sum() < most:
+    while chosen.sum() < most:
         reached = np.any(np.isin(pairs, pairs[chosen]), axis=1) if chosen.any() else ~chosen
         next_to = new & np.any(reached[loops], axis=1)
         if not next_to.any():

@@ -82,6 +82,57 @@ def test_points_of_three_rays_confirm_a_result_with_many_gross_errors(
             call()
 
 
+@pytest.mark.parametrize("worst", [1.2, 5.0])
+def test_of_two_results_the_one_that_fits_better_counts(monkeypatch, worst):
+    """A result with some gross errors and a large misfit may be distorted by points of two rays:
+    that without them is taken only if it fits better."""
+    camera = Camera("cam", "brown", {"c": 24.0}, free=("c",))
+    network = simulate(ring_of_stations(4, 2.5, 6.0), grid_of_targets(4, 4, 0.5), camera, noise=0.0)
+    results = []
+    for factor in (3.0, worst):
+        # 4 of 64 measurements: more than 5 %, less than 25 %
+        found = SimpleNamespace(converged=True, removed=range(4), network=network)
+        found.with_changes = lambda found=found, **_: found
+        results.append(adjusting.WeightedAdjustment(found, {"all": factor}, 64))
+    attempts = iter(results)
+    monkeypatch.setattr(adjusting, "_weight", lambda *_: next(attempts))
+    monkeypatch.setattr(adjusting, "_count_agreeing", lambda *_: 64)
+    kinds = np.zeros(len(network.observations), int)
+    found = adjusting.adjust_weighted(network, kinds, {0: "all"}, 0.001, print)
+    assert found.factors == {"all": min(3.0, worst)}
+
+
+@pytest.mark.parametrize("last, changes, expected", [
+    (True, [1.5, 2.0, 1.2, 1.001, 9.0], 1.5 * 2.0 * 1.2), (False, [1.5, 2.0], 1.5),
+])  # fmt: skip
+def test_sigma_are_multiplied_until_they_fit(monkeypatch, last, changes, expected):
+    """Round by round until the factor is 1; residuals of an adjustment without a minimum are none,
+    and change nothing."""
+    camera = Camera("cam", "brown", {"c": 24.0}, free=("c",))
+    network = simulate(ring_of_stations(4, 2.5, 6.0), grid_of_targets(4, 4, 0.5), camera, noise=0.0)
+    every = np.arange(len(network.observations))
+    converged, sigma, changes = iter([True, *[last] * 4]), [], iter(changes)
+
+    def adjust(given, **_):
+        sigma.append(given.observations.sigma[0, 0])
+        found = SimpleNamespace(converged=next(converged), network=given)
+        found.problem, found.with_changes = SimpleNamespace(used=every >= 0), lambda **_: found
+        return found, given, every
+
+    monkeypatch.setattr(adjusting, "adjust_determined", adjust)
+    monkeypatch.setattr(adjusting, "choose_datum_points", lambda _: ())
+    monkeypatch.setattr(adjusting, "_rows", lambda *_: every)
+    monkeypatch.setattr(adjusting, "_pairs_of_ids", lambda *_: [])
+    for name in ("_approximate_redundancy", "_redundancy"):
+        monkeypatch.setattr(adjusting, name, lambda _: (np.ones((len(every), 2)),) * 2)
+    monkeypatch.setattr(adjusting, "_factors", lambda *_: np.full(len(every), next(changes)))
+    kinds, settings = np.zeros(len(every), int), adjusting.WeightingSettings()
+    done = adjusting._weight(network, kinds, {0: "all"}, 0.001, lambda _: None, settings)
+    assert done.factors["all"] == pytest.approx(expected)
+    # the last result is that with the last σ
+    assert sigma[-1] == pytest.approx(expected * sigma[0])
+
+
 @pytest.mark.parametrize("how", ["raises", "ends without a minimum"])
 def test_points_that_gross_errors_leave_undetermined_are_left_out(monkeypatch, how):
     camera = Camera("cam", "brown", {"c": 24.0}, free=("c",))
@@ -163,3 +214,31 @@ def test_start_values_that_leave_out_the_fewest_photographs_come_first(monkeypat
     monkeypatch.setattr(starting, "_try_other_distances", lambda *_: ())
     found = starting.start_values(SimpleNamespace(images="abcdefgh"), (), {})
     assert [oriented.images_not_placed for oriented in found] == ["d", "abc"]
+
+
+def test_a_wide_tolerance_is_not_tried_where_the_narrow_one_loses_nothing(monkeypatch):
+    """It would let wrong points in, and takes its time."""
+    orient = lambda network, tolerance, *_: SimpleNamespace(images_not_placed={}, used=tolerance)
+    monkeypatch.setattr(starting, "_orient", orient)
+    monkeypatch.setattr(starting, "_try_other_distances", lambda *_: ())
+    (found,) = starting.start_values(SimpleNamespace(images="abcdefgh"), (), {})
+    assert found.used == starting.BlockStartSettings().tolerance
+
+
+def test_of_other_principal_distances_those_that_explain_most_are_adjusted(monkeypatch):
+    """Most image points of enough photographs: of 8, 3 are less than half."""
+    found = [
+        SimpleNamespace(network=SimpleNamespace(images=range(images), observations=range(rays)))
+        for images, rays in ((8, 100), (7, 300), (3, 900), (8, 200))
+    ]
+
+    def orient(changed, *_):
+        if changed in found:
+            return changed
+        raise NotSolvedError("not solved")
+
+    monkeypatch.setattr(starting, "_orient", orient)
+    monkeypatch.setattr(starting, "_try_other_distances", lambda *_: found)
+    settings = starting.BlockStartSettings(max_others=2)
+    best = [*starting.start_values(SimpleNamespace(images=range(8)), (), {}, settings)]
+    assert [len(one.network.observations) for one in best] == [300, 200]

@@ -1,6 +1,7 @@
 """Pixels that are not square: what the photographs alone give, and what their halves confirm."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -48,6 +49,12 @@ def test_square_pixels_are_not_contradicted_by_chance():
     assert contradicted_ratios(result) == {}
     p = result.camera_parameters("cam")
     assert abs(p["fy"] / p["fx"] - 1) < 2e-4
+
+
+def test_without_an_observed_ratio_nothing_is_contradicted():
+    """A calibrated camera has none."""
+    network = SimpleNamespace(further=())
+    assert contradicted_ratios(SimpleNamespace(problem=SimpleNamespace(network=network))) == {}
 
 
 def test_the_ratio_of_the_photographs_alone_is_that_without_the_observation(squeezed):

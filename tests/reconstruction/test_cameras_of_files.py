@@ -15,12 +15,14 @@ def photographs(*exif):
 WIDE = Exif((3000, 2000), "Maker", "X1", 24.0, 36.0)
 LONG = Exif((3000, 2000), "Maker", "X1", 50.0, 75.0)
 UPRIGHT = Exif((2000, 3000), "Maker", "X1", 24.0, 36.0)
+ZOOMED = Exif((3000, 2000), "Maker", "X1", 24.0), Exif((3000, 2000), "Maker", "X1", 50.0)
 NAMELESS = Exif((3000, 2000))
 
 
 @pytest.mark.parametrize("exif, ids, of, lens", [
     ([WIDE, WIDE], ["Maker X1"], (0, 0), (0,)),
     ([WIDE, LONG, WIDE], ["Maker X1 1", "Maker X1 2"], (0, 1, 0), (0, 1)),
+    ([*ZOOMED], ["Maker X1 1", "Maker X1 2"], (0, 1), (0, 1)),
     ([WIDE, UPRIGHT], ["Maker X1 1", "Maker X1 2"], (0, 1), (0, 0)),
     ([NAMELESS], ["camera"], (0,), (0,)),
 ])  # fmt: skip

@@ -32,6 +32,19 @@ def test_positions_may_be_shifted_against_the_control_that_agrees(monkeypatch, a
     np.testing.assert_allclose(moved, shift if agree else np.zeros(3))
 
 
+def test_points_that_the_block_does_not_have_are_used_by_their_rays():
+    """Such as those whose rays data snooping removed, and that meet in the frame of control:
+    nothing contradicts control points, and check points are never used."""
+    control = Points(("A", "B"), ("control", "check"), np.eye(2, 3), np.full((2, 3), 0.02))
+    rays = SimpleNamespace(rows=[0, 1], good=np.ones(2, bool), position=np.full(3, np.nan))
+    assessed = SimpleNamespace(factor=1.0)
+    block = SimpleNamespace(row_of_determined={}, settings=ControlSettings())
+    found = control_choice.choose_control(
+        block, control, {"A": rays, "B": rays}, [], assessed, 0.1
+    )
+    assert found.used.tolist() == [True, False] and found.reasons == {}
+
+
 def many_points(compared_together, role="control"):
     """120 points, determined by the block to a millimetre, with errors of 0.3 m in the plane and
     0.6 m in height, of unknown σ; the first of the given role."""

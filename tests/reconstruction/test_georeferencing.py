@@ -5,6 +5,7 @@ import datetime
 import json
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,11 +15,20 @@ from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.cli.outputs import write_targets
 from jaxbundle.cli.reconstruct_files import write_reconstruction
 from jaxbundle.errors import InputError
+from jaxbundle.network.kinds import Antennas
 from jaxbundle.photographs.exif import Exif
 from jaxbundle.reconstruction import georeferencing
-from jaxbundle.reconstruction.block import CameraPositions, describe_block
+from jaxbundle.reconstruction.block import (
+    BlockFacts,
+    CameraPositions,
+    camera_positions,
+    describe_block,
+)
+from jaxbundle.reconstruction.control_choice import ControlChoice
+from jaxbundle.reconstruction.controlled_network import network_with_control
 from jaxbundle.reconstruction.georeferencing import georeference
 from jaxbundle.reconstruction.oriented_block import OrientedBlock
+from jaxbundle.reconstruction.page import describe_part
 from jaxbundle.reconstruction.result import ReconstructedPart, Reconstruction
 
 SIGMA = 0.5
@@ -218,6 +228,34 @@ def test_a_point_without_height_leaves_the_others_to_give_the_frame(drone, monke
         controlled(drone, drone.given(X, sigma, positions=False))
 
 
+def test_the_adjustment_with_control_starts_at_the_block_in_its_frame(drone):
+    """Also the projection centres: without satellite positions those of the block may be in any
+    frame, and map coordinates are 4000 km from its origin."""
+    given = drone.given(drone.truth, 0.05, positions=False)
+    block = OrientedBlock(drone.block(False).adjustment, given)
+    block.move(range(CONTROL), given.points)
+    used, sigma = np.ones(CONTROL, bool), given.points.sigma
+    choice = ControlChoice(block.resolve(), used, sigma, {}, {}, None)
+    network = network_with_control(block, given.points, choice)
+    far = network.images.position - (drone.positions[0] - OFFSET)
+    # satellite positions with their errors; those of the block are centimetres
+    assert np.abs(far / SATELLITE).max() < 4
+
+
+def test_sigma_of_positions_is_the_median_of_those_given():
+    """Each axis by itself: of heights it is larger."""
+    sigma = np.array([[1.0, 2.0, 5.0], [1.5, 2.5, 6.0], [9.0, 9.0, 90.0]])
+    covariance = sigma[:, :, None] * sigma[:, None] * (np.eye(3) + 0.1) / 1.1
+    antennas = Antennas(image=tuple("abc"), position=np.zeros((3, 3)), covariance=covariance,
+                        strip=("",) * 3, time=np.zeros(3))  # fmt: skip
+    network = SimpleNamespace(further=(antennas,), images=SimpleNamespace(id=tuple("abc")))
+    result = SimpleNamespace(problem=SimpleNamespace(network=network),
+                             image_values=np.ones((3, 6)), further_unknowns={})  # fmt: skip
+    found = camera_positions(result)
+    np.testing.assert_allclose(found.sigma, sigma[1])
+    np.testing.assert_allclose(found.rms, 1.0)
+
+
 def test_report_page_and_json_show_control_and_block(drone, spoilt, tmp_path):
     image, result, _, table = spoilt
     positions = any(one.TABLE == "antennas" for one in result.network.further)
@@ -249,6 +287,21 @@ def test_report_page_and_json_show_control_and_block(drone, spoilt, tmp_path):
     with (folder / "control.csv").open() as file:
         rows = {row["id"]: row for row in csv.DictReader(file)}
     assert rows["gcp06"]["used"] == "False" and "left out" in rows["gcp06"]["verdict"]
+
+
+def test_the_time_of_computation_is_in_whole_seconds():
+    """As the times of the photographs, which have no fractions, in ISO 8601."""
+    time = datetime.datetime(2024, 5, 1, 10, 20, 30, 123456, datetime.UTC)
+    facts = BlockFacts(3, None, time, "local", "m", 0.01, 60.0, None, None, 3.0, 90.0, None, None)
+    assert facts.as_dict()["computed"] == "2024-05-01T10:20:30+00:00"
+
+
+def test_control_that_is_not_used_is_reported_with_the_reason():
+    """In the text, too: a surveyor who gave control sees why the block is without it."""
+    block = SimpleNamespace(facts=lambda: [("Photographs", "3")])
+    part = SimpleNamespace(name="part 1", block=block, control=None, no_control="expected 3, got 2")
+    whole = SimpleNamespace(name="survey", parts=(part,))
+    assert "Control is not used: expected 3, got 2" in describe_part(whole, part)
 
 
 def test_the_written_network_gives_the_same_numbers(good, tmp_path):

@@ -15,7 +15,12 @@ from jaxbundle.photographs.exif import GeographicPosition
 from jaxbundle.photographs.places import map_positions
 from jaxbundle.reconstruction.control import read_control_measurements, with_sigma
 from jaxbundle.reconstruction.controlled_network import says_left_out, without_names
-from jaxbundle.reconstruction.named import NamedMeasurements, name_unused, read_distances
+from jaxbundle.reconstruction.named import (
+    NamedMeasurements,
+    find_named,
+    name_unused,
+    read_distances,
+)
 from jaxbundle.reconstruction.satellite_positions import find_positions
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -79,13 +84,30 @@ def test_scale_bars_and_control_that_no_photograph_shows(tmp_path):
     assert name_unused(seen, None, [], 3) == []
     with pytest.raises(InputError, match="no scale bar has both ends in two .*45 to 51"):
         name_unused(seen, None, [bar("45", "51")], 3)
+    with pytest.raises(InputError, match=r"\(1 to 2, 2 to 3, 3 to 4 and 2 more\)"):
+        name_unused(seen, None, [bar(str(k), str(k + 1)) for k in range(1, 6)], 3)
     both = dataclasses.replace(seen, image=np.array([0, 1, 0, 1]), name=("45", "45", "51", "51"))
     (note,) = name_unused(both, None, [bar("45", "51"), bar("45", "7")], 3)
     assert "45 to 7" in note and "51" not in note
+    # an end in one photograph has no position, however many show the other points
+    part = NamedMeasurements(np.array([0, 1, 0, 0, 1]), ("45", "45", "51", "52", "52"),
+                             np.zeros((5, 2)), np.ones((5, 2)))  # fmt: skip
+    (note,) = name_unused(part, None, [bar("45", "51"), bar("45", "52")], 3)
+    assert "45 to 51" in note and "52" not in note
     control = read_control_measurements(written(tmp_path, "id,X,Y,Z\n45,1,2,3\n7,1,2,4\n"))
     with pytest.raises(InputError, match="1 control points are measured .* 3 are needed.*7"):
         name_unused(both, control, [], 3)
     assert name_unused(both, control, [], 1) == ["control points in no photograph: 7"]
+
+
+def test_measurements_in_missing_photographs_are_reported(tmp_path):
+    """The others are used; if none is left another folder was given."""
+    text = "id,X,Y,Z,image,u,v\nA,1,2,3,a.jpg,10,20\nA,1,2,3,b.jpg,11,21\nB,4,2,3,b.jpg,1,2\n"
+    control = read_control_measurements(written(tmp_path, text))
+    found, notes = find_named([SimpleNamespace(name="a.jpg")], None, control)
+    assert found.name == ("A",) and notes == ["control measured in missing photographs: 'b.jpg'"]
+    with pytest.raises(InputError, match="measured in none of the photographs, but in a.jpg, b"):
+        find_named([SimpleNamespace(name="c.jpg")], None, control)
 
 
 TABLE = ("id,X,Y,Z,sX,sY,sZ,image,u,v\nA,1,2,3,,,,a.jpg,10,20\nB,4,2,3,0.01,0.01,0.02,a.jpg,11,2\n"

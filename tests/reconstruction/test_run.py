@@ -5,7 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from jaxbundle import Camera
 from jaxbundle.reconstruction import reconstruct, square_pixels
+from jaxbundle.reconstruction.photographs import Cameras
 from jaxbundle.reconstruction.reconstruct import ReconstructionSettings, _ReconstructionRun
 from jaxbundle.tiepoints.matching import FeatureMatches
 
@@ -33,6 +35,16 @@ def test_pairs_with_matches_are_known_with_those_that_are_only_marks(run, monkey
     monkeypatch.setattr(reconstruct, "without_marks", lambda *_: ([], 2))
     assert run._match() == ([], [])
     assert run.matched_pairs == {(0, 1)} and run.left_out.keys() == {"2.jpg"}
+
+
+def test_the_photographs_are_matched_with_the_cameras_that_the_matches_gave(run, monkeypatch):
+    """Not with the first guess; those given as calibrated stay."""
+    guess, found = (Camera("c", "opencv", {"fx": f, "fy": f}) for f in (1000.0, 1400.0))
+    monkeypatch.setattr(reconstruct, "start_cameras", lambda *_: ([found], ["found"]))
+    for calibrated, camera in ((True, guess), (False, found)):
+        run.cameras = Cameras((guess,), (0, 0, 0), (None,), calibrated, ())
+        run._find_cameras([], [])
+        assert run.cameras.cameras == (camera,) and run.cameras.camera_of == (0, 0, 0)
 
 
 @pytest.mark.parametrize("confirmed", [True, False])

@@ -13,12 +13,12 @@ from jaxbundle import plotting
 from jaxbundle.errors import InputError
 from jaxbundle.planning.texture import Texture
 from jaxbundle.surfaces.accuracy import accuracy_of, at_check_points, to_plane
-from jaxbundle.surfaces.cloud import Cloud, merge
+from jaxbundle.surfaces.cloud import Cloud, empty_cloud, merge
 from jaxbundle.surfaces.cloud_filters import drop_isolated, drop_weak, thin
 from jaxbundle.surfaces.compare import compare
 from jaxbundle.surfaces.dsm import NO_DATA, Dsm, make_dsm, write_dsm
 from jaxbundle.surfaces.files import text_of
-from jaxbundle.surfaces.orthophoto import orthophoto
+from jaxbundle.surfaces.orthophoto import orthophoto, write_orthophoto
 from jaxbundle.surfaces.point_files import read_cloud, write_cloud
 
 
@@ -50,6 +50,24 @@ def test_a_cube_gives_its_corner_or_mean_where_it_has_enough_points():
     np.testing.assert_allclose(mean.X, [(4 * X[0] + X[1]) / 5])
     np.testing.assert_allclose(mean.covariance[0], np.eye(3) * 2 / (1 + 1 / 4))
     np.testing.assert_allclose(thin(cloud, 1.0, least=2, place="best").X, X[:1])
+
+
+def test_a_point_of_no_sigma_has_the_weight_of_the_worst():
+    """σ 0 says that nothing is known of it; 1/0 would make it the only one, or the mean NaN."""
+    X = np.array([[0.1, 0.2, 0.3], [0.3, 0.4, 0.7], [0.9, 0.9, 0.9]])
+    C = np.stack([0 * np.eye(3), 4 * np.eye(3), np.eye(3)])
+    cloud = Cloud(X, C, np.full(3, 2), np.zeros(3, int), np.zeros((3, 2)), ("a",))
+    np.testing.assert_allclose(thin(cloud, 1.0).X, [(X[0] + X[1] + 4 * X[2]) / 6])
+
+
+def test_images_without_points_can_be_merged(plane):
+    none = empty_cloud("c.jpg")
+    assert merge([none, plane, none]).images == plane.images
+    alone = merge([none, none])
+    assert alone.X.shape == (0, 3) and alone.covariance.shape == (0, 3, 3)
+    assert {len(column) for column in alone.table().values()} == {0}
+    with pytest.raises(InputError, match="no clouds to merge"):
+        merge([])
 
 
 def test_lonely_and_weak_points_go(plane):
@@ -104,6 +122,17 @@ def test_points_without_sigma_count_as_those_of_the_median(plane, sigma):
     np.testing.assert_allclose(dsm.sigma, expected.sigma)
 
 
+def test_a_drawing_of_too_many_points_is_refused(tmp_path, monkeypatch):
+    """At once, with a way out: its objects would take gigabytes, and no CAD program reads it."""
+    monkeypatch.setattr("ezdxf.filemanagement.new", lambda _: pytest.fail("it is drawn"))
+    n = 5_000_001
+    many = lambda *shape: np.broadcast_to(0, (n, *shape))
+    cloud = Cloud(many(3), many(3, 3), many(), many(), many(2), ("a",))
+    with pytest.raises(InputError, match="5000001 points are too many for a drawing; thin"):
+        write_cloud(cloud, tmp_path / "cloud.dxf")
+    assert not list(tmp_path.iterdir())
+
+
 def test_heights_of_a_dsm_are_as_good_as_its_sigma_says(plane, tmp_path):
     dsm = make_dsm(plane, 2.0)
     x, y = dsm.centres()
@@ -136,6 +165,24 @@ def test_gaps_of_a_dsm_are_filled_inside_only(plane):
     gap = np.isnan(plain.height) & np.isfinite(filled.height)
     assert gap.sum() >= 1 and np.isnan(filled.height).sum() > 15
     assert (filled.sigma[gap] > np.nanmedian(plain.sigma)).all()
+
+
+def test_a_gap_at_the_border_is_filled_from_the_cells_that_there_are():
+    """By inverse squares of distances. Heights mirrored at the border would count twice, and bend a
+    slope there."""
+    row, column = np.indices((7, 7))
+    height = 30 + 0.3 * column + 0.1 * row
+    gap = (row == 3) & (column == 1)
+    X = np.stack([column + 0.5, 6.5 - row, height], 2)[~gap]
+    n = len(X)
+    C = np.tile(1e-4 * np.eye(3), (n, 1, 1))
+    found = make_dsm(Cloud(X, C, np.full(n, 2), np.zeros(n, int), np.zeros((n, 2)), ("a",)), 1.0,
+                     fill=1)  # fmt: skip
+    square = ((row - 3) ** 2 + (column - 1) ** 2).astype(float)
+    near = (abs(row - 3) <= 2) & (abs(column - 1) <= 2) & ~gap
+    expected = np.average(height[near], weights=1 / square[near])
+    assert found.height[3, 1] == pytest.approx(expected, abs=1e-6)
+    np.testing.assert_allclose(found.height[~gap], height[~gap])
 
 
 def test_a_gap_beside_a_wall_is_filled_from_below(plane):
@@ -217,3 +264,15 @@ def test_a_folder_where_a_cloud_is_expected(tmp_path, command):
     told = command("cloud", tmp_path)
     assert told.status == 2
     assert told.err.startswith(f"jaxbundle: {tmp_path}: is a folder; expected a cloud, .csv")
+
+
+@pytest.mark.parametrize("values, kind", [([7.0, np.nan], "uint8"), ([np.nan] * 2, "uint8"),
+                                          ([7.0, 300.0], "uint16")])  # fmt: skip
+def test_an_orthophoto_has_as_many_bits_as_its_grey_values(tmp_path, values, kind):
+    """Also where no cell has one, without a warning: 0 stands for none."""
+    grey = np.array([values])
+    dsm = Dsm(0 * grey, 0 * grey, np.zeros((1, 2), int), 0.0, 1.0, 1.0)
+    write_orthophoto(grey, dsm, tmp_path / "o.tif")
+    with rasterio.open(tmp_path / "o.tif") as raster:
+        assert raster.dtypes == (kind,)
+        np.testing.assert_array_equal(raster.read(1), np.nan_to_num(grey))

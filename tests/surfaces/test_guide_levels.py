@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from jaxbundle.surfaces import guide
+from jaxbundle.surfaces.segments import Segments
 
 
 @pytest.mark.parametrize("max_nodes, finest", [(10**9, 0), (2000, 2), (1, 4)])
@@ -28,6 +29,20 @@ def test_a_guide_has_at_most_so_many_nodes(monkeypatch, max_nodes, finest):
     assert levels == list(range(4, finest - 1, -1))
     assert max(numbers[1:], default=0) <= max_nodes
     assert finest == 0 or 4 * numbers[-1] > 0.9 * max_nodes
+
+
+def test_an_image_says_nothing_beyond_the_part_of_a_line_of_sight_that_it_shows(monkeypatch):
+    """Although it is searched some positions farther, for peaks at either end."""
+    steps, one = 11, np.ones(1, bool)
+    monkeypatch.setattr(guide, "correlate", lambda *_, **given: (np.ones((1, steps)), None))
+    # 4 pixels between q = 1 and q = 2, in the middle of 11 positions
+    segment = Segments(np.array([[1.0, 2.0]]), np.array([4.0]), np.zeros(1))
+    window = SimpleNamespace(other_axis=np.array([[1.0, 0.0]]))
+    q = np.array([[0.5, 1.0, 1.4, 2.0, 2.5]])
+    rho = guide._correlate_at(
+        q, (None, None), (None, None), None, segment, window, one, level=0, steps=steps, half=2
+    )
+    np.testing.assert_array_equal(rho, [[np.nan, 1, 1, 1, np.nan]])
 
 
 def test_the_normal_at_an_edge_is_the_line_of_sight_at_height_zero():

@@ -1,11 +1,14 @@
 """Which images form pairs: by overlap and angle of intersection, known for two vertical ones."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from jaxbundle.surfaces.pairs import score
+from jaxbundle.surfaces import matching
+from jaxbundle.surfaces.bounds import bounds_from_points
+from jaxbundle.surfaces.pairs import choose_partners, score
 
 HEIGHT = 100.0
 
@@ -24,6 +27,9 @@ class Vertical:
 
     def project(self, X):
         return (X[:, :2] - [self.x, 0]) * (HEIGHT / (HEIGHT - X[:, 2]))[:, None] + 100
+
+    def parameter(self, X):
+        return X[:, 2]
 
     def derivative(self, X):
         away = HEIGHT - X[:, 2]
@@ -55,3 +61,37 @@ def test_of_depths_the_best_counts_and_images_far_apart_are_no_pair():
                  for q in (-285.0, -170.0, -55.0)]  # fmt: skip
     assert score(Vertical(0.0), hills, Vertical(60.0)) == max(at_depths) > min(at_depths)
     assert score(Vertical(0.0), flat, Vertical(300.0)) == 0.0
+
+
+def test_partners_are_the_images_that_overlap_the_best_first():
+    """At most so many; one without any is not in the list, and is not matched in vain."""
+    views = [Vertical(x) for x in (0.0, 10.0, 25.0, 1000.0)]
+    flat = [lambda uv: np.zeros((len(uv), 2))] * 4
+    found = choose_partners(views, flat)
+    assert found.keys() == {0, 1, 2} and found[0] == [2, 1] and set(found[2]) == {0, 1}
+    assert choose_partners(views, flat, most=1)[0] == [2]
+
+
+def test_bounds_need_five_points():
+    """They lie within them with a margin; fewer tell little of the range of a surface."""
+    X = np.column_stack([np.zeros((5, 2)), np.linspace(10, 20, 5)])
+    low, high = bounds_from_points(Vertical(0.0), X)
+    assert 0 < low < 10 and high > 20
+    assert bounds_from_points(Vertical(0.0), X[:4]) is None
+    outside = np.concatenate([X[:4], [[500.0, 0.0, 10.0]]])
+    assert bounds_from_points(Vertical(0.0), outside) is None
+
+
+def test_the_scatter_of_points_in_one_column_of_the_grid(monkeypatch):
+    """Of a narrow overlap: the step of the grid along the image is not known then."""
+    n, shapes = 9, []
+    monkeypatch.setattr(matching, "missing_sigma", lambda q, *_: shapes.append(q.shape))
+    X = np.column_stack([np.zeros(n), np.arange(n), np.zeros(n)])
+    uv = np.repeat(Vertical(0.0).project(X)[:, None], 2, axis=1)
+    table = SimpleNamespace(
+        views=(Vertical(0.0), Vertical(25.0)), uv=uv, is_used=np.ones((n, 2), bool)
+    )
+    found = SimpleNamespace(covariance=np.tile(np.eye(3), (n, 1, 1)), X=X)
+    settings = dataclasses.replace(matching.MatchingSettings(), block_side=3)
+    assert matching._shape_variance(table, found, 0.5, settings) is None
+    assert shapes == [(n, 1)]

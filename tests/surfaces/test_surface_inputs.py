@@ -2,6 +2,7 @@
 colours, large rasters by blocks."""
 
 import dataclasses
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -21,6 +22,7 @@ from jaxbundle.surfaces import scanner_inputs
 from jaxbundle.surfaces.correlation import make_pyramid
 from jaxbundle.surfaces.inputs import find_photographs, read_views
 from jaxbundle.surfaces.intersection import intersect
+from jaxbundle.surfaces.matching import _drop_worst_rays, _Rays
 from jaxbundle.surfaces.orientation import (
     derivative_by_orientation,
     is_uncertain,
@@ -62,6 +64,31 @@ def test_uncertain_orientations_move_points_as_their_covariance_says():
     found = orientation_covariance(given, X, used)
     np.testing.assert_allclose(found, expected, rtol=0.02, atol=1e-9)
     assert not orientation_covariance(views([None] * 3), X, used).any()
+
+
+def test_a_point_without_its_worst_ray_keeps_the_weights_of_the_others():
+    """As if only the others had been intersected, each with its own covariance."""
+    X = np.array([[0.3, 0.2, 0.1], [-0.5, 0.6, 1.0]])
+    given, rng = tuple(views([None] * 3)), np.random.default_rng(2)
+    uv = np.stack([v.project(X) for v in given], 1) + rng.normal(size=(2, 3, 2))
+    uv[1, 2] += 20.0
+    covariance = rng.uniform(0.5, 3.0, (2, 3, 1, 1)) * np.eye(2)
+    table = _Rays(given, uv, covariance, np.ones((2, 3), bool))
+    first = table.intersect(X)
+    changed, found = _drop_worst_rays(table, first, np.array([False, True]))
+    assert changed.is_used.tolist() == [[True] * 3, [True, True, False]]
+    again = intersect(given, uv, covariance, changed.is_used, first.X)
+    for name in ("X", "covariance", "rays", "vtpv"):
+        expected = [getattr(first, name)[0], getattr(again, name)[1]]
+        np.testing.assert_allclose(getattr(found, name), expected, rtol=1e-9)
+
+
+def test_one_input_is_an_image_by_its_name_or_a_project():
+    """Of an image alone, `surface` says that it needs another; a folder holds photographs."""
+    for name in ("a.tif", "a.TIF", "a_RPC.TXT", "a.RPB", "a.json"):
+        assert scanner_inputs.is_ground_image(Path(name)), name
+    for name in ("project", "images.csv", "project.toml"):
+        assert not scanner_inputs.is_ground_image(Path(name)), name
 
 
 def test_a_joint_covariance_of_orientations_and_camera_moves_points_as_it_says(tmp_path):
@@ -120,6 +147,9 @@ def test_photographs_are_found_beside_masks_and_depths(tmp_path):
     found = find_photographs(["im0", "a", "im0.png"], tmp_path)
     assert [p.relative_to(tmp_path).as_posix() for p in found] == ["im0.png", "left/a.JPG",
                                                                    "im0.png"]  # fmt: skip
+    # a file of another kind, too, if there is no image: its reader says what can be read
+    (tmp_path / "left/b.sketch").write_bytes(b"")
+    assert find_photographs(["b"], tmp_path) == [tmp_path / "left/b.sketch"]
     (tmp_path / "im0.jpg").write_bytes(b"")
     with pytest.raises(InputError, match=r"im0: there are .*im0\.jpg, .*im0\.png"):
         find_photographs(["im0"], tmp_path)
@@ -143,6 +173,9 @@ def test_a_colmap_folder_gives_oriented_photographs_in_colour(tmp_path):
     np.testing.assert_allclose([v.M for v in found], [np.eye(3)] * 3, atol=1e-12)
     np.testing.assert_allclose(found[1].project(CENTRES[1:2] - [0, 0, 5]), [[127.5, 95.5]])
     assert (found[0].colours()[..., ::-1] == colour).all() and found[0].grey.ndim == 2
+    (tmp_path / "images.txt").write_text(rows[0])
+    with pytest.raises(InputError, match="1 oriented images; a surface needs at least two"):
+        read_views(tmp_path, photos)
 
 
 def test_a_raster_is_read_by_blocks_and_keeps_its_bits(tmp_path):

@@ -9,6 +9,7 @@ from scipy import ndimage
 from surface_scenes import CAMERA, F, hills, photographs, two_shapes
 
 from jaxbundle.measure.least_squares_matching import MatchingStatus
+from jaxbundle.surfaces import correlation
 from jaxbundle.surfaces.correlation import find_peaks, make_pyramid, slide
 from jaxbundle.surfaces.dense_cloud import combine
 from jaxbundle.surfaces.reconstruct import find_bounds, reconstruct_surface
@@ -120,6 +121,20 @@ def test_correlation_along_a_strip_is_that_of_every_window():
     assert np.isnan([peak[1], best[1], second[1]]).all()
 
 
+def test_a_peak_is_the_vertex_of_the_parabola_through_its_neighbours():
+    """At either end, where a neighbour is missing, the largest value itself."""
+    k = np.arange(6.0)
+    rho = np.stack([0.9 - 0.05 * (k - 2.3) ** 2, 0.9 - 0.05 * (k - 5.2) ** 2, 0.9 - 0.1 * k])
+    np.testing.assert_allclose(find_peaks(rho)[1], [2.3, 5.0, 0.0])
+
+
+def test_correlations_of_several_images_are_the_mean_of_the_better_half():
+    """Of n the best ⌊n/2⌋ + 1: an image in which the point is hidden does not spoil the others."""
+    nan = np.nan
+    rho = np.array([[[0.9, 0.9, nan, 0.7]], [[-0.5, nan, nan, nan]], [[0.8, 0.1, nan, nan]]])
+    np.testing.assert_allclose(correlation.combine(rho), [[0.85, 0.5, nan, 0.7]])
+
+
 @pytest.mark.parametrize("unit, level", [(1.0, 128.0), (1e-3, 0.128), (1e-6, 0.0), (1e4, 1e6)])
 def test_correlation_has_no_unit_of_grey_values(unit, level):
     """Rasters of floating point may be reflectances; a flat window is flat in any unit."""
@@ -217,6 +232,15 @@ def test_rectified_points_are_where_they_are(pair):
     row, column = np.rint(place[:, 1]).astype(int), np.rint(place[:, 0]).astype(int)
     assert present(rectify(*views[::-1], X))[0].base == found.base
     assert np.isfinite(found.left[row, column]).all()
+    # and only what the photograph shows, up to half a pixel from the centres of those at its edge
+    rows, columns = found.left.shape
+    cells = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1).reshape(-1, 2)
+    uv = views[0].project(found.points(1.0 * cells, np.full(len(cells), d.mean())))
+    size = np.array(views[0].size)
+    away = np.minimum(uv + 0.5, size - 0.5 - uv).min(1)
+    sure = np.abs(away) > 1e-3
+    np.testing.assert_array_equal(np.isfinite(found.left).ravel()[sure], away[sure] > 0)
+    assert (np.abs(away) < 0.5).any()
 
 
 def test_one_camera_before_the_other_cannot_be_rectified(pair):
@@ -233,6 +257,13 @@ def test_pairs_that_disagree_are_left_out_where_no_third_decides():
     assert number.tolist()[0] == 2 and number.tolist()[2:] == [2, 1]
     # one pair: its σ; of two, the half that is the base image's stays
     np.testing.assert_allclose(variance[[0, 3]], [0.75e-4, 1e-4])
+
+
+def test_a_value_without_sigma_is_no_value_of_the_only_pair():
+    """Beside a step a disparity may be known and its σ not."""
+    mean, variance, number = combine(np.array([[1.0, 2.0]]), np.array([[0.1, np.nan]]))
+    assert mean[0] == 1.0 and np.isnan(mean[1]) and number.tolist() == [1, 0]
+    np.testing.assert_allclose(variance[0], 0.01)
 
 
 def test_points_that_no_other_image_shows_are_said(pair):

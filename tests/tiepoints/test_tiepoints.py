@@ -18,7 +18,13 @@ from jaxbundle.tiepoints.closure import (
     find_loops,
 )
 from jaxbundle.tiepoints.coplanarity import CoplanaritySettings, estimate_interior
-from jaxbundle.tiepoints.features import Features, FeatureSettings, find_features
+from jaxbundle.tiepoints.features import (
+    Features,
+    FeatureSettings,
+    _search,
+    find_features,
+    memory_of_features,
+)
 from jaxbundle.tiepoints.loops import split_contradicted
 from jaxbundle.tiepoints.matching import (
     FeatureMatches,
@@ -26,7 +32,7 @@ from jaxbundle.tiepoints.matching import (
     distances_within,
     match_features,
 )
-from jaxbundle.tiepoints.pairs import candidate_pairs
+from jaxbundle.tiepoints.pairs import CandidateSettings, candidate_pairs
 from jaxbundle.tiepoints.still import MarkSettings, without_marks
 from jaxbundle.tiepoints.store import Store
 from jaxbundle.tiepoints.track_measurement import TrackMatchingSettings
@@ -157,6 +163,13 @@ def test_a_first_principal_distance_without_loops_is_passed_over(monkeypatch):
     np.testing.assert_array_equal(close_rotations(lambda x: None, start), start)
 
 
+def test_first_principal_distances_are_one_sigma_on_either_side():
+    """Of ln c, in which a camera is as often too long as too short."""
+    settings = ClosureSettings()
+    first = np.sort(np.log(settings.first_factors)) / settings.sigma_log_distance
+    np.testing.assert_allclose(first, [-1.0, 0.0, 1.0], atol=0.12)
+
+
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 0.4, 3.0, np.pi])
 def test_the_angle_of_a_rotation(angle):
     M = Rotation.from_rotvec(angle * np.array([2, -1, 2]) / 3).as_matrix()
@@ -211,6 +224,23 @@ def test_verification_keeps_true_matches_and_names_what_is_degenerate(cloud):
     assert np.linalg.norm(Rotation.from_matrix(M @ true.T).as_rotvec()) < 0.01
     assert 0.5 < angle < 1.3
     assert [one and one[4] for one in found] == ["relative", "rotation", "plane", None]
+
+
+def test_matches_that_are_not_unique_are_another_trial_only_if_they_are_many(monkeypatch):
+    """With fewer than orient a pair, the same matches would fail again, at the cost of all."""
+    least, tried = VerificationSettings().min_matches, []
+
+    def find(rows, *_):
+        tried.append({k: len(r) for k, r in rows.items()})
+        return {}
+
+    monkeypatch.setattr("jaxbundle.tiepoints.verification._find_agreeing", find)
+    monkeypatch.setattr("jaxbundle.tiepoints.verification._find_rotation", lambda *_: None)
+    n = 3 * least
+    xy = [np.zeros((n, 2))] * 3
+    unique = [np.arange(n) >= repeated for repeated in (0, least - 1, least)]
+    assert verify_pairs(xy, xy, np.ones(3), unique) == [None] * 3
+    assert tried == [{0: n, 1: n - least + 1, 2: n - least}, {2: n}]
 
 
 @pytest.fixture(scope="module")
@@ -293,7 +323,7 @@ def paired(i, j, rows, distance_ratio):
     return Pair((i, j), rows, np.array(distance_ratio), np.eye(3), np.zeros(3), 0.1, "relative", 9)
 
 
-def test_features_lie_at_the_centres_of_blobs():
+def test_features_lie_at_the_centres_of_blobs(monkeypatch):
     """OpenCV's own upscaling would move the smallest a quarter of a pixel right and down."""
     rng = np.random.default_rng(5)
     true = np.stack(np.meshgrid(np.arange(20, 300, 20), np.arange(20, 220, 20)), -1).reshape(-1, 2)
@@ -306,6 +336,13 @@ def test_features_lie_at_the_centres_of_blobs():
     near = np.linalg.norm(found.xy[:, None] - true[None], axis=2)
     e = (found.xy - true[near.argmin(1)])[near.min(1) < 1.5]
     assert len(e) >= len(true) / 2
+    # these are a third of so many, enough: no second search of the features of noise
+    searched = []
+    search = lambda *given: searched.append(given[-1]) or _search(*given)
+    monkeypatch.setattr("jaxbundle.tiepoints.features._search", search)
+    settings = FeatureSettings(number=len(true))
+    find_features(np.rint(grey).astype(np.uint8), settings)
+    assert searched == [settings.contrast]
     assert np.abs(np.median(e, axis=0)).max() < 0.05
 
 
@@ -319,6 +356,18 @@ def test_faint_features_are_searched_where_there_are_few():
     found = find_features(np.rint(grey).astype(np.uint8))
     near = np.linalg.norm(found.xy[:, None] - true[None], axis=2)
     assert (near.min(0) < 1.0).mean() > 0.9
+
+
+def test_the_memory_of_a_search_is_what_was_measured_and_hardly_more():
+    """225 bytes a pixel: with less, photographs would be searched at once that do not fit; with
+    twice as much, half as many. Tiles bound it."""
+    settings = FeatureSettings(side=0)
+    assert 1 <= memory_of_features(1500, 1000, settings) / (225 * 1500 * 1000) < 1.1
+    whole, larger = (memory_of_features(n, n, settings) for n in (20_000, 40_000))
+    assert whole == larger < 1.6e9
+    assert memory_of_features(3600, 3600, FeatureSettings()) == pytest.approx(
+        memory_of_features(1800, 1800, settings)
+    )
 
 
 def test_tracks_without_contradictions():
@@ -389,6 +438,16 @@ def test_candidates():
     assert {(0, 1), (0, 8)} <= set(candidate_pairs(none, "place", place))
 
 
+def test_neighbours_by_similarity_are_those_with_the_most_matches():
+    """Each photograph chooses its best one; those with hardly a match are no candidates."""
+    counts = {(0, 1): 90, (0, 2): 40, (0, 3): 30, (1, 2): 20, (1, 3): 50, (2, 3): 3}
+    run = lambda function, pairs: [counts[pair] for pair in pairs]
+    none, settings = [features_at(np.zeros((3, 2)))] * 4, CandidateSettings(neighbours=1)
+    assert candidate_pairs(none, "alike", None, run, settings) == [(0, 1), (0, 2), (1, 3)]
+    everyone = dataclasses.replace(settings, neighbours=3)
+    assert candidate_pairs(none, "alike", None, run, everyone) == [*counts][:-1]
+
+
 def test_what_is_kept_is_found_again_for_the_same_content_only(tmp_path):
     found = features_at(np.arange(12.0).reshape(6, 2))
     store = Store(tmp_path / "kept", FeatureSettings())
@@ -434,5 +493,10 @@ def test_marks_at_the_same_pixels_of_photographs_match_nothing(cloud):
     matches = [pair(i, j) for i in range(5) for j in range(i)]
     found, marked = without_marks(matches, photographs, [SIZE] * 5)
     assert marked == 5 and all(set(m.rows[:, 0]) == set(range(len(X))) for m in found)
+    # pixels of photographs of different size are not the same, and two of one size are too few
+    sizes = [SIZE] * 3 + [SIZE[::-1]] * 2
+    found, _ = without_marks(matches, photographs, sizes)
+    whole = [m.images for m in found if len(m.rows) == len(rows)]
+    assert whole == [(i, j) for i in (3, 4) for j in range(i)]
     same = [photographs[0]] * 5
     assert without_marks(matches, same, [SIZE] * 5)[1] == 0, "photographs from one place"

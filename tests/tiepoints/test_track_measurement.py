@@ -125,3 +125,10 @@ def test_features_are_matched_where_the_window_fits_into_the_photograph(
     np.testing.assert_array_equal(
         measured.level[measured.image == 0] >= 0, np.tile(away >= window // 2 + 2, 2)
     )
+
+
+def test_features_are_matched_on_the_level_on_which_they_have_the_same_size():
+    """7 pixels, up to 2⁶ · 7 = 450 in the original; larger ones on the coarsest."""
+    track, size = np.repeat(np.arange(9), 2), np.repeat(7.0 * 2 ** np.arange(9), 2)
+    _, level = track_measurement._choose_templates(track, size, TrackMatchingSettings())
+    assert level[::2].tolist() == level[1::2].tolist() == [0, 1, 2, 3, 4, 5, 6, 6, 6]
