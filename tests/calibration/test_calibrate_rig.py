@@ -47,6 +47,7 @@ def test_a_chain_of_overlaps_is_one_rig(chain):
     assert "'c3' and 'c2' at the same time" in chain.advice[-1]
 
 
+@pytest.mark.further
 def test_cameras_back_to_back_are_tied_by_motion(back_to_back):
     found = back_to_back
     assert found.converged and found.bodies == [("front", "rear")] and len(found.epochs) == 16

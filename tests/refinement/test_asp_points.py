@@ -74,6 +74,7 @@ def folder(tmp_path):
     return tmp_path, scene, place
 
 
+@pytest.mark.further
 def test_matches_and_control_become_a_refinement(folder):
     path, scene, place = folder
     file = read_refinement(path / "refine.toml")

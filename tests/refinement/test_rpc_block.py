@@ -161,6 +161,7 @@ def terrain_of(scene, cover=1.0):
     return terrain, np.stack(earth_fixed(WGS84, (*place.T, on)), 1)
 
 
+@pytest.mark.further
 def test_terrain_heights_are_observations(scene):
     terrain, X = terrain_of(scene)
     ground = tuple(np.asarray(v) for v in geodetic(WGS84, tuple(X.T)))
