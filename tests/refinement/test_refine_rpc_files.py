@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+import rasterio
 from rpc_block import SIGMA_CONTROL, block
 from typer.testing import CliRunner
 
@@ -21,7 +22,6 @@ from jaxbundle.io.text.csv_tables import read_csv, write_csv
 from jaxbundle.pushbroom.rpc import project_points
 from jaxbundle.refinement import HELD, Freedom
 
-rasterio = pytest.importorskip("rasterio")
 TEXT = """
 [refine]
 points = "points.csv"
