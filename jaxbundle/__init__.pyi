@@ -28,6 +28,8 @@ from jaxbundle.adjustment import make_problem as make_problem
 from jaxbundle.adjustment import solve as solve
 from jaxbundle.adjustment.adjust import adjust as adjust
 from jaxbundle.adjustment.compare import AdjustmentComparison as AdjustmentComparison
+from jaxbundle.adjustment.error_budget import Budget as Budget
+from jaxbundle.adjustment.error_budget import sensitivity as sensitivity
 from jaxbundle.adjustment.gradients import check_gradients as check_gradients
 from jaxbundle.adjustment.influence import Influence as Influence
 from jaxbundle.adjustment.influence import influence as influence
@@ -39,8 +41,6 @@ from jaxbundle.adjustment.quality.precision import redundancy as redundancy
 from jaxbundle.adjustment.replicate import Replication as Replication
 from jaxbundle.adjustment.replicate import replicate as replicate
 from jaxbundle.adjustment.result import Adjustment as Adjustment
-from jaxbundle.adjustment.sensitivity import Budget as Budget
-from jaxbundle.adjustment.sensitivity import sensitivity as sensitivity
 from jaxbundle.batches.calibrate import BatchCalibration as BatchCalibration
 from jaxbundle.batches.calibrate import calibrate_batch as calibrate_batch
 from jaxbundle.batches.calibrate_rigs import RigBatch as RigBatch

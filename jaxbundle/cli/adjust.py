@@ -95,7 +95,7 @@ def adjust(  # noqa: PLR0913 - the options of the command
 ) -> None:
     """Adjust a network and report it."""
     from jaxbundle import report
-    from jaxbundle.adjustment.sensitivity import sensitivity
+    from jaxbundle.adjustment.error_budget import sensitivity
     from jaxbundle.cli.budget_option import held_of
     from jaxbundle.cli.outputs import check_targets, trace_origin, why_not, write_targets
     from jaxbundle.cli.processes import join_for_one_task

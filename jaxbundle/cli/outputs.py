@@ -13,9 +13,9 @@ from pathlib import Path
 from types import MappingProxyType
 
 from jaxbundle import report
+from jaxbundle.adjustment.error_budget import Budget
 from jaxbundle.adjustment.orientation_covariance import orientation_covariance
 from jaxbundle.adjustment.result import Adjustment
-from jaxbundle.adjustment.sensitivity import Budget
 from jaxbundle.commands.origins import network_files as network_files
 from jaxbundle.commands.origins import trace_files as trace_files
 from jaxbundle.commands.origins import trace_origin as trace_origin
