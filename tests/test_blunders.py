@@ -258,7 +258,9 @@ def test_rays_that_cannot_mask_each_other_go_together(network):
     assert bad[rows].all()
 
 
-@pytest.mark.parametrize("options", [{"snooping": "pope"}, {"robust": "tukey"}])
+@pytest.mark.parametrize("options", [
+    {"snooping": "pope"}, pytest.param({"robust": "tukey"}, marks=pytest.mark.further),
+])  # fmt: skip
 def test_a_large_network_takes_single_steps(network, options, monkeypatch):
     """To the same end, with two whole adjustments after the first."""
     spoilt, _, _ = with_blunders(network, 1)

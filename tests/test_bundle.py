@@ -241,6 +241,7 @@ def test_what_is_not_solved_has_no_values(simulation):
             ask()
 
 
+@pytest.mark.further
 def test_a_wild_coordinate_ends_without_a_result(simulation):
     found = adjust(with_xy(simulation.network, [7], 1e10))
     assert not found.converged and "Not solved" in found.report()

@@ -104,6 +104,7 @@ def test_line_scanners_draw_random_errors(home):
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="the folder ../shared/data/real is not here")
+@pytest.mark.further
 def test_models_of_real_files(home):
     lines = [f"camera {SHARED}/tp.toml#a", f"convert {SHARED}/tpcol out.csv --force"]
     assert "thin-prism-fisheye" in run_twice(lines, home)

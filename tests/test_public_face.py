@@ -69,6 +69,7 @@ def test_every_command_of_coefficients_is_a_function(command):
     assert command in room.__all__
 
 
+@pytest.mark.further
 def test_functions_take_the_path_of_a_network_with_the_settings_of_its_command():
     given = jaxbundle.read_network(PROJECT, overrides=["sigma_image=0.5"])
     for path in (PROJECT, str(PROJECT)):

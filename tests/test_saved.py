@@ -42,7 +42,8 @@ def _leaves(value):
 
 
 @pytest.mark.parametrize("options", [
-    {}, {"robust": "huber"}, {"snooping": "pope", "eliminate": True}, {"estimate_components": True},
+    {}, pytest.param({"robust": "huber"}, marks=pytest.mark.further),
+    {"snooping": "pope", "eliminate": True}, {"estimate_components": True},
 ], ids=lambda options: "-".join(options) or "plain")  # fmt: skip
 def test_a_loaded_adjustment_has_all_that_the_saved_one_has(network, tmp_path, options):
     result = jaxbundle.adjust(network, **options)

@@ -86,6 +86,7 @@ def test_images_and_points(case):
                 assert np.all(np.abs(found - value)[free] < 0.002 * sigma[free])
 
 
+@pytest.mark.further
 def test_camcal_with_blunders():
     """5 % of 5 to 50 σ (a posteriori): those above 8 σ with redundancy numbers above 0.3 are found,
     1 % of the good ones may go; Huber's estimate stays within its σ of the clean one."""
@@ -118,6 +119,7 @@ needs_small = pytest.mark.skipif(not SMALL.is_dir(), reason="../shared/data/real
 
 
 @needs_small
+@pytest.mark.further
 def test_a_repeated_video_frame_leaves_the_rest_adjusted():
     """Three points are seen only in the two equal frames; σ0 without frame and points 0.6146."""
     network = jaxbundle.read_network(SMALL / "twin_frames" / "project.toml")
@@ -138,6 +140,7 @@ def test_a_repeated_video_frame_leaves_the_rest_adjusted():
 
 
 @needs_small
+@pytest.mark.further
 def test_poor_start_values_of_a_fisheye_lose_nothing():
     result = adjust(jaxbundle.read_network(SMALL / "poor_start_poses" / "project.toml"))
     assert result.converged and not result.problem.network.left_out

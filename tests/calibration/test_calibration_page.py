@@ -48,6 +48,7 @@ def test_views_are_compared_in_halves_without_being_asked(calibration):
     assert halves.sentence in page.partition("<nav>")[0] and "affine by photograph" in page
 
 
+@pytest.mark.further
 def test_halves_are_not_made_of_few_views_or_if_turned_off(calibration):
     plain = calibrate(calibration.views, correlated=False).adjustment
     assert plain.replication is None and plain.error_model is None

@@ -251,6 +251,7 @@ def flawed():
     return calibrate_cameras(views, snooping=None, cross_validation=False)
 
 
+@pytest.mark.further
 def test_what_only_the_mounting_shows_is_removed(flawed):
     """Epochs that are not simultaneous, then single points: named, and without effect."""
     found = calibrate_rig(flawed.cameras, snooping="pope")

@@ -117,6 +117,7 @@ def test_no_photograph_is_searched_twice_and_a_changed_one_is_noticed(searched, 
         again()
 
 
+@pytest.mark.further
 def test_charuco_boards_with_missing_corners(searched, tmp_path):
     """Every photograph shows another part of the board: from less than half of it to all but a
     corner; the camera is within its σ."""

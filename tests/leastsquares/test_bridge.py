@@ -57,6 +57,7 @@ def assert_same(values, minimum):
         np.testing.assert_allclose(a, b, atol=1e-8)
 
 
+@pytest.mark.further
 def test_stock_solver_reaches_our_minimum(problem, minimum):
     fn, y0, linear = stock_problem(problem)
     solver = optx.LevenbergMarquardt(1e-10, 1e-10, linear_solver=linear)

@@ -250,6 +250,7 @@ def _vtpv_of_images(problem, values):
                if part.set_name in of_images)  # fmt: skip
 
 
+@pytest.mark.further
 def test_a_blunder_among_the_rays_of_the_horizon_is_found(horizon):
     network, _, result = horizon
     row = int(np.flatnonzero(network.observations.point == NEAR + 1)[2])

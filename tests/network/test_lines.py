@@ -87,6 +87,7 @@ def test_jacobians(result):
     check_jacobians(result.problem, result.values)
 
 
+@pytest.mark.further
 def test_sigma_is_that_of_a_sample(simulated, result):
     """Noise of the points moves the residual across the line by one σ, whatever its direction."""
     problem = jaxbundle.make_problem(with_lines(simulated.truth, seen(simulated.truth, 0.0)))

@@ -88,6 +88,7 @@ def test_a_held_mounting_is_held_and_gives_the_scale(simulated):
     assert "the scale is that of the rig" in result.report()
 
 
+@pytest.mark.further
 def test_a_weighted_mounting_is_the_weighted_mean(simulated):
     """Of the given one and of what the images say with a free mounting and the same scale."""
     sigma = np.array([3e-4, 3e-4, 3e-4, 2e-4, 2e-4, 2e-4])
@@ -137,6 +138,7 @@ def covariance_of_mounting(result):
     return np.asarray(result.covariance_of(unknowns)) / result.sigma0**2
 
 
+@pytest.mark.further
 def test_a_covariance_says_what_its_sigmas_say(simulated):
     sigma = np.array([3e-4, 2e-4, 4e-4, 2e-4, 3e-4, 1e-4])
     by_sigma = GIVEN | {"sigma_position": sigma[:3].tolist(), "sigma_angle": sigma[3:].tolist()}

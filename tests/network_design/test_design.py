@@ -203,6 +203,7 @@ def test_a_further_photograph(network, site):
     assert len(found.tried[1]) == 6
 
 
+@pytest.mark.further
 def test_a_minimal_datum_is_worse_than_inner_constraints(network):
     found = jaxbundle.design(network.replace(datum="minimal"), order="zero")
     assert found.gain > 1.2 and found.network.datum == "inner"

@@ -155,7 +155,9 @@ def test_several_cameras_of_several_models():
     assert np.abs(ratio[0] / scale - ratio[1]).max() < 0.05 * ratio[1].max()
 
 
-@pytest.mark.parametrize("what", ["y downward", "X and Y exchanged"])
+@pytest.mark.parametrize(
+    "what", ["y downward", pytest.param("X and Y exchanged", marks=pytest.mark.further)]
+)
 def test_a_mirror_is_named(what):
     """Control in a left-handed system, or images with y downward: both fit in part, and are a
     mirror image in truth."""
@@ -175,6 +177,7 @@ def test_a_mirror_is_named(what):
         orient(network)
 
 
+@pytest.mark.further
 def test_half_a_network_is_none(solid):
     """Two parts that share nothing: `orient` places one and names the other, `adjust` refuses."""
     network = bare(solid)
@@ -411,6 +414,7 @@ def test_an_image_first_placed_by_repeated_parts_is_placed_again():
     np.testing.assert_allclose(ratio(images.position), ratio(true), rtol=0.1)
 
 
+@pytest.mark.further
 def test_handheld_control_is_not_refused(with_control):
     """σ of control a twelfth of its extent, with one measurement under a wrong name: start values
     are found, and the wrong measurement is named."""

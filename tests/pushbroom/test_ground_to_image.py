@@ -152,6 +152,7 @@ def test_where_a_point_is_that_is_not_in_the_image():
     assert all(status.meaning for status in ProjectionStatus)
 
 
+@pytest.mark.further
 def test_the_other_side_of_the_earth():
     image = CASES[LINEAR]
     seen = np.array(locate(image, Ground(), SOME_LINES[5:6], SOME_PIXELS[5:6])).ravel()

@@ -129,6 +129,7 @@ def test_states_adjusted_by_another_program_are_read():
 
 
 @real
+@pytest.mark.further
 def test_worldview_1_agrees_with_its_rpc():
     """With all corrections to centimetres (17 m apart without them): the origin of lines and pixels
     and the refraction are those of the vendor."""

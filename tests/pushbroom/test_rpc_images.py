@@ -146,6 +146,7 @@ def test_a_map_shows_what_the_polynomials_see(folder, scene, tmp_path, given):
         np.testing.assert_allclose(band[rows, columns][inner], true[inner], atol=2e-3)
 
 
+@pytest.mark.further
 def test_hidden_terrain_is_hidden_for_both(scene):
     """A wall of 1500 m: rigorous image and polynomials agree on what it hides."""
     image, coefficients = scene
@@ -201,6 +202,7 @@ def test_info_says_the_same_of_both(folder):
     assert found["height"] == 700.0 and own["duration"] == pytest.approx(4.0 * 599 / 600)
 
 
+@pytest.mark.further
 def test_commands_as_processes(folder, tmp_path):
     def run(*arguments):
         command = [sys.executable, "-m", "jaxbundle", "pushbroom", *map(str, arguments)]

@@ -190,6 +190,7 @@ def photographs_of_columns(share):
 
 
 @pytest.mark.parametrize("share", [0.0, pytest.param(0.2, marks=pytest.mark.further)])
+@pytest.mark.further
 def test_points_of_two_rays_at_different_columns_do_not_distort_the_others(share):
     network, two, wrong = photographs_of_columns(share)
     number = len(network.observations)

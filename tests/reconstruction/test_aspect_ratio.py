@@ -78,6 +78,7 @@ def test_both_halves_confirm_pixels_that_are_not_square(squeezed):
         assert abs(half.deviation - 3 / 900) < 4 * half.sigma
 
 
+@pytest.mark.further
 def test_what_only_one_half_of_the_photographs_says_is_not_believed():
     result = jaxbundle.adjust(photographs(stretched=(0, 2, 4, 6, 8)))
     assert set(contradicted_ratios(result)) == {"cam"}

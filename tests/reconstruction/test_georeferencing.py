@@ -304,6 +304,7 @@ def test_control_that_is_not_used_is_reported_with_the_reason():
     assert "Control is not used: expected 3, got 2" in describe_part(whole, part)
 
 
+@pytest.mark.further
 def test_the_written_network_gives_the_same_numbers(good, tmp_path):
     result, _, _ = good
     write_targets(result, "", tmp_path / "out", brief=True, plots=False)

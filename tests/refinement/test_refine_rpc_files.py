@@ -95,6 +95,7 @@ def change(folder, old, new):
     (folder / "refine.toml").write_text(text.replace(old, new))
 
 
+@pytest.mark.further
 def test_the_command_writes_compensated_coefficients(folder, scene):
     change(folder, "dem_sigma", 'rpc_format = "rpb"\ndem_sigma')
     done = run(folder, "--out", str(folder / "out"))

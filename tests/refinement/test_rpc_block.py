@@ -128,6 +128,7 @@ def test_blunders_in_control_and_tie_points_are_named(scene, case):
     assert found.sigma0 < 1.3 and result.robust_sigma0 == pytest.approx(1.0, abs=0.25)
 
 
+@pytest.mark.further
 def test_undetermined_biases_are_named(scene, case):
     (images, points, observations), _, _ = case
     # no measurement in one image

@@ -96,6 +96,7 @@ def test_derivatives_by_stations_targets_cameras_and_weights(problem, program):
     assert not np.asarray(slopes.measured["image"]).any()
 
 
+@pytest.mark.further
 def test_a_design_that_determines_nothing_is_nan(problem, program):
     """All stations at one place."""
     same = jnp.tile(problem.data.start["image"].position[:1], (4, 1))

@@ -74,6 +74,7 @@ def wavy_pair():
 
 
 @pytest.mark.parametrize("levels", [0, 1, pytest.param(2, marks=pytest.mark.further)])
+@pytest.mark.further
 def test_a_large_pair_is_matched_at_half_its_size_first(levels):
     pair, true = wavy_pair()
     span = 80
