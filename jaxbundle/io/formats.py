@@ -196,7 +196,6 @@ FORMATS: dict[str, Format] = {
         is_colmap,
         read_colmap,
         NETWORK_FILES["colmap"],
-        unread=("colours, which are not read",),
     ),
     "bingo": Format(
         is_bingo,
@@ -216,7 +215,6 @@ FORMATS: dict[str, Format] = {
         is_bundler,
         read_bundler,
         NETWORK_FILES["bundler"],
-        unread=("colours, which are not read",),
     ),
     "openmvg": Format(
         is_openmvg,
@@ -227,7 +225,6 @@ FORMATS: dict[str, Format] = {
         is_opensfm,
         read_opensfm,
         NETWORK_FILES["opensfm"],
-        unread=("colours, which are not read",),
     ),
     "transforms": Format(
         is_transforms,
@@ -260,13 +257,11 @@ FORMATS: dict[str, Format] = {
         is_nvm,
         read_nvm,
         NETWORK_FILES["nvm"],
-        unread=("colours, which are not read",),
     ),
     "alicevision": Format(
         is_alicevision,
         read_alicevision,
         NETWORK_FILES["alicevision"],
-        unread=("colours, which are not read",),
     ),
 }
 

@@ -26,9 +26,10 @@ NO_NUMBERS = (bool, np.bool_, complex, np.complexfloating, type(np.ma.masked))
 
 
 class RepeatedIds:
-    """A column of millions of ids of which few differ: `labels[codes]`."""
+    """A column of millions of ids of which few differ: `labels[codes]`; labels may be an array of
+    whole numbers."""
 
-    def __init__(self, labels: Sequence[Any], codes: Int[np.ndarray, " rows"]):
+    def __init__(self, labels: Sequence[Any] | np.ndarray, codes: Int[np.ndarray, " rows"]):
         self.labels, self.codes = labels, codes
 
     def __len__(self) -> int:
@@ -39,6 +40,12 @@ class RepeatedIds:
 
     def __iter__(self) -> Iterator[Any]:
         return map(self.labels.__getitem__, self.codes.tolist())
+
+    def texts(self) -> Iterator[str]:
+        """The labels as ids."""
+        if isinstance(self.labels, np.ndarray) and self.labels.dtype.kind in "iu":
+            return map(str, self.labels.tolist())
+        return map(_id, self.labels)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,9 +147,9 @@ class Columns:
         try:
             if isinstance(values, np.ndarray) and values.dtype.kind in "iu":
                 different, codes = np.unique(values, return_inverse=True)
-                values = RepeatedIds([*map(str, different.tolist())], codes)
+                values = RepeatedIds(different, codes)
             if isinstance(values, RepeatedIds):
-                found = [of.get(label, -1) for label in map(_id, values.labels)]
+                found = [of.get(label, -1) for label in values.texts()]
                 indices = np.array(found, np.int64)[values.codes]
                 if indices.size and indices.min() < 0:
                     raise KeyError

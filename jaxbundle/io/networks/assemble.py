@@ -10,18 +10,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Num
 
 from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.geometry.pose_conventions import exterior_from_cv
 from jaxbundle.io.networks.poses import angles_of
 from jaxbundle.io.networks.settings import SETTINGS, Document, apply_overrides, check_settings
-from jaxbundle.network.build import make_cameras, make_network
+from jaxbundle.network.build import POINT_COLOURS, make_cameras, make_network
 from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.kinds import Rigs
 from jaxbundle.network.rules import check_unique
 from jaxbundle.network.tables import (
     EXTERIOR,
+    GREY,
     Camera,
     Images,
     Network,
@@ -33,6 +34,8 @@ from jaxbundle.network.tables import (
 # Coordinates of the centre of the first pixel in programs that count from its corner (COLMAP,
 # nerfstudio, Metashape, PhotoModeler); here they are 0 (docs/conventions.md).
 PIXEL_CENTRE = 0.5
+# What programs write that have no colours: black, or grey as we do.
+NO_COLOURS = ((0, 0, 0), GREY)
 # The rig of a file of calibrated cameras, and its only epoch.
 RIG, MOMENT = "rig", "0"
 
@@ -175,6 +178,16 @@ def image_columns(
     values = np.concatenate([np.reshape(X0, (-1, 3)), angles_of(M)], 1)
     columns = {"id": ids, "camera": cameras, **dict(zip(EXTERIOR, values.T))}
     return Columns(columns, source)
+
+
+def colour_columns(colours: Num[np.ndarray, "points 3"]) -> dict[str, np.ndarray]:
+    """The columns of colours in a table of points, NaN where there is none; no columns if no
+    point has one. They take no part in an adjustment: numbers that are no colours are rounded, and
+    limited to 0 to 255."""
+    colours = np.clip(np.rint(colours), 0, 255)
+    if np.isnan(colours).all() or any((colours == none).all() for none in NO_COLOURS):
+        return {}
+    return dict(zip(POINT_COLOURS, colours.T))
 
 
 def entry_of(camera: Camera) -> dict[str, Any]:

@@ -29,6 +29,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import flip_rows
 from jaxbundle.io.networks.assemble import (
     assemble,
+    colour_columns,
     foreign_document,
     image_columns,
     unique_labels,
@@ -120,7 +121,7 @@ def _network(path: Path, model: _Model, overrides: Sequence[str], told: Sequence
         | {"free": ["c", "K1"]}
         for name, f, r in zip(names, c.tolist(), p[:, 8].tolist())
     ]
-    position, rays = _points(model, len(names))
+    position, colours, rays = _points(model, len(names))
     kept = {}
     for k, (image, point, *_) in enumerate(rays[:, :2].astype(np.int64).tolist()):
         kept.setdefault((image, point), k)
@@ -136,8 +137,8 @@ def _network(path: Path, model: _Model, overrides: Sequence[str], told: Sequence
         overrides,
         image_columns(Source(str(path), np.array(lines), "line"), names, names, M, p[:, 5:8]),
         Columns(
-            {"id": range(len(position)), "role": ["tie"] * len(position),
-             **dict(zip("XYZ", np.reshape(position, (-1, 3)).T))},
+            {"id": range(len(position)), **dict(zip("XYZ", position.T)),
+             **colour_columns(colours)},
             Source(str(path), np.array([row.number for row in model.points], np.int64), "line"),
         ),
         Columns(
@@ -150,13 +151,14 @@ def _network(path: Path, model: _Model, overrides: Sequence[str], told: Sequence
     )  # fmt: skip
 
 
-def _points(model: _Model, images: int) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates, and image, point, x, y, line of all rays."""
+def _points(model: _Model, images: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Coordinates, colours, and image, point, x, y, line of all rays."""
     position, rays = [], [np.zeros((0, 5))]
     for k, row in enumerate(model.points):
         numbers = row.all_numbers("a point")
         views = row.rays(6, "a point", images, "image")
         rest = np.ones((len(views), 1))
-        position.append(numbers[:3])
+        position.append(numbers[:6])
         rays.append(np.hstack([views[:, :1], k * rest, views[:, 2:], row.number * rest]))
-    return np.array(position), np.concatenate(rays)
+    values = np.reshape(position, (-1, 6))
+    return values[:, :3], values[:, 3:], np.concatenate(rays)
