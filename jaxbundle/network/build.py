@@ -23,7 +23,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from jaxbundle.arguments import text
 from jaxbundle.cameras import CameraModel, is_known
@@ -31,6 +31,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.network.columns import (
     NO_NUMBERS,
     Columns,
+    RepeatedIds,
     as_columns,
     count,
     did_you_mean,
@@ -379,13 +380,21 @@ def _make_observations(
     table.check_names(OBSERVATION_COLUMNS, OBSERVATION_SIGMAS)
     sigma = _matrix(table, OBSERVATION_SIGMAS)
     return Observations(
-        image=table.indices("image", "image", _index(images.id), images.source.name),
-        point=table.indices("point", "point", _index(points.id), points.source.name),
+        image=_rows_in(images, table, "image"),
+        point=_rows_in(points, table, "point"),
         xy=_matrix(table, ("x", "y"), required=True),
         sigma=np.where(np.isnan(sigma), sigma_image or 1.0, sigma),
         source=table.source,
         sigma_origin=origin or (UNIT if sigma_image is None and np.isnan(sigma).any() else STATED),
     )
+
+
+def _rows_in(of: Images | Points, table: Columns, name: str) -> Int[np.ndarray, " rays"]:
+    """The rows of images or points that a column names."""
+    values = table.column(name)
+    if isinstance(values, RepeatedIds) and values.are_rows:
+        return values.codes
+    return table.indices(name, name, _index(of.id), of.source.name)
 
 
 def _make_distances(table: Columns, points: Points) -> Distances:

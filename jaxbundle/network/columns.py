@@ -27,10 +27,16 @@ NO_NUMBERS = (bool, np.bool_, complex, np.complexfloating, type(np.ma.masked))
 
 class RepeatedIds:
     """A column of millions of ids of which few differ: `labels[codes]`; labels may be an array of
-    whole numbers."""
+    whole numbers. `are_rows`: the labels are the ids of the table that the column refers to, in
+    its order."""
 
-    def __init__(self, labels: Sequence[Any] | np.ndarray, codes: Int[np.ndarray, " rows"]):
-        self.labels, self.codes = labels, codes
+    def __init__(
+        self,
+        labels: Sequence[Any] | np.ndarray,
+        codes: Int[np.ndarray, " rows"],
+        are_rows: bool = False,
+    ):
+        self.labels, self.codes, self.are_rows = labels, codes, are_rows
 
     def __len__(self) -> int:
         return len(self.codes)

@@ -11,12 +11,15 @@ Source: COLMAP documentation, "Output Format", and src/colmap/scene/reconstructi
 """
 
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Int
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.colmap_model import (
+    NO_POINT,
     ColmapImage,
     ColmapModel,
     ColmapPoints,
@@ -100,7 +103,7 @@ def read_binary_model(folder: Path) -> ColmapModel:
     """The contents of the three binary files of a folder."""
     cameras = read_binary_cameras(folder / "cameras.bin")
     images = _images(folder / "images.bin")
-    points = _points(folder / "points3D.bin", {image.id for image in images})
+    points = _points(folder / "points3D.bin", images)
     return ColmapModel(cameras, images, points)
 
 
@@ -154,28 +157,16 @@ def _images(path: Path) -> list[ColmapImage]:
     return images
 
 
-def _points(path: Path, images: set[int]) -> ColmapPoints:
+def _points(path: Path, images: Sequence[ColmapImage]) -> ColmapPoints:
     """The points; of their tracks the images are checked, since the image points name their object
     points."""
     file = BinaryFile(path)
-    number, data = file.count("points", POINT.itemsize), file.data
-    rays_of, size, length = struct.Struct("<Q").unpack_from, POINT.itemsize, len(file.data)
-    heads, tracks, begin = [], [], file.position
-    # the length of a track tells where the next point is
-    for k in range(number):
-        end = begin + size
-        if end > length or (next := end + 8 * rays_of(data, end - 8)[0]) > length:
-            file.what, file.position = f"point {k + 1}", begin
-            file.raw(size - 8)
-            file.count("rays", 8)
-            raise file.error("the file ends here; it is truncated")
-        heads.append(data[begin:end])
-        tracks.append(data[end:next])
-        begin = next
-    file.position = begin
-    file.end()
-    points = np.frombuffer(b"".join(heads), POINT)
-    track = np.frombuffer(b"".join(tracks), TRACK)["image"]
+    rays = _track_lengths(file, file.count("points", POINT.itemsize), images)
+    # points and tracks alternate
+    lengths = np.stack([np.full(len(rays), POINT.itemsize), 8 * rays], 1).ravel()
+    is_point = np.repeat(np.arange(len(lengths)) % 2 == 0, lengths)
+    data = np.frombuffer(file.data, np.uint8)[8:]
+    points, track = data[is_point].view(POINT), data[~is_point].view(TRACK)["image"]
     position = points["xyz"].astype(float)
 
     if (impossible := points["id"] >= 2**63).any():
@@ -184,15 +175,47 @@ def _points(path: Path, images: set[int]) -> ColmapPoints:
     if (infinite := ~np.isfinite(position)).any():
         file.what = f"point {infinite.any(1).argmax() + 1}"
         raise file.error(f"coordinates: {position[infinite][0]} is not a finite number")
-    unknown = ~np.isin(track, np.array(sorted(images), "<u4"))
+    unknown = ~np.isin(track, np.array(sorted(image.id for image in images), "<u4"))
     if unknown.any():
         ray = int(unknown.argmax())
-        point = np.searchsorted(np.cumsum(points["rays"].astype(np.int64)), ray, "right")
-        file.what = f"point {point + 1}"
+        file.what = f"point {np.searchsorted(np.cumsum(rays), ray, 'right') + 1}"
         raise file.error(f"the image {track[ray]} of the track is not in images")
     source, ids = Source(str(path), None, "point"), points["id"].astype(np.int64)
     check_unique(ids, source, "point")
     return ColmapPoints(ids, position, points["rgb"], source)
+
+
+def _track_lengths(
+    file: BinaryFile, number: int, images: Sequence[ColmapImage]
+) -> Int[np.ndarray, " points"]:
+    """The numbers of rays of all points, which tell where the next point is.
+
+    COLMAP writes points by their numbers, and each with its image points: the lengths that follow
+    from the images are those of the file if every point has the length expected there.
+    """
+    first, size, length = file.position, POINT.itemsize, len(file.data)
+    if number and images:
+        seen = np.concatenate([image.point for image in images])
+        expected = np.unique(seen[seen != NO_POINT], return_counts=True)[1]
+        ends = first + np.cumsum(size + 8 * expected)
+        if len(expected) == number and ends[-1] == length:
+            place = ends - 8 * expected - 8
+            data = np.frombuffer(file.data, np.uint8)
+            if (data[place[:, None] + np.arange(8)].view("<u8").ravel() == expected).all():
+                return expected
+    rays_of, lengths, begin = struct.Struct("<Q").unpack_from, [], first
+    for k in range(number):
+        end = begin + size
+        if end > length or (next := end + 8 * rays_of(file.data, end - 8)[0]) > length:
+            file.what, file.position = f"point {k + 1}", begin
+            file.raw(size - 8)
+            file.count("rays", 8)
+            raise file.error("the file ends here; it is truncated")
+        lengths.append((next - end) // 8)
+        begin = next
+    file.position = begin
+    file.end()
+    return np.array(lengths, np.int64)
 
 
 def binary_files(model: ColmapModel) -> dict[str, bytes]:

@@ -162,8 +162,8 @@ def _observations(path: Path, model: ColmapModel) -> tuple[Columns, tuple[str, .
             f"the same image: {list_some(names)}",
         )
     columns = {
-        "image": RepeatedIds([one.name for one in model.images], image),
-        "point": RepeatedIds(model.points.ids, row),
+        "image": RepeatedIds([one.name for one in model.images], image, are_rows=True),
+        "point": RepeatedIds(model.points.ids, row, are_rows=True),
         "x": xy[:, 0],
         "y": xy[:, 1],
     }

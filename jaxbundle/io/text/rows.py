@@ -141,7 +141,9 @@ class TextRows:
         self.lines = [
             (number, line)
             for number, line in enumerate(read_text(path, fallback).splitlines(), 1)
-            if (blank or line.strip()) and not (comment and line.lstrip().startswith(comment))
+            if (blank or (line and not line.isspace()))
+            # most lines have none of it, and need not be copied without their blanks
+            and not (comment and comment in line and line.lstrip().startswith(comment))
         ]
         self.separator = separator
         self.position = 0
