@@ -184,3 +184,26 @@ def test_an_adjustment_keeps_them(tmp_path):
         jaxbundle.load_adjustment(tmp_path / "saved.npz").network,
     ):
         np.testing.assert_array_equal(network_.points.colour, RGB)
+
+
+@pytest.mark.parametrize("kind", ["colmap", "colmap-text", "opensfm", "project", "bundler"])
+def test_points_without_image_points_are_kept(tmp_path, command, kind):
+    """Models of networks that predict depth, and reconstructions without their tracks."""
+    net = coloured("snavely" if kind == "bundler" else "opencv")
+    net = net.replace(observations=net.observations.take(np.zeros(0, int)))
+    path = write(kind, net, tmp_path)[0]
+    back = read_network(path)
+    np.testing.assert_array_equal(back.points.position, net.points.position)
+    np.testing.assert_array_equal(back.points.colour, RGB)
+    assert len(back.images) == 3 and not len(back.observations)
+    write_ply(back, tmp_path / "p.ply")
+    assert plyfile.PlyData.read(str(tmp_path / "p.ply"))["vertex"].count == 12 + 5 * 3
+    told = command("adjust", path)
+    assert told.status == 2 and "there are no image points" in told.err
+
+
+def test_opensfm_without_its_tracks(tmp_path):
+    folder = write("opensfm", coloured(), tmp_path)[0]
+    (folder / "tracks.csv").unlink()
+    net = read_network(folder)
+    assert len(net.points) == 12 and any("tracks.csv is not there" in w for w in net.warnings)

@@ -336,3 +336,19 @@ def test_a_camera_model_that_is_no_name(tmp_path, model):
     path = tmp_path / "cameras.toml"
     path.write_text(f'[[camera]]\nid = "c"\nmodel = {model}\nfx = 1.0\n')
     refused(read_cameras, path, "model")
+
+
+def test_laz_of_laszip_1_is_named(tmp_path):
+    """Points that are not in chunks: another form, not damage."""
+    header = laspy.LasHeader(point_format=1, version="1.2")
+    las = laspy.LasData(header)
+    las.x = las.y = las.z = np.arange(9.0)
+    path = tmp_path / "c.laz"
+    las.write(path)
+    data = bytearray(path.read_bytes())
+    at = data.index(b"laszip encoded") + 16 + 2 + 2 + 32  # record, length, description
+    assert struct.unpack_from("<H", data, at) == (2,)
+    data[at : at + 2] = b"\1\0"
+    path.write_bytes(data)
+    with pytest.raises(InputError, match="LASzip 1, .*decompress it"):
+        read_cloud(path)

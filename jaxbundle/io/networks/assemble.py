@@ -16,7 +16,12 @@ from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.geometry.pose_conventions import exterior_from_cv
 from jaxbundle.io.networks.poses import angles_of
 from jaxbundle.io.networks.settings import SETTINGS, Document, apply_overrides, check_settings
-from jaxbundle.network.build import POINT_COLOURS, make_cameras, make_network
+from jaxbundle.network.build import (
+    OBSERVATION_COLUMNS,
+    POINT_COLOURS,
+    make_cameras,
+    make_network,
+)
 from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.kinds import Rigs
 from jaxbundle.network.rules import check_unique
@@ -65,8 +70,9 @@ def assemble(
 ) -> Network:
     """The network of a document and its tables, angles in radians.
 
-    Without points the network has only cameras and images and can be written but not
-    adjusted. The image unit is that of the file and cannot be set.
+    Without points the network has only cameras and images, and without image points it has only
+    what else there is: both can be written but not adjusted. The image unit is that of the file and
+    cannot be set.
 
     **Raises:** `InputError`.
     """
@@ -77,7 +83,10 @@ def assemble(
     # the tables are in radians; the unit is one of the output
     angle_unit = project.pop("angle_unit", "rad")
     cameras = make_cameras(document["camera"], f"{path}, ")
-    if points is not None and len(points) and observations is not None and len(observations):
+    if points is not None and len(points):
+        if observations is None or not len(observations):
+            columns = dict.fromkeys(OBSERVATION_COLUMNS, ())
+            observations = Columns(columns, Source(str(path), None, "image point"), True)
         network = make_network(cameras, images, points, observations, **project)
     else:
         network = _without_points(cameras, images, project)

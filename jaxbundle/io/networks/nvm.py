@@ -13,6 +13,9 @@ The distortion is of the measured point: with m = (x, y)/f
 
 which is `brown` with K1 = r/c². That model is in mm: the file has no pixel size, which is taken as
 0.005 mm; another would scale c and K1 and change nothing in pixels. The file has no image size.
+Some programs, COLMAP among them, write x, y from a corner of the image instead, and not where its
+centre is: then no coordinate is negative, and the points are off by half an image. Their median
+offset is subtracted, with a note.
 The largest model is read. FixedK, whose principal point moves the measurements, is refused unless
 it is in the middle (cx = cy = 0).
 
@@ -24,6 +27,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import flip_rows
@@ -106,7 +110,13 @@ def _network(path: Path, model: _Model, overrides: Sequence[str], told: Sequence
         names.append(" ".join(row.words[:-10]) if len(row) > 10 else "")
         if not names[-1]:
             raise row.error(f"{len(row)} values; a name and {', '.join(NUMBERS)}, 0 are expected")
-        values.append(row.numbers(NUMBERS, len(row) - 10, more=True))
+        numbers = row.numbers((*NUMBERS, "0"), len(row) - 10)
+        if numbers[-1] != 0:
+            raise row.error(
+                f"the last number of a camera is {numbers[-1]:g}; expected 0: VisualSFM has one coefficient "
+                "of distortion"
+            )
+        values.append(numbers[:-1])
         lines.append(row.number)
         if not values[-1][0] > 0 or not values[-1][1:5].any():
             raise row.error(
@@ -130,7 +140,15 @@ def _network(path: Path, model: _Model, overrides: Sequence[str], told: Sequence
         told = [*told, f"left out {what} of object points that have another in the same image"]
         rays = rays[list(kept.values())]
     source = Source(str(path), rays[:, 4].astype(np.int64), "line")
-    xy = rays[:, 2:4] * [PIXEL, -PIXEL]
+    offset = _offset_of_centre(rays, position, M, p)
+    if offset.any():
+        at = ", ".join(f"{x:.2f}" for x in np.median(offset, axis=0))
+        told = [
+            *told,
+            "image points are counted from a corner of the images, as other programs than "
+            f"VisualSFM write them: their centres, ({at}) px, are where the points fit best",
+        ]
+    xy = (rays[:, 2:4] - offset[rays[:, 0].astype(np.int64)]) * [PIXEL, -PIXEL]
     return assemble(
         path,
         foreign_document(path.stem, cameras, image_unit="mm", residuals="corrected"),
@@ -149,6 +167,34 @@ def _network(path: Path, model: _Model, overrides: Sequence[str], told: Sequence
         ),
         told,
     )  # fmt: skip
+
+
+def _offset_of_centre(
+    rays: Float[np.ndarray, "rays 5"],
+    position: Float[np.ndarray, "points 3"],
+    M: Float[np.ndarray, "images 3 3"],
+    p: Float[np.ndarray, "images 9"],
+    spread: float = 0.1,
+) -> Float[np.ndarray, "images 2"]:
+    """Where the centre of the images is, px; 0 where image points count from it.
+
+    **Arguments:** `spread`: relative to the image; the offset is half an image or none. Offsets of
+    images that differ by less are one, those of images of other sizes differ by more.
+    """
+    none, xy = np.zeros((len(p), 2)), rays[:, 2:4]
+    if not len(xy) or xy.min() < 0:
+        return none
+    image, point = rays[:, :2].astype(np.int64).T
+    r, s, q = np.einsum("nij,nj->in", M[image], position[point] - p[image, 5:8])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        off = xy - p[image, :1] * np.stack([-r / q, s / q], 1)
+    off[~np.isfinite(off).all(1)] = np.nan
+    if np.isnan(off).all() or (whole := np.nanmedian(off, axis=0)).min() < spread * xy.max():
+        return none
+    own = [off[image == k] for k in range(len(p))]
+    own = [whole if np.isnan(rows).all() else np.nanmedian(rows, axis=0) for rows in own]
+    far = (np.abs(own - whole) > spread * xy.max()).any()
+    return np.array(own) if far else none + whole
 
 
 def _points(model: _Model, images: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -229,6 +229,8 @@ def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     rays, missing = _tracks(file.parent / TRACKS, cameras, shots, points)
     if missing:
         told.append(f"left out {count(missing, 'image point')} of tracks that have no point")
+    if points and rays is None:
+        told.append(f"{file.parent / TRACKS} is not there: no image points")
     names, control = list(points), None
     if (file.parent / CONTROL).is_file():
         used = {id: cameras[shot.text("camera")] for id, shot in shots.items()}

@@ -120,6 +120,9 @@ def read_project(
         if found is None:
             found = Columns(dict.fromkeys(columns, ()), Source(table))
         tables[table] = dataclasses.replace(found, may_be_empty=True)
+    # points of a model without image points can be written for other programs
+    if (rays := tables.get("observations")) is not None:
+        tables["observations"] = dataclasses.replace(rays, may_be_empty=True)
     return network_of(
         document, {k: v for k, v in tables.items() if v is not None}, str(path), models
     )
