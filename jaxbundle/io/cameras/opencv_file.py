@@ -25,7 +25,7 @@ centre of the first pixel, as here. A skew and a tilted sensor (τx, τy),
     u = fx·x'' + skew·y'' + cx
 
 are not part of our models: if they are not 0 the nearest is fitted, which needs the image size.
-With an entry `xi` the camera is that of OpenCV's `omnidir` module, `mei`: k1, k2, p1, p2, and a skew.
+With an entry `xi` it is the camera of OpenCV's module `omnidir`, `mei` with k1, k2, p1, p2.
 
 `opencv_writing.py` writes such files.
 

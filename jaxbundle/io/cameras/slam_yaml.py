@@ -135,8 +135,8 @@ ORB_KEYS = Keys(
     {
         **dict.fromkeys(
             ("ORBextractor.*", "Viewer.*", "System.*", "File.version", "loopClosing", "Tracking.*",
-             "Mapping.*", "UseMotionModel", "Feature.*", "PangolinViewer.*", "SocketPublisher.*", "KeyFrame*",
-             "Initializer.*", "LoopDetector.*", "GraphOptimizer.*", "GlobalOptimizer.*",
+             "Mapping.*", "UseMotionModel", "Feature.*", "PangolinViewer.*", "SocketPublisher.*",
+             "KeyFrame*", "Initializer.*", "LoopDetector.*", "GraphOptimizer.*", "GlobalOptimizer.*",
              "Relocalizer.*", "Optimizer.*", "Preprocessing.*", "MarkerModel.*"),
             "settings of the program",
         ),

@@ -177,8 +177,8 @@ def camera_entries(
     folded = {fold(name): name for name in rest}
     if "xi" in found and (sphere := [name for key, name in folded.items() if key == "alpha"]):
         raise InputError(
-            f"{where}: {found['xi'][0]} and {sphere[0]} are a double sphere, which is not OpenCV's; "
-            "expected a Kalibr file, camera_model ds"
+            f"{where}: {found['xi'][0]} and {sphere[0]} are a double sphere, not a camera of "
+            "OpenCV; expected a Kalibr file, camera_model ds"
         )
     for name in left.unknown(folded):
         unknown.check([folded[name]], Keys((*CORE, *SPELLINGS)), where)

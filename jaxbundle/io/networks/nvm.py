@@ -113,8 +113,8 @@ def _network(path: Path, model: _Model, overrides: Sequence[str], told: Sequence
         numbers = row.numbers((*NUMBERS, "0"), len(row) - 10)
         if numbers[-1] != 0:
             raise row.error(
-                f"the last number of a camera is {numbers[-1]:g}; expected 0: VisualSFM has one coefficient "
-                "of distortion"
+                f"the last number of a camera is {numbers[-1]:g}; expected 0: VisualSFM has "
+                "one coefficient of distortion"
             )
         values.append(numbers[:-1])
         lines.append(row.number)
