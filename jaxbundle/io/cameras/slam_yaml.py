@@ -136,8 +136,9 @@ ORB_KEYS = Keys(
         **dict.fromkeys(
             ("ORBextractor.*", "Viewer.*", "System.*", "File.version", "loopClosing", "Tracking.*",
              "Mapping.*", "UseMotionModel", "Feature.*", "PangolinViewer.*", "SocketPublisher.*",
-             "KeyFrame*", "Initializer.*", "LoopDetector.*", "GraphOptimizer.*", "GlobalOptimizer.*",
-             "Relocalizer.*", "Optimizer.*", "Preprocessing.*", "MarkerModel.*"),
+             "KeyFrame*", "Initializer.*", "LoopDetector.*", "GraphOptimizer.*",
+             "GlobalOptimizer.*", "Relocalizer.*", "Optimizer.*", "Preprocessing.*",
+             "MarkerModel.*"),
             "settings of the program",
         ),
         **dict.fromkeys(
