@@ -352,3 +352,15 @@ def test_laz_of_laszip_1_is_named(tmp_path):
     path.write_bytes(data)
     with pytest.raises(InputError, match="LASzip 1, .*decompress it"):
         read_cloud(path)
+
+
+def test_a_damaged_statement_of_kept_corners(tmp_path):
+    """SQLite quotes it, bytes that are no text and all."""
+    path = tmp_path / "kept.sqlite"
+    with KeptCorners(path):
+        pass
+    data = path.read_bytes()
+    assert data.count(b"PRIMARY") > 1
+    path.write_bytes(data.replace(b"PRIMARY", b"\xc9RIMARY"))
+    with pytest.raises(InputError, match="kept.sqlite: the corners found before"):
+        KeptCorners(path)
