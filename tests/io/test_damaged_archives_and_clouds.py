@@ -360,7 +360,11 @@ def test_a_damaged_statement_of_kept_corners(tmp_path):
     with KeptCorners(path):
         pass
     data = path.read_bytes()
-    assert data.count(b"PRIMARY") > 1
-    path.write_bytes(data.replace(b"PRIMARY", b"\xc9RIMARY"))
+    for column in (b"path TEXT", b"size INTEGER"):  # two of one name, which the error quotes
+        assert data.count(column) == 1
+        data = data.replace(column, b"\xc9\xc9\xc9\xc9" + column[4:])
+    path.write_bytes(data)
+    with pytest.raises(UnicodeDecodeError):
+        sqlite3.connect(path).execute("SELECT * FROM photographs")
     with pytest.raises(InputError, match="kept.sqlite: the corners found before"):
         KeptCorners(path)
