@@ -366,3 +366,20 @@ def test_a_damaged_statement_of_kept_corners(tmp_path):
     path.write_bytes(data)
     with pytest.raises(InputError, match="kept.sqlite: the corners found before"):
         KeptCorners(path)
+
+
+def test_a_terrain_model_of_one_column_is_named(tmp_path):
+    from jaxbundle.geometry.ellipsoid import WGS84
+    from jaxbundle.io.rasters.reading import read_terrain
+
+    path = tmp_path / "dem.asc"
+    rows = "\n".join(map(str, range(100, 120)))
+    path.write_text(
+        f"ncols 1\nnrows 20\nxllcorner 13.0\nyllcorner 40.8\ncellsize 0.01\n{rows}\n"
+    )
+    path.with_suffix(".prj").write_text(
+        'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],'
+        'PRIMEM["Greenwich",0],UNIT["degree",0.0174532925199433]]'
+    )
+    with pytest.raises(InputError, match="dem.asc: terrain: heights of shape .20, 1."):
+        read_terrain(path, WGS84)
