@@ -567,3 +567,16 @@ def test_image_points_of_an_nvm_from_a_corner(tmp_path, centres):
     assert not nets[False].warnings
     told = f"({np.median(centres, axis=0)[0]:.2f}, {np.median(centres, axis=0)[1]:.2f}) px"
     assert "counted from a corner" in nets[True].warnings[0] and told in nets[True].warnings[0]
+
+
+@pytest.mark.parametrize("name, text, kind", [
+    ("default.xml", '<?xml version="1.0"?>\n<opencv_storage><Settings><BoardSize_Width>9'
+     "</BoardSize_Width></Settings></opencv_storage>\n", "a FileStorage of OpenCV without camera_"),
+    ("ground_control_points.json", '{"points": []}', "ground control of OpenSfM; give its folder"),
+])  # fmt: skip
+def test_a_refusal_names_the_kind_and_what_is_missing(tmp_path, command, name, text, kind):
+    path = tmp_path / name
+    path.write_text(text)
+    for words in (("convert", path, tmp_path / "n.csv"), ("camera", path), ("adjust", path)):
+        told = command(*words)
+        assert told.status == 2 and kind in told.err and name in told.err
