@@ -35,6 +35,7 @@ from jaxbundle.network.tables import (
     Points,
     Source,
 )
+from jaxbundle.types import Column
 
 # Coordinates of the centre of the first pixel in programs that count from its corner (COLMAP,
 # nerfstudio, Metashape, PhotoModeler); here they are 0 (docs/conventions.md).
@@ -85,7 +86,7 @@ def assemble(
     cameras = make_cameras(document["camera"], f"{path}, ")
     if points is not None and len(points):
         if observations is None or not len(observations):
-            columns = dict.fromkeys(OBSERVATION_COLUMNS, ())
+            columns: dict[str, Column] = {name: () for name in OBSERVATION_COLUMNS}
             observations = Columns(columns, Source(str(path), None, "image point"), True)
         network = make_network(cameras, images, points, observations, **project)
     else:
