@@ -101,7 +101,7 @@ BLOCK = BlockFacts(
 
 
 def test_a_reconstruction_names_what_it_left_out(convergent4):
-    part = ReconstructedPart("part 1", convergent4, {}, {"sift": 1.75}, BLOCK)
+    part = ReconstructedPart("part 1", convergent4, {"sift": 1.75}, BLOCK)
     found = Reconstruction(
         (part,), {f"{HOSTILE}.jpg": "too few matches"}, ("a note",),
         (("a.jpg", "b.jpg", 100, 60, "general"),), {name: None for name in "abcde"},
@@ -131,7 +131,7 @@ def test_estimated_sigma_are_not_confirmed_after_control_either(convergent4):
     (3.0, "met", ""), (5.0, "doubtful", "doubtful: "), (19.7, "not met", "most likely wrong: ")
 ])  # fmt: skip
 def test_a_reconstruction_that_fits_badly_says_so_first(convergent4, factor, state, words):
-    part = ReconstructedPart("part 1", convergent4, {}, {"sift": factor, "other": 1.0}, BLOCK)
+    part = ReconstructedPart("part 1", convergent4, {"sift": factor, "other": 1.0}, BLOCK)
     warnings = (f"part 1: {words}measurements fit {factor} times worse",) if words else ()
     found = Reconstruction((part,), {}, ("a note",), (), {"a": None}, warnings)
     first = str(found).splitlines()[0]

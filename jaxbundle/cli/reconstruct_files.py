@@ -117,7 +117,7 @@ def _write_part(
         read = lambda name: _thumbnail(found.photographs[name])
         draw_tracks(part.adjustment, read, folder, progress)
     network = adjusted_network(part.adjustment)
-    write_ply(network, folder / CLOUD, part.colours)
+    write_ply(network, folder / CLOUD)
     try:
         fill_colmap(network, folder / MODEL, False)
     except InputError as error:

@@ -23,7 +23,12 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.camera_files import choose_camera, is_camera_file, read_cameras
 from jaxbundle.io.cameras.nearest_camera import with_messages
 from jaxbundle.io.cameras.result_json import is_result, read_calibrated
-from jaxbundle.io.formats import expected_inputs, read_network, recognise_format
+from jaxbundle.io.formats import (
+    describe_incomplete,
+    expected_inputs,
+    read_network,
+    recognise_format,
+)
 from jaxbundle.io.networks.assemble import all_parameters
 from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.network.tables import Camera
@@ -71,6 +76,9 @@ def open_calibration(
         file, id = text, None
     path = Path(file)
     covariances = {}
+    known = describe_incomplete(path)
+    if known and not is_camera_file(path) and recognise_format(path) is None:
+        raise InputError(f"{path}: {known}")
     if is_result(path):
         results = read_calibrated(path)
         cameras, covariances = [c for c, _ in results], {c.id: C for c, C in results}

@@ -13,8 +13,8 @@ from jaxbundle.cameras import CameraModel
 from jaxbundle.choices import CAMERA_INPUTS, NETWORK_FILES
 from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.camera_files import is_camera_file, write_cameras
+from jaxbundle.io.cameras.opencv_file import FILE_STORAGE, YAML
 from jaxbundle.io.cameras.opencv_file import SUFFIXES as OPENCV_SUFFIXES
-from jaxbundle.io.cameras.opencv_file import YAML
 from jaxbundle.io.cameras.opencv_writing import write_opencv, write_ros
 from jaxbundle.io.networks.alicevision import is_alicevision, read_alicevision
 from jaxbundle.io.networks.anipose import (
@@ -63,6 +63,7 @@ from jaxbundle.io.networks.opensfm import (
     read_opensfm,
     write_opensfm_cameras,
 )
+from jaxbundle.io.networks.opensfm_control import CONTROL
 from jaxbundle.io.networks.orb_slam import is_orb_slam_pair, read_orb_slam_pair
 from jaxbundle.io.networks.photo_list import read_photo_list
 from jaxbundle.io.networks.photomodeler import is_photomodeler, read_photomodeler
@@ -98,7 +99,7 @@ from jaxbundle.io.results.ply import PLY_LOSSES, write_ply
 from jaxbundle.network.columns import count, did_you_mean, list_some
 from jaxbundle.network.rules import check_unique, model_of
 from jaxbundle.network.tables import Camera, Network, Source
-from jaxbundle.system.file_content import is_plain
+from jaxbundle.system.file_content import beginning, is_plain
 
 
 @dataclasses.dataclass(frozen=True)
@@ -196,7 +197,6 @@ FORMATS: dict[str, Format] = {
         is_colmap,
         read_colmap,
         NETWORK_FILES["colmap"],
-        unread=("colours, which are not read",),
     ),
     "bingo": Format(
         is_bingo,
@@ -216,7 +216,6 @@ FORMATS: dict[str, Format] = {
         is_bundler,
         read_bundler,
         NETWORK_FILES["bundler"],
-        unread=("colours, which are not read",),
     ),
     "openmvg": Format(
         is_openmvg,
@@ -227,7 +226,6 @@ FORMATS: dict[str, Format] = {
         is_opensfm,
         read_opensfm,
         NETWORK_FILES["opensfm"],
-        unread=("colours, which are not read",),
     ),
     "transforms": Format(
         is_transforms,
@@ -260,13 +258,11 @@ FORMATS: dict[str, Format] = {
         is_nvm,
         read_nvm,
         NETWORK_FILES["nvm"],
-        unread=("colours, which are not read",),
     ),
     "alicevision": Format(
         is_alicevision,
         read_alicevision,
         NETWORK_FILES["alicevision"],
-        unread=("colours, which are not read",),
     ),
 }
 
@@ -565,6 +561,8 @@ def read_network(
             "network, is expected (jaxbundle camera, compare and convert read it)"
         )
     if format is None:
+        if known := describe_incomplete(path):
+            raise InputError(f"{path}: {known}")
         raise InputError(f"{path}: the kind of input is not recognised; {expected_inputs(path)}")
     # read before the network, which may take long: its errors come at once
     control_points = None if control is None else read_control(control)
@@ -576,6 +574,18 @@ def read_network(
     if control_points is not None:
         return with_control(network, control_points, datum=not choose_datum(overrides))
     return _with_adjusted_control(network) if FORMATS[format].adjusted else network
+
+
+def describe_incomplete(path: Path) -> str:
+    """What a file is that has a known form and not what is read from it; empty for others."""
+    if path.name == CONTROL:
+        return "ground control of OpenSfM; give its folder, with reconstruction.json"
+    if FILE_STORAGE in beginning(path, 1000):
+        return (
+            "a FileStorage of OpenCV without camera_matrix; expected the result of a calibration, "
+            "such as out_camera_data.xml, not its settings or images"
+        )
+    return ""
 
 
 def expected_inputs(path: Path) -> str:

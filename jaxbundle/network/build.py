@@ -6,14 +6,15 @@ The columns are those of the project format:
 |---|---|
 | cameras | id, model, image_size, pixel_size, free, sigma, and the parameters of the model |
 | images | id, camera, X0, Y0, Z0, omega, phi, kappa, and σ: sX0, sY0, sZ0, somega, sphi, skappa |
-| points | id, role (tie, control, fixed, check), X, Y, Z, and σ: sX, sY, sZ |
+| points | id, role (tie, control, fixed, check), X, Y, Z, σ: sX, sY, sZ, and red, green, blue |
 | observations | image, point, x, y, and σ: sx, sy |
 | distances | from, to, value, sigma |
 | antennas, attitudes, camera_parameters, … | `jaxbundle.network.kinds` |
 
 The columns X0, Y0, Z0 of images, and omega, phi, kappa, are optional, all three together.
 Missing values (None, NaN, empty text) mean no start value or no σ. A σ of an image may be "fixed"
-(the value is held), a σ of a control point "free" (this axis is not controlled).
+(the value is held), a σ of a control point "free" (this axis is not controlled). Colours are whole
+numbers from 0 to 255; a point without one among others is grey.
 """
 
 import dataclasses
@@ -22,7 +23,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int, UInt8
 
 from jaxbundle.arguments import text
 from jaxbundle.cameras import CameraModel, is_known
@@ -30,6 +31,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.network.columns import (
     NO_NUMBERS,
     Columns,
+    RepeatedIds,
     as_columns,
     count,
     did_you_mean,
@@ -49,6 +51,7 @@ from jaxbundle.network.rules import (
 )
 from jaxbundle.network.tables import (
     EXTERIOR,
+    GREY,
     SIGMA_ORIGINS,
     STATED,
     UNIT,
@@ -70,6 +73,7 @@ GROUPS = EXTERIOR[:3], EXTERIOR[3:]
 IMAGE_SIGMAS = tuple(f"s{name}" for name in EXTERIOR)
 POINT_COLUMNS = ("id", "role", *AXES)
 POINT_SIGMAS = tuple(f"s{name}" for name in AXES)
+POINT_COLOURS = ("red", "green", "blue")
 # Reprojection errors in written point tables; not used.
 POINT_ERRORS = ("error_px", "error_mm")
 OBSERVATION_COLUMNS = ("image", "point", "x", "y")
@@ -347,8 +351,11 @@ def _make_images(table: Columns, cameras: Sequence[Camera], radians: float) -> I
 
 
 def _make_points(table: Columns) -> Points:
-    needed = AXES if {*AXES} & {*table.values} else ()
-    table.check_names(("id", *needed), ("role", *AXES, *POINT_SIGMAS, *POINT_ERRORS))
+    # all columns of coordinates, and of colours, or none
+    needed = [n for group in (AXES, POINT_COLOURS) if {*group} & {*table.values} for n in group]
+    table.check_names(
+        ("id", *needed), ("role", *AXES, *POINT_SIGMAS, *POINT_COLOURS, *POINT_ERRORS)
+    )
     ids = table.ids("id")
     check_unique(ids, table.source, "point")
     return Points(
@@ -357,7 +364,23 @@ def _make_points(table: Columns) -> Points:
         position=_matrix(table, AXES),
         sigma=_matrix(table, POINT_SIGMAS, words={"free": math.inf}),
         source=table.source,
+        colour=_colours(table),
     )
+
+
+def _colours(table: Columns) -> UInt8[np.ndarray, "points 3"] | None:
+    """Red, green, blue; points without any are grey."""
+    if POINT_COLOURS[0] not in table.values:
+        return None
+    colour = _matrix(table, POINT_COLOURS)
+    colour[np.isnan(colour).all(1)] = GREY
+    bad = ~((colour >= 0) & (colour <= 255) & (colour % 1 == 0))
+    for row, k in np.argwhere(bad)[:1]:
+        raise InputError(
+            f"{table.source(row)}: {POINT_COLOURS[k]} is {show(colour[row, k])}; a whole number "
+            "from 0 to 255 is expected, or no colour at all"
+        )
+    return colour.astype(np.uint8)
 
 
 def _make_observations(
@@ -366,13 +389,21 @@ def _make_observations(
     table.check_names(OBSERVATION_COLUMNS, OBSERVATION_SIGMAS)
     sigma = _matrix(table, OBSERVATION_SIGMAS)
     return Observations(
-        image=table.indices("image", "image", _index(images.id), images.source.name),
-        point=table.indices("point", "point", _index(points.id), points.source.name),
+        image=_rows_in(images, table, "image"),
+        point=_rows_in(points, table, "point"),
         xy=_matrix(table, ("x", "y"), required=True),
         sigma=np.where(np.isnan(sigma), sigma_image or 1.0, sigma),
         source=table.source,
         sigma_origin=origin or (UNIT if sigma_image is None and np.isnan(sigma).any() else STATED),
     )
+
+
+def _rows_in(of: Images | Points, table: Columns, name: str) -> Int[np.ndarray, " rays"]:
+    """The rows of images or points that a column names."""
+    values = table.column(name)
+    if isinstance(values, RepeatedIds) and values.are_rows:
+        return values.codes
+    return table.indices(name, name, _index(of.id), of.source.name)
 
 
 def _make_distances(table: Columns, points: Points) -> Distances:

@@ -90,9 +90,12 @@ def _check_sizes(network: Network) -> None:
     if not network.cameras:
         raise InputError("the network has no camera; give at least one")
     images, points, observations = network.images, network.points, network.observations
-    for table in (images, points, observations):
+    tables = (images, "images"), (points, "points"), (observations, "image points")
+    for table, things in tables:
         if not len(table):
-            raise InputError(f"{table.source.name}: the table is empty; give at least one row")
+            raise InputError(
+                f"{table.source.name}: the table is empty: there are no {things}; give at least one"
+            )
     n, p, r, d = len(images), len(points), len(observations), len(network.distances)
     shapes = (
         (images, {"camera": (n,), "position": (n, 3), "angles": (n, 3), "sigma": (n, 6)}),

@@ -26,10 +26,17 @@ NO_NUMBERS = (bool, np.bool_, complex, np.complexfloating, type(np.ma.masked))
 
 
 class RepeatedIds:
-    """A column of millions of ids of which few differ: `labels[codes]`."""
+    """A column of millions of ids of which few differ: `labels[codes]`; labels may be an array of
+    whole numbers. `are_rows`: the labels are the ids of the table that the column refers to, in
+    its order."""
 
-    def __init__(self, labels: Sequence[Any], codes: Int[np.ndarray, " rows"]):
-        self.labels, self.codes = labels, codes
+    def __init__(
+        self,
+        labels: Sequence[Any] | np.ndarray,
+        codes: Int[np.ndarray, " rows"],
+        are_rows: bool = False,
+    ):
+        self.labels, self.codes, self.are_rows = labels, codes, are_rows
 
     def __len__(self) -> int:
         return len(self.codes)
@@ -39,6 +46,12 @@ class RepeatedIds:
 
     def __iter__(self) -> Iterator[Any]:
         return map(self.labels.__getitem__, self.codes.tolist())
+
+    def texts(self) -> Iterator[str]:
+        """The labels as ids."""
+        if isinstance(self.labels, np.ndarray) and self.labels.dtype.kind in "iu":
+            return map(str, self.labels.tolist())
+        return map(_id, self.labels)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,9 +153,9 @@ class Columns:
         try:
             if isinstance(values, np.ndarray) and values.dtype.kind in "iu":
                 different, codes = np.unique(values, return_inverse=True)
-                values = RepeatedIds([*map(str, different.tolist())], codes)
+                values = RepeatedIds(different, codes)
             if isinstance(values, RepeatedIds):
-                found = [of.get(label, -1) for label in map(_id, values.labels)]
+                found = [of.get(label, -1) for label in values.texts()]
                 indices = np.array(found, np.int64)[values.codes]
                 if indices.size and indices.min() < 0:
                     raise KeyError

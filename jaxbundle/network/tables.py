@@ -8,6 +8,7 @@ message can name file and row. Rows refer to each other by index; ids are kept f
 | `Images.angles` | ω, φ, κ in radians, M = R3(κ)·R2(φ)·R1(ω) |
 | `Images.sigma` | prior σ of X0, Y0, Z0, ω, φ, κ; NaN: no prior; 0: held fixed |
 | `Points.sigma` | σ of a control point; NaN: none; inf: this axis is not controlled |
+| `Points.colour` | red, green, blue, 0 to 255; None: the network has no colours |
 | `Observations.xy` | measured image coordinates, in the unit and axes of the camera's model |
 """
 
@@ -18,7 +19,7 @@ from operator import index
 from typing import Any, SupportsIndex
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
 
 from jaxbundle.arguments import show
 from jaxbundle.cameras import CameraModel, get_model, key_of
@@ -33,6 +34,8 @@ ROLES = ("tie", "control", "fixed", "check")
 DATUMS = ("control", "inner", "minimal")
 RESIDUAL_DOMAINS = ("corrected", "measured")
 EXTERIOR = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
+# Red, green, blue of a point without a colour, among coloured ones or where a format requires one.
+GREY = (128, 128, 128)
 # Which rows of a table: a mask, or indices.
 Rows = Bool[np.ndarray, " n"] | Int[np.ndarray, " k"] | Sequence[int]
 # σ of an image coordinate of a calibration, pixels, where none is stated: a unit of weight, about
@@ -149,13 +152,15 @@ class Images:
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Points:
-    """Object points: role, coordinates (start values, given values) and σ."""
+    """Object points: role, coordinates (start values, given values), σ, and colour, which takes no
+    part in an adjustment."""
 
     id: tuple[str, ...]
     role: tuple[str, ...]
     position: Float[np.ndarray, "points 3"]
     sigma: Float[np.ndarray, "points 3"]
     source: Source = Source("points")
+    colour: UInt8[np.ndarray, "points 3"] | None = None
     __post_init__ = _fill_masked
 
     def __len__(self) -> int:
@@ -170,7 +175,17 @@ class Points:
             self.position[rows],
             self.sigma[rows],
             self.source.take(rows),
+            None if self.colour is None else self.colour[rows],
         )
+
+    def colour_or_grey(self) -> UInt8[np.ndarray, "points 3"]:
+        """The colours, `GREY` without."""
+        return np.full((len(self), 3), GREY, np.uint8) if self.colour is None else self.colour
+
+    def with_colours(self, colours: Mapping[str, Sequence[int]]) -> "Points":
+        """The same points with the colours of some, by id; the others are `GREY`."""
+        known = [tuple(colours.get(id, GREY)) for id in self.id]
+        return dataclasses.replace(self, colour=np.array(known, np.uint8).reshape(-1, 3))
 
     def has_role(self, *roles: str) -> Bool[np.ndarray, " points"]:
         """Which points have one of these roles."""

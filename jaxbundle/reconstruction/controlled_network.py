@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 
 from jaxbundle.io.results.result_project import readjustable_network
 from jaxbundle.network.kinds import Antennas, ExteriorPriors
-from jaxbundle.network.tables import Distances, LeftOut, Network, Points, Source
+from jaxbundle.network.tables import GREY, Distances, LeftOut, Network, Points, Source
 from jaxbundle.network.undetermined import keep_points
 from jaxbundle.network.units import from_image_unit
 from jaxbundle.reconstruction.control_choice import ControlChoice
@@ -55,6 +55,7 @@ def network_with_control(block: OrientedBlock, control: Points, choice: ControlC
             (*network.points.role, *added.role),
             np.concatenate([block.X[moved], added.position]),
             np.concatenate([network.points.sigma, added.sigma]),
+            colour=_colours_with_added(network.points, len(added.id)),
         ),
         observations=dataclasses.replace(
             rays,
@@ -84,6 +85,13 @@ def network_with_control(block: OrientedBlock, control: Points, choice: ControlC
         notes=tuple(note for note in whole.notes if not says_left_out(note, added.id)),
         left_out=without_names(network.left_out, added.id),
     )
+
+
+def _colours_with_added(points: Points, number: int) -> UInt8[np.ndarray, "n 3"] | None:
+    """The colours of points and of a number of grey ones."""
+    if points.colour is None:
+        return None
+    return np.concatenate([points.colour, np.full((number, 3), GREY, np.uint8)])
 
 
 def says_left_out(note: str, ids: tuple[str, ...]) -> bool:

@@ -82,6 +82,10 @@ def photograph_network(
         datum="inner" if extra.positions is None else "control",
         object_unit="m" if distances or extra.positions is not None else "unit",
     )
+    # of the photograph whose window is matched in the others
+    tracks, colours = measured.track[measured.is_template], measured.colour[measured.is_template]
+    colour_of = dict(zip(map(track_name, tracks.tolist()), colours.tolist()))
+    network = network.replace(points=network.points.with_colours(colour_of))
     if not cameras.calibrated:
         stated = [cameras.stated_distances[c] for c in used]
         lens = [cameras.lens[c] for c in used]

@@ -434,12 +434,7 @@ class _ReconstructionRun:
         # without control and positions the frame is an arbitrary one
         absolute = control is not None or self.further.positions is not None
         block = describe_block(result, exif, self.system if absolute else "")
-        template = measured.is_template
-        tracks, colours = measured.track[template].tolist(), measured.colour[template].tolist()
-        colour_of = {track_name(track): tuple(colour) for track, colour in zip(tracks, colours)}
-        part = ReconstructedPart(
-            name, result, colour_of, weighted.factors, block, control, no_control
-        )
+        part = ReconstructedPart(name, result, weighted.factors, block, control, no_control)
         if part.misfit >= DOUBTFUL_MISFIT:
             self._warn(f"{name}: {misfit_in_words(part)}", part.misfit)
         for said in (*self._compare_with_files(weighted.adjustment), *doubts):

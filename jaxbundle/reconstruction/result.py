@@ -20,13 +20,12 @@ from jaxbundle.results import TableMethods
 
 @dataclasses.dataclass(frozen=True)
 class ReconstructedPart:
-    """Connected photographs, adjusted: `name`; `colours` of the points by id; `factors` of the σ of
-    kinds of measurements; facts about the `block`; the table of `control`, None without, or if it
-    could not be used, with the reason in `no_control`."""
+    """Connected photographs, adjusted: `name`; `factors` of the σ of kinds of measurements; facts
+    about the `block`; the table of `control`, None without, or if it could not be used, with the
+    reason in `no_control`. The colours of the points are those of the network."""
 
     name: str
     adjustment: Adjustment
-    colours: Mapping[str, tuple[int, int, int]]
     factors: Mapping[str, float]
     block: BlockFacts
     control: ControlTable | None = None

@@ -20,7 +20,7 @@ from jaxbundle.adjustment.adjust import adjust
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.kinds import Ties
-from jaxbundle.network.tables import Images, Network, Points
+from jaxbundle.network.tables import Images, Network
 from jaxbundle.network.undetermined import keep_images, keep_points
 from jaxbundle.reconstruction.camera_priors import ASPECT, observed_parameters, with_observed
 
@@ -137,7 +137,7 @@ def _adjusted_network(result: Adjustment) -> Network:
     images = Images(
         images.id, images.camera, start[:, :3], start[:, 3:], images.sigma, images.source
     )
-    points = Points(points.id, points.role, position, points.sigma, points.source)
+    points = dataclasses.replace(points, position=position)
     rays = rays.take(used)
     network = network.replace(cameras=cameras, images=images, points=points, observations=rays)
     return keep_points(network, np.all(np.isfinite(position), axis=1))

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxbundle import cameras
 from jaxbundle.geometry import matrix_from_quaternion, omega_phi_kappa_from_matrix
-from jaxbundle.network.tables import Images, Network, Points
+from jaxbundle.network.tables import Images, Network
 from jaxbundle.refinement.inputs import PHOTOGRAPH
 from jaxbundle.refinement.refining import Refinement
 
@@ -71,7 +71,9 @@ def adjusted_photographs(result: Refinement) -> Network | None:
             np.where(held, 0.0, np.nan),
             network.images.source,
         ),
-        points=Points(points.id, roles, X, np.full_like(points.sigma, np.nan), points.source),
+        points=dataclasses.replace(
+            points, role=roles, position=X, sigma=np.full_like(points.sigma, np.nan)
+        ),
         observations=network.observations.take(kept),
         datum="inner",
         datum_points=(),

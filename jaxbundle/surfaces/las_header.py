@@ -24,6 +24,8 @@ POINT_SIZES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)
 # Of a compressed point by their type: bytes (None: any) and layers (None: one a byte).
 ITEMS = {6: (20, 0), 7: (8, 0), 8: (6, 0), 9: (29, 0), 0: (None, 0),
          10: (30, 9), 11: (6, 1), 12: (8, 2), 13: (29, 1), 14: (None, None)}  # fmt: skip
+# The compressor of LASzip 1, before there were chunks; later ones are 2 and 3.
+POINTWISE = 1
 # The size of chunks that have as many points each as the chunk table says.
 VARIABLE_CHUNKS = 2**32 - 1
 
@@ -105,6 +107,12 @@ def _check_compression(
     laszip = records.get((b"laszip encoded", 22204), b"")
     if len(laszip) < 34:
         raise InputError(f"{path}: damaged: the record that describes its compression is missing")
+    (compressor,) = struct.unpack_from("<H", laszip)
+    if compressor == POINTWISE:
+        raise InputError(
+            f"{path}: LAZ of LASzip 1, compressed as a whole and not in chunks, is not read; "
+            "decompress it: laszip64 -i FILE.laz -o FILE.las"
+        )
     (chunk,) = struct.unpack_from("<I", laszip, 12)
     (number,) = struct.unpack_from("<H", laszip, 32)
     if len(laszip) < 34 + 6 * number:

@@ -204,26 +204,35 @@ def _write_las(cloud: Cloud, path: Path) -> None:
     write_bytes(path, file.getvalue())
 
 
-def _read_las(path: Path) -> Cloud:
+def _read_las(path: Path, together: int = 1 << 18) -> Cloud:
+    """A cloud; **Arguments:** `together`: points read at once, some megabytes, which stay in the
+    cache of the processor for their coordinates and colours."""
     laspy = _laspy()
     check_las(path)
-    with foreign_parser(path, EXPECTED):
-        las = laspy.read(path)
-        names = {*las.point_format.dimension_names}
-        # as laspy's las.x, without the arrays between
-        X = np.empty((len(las.points), 3))
-        for k, raw in enumerate((las.X, las.Y, las.Z)):
-            np.multiply(raw, las.header.scales[k], out=X[:, k])
-            X[:, k] += las.header.offsets[k]
-        rgb = [np.asarray(las[name]) for name in COLOURS if name in names]
-        columns = {name: np.asarray(las[name]) for name in (*SIGMAS, "rays") if name in names}
-        crs = las.header.parse_crs() if len(X) else None
+    with foreign_parser(path, EXPECTED), laspy.open(path) as reader:
+        header, begin = reader.header, 0
+        names = {*header.point_format.dimension_names}
+        X = np.empty((header.point_count, 3))
+        colour = np.empty(X.shape, np.uint8) if {*COLOURS} <= names else None
+        more = {name: [] for name in (*SIGMAS, "rays") if name in names}
+        for points in reader.chunk_iterator(together):
+            part = slice(begin, begin := begin + len(points))
+            # as laspy's x, without the arrays between
+            for k, raw in enumerate((points.X, points.Y, points.Z)):
+                np.multiply(raw, header.scales[k], out=X[part, k])
+                X[part, k] += header.offsets[k]
+            if colour is not None:
+                for k, name in enumerate(COLOURS):
+                    np.floor_divide(points[name], 257, out=colour[part, k], casting="unsafe")
+            for name, columns in more.items():
+                columns.append(np.array(points[name]))
+        if begin < len(X):
+            raise InputError(
+                f"{path}: is cut, or damaged: its header counts {len(X)} points, there are {begin}"
+            )
+        crs = header.parse_crs() if len(X) else None
         system = None if crs is None else (crs.to_string() if crs.to_epsg() else crs.to_wkt())
-    colour = None
-    if len(rgb) == len(COLOURS):
-        colour = np.empty((len(X), 3), np.uint8)
-        for k, values in enumerate(rgb):
-            colour[:, k] = values // 257
+    columns = {name: np.concatenate(some) if some else np.zeros(0) for name, some in more.items()}
     return make_cloud(Source(str(path), None, "point"), X, columns, colour, system)
 
 

@@ -92,6 +92,7 @@ def full_network(model: str, plain: bool = False) -> Network:
         if not plain and p in roles:
             row["role"] = roles[p]
             row |= dict(sX=0.01, sY=0.02, sZ=0.03) if roles[p] == "control" else {}
+        row |= {} if plain else dict(red=20 * p, green=255 - p, blue=p)
         points.append(row)
     tables = {} if plain else {
         "distances": [{"from": "P5", "to": "P6", "value": 1.25, "sigma": 0.01}],
@@ -160,6 +161,10 @@ class Comparison:
         roles = [(a.points.role[i], b.points.role[j]) for i, j in self.points]
         if any(x != y for x, y in roles):
             lost.add("roles of points")
+        if "colours of points" not in lost and a.points.colour is not None:
+            rows = np.array(self.points, int).reshape(-1, 2)
+            if (a.points.colour[rows[:, 0]] != b.points.colour_or_grey()[rows[:, 1]]).any():
+                lost.add("colours of points")
         for name, x, y in (
             ("σ of control points", a.points.sigma, b.points.sigma),
             ("prior σ of orientations", a.images.sigma, b.images.sigma),
@@ -242,6 +247,7 @@ LETTERS = {
     "prior σ of camera parameters": "σC", "orientations of images": "O",
     "names of images": "I", "prior σ of orientations": "σO", "points": "P",
     "names of points": "M", "roles of points": "R", "σ of control points": "σR",
+    "colours of points": "K",
     "datum points": "D", "image points": "X", "σ of image points": "σX", "distances": "L",
     "rigs": "B", "antennas": "G",
 }  # fmt: skip
@@ -261,8 +267,8 @@ HOLDS: dict[str, set[str]] = {
     "bingo": {"prior σ of camera parameters", "roles of points", "image sizes of cameras",
               "pixel sizes of cameras"},
     "csm-frame": {"image sizes of cameras", "pixel sizes of cameras"},
-    "nvm": {"pixel sizes of cameras", "σ of image points"},
-    "alicevision": {"image sizes of cameras", "pixel sizes of cameras"},
+    "nvm": {"pixel sizes of cameras", "σ of image points", "colours of points"},
+    "alicevision": {"image sizes of cameras", "pixel sizes of cameras", "colours of points"},
     "orb-slam": {"image sizes of cameras", "rigs"},
     "vins": {"image sizes of cameras", "rigs"},
     "euroc": {"image sizes of cameras", "rigs"},

@@ -113,7 +113,8 @@ BROKEN = {
     "camera": ("2 0 17", "2 7 17", "line 15: camera 7 does not exist; there are 2"),
     "rays": ("2 0 17", "3 0 17", "3 rays are announced; 12 numbers should follow, not 8"),
     "huge rays": ("2 0 17", "999999999999999999 0 17", "announced"),
-    "cut": ("9 9 9\n2 0 17 80 40 1 3 1 1\n", "9 9", "ends after line 14; rays of point 0"),
+    "cut": ("9 9 9\n2 0 17 80 40 1 3 1 1\n", "9 9 9", "ends after line 14; rays of point 0"),
+    "colour": ("9 9 9", "9 9", "line 14: 2 values where 3 are expected .red, green, blue"),
 }
 
 

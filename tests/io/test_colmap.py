@@ -19,6 +19,7 @@ from jaxbundle.io.networks.colmap import (
     read_colmap_cameras,
     write_colmap,
 )
+from jaxbundle.io.networks.colmap_model import find_rows
 from jaxbundle.io.networks.colmap_models import MODELS, from_colmap, to_colmap
 from jaxbundle.network import Camera
 
@@ -370,3 +371,33 @@ def test_cut_rigs(folder, tmp_path, name):
         path.write_bytes(cut)
         with pytest.raises(InputError, match=name):
             read_colmap(tmp_path / "binary")
+
+
+def test_points_in_any_order(tmp_path):
+    """COLMAP writes them by number, older versions in no order; with gaps between their numbers."""
+    for name in ("sorted", "shuffled"):
+        write_colmap(network("opencv"), tmp_path / name)
+    path = tmp_path / "shuffled" / "points3D.bin"
+    data, position, rows = path.read_bytes(), 8, []
+    while position < len(data):
+        size = struct.calcsize("<Q3d3BdQ")
+        end = position + size + 8 * struct.unpack_from("<Q", data, position + size - 8)[0]
+        rows.append(data[position:end])
+        position = end
+    path.write_bytes(data[:8] + b"".join(rows[k] for k in [5, 0, 11, *range(1, 5), *range(6, 11)]))
+    first, other = (read_colmap(tmp_path / name) for name in ("sorted", "shuffled"))
+    assert other.points.id[:3] == ("6", "1", "12")
+    row = [other.points.id.index(id) for id in first.points.id]
+    np.testing.assert_array_equal(other.points.position[row], first.points.position)
+    names = lambda net: sorted(
+        (net.images.id[i], net.points.id[p], *xy)
+        for i, p, xy in zip(net.observations.image, net.observations.point, net.observations.xy)
+    )
+    assert names(first) == names(other)
+
+
+@pytest.mark.parametrize("ids", [[4, 2, 9, 0], [10**12, 7, 8, 3], []])
+def test_rows_of_numbers(ids):
+    wanted = np.array([2, 9, -5, 10**15, 7, 10**12, 0])
+    expected = [ids.index(k) if k in ids else -1 for k in wanted.tolist()]
+    assert find_rows(np.array(ids, np.int64), wanted).tolist() == expected

@@ -205,7 +205,7 @@ def test_the_command_tells_it(command, tmp_path):
     assert "warning: not kept: names of cameras (2); pixel sizes of cameras (2);" in done.err
     assert "not kept: names of rigs and epochs, which are numbered\n" in done.out
     again = command("convert", tmp_path / "m_colmap", tmp_path / "camera.yaml", "--camera", "1")
-    assert "image" in again.err and "colours, which are not read" in again.err
+    assert "image" in again.err and "points (12)" in again.err
     quiet = command("convert", tmp_path / "given", tmp_path / "n.ply", "--quiet")
     assert quiet.err == quiet.out == ""
 

@@ -336,3 +336,50 @@ def test_a_camera_model_that_is_no_name(tmp_path, model):
     path = tmp_path / "cameras.toml"
     path.write_text(f'[[camera]]\nid = "c"\nmodel = {model}\nfx = 1.0\n')
     refused(read_cameras, path, "model")
+
+
+def test_laz_of_laszip_1_is_named(tmp_path):
+    """Points that are not in chunks: another form, not damage."""
+    header = laspy.LasHeader(point_format=1, version="1.2")
+    las = laspy.LasData(header)
+    las.x = las.y = las.z = np.arange(9.0)
+    path = tmp_path / "c.laz"
+    las.write(path)
+    data = bytearray(path.read_bytes())
+    at = data.index(b"laszip encoded") + 16 + 2 + 2 + 32  # record, length, description
+    assert struct.unpack_from("<H", data, at) == (2,)
+    data[at : at + 2] = b"\1\0"
+    path.write_bytes(data)
+    with pytest.raises(InputError, match="LASzip 1, .*decompress it"):
+        read_cloud(path)
+
+
+def test_a_damaged_statement_of_kept_corners(tmp_path):
+    """SQLite quotes it, bytes that are no text and all."""
+    path = tmp_path / "kept.sqlite"
+    with KeptCorners(path):
+        pass
+    data = path.read_bytes()
+    for column in (b"path TEXT", b"size INTEGER"):  # two of one name, which the error quotes
+        assert data.count(column) == 1
+        data = data.replace(column, b"\xc9\xc9\xc9\xc9" + column[4:])
+    path.write_bytes(data)
+    with pytest.raises(InputError, match="kept.sqlite: the corners found before"):
+        KeptCorners(path)
+
+
+def test_a_terrain_model_of_one_column_is_named(tmp_path):
+    from jaxbundle.geometry.ellipsoid import WGS84
+    from jaxbundle.io.rasters.reading import read_terrain
+
+    path = tmp_path / "dem.asc"
+    rows = "\n".join(map(str, range(100, 120)))
+    path.write_text(
+        f"ncols 1\nnrows 20\nxllcorner 13.0\nyllcorner 40.8\ncellsize 0.01\n{rows}\n"
+    )
+    path.with_suffix(".prj").write_text(
+        'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],'
+        'PRIMEM["Greenwich",0],UNIT["degree",0.0174532925199433]]'
+    )
+    with pytest.raises(InputError, match="dem.asc: terrain: heights of shape .20, 1."):
+        read_terrain(path, WGS84)

@@ -72,6 +72,7 @@ def test_the_distortion_is_never_dropped(tmp_path, key):
     {"camera_matrix": K, "distortion": {"model": "plumb_bob", "coefficients": D}},
     {"camera_matrix": K, "dist": D, "fx": 500.0, "fy": 501.0},
     {"camera_matrix": K, "dist": D, "model": "HERO7 Black"},
+    {"camera_matrix": K, "dist": D, "camera_name": "left", "cam_id": 0},
 ])  # fmt: skip
 def test_spellings_of_one_camera(tmp_path, document):
     camera = read_one(tmp_path, document)
@@ -99,6 +100,35 @@ def test_spellings_of_one_camera(tmp_path, document):
 def test_contradictions_are_refused(tmp_path, document, message):
     with pytest.raises(InputError, match=message):
         read_one(tmp_path, document)
+
+
+@pytest.mark.parametrize("xi, skew", [(0.95, 0.0), ([[1.3]], 0.0), (0.95, 0.4)])
+def test_an_omnidirectional_camera_of_opencv(tmp_path, xi, skew):
+    """A ray of length 1, divided by Z + ξ, distorted, times K (OpenCV contrib, omnidir)."""
+    matrix = [[500, skew, 320.5], [0, 501, 241.25], [0, 0, 1]]
+    camera = read_one(tmp_path, {"K": matrix, "D": D[:4], "xi": xi, "image_size": [640, 480]})
+    X = np.array([[0.1, -0.2, 1], [-0.9, 0.4, 0.8], [0.5, 0.7, 0.2]])
+    Xs = X / np.linalg.norm(X, axis=1, keepdims=True)
+    x, y = (Xs[:, :2] / (Xs[:, 2:] + np.ravel(xi)[0])).T
+    k1, k2, p1, p2 = D[:4]
+    r2 = x * x + y * y
+    xd = x * (1 + k1 * r2 + k2 * r2**2) + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    yd = y * (1 + k1 * r2 + k2 * r2**2) + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
+    uv = (np.stack([xd, yd, np.ones(3)], 1) @ np.array(matrix).T)[:, :2]
+    found = images_of(get_model(camera.model), camera.parameters, X * [1, -1, -1])
+    assert camera.model == "mei"
+    # a skew of 0.4 moves no image point by more: |y'| < 1
+    np.testing.assert_allclose(found, uv, rtol=0, atol=0.4 if skew else 1e-10)
+
+
+@pytest.mark.parametrize("more, message", [
+    ({"alpha": 0.6}, "xi and alpha are a double sphere"), ({"D": D[:4] + [0.1]}, "has 4"),
+    ({"model": "ds"}, "'ds' with xi is not known"), ({"xi": [1, 2]}, "xi has 2 values"),
+    ({"distortion_model": "equidistant"}, "'equidistant' with xi"),
+])  # fmt: skip
+def test_what_is_no_omnidirectional_camera_of_opencv(tmp_path, more, message):
+    with pytest.raises(InputError, match=message):
+        read_one(tmp_path, {"K": K, "D": D[:4], "xi": 0.9} | more)
 
 
 def test_region_and_binning_of_ros(tmp_path):
@@ -317,6 +347,7 @@ def test_visualsfm(tmp_path):
     for old, new, message in [
         ("NVM_V3", "NVM_V3_R9T", "expected NVM_V3"), ("2 0 7", "3 0 7", "line 7: 3 rays"),
         ("NVM_V3", "NVM_V3 FixedK 1000 500 1000 400", "line 1: FixedK"),
+        ("-0.02 0", "-0.02 0.1", "line 4: the last number of a camera is 0.1"),
         ("1 9 55", "4 9 55", "image 4 does not exist"),
         ("1000 1 0", "-1000 1 0", "line 4: f is -1000"), ("\n2\n", "\n0\n", "no model"),
         ("\n1\n", "\n2\n", "line 9: the number of rays"), ("0.75", "x", "line 7: "),
@@ -507,3 +538,45 @@ def test_scaramuzza_of_camodocal(tmp_path):
     path.write_text(PAL.replace("scaramuzza", "POLYFISHEYE"))
     with pytest.raises(InputError, match="model_type is POLYFISHEYE, a camera of camodocal"):
         read_cameras(path)
+
+
+@pytest.mark.parametrize("centres", [[(320.5, 240.25)] * 3, [(320, 240), (960, 640), (320, 240)]])
+def test_image_points_of_an_nvm_from_a_corner(tmp_path, centres):
+    """COLMAP and others write them so; without a negative coordinate they count from a corner."""
+    rng = np.random.default_rng(2)
+    X = rng.uniform([-0.9, -0.7, 4], [0.9, 0.7, 6], (40, 3))
+    text = {True: "NVM_V3\n\n3\n", False: "NVM_V3\n\n3\n"}
+    shift = np.array([[0, 0, 0], [0.3, 0, 0], [0, 0.2, 0.1]])
+    for k in range(3):
+        for corner in text:
+            text[corner] += f"{k}.jpg 1000 1 0 0 0 {' '.join(map(str, shift[k]))} 0 0\n"
+    uv = 1000 * np.array([(X - t)[:, :2] / (X - t)[:, 2:] for t in shift])
+    for corner in text:
+        text[corner] += f"{len(X)}\n"
+        for p, at in enumerate(X.tolist()):
+            views = " ".join(
+                f"{k} {p} {x!r} {y!r}"
+                for k, (x, y) in enumerate((uv[:, p] + corner * np.array(centres)).tolist())
+            )
+            text[corner] += f"{' '.join(map(repr, at))} 1 2 3 3 {views}\n"
+    nets = {}
+    for corner in text:
+        (tmp_path / "m.nvm").write_text(text[corner])
+        nets[corner] = read_network(tmp_path / "m.nvm")
+    assert_allclose(nets[True].observations.xy, nets[False].observations.xy, atol=1e-12)
+    assert not nets[False].warnings
+    told = f"({np.median(centres, axis=0)[0]:.2f}, {np.median(centres, axis=0)[1]:.2f}) px"
+    assert "counted from a corner" in nets[True].warnings[0] and told in nets[True].warnings[0]
+
+
+@pytest.mark.parametrize("name, text, kind", [
+    ("default.xml", '<?xml version="1.0"?>\n<opencv_storage><Settings><BoardSize_Width>9'
+     "</BoardSize_Width></Settings></opencv_storage>\n", "a FileStorage of OpenCV without camera_"),
+    ("ground_control_points.json", '{"points": []}', "ground control of OpenSfM; give its folder"),
+])  # fmt: skip
+def test_a_refusal_names_the_kind_and_what_is_missing(tmp_path, command, name, text, kind):
+    path = tmp_path / name
+    path.write_text(text)
+    for words in (("convert", path, tmp_path / "n.csv"), ("camera", path), ("adjust", path)):
+        told = command(*words)
+        assert told.status == 2 and kind in told.err and name in told.err

@@ -357,3 +357,14 @@ def test_short_tables_with_a_stated_extrapolation(tmp_path):
     (tmp_path / "scanner.toml").write_text('[scanner]\nsource = "isd.json"\nextrapolate = -1\n')
     with pytest.raises(InputError, match="extrapolate is -1"):
         read_scanner(tmp_path / "scanner.toml")
+
+
+def test_a_key_that_is_not_known_is_named_or_refused(tmp_path):
+    path = tmp_path / "isd.json"
+    path.write_text(json.dumps(support_data(older=True)))
+    assert not any("unknown key" in told for told in read_csm(path).warnings)
+    path.write_text(json.dumps(support_data(older=True) | {"vendor_remark": 7}))
+    assert any("unknown key 'vendor_remark'" in told for told in read_csm(path).warnings)
+    path.write_text(json.dumps(support_data(older=True) | {"lens_offset": 7}))
+    with pytest.raises(InputError, match="isd.json.*unknown key 'lens_offset'.*geometry"):
+        read_csm(path)

@@ -262,7 +262,7 @@ def test_report_page_and_json_show_control_and_block(drone, spoilt, tmp_path):
     time = datetime.datetime(2026, 5, 4, 10, 30)
     exif = {id: Exif((2000, 1500), time=time) for id in drone.images}
     facts = describe_block(result, exif, "EPSG:32611")
-    part = ReconstructedPart("part 1", result, {}, {}, facts, table)
+    part = ReconstructedPart("part 1", result, {}, facts, table)
     found = Reconstruction((part,), {}, ("a note",), (), {}, name="quarry")
     folder = tmp_path / "out"
     write_reconstruction(found, "", folder, True, False, False)

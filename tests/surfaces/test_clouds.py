@@ -19,7 +19,7 @@ from jaxbundle.surfaces.compare import compare
 from jaxbundle.surfaces.dsm import NO_DATA, Dsm, make_dsm, write_dsm
 from jaxbundle.surfaces.files import text_of
 from jaxbundle.surfaces.orthophoto import orthophoto, write_orthophoto
-from jaxbundle.surfaces.point_files import read_cloud, write_cloud
+from jaxbundle.surfaces.point_files import _read_las, read_cloud, write_cloud
 
 
 def cloud_on_plane(n=4000, noise=0.05, seed=0, system=None):
@@ -276,3 +276,13 @@ def test_an_orthophoto_has_as_many_bits_as_its_grey_values(tmp_path, values, kin
     with rasterio.open(tmp_path / "o.tif") as raster:
         assert raster.dtypes == (kind,)
         np.testing.assert_array_equal(raster.read(1), np.nan_to_num(grey))
+
+
+@pytest.mark.parametrize("suffix", ["las", "laz"])
+def test_clouds_are_read_in_pieces(tmp_path, suffix):
+    path = tmp_path / f"c.{suffix}"
+    write_cloud(cloud_on_plane(900, system="EPSG:32633"), path)
+    whole, pieces = read_cloud(path), _read_las(path, together=7)
+    for name in ("X", "covariance", "rays", "colour"):
+        np.testing.assert_array_equal(getattr(whole, name), getattr(pieces, name))
+    assert whole.system == pieces.system

@@ -51,7 +51,7 @@ def intersect_check_points(
     # their covariance: check points have no part in what they check.
     problem, role = inspection.problem, ("tie",) * len(points)
     network = problem.network.replace(
-        points=Points(points.id, role, points.position, np.full((len(points), 3), np.nan)),
+        points=dataclasses.replace(points, role=role, sigma=np.full((len(points), 3), np.nan)),
         observations=observations,
         distances=Distances.none(),
     )

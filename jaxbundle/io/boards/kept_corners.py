@@ -32,6 +32,8 @@ CREATE TABLE IF NOT EXISTS boards
 """
 
 
+# The text of an error about a damaged file may quote bytes of it that are no text.
+SQLITE_ERRORS = (sqlite3.Error, UnicodeDecodeError)
 # Number of the method of measurement, part of the keys in the file: corners by an earlier one are
 # searched again. Raise it when `measure` finds other coordinates in the same photograph.
 MEASUREMENT_VERSION = 2
@@ -53,7 +55,7 @@ class KeptCorners:
             # autocommit: a search result is on the disk before the next photograph is opened
             self._file = sqlite3.connect(path, isolation_level=None)
             self._file.executescript(TABLES)
-        except sqlite3.Error as error:
+        except SQLITE_ERRORS as error:
             raise self._error(error) from None
 
     def __enter__(self) -> "KeptCorners":
@@ -122,16 +124,16 @@ class KeptCorners:
     def _first(self, question: str, *values: SqlValue) -> tuple | None:
         try:
             return self._file.execute(question, values).fetchone()
-        except sqlite3.Error as error:
+        except SQLITE_ERRORS as error:
             raise self._error(error) from None
 
     def _write(self, order: str, *values: SqlValue) -> None:
         try:
             self._file.execute(order, values)
-        except sqlite3.Error as error:
+        except SQLITE_ERRORS as error:
             raise self._error(error) from None
 
-    def _error(self, error: sqlite3.Error) -> InputError:
+    def _error(self, error: Exception) -> InputError:
         return InputError(
             f"{self.path}: the corners found before cannot be kept there ({error}); remove it, or "
             "give another file to --json-lines"

@@ -48,6 +48,7 @@ PERSPECTIVE = (
     ("brown-projected", fitted_parameters(get_model("brown-projected"))),
 )
 FISHEYE = (("kannala-brandt", fitted_parameters(get_model("kannala-brandt"))),)
+MIRROR = (("mei", fitted_parameters(get_model("mei"))),)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,7 +87,8 @@ class Foreign:
     """A camera of another program.
 
     `parameters`: those of the formula, numbers in any container of JAX; `start`: the parameters of
-    `opencv`, or of `kannala-brandt` if it is a `fisheye`, that come nearest to its formula;
+    `opencv`, or of `kannala-brandt` if it is a `fisheye`, or of `mei` if they have ξ, that come
+    nearest to its formula;
     `image_size` in pixels, `pixel_size` in mm where it is known.
     """
 
@@ -115,10 +117,11 @@ def nearest_camera(
             "back inside the image"
         )
     uv, rays = uv[there], rays[there] * [1, -1, -1]  # y up, looking along −z, as all models here
-    source = get_model("kannala-brandt" if camera.fisheye else "opencv")
+    wide = (MIRROR if "xi" in camera.start else FISHEYE) if camera.fisheye else ()
+    source = get_model(wide[0][0] if wide else "opencv")
     narrow = (-rays[:, 2] > np.cos(np.radians(settings.perspective_angle))).all()
     fits, problem = [], ""
-    for name, free in (*(FISHEYE if camera.fisheye else ()), *(PERSPECTIVE if narrow else ())):
+    for name, free in (*wide, *(PERSPECTIVE if narrow else ())):
         target = get_model(name)
         if target.unit == "mm" and camera.pixel_size is None:
             continue

@@ -25,6 +25,7 @@ centre of the first pixel, as here. A skew and a tilted sensor (τx, τy),
     u = fx·x'' + skew·y'' + cx
 
 are not part of our models: if they are not 0 the nearest is fitted, which needs the image size.
+With an entry `xi` it is the camera of OpenCV's module `omnidir`, `mei` with k1, k2, p1, p2.
 
 `opencv_writing.py` writes such files.
 
@@ -81,6 +82,8 @@ ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
 # two of 14 are the tilt.
 COEFFICIENT_COUNTS = (4, 5, 8, 12, 14)
 FISHEYE = ("equidistant", "fisheye")
+# Names of its omnidirectional camera.
+OMNIDIRECTIONAL = re.compile("omni|mei")
 # Parts of the names of lens models that are none of OpenCV's; what has none of them under the key
 # `model` names a product, "HERO7 Black".
 FOREIGN_MODELS = re.compile(
@@ -195,18 +198,20 @@ def camera_of(path: str | Path, found: Found, id: str) -> Camera:
     **Raises:** `InputError` naming the entry.
     """
     core, skew = _core(path, found)
-    fisheye = _is_fisheye(path, found)
+    mirror = _mirror(path, found)
+    fisheye = not mirror and _is_fisheye(path, found)
     values = _coefficients(path, found, fisheye)
     coefficients, tilt = values[: len(ORDER)], values[len(ORDER) :]
-    if fisheye and (any(coefficients[4:]) or any(tilt)):
-        raise InputError(f"{path}: {len(values)} distortion coefficients; a fisheye has 4")
+    short = "a fisheye" if fisheye else "an omnidirectional camera" if mirror else ""
+    if short and (any(coefficients[4:]) or any(tilt)):
+        raise InputError(f"{path}: {len(values)} distortion coefficients; {short} has 4")
     size = _image_size(path, found)
     core, size, told = _published_image(path, found, core, size)
     names = ORDER if not fisheye else ("k1", "k2", "k3", "k4")
     camera = Camera(
         id=id,
-        model="kannala-brandt" if fisheye else "opencv",
-        parameters=core | dict(zip(names, coefficients)),
+        model="mei" if mirror else "kannala-brandt" if fisheye else "opencv",
+        parameters=core | mirror | dict(zip(names[:4] if mirror else names, coefficients)),
         image_size=size,
     )
     check_camera(camera, f"{path}, ")
@@ -244,6 +249,27 @@ def _core(path: str | Path, found: Found) -> tuple[dict[str, float], float]:
     if K[0, 1] and extra and K[0, 1] != extra:
         raise InputError(f"{path}: {found['skew'][0]} and {name}[0][1] differ; expected one skew")
     return core, float(K[0, 1]) or extra
+
+
+def _mirror(path: str | Path, found: Found) -> dict[str, float]:
+    """ξ of an omnidirectional camera; nothing of others.
+
+    **Raises:** `InputError` for a lens model that is another."""
+    if "xi" not in found:
+        return {}
+    for meaning in MODEL_KEYS:
+        key, kind = found.get(meaning, ("", ""))
+        folded = fold(str(kind))
+        if folded and not OMNIDIRECTIONAL.search(folded) and MODEL_NAMES.get(folded) != "opencv":
+            raise InputError(
+                f"{path}: {key} {show(kind)} with xi is not known here; expected OpenCV's "
+                "omnidirectional camera"
+            )
+    name, value = found["xi"]
+    values = [value] if _is_number(value) else matrix_of(path, name, value, None).tolist()
+    if len(values) != 1:
+        raise InputError(f"{path}: {name} has {len(values)} values; a finite number is expected")
+    return {"xi": float(values[0])}
 
 
 def _number(path: str | Path, found: Found, kind: str, default: float | None = None) -> float:
@@ -405,7 +431,7 @@ def _fit(path: Path, camera: Camera, skew: float, tilt: Sequence[float]) -> Fitt
         parameters,
         p,
         camera.image_size,
-        fisheye=camera.model == "kannala-brandt",
+        fisheye=camera.model != "opencv",
     )
     return fit_camera(camera.id, foreign, str(path), f"has {' and '.join(has)}")
 
@@ -421,7 +447,7 @@ def _image(name: str, p: Mapping[str, Any], X: Scalar, Y: Scalar, Z: Scalar) -> 
     return jnp.stack([u, own["fy"] * y / s + own["cy"]])
 
 
-FORMULAS = {name: partial(_image, name) for name in ("opencv", "kannala-brandt")}
+FORMULAS = {name: partial(_image, name) for name in ("opencv", "kannala-brandt", "mei")}
 
 
 def _tilt(tx: float, ty: float) -> Float[np.ndarray, "3 3"]:

@@ -135,9 +135,10 @@ ORB_KEYS = Keys(
     {
         **dict.fromkeys(
             ("ORBextractor.*", "Viewer.*", "System.*", "File.version", "loopClosing", "Tracking.*",
-             "Mapping.*", "Feature.*", "PangolinViewer.*", "SocketPublisher.*", "KeyFrame*",
-             "Initializer.*", "LoopDetector.*", "GraphOptimizer.*", "GlobalOptimizer.*",
-             "Relocalizer.*", "Optimizer.*", "Preprocessing.*", "MarkerModel.*"),
+             "Mapping.*", "UseMotionModel", "Feature.*", "PangolinViewer.*", "SocketPublisher.*",
+             "KeyFrame*", "Initializer.*", "LoopDetector.*", "GraphOptimizer.*",
+             "GlobalOptimizer.*", "Relocalizer.*", "Optimizer.*", "Preprocessing.*",
+             "MarkerModel.*"),
             "settings of the program",
         ),
         **dict.fromkeys(

@@ -7,6 +7,7 @@ is spelled. Any other entry is subject to the rule of keys (`text.known_keys`).
     camera_matrix              3 × 3, or fx, fy, cx, cy by name, or [fx, fy, cx, cy] of `intrinsics`
     distortion_coefficients    a vector of any shape, or k1, k2, p1, p2, k3 … by name
     image_size                 [w, h], or image_width and image_height
+    xi                         a number: the mirror of OpenCV's omnidirectional camera
     distortion_model           a word of MODEL_NAMES; camera_model the same, or a product's name
 
 Source: OpenCV's samples and documentation, ROS's messages, public calibration files.
@@ -39,6 +40,7 @@ SPELLINGS = {
     "camera_model": "projectionmodel projectiontype cameramodel cameratype modeltype model",
     "fisheye_model": "fisheyemodel fisheye isfisheye usefisheye",
     "skew": "skew skewness",
+    "xi": "xi",
     "roi": "roi regionofinterest",
     "binning_x": "binningx",
     "binning_y": "binningy",
@@ -173,13 +175,19 @@ def camera_entries(
             )
         del found["roi"]
     folded = {fold(name): name for name in rest}
+    if "xi" in found and (sphere := [name for key, name in folded.items() if key == "alpha"]):
+        raise InputError(
+            f"{where}: {found['xi'][0]} and {sphere[0]} are a double sphere, not a camera of "
+            "OpenCV; expected a Kalibr file, camera_model ds"
+        )
     for name in left.unknown(folded):
         unknown.check([folded[name]], Keys((*CORE, *SPELLINGS)), where)
     return found
 
 
 def _put(found: Found, kind: str, entry: tuple[str, Any], where: object) -> None:
-    if kind in found and found[kind][1] != entry[1]:
+    # of several names, the first: none of them concerns rays
+    if kind != "camera_name" and kind in found and found[kind][1] != entry[1]:
         raise InputError(
             f"{where}: {found[kind][0]} and {entry[0]} are both the {kind.replace('_', ' ')}, and "
             "differ; expected one of them"

@@ -6,7 +6,7 @@
                   principalPoint, pxFocalLength (before 1.2.2); focalLength and sensorWidth in mm,
                   pixelRatio
     poses         poseId, pose/transform: rotation (by columns), center
-    structure     landmarkId, X, observations: observationId (a view), x
+    structure     landmarkId, X, color, observations: observationId (a view), x
 
 x_camera = R·(X − center), x right, y down, z forward. The principal point counts from the centre of
 the image, before version 1.2.1 from its corner; fx = focalLength/sensorWidth·width and fy =
@@ -36,6 +36,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import flip_rows
 from jaxbundle.io.networks.assemble import (
     assemble,
+    colour_columns,
     foreign_document,
     image_columns,
     unique_labels,
@@ -45,7 +46,7 @@ from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.io.text.json_fields import JsonFields, read_object, stack_rows
 from jaxbundle.io.text.known_keys import Keys, UnknownKeys
 from jaxbundle.network.columns import Columns, count, list_some
-from jaxbundle.network.tables import Network, Source
+from jaxbundle.network.tables import GREY, Network, Source
 from jaxbundle.system.file_content import beginning
 
 SUFFIXES = (".sfm", ".json")
@@ -96,8 +97,8 @@ INTRINSIC_KEYS = Keys(
     },
 )  # fmt: skip
 POINT_KEYS = Keys(
-    ("landmarkId", "X", "observations"),
-    dict.fromkeys(("descType", "color", "parallaxRobust", "state"), "features and colours"),
+    ("landmarkId", "X", "color", "observations"),
+    dict.fromkeys(("descType", "parallaxRobust", "state"), "features"),
 )
 RAY_KEYS = Keys(("observationId", "x"), dict.fromkeys(("featureId", "scale", "depth"), "features"))
 
@@ -136,7 +137,7 @@ def read_alicevision(path: str | Path, overrides: Sequence[str] = ()) -> Network
         unknown.check(row.document, VIEW_KEYS, row.path)
         if row.text("intrinsicId", "none") in cameras:
             views[row.text("viewId")] = row
-    tie, rays = _structure(file, unknown, views)
+    tie, colours, rays = _structure(file, unknown, views)
     seen = {view for view, *_ in rays}
     posed = {id for id, row in views.items() if row.text("poseId", "none") in poses}
     left = [Path(_path(views[id], id)).name for id in views if id not in posed | seen]
@@ -164,6 +165,8 @@ def read_alicevision(path: str | Path, overrides: Sequence[str] = ()) -> Network
     )
     place = lambda k: (f"{path}, structure[{k}]", "X")
     X = stack_rows([_plain(value) for value in tie.values()], 3, place).reshape(-1, 3)
+    place = lambda k: (f"{path}, structure[{k}]", "color")
+    rgb = stack_rows([_plain(value) for value in colours], 3, place).reshape(-1, 3)
     place = lambda k: (f"{path}, landmark {rays[k][1]}, view {rays[k][0]}", "x")
     xy = stack_rows([_plain(x) for *_, x in rays], 2, place).reshape(-1, 2)
     told = [f"left out {count(len(left), 'view')} without pose and image points: {list_some(left)}"]
@@ -173,7 +176,7 @@ def read_alicevision(path: str | Path, overrides: Sequence[str] = ()) -> Network
         overrides,
         images,
         Columns(
-            {"id": list(tie), "role": ["tie"] * len(tie), **dict(zip("XYZ", X.T))},
+            {"id": list(tie), **dict(zip("XYZ", X.T)), **colour_columns(rgb)},
             Source(str(path), None, "landmark"),
         ),
         Columns(
@@ -251,19 +254,19 @@ def _path(view: JsonFields, id: str) -> str:
 
 def _structure(
     file: JsonFields, unknown: UnknownKeys, views: Mapping[str, JsonFields]
-) -> tuple[dict[str, Any], list[tuple[str, str, Any]]]:
-    """X of the landmarks, and view, landmark, x of the image points."""
-    tie, rays = {}, []
+) -> tuple[dict[str, Any], list[Any], list[tuple[str, str, Any]]]:
+    """X of the landmarks; their colours; view, landmark, x of the image points."""
+    tie, colours, rays = {}, {}, []
     for row in file.rows("structure"):
         unknown.check(row.document, POINT_KEYS, row.path)
         id = row.text("landmarkId")
-        tie[id] = row.get("X")
+        tie[id], colours[id] = row.get("X"), row.get("color", GREY)
         for ray in row.rows("observations"):
             unknown.check(ray.document, RAY_KEYS, ray.path)
             view = ray.text("observationId")
             if view in views and ray.get("x") is not None:
                 rays.append((view, id, ray.get("x")))
-    return tie, rays
+    return tie, [*colours.values()], rays
 
 
 def _plain(value: Any) -> Any:

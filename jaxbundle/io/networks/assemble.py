@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Num
 
 from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.geometry.pose_conventions import exterior_from_cv
@@ -21,12 +21,18 @@ from jaxbundle.io.networks.settings import (
     apply_overrides,
     check_project_settings,
 )
-from jaxbundle.network.build import make_cameras, make_network
+from jaxbundle.network.build import (
+    OBSERVATION_COLUMNS,
+    POINT_COLOURS,
+    make_cameras,
+    make_network,
+)
 from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.kinds import Rigs
 from jaxbundle.network.rules import check_unique
 from jaxbundle.network.tables import (
     EXTERIOR,
+    GREY,
     Camera,
     Images,
     Network,
@@ -34,10 +40,13 @@ from jaxbundle.network.tables import (
     Points,
     Source,
 )
+from jaxbundle.types import Column
 
 # Coordinates of the centre of the first pixel in programs that count from its corner (COLMAP,
 # nerfstudio, Metashape, PhotoModeler); here they are 0 (docs/conventions.md).
 PIXEL_CENTRE = 0.5
+# What programs write that have no colours: black, or grey as we do.
+NO_COLOURS = ((0, 0, 0), GREY)
 # The rig of a file of calibrated cameras, and its only epoch.
 RIG, MOMENT = "rig", "0"
 
@@ -67,8 +76,9 @@ def assemble(
 ) -> Network:
     """The network of a document and its tables, angles in radians.
 
-    Without points the network has only cameras and images and can be written but not
-    adjusted. The image unit is that of the file and cannot be set.
+    Without points the network has only cameras and images, and without image points it has only
+    what else there is: both can be written but not adjusted. The image unit is that of the file and
+    cannot be set.
 
     **Raises:** `InputError`.
     """
@@ -79,7 +89,10 @@ def assemble(
     # the tables are in radians; the unit is one of the output
     angle_unit = project.pop("angle_unit", "rad")
     cameras = make_cameras(document["camera"], f"{path}, ")
-    if points is not None and len(points) and observations is not None and len(observations):
+    if points is not None and len(points):
+        if observations is None or not len(observations):
+            columns: dict[str, Column] = {name: () for name in OBSERVATION_COLUMNS}
+            observations = Columns(columns, Source(str(path), None, "image point"), True)
         network = make_network(cameras, images, points, observations, **project)
     else:
         network = _without_points(cameras, images, project)
@@ -180,6 +193,16 @@ def image_columns(
     values = np.concatenate([np.reshape(X0, (-1, 3)), angles_of(M)], 1)
     columns = {"id": ids, "camera": cameras, **dict(zip(EXTERIOR, values.T))}
     return Columns(columns, source)
+
+
+def colour_columns(colours: Num[np.ndarray, "points 3"]) -> dict[str, np.ndarray]:
+    """The columns of colours in a table of points, NaN where there is none; no columns if no
+    point has one. They take no part in an adjustment: numbers that are no colours are rounded, and
+    limited to 0 to 255."""
+    colours = np.clip(np.rint(colours), 0, 255)
+    if np.isnan(colours).all() or any((colours == none).all() for none in NO_COLOURS):
+        return {}
+    return dict(zip(POINT_COLOURS, colours.T))
 
 
 def entry_of(camera: Camera) -> dict[str, Any]:

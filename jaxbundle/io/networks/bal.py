@@ -100,7 +100,6 @@ def read_bal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
             "point",
             {
                 "id": np.arange(points),
-                "role": np.full(points, "tie"),
                 **dict(zip("XYZ", position.reshape(-1, 3).T)),
             },
         ),
@@ -122,6 +121,7 @@ BAL_LOSSES = losing(
     "that images share a camera",
     "image sizes of cameras",
     "pixel sizes of cameras",
+    "colours of points",
     partly={
         "names of cameras": lambda n: changed([c.id for c in n.cameras], range(len(n.cameras))),
         "names of images": lambda n: changed(n.images.id, range(len(n.images))),

@@ -25,9 +25,14 @@ from jaxtyping import Float, Int
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import bundler_pose, exterior_from_bundler
-from jaxbundle.io.networks.assemble import all_parameters, assemble, foreign_document, image_columns
+from jaxbundle.io.networks.assemble import (
+    all_parameters,
+    assemble,
+    colour_columns,
+    foreign_document,
+    image_columns,
+)
 from jaxbundle.io.networks.losses import (
-    GREY,
     are_numbered_from_0,
     changed,
     describe_losses,
@@ -38,6 +43,7 @@ from jaxbundle.io.networks.poses import check_rotations, matrices_of
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.io.text.rows import TextRows, join_numbers
 from jaxbundle.io.writing.replacing import replace_files
+from jaxbundle.network.build import POINT_COLOURS
 from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.tables import Network, Source
 from jaxbundle.system.file_content import beginning
@@ -71,7 +77,7 @@ def read_bundler(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     if not len(oriented):
         raise InputError(f"{path}: no camera is oriented")
     names = _names(path.parent / LIST, cameras)
-    position, lines, observed = _points(rows, points, cameras)
+    position, colours, lines, observed = _points(rows, points, cameras)
     if rows.more():
         raise rows.take("").error(f"a line after the last of {points} points")
     image = observed[:, 0].astype(np.int64)
@@ -94,7 +100,7 @@ def read_bundler(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         overrides,
         images,
         Columns(
-            {"id": ids, "role": ["tie"] * points, **dict(zip("XYZ", position.T))},
+            {"id": ids, **dict(zip("XYZ", position.T)), **colour_columns(colours)},
             Source(str(path), lines, "line"),
         ),
         Columns(
@@ -140,21 +146,27 @@ def _cameras(
 
 def _points(
     rows: TextRows, number: int, cameras: int
-) -> tuple[Float[np.ndarray, "points 3"], Int[np.ndarray, " points"], Float[np.ndarray, "rays 5"]]:
-    """Coordinates; lines; and (camera, point, x, y, line) of all rays."""
-    position, lines, rays = [], [], []
+) -> tuple[
+    Float[np.ndarray, "points 3"],
+    Float[np.ndarray, "points 3"],
+    Int[np.ndarray, " points"],
+    Float[np.ndarray, "rays 5"],
+]:
+    """Coordinates; colours; lines; and (camera, point, x, y, line) of all rays."""
+    position, colours, lines, rays = [], [], [], []
     for k in range(number):
         thing = f"point {k} of {number}"
         row = rows.take(f"coordinates of {thing}")
         position.append(row.numbers("XYZ"))
         lines.append(row.number)
-        rows.take(f"colour of {thing}")
+        colours.append(rows.take(f"colour of {thing}").numbers(POINT_COLOURS))
         row = rows.take(f"rays of {thing}")
         views = row.rays(0, "a ray", cameras, "camera")
         rest = np.full((len(views), 1), row.number)
         rays.append(np.concatenate([views[:, :1], np.full_like(rest, k), views[:, 2:], rest], 1))
     rays = np.concatenate(rays) if rays else np.zeros((0, 5))
-    return np.array(position).reshape(-1, 3), np.array(lines, np.int64), rays
+    position, colours = (np.array(values).reshape(-1, 3) for values in (position, colours))
+    return position, colours, np.array(lines, np.int64), rays
 
 
 def _names(path: Path, number: int) -> list[str]:
@@ -201,9 +213,9 @@ def write_bundler(network: Network, path: str | Path) -> tuple[str, ...]:
     for image, point, (x, y) in zip(rays.image.tolist(), rays.point.tolist(), rays.xy.tolist()):
         of_point[point].append(f"{image} {key[image]} {x!r} {y!r}")
         key[image] += 1
-    for position, views in zip(points.position, of_point):
-        colour = " ".join(map(str, GREY))
-        lines += [join_numbers(position), colour, " ".join([str(len(views)), *views])]
+    for position, colour, views in zip(points.position, points.colour_or_grey().tolist(), of_point):
+        rgb = " ".join(map(str, colour))
+        lines += [join_numbers(position), rgb, " ".join([str(len(views)), *views])]
     numbered = are_numbered_from_0(images.id)
     names = path.parent / LIST
     if not numbered:

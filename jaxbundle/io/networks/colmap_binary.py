@@ -11,17 +11,19 @@ Source: COLMAP documentation, "Output Format", and src/colmap/scene/reconstructi
 """
 
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.colmap_model import (
+    NO_POINT,
     ColmapImage,
     ColmapModel,
+    ColmapPoints,
     check_unique,
-    rows_of_points,
     tracks,
 )
 from jaxbundle.io.networks.colmap_models import (
@@ -31,7 +33,7 @@ from jaxbundle.io.networks.colmap_models import (
     parameter_names,
     to_colmap,
 )
-from jaxbundle.io.networks.losses import GREY, size_of
+from jaxbundle.io.networks.losses import size_of
 from jaxbundle.network.tables import Camera, Source
 from jaxbundle.system.file_content import read_content
 
@@ -40,6 +42,7 @@ POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<u8")])
 POINT = np.dtype(
     [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("rays", "<u8")]
 )
+TRACK = np.dtype([("image", "<u4"), ("index", "<u4")])
 NO_POINT_ID = np.uint64(2**64 - 1)
 
 
@@ -100,8 +103,8 @@ def read_binary_model(folder: Path) -> ColmapModel:
     """The contents of the three binary files of a folder."""
     cameras = read_binary_cameras(folder / "cameras.bin")
     images = _images(folder / "images.bin")
-    ids, points, source = _points(folder / "points3D.bin", {image.id for image in images})
-    return ColmapModel(cameras, images, ids, points, source)
+    points = _points(folder / "points3D.bin", images)
+    return ColmapModel(cameras, images, points)
 
 
 def read_binary_cameras(path: Path) -> dict[int, Camera]:
@@ -154,48 +157,65 @@ def _images(path: Path) -> list[ColmapImage]:
     return images
 
 
-def _points(
-    path: Path, images: set[int]
-) -> tuple[Int[np.ndarray, " points"], Float[np.ndarray, "points 3"], Source]:
-    """Numbers and coordinates of the points; as of the text form."""
+def _points(path: Path, images: Sequence[ColmapImage]) -> ColmapPoints:
+    """The points; of their tracks the images are checked, since the image points name their object
+    points."""
     file = BinaryFile(path)
-    number = file.count("points", POINT.itemsize)
-    count_of, places = struct.Struct("<Q").unpack_from, []
-    # the length of a track tells where the next point is
-    for k in range(number):
-        places.append(file.position)
-        end = file.position + POINT.itemsize
-        if end > len(file.data) or end + 8 * count_of(file.data, end - 8)[0] > len(file.data):
-            file.what = f"point {k + 1}"
-            file.raw(POINT.itemsize - 8)
-            file.count("rays", 8)
-        file.position = end + 8 * count_of(file.data, end - 8)[0]
-    file.end()
-    starts = np.array(places, np.int64)
-    data = np.frombuffer(file.data, np.uint8)
-    points = data[starts[:, None] + np.arange(POINT.itemsize)].reshape(-1).view(POINT)
-    rays = points["rays"].astype(np.int64)
-    # of each ray the image, behind its point
-    of_ray = np.repeat(np.arange(number), rays)
-    nth = np.arange(len(of_ray)) - np.repeat(np.cumsum(rays) - rays, rays)
-    at = starts[of_ray] + POINT.itemsize + 8 * nth
-    track = data[at[:, None] + np.arange(4)].reshape(-1).view("<u4")
+    rays = _track_lengths(file, file.count("points", POINT.itemsize), images)
+    # points and tracks alternate
+    lengths = np.stack([np.full(len(rays), POINT.itemsize), 8 * rays], 1).ravel()
+    is_point = np.repeat(np.arange(len(lengths)) % 2 == 0, lengths)
+    data = np.frombuffer(file.data, np.uint8)[8:]
+    points, track = data[is_point].view(POINT), data[~is_point].view(TRACK)["image"]
+    position = points["xyz"].astype(float)
 
     if (impossible := points["id"] >= 2**63).any():
         file.what = f"point {impossible.argmax() + 1}"
         raise file.error(f"its number {points['id'][impossible][0]} is impossible")
-    if (infinite := ~np.isfinite(points["xyz"])).any():
+    if (infinite := ~np.isfinite(position)).any():
         file.what = f"point {infinite.any(1).argmax() + 1}"
-        raise file.error(f"coordinates: {points['xyz'][infinite][0]} is not a finite number")
-    unknown = ~np.isin(track, np.array(sorted(images), "<u4"))
+        raise file.error(f"coordinates: {position[infinite][0]} is not a finite number")
+    unknown = ~np.isin(track, np.array(sorted(image.id for image in images), "<u4"))
     if unknown.any():
         ray = int(unknown.argmax())
-        file.what = f"point {of_ray[ray] + 1}"
+        file.what = f"point {np.searchsorted(np.cumsum(rays), ray, 'right') + 1}"
         raise file.error(f"the image {track[ray]} of the track is not in images")
-    source = Source(str(path), None, "point")
-    ids = points["id"].astype(np.int64)
+    source, ids = Source(str(path), None, "point"), points["id"].astype(np.int64)
     check_unique(ids, source, "point")
-    return ids, points["xyz"].astype(float), source
+    return ColmapPoints(ids, position, points["rgb"], source)
+
+
+def _track_lengths(
+    file: BinaryFile, number: int, images: Sequence[ColmapImage]
+) -> Int[np.ndarray, " points"]:
+    """The numbers of rays of all points, which tell where the next point is.
+
+    COLMAP writes points by their numbers, and each with its image points: the lengths that follow
+    from the images are those of the file if every point has the length expected there.
+    """
+    first, size, length = file.position, POINT.itemsize, len(file.data)
+    if number and images:
+        seen = np.concatenate([image.point for image in images])
+        expected = np.unique(seen[seen != NO_POINT], return_counts=True)[1]
+        ends = first + np.cumsum(size + 8 * expected)
+        if len(expected) == number and ends[-1] == length:
+            place = ends - 8 * expected - 8
+            data = np.frombuffer(file.data, np.uint8)
+            if (data[place[:, None] + np.arange(8)].view("<u8").ravel() == expected).all():
+                return expected
+    rays_of, lengths, begin = struct.Struct("<Q").unpack_from, [], first
+    for k in range(number):
+        end = begin + size
+        if end > length or (next := end + 8 * rays_of(file.data, end - 8)[0]) > length:
+            file.what, file.position = f"point {k + 1}", begin
+            file.raw(size - 8)
+            file.count("rays", 8)
+            raise file.error("the file ends here; it is truncated")
+        lengths.append((next - end) // 8)
+        begin = next
+    file.position = begin
+    file.end()
+    return np.array(lengths, np.int64)
 
 
 def binary_files(model: ColmapModel) -> dict[str, bytes]:
@@ -215,11 +235,11 @@ def binary_files(model: ColmapModel) -> dict[str, bytes]:
             struct.pack("<Q", len(points)),
             points.tobytes(),
         ]
-    points = [struct.pack("<Q", len(model.points))]
+    points = [struct.pack("<Q", len(model.points.ids))]
     of_point = tracks(model)
-    for id, position, error in rows_of_points(model):
+    for id, position, colour, error in model.points.rows():
         track = np.array(of_point[id], "<u4")
-        head = struct.pack("<Q3d3BdQ", id, *position, *GREY, error, len(track))
+        head = struct.pack("<Q3d3BdQ", id, *position, *colour, error, len(track))
         points += [head, track.tobytes()]
     parts = {"cameras.bin": cameras, "images.bin": images, "points3D.bin": points}
     return {name: b"".join(part) for name, part in parts.items()}

@@ -12,14 +12,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.colmap_model import (
     ColmapImage,
     ColmapModel,
+    ColmapPoints,
     check_unique,
-    rows_of_points,
     tracks,
 )
 from jaxbundle.io.networks.colmap_models import (
@@ -27,8 +26,8 @@ from jaxbundle.io.networks.colmap_models import (
     parameter_names,
     to_colmap,
 )
-from jaxbundle.io.networks.losses import GREY, size_of
-from jaxbundle.io.text.rows import TextRow, TextRows, join_numbers
+from jaxbundle.io.networks.losses import size_of
+from jaxbundle.io.text.rows import TextRow, TextRows, join_numbers, parse_numbers
 from jaxbundle.network.tables import Camera, Source
 
 QT = ("QW", "QX", "QY", "QZ", "TX", "TY", "TZ")
@@ -38,8 +37,8 @@ def read_text_model(folder: Path) -> ColmapModel:
     """The contents of the three text files of a folder."""
     cameras = read_text_cameras(folder / "cameras.txt")
     images = _images(folder / "images.txt")
-    ids, points, source = _points(folder / "points3D.txt", {image.id for image in images})
-    return ColmapModel(cameras, images, ids, points, source)
+    points = _points(folder / "points3D.txt", {image.id for image in images})
+    return ColmapModel(cameras, images, points)
 
 
 def read_text_cameras(path: Path) -> dict[int, Camera]:
@@ -97,18 +96,15 @@ def _images(path: Path) -> list[ColmapImage]:
     return images
 
 
-def _points(
-    path: Path, images: set[int]
-) -> tuple[Int[np.ndarray, " points"], Float[np.ndarray, "points 3"], Source]:
-    """Numbers and coordinates of the points, and their lines; tracks are only checked, since the
-    image points name their object points."""
+def _points(path: Path, images: set[int]) -> ColmapPoints:
+    """The points; tracks are only checked, since the image points name their object points."""
     rows = TextRows(path, "#")
     if (found := _plain_points(path, rows.lines, images)) is not None:
         return found
-    ids, positions, lines = [], [], []
+    ids, values, lines = [], [], []
     for row in rows:
         ids.append(row.integer(0, "POINT3D_ID"))
-        positions.append(row.numbers(("X", "Y", "Z", "R", "G", "B", "ERROR"), 1, more=True)[:3])
+        values.append(row.numbers(("X", "Y", "Z", "R", "G", "B", "ERROR"), 1, more=True)[:6])
         lines.append(row.number)
         if len(row) % 2:
             raise row.error("the track has an IMAGE_ID without its POINT2D_IDX")
@@ -117,33 +113,42 @@ def _points(
                 raise row.error(f"the image {row.words[k]} of the track is not in images")
     source = Source(str(path), np.array(lines, np.int64), "line")
     check_unique(ids, source, "point")
-    return np.array(ids, np.int64), np.array(positions, float).reshape(-1, 3), source
+    values = np.array(values, float).reshape(-1, 6)
+    return ColmapPoints(np.array(ids, np.int64), values[:, :3], values[:, 3:], source)
 
 
 def _plain_points(
     path: Path, lines: Sequence[tuple[int, str]], images: set[int]
-) -> tuple[Int[np.ndarray, " points"], Float[np.ndarray, "points 3"], Source] | None:
+) -> ColmapPoints | None:
     """The same at once; None if something is unusual, and read line by line."""
-    known = {str(id) for id in images}
-    ids: list[str] = []
-    numbers: list[str] = []
-    for _, text in lines:
-        words = text.split()
-        if len(words) < 8 or len(words) % 2 or "_" in text or not known.issuperset(words[8::2]):
-            return None
-        ids.append(words[0])
-        numbers += words[1:8]
+    text = "\n".join(line for _, line in lines)
     try:
-        values = np.fromiter(map(float, numbers), float, len(numbers)).reshape(-1, 7)
-        points = np.fromiter(map(int, ids), np.int64, len(ids))
-    except (ValueError, OverflowError):
+        content = np.frombuffer(f"\n{text}\n".encode("ascii"), np.uint8)
+        numbers = parse_numbers(text)
+    except ValueError:
         return None
-    unique = len(np.unique(points)) == len(points)
-    if not (np.isfinite(values).all() and unique and (points >= 0).all()):
+    blank = content <= ord(" ")
+    # where words and lines begin, in characters; words of every line
+    words = np.flatnonzero(blank[:-1] & ~blank[1:])
+    first = np.searchsorted(words, np.flatnonzero(content == ord("\n")))
+    number, first = np.diff(first), first[:-1]
+    # beyond 2⁵² floats are all whole: a number there has lost digits
+    plain = len(numbers) == len(words) and (number >= 8).all() and (number % 2 == 0).all()
+    if not plain or not (np.abs(numbers) < 2**52).all():
         return None
+    in_line = np.arange(len(words)) - np.repeat(first, number)
+    track, ids = numbers[(in_line >= 8) & (in_line % 2 == 0)], numbers[first]
+    image = track.astype(np.int64)  # whole numbers are looked up in a table, others sorted
+    if (image != track).any() or not np.isin(image, [*images]).all():
+        return None
+    if (ids < 0).any() or (ids % 1).any():
+        return None
+    ids = ids.astype(np.int64)
     # the line of every point
     source = Source(str(path), np.array([number for number, _ in lines], np.int64), "line")
-    return points, values[:, :3].copy(), source
+    check_unique(ids, source, "point")
+    values = numbers[first[:, None] + np.arange(1, 7)]
+    return ColmapPoints(ids, values[:, :3], values[:, 3:], source)
 
 
 def text_files(model: ColmapModel) -> dict[str, bytes]:
@@ -168,10 +173,10 @@ def text_files(model: ColmapModel) -> dict[str, bytes]:
         )
     points = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)"]
     of_point = tracks(model)
-    for id, position, error in rows_of_points(model):
+    for id, position, colour, error in model.points.rows():
         track = " ".join(f"{image} {k}" for image, k in of_point[id])
-        colour = " ".join(map(str, GREY))
-        points.append(f"{id} {join_numbers(position)} {colour} {error!r} {track}".rstrip())
+        rgb = " ".join(map(str, colour))
+        points.append(f"{id} {join_numbers(position)} {rgb} {error!r} {track}".rstrip())
     texts = {
         "cameras.txt": camera_lines(model.cameras),
         "images.txt": images,

@@ -244,7 +244,10 @@ def with_control(
     position[places], sigma[places] = control.position[rows], control.sigma[rows]
     changed = {"datum": "control"} if datum and set(roles) & {"control", "fixed"} else {}
     network = network.replace(
-        points=Points(points.id, tuple(roles.tolist()), position, sigma, points.source), **changed
+        points=dataclasses.replace(
+            points, role=tuple(roles.tolist()), position=position, sigma=sigma
+        ),
+        **changed,
     )
     lost = [id for id in control.id if id not in index]
     warnings, notes = [], []
@@ -340,7 +343,9 @@ def _intersect(network: Network, places: Int[np.ndarray, " n"]) -> Float[np.ndar
     roles[points.has_role("control", "fixed")], position[places] = "tie", np.nan
     roles[places] = "tie"
     start = network.replace(
-        points=Points(points.id, tuple(roles.tolist()), position, free, points.source),
+        points=dataclasses.replace(
+            points, role=tuple(roles.tolist()), position=position, sigma=free
+        ),
         datum="inner",
         datum_points=(),
     )

@@ -289,6 +289,7 @@ def _numbers(ids: Sequence[str]) -> list[str]:
 
 # What it loses; names of cameras and images are numbers.
 JAICOV_LOSSES = losing(
+    "colours of points",
     keeping=("distances", "σ of image points", "datum points"),
     partly={
         "names of cameras": lambda n: _renumbered([camera.id for camera in n.cameras]),

@@ -18,8 +18,6 @@ from jaxbundle.network.tables import UNIT, Camera, Network
 # Camera models common to formats of computer vision.
 PIXEL_MODELS = ("opencv", "kannala-brandt")
 CORE = ("fx", "fy", "cx", "cy")
-# Red, green, blue of points in formats that require a colour, which a network does not have.
-GREY = (128, 128, 128)
 
 
 def need_values(network: Network, model: str = "", format: str = "", points: bool = True) -> None:
@@ -90,6 +88,7 @@ QUANTITIES: Losses = MappingProxyType(
         "names of points": lambda n: len(n.points),
         "roles of points": lambda n: int((~n.points.has_role("tie")).sum()),
         "σ of control points": lambda n: int((~np.isnan(n.points.sigma)).any(1).sum()),
+        "colours of points": lambda n: 0 if n.points.colour is None else len(n.points),
         "datum points": lambda n: len(n.datum_points),
         "image points": lambda n: len(n.observations),
         "σ of image points": _stated_sigmas,
@@ -109,6 +108,7 @@ PARTS = {
         "names of points",
         "roles of points",
         "σ of control points",
+        "colours of points",
         "datum points",
         "image points",
         "σ of image points",

@@ -13,6 +13,9 @@ The distortion is of the measured point: with m = (x, y)/f
 
 which is `brown` with K1 = r/c². That model is in mm: the file has no pixel size, which is taken as
 0.005 mm; another would scale c and K1 and change nothing in pixels. The file has no image size.
+Some programs, COLMAP among them, write x, y from a corner of the image instead, and not where its
+centre is: then no coordinate is negative, and the points are off by half an image. Their median
+offset is subtracted, with a note.
 The largest model is read. FixedK, whose principal point moves the measurements, is refused unless
 it is in the middle (cx = cy = 0).
 
@@ -24,11 +27,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import flip_rows
 from jaxbundle.io.networks.assemble import (
     assemble,
+    colour_columns,
     foreign_document,
     image_columns,
     unique_labels,
@@ -105,7 +110,13 @@ def _network(path: Path, model: _Model, overrides: Sequence[str], told: Sequence
         names.append(" ".join(row.words[:-10]) if len(row) > 10 else "")
         if not names[-1]:
             raise row.error(f"{len(row)} values; a name and {', '.join(NUMBERS)}, 0 are expected")
-        values.append(row.numbers(NUMBERS, len(row) - 10, more=True))
+        numbers = row.numbers((*NUMBERS, "0"), len(row) - 10)
+        if numbers[-1] != 0:
+            raise row.error(
+                f"the last number of a camera is {numbers[-1]:g}; expected 0: VisualSFM has "
+                "one coefficient of distortion"
+            )
+        values.append(numbers[:-1])
         lines.append(row.number)
         if not values[-1][0] > 0 or not values[-1][1:5].any():
             raise row.error(
@@ -120,7 +131,7 @@ def _network(path: Path, model: _Model, overrides: Sequence[str], told: Sequence
         | {"free": ["c", "K1"]}
         for name, f, r in zip(names, c.tolist(), p[:, 8].tolist())
     ]
-    position, rays = _points(model, len(names))
+    position, colours, rays = _points(model, len(names))
     kept = {}
     for k, (image, point, *_) in enumerate(rays[:, :2].astype(np.int64).tolist()):
         kept.setdefault((image, point), k)
@@ -129,15 +140,23 @@ def _network(path: Path, model: _Model, overrides: Sequence[str], told: Sequence
         told = [*told, f"left out {what} of object points that have another in the same image"]
         rays = rays[list(kept.values())]
     source = Source(str(path), rays[:, 4].astype(np.int64), "line")
-    xy = rays[:, 2:4] * [PIXEL, -PIXEL]
+    offset = _offset_of_centre(rays, position, M, p)
+    if offset.any():
+        at = ", ".join(f"{x:.2f}" for x in np.median(offset, axis=0))
+        told = [
+            *told,
+            "image points are counted from a corner of the images, as other programs than "
+            f"VisualSFM write them: their centres, ({at}) px, are where the points fit best",
+        ]
+    xy = (rays[:, 2:4] - offset[rays[:, 0].astype(np.int64)]) * [PIXEL, -PIXEL]
     return assemble(
         path,
         foreign_document(path.stem, cameras, image_unit="mm", residuals="corrected"),
         overrides,
         image_columns(Source(str(path), np.array(lines), "line"), names, names, M, p[:, 5:8]),
         Columns(
-            {"id": range(len(position)), "role": ["tie"] * len(position),
-             **dict(zip("XYZ", np.reshape(position, (-1, 3)).T))},
+            {"id": range(len(position)), **dict(zip("XYZ", position.T)),
+             **colour_columns(colours)},
             Source(str(path), np.array([row.number for row in model.points], np.int64), "line"),
         ),
         Columns(
@@ -150,13 +169,42 @@ def _network(path: Path, model: _Model, overrides: Sequence[str], told: Sequence
     )  # fmt: skip
 
 
-def _points(model: _Model, images: int) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates, and image, point, x, y, line of all rays."""
+def _offset_of_centre(
+    rays: Float[np.ndarray, "rays 5"],
+    position: Float[np.ndarray, "points 3"],
+    M: Float[np.ndarray, "images 3 3"],
+    p: Float[np.ndarray, "images 9"],
+    spread: float = 0.1,
+) -> Float[np.ndarray, "images 2"]:
+    """Where the centre of the images is, px; 0 where image points count from it.
+
+    **Arguments:** `spread`: relative to the image; the offset is half an image or none. Offsets of
+    images that differ by less are one, those of images of other sizes differ by more.
+    """
+    none, xy = np.zeros((len(p), 2)), rays[:, 2:4]
+    if not len(xy) or xy.min() < 0:
+        return none
+    image, point = rays[:, :2].astype(np.int64).T
+    r, s, q = np.einsum("nij,nj->in", M[image], position[point] - p[image, 5:8])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        off = xy - p[image, :1] * np.stack([-r / q, s / q], 1)
+    off[~np.isfinite(off).all(1)] = np.nan
+    if np.isnan(off).all() or (whole := np.nanmedian(off, axis=0)).min() < spread * xy.max():
+        return none
+    own = [off[image == k] for k in range(len(p))]
+    own = [whole if np.isnan(rows).all() else np.nanmedian(rows, axis=0) for rows in own]
+    far = (np.abs(own - whole) > spread * xy.max()).any()
+    return np.array(own) if far else none + whole
+
+
+def _points(model: _Model, images: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Coordinates, colours, and image, point, x, y, line of all rays."""
     position, rays = [], [np.zeros((0, 5))]
     for k, row in enumerate(model.points):
         numbers = row.all_numbers("a point")
         views = row.rays(6, "a point", images, "image")
         rest = np.ones((len(views), 1))
-        position.append(numbers[:3])
+        position.append(numbers[:6])
         rays.append(np.hstack([views[:, :1], k * rest, views[:, 2:], row.number * rest]))
-    return np.array(position), np.concatenate(rays)
+    values = np.reshape(position, (-1, 6))
+    return values[:, :3], values[:, 3:], np.concatenate(rays)

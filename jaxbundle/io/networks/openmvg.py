@@ -394,6 +394,7 @@ def write_openmvg(network: Network, path: str | Path) -> tuple[str, ...]:
 # What it loses; fixed points become control points.
 OPENMVG_LOSSES = losing(
     "pixel sizes of cameras",
+    "colours of points",
     partly={
         "names of cameras": lambda n: changed([c.id for c in n.cameras], range(len(n.cameras))),
         "roles of points": lambda n: int(n.points.has_role("fixed", "check").sum()),

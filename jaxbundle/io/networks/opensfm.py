@@ -48,10 +48,15 @@ from jaxbundle.io.cameras.nearest_camera import (
     root,
     with_messages,
 )
-from jaxbundle.io.networks.assemble import assemble, entry_of, foreign_document, image_columns
+from jaxbundle.io.networks.assemble import (
+    assemble,
+    colour_columns,
+    entry_of,
+    foreign_document,
+    image_columns,
+)
 from jaxbundle.io.networks.control import with_control
 from jaxbundle.io.networks.losses import (
-    GREY,
     check_others_zero,
     describe_losses,
     losing,
@@ -73,7 +78,7 @@ from jaxbundle.io.text.rows import TextRows
 from jaxbundle.io.writing.folders import replace_folder
 from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.kinds import Antennas
-from jaxbundle.network.tables import Camera, Network, Source
+from jaxbundle.network.tables import GREY, Camera, Network, Source
 from jaxbundle.system.file_content import beginning, parse_json
 from jaxbundle.types import present
 
@@ -127,8 +132,8 @@ SHOT_KEYS = Keys(
     },
 )  # fmt: skip
 POINT_KEYS = Keys(
-    ("coordinates",),
-    dict.fromkeys(("color", "reprojection_errors", "reprojection_error", "rig*"), "colours"),
+    ("coordinates", "color"),
+    dict.fromkeys(("reprojection_errors", "reprojection_error", "rig*"), "residuals"),
 )
 SCENE_KEYS = Keys(
     ("cameras", "shots", "points"),
@@ -213,14 +218,19 @@ def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     points = scene.objects("points")
     for point in points.values():
         unknown.check(point.document, POINT_KEYS, point.path)
-    at = stack_rows(
-        [p.get("coordinates") for p in points.values()],
-        3,
-        lambda k: (str([*points.values()][k].path), "coordinates"),
-    ).reshape(-1, 3)
+    at, colours = (
+        stack_rows(
+            [p.get(name, default) for p in points.values()],
+            3,
+            lambda k, name=name: (str([*points.values()][k].path), name),
+        ).reshape(-1, 3)
+        for name, default in (("coordinates", None), ("color", GREY))
+    )
     rays, missing = _tracks(file.parent / TRACKS, cameras, shots, points)
     if missing:
         told.append(f"left out {count(missing, 'image point')} of tracks that have no point")
+    if points and rays is None:
+        told.append(f"{file.parent / TRACKS} is not there: no image points")
     names, control = list(points), None
     if (file.parent / CONTROL).is_file():
         used = {id: cameras[shot.text("camera")] for id, shot in shots.items()}
@@ -228,6 +238,7 @@ def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         told += control.messages
         control = control.renamed({*names})
         names, at, rays = _add_control(file, control, names, at, rays)
+        colours = np.concatenate([colours, np.full((len(at) - len(colours), 3), np.nan)])
     if (file.parent / REFERENCE).is_file():
         told.append(_reference(file.parent / REFERENCE))
     datum = {"datum": "control"} if gps else {}
@@ -239,7 +250,7 @@ def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         overrides,
         _images(file, shots),
         Columns(
-            {"id": names, "role": ["tie"] * len(names), **dict(zip("XYZ", at.T))},
+            {"id": names, **dict(zip("XYZ", at.T)), **colour_columns(colours)},
             Source(str(file), None, "point"),
         ),
         rays,
@@ -481,8 +492,10 @@ def fill_opensfm(network: Network, folder: Path) -> tuple[str, ...]:
         "cameras": cameras,
         "shots": shots,
         "points": {
-            id: {"coordinates": X, "color": [*map(float, GREY)]}
-            for id, X in zip(points.id, points.position.tolist())
+            id: {"coordinates": X, "color": colour}
+            for id, X, colour in zip(
+                points.id, points.position.tolist(), points.colour_or_grey().astype(float).tolist()
+            )
         },
     }
     folder.mkdir(exist_ok=True)

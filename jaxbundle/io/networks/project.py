@@ -31,6 +31,7 @@ Small tables may be part of the file, one `[[image]]`, `[[point]]`, `[[observati
 """
 
 import dataclasses
+import itertools
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -61,6 +62,7 @@ from jaxbundle.network.build import (
     IMAGE_SIGMAS,
     OBSERVATION_COLUMNS,
     OBSERVATION_SIGMAS,
+    POINT_COLOURS,
     POINT_COLUMNS,
     POINT_SIGMAS,
 )
@@ -118,6 +120,9 @@ def read_project(
         if found is None:
             found = Columns(dict.fromkeys(columns, ()), Source(table))
         tables[table] = dataclasses.replace(found, may_be_empty=True)
+    # points of a model without image points can be written for other programs
+    if (rays := tables.get("observations")) is not None:
+        tables["observations"] = dataclasses.replace(rays, may_be_empty=True)
     return network_of(
         document, {k: v for k, v in tables.items() if v is not None}, str(path), models
     )
@@ -228,6 +233,7 @@ def fill_project(network: Network, folder: Path) -> None:
         POINT_SIGMAS,
         points.sigma,
         {np.inf: "free"},
+        dict(zip(POINT_COLOURS, () if points.colour is None else points.colour.T)),
     )
     origin = rays.sigma_origin
     # 1e-12: the conversion between pixels and millimetres rounds 1 to a few eps (2e-16)
@@ -267,14 +273,16 @@ def _write_table(
     sigma_header: Sequence[str],
     sigma: Float[np.ndarray, "rows m"],
     words: Mapping[float, str],
+    more: Mapping[str, np.ndarray] = MappingProxyType({}),
 ) -> None:
-    """Ids, numbers and σ if given; `words` replace special values of σ."""
+    """Ids, numbers and σ if given; `words` replace special values of σ; `more` columns follow."""
     with_sigma = bool(sigma_header) and not np.isnan(sigma).all()
+    last = zip(*(column.tolist() for column in more.values())) if more else itertools.repeat(())
     rows = (
-        (*names, *_cells(row), *(_cells(s, words) if with_sigma else ()))
-        for *names, row, s in zip(*ids, values.tolist(), sigma.tolist())
+        (*names, *_cells(row), *(_cells(s, words) if with_sigma else ()), *rest)
+        for *names, row, s, rest in zip(*ids, values.tolist(), sigma.tolist(), last)
     )
-    write_csv(path, (*header, *(sigma_header if with_sigma else ())), rows)
+    write_csv(path, (*header, *(sigma_header if with_sigma else ()), *more), rows)
 
 
 def _cells(

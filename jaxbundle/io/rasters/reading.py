@@ -258,7 +258,8 @@ def _terrain(
     if not np.isfinite(heights).any():
         there = "" if extent is None else f" where the image looks, {extent}"
         raise InputError(f"{path}: no height{there}; give a model that covers the image")
-    return make_terrain(heights, (unit * x, unit * y), (unit * step[0], unit * step[1]), earth)
+    with naming_file(path):
+        return make_terrain(heights, (unit * x, unit * y), (unit * step[0], unit * step[1]), earth)
 
 
 def _cut(

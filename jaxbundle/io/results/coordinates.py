@@ -1,8 +1,8 @@
 """Points and orientations as tables of comma-separated values.
 
 `NAME.csv` has the points, `NAME_images.csv` the exterior orientations, angles in the network's
-unit; the columns are those of a project's tables, without σ if there are none, and for points the
-mean reprojection error, `error_px` or `error_mm`, which is not read again.
+unit; the columns are those of a project's tables, without σ or colours if there are none, and for
+points the mean reprojection error, `error_px` or `error_mm`, which is not read again.
 """
 
 from collections.abc import Iterable, Iterator
@@ -13,7 +13,7 @@ import numpy as np
 from jaxbundle.io.networks.losses import describe_losses, losing
 from jaxbundle.io.text.csv_tables import write_csv
 from jaxbundle.io.writing.replacing import replace_files
-from jaxbundle.network.build import IMAGE_COLUMNS, POINT_COLUMNS, POINT_SIGMAS
+from jaxbundle.network.build import IMAGE_COLUMNS, POINT_COLOURS, POINT_COLUMNS, POINT_SIGMAS
 from jaxbundle.network.reprojection import point_errors
 from jaxbundle.network.tables import Network
 from jaxbundle.network.units import ANGLE_UNITS
@@ -38,8 +38,13 @@ def write_coordinates(network: Network, path: str | Path) -> tuple[str, ...]:
     numbers = np.concatenate(
         [points.position, *([points.sigma] if sigma else []), errors[:, None]], 1
     )
-    header = (*POINT_COLUMNS, *(POINT_SIGMAS if sigma else ()), f"error_{unit}")
-    rows = zip(points.id, points.role, numbers.tolist())
+    coloured = points.colour is not None
+    header = (
+        *(*POINT_COLUMNS, *(POINT_SIGMAS if sigma else ()), f"error_{unit}"),
+        *(POINT_COLOURS if coloured else ()),
+    )
+    rgb = points.colour_or_grey()[:, : 3 if coloured else 0].tolist()
+    rows = zip(points.id, points.role, numbers.tolist(), rgb)
     with replace_files(images_path(path), path) as (of_images, of_points):
         write_csv(
             of_images,
@@ -51,7 +56,9 @@ def write_coordinates(network: Network, path: str | Path) -> tuple[str, ...]:
                 )
             ),
         )
-        write_csv(of_points, header, ((id, role, *_cells(row)) for id, role, row in rows))
+        write_csv(
+            of_points, header, ((id, role, *_cells(row), *rgb) for id, role, row, rgb in rows)
+        )
     return describe_losses(network, COORDINATES_LOSSES)
 
 

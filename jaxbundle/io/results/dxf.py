@@ -66,6 +66,7 @@ def write_dxf(network: Network, path: str | Path) -> tuple[str, ...]:
 DXF_LOSSES = losing(
     "interior orientations",
     "names of cameras",
+    "colours of points",
     "image points",
     keeping=("roles of points",),
     partly={"points": lambda n: int((~np.isfinite(n.points.position)).any(1).sum())},

@@ -1,4 +1,5 @@
-"""Points and cameras as a PLY file: vertices with colours by role, edges of the cameras' pyramids.
+"""Points and cameras as a PLY file: vertices with their colours, or by role in a network without;
+edges of the cameras' pyramids.
 
 Binary, little endian, coordinates in double precision. `error` is the mean reprojection error of a
 point, NaN if it has none (a comment in the header gives its unit).
@@ -31,7 +32,8 @@ def write_ply(
 ) -> tuple[str, ...]:
     """Write points and cameras; points without coordinates are left out.
 
-    **Arguments:** `colours`: red, green, blue of points by id; the others are coloured by role.
+    **Arguments:** `colours`: red, green, blue of points by id; the others have the colour of the
+    network, or are coloured by role if it has none.
 
     **Returns:** messages about what is lost.
     """
@@ -44,13 +46,13 @@ def write_ply(
     errors, unit = point_errors(network)
     vertices["error"][:first], vertices["error"][first:] = errors[known], np.nan
     vertices["position"][first:] = corners.reshape(-1, 3)
-    own = colours or {}
-    roles = [
-        own.get(id, COLOURS[role])
-        for id, role, there in zip(network.points.id, network.points.role, known)
-        if there
-    ]
-    vertices["colour"][:first] = np.array(roles).reshape(-1, 3)
+    rgb = network.points.colour
+    if rgb is None:
+        rgb = np.array([COLOURS[role] for role in network.points.role], np.uint8).reshape(-1, 3)
+    if colours:
+        own = [colours.get(id, given) for id, given in zip(network.points.id, rgb.tolist())]
+        rgb = np.array(own, np.uint8)
+    vertices["colour"][:first] = rgb[known]
     vertices["colour"][first:] = (220, 40, 40)  # red: cameras, against the blues of points
     edges = (edges.reshape(-1, 2) + first).astype("<i4")
     head = [
@@ -70,7 +72,7 @@ def write_ply(
     return describe_losses(network, PLY_LOSSES)
 
 
-# What it loses; roles of points are colours, which nothing reads.
+# What it loses; roles of points are colours at most, which nothing reads.
 PLY_LOSSES = losing(
     "interior orientations",
     "names of cameras",

@@ -56,12 +56,11 @@ def adjusted_network(adjustment: "Adjustment") -> Network:
             np.full_like(images.sigma, np.nan),
             images.source,
         ),
-        points=Points(
-            points.id,
-            roles,
-            adjustment.point_values,
-            np.full_like(points.sigma, np.nan),
-            points.source,
+        points=dataclasses.replace(
+            points,
+            role=roles,
+            position=adjustment.point_values,
+            sigma=np.full_like(points.sigma, np.nan),
         ),
         observations=rays.take(used),
         datum="inner",
@@ -156,7 +155,7 @@ def _given_points(adjustment: "Adjustment") -> Points:
     roles[control[~(weight > 0).any(1)]] = "tie"
     # a tie point has no observed coordinates
     sigma[roles == "tie"] = np.nan
-    return Points(points.id, tuple(roles.tolist()), position, sigma, points.source)
+    return dataclasses.replace(points, role=tuple(roles.tolist()), position=position, sigma=sigma)
 
 
 def _priors(adjustment: "Adjustment") -> list[Further]:

@@ -32,12 +32,35 @@ from jaxbundle.io.scanner.csm_trajectory import (
 from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.io.text.json_fields import JsonFields, read_object
+from jaxbundle.io.text.known_keys import Keys, UnknownKeys
 from jaxbundle.network.columns import show
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.ancillary import DEFAULTS, check_times
 from jaxbundle.pushbroom.image import check_size, make_image
 from jaxbundle.pushbroom.scanner import LineTimes
 
+KEYS = Keys(
+    (
+        *("name_model", "name_sensor", "image_lines", "image_samples", "center_ephemeris_time"),
+        *("line_scan_rate", "body_rotation", "instrument_pointing", "instrument_position"),
+        *("sensor_position", "sensor_orientation", "radii", "focal_length_model"),
+        *("detector_center", "detector_sample_summing", "detector_line_summing"),
+        *("focal2pixel_lines", "focal2pixel_samples", "optical_distortion"),
+        *("starting_detector_line", "starting_detector_sample", "projection", "geotransform"),
+    ),
+    {
+        **dict.fromkeys(
+            ("isis_camera_version", "name_platform", "image_identifier", "naif_keywords",
+             "interpolation_method", "number_of_*", "dt_ephemeris", "t0_ephemeris", "dt_quaternion",
+             "t0_quaternion", "b_summing", "exposure_duration", "starting_ephemeris_time"),
+            "names and sources; times that stand in the tables as well",
+        ),
+        **dict.fromkeys(
+            ("reference_height", "sun_position", "sun_velocity", "velocity*", "sensor_velocity"),
+            "heights of the terrain, the sun; velocities stand in the table of positions",
+        ),
+    },
+)  # fmt: skip
 # The model of frame cameras (`io.networks.csm_frame`).
 FRAME_MODEL = "USGS_ASTRO_FRAME_SENSOR_MODEL"
 
@@ -55,7 +78,8 @@ def read_csm(
     **Raises:** `InputError` naming file and field: missing, of another kind, not a number,
     an unknown distortion; tables that end too long before the image.
     """
-    isd, order = _read_support_data(Path(path))
+    unknown = UnknownKeys()
+    isd, order = _read_support_data(Path(path), unknown)
     lines, pixels = (isd.number(key) for key in ("image_lines", "image_samples"))
     check_size(lines, pixels, f"{path}: image_lines, image_samples")
     lines, pixels = int(lines), int(pixels)
@@ -82,11 +106,13 @@ def read_csm(
         sources=states.sources,
     )
     name = str(isd.get("name_sensor") or Path(path).stem)
-    return ScannerInput(name, image, _earth(isd), states.warnings, backwards)
+    told = (*states.warnings, *unknown.messages())
+    return ScannerInput(name, image, _earth(isd), told, backwards)
 
 
-def _read_support_data(path: Path) -> tuple[JsonFields, int]:
-    """The fields of an ISD, also of a state, and the degree of its interpolation."""
+def _read_support_data(path: Path, unknown: UnknownKeys) -> tuple[JsonFields, int]:
+    """The fields of an ISD, also of a state, and the degree of its interpolation; keys of an ISD
+    that are not known are noticed."""
     text = read_text(path)
     name, brace, _ = text.partition("{")
     name = name.strip()
@@ -112,6 +138,7 @@ def _read_support_data(path: Path) -> tuple[JsonFields, int]:
     if model != MODEL:
         hint = " (`jaxbundle convert` reads it as a photograph)" if model == FRAME_MODEL else ""
         raise InputError(f"{path}: name_model is {show(model)}{hint}; {MODEL} is expected")
+    unknown.check(isd.document, KEYS, path)
     return isd, order
 
 

@@ -3,6 +3,7 @@
 import math
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,9 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.network.columns import show
 
-# Words: longer rows are read without a text for each number, four times faster; in shorter ones the
-# guard around it costs more than it gains.
-LONG_ROW = 100
+# Characters, of some hundred numbers: longer rows are read without a text for each number, four
+# times faster; in shorter ones the guard around it costs more than it gains.
+LONG_ROW = 1000
 BLANKS = "; blanks separate columns, so that no name may have one"
 
 
@@ -23,15 +24,31 @@ def join_numbers(values: Iterable[float], separator: str = " ") -> str:
     return separator.join(repr(float(value)) for value in values)
 
 
+def parse_numbers(text: str) -> Float[np.ndarray, " n"]:
+    """The numbers of a text that blanks and line feeds separate, without a text for each.
+
+    **Raises:** `ValueError` for anything else."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # about text that is not a number
+        try:
+            return np.fromstring(text, sep=" ")
+        except DeprecationWarning as error:
+            raise ValueError(f"{error}") from None
+
+
 class TextRow:
     """A line of a file: its place, text, and words."""
 
     def __init__(self, path: Path, number: int, text: str, separator: str | None = None):
         self.path, self.number, self.text = path, number, text
-        # blanks as separators leave none in the words
-        words = text.split(separator)
-        self.words = words if separator is None else [word.strip() for word in words]
         self.separator = separator
+
+    @cached_property
+    def words(self) -> list[str]:
+        """The words; not split before they are needed: rows of numbers have many."""
+        words = self.text.split(self.separator)
+        # blanks as separators leave none in the words
+        return words if self.separator is None else [word.strip() for word in words]
 
     def __len__(self) -> int:
         return len(self.words)
@@ -60,13 +77,11 @@ class TextRow:
     def all_numbers(self, what: str) -> Float[np.ndarray, " n"]:
         """All words as numbers; `what` names each in messages."""
         try:
-            if self.separator is None and len(self.words) > LONG_ROW:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("error")  # about text that is not a number
-                    numbers = np.fromstring(self.text, sep=" ")
+            if self.separator is None and len(self.text) > LONG_ROW:
+                numbers = parse_numbers(self.text)
             else:
                 numbers = np.array(self.words, float) if self.words else np.zeros(0)
-        except (ValueError, DeprecationWarning):
+        except ValueError:
             numbers = np.array([np.nan])
         # Python and NumPy read "1_0" as ten; in a file it is a name, or a mistake.
         if not np.isfinite(numbers).all() or "_" in self.text:
@@ -126,7 +141,9 @@ class TextRows:
         self.lines = [
             (number, line)
             for number, line in enumerate(read_text(path, fallback).splitlines(), 1)
-            if (blank or line.strip()) and not (comment and line.lstrip().startswith(comment))
+            if (blank or (line and not line.isspace()))
+            # most lines have none of it, and need not be copied without their blanks
+            and not (comment and comment in line and line.lstrip().startswith(comment))
         ]
         self.separator = separator
         self.position = 0
