@@ -45,6 +45,10 @@ _HOME = {
         "Budget",
         "sensitivity",
     ),
+    "jaxbundle.adjustment.uncertainty_budget": (
+        "UncertaintyBudget",
+        "uncertainty_budget",
+    ),
     "jaxbundle.calibration": (
         "Board",
         "BoardViews",
@@ -56,6 +60,22 @@ _HOME = {
     ),
     "jaxbundle.calibration.stability": ("Stability",),
     "jaxbundle.cameras": ("CameraModel",),
+    "jaxbundle.certificates.acceptance": (
+        "Acceptance",
+        "accept",
+    ),
+    "jaxbundle.certificates.document": (
+        "Certificate",
+        "certificate",
+    ),
+    "jaxbundle.certificates.lengths": (
+        "LengthTest",
+        "length_errors",
+    ),
+    "jaxbundle.certificates.positional": (
+        "PositionalAccuracy",
+        "positional_accuracy",
+    ),
     "jaxbundle.commands.batch_run": (
         "BatchRun",
         "batch",

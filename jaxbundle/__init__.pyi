@@ -4,6 +4,7 @@ from jaxbundle import adjustment as adjustment
 from jaxbundle import batches as batches
 from jaxbundle import calibration as calibration
 from jaxbundle import cameras as cameras
+from jaxbundle import certificates as certificates
 from jaxbundle import cli as cli
 from jaxbundle import commands as commands
 from jaxbundle import explorer as explorer
@@ -41,6 +42,8 @@ from jaxbundle.adjustment.replicate import replicate as replicate
 from jaxbundle.adjustment.result import Adjustment as Adjustment
 from jaxbundle.adjustment.sensitivity import Budget as Budget
 from jaxbundle.adjustment.sensitivity import sensitivity as sensitivity
+from jaxbundle.adjustment.uncertainty_budget import UncertaintyBudget as UncertaintyBudget
+from jaxbundle.adjustment.uncertainty_budget import uncertainty_budget as uncertainty_budget
 from jaxbundle.batches.calibrate import BatchCalibration as BatchCalibration
 from jaxbundle.batches.calibrate import calibrate_batch as calibrate_batch
 from jaxbundle.batches.calibrate_rigs import RigBatch as RigBatch
@@ -54,6 +57,14 @@ from jaxbundle.calibration import calibrate_cameras as calibrate_cameras
 from jaxbundle.calibration import calibrate_rig as calibrate_rig
 from jaxbundle.calibration.stability import Stability as Stability
 from jaxbundle.cameras import CameraModel as CameraModel
+from jaxbundle.certificates.acceptance import Acceptance as Acceptance
+from jaxbundle.certificates.acceptance import accept as accept
+from jaxbundle.certificates.document import Certificate as Certificate
+from jaxbundle.certificates.document import certificate as certificate
+from jaxbundle.certificates.lengths import LengthTest as LengthTest
+from jaxbundle.certificates.lengths import length_errors as length_errors
+from jaxbundle.certificates.positional import PositionalAccuracy as PositionalAccuracy
+from jaxbundle.certificates.positional import positional_accuracy as positional_accuracy
 from jaxbundle.commands.batch_run import BatchRun as BatchRun
 from jaxbundle.commands.batch_run import batch as batch
 from jaxbundle.commands.cameras import CameraDescription as CameraDescription
@@ -106,6 +117,7 @@ from jaxbundle.system.progress import show_progress as show_progress
 __version__: str
 
 __all__ = [
+    "Acceptance",
     "Adjustment",
     "AdjustmentComparison",
     "Aim",
@@ -119,16 +131,19 @@ __all__ = [
     "Camera",
     "CameraDescription",
     "CameraModel",
+    "Certificate",
     "CloudResult",
     "Conditions",
     "Data",
     "Design",
     "Influence",
     "InputError",
+    "LengthTest",
     "Network",
     "NotSolvedError",
     "Oriented",
     "PlannedBlock",
+    "PositionalAccuracy",
     "Precision",
     "Problem",
     "Reconstruction",
@@ -137,7 +152,9 @@ __all__ = [
     "RigCalibration",
     "Stability",
     "Surface",
+    "UncertaintyBudget",
     "Values",
+    "accept",
     "add_further",
     "adjust",
     "aerial_block",
@@ -148,6 +165,7 @@ __all__ = [
     "calibrate_rig",
     "calibrate_rigs",
     "camera",
+    "certificate",
     "check_gradients",
     "check_network",
     "cloud",
@@ -162,11 +180,13 @@ __all__ = [
     "influence",
     "join_processes",
     "keep_programs",
+    "length_errors",
     "load_adjustment",
     "make_network",
     "make_problem",
     "orient",
     "plan",
+    "positional_accuracy",
     "precision",
     "read_network",
     "reconstruct",
@@ -182,6 +202,7 @@ __all__ = [
     "stability",
     "stations_looking_at",
     "surface",
+    "uncertainty_budget",
     "use_cores",
     "write_project",
 ]
