@@ -4,7 +4,7 @@ An adjusted quantity y is a function of its inputs x: the measurements, and what
 holds. Its combined standard uncertainty, effective degrees of freedom and expanded uncertainty are
 
     u_c² = Σ (c_i·u(x_i))²,     c_i = ∂y/∂x_i                                 5.1.2, equation (10)
-    ν_eff = u_c⁴ / Σ (c_i·u(x_i))⁴/ν_i                                         G.4.1, equation (G.2b)
+    ν_eff = u_c⁴ / Σ (c_i·u(x_i))⁴/ν_i                                        G.4.1, equation (G.2b)
     U = k·u_c,     k = t_p(ν_eff)                                              6.2.1; G.3.2, (G.1d)
 
 The sensitivity coefficients c_i are the derivatives of the solution itself, c = −λᵀ·∂g/∂l with

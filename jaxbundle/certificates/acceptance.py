@@ -23,7 +23,7 @@ from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.columns import count
 from jaxbundle.network.tables import EXTERIOR, Camera, Network
-from jaxbundle.report.layout import significant, table
+from jaxbundle.report.layout import MISSING, significant, table
 from jaxbundle.results import ReportedResult, TableMethods
 
 # Arguments that are names of unknowns; of other quantities they are words.
@@ -53,8 +53,16 @@ class AcceptanceRow:
             bool(self.of) and self.number > 1
         )
         where += ")" * bool(self.of)
-        value = f"{significant(self.value, self.digits)} {self.criterion.unit}".strip()
-        return f"{self.criterion.text}: {value}{where}"
+        return f"{self.criterion.text}: {self.said}{where}"
+
+    @property
+    def said(self) -> str:
+        """The value with its unit; a dash without one."""
+        if self.why:
+            return MISSING
+        whole = self.value == round(self.value) and abs(self.value) < 1e9
+        value = f"{self.value:.0f}" if whole else significant(self.value, self.digits)
+        return f"{value} {self.criterion.unit}".strip()
 
     @property
     def digits(self) -> int:
@@ -118,7 +126,7 @@ class Acceptance(TableMethods):
         return [
             (
                 row.criterion.text,
-                "–" if row.why else f"{significant(row.value, row.digits)} {row.criterion.unit}",
+                row.said,
                 row.why or row.of,
                 "met" if row.met else "not met",
             )

@@ -26,7 +26,6 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from jaxbundle.adjustment.quality.fixed_quantities import split_name
@@ -82,7 +81,7 @@ class CertificateDetails:
     `jaxbundle.uncertainty_budget`, but angles in the unit of the network.
     """
 
-    fields: Mapping[str, str] = MappingProxyType({})
+    fields: Mapping[str, str] = dataclasses.field(default_factory=dict)
     coverage: float = 0.95
     measurands: tuple[str, ...] = ()
     mpe: str = ""
@@ -90,7 +89,7 @@ class CertificateDetails:
     volume: tuple[float, ...] | None = None
     horizontal_class: float | None = None
     vertical_class: float | None = None
-    inputs: Mapping[str, HeldInput] = MappingProxyType({})
+    inputs: Mapping[str, HeldInput] = dataclasses.field(default_factory=dict)
 
     def held(self, angle_unit: str) -> dict[str, HeldInput]:
         """The held inputs, angles in radians."""

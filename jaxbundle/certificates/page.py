@@ -32,6 +32,7 @@ from jaxbundle.report.verdict import BAD, GOOD
 if TYPE_CHECKING:
     from jaxbundle.adjustment.result import Adjustment
     from jaxbundle.calibration.rig.result import RigCalibration
+    from jaxbundle.certificates.acceptance import Acceptance
     from jaxbundle.certificates.document import Certificate, CertifiedPart
     from jaxbundle.certificates.lengths import LengthTest
 
@@ -312,14 +313,22 @@ def _budgets(certificate: "Certificate") -> Iterator[Section]:
 def _acceptance(certificate: "Certificate") -> Iterator[Section]:
     if certificate.acceptance is None:
         return
-    content = grid(ACCEPTANCE_HEADER, certificate.acceptance.text_rows(), "words")
-    yield Section("acceptance", "Acceptance criteria", content, "Acceptance")
+    yield acceptance_section(certificate.acceptance)
+
+
+def acceptance_section(found: "Acceptance") -> Section:
+    """The criteria, with what was found."""
+    content = grid(ACCEPTANCE_HEADER, found.text_rows(), "words")
+    return Section("acceptance", "Acceptance criteria", content, "Acceptance")
 
 
 def _lengths(certificate: "Certificate") -> Iterator[Section]:
-    test = certificate.lengths
-    if test is None:
-        return
+    if certificate.lengths is not None:
+        yield lengths_section(certificate.lengths)
+
+
+def lengths_section(test: "LengthTest") -> Section:
+    """The errors of calibrated lengths, with verdict and arrangement."""
     unit = clean(test.unit)
     rule = (
         "ISO 14253-1 (2017): an error conforms if |E| ≤ MPE − g, and does not if |E| > MPE + g, "
@@ -350,7 +359,7 @@ def _lengths(certificate: "Certificate") -> Iterator[Section]:
         ends = [" – ".join(one) for one in test.missing]
         parts += ["<h3>Not measured</h3>\n", items(ends)]
     title = "Length measurement errors (VDI/VDE 2634-1)"
-    yield Section("lengths", title, "".join(parts), "Length errors")
+    return Section("lengths", title, "".join(parts), "Length errors")
 
 
 def _mpe_in_words(test: "LengthTest") -> str:

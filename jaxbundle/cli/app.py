@@ -24,12 +24,13 @@ from jaxbundle.system.joined_processes import leave
 from jaxbundle.system.memory import free_memory, is_memory_shortage, require_address_space
 from jaxbundle.system.terminals import for_output
 
-BAD_INPUT, NOT_SOLVED = 2, 3
+BAD_INPUT, NOT_SOLVED, NOT_ACCEPTED = 2, 3, 4
 # Exit status of a Unix tool ended by SIGPIPE (13): the reader has closed the pipe.
 NO_READER = 128 + 13
 
 EXIT_STATUS = (
     "0 done; 2 bad input: one line, nothing written; 3 not solved, with the reason; "
+    "4 a criterion of --accept is not met; "
     "130, 143 interrupted; 141 output pipe closed."
 )
 

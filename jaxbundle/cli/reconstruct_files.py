@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from jaxbundle.cli.outputs import FILES as RESULTS
-from jaxbundle.cli.outputs import PAGE, can_plot, fill_results, write_result
+from jaxbundle.cli.outputs import PAGE, Supplement, can_plot, fill_results, write_result
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.colmap import FILES as COLMAP
 from jaxbundle.io.networks.colmap import fill_colmap
@@ -25,6 +25,7 @@ from jaxbundle.plotting.files import TRACKS, draw_pairs, draw_tracks
 from jaxbundle.reconstruction.page import compose_part, conclude_part, describe_part
 from jaxbundle.reconstruction.result import ReconstructedPart, Reconstruction
 from jaxbundle.report.page import UNKNOWN, Origin
+from jaxbundle.report.page.adjustment import NO_ADDITION
 from jaxbundle.types import Progress
 
 COMMAND, STORE, MODEL, CLOUD, PAIRS = "reconstruct", "matches", "colmap", "points.ply", "pairs.csv"
@@ -64,12 +65,17 @@ def write_reconstruction(
     html: str = "",
     origin: Origin = UNKNOWN,
     progress: Progress | None = None,
+    more: Supplement | None = None,
 ) -> None:
-    """Write JSON and page, and the folder with each part, its pairs and figures."""
+    """Write JSON and page, and the folder with each part, its pairs and figures, and what `more`
+    options add."""
     first, plots = found.parts[0], plots and can_plot()
     also = {"reconstruction": found.to_dict(), "verdict": verdict_dict(conclude_part(found, first))}
+    also |= {} if more is None else more.json
     text = result_text(first.adjustment, brief, also)
-    page = partial(compose_part, found, first, origin)
+    page = partial(
+        compose_part, found, first, origin, NO_ADDITION if more is None else more.addition
+    )
     with write_result(json, text, out, COMMAND, FILES, force, html, page) as new:
         if new is None:
             return
@@ -89,6 +95,8 @@ def write_reconstruction(
             write_text(folder / PAGE, compose_part(found, part, origin))
         if plots:
             draw_pairs(list(found.photographs), found.pairs, list(found.left_out), new, progress)
+        if more is not None:
+            more.fill(new)
         write_csv(new / PAIRS, ["image", "other", "matches", "verified", "kind"], found.pairs)
 
 
