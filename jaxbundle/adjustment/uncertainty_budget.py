@@ -63,8 +63,8 @@ DIVISORS = {
     "triangular": math.sqrt(6.0),
     "u-shaped": math.sqrt(2.0),
 }
-# Of a kind with no more inputs than this every one has its line, as scale bars have; of image
-# coordinates one line a camera and axis says more. The table of inputs always has all.
+# Of a kind with no more inputs than this every one has its line, as scale bars have; of more, and
+# of image coordinates, one line an axis says more. The table of inputs always has all.
 SINGLE_LINES = 8
 
 
@@ -446,22 +446,19 @@ class _InputGroup:
     uncertainty: Float[np.ndarray, " n"]
     derivatives: Float[np.ndarray, "n measurands"]
     pool: str
+    single: bool
 
     def lines(self) -> list[BudgetLine]:
         """One line for each of a few inputs, or one for all."""
-        many = self.pool == IMAGE_POOL or len(self.uncertainty) > SINGLE_LINES
-        places = (
-            [np.arange(len(self.uncertainty))]
-            if many
-            else np.arange(len(self.uncertainty))[:, None]
-        )
+        every = np.arange(len(self.uncertainty))
+        places = every[:, None] if self.single else [every]
         return [self._line(rows) for rows in places if len(rows)]
 
     def _line(self, rows: np.ndarray) -> BudgetLine:
         c, u = self.derivatives[rows], self.uncertainty[rows]
         single = len(rows) == 1
         words = self.words
-        if single and self.pool != IMAGE_POOL:
+        if self.single:
             ids = [str(self.columns[name][rows[0]]) for name in ("image", "point")]
             words = f"{words} {' – '.join(id for id in ids if id)}".strip()
         return BudgetLine(
@@ -525,6 +522,7 @@ def _groups_of(
                     u * conversion,
                     c / conversion,
                     IMAGE_POOL if scale is not None else "",
+                    scale is None and int((part.inverse_sigma > 0).sum()) <= SINGLE_LINES,
                 )
             )
     return found

@@ -20,6 +20,7 @@ from jaxbundle.certificates import positional
 from jaxbundle.certificates.acceptance import HEADER as ACCEPTANCE_HEADER
 from jaxbundle.certificates.details import FIELDS, WANTED
 from jaxbundle.certificates.positional import SUMMARY_HEADER
+from jaxbundle.certificates.units import LENGTHS, convert
 from jaxbundle.network.columns import count
 from jaxbundle.report import head, observations
 from jaxbundle.report.layout import clean, column_decimals, fixed, significant
@@ -115,8 +116,9 @@ def find_cards(certificate: "Certificate") -> list[Card]:
         state = STATES.get(found.state, "")
         cards.append(Card("Tests of the adjustment", found.state, "see report", state))
     if test is not None:
-        note = f"largest of {count(len(test.lengths), 'length')}, RMS {significant(test.rms)}"
-        cards.append(Card("|E|", f"{significant(test.largest)} {clean(test.unit)}", note))
+        rms = readable_length(test.rms, test.unit)
+        note = f"largest of {count(len(test.lengths), 'length')}, RMS {rms}"
+        cards.append(Card("|E|", readable_length(test.largest, test.unit), note))
     for part in certificate.parts:
         cards += _figures(part)
     return cards
@@ -135,9 +137,8 @@ def _figures(part: "CertifiedPart") -> list[Card]:
     if part.accuracy is not None:
         accuracy = part.accuracy
         state = {"met": "good", "not met": "bad", "": ""}[accuracy.verdict]
-        value = f"{significant(accuracy.rmse_3d)} {clean(accuracy.unit)}"
-        if not all(accuracy.number):
-            value = f"{significant(accuracy.rmse_v)} {clean(accuracy.unit)}"
+        whole = accuracy.rmse_3d if all(accuracy.number) else accuracy.rmse_v
+        value = readable_length(whole, accuracy.unit)
         note = count(max(accuracy.number), "check point")
         title = "RMSE_3D" if all(accuracy.number) else "RMSE_V"
         found.append(Card(f"{name}{title}", value, note, state))
@@ -147,6 +148,14 @@ def _figures(part: "CertifiedPart") -> list[Card]:
         note = f"± {U} {unit}, {100 * part.budget.coverage:.4g} %"
         found.append(Card(first, f"{value} {unit}".strip(), note))
     return found
+
+
+def readable_length(value: float, unit: str) -> str:
+    """A length in km, m, mm or µm, whichever has one to three digits before the point."""
+    if unit not in LENGTHS or not np.isfinite(value) or value == 0:
+        return f"{significant(value)} {clean(unit)}"
+    best = next((u for u in ("km", "m", "mm", "um") if abs(convert(value, unit, u)) >= 1), "um")
+    return f"{significant(convert(value, unit, best))} {best.replace('um', 'µm')}"
 
 
 def _identity(certificate: "Certificate") -> str:
@@ -199,7 +208,7 @@ def draw_network(adjustment: "Adjustment") -> str:
     corners = size * np.array([[0, 1], [-0.87, -0.5], [0.87, -0.5], [0, 1]])
     for station in stations:
         x, y = (station + corners).T
-        lines.append(Curve("station", x, y, kind="second"))
+        lines.append(Curve("station", x, y, kind="station"))
     unit = clean(adjustment.network.object_unit)
     layout = ChartLayout(height=380)
     drawing = draw_plan(lines, f"X [{unit}]", f"Y [{unit}]", layout=layout)
@@ -337,8 +346,8 @@ def lengths_section(test: "LengthTest") -> Section:
         else "simple acceptance: an error conforms if |E| ≤ MPE"
     )
     rows = [
-        ("Largest |E|", f"{significant(test.largest)} {unit}"),
-        ("RMS of E", f"{significant(test.rms)} {unit}"),
+        ("Largest |E|", readable_length(test.largest, unit)),
+        ("RMS of E", readable_length(test.rms, unit)),
         ("Maximum permissible error", _mpe_in_words(test)),
         ("Decision rule", rule),
         ("Verdict", test.verdict or "none: no maximum permissible error is stated"),
@@ -385,12 +394,8 @@ def _draw_errors(test: "LengthTest") -> str:
         over = np.linspace(0.0, float(x[-1]), 60)
         limit = (test.mpe or (lambda _: over))(over)
         curves += [Curve("± MPE", over, sign * limit, kind="second") for sign in (1.0, -1.0)]
-    named, seen = [], set()
-    for curve in curves:  # one sample of each kind in the legend
-        named.append(curve if curve.kind not in seen else curve._replace(label=""))
-        seen.add(curve.kind)
     unit = clean(test.unit)
-    drawing = draw_curves(named, f"calibrated length [{unit}]", f"E [{unit}]")
+    drawing = draw_curves(curves, f"calibrated length [{unit}]", f"E [{unit}]")
     return figure(drawing, "Length measurement errors E = measured − calibrated, bars ± 2u")
 
 
