@@ -21,7 +21,7 @@ residuals both are equal.
 | held quantities | B | given, or from limits and a distribution (`HeldInput`) | given |
 
 All image coordinates share one estimate s, so that they are one term of ν_eff. ν of a component
-follows from its relative uncertainty, ν = ½·(Δu/u)⁻² (G.4.2, (G.3)), with Δu/u = ½·σ_θ/θ.
+follows from its relative uncertainty, ν = ½·(Δu/u)⁻² (G.4.2, (G.3)), Δu/u = ½·σ_θ/θ; at least 1.
 """
 
 import dataclasses
@@ -566,7 +566,8 @@ def _shared_errors(
         if not theta > 0 or component.name == OTHERS:
             continue
         size = np.sqrt((np.asarray(component.root.T @ D.T) ** 2).sum(0)) * factor
-        degrees = 2 * (theta / spread) ** 2 if spread > 0 else math.inf
+        # a size that is hardly determined: no estimate has less than one degree of freedom
+        degrees = max(2 * (theta / spread) ** 2, 1.0) if spread > 0 else math.inf
         unit = "" if component.unit != "image" else "of an image coordinate"
         lines.append(
             BudgetLine(

@@ -12,7 +12,7 @@ from jaxbundle.certificates.criteria import Criterion, read_criteria
 from jaxbundle.certificates.lengths import LengthTest, length_errors, read_lengths
 from jaxbundle.certificates.quantities import (
     AXES,
-    Found,
+    QuantityValues,
     find_quantity,
     offered,
     require_parameter,
@@ -214,7 +214,7 @@ def _judge(result: Any, test: LengthTest | None, one: Criterion) -> AcceptanceRo
     )  # fmt: skip
 
 
-def _in_unit(found: Found, unit: str) -> dict[str, float]:
+def _in_unit(found: QuantityValues, unit: str) -> dict[str, float]:
     """Values in the unit of the limit."""
     return {name: convert(v, found.unit, unit, found.pitch) for name, v in found.values.items()}
 

@@ -38,7 +38,7 @@ class Subject:
 
 
 @dataclasses.dataclass(frozen=True)
-class Found:
+class QuantityValues:
     """Values of a quantity by what they are of ("" for the whole), in `unit`."""
 
     values: Mapping[str, float]
@@ -48,22 +48,22 @@ class Found:
 
 @dataclasses.dataclass(frozen=True)
 class Quantity:
-    """A quantity: its `form` for lists ("sigma(NAME)"), its `unit` in words, what it is; `find` its
-    values in a subject, by the argument."""
+    """A quantity: its `form` for lists ("sigma(NAME)", in brackets what may be omitted), its `unit`
+    in words, what it is; `find` its values in a subject, by the argument."""
 
     form: str
     unit: str
     words: str
-    find: Callable[[Subject, str], Found]
+    find: Callable[[Subject, str], QuantityValues]
 
     @property
     def name(self) -> str:
-        return self.form.partition("(")[0]
+        return self.form.partition("(")[0].rstrip("[")
 
     @property
     def arguments(self) -> tuple[str, ...]:
-        """The arguments it may have, in capitals; an optional one is in brackets."""
-        inside = self.form.partition("(")[2].rstrip(")")
+        """The arguments it may have; names of them in capitals."""
+        inside = self.form.partition("(")[2].rstrip(")]")
         return tuple(inside.split("|")) if inside else ()
 
 
@@ -83,7 +83,9 @@ def offered(kind: str) -> dict[str, Quantity]:
     return found
 
 
-def find_quantity(result: Any, lengths: LengthTest | None, name: str, argument: str) -> Found:
+def find_quantity(
+    result: Any, lengths: LengthTest | None, name: str, argument: str
+) -> QuantityValues:
     """The values of a quantity in a result, of all of its parts.
 
     **Raises:** `InputError` for an unknown quantity or argument; `LookupError` with the reason if
@@ -105,7 +107,7 @@ def find_quantity(result: Any, lengths: LengthTest | None, name: str, argument: 
 
 def unknown_quantity(name: str, forms: list[str]) -> str:
     """The message for an unknown quantity, with the list."""
-    names = [form.partition("(")[0] for form in forms]
+    names = [form.partition("(")[0].rstrip("[") for form in forms]
     mean = did_you_mean(name, names, listing=False)
     return f"unknown quantity {name!r}{mean}; known: {list_some(forms, len(forms), str)}"
 
@@ -132,7 +134,7 @@ def _parts_of(result: Any) -> list[tuple[tuple[Quantity, ...], dict[str, Any]]]:
     return []
 
 
-def _join(parts: Mapping[str, Found]) -> Found:
+def _join(parts: Mapping[str, QuantityValues]) -> QuantityValues:
     """Values of several parts; their units are the same, or it is said."""
     units = {found.unit for found in parts.values()}
     if len(units) > 1:
@@ -143,10 +145,10 @@ def _join(parts: Mapping[str, Found]) -> Found:
         for label, found in parts.items()
         for name, value in found.values.items()
     }
-    return Found(values, units.pop(), pitches.pop() if len(pitches) == 1 else NO_PITCH)
+    return QuantityValues(values, units.pop(), pitches.pop() if len(pitches) == 1 else NO_PITCH)
 
 
-def _by_path(result: Any, name: str, argument: str) -> Found:
+def _by_path(result: Any, name: str, argument: str) -> QuantityValues:
     """A number of `to_dict` by its path, such as `rms` or `counts.images`, of any other result."""
     to_dict = getattr(result, "to_dict", None)
     if to_dict is None:
@@ -160,7 +162,7 @@ def _by_path(result: Any, name: str, argument: str) -> Found:
         found = found[part]
     if isinstance(found, bool) or not isinstance(found, int | float) or argument:
         raise InputError(f"{name}: is not one number of the result")
-    return Found({"": float(found)})
+    return QuantityValues({"": float(found)})
 
 
 # --- adjustment -----------------------------------------------------------------------------
@@ -174,12 +176,12 @@ def _pitch(cameras: Any) -> PixelPitch:
     return NO_PITCH
 
 
-def _one(value: float, unit: str = "") -> Found:
-    return Found({"": float(value)}, unit)
+def _one(value: float, unit: str = "") -> QuantityValues:
+    return QuantityValues({"": float(value)}, unit)
 
 
-def _number(function: Callable[[Adjustment], float]) -> Callable[[Subject, str], Found]:
-    def find(subject: Subject, argument: str) -> Found:
+def _number(function: Callable[[Adjustment], float]) -> Callable[[Subject, str], QuantityValues]:
+    def find(subject: Subject, argument: str) -> QuantityValues:
         _refuse_argument(argument)
         return _one(function(subject.result))
 
@@ -216,7 +218,7 @@ def _parameters(
     subject: Subject, argument: str, of_camera: Callable[[Mapping[str, Any]], float | None],
     of_table: Callable[[Mapping[str, np.ndarray], str], np.ndarray] | None,
     unit_less: bool = False,
-) -> Found:  # fmt: skip
+) -> QuantityValues:  # fmt: skip
     """A number for each of the named unknowns that are estimated."""
     adjustment: Adjustment = subject.result
     kind, id, name = _split(argument)
@@ -241,13 +243,13 @@ def _parameters(
     if not chosen:
         raise LookupError(f"no {name} of an {kind} is estimated")
     angle = name in EXTERIOR[3:]
-    return Found(chosen, network.angle_unit if angle else network.object_unit)
+    return QuantityValues(chosen, network.angle_unit if angle else network.object_unit)
 
 
 def _of_cameras(
     adjustment: Adjustment, id: str, name: str,
     of_camera: Callable[[Mapping[str, Any]], float | None], unit_less: bool,
-) -> Found:  # fmt: skip
+) -> QuantityValues:  # fmt: skip
     cameras = [c for c in adjustment.problem.network.cameras if id in ("*", c.id)]
     if not cameras:
         raise LookupError(f"there is no camera {id!r}")
@@ -263,7 +265,7 @@ def _of_cameras(
         raise LookupError(f"{name} is held, and not estimated")
     if len(units) > 1:
         raise LookupError(f"{name} has different units: {', '.join(sorted(units))}")
-    return Found(values, units.pop(), _pitch(cameras))
+    return QuantityValues(values, units.pop(), _pitch(cameras))
 
 
 def require_parameter(cameras: Any, name: str) -> None:
@@ -278,32 +280,32 @@ def require_parameter(cameras: Any, name: str) -> None:
         )
 
 
-def _sigma(subject: Subject, argument: str) -> Found:
+def _sigma(subject: Subject, argument: str) -> QuantityValues:
     return _parameters(subject, argument, stated_sigma_of, stated_sigma)
 
 
-def _value(subject: Subject, argument: str) -> Found:
+def _value(subject: Subject, argument: str) -> QuantityValues:
     return _parameters(
         subject, argument, lambda entry: entry["value"], lambda rows, name: rows[name]
     )
 
 
-def _t(subject: Subject, argument: str) -> Found:
+def _t(subject: Subject, argument: str) -> QuantityValues:
     return _parameters(subject, argument, lambda entry: entry["t"], None, unit_less=True)
 
 
-def _total_correlation(subject: Subject, argument: str) -> Found:
+def _total_correlation(subject: Subject, argument: str) -> QuantityValues:
     find = lambda entry: entry["total_correlation"]
     return _parameters(subject, argument, find, None, unit_less=True)
 
 
-def _rms_sigma(subject: Subject, argument: str) -> Found:
+def _rms_sigma(subject: Subject, argument: str) -> QuantityValues:
     found = _sigma(subject, argument)
     values = np.array(list(found.values.values()))
     return dataclasses.replace(found, values={"": float(np.sqrt(np.mean(values**2)))})
 
 
-def _image_rms(subject: Subject, argument: str) -> Found:
+def _image_rms(subject: Subject, argument: str) -> QuantityValues:
     _refuse_argument(argument)
     adjustment: Adjustment = subject.result
     rows = adjustment.residuals
@@ -316,7 +318,7 @@ def _image_rms(subject: Subject, argument: str) -> Found:
     scale = {"µm": 1e-3, "um": 1e-3}.get(unit)
     if scale is not None:
         v, unit = v * scale, "mm"
-    return Found({"": float(np.sqrt(np.mean(v**2)))}, unit, pitch)
+    return QuantityValues({"": float(np.sqrt(np.mean(v**2)))}, unit, pitch)
 
 
 def _least_redundancy(adjustment: Adjustment) -> float:
@@ -331,7 +333,7 @@ def _differences(subject: Subject) -> tuple[dict[str, np.ndarray], str]:
     return found, adjustment.network.object_unit
 
 
-def _check_rms(subject: Subject, argument: str) -> Found:
+def _check_rms(subject: Subject, argument: str) -> QuantityValues:
     table, unit = _differences(subject)
     rms = {axis: _rms(table[f"d{axis}"]) for axis in AXES}
     parts = {"": AXES, "3D": AXES, "H": AXES[:2], "V": AXES[2:], **{a: (a,) for a in AXES}}
@@ -340,11 +342,11 @@ def _check_rms(subject: Subject, argument: str) -> Found:
     return _one(math.sqrt(sum(rms[axis] ** 2 for axis in parts[argument])), unit)
 
 
-def _check_max(subject: Subject, argument: str) -> Found:
+def _check_max(subject: Subject, argument: str) -> QuantityValues:
     table, unit = _differences(subject)
     if argument not in ("", *AXES):
         raise InputError(f"({argument}): one of X, Y, Z is expected")
-    return Found(
+    return QuantityValues(
         {
             f"{axis} of check point {id}": abs(float(d))
             for axis in AXES
@@ -365,7 +367,7 @@ def _rms(x: np.ndarray) -> float:
     return float(np.sqrt(np.mean(known**2))) if len(known) else 0.0
 
 
-def _control_rms(subject: Subject, argument: str) -> Found:
+def _control_rms(subject: Subject, argument: str) -> QuantityValues:
     adjustment: Adjustment = subject.result
     rows = adjustment.residuals
     if argument not in ("", *AXES):
@@ -383,19 +385,19 @@ def _lengths(subject: Subject) -> LengthTest:
     return subject.lengths
 
 
-def _lme(subject: Subject, argument: str) -> Found:
+def _lme(subject: Subject, argument: str) -> QuantityValues:
     _refuse_argument(argument)
     test = _lengths(subject)
     errors = zip(test.lengths.ends, np.abs(test.error).tolist())
-    return Found({f"length {a} – {b}": error for (a, b), error in errors}, test.unit)
+    return QuantityValues({f"length {a} – {b}": error for (a, b), error in errors}, test.unit)
 
 
-def _lme_rms(subject: Subject, argument: str) -> Found:
+def _lme_rms(subject: Subject, argument: str) -> QuantityValues:
     _refuse_argument(argument)
     return _one(_lengths(subject).rms, _lengths(subject).unit)
 
 
-def _lme_number(subject: Subject, argument: str) -> Found:
+def _lme_number(subject: Subject, argument: str) -> QuantityValues:
     _refuse_argument(argument)
     return _one(len(_lengths(subject).lengths))
 
@@ -427,11 +429,11 @@ OF_ADJUSTMENT: tuple[Quantity, ...] = (
     Quantity("correlation(NAME)", "", "total correlation of a camera parameter",
              _total_correlation),
     Quantity("image.rms", "px, length", "RMS residual of an image coordinate", _image_rms),
-    Quantity("check.rms(|X|Y|Z|H|V|3D)", "length", "RMS difference at check points, of all axes",
+    Quantity("check.rms[(X|Y|Z|H|V|3D)]", "length", "RMS difference at check points, of all axes",
              _check_rms),
-    Quantity("check.max(|X|Y|Z)", "length", "largest difference at check points", _check_max),
+    Quantity("check.max[(X|Y|Z)]", "length", "largest difference at check points", _check_max),
     Quantity("check.number", "", "number of check points", _number(_check_number)),
-    Quantity("control.rms(|X|Y|Z)", "length", "RMS residual of control", _control_rms),
+    Quantity("control.rms[(X|Y|Z)]", "length", "RMS residual of control", _control_rms),
     Quantity("LME", "length", "largest length measurement error (--lengths)", _lme),
     Quantity("LME.rms", "length", "RMS of length measurement errors", _lme_rms),
     Quantity("LME.number", "", "number of compared lengths", _lme_number),
@@ -443,11 +445,11 @@ OF_ADJUSTMENT: tuple[Quantity, ...] = (
 
 def _calibrated(
     function: Callable[[Calibration], float], unit: str = ""
-) -> Callable[[Subject, str], Found]:
-    def find(subject: Subject, argument: str) -> Found:
+) -> Callable[[Subject, str], QuantityValues]:
+    def find(subject: Subject, argument: str) -> QuantityValues:
         _refuse_argument(argument)
         camera = present(subject.result).camera
-        return Found({"": float(function(subject.result))}, unit, _pitch([camera]))
+        return QuantityValues({"": float(function(subject.result))}, unit, _pitch([camera]))
 
     return find
 
@@ -469,23 +471,25 @@ OF_CALIBRATION: tuple[Quantity, ...] = (
 # --- rigs -----------------------------------------------------------------------------------
 
 
-def _rig_number(function: Callable[[RigCalibration], float]) -> Callable[[Subject, str], Found]:
-    def find(subject: Subject, argument: str) -> Found:
+def _rig_number(
+    function: Callable[[RigCalibration], float],
+) -> Callable[[Subject, str], QuantityValues]:
+    def find(subject: Subject, argument: str) -> QuantityValues:
         _refuse_argument(argument)
         return _one(function(subject.result))
 
     return find
 
 
-def _rig_rms(subject: Subject, argument: str) -> Found:
+def _rig_rms(subject: Subject, argument: str) -> QuantityValues:
     rig: RigCalibration = subject.result
     if argument and argument not in rig.rms:
         raise InputError(f"there is no camera {argument!r}{did_you_mean(argument, rig.rms)}")
     chosen = {f"camera {n}": v for n, v in rig.rms.items() if argument in ("", n)}
-    return Found(chosen, "px", _pitch([one.camera for one in rig.cameras.values()]))
+    return QuantityValues(chosen, "px", _pitch([one.camera for one in rig.cameras.values()]))
 
 
-def _rig_sigma(subject: Subject, argument: str) -> Found:
+def _rig_sigma(subject: Subject, argument: str) -> QuantityValues:
     rig: RigCalibration = subject.result
     if argument in ("base", "rotation"):
         return _mountings(rig, argument)
@@ -503,16 +507,16 @@ def _rig_sigma(subject: Subject, argument: str) -> Found:
     units = {unit_of_parameter(cameras[n].model, name) for n in cameras if name in rig.sigma[n]}
     if len(units) > 1:
         raise LookupError(f"{name} has different units: {', '.join(sorted(units))}")
-    return Found(values, units.pop(), _pitch(cameras.values()))
+    return QuantityValues(values, units.pop(), _pitch(cameras.values()))
 
 
-def _mountings(rig: RigCalibration, what: str) -> Found:
+def _mountings(rig: RigCalibration, what: str) -> QuantityValues:
     if what == "base":
         values = {f"base of {n}": m.length_sigma for n, m in rig.mountings.items()}
-        return Found(values, rig.object_unit)
+        return QuantityValues(values, rig.object_unit)
     # angles of a mounting are in degrees
     values = {f"rotation of {n}": float(max(m.sigma[3:])) for n, m in rig.mountings.items()}
-    return Found(values, "deg")
+    return QuantityValues(values, "deg")
 
 
 OF_RIG: tuple[Quantity, ...] = (
@@ -520,7 +524,7 @@ OF_RIG: tuple[Quantity, ...] = (
     Quantity("redundancy", "", "redundancy of the rig", _rig_number(lambda r: r.redundancy)),
     Quantity("epochs", "", "epochs used", _rig_number(lambda r: len(r.epochs))),
     Quantity("left_out", "", "epochs left out", _rig_number(lambda r: len(r.left_out))),
-    Quantity("rms(|CAMERA)", "px", "RMS of an image point by camera", _rig_rms),
+    Quantity("rms[(CAMERA)]", "px", "RMS of an image point by camera", _rig_rms),
     Quantity("sigma(NAME|CAMERA:NAME|base|rotation)", "of NAME",
              "σ of a parameter, of the bases, of the rotations of the mountings", _rig_sigma),
 )  # fmt: skip
@@ -531,8 +535,8 @@ OF_RIG: tuple[Quantity, ...] = (
 
 def _reconstructed(
     function: Callable[[Reconstruction], float],
-) -> Callable[[Subject, str], Found]:
-    def find(subject: Subject, argument: str) -> Found:
+) -> Callable[[Subject, str], QuantityValues]:
+    def find(subject: Subject, argument: str) -> QuantityValues:
         _refuse_argument(argument)
         return _one(function(subject.result))
 

@@ -26,9 +26,9 @@ from jaxbundle.cli.certificate_options import (
     CertificateOptions,
     Details,
     Lengths,
-    judge_of,
 )
 from jaxbundle.cli.common_options import is_in_file
+from jaxbundle.cli.judging import judge_of
 from jaxbundle.errors import InputError, NotSolvedError
 
 

@@ -22,9 +22,9 @@ from jaxbundle.cli.certificate_options import (
     JUDGEMENT_FILES,
     NOT_JUDGED,
     CertificateOptions,
-    judge_of,
 )
 from jaxbundle.cli.common_options import is_in_file
+from jaxbundle.cli.judging import judge_of
 from jaxbundle.cli.outputs import can_plot, check_writable, name_inside, trace_files, write_result
 from jaxbundle.cli.progress import counting
 from jaxbundle.errors import InputError, NotSolvedError

@@ -13,8 +13,8 @@ from jaxbundle.cli.certificate_options import (
     CertificateOptions,
     Details,
     Lengths,
-    judge_of,
 )
+from jaxbundle.cli.judging import judge_of
 from jaxbundle.errors import InputError
 from jaxbundle.system.interrupts import advise
 
