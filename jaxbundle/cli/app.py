@@ -232,6 +232,8 @@ def run(prepare: Callable[[], object] | None = None) -> None:
     except typer.Abort as error:  # typer's word for EOFError
         _end(f"unexpected end of file: {error.__cause__}", BAD_INPUT)
     except OSError as error:
+        if is_closed_pipe(error):
+            leave(NO_READER)
         _end(_describe_system_error(error), BAD_INPUT)
     except (OverflowError, RecursionError) as error:
         _end(" ".join(str(error).split()), BAD_INPUT)
@@ -255,6 +257,11 @@ def run(prepare: Callable[[], object] | None = None) -> None:
         traceback.print_exc()
         leave(1)
     sys.exit(status)
+
+
+def is_closed_pipe(error: OSError) -> bool:
+    """Whether a write failed because nobody reads: on Windows an invalid argument of a stream."""
+    return sys.platform == "win32" and error.errno == errno.EINVAL and error.filename is None
 
 
 def _describe_system_error(error: OSError) -> str:

@@ -138,7 +138,8 @@ def test_bad_tables_of_lengths():
     good = {"from": ["a"], "to": ["b"], "value": [1.0], "sigma": [0.0]}
     assert len(read_lengths(good)) == 1
     for change, why in (
-        ({"to": ["a"]}, "same point"), ({"value": [-1.0]}, "positive"), ({"sigma": [-1.0]}, "sigma"),
+        ({"to": ["a"]}, "same point"), ({"value": [-1.0]}, "positive"),
+        ({"sigma": [-1.0]}, "sigma"),
         ({"lin": [1]}, "unknown column 'lin'"),
     ):  # fmt: skip
         with pytest.raises(InputError, match=why):
