@@ -1,6 +1,5 @@
 """Windows and macOS as far as Linux imitates them: what they lack is missing, what they have stands
 in."""
-instead stands in."""
 
 import ctypes
 import errno
