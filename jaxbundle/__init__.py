@@ -58,6 +58,7 @@ _HOME = {
         "calibrate_cameras",
         "calibrate_rig",
     ),
+    "jaxbundle.calibration.as_opencv": ("calibrate_opencv",),
     "jaxbundle.calibration.stability": ("Stability",),
     "jaxbundle.cameras": ("CameraModel",),
     "jaxbundle.certificates.acceptance": (
@@ -113,6 +114,10 @@ _HOME = {
         "convert",
         "read_network",
         "write_project",
+    ),
+    "jaxbundle.io.networks.pycolmap_objects": (
+        "from_pycolmap",
+        "to_pycolmap",
     ),
     "jaxbundle.leastsquares": (
         "Data",

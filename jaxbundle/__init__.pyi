@@ -55,6 +55,7 @@ from jaxbundle.calibration import RigCalibration as RigCalibration
 from jaxbundle.calibration import calibrate as calibrate
 from jaxbundle.calibration import calibrate_cameras as calibrate_cameras
 from jaxbundle.calibration import calibrate_rig as calibrate_rig
+from jaxbundle.calibration.as_opencv import calibrate_opencv as calibrate_opencv
 from jaxbundle.calibration.stability import Stability as Stability
 from jaxbundle.cameras import CameraModel as CameraModel
 from jaxbundle.certificates.acceptance import Acceptance as Acceptance
@@ -87,6 +88,8 @@ from jaxbundle.float64 import enable_x64 as enable_x64
 from jaxbundle.io import convert as convert
 from jaxbundle.io import read_network as read_network
 from jaxbundle.io import write_project as write_project
+from jaxbundle.io.networks.pycolmap_objects import from_pycolmap as from_pycolmap
+from jaxbundle.io.networks.pycolmap_objects import to_pycolmap as to_pycolmap
 from jaxbundle.leastsquares import Data as Data
 from jaxbundle.leastsquares import Problem as Problem
 from jaxbundle.leastsquares import Values as Values
@@ -162,6 +165,7 @@ __all__ = [
     "calibrate",
     "calibrate_batch",
     "calibrate_cameras",
+    "calibrate_opencv",
     "calibrate_rig",
     "calibrate_rigs",
     "camera",
@@ -176,6 +180,7 @@ __all__ = [
     "enable_x64",
     "example",
     "explore",
+    "from_pycolmap",
     "grid_of_targets",
     "influence",
     "join_processes",
@@ -202,6 +207,7 @@ __all__ = [
     "stability",
     "stations_looking_at",
     "surface",
+    "to_pycolmap",
     "uncertainty_budget",
     "use_cores",
     "write_project",

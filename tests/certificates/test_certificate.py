@@ -30,7 +30,9 @@ def document():
     )  # fmt: skip
     result = jaxbundle.adjust(network)
     length = float(np.linalg.norm(targets[12] - targets[13]))
-    lengths = {"from": ["13", "no"], "to": ["14", "14"], "value": [length, 1.0], "sigma": [1e-6] * 2}
+    lengths = {
+        "from": ["13", "no"], "to": ["14", "14"], "value": [length, 1.0], "sigma": [1e-6] * 2,
+    }  # fmt: skip
     return jaxbundle.certificate(
         result, details=DETAILS, lengths=lengths, criteria=["LME < 1 mm", "sigma0 < 0.01"]
     )
@@ -95,7 +97,10 @@ def test_cameras_that_are_held_are_no_measurands(document):
         ({"input": [{"limits": 1.0}]}, "input 1: name is missing"),
         ({"input": [{"name": "camera:cam:K3"}]}, "one of sigma, limits, expanded"),
         ({"input": [{"name": "camera:cam:K3", "sigma": -1}]}, "positive"),
-        ({"input": [{"name": "camera:cam:K3", "sigma": 1, "distribution": "flat"}]}, "one of normal"),
+        (
+            {"input": [{"name": "camera:cam:K3", "sigma": 1, "distribution": "flat"}]},
+            "one of normal",
+        ),
         ({"input": [{"name": "camera:cam:K3", "sigma": 1}] * 2}, "given twice"),
         (3, "the path of a TOML file"),
     ],

@@ -1,4 +1,4 @@
-"""Length measurement errors by hand, as VDI/VDE 2634-1 and ISO 14253-1 have them; ASPRS accuracy."""
+"""Length measurement errors by hand, as in VDI/VDE 2634-1 and ISO 14253-1; accuracy of ASPRS."""
 
 import dataclasses
 
@@ -44,7 +44,10 @@ def test_errors_by_hand():
 
 @pytest.mark.parametrize(
     ("error", "verdict"),
-    [(40e-6, CONFORMS), (-40e-6, CONFORMS), (43e-6, OPEN), (57e-6, OPEN), (59e-6, FAILS), (-59e-6, FAILS)],
+    [
+        (40e-6, CONFORMS), (-40e-6, CONFORMS), (43e-6, OPEN), (57e-6, OPEN), (59e-6, FAILS),
+        (-59e-6, FAILS),
+    ],
 )
 def test_the_decision_rule_of_iso_14253(error, verdict):
     """MPE 50 µm, u = 5 µm: g = 1.645 · 5 = 8.2 µm: conformity to 41.8, nonconformity from 58.2."""
