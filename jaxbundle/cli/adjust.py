@@ -28,6 +28,7 @@ from jaxbundle.cli.certificate_options import (
     Lengths,
 )
 from jaxbundle.cli.common_options import is_in_file
+from jaxbundle.cli.gis_output import Crs, Gis, check_gis, write_gis
 from jaxbundle.cli.judging import judge_of
 from jaxbundle.errors import InputError, NotSolvedError
 
@@ -88,6 +89,8 @@ def adjust(  # noqa: PLR0913 - the options of the command
     certificate: CertificateFile = "",
     details: Details = None,
     lengths: Lengths = None,
+    gis: Gis = "",
+    crs: Crs = "",
     brief: Annotated[
         bool, typer.Option("--brief", help="omit points and residuals from the JSON")
     ] = False,
@@ -159,7 +162,7 @@ def adjust(  # noqa: PLR0913 - the options of the command
         if not first:
             # only the first process writes, though all compute
             json, out, html, save, quiet, print_report = "", None, "", "", True, False
-            judged = CertificateOptions()
+            judged, gis, crs = CertificateOptions(), "", ""
     network = read_network(input, format=format, overrides=tuple(set or ()), control=control)
     if check:
         network = network.replace(points=select_checks(network.points, check))
@@ -167,12 +170,14 @@ def adjust(  # noqa: PLR0913 - the options of the command
     held = held_of(budget, network)
     # before an adjustment that may take hours
     check_targets(input, network, json, out, control, force, html, save)
+    files = network_files(input, network, control)
+    check_gis(gis, crs, files, force)
     judge = judge_of(
         "adjust",
         judged,
         {"--json": json, "--html": html, "--save": save},
         out,
-        network_files(input, network, control),
+        files,
         network=network,
         force=force,
     )
@@ -223,6 +228,7 @@ def adjust(  # noqa: PLR0913 - the options of the command
     with staging(quiet or json == "-") as show:
         write_targets(result, json, out, brief, plots, force, html, origin, more, show)
         judge.write(judgement)
+        write_gis(result, gis, crs)
     if save and result.converged:
         result.save(save)
     if print_report and result.converged:

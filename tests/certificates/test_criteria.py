@@ -39,7 +39,8 @@ def test_a_criterion_is_read(text, fields):
 @pytest.mark.parametrize(
     "text",
     ["", "sigma0", "sigma0 < ", "< 3", "sigma0 == 1", "sigma0 < 1 < 2", "sigma0 < nan",
-     "sigma0 < 1e999", "__import__('os') < 1", "a < 1; b", "sigma(c < 2 um", "sigma0 < 1 um mm", 3, None],
+     "sigma0 < 1e999",
+     "__import__('os') < 1", "a < 1; b", "sigma(c < 2 um", "sigma0 < 1 um mm", 3, None],
 )  # fmt: skip
 def test_anything_else_is_refused_with_the_form(text):
     with pytest.raises(InputError, match="criterion"):

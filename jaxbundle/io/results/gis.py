@@ -63,13 +63,7 @@ def write_geojson(
     **Raises:** `InputError` without `crs` or pyproj, for an unknown `crs`, or coordinates outside
     of it; `NotSolvedError` without a solution.
     """
-    system = check_crs(crs)
-    if system is None:
-        raise InputError(
-            "GeoJSON has longitude and latitude (RFC 7946): give the crs of the coordinates, such "
-            "as EPSG:25832, or write a GeoPackage"
-        )
-    transform = _to_wgs84(crs)
+    transform = require_transformation(crs)
     features = []
     for one in collect_features(result, factor):
         place = np.atleast_2d(one.place)
@@ -99,7 +93,8 @@ def _geometry(
 
 
 def _is_counterclockwise(ring: Float[np.ndarray, "n 2"]) -> bool:
-    x, y = ring.T
+    # about its centre: of map coordinates the area is in the last digits
+    x, y = (ring - ring.mean(0)).T
     return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) > 0
 
 
@@ -136,7 +131,15 @@ def check_crs(crs: str) -> int | None:
     return int(found[1])
 
 
-def _to_wgs84(crs: str) -> Any:
+def require_transformation(crs: str) -> Any:
+    """The transformation of coordinates to longitude and latitude.
+
+    **Raises:** `InputError` without `crs` or pyproj, and for an unknown one."""
+    if check_crs(crs) is None:
+        raise InputError(
+            "GeoJSON has longitude and latitude (RFC 7946): give the crs of the coordinates, such "
+            "as EPSG:25832, or write a GeoPackage"
+        )
     try:
         import pyproj
         from pyproj.exceptions import ProjError
