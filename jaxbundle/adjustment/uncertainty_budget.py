@@ -45,7 +45,7 @@ from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.adjustment.result_tables import KindRows, observations
 from jaxbundle.adjustment.sensitivity import sensitivity
 from jaxbundle.arguments import number, positive, show
-from jaxbundle.cameras import get_model
+from jaxbundle.cameras import CameraModel, get_model
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.leastsquares.quality.distributions import normal_quantile, t_quantile
@@ -413,7 +413,7 @@ def _named(adjustment: Adjustment, one: RequestedResult, value: float) -> tuple[
     )
 
 
-def unit_of_parameter(model: str, parameter: str) -> str:
+def unit_of_parameter(model: str | CameraModel, parameter: str) -> str:
     """The unit of a camera parameter: that of image coordinates of a principal distance and a
     principal point; none of others, whose unit depends on the power of their term."""
     found = get_model(model)

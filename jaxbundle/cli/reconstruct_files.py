@@ -81,7 +81,7 @@ def write_reconstruction(
             return
         verdict = f"{first.name}: {conclude_part(found, first).words}"
         told = f"{verdict}\n{found}\n\n{describe_part(found, first)}"
-        _write_part(found, first, new, plots, told, also, progress, origin.computed)
+        _write_part(found, first, new, plots, told, also, progress, origin.computed, more)
         for number, part in enumerate(found.parts[1:], 2):
             folder = new / f"part_{number}"
             folder.mkdir()
@@ -90,13 +90,11 @@ def write_reconstruction(
             )
             verdict = conclude_part(found, part)
             note = "\n".join([verdict.words, *own, describe_part(found, part)])
-            more = {"verdict": verdict_dict(verdict)}
-            _write_part(found, part, folder, plots, note, more, progress, origin.computed)
+            entries = {"verdict": verdict_dict(verdict)}
+            _write_part(found, part, folder, plots, note, entries, progress, origin.computed)
             write_text(folder / PAGE, compose_part(found, part, origin))
         if plots:
             draw_pairs(list(found.photographs), found.pairs, list(found.left_out), new, progress)
-        if more is not None:
-            more.fill(new)
         write_csv(new / PAIRS, ["image", "other", "matches", "verified", "kind"], found.pairs)
 
 
@@ -109,6 +107,7 @@ def _write_part(
     also: Mapping[str, Any],
     progress: Progress | None,
     date: str,
+    more: Supplement | None = None,
 ) -> None:
     fill_results(
         part.adjustment,
@@ -116,6 +115,7 @@ def _write_part(
         plots,
         note,
         also,
+        more,
         progress=progress,
         date=date,
         verdict=conclude_part(found, part),

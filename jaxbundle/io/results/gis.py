@@ -161,7 +161,7 @@ def collect_features(result: "Adjustment", factor: float | None = None) -> Itera
         size = lambda C: np.trace(C, axis1=1, axis2=2)[:, None, None]
         C = np.where(size(modelled) > size(C), modelled, C)
     place = result.point_values
-    known = np.isfinite(place).all(1)
+    known = np.asarray(np.isfinite(place).all(1))
     for row in np.flatnonzero(known):
         sigma = np.sqrt(np.clip(np.diagonal(C[row]), 0, None))
         yield Feature("points", place[row], {
@@ -176,7 +176,8 @@ def collect_features(result: "Adjustment", factor: float | None = None) -> Itera
             "id": str(images["id"][row]), "camera": cameras[row],
             **{name: float(images[name][row]) for name in (*EXTERIOR, *sigmas)},
         })  # fmt: skip
-    yield from _ellipses(place, C, known, points["id"], factor)
+    ids = [str(id) for id in points["id"]]
+    yield from _ellipses(place, C, known, ids, factor)
 
 
 def _ellipses(
@@ -201,7 +202,7 @@ def _ellipses(
         ring = place[row, :2] + factor * ((vectors * axis) @ circle).T
         long = vectors[:, 1]
         yield Feature("ellipses", ring, {
-            "id": str(ids[row]), "of": "point", "a": float(axis[1]), "b": float(axis[0]),
+            "id": ids[int(row)], "of": "point", "a": float(axis[1]), "b": float(axis[0]),
             "bearing": math.degrees(math.atan2(long[0], long[1])) % 180.0, "factor": factor,
         })  # fmt: skip
 
