@@ -49,7 +49,7 @@ from jaxbundle.cameras import CameraModel, get_model
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.leastsquares.quality.distributions import normal_quantile, t_quantile
-from jaxbundle.leastsquares.quality.error_components import OTHERS, ErrorModel, effects
+from jaxbundle.leastsquares.quality.error_components import OTHERS, effects
 from jaxbundle.leastsquares.quality.sensitivity import pull_back
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.report.layout import estimate, significant, table
@@ -355,7 +355,7 @@ def uncertainty_budget(
         )
     )
     s, redundancy = _image_scale(adjustment)
-    shared = _shared_errors(adjustment.error_model, slopes, factor, results.sigma)
+    shared = _shared_errors(adjustment, slopes, factor, results.sigma)
     if shared and adjustment.error_model is not None:
         s = math.sqrt(float(adjustment.error_model.theta[0]))
     groups_of_inputs = [
@@ -548,13 +548,14 @@ def _estimated_degrees(adjustment: Adjustment) -> dict[str, float]:
 
 
 def _shared_errors(
-    model: ErrorModel | None,
+    adjustment: Adjustment,
     slopes: Mapping[str, Float[np.ndarray, "f rows width"]],
     factor: Float[np.ndarray, " f"],
     sigma: Float[np.ndarray, " f"],
 ) -> list[BudgetLine]:
     """A line for each component of errors that image points share; none where these do not make
     the standard uncertainties larger, as a rule of all measurands."""
+    model = adjustment.error_model
     if model is None:
         return []
     modelled = np.diagonal(model.propagate_rows(slopes))
@@ -568,7 +569,7 @@ def _shared_errors(
         size = np.sqrt((np.asarray(component.root.T @ D.T) ** 2).sum(0)) * factor
         # a size that is hardly determined: no estimate has less than one degree of freedom
         degrees = max(2 * (theta / spread) ** 2, 1.0) if spread > 0 else math.inf
-        unit = "" if component.unit != "image" else "of an image coordinate"
+        unit = adjustment.image_unit if component.unit == "image" else ""
         lines.append(
             BudgetLine(
                 f"shared error: {component.name}",

@@ -442,6 +442,8 @@ def _control(adjustment: "Adjustment") -> Iterator[str]:
     if rows := control_rows(adjustment):
         yield f"<h3>Control points: adjusted − given, in {text(unit)}</h3>\n"
         yield grid(CONTROL_HEADER, rows[:MOST_ROWS])
+    if number := int(adjustment.problem.network.points.has_role("fixed").sum()):
+        yield paragraph(f"{count(number, 'point')} held at given coordinates, without σ.")
     points = adjustment.table("control")
     if points:
         predicted = observations.predicted_rows(points, ("id",), "XYZ")
@@ -450,13 +452,13 @@ def _control(adjustment: "Adjustment") -> Iterator[str]:
         yield grid(observations.CONTROL_HEADER, predicted[:MOST_ROWS])
 
 
-CONTROL_HEADER = ("point", "role", "X", "Y", "Z", "vX", "vY", "vZ", "σX", "σY", "σZ")
+CONTROL_HEADER = ("point", "X", "Y", "Z", "vX", "vY", "vZ", "σX", "σY", "σZ")
 
 
 def control_rows(adjustment: "Adjustment") -> list[tuple[str, ...]]:
-    """Control and fixed points: adjusted coordinates, adjusted − given, and the given σ."""
+    """Control points: adjusted coordinates, adjusted − given, and the given σ."""
     points = adjustment.problem.network.points
-    chosen = np.flatnonzero(points.has_role("control", "fixed"))
+    chosen = np.flatnonzero(points.has_role("control"))
     if not len(chosen):
         return []
     given, sigma = points.position[chosen], points.sigma[chosen]
@@ -466,7 +468,7 @@ def control_rows(adjustment: "Adjustment") -> list[tuple[str, ...]]:
     cell = lambda x: fixed(float(x), places)
     shown = lambda s: "free" if np.isposinf(s) else "held" if not s > 0 else cell(s)
     return [
-        (points.id[row], points.role[row], *map(cell, (*a, *d)), *map(shown, s))
+        (points.id[row], *map(cell, (*a, *d)), *map(shown, s))
         for row, a, d, s in zip(chosen, adjusted, v, sigma)
     ]
 

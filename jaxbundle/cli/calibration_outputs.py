@@ -10,6 +10,9 @@ from typing import Any
 from jaxbundle.calibration import Calibrations, ModelComparison
 from jaxbundle.calibration.files import (
     COMPARED,
+    PAGE,
+    REPORT,
+    RESULT,
     calibrations_dict,
     file_name,
     files_of,
@@ -29,6 +32,7 @@ from jaxbundle.cli.outputs import can_plot, check_writable, name_inside, trace_f
 from jaxbundle.cli.progress import counting
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.results.result_json import unsolved_text
+from jaxbundle.io.text.csv_tables import write_text
 from jaxbundle.network.columns import count
 from jaxbundle.report.page import UNKNOWN, Origin, compose_failure, head_line
 from jaxbundle.report.page.adjustment import NO_ADDITION
@@ -177,7 +181,17 @@ class CalibrationOutputs:
                     fill_comparison(compared, new, plots, show)
                 if judgement is not None:
                     judgement.fill(new)
+                    _add_judgement(found, judgement, new, page())
         return report
+
+
+def _add_judgement(found: Calibrations, judgement: Any, folder: Path, page: Iterable[str]) -> None:
+    """The page, the numbers and the report of a folder with the judgement of the result."""
+    write_text(folder / PAGE, page)
+    numbers = calibrations_dict(found) | judgement.json
+    write_text(folder / RESULT, json_text(numbers))
+    report = (folder / REPORT).read_text(encoding="utf-8")
+    write_text(folder / REPORT, report + judgement.text)
 
 
 def require_solved(found: Calibrations) -> None:

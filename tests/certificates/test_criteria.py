@@ -219,3 +219,26 @@ def test_status_0_if_all_are_met_and_2_before_the_work(command, tmp_path):
         told = command("adjust", PROJECT, *options, "--out", tmp_path / "o")
         assert told.status == 2 and why in told.err and told.err.count("\n") == 1, told.err
         assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.further
+def test_a_calibration_is_judged_and_certified(command, tmp_path):
+    page = tmp_path / "certificate.html"
+    told = command(
+        "calibrate", ROOT / "examples" / "board", "--board", "9x6", "--square", "0.03",
+        "--out", tmp_path / "out", "--no-plots", "--no-cross-validation", "--certificate", page,
+        "--accept", "rms < 0.2 px", "--accept", "sigma(fx) < 1e-3 px", "--accept",
+        "coverage > 50 %",
+        "--json", tmp_path / "r.json", "--quiet",
+    )  # fmt: skip
+    assert told.status == 4 and told.err.count("not met") == 1 and "sigma(fx)" in told.err
+    document = json.loads((tmp_path / "r.json").read_text())
+    assert [row["met"] for row in document["acceptance"]["criteria"]] == [True, False, True]
+    assert (tmp_path / "out" / "acceptance.csv").is_file()
+    assert 'id="acceptance"' in (tmp_path / "out" / "report.html").read_text("utf-8")
+    text = page.read_text("utf-8")
+    assert "Calibration certificate" in text and "k1 of camera cam" in text
+    told = command("calibrate", ROOT / "examples" / "board", "--board", "9x6", "--square", "0.03",
+                   "--accept", "sigma(c) < 1 px")  # fmt: skip
+    assert told.status == 2 and "no parameter 'c'" in told.err
+

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import sqlite3
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -124,3 +125,21 @@ def test_without_pyproj_a_geopackage_says_the_number(result, tmp_path, monkeypat
     assert row == ("EPSG", 25832, "undefined")
     with pytest.raises(InputError, match="pyproj"):
         write_geojson(result, tmp_path / "a.geojson", "EPSG:25832")
+
+
+def test_the_command_writes_it_and_refuses_before_the_work(command, tmp_path):
+    project = "examples/convergent4/project.toml"
+    project = Path(__file__).parents[2] / project
+    told = command("adjust", project, "--gis", tmp_path / "n.gpkg", "--quiet")
+    assert told.status == 0 and (tmp_path / "n.gpkg").read_bytes()[:15] == b"SQLite format 3"
+    (tmp_path / "x.gpkg").write_text("notes")
+    for options, why in (
+        (["--gis", tmp_path / "n.shp"], ".gpkg or .geojson is expected"),
+        (["--gis", tmp_path / "n.geojson"], "longitude and latitude"),
+        (["--gis", tmp_path / "n.gpkg", "--crs", "utm"], "EPSG:NUMBER"),
+        (["--crs", "EPSG:25832"], "it is for --gis"),
+        (["--gis", tmp_path / "x.gpkg"], "no GeoPackage"),
+        (["--gis", tmp_path / "no" / "n.gpkg"], "there is no folder"),
+    ):
+        told = command("adjust", project, *options)
+        assert told.status == 2 and why in told.err and told.err.count("\n") == 1, told.err
