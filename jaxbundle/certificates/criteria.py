@@ -16,6 +16,7 @@ from typing import NamedTuple
 from jaxbundle.arguments import show
 from jaxbundle.certificates.units import KINDS
 from jaxbundle.errors import InputError
+from jaxbundle.system.terminals import in_utf8
 
 FORM = "QUANTITY < NUMBER UNIT is expected, such as 'sigma(c) < 2 um' or 'sigma0 < 1.2'"
 PATTERN = re.compile(
@@ -64,6 +65,8 @@ def read_criterion(text: str) -> Criterion:
     """A criterion from its text.
 
     **Raises:** `InputError`, with the form that is expected."""
+    # of a locale without UTF-8 a command line has bytes for ≤ and µ
+    text = in_utf8(text) if isinstance(text, str) else text
     found = PATTERN.fullmatch(text) if isinstance(text, str) else None
     if found is None:
         raise InputError(f"criterion {show(text)}: {FORM}")

@@ -34,6 +34,8 @@ def test_a_criterion_is_read(text, fields):
     one = read_criterion(text)
     assert (one.name, one.argument, one.comparison, one.limit, one.unit) == fields
     assert read_criterion(one.text) == one
+    # as Python has it from a command line in a locale without UTF-8
+    assert read_criterion(text.encode().decode("ascii", "surrogateescape")) == one
 
 
 @pytest.mark.parametrize(
