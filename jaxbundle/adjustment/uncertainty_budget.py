@@ -542,7 +542,9 @@ def _estimated_degrees(adjustment: Adjustment) -> dict[str, float]:
     changed = {name for name, f in adjustment.sigma_factors.items() if f != 1}
     known = {group.name for group in groups(adjustment.problem)}
     for kind in {*rows["kind"].tolist()} - {"image"}:
-        if any(kind.rstrip("s") in name for name in changed & known):
+        # as the groups are named: "control points in X", "distances", "interior orientation"
+        part = "orientation" if kind == "prior" else kind.rstrip("s")
+        if any(part in name for name in changed & known):
             found[kind] = float(rows["r"][rows["kind"] == kind].sum())
     return found
 
