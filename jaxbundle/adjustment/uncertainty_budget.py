@@ -9,8 +9,9 @@ holds. Its combined standard uncertainty, effective degrees of freedom and expan
 
 The sensitivity coefficients c_i are the derivatives of the solution itself, c = −λᵀ·∂g/∂l with
 H·λ = ∂y/∂x, of the exact Hessian H (`leastsquares/quality/sensitivity.py`); of held quantities they
-are −H⁻¹·∂g/∂θ. They include the curvature, which the covariance of the adjustment omits: without
-residuals both are equal.
+are −H⁻¹·∂g/∂θ. They include the curvature, which the covariance of the adjustment omits, and where
+residuals are formed in the corrected image the scale of the correction, since u(x) is that of a
+measured coordinate: without residuals, and in the measured image, both are equal.
 
 | input | type | u(x) | ν |
 |---|---|---|---|
