@@ -43,9 +43,9 @@ from jaxbundle.pushbroom.earth_frames import circular_orbit  # noqa: E402
 from jaxbundle.pushbroom.ground_to_image import make_search, project_from, project_points  # noqa: E402
 from jaxbundle.pushbroom.image import make_image  # noqa: E402
 from jaxbundle.pushbroom.image_to_ground import locate_lines  # noqa: E402
-from jaxbundle.pushbroom.rpc import locate_points as rpc_locate  # noqa: E402
-from jaxbundle.pushbroom.rpc import project_points as rpc_project  # noqa: E402
-from jaxbundle.pushbroom.rpc_fit import fit_image  # noqa: E402
+from jaxbundle.pushbroom.rpc.fitting import fit_image  # noqa: E402
+from jaxbundle.pushbroom.rpc.polynomials import locate_points as rpc_locate  # noqa: E402
+from jaxbundle.pushbroom.rpc.polynomials import project_points as rpc_project  # noqa: E402
 from jaxbundle.pushbroom.scanner import FocalLine, LineTimes  # noqa: E402
 from jaxbundle.pushbroom.surfaces import Ground  # noqa: E402
 from jaxbundle.pushbroom.terrain import bilinear, make_terrain  # noqa: E402

@@ -23,7 +23,7 @@ from jaxbundle.planning.shapes import HeightField, Rectangle
 from jaxbundle.planning.texture import Texture
 from jaxbundle.pushbroom.flight import Flight, true_image
 from jaxbundle.pushbroom.image_to_ground import locate_point
-from jaxbundle.pushbroom.rpc_fit import fit_image
+from jaxbundle.pushbroom.rpc.fitting import fit_image
 from jaxbundle.pushbroom.scanner import FocalLine
 from jaxbundle.pushbroom.surfaces import Ground
 from jaxbundle.surfaces.dsm import make_dsm

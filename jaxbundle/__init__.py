@@ -41,7 +41,7 @@ _HOME = {
         "replicate",
     ),
     "jaxbundle.adjustment.result": ("Adjustment",),
-    "jaxbundle.adjustment.sensitivity": (
+    "jaxbundle.adjustment.error_budget": (
         "Budget",
         "sensitivity",
     ),

@@ -29,6 +29,8 @@ from jaxbundle.adjustment import make_problem as make_problem
 from jaxbundle.adjustment import solve as solve
 from jaxbundle.adjustment.adjust import adjust as adjust
 from jaxbundle.adjustment.compare import AdjustmentComparison as AdjustmentComparison
+from jaxbundle.adjustment.error_budget import Budget as Budget
+from jaxbundle.adjustment.error_budget import sensitivity as sensitivity
 from jaxbundle.adjustment.gradients import check_gradients as check_gradients
 from jaxbundle.adjustment.influence import Influence as Influence
 from jaxbundle.adjustment.influence import influence as influence
@@ -40,8 +42,6 @@ from jaxbundle.adjustment.quality.precision import redundancy as redundancy
 from jaxbundle.adjustment.replicate import Replication as Replication
 from jaxbundle.adjustment.replicate import replicate as replicate
 from jaxbundle.adjustment.result import Adjustment as Adjustment
-from jaxbundle.adjustment.sensitivity import Budget as Budget
-from jaxbundle.adjustment.sensitivity import sensitivity as sensitivity
 from jaxbundle.adjustment.uncertainty_budget import UncertaintyBudget as UncertaintyBudget
 from jaxbundle.adjustment.uncertainty_budget import uncertainty_budget as uncertainty_budget
 from jaxbundle.batches.calibrate import BatchCalibration as BatchCalibration

@@ -11,7 +11,7 @@ from rich.progress import Progress as Bars
 import jaxbundle
 from jaxbundle import types
 from jaxbundle.batches.run_on_files import run_batch
-from jaxbundle.calibration.choice import compare_models
+from jaxbundle.calibration.model_choice import compare_models
 from jaxbundle.io.rasters.correction import write_corrected
 from jaxbundle.measure.views import measure_boards
 from jaxbundle.reconstruction.reconstruct import reconstruct

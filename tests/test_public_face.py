@@ -54,12 +54,21 @@ def test_a_function_takes_the_options_of_its_command(command):
 
 
 @pytest.mark.parametrize(
-    "command", ["locate", "project", "correct", "simulate", "accuracy", "refine"]
+    "command", ["info", "locate", "project", "correct", "simulate", "accuracy", "refine"]
 )
 def test_every_command_of_line_scanners_is_a_function(command):
     function = getattr(jaxbundle.pushbroom, command)
     assert inspect.isfunction(function)
     assert command in jaxbundle.pushbroom.__all__
+
+
+@pytest.mark.parametrize("command", ["fit", "apply", "compensate"])
+def test_every_command_of_coefficients_is_a_function(command):
+    room, module = jaxbundle.pushbroom.rpc, importlib.import_module("jaxbundle.cli.pushbroom.rpc")
+    function = getattr(room, command)
+    options = {*inspect.signature(getattr(module, command)).parameters} - PRESENTATION
+    assert options <= {*inspect.signature(function).parameters}
+    assert command in room.__all__
 
 
 def test_functions_take_the_path_of_a_network_with_the_settings_of_its_command():

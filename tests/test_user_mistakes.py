@@ -8,7 +8,7 @@ import pytest
 
 import jaxbundle
 from jaxbundle import Camera, grid_of_targets, ring_of_stations, simulate
-from jaxbundle.adjustment.mirror_image import name_mirrored, name_other_side
+from jaxbundle.adjustment.mirrored_control import name_mirrored, name_other_side
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.networks.control import read_control, with_control
 from jaxbundle.network.unit_mistakes import (
@@ -16,7 +16,7 @@ from jaxbundle.network.unit_mistakes import (
     name_sigma_unit,
     name_unit_of_positions,
 )
-from jaxbundle.orientation.conventions import (
+from jaxbundle.orientation.image_conventions import (
     explains_better,
     name_image_convention,
     name_image_extent,

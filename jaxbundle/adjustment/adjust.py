@@ -24,7 +24,7 @@ from jaxbundle.adjustment.minimum import (
     names_of_defects,
     weakness_without_solution,
 )
-from jaxbundle.adjustment.mirror_image import name_mirrored, name_other_side
+from jaxbundle.adjustment.mirrored_control import name_mirrored, name_other_side
 from jaxbundle.adjustment.orient import orient
 from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.adjustment.quality.blunder_names import name_suspect

@@ -40,7 +40,7 @@ from jaxbundle.network.undetermined import split_check_points
 from jaxbundle.network.unit_mistakes import (
     name_pixels,
 )
-from jaxbundle.orientation.conventions import name_image_extent
+from jaxbundle.orientation.image_conventions import name_image_extent
 from jaxbundle.orientation.network import Oriented
 
 

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.adjustment.error_budget import inspection_of
 from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.adjustment.quality.requested_results import CAMERAS, RequestedResult, request_results
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.adjustment.result_tables import observations
-from jaxbundle.adjustment.sensitivity import inspection_of
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.quality.sensitivity import pull_back

@@ -19,7 +19,7 @@ from jaxbundle.network.unit_mistakes import (
     name_sigma_unit,
 )
 from jaxbundle.orientation.angle_units import name_angle_unit
-from jaxbundle.orientation.conventions import name_image_convention, name_image_extent
+from jaxbundle.orientation.image_conventions import name_image_convention, name_image_extent
 from jaxbundle.orientation.one_place import name_one_place
 from jaxbundle.orientation.swapped_control import CONTRADICTORY_CONTROL, name_contradiction
 

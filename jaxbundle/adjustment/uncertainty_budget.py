@@ -33,6 +33,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.adjustment.error_budget import sensitivity
 from jaxbundle.adjustment.influence import COLUMNS
 from jaxbundle.adjustment.quality.fixed_quantities import split_name
 from jaxbundle.adjustment.quality.requested_results import (
@@ -44,7 +45,6 @@ from jaxbundle.adjustment.quality.requested_results import (
 from jaxbundle.adjustment.quality.variance_groups import groups
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.adjustment.result_tables import KindRows, observations
-from jaxbundle.adjustment.sensitivity import sensitivity
 from jaxbundle.arguments import number, positive, show
 from jaxbundle.cameras import CameraModel, get_model
 from jaxbundle.display import print_in_one_screen

@@ -1,8 +1,8 @@
 """Camera calibration from photographs of a board, and its accuracy."""
 
 from jaxbundle.calibration.calibrate import calibrate
-from jaxbundle.calibration.choice import ModelComparison, compare_models
 from jaxbundle.calibration.files import write_calibration, write_calibrations
+from jaxbundle.calibration.model_choice import ModelComparison, compare_models
 from jaxbundle.calibration.pixels import images_of_board
 from jaxbundle.calibration.result import Calibration
 from jaxbundle.calibration.rig.calibrate import calibrate_rig

@@ -48,7 +48,7 @@ from jaxbundle.report.page import UNKNOWN, Origin, head_line
 from jaxbundle.types import Progress
 
 if TYPE_CHECKING:
-    from jaxbundle.calibration.choice import ModelComparison
+    from jaxbundle.calibration.model_choice import ModelComparison
     from jaxbundle.calibration.result import Calibration
     from jaxbundle.calibration.rig.result import RigCalibration
     from jaxbundle.calibration.several import Calibrations
@@ -257,7 +257,7 @@ def fill_rig(network: Network, folder: Path) -> None:
 def fill_comparison(
     choice: "ModelComparison", folder: Path, plots: bool, progress: Progress | None = None
 ) -> None:
-    """Write a comparison of models (`choice.ModelComparison`) into an existing folder."""
+    """Write a comparison of models (`model_choice.ModelComparison`) into an existing folder."""
     write_text(folder / "models.txt", choice.report())
     write_text(folder / "models.json", json_text(choice.to_dict()))
     if plots:

@@ -49,7 +49,7 @@ from jaxbundle.report.page.sections import show_residuals
 from jaxbundle.report.page.tables import table_of_residuals
 
 if TYPE_CHECKING:
-    from jaxbundle.calibration.choice import ModelComparison
+    from jaxbundle.calibration.model_choice import ModelComparison
     from jaxbundle.calibration.result import Calibration
     from jaxbundle.calibration.rig.result import RigCalibration
     from jaxbundle.calibration.several import Calibrations

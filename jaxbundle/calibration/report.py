@@ -33,8 +33,8 @@ from jaxbundle.report.layout import (
 
 if TYPE_CHECKING:
     from jaxbundle.calibration.bias import CalibrationBias
-    from jaxbundle.calibration.choice import ModelComparison
     from jaxbundle.calibration.mapping_error import MappingError
+    from jaxbundle.calibration.model_choice import ModelComparison
     from jaxbundle.calibration.quality import Coverage, UncertaintyMap
     from jaxbundle.calibration.result import Calibration
     from jaxbundle.calibration.rig.mounting import Mounting
@@ -238,7 +238,7 @@ def _quality_dict(calibration: "Calibration") -> dict:
 
 
 def choice_text(found: "ModelComparison") -> str:
-    """The comparison of models (`choice.ModelComparison`)."""
+    """The comparison of models (`model_choice.ModelComparison`)."""
     lines = ["Camera models compared", "=" * 100]
     lines += facts(
         [

@@ -34,7 +34,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.adjustment.quality.calibration_difference import Covariance
+from jaxbundle.adjustment.quality.expected_difference import Covariance
 from jaxbundle.calibration.mapping_error import mapping_form
 from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.display import print_in_one_screen

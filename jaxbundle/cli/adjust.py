@@ -109,7 +109,7 @@ def adjust(  # noqa: PLR0913 - the options of the command
     ] = False,
 ) -> None:
     """Adjust a network and report it."""
-    from jaxbundle.adjustment.sensitivity import sensitivity
+    from jaxbundle.adjustment.error_budget import sensitivity
     from jaxbundle.cli.budget_option import held_of
     from jaxbundle.cli.outputs import (
         BudgetSupplement,

@@ -4,7 +4,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from jaxbundle.adjustment.quality.calibration_difference import Covariance
+from jaxbundle.adjustment.quality.expected_difference import Covariance
 from jaxbundle.commands.cameras import open_calibration
 from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.nearest_camera import fit_messages

@@ -15,9 +15,9 @@ from types import MappingProxyType
 from typing import Any, Protocol
 
 from jaxbundle import report
+from jaxbundle.adjustment.error_budget import Budget
 from jaxbundle.adjustment.orientation_covariance import orientation_covariance
 from jaxbundle.adjustment.result import Adjustment
-from jaxbundle.adjustment.sensitivity import Budget
 from jaxbundle.cli.certificate_options import JUDGEMENT_FILES
 from jaxbundle.commands.origins import network_files as network_files
 from jaxbundle.commands.origins import trace_files as trace_files

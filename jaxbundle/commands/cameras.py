@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from jaxbundle.adjustment.quality.calibration_difference import Covariance
+from jaxbundle.adjustment.quality.expected_difference import Covariance
 from jaxbundle.arguments import show
 from jaxbundle.calibration.result import Calibration
 from jaxbundle.cameras import get_model

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from jaxbundle.adjustment.compare import AdjustmentComparison
 from jaxbundle.adjustment.compare import compare as compare_adjustments
 from jaxbundle.adjustment.load_saved import load_adjustment
-from jaxbundle.adjustment.quality.calibration_difference import expected_difference
+from jaxbundle.adjustment.quality.expected_difference import expected_difference
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.arguments import show
 from jaxbundle.calibration.result import Calibration

@@ -33,7 +33,7 @@ from jaxbundle.io.writing.folders import check_folder, replace_folder
 from jaxbundle.pushbroom.flight import measured_image, true_image
 from jaxbundle.pushbroom.ground_to_image import make_search
 from jaxbundle.pushbroom.image import PushbroomImage
-from jaxbundle.pushbroom.rpc_image import RpcImage
+from jaxbundle.pushbroom.rpc.image import RpcImage
 from jaxbundle.refinement import Refinement
 from jaxbundle.refinement import refine as refine_images
 from jaxbundle.types import Progress

@@ -18,8 +18,8 @@ from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.pushbroom.error_propagation import east_north
 from jaxbundle.pushbroom.image import PushbroomImage, pose_at
 from jaxbundle.pushbroom.image_to_ground import locate_points
-from jaxbundle.pushbroom.rpc import sight
-from jaxbundle.pushbroom.rpc_image import RpcImage, heights_in_words, locate_rpc_points
+from jaxbundle.pushbroom.rpc.image import RpcImage, heights_in_words, locate_rpc_points
+from jaxbundle.pushbroom.rpc.polynomials import sight
 from jaxbundle.pushbroom.surfaces import GroundSurface
 from jaxbundle.results import TableMethods, rows_of
 from jaxbundle.types import Column

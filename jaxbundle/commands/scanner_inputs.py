@@ -17,8 +17,8 @@ from jaxbundle.io.text.csv_tables import read_csv
 from jaxbundle.network.columns import Columns, did_you_mean
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.image import PushbroomImage
-from jaxbundle.pushbroom.rpc import Rpc
-from jaxbundle.pushbroom.rpc_image import RpcImage, heights_in_words, heights_of
+from jaxbundle.pushbroom.rpc.image import RpcImage, heights_in_words, heights_of
+from jaxbundle.pushbroom.rpc.polynomials import Rpc
 from jaxbundle.pushbroom.surfaces import Ground, GroundSurface, Height, Plane
 from jaxbundle.pushbroom.terrain import Terrain
 

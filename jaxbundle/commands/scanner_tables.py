@@ -38,9 +38,9 @@ from jaxbundle.pushbroom.ground_to_image import ProjectionStatus, make_search, p
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.image_to_ground import locate_points
 from jaxbundle.pushbroom.noise import Noise
-from jaxbundle.pushbroom.rpc import RpcStatus
-from jaxbundle.pushbroom.rpc import project_points as rpc_project_points
-from jaxbundle.pushbroom.rpc_image import RpcImage, heights_in_words, locate_rpc_points
+from jaxbundle.pushbroom.rpc.image import RpcImage, heights_in_words, locate_rpc_points
+from jaxbundle.pushbroom.rpc.polynomials import RpcStatus
+from jaxbundle.pushbroom.rpc.polynomials import project_points as rpc_project_points
 from jaxbundle.pushbroom.surfaces import GroundSurface
 from jaxbundle.pushbroom.terrain import Terrain
 from jaxbundle.results import TableMethods

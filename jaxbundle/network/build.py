@@ -166,7 +166,7 @@ def make_network(  # noqa: PLR0913 - the tables of a network
     return network
 
 
-def add_further(network: Network, *, angle_unit: str = "rad", **further: Any) -> Network:
+def add_further(network: Network, *, angle_unit: str | None = None, **further: Any) -> Network:
     """The network with further observations, in place of those it has of the same kinds.
 
         jaxbundle.add_further(
@@ -175,14 +175,23 @@ def add_further(network: Network, *, angle_unit: str = "rad", **further: Any) ->
         )
 
     **Arguments:** `further`: tables and the settings of their sections, as of `make_network`;
-    `angle_unit` of what is an angle in them.
+    `angle_unit` of what is an angle in the tables, by default that of the network; angles in the
+    settings of a section are always in that.
 
     **Raises:** `InputError` naming table, row and column.
     """
+    own = require_network(network).angle_unit
+    angle_unit = own if angle_unit is None else angle_unit
     check_choice("angle_unit", angle_unit, CHOICES["angle_unit"])
     made = make_further(further, ANGLE_UNITS[angle_unit])
+    for one in made:
+        if angle_unit != own and one.ANGLES_IN_SETTINGS and one.settings:
+            raise InputError(
+                f"add_further: the settings of [{one.SECTION}] are in the unit of the network, "
+                f"{own}: expected the table in {own} too, got angle_unit {angle_unit!r}"
+            )
     new = {one.TABLE for one in made}
-    kept = tuple(one for one in require_network(network).further if one.TABLE not in new)
+    kept = tuple(one for one in network.further if one.TABLE not in new)
     network = network.replace(further=(*kept, *made))
     for one in made:
         one.check(network)

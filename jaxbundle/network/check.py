@@ -82,7 +82,7 @@ def check_tables(network: Network) -> Network:
     network = _check_points(network)
     _check_observations(network)
     network = check_units(_check_distances(network))
-    return _check_datum_points(network)
+    return _note_rows_of_check_points(_check_datum_points(network))
 
 
 def _check_sizes(network: Network) -> None:
@@ -324,6 +324,21 @@ def _check_distances(network: Network) -> Network:
             f"left out {count(idle.sum(), 'distance')} between fixed points: "
             f"{names[idle.argmax()]}{' …' if idle.sum() > 1 else ''}"
         )
+    return network
+
+
+def _note_rows_of_check_points(network: Network) -> Network:
+    """Say which rows of further kinds are about check points, which take no part."""
+    check = {id for id, role in zip(network.points.id, network.points.role) if role == "check"}
+    for one in network.further if check else ():
+        about = np.zeros(len(one), bool)
+        for field in one.POINTS:
+            about |= np.array([id in check for id in getattr(one, field)], bool)
+        if about.any():
+            network = network.note(
+                f"{one.source(int(about.argmax()))}: {about.sum()} of {len(one)} {one.TABLE} are "
+                "about check points, which take no part in the adjustment, and are left out"
+            )
     return network
 
 

@@ -31,7 +31,7 @@ from jaxbundle.network.undetermined import keep_images, keep_points, leave_out
 from jaxbundle.network.unit_mistakes import name_pixels
 from jaxbundle.orientation import batched
 from jaxbundle.orientation.alignment import describe_mirror, join, move_to_given_frame, to_scale
-from jaxbundle.orientation.conventions import name_image_extent
+from jaxbundle.orientation.image_conventions import name_image_extent
 from jaxbundle.orientation.incremental import (
     Improve,
     Model,

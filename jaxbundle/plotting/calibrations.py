@@ -87,7 +87,7 @@ def expected_map(
     """σ of the length of a difference over the image, √(σx² + σy²); matplotlib axes.
 
     **Arguments:** `covariance` [rows, columns, 2, 2] of the differences, from
-    `jaxbundle.adjustment.quality.calibration_difference.expected_difference`.
+    `jaxbundle.adjustment.quality.expected_difference.expected_difference`.
     """
     ax = axes(ax, (7.5, 6))
     factor, unit = micrometres(comparison.unit)

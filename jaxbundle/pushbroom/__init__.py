@@ -86,20 +86,20 @@ _HOME = {
     "jaxbundle.pushbroom.orbit": ("state_orbit",),
     "jaxbundle.pushbroom.rectification": ("BLOCK_SIZE", "NODE_STEP", "block_places"),
     "jaxbundle.pushbroom.resampling": ("resample",),
-    "jaxbundle.pushbroom.rpc_agreement": (
+    "jaxbundle.pushbroom.rpc.agreement": (
         "Agreement",
         "compare_with_rpc",
     ),
-    "jaxbundle.pushbroom.rpc": (
+    "jaxbundle.pushbroom.rpc.polynomials": (
         "Rpc",
         "RpcStatus",
     ),
-    "jaxbundle.pushbroom.rpc_image": ("RpcImage",),
-    "jaxbundle.pushbroom.rpc_bias": (
+    "jaxbundle.pushbroom.rpc.image": ("RpcImage",),
+    "jaxbundle.pushbroom.rpc.bias": (
         "apply_bias",
         "fit_bias",
     ),
-    "jaxbundle.pushbroom.rpc_fit": (
+    "jaxbundle.pushbroom.rpc.fitting": (
         "RpcCheck",
         "RpcFit",
         "RpcTable",

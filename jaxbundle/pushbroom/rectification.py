@@ -28,8 +28,8 @@ from jaxbundle.pushbroom.image import LinePose, PushbroomImage
 from jaxbundle.pushbroom.image_to_ground import ground_point
 from jaxbundle.pushbroom.pieces import sample
 from jaxbundle.pushbroom.prepared import ScannerGeometry, Search, scanner_of
-from jaxbundle.pushbroom.rpc import Rpc
-from jaxbundle.pushbroom.rpc_image import RpcImage, are_occluded_in_rpc, project_to_rpc
+from jaxbundle.pushbroom.rpc.image import RpcImage, are_occluded_in_rpc, project_to_rpc
+from jaxbundle.pushbroom.rpc.polynomials import Rpc
 from jaxbundle.pushbroom.surfaces import GroundSurface, Height, Plane
 from jaxbundle.pushbroom.terrain import Terrain, bilinear
 from jaxbundle.system.programs import compile_once

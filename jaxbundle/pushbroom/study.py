@@ -11,11 +11,12 @@ rate of the samples; here they are stated.
 
 import dataclasses
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxbundle.choices import AttitudeError
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.pushbroom.error_propagation import (
     circular_error,
     closed_form,
@@ -30,6 +31,7 @@ from jaxbundle.pushbroom.image_to_ground import locate_points
 from jaxbundle.pushbroom.noise import Noise
 from jaxbundle.pushbroom.scanner import slopes_of
 from jaxbundle.pushbroom.surfaces import GroundSurface
+from jaxbundle.results import TableMethods, rows_of
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import Numbers
 
@@ -40,6 +42,7 @@ TRAJECTORIES = {
     "3 axes": ("pitch", "roll", "yaw"),
 }
 FLOORS = ("linear", "spline")
+WAYS = ("drawn", "propagated", "closed")
 # Default accuracies of attitudes, radians.
 SIGMAS = (math.radians(0.01), math.radians(0.1))
 
@@ -66,7 +69,9 @@ class Erring(NamedTuple):
     closed_ce90: float
 
 
-class AccuracyTable(NamedTuple):
+@print_in_one_screen
+@dataclasses.dataclass(frozen=True)
+class AccuracyTable(TableMethods):
     """`altitude` above the surface in metres, `field_of_view` in radians, and the cells."""
 
     altitude: float
@@ -75,6 +80,70 @@ class AccuracyTable(NamedTuple):
     draws: int
     error_free: list[ErrorFree]
     erring: list[Erring]
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """Of the whole table; the field of view in degrees."""
+        view = _degrees(self.field_of_view)
+        return {
+            "altitude": self.altitude,
+            "field_of_view": view,
+            "kind": self.kind,
+            "draws": self.draws,
+        }
+
+    def table(self) -> dict[str, np.ndarray]:
+        """A row per trajectory and accuracy (degrees; 0 for error-free samples, which only their
+        interpolation moves), errors in metres."""
+        rows = [
+            (cell.trajectory, 0.0, cell.interpolation, cell.rms, cell.ce90, *[np.nan] * 4)
+            for cell in self.error_free
+        ]
+        rows += [
+            (
+                cell.trajectory,
+                _degrees(cell.sigma),
+                "",
+                cell.drawn_rms,
+                cell.drawn_ce90,
+                cell.propagated_rms,
+                cell.propagated_ce90,
+                cell.closed_rms,
+                cell.closed_ce90,
+            )
+            for cell in self.erring
+        ]
+        names = ["trajectory", "sigma", "interpolation", "rms", "ce90"]
+        names += [f"{way}_{value}" for way in WAYS[1:] for value in names[3:5]]
+        return {name: np.array(column) for name, column in zip(names, zip(*rows))}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Figures and rows as plain dicts and numbers, as in JSON."""
+        return {**self.figures, "rows": rows_of(self.table())}
+
+    def __str__(self) -> str:
+        """Trajectories across, accuracies down."""
+        what = {"bias": "one error per image", "white": "an error in every record of the table"}
+        view = _degrees(self.field_of_view)
+        text = [
+            f"altitude {self.altitude / 1e3:.1f} km, field of view {view:g}°",
+            f"error of attitude about each axis: {what[self.kind]}; {self.draws} draws",
+        ]
+        line = lambda name, values, form: f"{name:22}" + "".join(f"{v:>10{form}}" for v in values)
+        for value in ("rms", "ce90"):
+            text += ["", line(f"{value.upper()} [m]", TRAJECTORIES, "")]
+            for method in dict.fromkeys(cell.interpolation for cell in self.error_free):
+                cells = [getattr(c, value) for c in self.error_free if c.interpolation == method]
+                text.append(line(f"no error, {method}", cells, ".4f"))
+            for sigma in dict.fromkeys(cell.sigma for cell in self.erring):
+                for way in WAYS:
+                    cells = [getattr(c, f"{way}_{value}") for c in self.erring if c.sigma == sigma]
+                    text.append(line(f"{_degrees(sigma):g}°, {way}", cells, ".2f"))
+        return "\n".join(text)
+
+
+def _degrees(angle: float) -> float:
+    return float(f"{np.degrees(angle):.6g}")
 
 
 def accuracy_table(

@@ -22,10 +22,10 @@ from jaxbundle.network.blunders import Removed
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import STATED, Network, Observations
 from jaxbundle.pushbroom.image import PushbroomImage
-from jaxbundle.pushbroom.rpc import RpcStatus
-from jaxbundle.pushbroom.rpc_bias import RpcBias, apply_bias
-from jaxbundle.pushbroom.rpc_fit import RpcCheck
-from jaxbundle.pushbroom.rpc_image import RpcImage
+from jaxbundle.pushbroom.rpc.bias import RpcBias, apply_bias
+from jaxbundle.pushbroom.rpc.fitting import RpcCheck
+from jaxbundle.pushbroom.rpc.image import RpcImage
+from jaxbundle.pushbroom.rpc.polynomials import RpcStatus
 from jaxbundle.refinement.build import check_input, choose_rays, start_points
 from jaxbundle.refinement.check_points import RefinementCheckPoints, intersect
 from jaxbundle.refinement.declare import declare

@@ -2,7 +2,7 @@
 
     v = [l + Σ aₖ·mₖ(l̂, ŝ) − line,  s + Σ bₖ·mₖ(l̂, ŝ) − sample],       m = 1, l̂, ŝ, l̂², l̂ŝ, ŝ²,
 
-(l, s) the image of the point by the coefficients (`pushbroom.rpc_bias.project_compensated`), of
+(l, s) the image of the point by the coefficients (`pushbroom.rpc.bias.project_compensated`), of
 which a bias of degree 0, 1 or 2 has 1, 3 or 6 terms (Grodecki and Dial, 2003, PE&RS 69(1)). The
 terms are about 1 at the edges of the image, so that every unknown is in pixels there.
 
@@ -30,13 +30,13 @@ from jaxbundle.geometry.vectors import Triple, along
 from jaxbundle.leastsquares.declarations import Kind
 from jaxbundle.leastsquares.indexing.indices import fill_up
 from jaxbundle.leastsquares.spaces import Change, WithoutChart
-from jaxbundle.pushbroom.rpc import ABOVE_DOMAIN, Rpc, domain, fit_inverse, sight
-from jaxbundle.pushbroom.rpc_bias import (
+from jaxbundle.pushbroom.rpc.bias import (
     MODELS,
     RpcBias,
     images_and_slopes,
     project_compensated,
 )
+from jaxbundle.pushbroom.rpc.polynomials import ABOVE_DOMAIN, Rpc, domain, fit_inverse, sight
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, Scalar
 

@@ -12,8 +12,8 @@ from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid
 from jaxbundle.network.tables import Network, Observations, Source
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.interpolation import covers, interval
-from jaxbundle.pushbroom.rpc import DOMAIN_MARGIN
-from jaxbundle.pushbroom.rpc_image import RpcImage
+from jaxbundle.pushbroom.rpc.image import RpcImage
+from jaxbundle.pushbroom.rpc.polynomials import DOMAIN_MARGIN
 from jaxbundle.refinement.freedom import Freedom
 from jaxbundle.refinement.rpc_points import BIAS_TERMS
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from jaxbundle.report.layout import heading, paragraph, table
 
 if TYPE_CHECKING:
-    from jaxbundle.adjustment.sensitivity import Budget
+    from jaxbundle.adjustment.error_budget import Budget
 
 TITLE = "Error budget"
 HEADER = ("result", "error of", "σ of it", "effect", "share %")

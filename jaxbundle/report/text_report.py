@@ -8,8 +8,8 @@ from jaxbundle.report.correlated import correlated_lines
 from jaxbundle.report.verdict import Verdict
 
 if TYPE_CHECKING:
+    from jaxbundle.adjustment.error_budget import Budget
     from jaxbundle.adjustment.result import Adjustment
-    from jaxbundle.adjustment.sensitivity import Budget
 
 
 def text(

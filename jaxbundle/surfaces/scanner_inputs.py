@@ -28,7 +28,7 @@ from jaxbundle.io.scanner.rpc_images import (
 from jaxbundle.photographs.places import utm_system
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.image_to_ground import locate_point
-from jaxbundle.pushbroom.rpc import Rpc
+from jaxbundle.pushbroom.rpc.polynomials import Rpc
 from jaxbundle.pushbroom.surfaces import Ground
 from jaxbundle.surfaces.cloud import Cloud
 from jaxbundle.surfaces.scanner_views import (

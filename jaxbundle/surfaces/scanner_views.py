@@ -22,7 +22,7 @@ from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, earth_fixed, geodetic
 from jaxbundle.pushbroom.ground_to_image import make_search, project_near, project_points
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.image_to_ground import locate_point
-from jaxbundle.pushbroom.rpc import Rpc, locate, project
+from jaxbundle.pushbroom.rpc.polynomials import Rpc, locate, project
 from jaxbundle.pushbroom.surfaces import Height, Plane
 from jaxbundle.surfaces.views import Grey, Places, Points, run_in_lanes
 from jaxbundle.system.programs import compile_once

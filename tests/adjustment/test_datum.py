@@ -20,8 +20,15 @@ from adjustment_checks import (
     synthetic,
 )
 
+import jaxbundle
 from jaxbundle.adjustment.problem import make_problem
+from jaxbundle.adjustment.solve import solve
 from jaxbundle.errors import InputError
+from jaxbundle.geometry import (
+    matrix_from_omega_phi_kappa,
+    matrix_from_rotation_vector,
+    omega_phi_kappa_from_matrix,
+)
 from jaxbundle.leastsquares.datum.conditions import generators, move_to_datum, s_transform
 from jaxbundle.leastsquares.datum.defect import find_open_motions, survey_motions
 from jaxbundle.leastsquares.equations.normal import zero_tangent
@@ -231,3 +238,68 @@ def test_inner_constraints_have_the_smallest_trace():
         for dense in map(linearised, ("free", "minimal")) for at in [dense.columns["point"].ravel()]
     ]  # fmt: skip
     assert traces[0] < 0.9 * traces[1]
+
+
+@pytest.fixture(scope="module")
+def attitudes_without_a_scale():
+    """A network of observed attitudes: they turn it, and only its start values give its scale."""
+    made = jaxbundle.simulate_with_truth(
+        jaxbundle.ring_of_stations(6, radius=4.0, height=2.0),
+        jaxbundle.cloud_of_targets(20, 2.0, seed=1),
+        jaxbundle.Camera("cam", "brown", {"c": 20.0}, ("c",)),
+        noise=0.002, seed=2, datum="inner",
+    )  # fmt: skip
+    angles, sigmas = ("omega", "phi", "kappa"), ("somega", "sphi", "skappa")
+    rows = [
+        {"image": id, **dict.fromkeys(angles, 0.0), **dict.fromkeys(sigmas, 1e-3)}
+        for id in made.network.images.id
+    ]
+    network = jaxbundle.add_further(made.network, attitudes=rows)
+    return jaxbundle.simulate_further(network, made.truth, seed=3)
+
+
+def turned_about_z(network, degrees):
+    """The network with its start values turned."""
+    R = matrix_from_rotation_vector(np.radians(degrees) * np.array([0.0, 0.0, 1.0]))
+    M = [matrix_from_omega_phi_kappa(a) @ R.T for a in network.images.angles]
+    images = dataclasses.replace(
+        network.images,
+        position=network.images.position @ R.T,
+        angles=np.stack([omega_phi_kappa_from_matrix(m) for m in M]),
+    )
+    points = dataclasses.replace(network.points, position=network.points.position @ R.T)
+    return network.replace(images=images, points=points)
+
+
+def test_the_scale_of_start_values_stays_however_observations_turn_them(attitudes_without_a_scale):
+    """|x|·cos θ would be too small, beyond 90° nothing."""
+    points = [
+        solved(make_problem(turned_about_z(attitudes_without_a_scale, degrees))).values["point"]
+        for degrees in (0.0, 20.0, 150.0)
+    ]
+    # the centroid is that of the turned start values
+    points = [np.asarray(p) - np.mean(p, 0) for p in points]
+    np.testing.assert_allclose(points[1:], [points[0]] * 2, atol=1e-9)
+
+
+@pytest.mark.further
+def test_derivatives_by_turned_start_values(attitudes_without_a_scale):
+    """First and second, by the start values of a point and by an attitude, against differences."""
+    problem = make_problem(turned_about_z(attitudes_without_a_scale, 40.0))
+    data = problem.data
+
+    def size(move):
+        point = data.start["point"].at[3].add(move[0] * jnp.array([1.0, -2.0, 0.5]))
+        attitudes = data.measured["attitudes"].at[0, 2].add(move[1] * 1e-2)
+        start, measured = data.start | {"point": point}, data.measured | {"attitudes": attitudes}
+        found = solve(problem, dataclasses.replace(data, start=start, measured=measured))
+        return jnp.linalg.norm(found["point"][0] - found["point"][7])
+
+    here, step = jnp.array([0.05, 0.1]), 1e-3
+    slope, curvature = jax.grad(size)(here), jax.hessian(size)(here)
+    for k, e in enumerate(step * np.eye(2)):
+        ends = [size(here + e), size(here - e)]
+        np.testing.assert_allclose(slope[k], (ends[0] - ends[1]) / (2 * step), rtol=1e-5)
+        slopes = [jax.grad(size)(here + e), jax.grad(size)(here - e)]
+        difference = (slopes[0] - slopes[1]) / (2 * step)
+        np.testing.assert_allclose(curvature[k], difference, rtol=1e-4, atol=1e-8)

@@ -219,7 +219,7 @@ def test_the_spline_follows_a_lens_that_no_parametric_model_fits(bumpy_views):
 @pytest.mark.further
 def test_the_command_compares_models(fisheye, command, tmp_path, monkeypatch):
     """Of the corners above, in place of those of the photographs."""
-    monkeypatch.setattr("jaxbundle.calibration.choice.views_of", lambda *_: fisheye)
+    monkeypatch.setattr("jaxbundle.calibration.model_choice.views_of", lambda *_: fisheye)
     folder, out = EXAMPLES / "board", tmp_path / "out"
     said = command(
         "calibrate", folder, "--board", "8x6", "--square", "0.03", "--models",

@@ -14,7 +14,7 @@ from test_calibrate import NOISE, simulated
 
 import jaxbundle
 from jaxbundle import cli
-from jaxbundle.adjustment.quality.calibration_difference import expected_difference
+from jaxbundle.adjustment.quality.expected_difference import expected_difference
 from jaxbundle.adjustment.quality.projection_uncertainty import images_through_scene
 from jaxbundle.batches.calibrate import calibrate_batch
 from jaxbundle.batches.calibrate_rigs import calibrate_rigs

@@ -206,6 +206,16 @@ def test_control_points_without_sigma_become_fixed_and_without_axes_tie():
     assert "σ of 1 tie or fixed point not used" in " ".join(checked.notes)
 
 
+def test_rows_about_check_points_are_left_out_with_a_note():
+    given = tables()
+    given["points"][2].update(CONTROL, role="check")
+    ids = [p["id"] for p in given["points"]]
+    rows = {"from": [ids[0], ids[2], ids[1]], "to": [ids[1], ids[0], ids[3]], "dZ": [0.1] * 3}
+    rows |= {"sdZ": [0.1] * 3}
+    checked = check_network(make_network(**given, differences=rows))
+    assert "row 2: 1 of 3 differences are about check points" in " ".join(checked.notes)
+
+
 def test_points_with_too_few_rays_are_left_out_with_a_warning():
     given = without_rays(lambda o: not (
         o["point"] == "p5" or (o["point"] in ("p6", "p7") and o["image"] != "i0")

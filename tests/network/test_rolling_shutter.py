@@ -104,6 +104,19 @@ def test_image_points_are_simulated_as_the_formula_says(flown):
         jaxbundle.simulate_further(fewer, made.truth, unknowns={"velocity": velocity})
 
 
+def test_added_angles_have_the_unit_of_the_network(flown):
+    network = flown[0].network.replace(angle_unit="deg")
+    row = dict.fromkeys(("omega", "phi", "kappa"), [90.0]) | {"image": [network.images.id[0]]}
+    row |= dict.fromkeys(("somega", "sphi", "skappa"), [1.0])
+    (rows,) = jaxbundle.add_further(network, attitudes=row).further
+    np.testing.assert_allclose(rows.angles, np.pi / 2)
+    (rows,) = jaxbundle.add_further(network, attitudes=row, angle_unit="gon").further
+    np.testing.assert_allclose(rows.angles, 0.45 * np.pi)
+    with pytest.raises(InputError, match="in the unit of the network, deg.*got angle_unit 'rad'"):
+        boresight = {"boresight": [0.1, 0.0, 0.0]}
+        jaxbundle.add_further(network, attitudes=row, attitude=boresight, angle_unit="rad")
+
+
 def test_further_observations_are_added_in_place_of_their_kind(flown):
     network = moving(flown[0].network, flown[0].network.observations.xy)
     levelled = {"from": ["1"], "to": ["2"], "dZ": [1.0], "sdZ": [0.1]}

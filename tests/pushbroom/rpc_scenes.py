@@ -6,8 +6,8 @@ from pushbroom_scenes import orbit
 
 from jaxbundle.pushbroom.ancillary import attitude_table, position_table
 from jaxbundle.pushbroom.image import make_image
-from jaxbundle.pushbroom.rpc import Rpc, project_points
-from jaxbundle.pushbroom.rpc_fit import RpcTable
+from jaxbundle.pushbroom.rpc.fitting import RpcTable
+from jaxbundle.pushbroom.rpc.polynomials import Rpc, project_points
 from jaxbundle.pushbroom.scanner import AnglePolynomial, LineTimes
 from jaxbundle.pushbroom.trajectory import Trajectory
 

@@ -17,7 +17,7 @@ from jaxbundle.io.scanner.rpc import read_rpc, write_rpc
 from jaxbundle.pushbroom import rpc as polynomials
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.image_to_ground import locate_points
-from jaxbundle.pushbroom.rpc_fit import fit_rpc, image_table
+from jaxbundle.pushbroom.rpc.fitting import fit_rpc, image_table
 from jaxbundle.pushbroom.surfaces import Height
 
 FOLDER = Path(__file__).parents[2] / ".." / "shared" / "data" / "real" / "satellite"

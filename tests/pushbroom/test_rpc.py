@@ -7,7 +7,7 @@ import pytest
 from rpc_scenes import made_up, places
 
 from jaxbundle.geometry import ellipsoid as el
-from jaxbundle.pushbroom import rpc as r
+from jaxbundle.pushbroom.rpc import polynomials as r
 from jaxbundle.pushbroom.surfaces import Height
 from jaxbundle.pushbroom.terrain import make_terrain
 

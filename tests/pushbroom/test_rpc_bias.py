@@ -8,9 +8,9 @@ from rpc_scenes import made_up, places
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, earth_fixed
-from jaxbundle.pushbroom.rpc import project_points
-from jaxbundle.pushbroom.rpc_bias import RpcBias, apply_bias, fit_bias, project_compensated
-from jaxbundle.pushbroom.rpc_fit import RpcTable
+from jaxbundle.pushbroom.rpc.bias import RpcBias, apply_bias, fit_bias, project_compensated
+from jaxbundle.pushbroom.rpc.fitting import RpcTable
+from jaxbundle.pushbroom.rpc.polynomials import project_points
 
 RPC = made_up()
 PLACES = places(RPC, 12)

@@ -13,7 +13,7 @@ from scanner_files import write_scanner
 from jaxbundle import cli
 from jaxbundle.io.scanner.rpc import read_rpc, write_rpc
 from jaxbundle.io.text.csv_tables import write_csv
-from jaxbundle.pushbroom.rpc_fit import RpcTable, check_rpc
+from jaxbundle.pushbroom.rpc.fitting import RpcTable, check_rpc
 
 RPC = made_up(longitude_offset=12.3)
 COLUMNS = ("longitude", "latitude", "height", "line", "sample")

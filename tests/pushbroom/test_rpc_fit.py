@@ -10,8 +10,8 @@ from scipy.optimize import least_squares
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84
-from jaxbundle.pushbroom.rpc import Rpc, project_points
-from jaxbundle.pushbroom.rpc_fit import RpcTable, check_rpc, fit_image, fit_rpc, image_table
+from jaxbundle.pushbroom.rpc.fitting import RpcTable, check_rpc, fit_image, fit_rpc, image_table
+from jaxbundle.pushbroom.rpc.polynomials import Rpc, project_points
 
 TRUE = made_up()
 

@@ -21,8 +21,8 @@ from jaxbundle.io.text.csv_tables import write_csv
 from jaxbundle.pushbroom import rpc
 from jaxbundle.pushbroom.ground_to_image import make_search
 from jaxbundle.pushbroom.rectification import BLOCK_SIZE, NODE_STEP, block_places
-from jaxbundle.pushbroom.rpc_fit import fit_image
-from jaxbundle.pushbroom.rpc_image import RpcImage
+from jaxbundle.pushbroom.rpc.fitting import fit_image
+from jaxbundle.pushbroom.rpc.image import RpcImage
 from jaxbundle.pushbroom.surfaces import Height
 from jaxbundle.pushbroom.terrain import make_terrain
 

@@ -11,7 +11,7 @@ from test_rpc_files import RPC, assert_same, write_raster
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.io.scanner.rpc import read_rpc, write_rpc
-from jaxbundle.pushbroom.rpc import locate_points_on, project_points
+from jaxbundle.pushbroom.rpc.polynomials import locate_points_on, project_points
 from jaxbundle.pushbroom.surfaces import Height
 
 PARTS = [("LINE", "line"), ("SAMP", "sample"), ("LONG", "longitude"), ("LAT", "latitude"),

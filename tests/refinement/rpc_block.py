@@ -17,10 +17,10 @@ from jaxbundle.pushbroom.earth_frames import circular_orbit
 from jaxbundle.pushbroom.ground_to_image import make_search, project_points
 from jaxbundle.pushbroom.image import make_image
 from jaxbundle.pushbroom.image_to_ground import locate_point
-from jaxbundle.pushbroom.rpc import Rpc
-from jaxbundle.pushbroom.rpc import project_points as project_rpc
-from jaxbundle.pushbroom.rpc_bias import bias_terms
-from jaxbundle.pushbroom.rpc_image import RpcImage
+from jaxbundle.pushbroom.rpc.bias import bias_terms
+from jaxbundle.pushbroom.rpc.image import RpcImage
+from jaxbundle.pushbroom.rpc.polynomials import Rpc
+from jaxbundle.pushbroom.rpc.polynomials import project_points as project_rpc
 from jaxbundle.pushbroom.scanner import FocalLine, LineTimes
 from jaxbundle.pushbroom.surfaces import Height
 from jaxbundle.pushbroom.trajectory import Trajectory

@@ -19,7 +19,7 @@ from jaxbundle.io.rasters.reading import open_plain
 from jaxbundle.io.scanner.refinement import read_refinement
 from jaxbundle.io.scanner.rpc import StatedErrors, read_rpc, read_stated_errors, write_rpc
 from jaxbundle.io.text.csv_tables import read_csv, write_csv
-from jaxbundle.pushbroom.rpc import project_points
+from jaxbundle.pushbroom.rpc.polynomials import project_points
 from jaxbundle.refinement import HELD, Freedom
 
 TEXT = """

@@ -12,8 +12,8 @@ from test_with_photographs import photograph
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.geometry.ellipsoid import WGS84, earth_fixed, geodetic
 from jaxbundle.network.tables import Distances
-from jaxbundle.pushbroom.rpc import project_points
-from jaxbundle.pushbroom.rpc_bias import RpcBias, project_compensated
+from jaxbundle.pushbroom.rpc.bias import RpcBias, project_compensated
+from jaxbundle.pushbroom.rpc.polynomials import project_points
 from jaxbundle.pushbroom.terrain import make_terrain
 from jaxbundle.refinement import HeightModel, point_rows, prior_of_bias, prior_of_errors, refine
 

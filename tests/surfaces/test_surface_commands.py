@@ -14,7 +14,7 @@ from jaxbundle.io.scanner.rpc import write_rpc
 from jaxbundle.planning.rendering import Scene, Sensor, render_rays
 from jaxbundle.planning.shapes import HeightField
 from jaxbundle.planning.texture import Texture
-from jaxbundle.pushbroom.rpc import Rpc
+from jaxbundle.pushbroom.rpc.polynomials import Rpc
 from jaxbundle.surfaces.point_files import read_cloud
 from jaxbundle.surfaces.scanner_inputs import from_map, map_coordinates
 from jaxbundle.surfaces.scanner_views import RpcView, neighbourhood

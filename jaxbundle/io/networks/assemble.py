@@ -15,7 +15,12 @@ from jaxtyping import Float
 from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.geometry.pose_conventions import exterior_from_cv
 from jaxbundle.io.networks.poses import angles_of
-from jaxbundle.io.networks.settings import SETTINGS, Document, apply_overrides, check_settings
+from jaxbundle.io.networks.settings import (
+    SETTINGS,
+    Document,
+    apply_overrides,
+    check_project_settings,
+)
 from jaxbundle.network.build import make_cameras, make_network
 from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.kinds import Rigs
@@ -70,7 +75,7 @@ def assemble(
     keys = tuple(key for key in SETTINGS if key != "image_unit")
     document = apply_overrides(document, overrides, keys)
     project = dict(document["project"])
-    check_settings(project, f"{path}: ")
+    check_project_settings(project, f"{path}: ")
     # the tables are in radians; the unit is one of the output
     angle_unit = project.pop("angle_unit", "rad")
     cameras = make_cameras(document["camera"], f"{path}, ")

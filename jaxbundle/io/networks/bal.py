@@ -36,7 +36,7 @@ from jaxbundle.io.networks.poses import (
     matrices_of_rotation_vectors,
     rotation_vectors_of,
 )
-from jaxbundle.io.networks.settings import apply_overrides, check_settings
+from jaxbundle.io.networks.settings import apply_overrides, check_project_settings
 from jaxbundle.io.text.archives import largest_unpacked_size
 from jaxbundle.io.text.csv_tables import write_bytes
 from jaxbundle.network.build import make_cameras, make_network
@@ -90,7 +90,7 @@ def read_bal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     document = foreign_document(path.name.split(".")[0], camera_entries)
     document = apply_overrides(document, overrides)
     project = document["project"]
-    check_settings(project, f"{path}: ")
+    check_project_settings(project, f"{path}: ")
     angle_unit = project.pop("angle_unit", "rad")
     return make_network(
         make_cameras(document["camera"], f"{path}, "),

@@ -30,9 +30,6 @@ from jaxtyping import Array, Float
 from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.nearest_camera import Foreign, Formula, fit_camera, fit_messages
 from jaxbundle.io.networks.assemble import assemble, entry_of, foreign_document, image_columns
-from jaxbundle.io.scanner.csm import FRAME_MODEL as MODEL
-from jaxbundle.io.scanner.csm import refuse_map
-from jaxbundle.io.scanner.csm_trajectory import pose_at_centre
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.io.text.json_fields import JsonFields, read_object
 from jaxbundle.io.text.known_keys import Keys, UnknownKeys
@@ -41,6 +38,9 @@ from jaxbundle.network.tables import Camera, Network, Source
 from jaxbundle.system.file_content import beginning
 from jaxbundle.types import Scalar
 
+# As in `io/scanner/csm.py`, which is imported on use: every command that reads a network would
+# load line scanners otherwise, a fifteenth of the time of a small adjustment.
+MODEL = "USGS_ASTRO_FRAME_SENSOR_MODEL"
 KEYS = Keys(
     (
         *("name_model", "name_sensor", "image_lines", "image_samples", "center_ephemeris_time"),
@@ -77,6 +77,9 @@ def read_csm_frame(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     **Raises:** `InputError` naming file and field: missing, not a number, a distortion without a
     camera here; for model states, maps, crops and mirror images.
     """
+    from jaxbundle.io.scanner.csm import refuse_map
+    from jaxbundle.io.scanner.csm_trajectory import pose_at_centre
+
     path = Path(path)
     text = read_text(path)
     if not text.lstrip().startswith("{"):

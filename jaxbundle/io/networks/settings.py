@@ -145,14 +145,14 @@ def network_of(
     """The network of a document and its tables; `where` is the file, for messages; `models`: own
     camera models it may name."""
     project = document["project"]
-    check_settings(project, f"{where}, [project]: ")
+    check_project_settings(project, f"{where}, [project]: ")
     settings = {key: project[key] for key in SETTINGS if key in project}
     cameras = make_cameras(document["camera"], f"{where}, ", models)
     sections = {name: document[name] for name in SECTIONS if name in document}
     return make_network(cameras, **tables, **sections, **settings)
 
 
-def check_settings(project: Mapping[str, Any], where: str) -> None:
+def check_project_settings(project: Mapping[str, Any], where: str) -> None:
     """Refuse unknown keys and impossible values of `[project]`."""
     for key, value in project.items():
         refuse_unknown(key, (*SETTINGS, *TABLES), where)

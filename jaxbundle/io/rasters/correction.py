@@ -19,7 +19,7 @@ from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.image_to_ground import locate_lines
 from jaxbundle.pushbroom.rectification import BLOCK_SIZE, MapNodes, block_places
 from jaxbundle.pushbroom.resampling import resample
-from jaxbundle.pushbroom.rpc_image import RpcImage, locate_rpc_lines
+from jaxbundle.pushbroom.rpc.image import RpcImage, locate_rpc_lines
 from jaxbundle.pushbroom.surfaces import GroundSurface
 from jaxbundle.pushbroom.terrain import Terrain
 from jaxbundle.system.programs import compile_once

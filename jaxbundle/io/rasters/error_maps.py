@@ -13,7 +13,7 @@ from jaxbundle.io.rasters.writing import write_raster
 from jaxbundle.pushbroom.ground_to_image import Search
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.rectification import MapNodes, block_errors, block_places
-from jaxbundle.pushbroom.rpc_image import RpcImage
+from jaxbundle.pushbroom.rpc.image import RpcImage
 from jaxbundle.pushbroom.surfaces import GroundSurface
 from jaxbundle.types import Progress
 

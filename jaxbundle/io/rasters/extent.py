@@ -14,8 +14,8 @@ from jaxtyping import Float
 from jaxbundle.geometry.ellipsoid import Ellipsoid, geodetic
 from jaxbundle.pushbroom.image import PushbroomImage, pose_at
 from jaxbundle.pushbroom.image_to_ground import locate_lines
-from jaxbundle.pushbroom.rpc import Rpc
-from jaxbundle.pushbroom.rpc_image import REACH
+from jaxbundle.pushbroom.rpc.image import REACH
+from jaxbundle.pushbroom.rpc.polynomials import Rpc
 from jaxbundle.pushbroom.surfaces import Height
 from jaxbundle.system.programs import compile_once
 

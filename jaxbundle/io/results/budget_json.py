@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from jaxbundle.adjustment.sensitivity import Budget
+    from jaxbundle.adjustment.error_budget import Budget
 
 
 def budget_dict(budget: "Budget") -> dict[str, Any]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from jaxbundle.io.scanner.refinement import RefineFile
 from jaxbundle.io.scanner.rpc import write_rpc
 from jaxbundle.io.scanner.writing import names_of, write_scanner_image
-from jaxbundle.pushbroom.rpc_image import RpcImage
+from jaxbundle.pushbroom.rpc.image import RpcImage
 from jaxbundle.refinement import Refinement, RpcScannerImage
 
 # Pixels that compensated coefficients may be off their bias without a warning: half of what good

@@ -27,7 +27,7 @@ from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.xml_fields import number_in
 from jaxbundle.io.writing.replacing import disk_of, replace_file
 from jaxbundle.network.columns import show
-from jaxbundle.pushbroom.rpc import TERMS, Rpc
+from jaxbundle.pushbroom.rpc.polynomials import TERMS, Rpc
 from jaxbundle.system.foreign_parsers import foreign_parser
 
 # Names in text and in RPB.

@@ -24,13 +24,13 @@ from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.image import PushbroomImage
-from jaxbundle.pushbroom.rpc import Rpc
-from jaxbundle.pushbroom.rpc_agreement import (
+from jaxbundle.pushbroom.rpc.agreement import (
     CORRECTION_SETS,
     SUBPIXEL,
     Agreement,
     compare_with_rpc,
 )
+from jaxbundle.pushbroom.rpc.polynomials import Rpc
 
 
 def check_against_rpc(scanner: ScannerInput, path: Path, choose: bool = True) -> ScannerInput:

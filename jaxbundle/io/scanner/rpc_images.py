@@ -16,8 +16,8 @@ from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid
 from jaxbundle.io.rasters.reading import check_raw, open_raster
 from jaxbundle.io.scanner.rpc import RASTERS, read_rpc
 from jaxbundle.io.text.xml_fields import read_xml
-from jaxbundle.pushbroom.rpc import Rpc
-from jaxbundle.pushbroom.rpc_image import RpcImage
+from jaxbundle.pushbroom.rpc.image import RpcImage
+from jaxbundle.pushbroom.rpc.polynomials import Rpc
 from jaxbundle.system.file_content import missing
 
 IMAGES = (*RASTERS, ".jp2", ".png", ".jpg")

@@ -16,7 +16,7 @@ from typing import Any
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.xml_fields import XmlFields, number_in, read_xml
 from jaxbundle.network.columns import show
-from jaxbundle.pushbroom.rpc import TERMS
+from jaxbundle.pushbroom.rpc.polynomials import TERMS
 
 AXES = {
     "line": "line",

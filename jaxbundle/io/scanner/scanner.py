@@ -4,7 +4,7 @@ import dataclasses
 
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.pushbroom.image import PushbroomImage
-from jaxbundle.pushbroom.rpc_agreement import Agreement
+from jaxbundle.pushbroom.rpc.agreement import Agreement
 
 
 @dataclasses.dataclass(frozen=True)

@@ -50,6 +50,8 @@ def move_into_datum(
     """`datum.move_to_datum` by Gauss–Newton steps only."""
     if plan.datum is None:
         return values, True
+    if plan.datum.turned:
+        start = _turn_start(declared, plan, values, start)
     if plan.datum.held:
         held = directions_of_motions(declared, {name: values[name] for name in plan.datum.held})
         plan = _keep_held_fixed(declared, plan, values, held)
@@ -130,5 +132,6 @@ def _of_rows(program: Callable, *given: Any) -> Any:
 
 _generators = compile_once(datum.generators)
 _keep_held_fixed = compile_once(datum.keep_held_fixed)
+_turn_start = compile_once(datum.turn_start)
 _free = compile_once(datum.free_of_tables)
 _move_at_once = compile_once(move_at_once)

@@ -12,23 +12,32 @@ unknowns,
 B = G on the datum rows for inner constraints (trace of their covariance smallest), B = as many
 single unknowns as the defect for a minimal datum. After convergence the whole problem is moved by
 finite open motions so that Bᵀ(x − x_start) = 0 holds exactly: the result does not depend on the
-path of the iterations. (Conditions imposed on every step instead let far points pull the whole
-problem: BAL 49 then needed 100 evaluations to reach ½vᵀPv = 13345.3, instead of 22.)
+path of the iterations. Where observations determine the rotation and not the scale, x_start is
+turned with the problem (`turn_start`). (Conditions imposed on every step instead let far points
+pull the whole problem: BAL 49 then needed 100 evaluations to reach ½vᵀPv = 13345.3, instead of 22.)
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxbundle.geometry.quaternions import (
+    matrix_from_rotation_vector,
+    rotation_vector_from_matrix,
+)
 from jaxbundle.implicit import implicit_root, solve_dense
+from jaxbundle.leastsquares.datum.motions import JointMotion
 from jaxbundle.leastsquares.equations.normal import Tangent, total
 from jaxbundle.leastsquares.indexing.plan import Datum, Plan
 from jaxbundle.leastsquares.indexing.rows import Declared, Values
+from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.types import AnyArray, Scalar, present
 
 # Smallest relative motion of datum unknowns that fix the datum. Below about 1e-8, √ε, the Gram
@@ -182,6 +191,7 @@ def move_to_datum(
     `by_table.move_into_datum`). Iterated until a step is rounding (`MotionSettings.reached`)."""
     if plan.datum is None:
         return values, jnp.asarray(True)
+    start = turn_start(declared, plan, values, start)
     plan = keep_held_fixed(declared, plan, values)
     datum = present(plan.datum)
     still, curved = jnp.zeros(datum.gauge.shape[1]), present(declared.motions).curved
@@ -207,6 +217,56 @@ def move_to_datum(
     begin = values, jnp.asarray(1e300), jnp.asarray(jnp.inf), 0
     values, distance, *_ = jax.lax.while_loop(moving, further, begin)
     return values, distance <= DATUM_MOTION.reached * size
+
+
+def turn_start(declared: Declared, plan: Plan, values: Values, start: Values) -> Values:
+    """The start values turned about their centroid as the observations have turned the problem,
+    where these determine its rotation, and its scale is open.
+
+    Otherwise the condition of the scale, Σ x·(x − x_start) = 0, gives the size |x_start|·cos θ to a
+    problem that is turned by θ, and to one turned by more than a right angle the size 0. The turn
+    is the best one, Σ x × (R·x_start) = 0 (Arun, Huang and Blostein 1987); a function of both that
+    is differentiable to any order."""
+    datum = present(plan.datum)
+    if not datum.turned:
+        return start
+    X, X0, p = (jnp.concatenate(parts) for parts in zip(*_datum_places(datum, values, start)))
+    centre, centre0 = (p @ x / p.sum() for x in (X, X0))
+
+    def misalignment(
+        turn: Float[Array, "3"], weight: Float[Array, " n"], given: tuple[Array, Array]
+    ) -> Float[Array, "3"]:
+        Y, Y0 = given
+        return weight @ jnp.cross(Y0 @ matrix_from_rotation_vector(turn).T, Y)
+
+    given = X - centre, X0 - centre0
+    Y, Y0 = stop_gradient(given)
+    U, _, Vt = jnp.linalg.svd((Y * p[:, None]).T @ Y0)
+    # no reflection
+    R = (U * jnp.stack([1.0, 1.0, jnp.sign(jnp.linalg.det(U @ Vt))])) @ Vt
+    turn = implicit_root(
+        misalignment, solve_dense, stop_gradient(rotation_vector_from_matrix(R)), p, given
+    )
+    # Where no shift is open, the centroid too is where the observations have it.
+    to = centre if datum.gauge.shape[1] == 1 else centre0
+    shift = to - matrix_from_rotation_vector(turn) @ centre0
+    motion = jnp.concatenate([shift, turn, jnp.zeros(1)])
+    turned = dict(start)
+    for name, act in present(declared.motions).actions:
+        if name in start:
+            move = act.move if isinstance(act, JointMotion) else act
+            turned[name] = jax.vmap(partial(move, motion))(start[name])
+    return turned
+
+
+def _datum_places(
+    datum: Datum, values: Values, start: Values
+) -> Iterator[tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, " n"]]]:
+    """Of every table of datum unknowns: places, those of the start values, and whether they are
+    datum unknowns."""
+    for name, weight in datum.weight.items():
+        place = lambda x: x.position if isinstance(x, PoseValue) else jax.tree.leaves(x)[0]
+        yield place(values[name]), place(start[name]), jnp.where(weight[:, :3].max(1) > 0, 1.0, 0.0)
 
 
 def moves_on(
@@ -288,6 +348,7 @@ def attach_motion(declared: Declared, plan: Plan, values: Values, start: Values)
     that is differentiable to any order."""
     if plan.datum is None:
         return values
+    start = turn_start(declared, plan, values, start)
     still, fixed = jnp.zeros(plan.datum.gauge.shape[1]), (declared, plan)
 
     def along(tau: Float[Array, " defect"], of: Values, values: Values) -> Values:

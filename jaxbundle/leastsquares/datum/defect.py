@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.datum.by_table import directions_of_motions
 from jaxbundle.leastsquares.datum.conditions import MIN_RELATIVE_MOTION, free_of_tables, of_groups
+from jaxbundle.leastsquares.datum.motions import ROTATION, SCALE, SEVEN
 from jaxbundle.leastsquares.equations.linearise import differentiate
 from jaxbundle.leastsquares.equations.normal import Tangent
 from jaxbundle.leastsquares.indexing.plan import Datum, Plan
@@ -176,7 +177,23 @@ def make_datum(
     pins = _choose_pins(plan, along({name: survey.of_groups[name] for name in plan.kept}))
     held = {t: (1 - free[t]) * real[t][:, None] for t, rows in moves.items() if rows.any()}
     held = {t: mask for t, mask in held.items() if mask.any()}
-    return Datum(*jax.device_put((gauge, weight, pins, held)))
+    turned = _leaves_scale_only(survey.moves, gauge, weight)
+    return Datum(*jax.device_put((gauge, weight, pins, held)), turned)
+
+
+def _leaves_scale_only(
+    moves: Tangent, gauge: Float[np.ndarray, "motions defect"], weight: dict[str, np.ndarray]
+) -> bool:
+    """Whether the open motions of a similarity scale the datum unknowns, and turn none of them."""
+    if len(gauge) != len(SEVEN):
+        return False
+
+    def size(motions: slice) -> float:
+        parts = [np.asarray(moves[t])[..., motions] @ gauge[motions] for t in weight]
+        known = [weight[t][..., None] * part for t, part in zip(weight, parts)]
+        return max(float(np.nanmax(abs(part), initial=0.0)) for part in known)
+
+    return size(SCALE) > 0 and size(ROTATION) <= MIN_RELATIVE_MOTION * size(SCALE)
 
 
 def _choose_pins(

@@ -21,6 +21,7 @@ from jaxbundle.leastsquares.spaces import Pose, PoseValue, Vector
 from jaxbundle.types import AnyArray
 
 SEVEN = ("shift X", "shift Y", "shift Z", "rotation X", "rotation Y", "rotation Z", "scale")
+ROTATION, SCALE = slice(3, 6), slice(6, 7)
 
 
 # For integrals from −1 to 1.

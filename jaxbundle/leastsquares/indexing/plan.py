@@ -125,12 +125,15 @@ class Datum(eqx.Module):
     """The datum of a problem that may float (`datum/conditions.py`): the open motions as
     combinations of all (`gauge`); the datum unknowns (`weight`, by table); elements of the reduced
     matrix that make it regular (`pins`); by table, the held ones among the unknowns moved by the
-    motions (`held`, 1 or 0; only tables with held unknowns)."""
+    motions (`held`, 1 or 0; only tables with held unknowns). `turned`: the scale is open and the
+    rotation is not, so that the start values are turned with the problem
+    (`conditions.turn_start`)."""
 
     gauge: Float[Array, "motions defect"]
     weight: dict[str, Float[Array, "rows width"]]
     pins: dict[str, Float[Array, "rows w"]]
     held: dict[str, Float[Array, "rows width"]]
+    turned: bool = eqx.field(static=True, default=False)
 
 
 class Plan(eqx.Module):

@@ -71,6 +71,7 @@ class Attitudes(Further):
 
     TABLE, SECTION, IMAGES = "attitudes", SECTION, ("image",)
     MEASURED = "angles"
+    ANGLES_IN_SETTINGS = True
 
     @classmethod
     def from_columns(

@@ -62,6 +62,8 @@ class Further(abc.ABC):
     """The field of measurements; none for conditions."""
     GIVES_SCALE: ClassVar[bool] = False
     """Whether the rows may contain lengths that give a network its scale."""
+    ANGLES_IN_SETTINGS: ClassVar[bool] = False
+    """Whether `settings` hold angles, which are in the unit of the network."""
 
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     source: Source = Source("table")

@@ -111,6 +111,7 @@ class Rigs(Further):
     image: tuple[str, ...]
 
     TABLE, SECTION, IMAGES = "rigs", SECTION, ("image",)
+    ANGLES_IN_SETTINGS = True
 
     @classmethod
     def from_columns(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Rigs":

@@ -8,7 +8,7 @@ from jaxbundle.report.page.document import Section
 from jaxbundle.report.page.markup import grid, paragraph
 
 if TYPE_CHECKING:
-    from jaxbundle.adjustment.sensitivity import Budget
+    from jaxbundle.adjustment.error_budget import Budget
 
 
 def describe_budget(budget: "Budget | None") -> Addition:

@@ -13,7 +13,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxbundle.geometry.ellipsoid import WGS84, earth_fixed, geodetic
 from jaxbundle.geometry.vectors import difference, dot, length
-from jaxbundle.pushbroom.rpc import Rpc, fit_inverse, locate_on, normalise, project, sight
+from jaxbundle.pushbroom.rpc.polynomials import (
+    Rpc,
+    fit_inverse,
+    locate_on,
+    normalise,
+    project,
+    sight,
+)
 from jaxbundle.pushbroom.surfaces import GroundSurface
 from jaxbundle.types import AnyArray, Scalar
 

@@ -27,8 +27,8 @@ from jaxbundle.float64 import require_x64
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, earth_fixed, geodetic
 from jaxbundle.geometry.vectors import Vector, along
 from jaxbundle.network.tables import Source
-from jaxbundle.pushbroom.rpc import DOMAIN_MARGIN, Rpc, Scalar, project, project_points
-from jaxbundle.pushbroom.rpc_fit import RpcCheck, RpcTable, check_rpc, fit_rpc
+from jaxbundle.pushbroom.rpc.fitting import RpcCheck, RpcTable, check_rpc, fit_rpc
+from jaxbundle.pushbroom.rpc.polynomials import DOMAIN_MARGIN, Rpc, Scalar, project, project_points
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 

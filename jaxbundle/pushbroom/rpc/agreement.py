@@ -15,7 +15,7 @@ from jaxbundle.geometry.ellipsoid import WGS84, geodetic
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.image import LinePose, PushbroomImage, pose_at
 from jaxbundle.pushbroom.image_to_ground import ground_point
-from jaxbundle.pushbroom.rpc import Rpc, project
+from jaxbundle.pushbroom.rpc.polynomials import Rpc, project
 from jaxbundle.pushbroom.scanner import slopes_of
 from jaxbundle.pushbroom.surfaces import Height
 from jaxbundle.types import AnyArray

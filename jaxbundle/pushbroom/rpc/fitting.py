@@ -39,7 +39,7 @@ from jaxbundle.geometry.ellipsoid import Ellipsoid, geodetic
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.image_to_ground import locate_points
-from jaxbundle.pushbroom.rpc import TERMS, Rpc, monomials, project_points
+from jaxbundle.pushbroom.rpc.polynomials import TERMS, Rpc, monomials, project_points
 from jaxbundle.pushbroom.surfaces import Height
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, Scalar

@@ -17,7 +17,11 @@ from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.columns import count
 from jaxbundle.network.tables import Network
 from jaxbundle.network.undetermined import count_controlled_axes
-from jaxbundle.orientation.conventions import EXPECTED_CONVENTION, explains_better, image_frame
+from jaxbundle.orientation.image_conventions import (
+    EXPECTED_CONVENTION,
+    explains_better,
+    image_frame,
+)
 from jaxbundle.orientation.network import lacks_start_values
 
 REMEDY = (

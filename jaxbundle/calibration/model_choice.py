@@ -32,7 +32,7 @@ from jaxtyping import Bool, Float
 
 from jaxbundle import plotting
 from jaxbundle.adjustment.adjust import adjust
-from jaxbundle.adjustment.quality.calibration_difference import expected_difference
+from jaxbundle.adjustment.quality.expected_difference import expected_difference
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.arguments import integer, show
 from jaxbundle.calibration.calibrate import calibrate, check_model, views_of
