@@ -45,6 +45,10 @@ _HOME = {
         "Budget",
         "sensitivity",
     ),
+    "jaxbundle.adjustment.uncertainty_budget": (
+        "UncertaintyBudget",
+        "uncertainty_budget",
+    ),
     "jaxbundle.calibration": (
         "Board",
         "BoardViews",
@@ -54,8 +58,25 @@ _HOME = {
         "calibrate_cameras",
         "calibrate_rig",
     ),
+    "jaxbundle.calibration.as_opencv": ("calibrate_opencv",),
     "jaxbundle.calibration.stability": ("Stability",),
     "jaxbundle.cameras": ("CameraModel",),
+    "jaxbundle.certificates.acceptance": (
+        "Acceptance",
+        "accept",
+    ),
+    "jaxbundle.certificates.document": (
+        "Certificate",
+        "certificate",
+    ),
+    "jaxbundle.certificates.lengths": (
+        "LengthTest",
+        "length_errors",
+    ),
+    "jaxbundle.certificates.positional": (
+        "PositionalAccuracy",
+        "positional_accuracy",
+    ),
     "jaxbundle.commands.batch_run": (
         "BatchRun",
         "batch",
@@ -93,6 +114,10 @@ _HOME = {
         "convert",
         "read_network",
         "write_project",
+    ),
+    "jaxbundle.io.networks.pycolmap_objects": (
+        "from_pycolmap",
+        "to_pycolmap",
     ),
     "jaxbundle.leastsquares": (
         "Data",

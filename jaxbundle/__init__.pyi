@@ -4,6 +4,7 @@ from jaxbundle import adjustment as adjustment
 from jaxbundle import batches as batches
 from jaxbundle import calibration as calibration
 from jaxbundle import cameras as cameras
+from jaxbundle import certificates as certificates
 from jaxbundle import cli as cli
 from jaxbundle import commands as commands
 from jaxbundle import explorer as explorer
@@ -41,6 +42,8 @@ from jaxbundle.adjustment.quality.precision import redundancy as redundancy
 from jaxbundle.adjustment.replicate import Replication as Replication
 from jaxbundle.adjustment.replicate import replicate as replicate
 from jaxbundle.adjustment.result import Adjustment as Adjustment
+from jaxbundle.adjustment.uncertainty_budget import UncertaintyBudget as UncertaintyBudget
+from jaxbundle.adjustment.uncertainty_budget import uncertainty_budget as uncertainty_budget
 from jaxbundle.batches.calibrate import BatchCalibration as BatchCalibration
 from jaxbundle.batches.calibrate import calibrate_batch as calibrate_batch
 from jaxbundle.batches.calibrate_rigs import RigBatch as RigBatch
@@ -52,8 +55,17 @@ from jaxbundle.calibration import RigCalibration as RigCalibration
 from jaxbundle.calibration import calibrate as calibrate
 from jaxbundle.calibration import calibrate_cameras as calibrate_cameras
 from jaxbundle.calibration import calibrate_rig as calibrate_rig
+from jaxbundle.calibration.as_opencv import calibrate_opencv as calibrate_opencv
 from jaxbundle.calibration.stability import Stability as Stability
 from jaxbundle.cameras import CameraModel as CameraModel
+from jaxbundle.certificates.acceptance import Acceptance as Acceptance
+from jaxbundle.certificates.acceptance import accept as accept
+from jaxbundle.certificates.document import Certificate as Certificate
+from jaxbundle.certificates.document import certificate as certificate
+from jaxbundle.certificates.lengths import LengthTest as LengthTest
+from jaxbundle.certificates.lengths import length_errors as length_errors
+from jaxbundle.certificates.positional import PositionalAccuracy as PositionalAccuracy
+from jaxbundle.certificates.positional import positional_accuracy as positional_accuracy
 from jaxbundle.commands.batch_run import BatchRun as BatchRun
 from jaxbundle.commands.batch_run import batch as batch
 from jaxbundle.commands.cameras import CameraDescription as CameraDescription
@@ -76,6 +88,8 @@ from jaxbundle.float64 import enable_x64 as enable_x64
 from jaxbundle.io import convert as convert
 from jaxbundle.io import read_network as read_network
 from jaxbundle.io import write_project as write_project
+from jaxbundle.io.networks.pycolmap_objects import from_pycolmap as from_pycolmap
+from jaxbundle.io.networks.pycolmap_objects import to_pycolmap as to_pycolmap
 from jaxbundle.leastsquares import Data as Data
 from jaxbundle.leastsquares import Problem as Problem
 from jaxbundle.leastsquares import Values as Values
@@ -106,6 +120,7 @@ from jaxbundle.system.progress import show_progress as show_progress
 __version__: str
 
 __all__ = [
+    "Acceptance",
     "Adjustment",
     "AdjustmentComparison",
     "Aim",
@@ -119,16 +134,19 @@ __all__ = [
     "Camera",
     "CameraDescription",
     "CameraModel",
+    "Certificate",
     "CloudResult",
     "Conditions",
     "Data",
     "Design",
     "Influence",
     "InputError",
+    "LengthTest",
     "Network",
     "NotSolvedError",
     "Oriented",
     "PlannedBlock",
+    "PositionalAccuracy",
     "Precision",
     "Problem",
     "Reconstruction",
@@ -137,7 +155,9 @@ __all__ = [
     "RigCalibration",
     "Stability",
     "Surface",
+    "UncertaintyBudget",
     "Values",
+    "accept",
     "add_further",
     "adjust",
     "aerial_block",
@@ -145,9 +165,11 @@ __all__ = [
     "calibrate",
     "calibrate_batch",
     "calibrate_cameras",
+    "calibrate_opencv",
     "calibrate_rig",
     "calibrate_rigs",
     "camera",
+    "certificate",
     "check_gradients",
     "check_network",
     "cloud",
@@ -158,15 +180,18 @@ __all__ = [
     "enable_x64",
     "example",
     "explore",
+    "from_pycolmap",
     "grid_of_targets",
     "influence",
     "join_processes",
     "keep_programs",
+    "length_errors",
     "load_adjustment",
     "make_network",
     "make_problem",
     "orient",
     "plan",
+    "positional_accuracy",
     "precision",
     "read_network",
     "reconstruct",
@@ -182,6 +207,8 @@ __all__ = [
     "stability",
     "stations_looking_at",
     "surface",
+    "to_pycolmap",
+    "uncertainty_budget",
     "use_cores",
     "write_project",
 ]

@@ -72,12 +72,22 @@ def test_coming_from(views):
     page = run_page(
         "howto/coming_from", objpoints=[board] * 5, imgpoints=images, image_size=SIZE
     )
-    values = dict(zip(page["found"].parameters, page["found"].values[0]))
-    assert [values[n] for n in ("fx", "fy", "cx", "cy", "k1")] == pytest.approx(
+    K = page["K"]
+    assert [K[0, 0], K[1, 1], K[0, 2], K[1, 2], page["dist"][0, 0]] == pytest.approx(
         [1600, 1610, 961, 541, -0.2], rel=1e-3
     )
-    assert page["tvecs"] == pytest.approx(shifts, abs=1e-4)
-    assert page["R"][1] == pytest.approx(cv2.Rodrigues(turns[1])[0], abs=1e-4)
+    assert np.squeeze(page["tvecs"]) == pytest.approx(shifts, abs=1e-4)
+    R = cv2.Rodrigues(page["rvecs"][1])[0]
+    assert cv2.Rodrigues(turns[1])[0] == pytest.approx(R, abs=1e-4)
+
+
+@pytest.mark.further
+def test_certificate(tmp_path, monkeypatch):
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    monkeypatch.chdir(tmp_path)  # it writes a page
+    page = run_page("certificate")
+    assert page["found"].met and page["test"].verdict == "conformity proven"
+    assert (tmp_path / "certificate.html").read_text("utf-8").startswith("<!doctype html>")
 
 
 @pytest.mark.further

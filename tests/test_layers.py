@@ -38,6 +38,7 @@ LAYERS = (
     "tiepoints",
     "reconstruction",
     "calibration",
+    "certificates",
     "explorer",
     "commands",
     "cli",

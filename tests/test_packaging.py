@@ -122,3 +122,99 @@ def test_the_demo_installs_what_it_needs_alone(tmp_path):
         [make, "install-demo", f"VENV={tmp_path}"], cwd=ROOT, capture_output=True, text=True,
         check=True,
     ).stdout  # fmt: skip
+
+
+# --- workflows, recipe, images --------------------------------------------------------------
+
+
+def test_addresses_are_in_one_place():
+    """To be set at publication in pyproject.toml; the recipe takes them from there."""
+    hosts = {re.match(r"https://[^/]+", url)[0] for url in PROJECT["urls"].values()}
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
+    if listed.returncode:
+        pytest.skip("no repository")
+    for name in listed.stdout.splitlines():
+        path = ROOT / name
+        if name == "pyproject.toml" or not path.is_file():
+            continue
+        content = path.read_bytes()
+        for host in hosts:
+            assert host.encode() not in content, name
+
+
+def test_workflows_are_valid_and_test_every_python():
+    yaml = pytest.importorskip("yaml")
+    pythons = set()
+    for path in sorted((ROOT / ".github" / "workflows").glob("*.yml")):
+        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+        assert document["permissions"] == {"contents": "read"}, path
+        assert True in document or "on" in document  # YAML 1.1 reads "on" as a truth
+        for name, job in document["jobs"].items():
+            assert job["steps"] and job["runs-on"], (path.name, name)
+            for need in [job["needs"]] if isinstance(job.get("needs"), str) else []:
+                assert need in document["jobs"]
+            for step in job["steps"]:
+                assert ("run" in step) != ("uses" in step), (path.name, step)
+                assert "@" in step.get("uses", "@")
+            pythons |= {*job.get("strategy", {}).get("matrix", {}).get("python", [])}
+    first = int(PROJECT["requires-python"].removeprefix(">=3."))
+    assert pythons == {f"3.{minor}" for minor in range(first, 15)}
+
+
+def test_workflows_run_tests_that_are_there():
+    text = (ROOT / ".github" / "workflows" / "tests.yml").read_text(encoding="utf-8")
+    named = re.findall(r"\btests/[\w/.]+", text)
+    assert len(named) > 10 and all((ROOT / name).exists() for name in named)
+    extras = {word for group in re.findall(r'"\.\[([\w,]+)\]"', text) for word in group.split(",")}
+    assert extras <= {*PROJECT["optional-dependencies"]}
+
+
+def rendered_recipe() -> dict:
+    """The conda recipe as conda-build's templates give it (functions load_file_data,
+    load_file_regex)."""
+    jinja2, yaml = pytest.importorskip("jinja2"), pytest.importorskip("yaml")
+    folder = ROOT / "packaging" / "conda"
+
+    def load_file_data(name, from_recipe_dir):
+        assert from_recipe_dir
+        return tomllib.loads((folder / name).read_text(encoding="utf-8"))
+
+    def load_file_regex(load_file, regex_pattern, from_recipe_dir):
+        assert from_recipe_dir
+        return re.search(regex_pattern, (folder / load_file).read_text(encoding="utf-8"))
+
+    text = (folder / "meta.yaml").read_text(encoding="utf-8")
+    template = jinja2.Environment().from_string(text)
+    return yaml.safe_load(
+        template.render(
+            load_file_data=load_file_data, load_file_regex=load_file_regex, PYTHON="python"
+        )
+    )
+
+
+def test_the_recipe_of_conda_is_pyproject_toml():
+    recipe = rendered_recipe()
+    assert recipe["package"] == {"name": PROJECT["name"], "version": __version__}
+    run = recipe["requirements"]["run"]
+    assert run[0] == f"python {PROJECT['requires-python']}"
+    assert len(run) == 1 + len(PROJECT["dependencies"])
+    assert "python-flatbuffers >=24.3.25" in run and "jax >=0.10" in run
+    assert recipe["build"]["entry_points"] == ["jaxbundle = jaxbundle.__main__:main"]
+    assert recipe["about"]["dev_url"] == PROJECT["urls"]["Source"]
+    assert (ROOT / recipe["about"]["license_file"]).is_file()
+    assert recipe["build"]["script"].startswith("python -m pip install . --no-deps")
+
+
+@pytest.mark.parametrize("name", ["Dockerfile", "Dockerfile.cuda"])
+def test_images_take_what_the_build_needs(name):
+    lines = (ROOT / "packaging" / name).read_text(encoding="utf-8").splitlines()
+    copied = {source for line in lines if line.startswith("COPY") for source in line.split()[1:-1]}
+    built = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]
+    included = {path.split("/")[0] for path in built["targets"]["wheel"]["force-include"]}
+    assert copied >= {"pyproject.toml", PROJECT["readme"], *PROJECT["license-files"], *included}
+    assert copied >= {*built["targets"]["wheel"]["packages"]}
+    kept = (ROOT / ".dockerignore").read_text().splitlines()
+    assert {f"!{one}" for one in copied} <= {*kept}
+    (extras,) = re.findall(r'"/source\[([\w,]+)\]"', "\n".join(lines))
+    assert {*extras.split(",")} <= {*PROJECT["optional-dependencies"]}
+    assert lines[-2:] == ['ENTRYPOINT ["jaxbundle"]', 'CMD ["--help"]']

@@ -20,8 +20,10 @@ SHELL_ONLY = {"completion"}
 PRESENTATION = {
     "brief", "browser", "csv", "force", "html", "json", "out", "plot", "plots", "quiet", "save",
     "verbose",
+    # jaxbundle.accept and jaxbundle.certificate of the result
+    "accept", "certificate", "details", "lengths",
 }  # fmt: skip
-"""Options about files and screen, for which a result has methods."""
+"""Options about files and screen, for which a result has methods or functions."""
 
 
 @pytest.mark.parametrize("command", sorted({*cli.COMMANDS} - SHELL_ONLY - {"pushbroom"}))

@@ -13,6 +13,8 @@ from jaxbundle.results import ReportedResult
 
 METHODS = ("converged", "report", "to_dict", "save", "_repr_html_")
 CLASSES = (
+    jaxbundle.Acceptance, jaxbundle.Certificate, jaxbundle.LengthTest,
+    jaxbundle.PositionalAccuracy, jaxbundle.UncertaintyBudget,
     jaxbundle.Adjustment, jaxbundle.AdjustmentComparison, jaxbundle.BatchCalibration,
     jaxbundle.BatchRun, jaxbundle.Budget, jaxbundle.Calibration, jaxbundle.CalibrationComparison,
     jaxbundle.CameraDescription, jaxbundle.CloudResult, jaxbundle.Design, jaxbundle.Influence,
@@ -44,6 +46,8 @@ def examples(convergent4):
     )
     yield convergent4
     yield jaxbundle.compare(convergent4, convergent4)
+    yield jaxbundle.accept(convergent4, "sigma0 < 1.2")
+    yield jaxbundle.uncertainty_budget(convergent4, "camera:cam:c")
     yield jaxbundle.camera(camera(k1=-0.1))
     yield jaxbundle.compare(camera(), camera(fx=801.0))
     yield jaxbundle.compare((camera(), C), (camera(fx=801.0), C))

@@ -40,6 +40,7 @@ from jaxbundle.report.page import (
     give_verdict,
     write,
 )
+from jaxbundle.report.page.adjustment import NO_ADDITION
 from jaxbundle.report.page.charts import Curve, draw_curves, draw_field
 from jaxbundle.report.page.columns import Column, estimates, numbers
 from jaxbundle.report.page.markup import facts, figure, grid, paragraph, text
@@ -57,22 +58,31 @@ KIND = "calibration of cameras"
 
 
 def compose_calibrations(
-    found: "Calibrations", origin: Origin = UNKNOWN, choice: "ModelComparison | None" = None
+    found: "Calibrations",
+    origin: Origin = UNKNOWN,
+    choice: "ModelComparison | None" = None,
+    also: Addition = NO_ADDITION,
 ) -> Iterator[str]:
     """The page of one calibration, or the common page of several, with the rig.
 
-    **Arguments:** `found`: `Calibrations`; `choice`: the underlying comparison of models.
+    **Arguments:** `found`: `Calibrations`; `choice`: the underlying comparison of models; `also`:
+    further findings and sections.
     """
     if len(found.cameras) == 1:
-        return compose_calibration(next(iter(found.cameras.values())), origin, choice)
-    return write(_describe_several(found, origin))
+        return compose_calibration(next(iter(found.cameras.values())), origin, choice, also)
+    return write(_describe_several(found, origin, also))
 
 
 def compose_calibration(
-    calibration: "Calibration", origin: Origin = UNKNOWN, choice: "ModelComparison | None" = None
+    calibration: "Calibration",
+    origin: Origin = UNKNOWN,
+    choice: "ModelComparison | None" = None,
+    also: Addition = NO_ADDITION,
 ) -> Iterator[str]:
-    """The page of one camera: that of its adjustment, and its accuracy."""
-    return compose(calibration.adjustment, origin, also=_describe_one(calibration, choice))
+    """The page of one camera: that of its adjustment, and its accuracy; `also`: further findings
+    and sections."""
+    own = _describe_one(calibration, choice).followed_by(also)
+    return compose(calibration.adjustment, origin, also=own)
 
 
 def _describe_one(calibration: "Calibration", choice: "ModelComparison | None" = None) -> Addition:
@@ -179,7 +189,7 @@ def _models(choice: "ModelComparison") -> Section:
     return Section("models", "Camera models compared", "".join(parts), "Models")
 
 
-def _describe_several(found: "Calibrations", origin: Origin) -> Page:
+def _describe_several(found: "Calibrations", origin: Origin, also: Addition) -> Page:
     """The common page: the verdict, the rig, the parameters of all."""
     sections, tables = [], {"cameras": _table_of_cameras(found)}
     rig = found.rig
@@ -199,8 +209,9 @@ def _describe_several(found: "Calibrations", origin: Origin) -> Page:
                 sections.append(_quality(one.coverage, maps, _unit(one), name, number))
     more = paragraph("Every camera has its own page in its folder of --out.")
     title = f"{KIND.capitalize()} {', '.join(map(clean, found.cameras))}"
-    first = give_verdict(conclude_calibrations(found).findings, (), more)
-    return Page(title, [first, *sections], origin, tables=tables)
+    findings = [*conclude_calibrations(found).findings, *also.findings]
+    first = give_verdict(findings, (), more)
+    return Page(title, [first, *also.sections, *sections], origin, tables=tables)
 
 
 def _rig(rig: "RigCalibration", unit: str) -> Section:

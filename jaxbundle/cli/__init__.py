@@ -4,7 +4,8 @@ Help, version and usage errors take 0.3 s because they do not import JAX: a comm
 at the top only what its arguments and options need, and the other subpackages in the first lines of
 its functions. Functions that share such imports are in a separate file.
 
-Exit status: 0 solved; 2 bad input (one line, nothing written); 3 not solved (with the reason); 130,
+Exit status: 0 solved; 2 bad input (one line, nothing written); 3 not solved (with the reason); 4 a
+criterion of `--accept` is not met; 130,
 143, 129 ended by Ctrl-C, SIGTERM, a lost terminal (`system.interrupts`); 141 closed pipe.
 """
 

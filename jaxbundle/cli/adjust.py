@@ -20,7 +20,16 @@ from jaxbundle.cli.app import (
     app,
     choice,
 )
+from jaxbundle.cli.certificate_options import (
+    Accept,
+    CertificateFile,
+    CertificateOptions,
+    Details,
+    Lengths,
+)
 from jaxbundle.cli.common_options import is_in_file
+from jaxbundle.cli.gis_output import Crs, Gis, check_gis, write_gis
+from jaxbundle.cli.judging import judge_of
 from jaxbundle.errors import InputError, NotSolvedError
 
 
@@ -76,6 +85,12 @@ def adjust(  # noqa: PLR0913 - the options of the command
             "point:*:Z; repeatable",
         ),
     ] = None,
+    accept: Accept = None,
+    certificate: CertificateFile = "",
+    details: Details = None,
+    lengths: Lengths = None,
+    gis: Gis = "",
+    crs: Crs = "",
     brief: Annotated[
         bool, typer.Option("--brief", help="omit points and residuals from the JSON")
     ] = False,
@@ -94,10 +109,17 @@ def adjust(  # noqa: PLR0913 - the options of the command
     ] = False,
 ) -> None:
     """Adjust a network and report it."""
-    from jaxbundle import report
     from jaxbundle.adjustment.error_budget import sensitivity
     from jaxbundle.cli.budget_option import held_of
-    from jaxbundle.cli.outputs import check_targets, trace_origin, why_not, write_targets
+    from jaxbundle.cli.outputs import (
+        BudgetSupplement,
+        check_targets,
+        network_files,
+        report_with,
+        trace_origin,
+        why_not,
+        write_targets,
+    )
     from jaxbundle.cli.processes import join_for_one_task
     from jaxbundle.cli.progress import iterating, staging
     from jaxbundle.io import read_network
@@ -108,6 +130,7 @@ def adjust(  # noqa: PLR0913 - the options of the command
     from jaxbundle.system.clock import in_words, now
 
     jaxbundle.use_cores(cores)
+    judged = CertificateOptions(accept, certificate, details, lengths)
     print_report = json != "-" and not (quiet and is_in_file(json, out, html, save))
     if join or cluster:
         if json in ("-", "/dev/stdout", "/dev/fd/1"):
@@ -139,6 +162,7 @@ def adjust(  # noqa: PLR0913 - the options of the command
         if not first:
             # only the first process writes, though all compute
             json, out, html, save, quiet, print_report = "", None, "", "", True, False
+            judged, gis, crs = CertificateOptions(), "", ""
     network = read_network(input, format=format, overrides=tuple(set or ()), control=control)
     if check:
         network = network.replace(points=select_checks(network.points, check))
@@ -146,9 +170,20 @@ def adjust(  # noqa: PLR0913 - the options of the command
     held = held_of(budget, network)
     # before an adjustment that may take hours
     check_targets(input, network, json, out, control, force, html, save)
+    files = network_files(input, network, control)
+    check_gis(gis, crs, files, force)
+    judge = judge_of(
+        "adjust",
+        judged,
+        {"--json": json, "--html": html, "--save": save},
+        out,
+        files,
+        network=network,
+        force=force,
+    )
     origin = Origin(computed=in_words(now()))
     # fingerprints read all files once more: only for outputs that state them
-    if html or out is not None:
+    if html or certificate or out is not None:
         origin = trace_origin(
             input,
             network,
@@ -165,6 +200,7 @@ def adjust(  # noqa: PLR0913 - the options of the command
                 "--correlated": correlated,
                 "--no-second-minimum": not second_minimum,
                 "--budget": ", ".join(budget or ()),
+                **judged.settings,
             },
         )
     try:
@@ -187,13 +223,18 @@ def adjust(  # noqa: PLR0913 - the options of the command
         write_targets(error, json, out, brief, plots, force, html, origin)
         raise
     found = sensitivity(result, held) if held and result.converged else None
+    judgement = judge.judge(result, origin)
+    more = BudgetSupplement(found, judgement)
     with staging(quiet or json == "-") as show:
-        write_targets(result, json, out, brief, plots, force, html, origin, found, show)
+        write_targets(result, json, out, brief, plots, force, html, origin, more, show)
+        judge.write(judgement)
+        write_gis(result, gis, crs)
     if save and result.converged:
         result.save(save)
     if print_report and result.converged:
-        print(report.text(result, budget=found, date=origin.computed))
+        print(report_with(result, more, origin.computed))
         for doubt in result.doubts:
             print(f"warning: {doubt}")
     if not result.converged:
         raise NotSolvedError(why_not(result))
+    judge.end(judgement)

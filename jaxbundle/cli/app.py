@@ -24,12 +24,13 @@ from jaxbundle.system.joined_processes import leave
 from jaxbundle.system.memory import free_memory, is_memory_shortage, require_address_space
 from jaxbundle.system.terminals import for_output
 
-BAD_INPUT, NOT_SOLVED = 2, 3
+BAD_INPUT, NOT_SOLVED, NOT_ACCEPTED = 2, 3, 4
 # Exit status of a Unix tool ended by SIGPIPE (13): the reader has closed the pipe.
 NO_READER = 128 + 13
 
 EXIT_STATUS = (
     "0 done; 2 bad input: one line, nothing written; 3 not solved, with the reason; "
+    "4 a criterion of --accept is not met; "
     "130, 143 interrupted; 141 output pipe closed."
 )
 
@@ -231,6 +232,8 @@ def run(prepare: Callable[[], object] | None = None) -> None:
     except typer.Abort as error:  # typer's word for EOFError
         _end(f"unexpected end of file: {error.__cause__}", BAD_INPUT)
     except OSError as error:
+        if is_closed_pipe(error):
+            leave(NO_READER)
         _end(_describe_system_error(error), BAD_INPUT)
     except (OverflowError, RecursionError) as error:
         _end(" ".join(str(error).split()), BAD_INPUT)
@@ -254,6 +257,11 @@ def run(prepare: Callable[[], object] | None = None) -> None:
         traceback.print_exc()
         leave(1)
     sys.exit(status)
+
+
+def is_closed_pipe(error: OSError) -> bool:
+    """Whether a write failed because nobody reads: on Windows an invalid argument of a stream."""
+    return sys.platform == "win32" and error.errno == errno.EINVAL and error.filename is None
 
 
 def _describe_system_error(error: OSError) -> str:

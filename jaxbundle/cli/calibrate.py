@@ -8,6 +8,13 @@ import typer
 
 from jaxbundle.cli import calibration_options as options
 from jaxbundle.cli.app import Correlated, Force, Html, Json, Quiet, app
+from jaxbundle.cli.certificate_options import (
+    Accept,
+    CertificateFile,
+    CertificateOptions,
+    Details,
+    Lengths,
+)
 from jaxbundle.errors import InputError
 
 
@@ -57,6 +64,10 @@ def calibrate(  # noqa: PLR0913 - the options of the command
     ] = None,
     html: Html = "",
     force: Force = False,
+    accept: Accept = None,
+    certificate: CertificateFile = "",
+    details: Details = None,
+    lengths: Lengths = None,
     brief: options.Brief = False,
     quiet: Quiet = False,
     plots: options.Plots = True,
@@ -138,7 +149,8 @@ def calibrate(  # noqa: PLR0913 - the options of the command
 
     CalibrationOutputs(
         COMMAND, [*cameras], files, settings, json, out, html, force, brief, quiet, plots,
-        bool(compared),
+        bool(compared), CertificateOptions(accept, certificate, details, lengths),
+        compared or [model],
     ).compute(compute)  # fmt: skip
 
 

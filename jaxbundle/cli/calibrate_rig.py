@@ -8,6 +8,13 @@ import typer
 
 from jaxbundle.cli import calibration_options as options
 from jaxbundle.cli.app import Correlated, Force, Html, Json, Quiet, app
+from jaxbundle.cli.certificate_options import (
+    Accept,
+    CertificateFile,
+    CertificateOptions,
+    Details,
+    Lengths,
+)
 from jaxbundle.errors import InputError
 
 COMMAND = "calibrate-rig"
@@ -64,6 +71,10 @@ def calibrate_rig(  # noqa: PLR0913 - the options of the command
     ] = None,
     html: Html = "",
     force: Force = False,
+    accept: Accept = None,
+    certificate: CertificateFile = "",
+    details: Details = None,
+    lengths: Lengths = None,
     brief: options.Brief = False,
     quiet: Quiet = False,
     plots: options.Plots = True,
@@ -134,7 +145,8 @@ def calibrate_rig(  # noqa: PLR0913 - the options of the command
         return Calibrations(rig.cameras, rig), None
 
     CalibrationOutputs(
-        COMMAND, [*cameras], files, settings, json, out, html, force, brief, quiet, plots
+        COMMAND, [*cameras], files, settings, json, out, html, force, brief, quiet, plots,
+        judged=CertificateOptions(accept, certificate, details, lengths), models=[model],
     ).compute(compute)  # fmt: skip
 
 

@@ -10,6 +10,9 @@ from typing import Any
 from jaxbundle.calibration import Calibrations, ModelComparison
 from jaxbundle.calibration.files import (
     COMPARED,
+    PAGE,
+    REPORT,
+    RESULT,
     calibrations_dict,
     file_name,
     files_of,
@@ -18,13 +21,21 @@ from jaxbundle.calibration.files import (
     json_text,
 )
 from jaxbundle.calibration.page import KIND, compose_calibrations
+from jaxbundle.cli.certificate_options import (
+    JUDGEMENT_FILES,
+    NOT_JUDGED,
+    CertificateOptions,
+)
 from jaxbundle.cli.common_options import is_in_file
+from jaxbundle.cli.judging import judge_of
 from jaxbundle.cli.outputs import can_plot, check_writable, name_inside, trace_files, write_result
 from jaxbundle.cli.progress import counting
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.results.result_json import unsolved_text
+from jaxbundle.io.text.csv_tables import write_text
 from jaxbundle.network.columns import count
 from jaxbundle.report.page import UNKNOWN, Origin, compose_failure, head_line
+from jaxbundle.report.page.adjustment import NO_ADDITION
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,7 +43,8 @@ class CalibrationOutputs:
     """Where a command writes its calibration.
 
     **Fields:** `command` whose folder it is; `names` of the cameras; `photographs` searched;
-    `settings`: options and their values, for the page; the options of the command.
+    `settings`: options and their values, for the page; the options of the command; `judged`: those
+    of criteria and certificate, about cameras of these `models`.
     """
 
     command: str
@@ -47,6 +59,8 @@ class CalibrationOutputs:
     quiet: bool = False
     plots: bool = True
     compared: bool = False
+    judged: CertificateOptions = NOT_JUDGED
+    models: Sequence[str] = ()
 
     def check(self) -> Origin:
         """Check the files; what the result is from, for its page."""
@@ -56,14 +70,30 @@ class CalibrationOutputs:
         check_names(self.names)
         inputs = self.photographs
         check_writable(self.json, self.out, self.command, self.files, inputs, self.force, self.html)
-        if self.html or self.out is not None:
-            return trace_files(inputs, self.settings)
+        if self.html or self.judged.certificate or self.out is not None:
+            files = [*inputs, *self.judged.files]
+            return trace_files(files, {**self.settings, **self.judged.settings})
         return UNKNOWN
+
+    @property
+    def judge(self) -> Any:
+        """The judge of the result."""
+        outputs = {"--json": self.json, "--html": self.html}
+        return judge_of(
+            self.command,
+            self.judged,
+            outputs,
+            self.out,
+            self.photographs,
+            models=self.models,
+            force=self.force,
+        )
 
     @property
     def files(self) -> list[str]:
         """The files that may be in the folder."""
-        return files_of([*self.names]) + (COMPARED if self.compared else [])
+        judged = list(JUDGEMENT_FILES) if any(self.judged) else []
+        return files_of([*self.names]) + (COMPARED if self.compared else []) + judged
 
     def compute(
         self, calibrate: Callable[[Callable], tuple[Calibrations, ModelComparison | None]]
@@ -73,7 +103,7 @@ class CalibrationOutputs:
 
         **Raises:** `NotSolvedError` for cameras without a solution, after all is written.
         """
-        origin = self.check()
+        judge, origin = self.judge, self.check()
         with counting(self.quiet or self.json == "-") as bar:
             task = bar.add_task("searching the board", total=len(self.photographs))
 
@@ -85,17 +115,21 @@ class CalibrationOutputs:
             with self._written_if_unsolved(origin):
                 found, compared = calibrate(tell)
             bar.update(task, description="assessing accuracy")
+            judgement = judge.judge(found, origin)
             report = self._write(
                 found,
                 compared,
                 origin,
+                judgement,
                 lambda stage, done, total: bar.update(
                     task, description=stage, completed=done, total=total
                 ),
             )
+            judge.write(judgement)
         if report:
             print(report)
         require_solved(found)
+        judge.end(judgement)
 
     @contextmanager
     def _written_if_unsolved(self, origin: Origin) -> Iterator[None]:
@@ -119,18 +153,24 @@ class CalibrationOutputs:
         found: Calibrations,
         compared: ModelComparison | None,
         origin: Origin,
+        judgement: Any,
         show: Callable[[str, int, int], object],
     ) -> str:
         """Write the result; the report, unless nobody is to see it."""
         document = calibrations_dict(found, self.brief) if self.json else {}
         if compared is not None and self.json:
             document["models"] = compared.to_dict()
+        if judgement is not None and self.json:
+            document |= judgement.json
         text = json_text(document) if self.json else ""
         written = is_in_file(self.json, self.out, self.html)
         silent = self.json == "-" or (self.quiet and written)
         report = "" if silent else head_line(origin) + (compared or found).report()
+        if report and judgement is not None:
+            report += judgement.text
         show("writing", 0, 1)
-        page = partial(compose_calibrations, found, origin, compared)
+        also = NO_ADDITION if judgement is None else judgement.addition
+        page = partial(compose_calibrations, found, origin, compared, also)
         plots = self.plots and self.out is not None and can_plot()
         with write_result(
             self.json, text, self.out, self.command, self.files, self.force, self.html, page
@@ -139,7 +179,19 @@ class CalibrationOutputs:
                 fill_calibrations(found, new, plots, origin, compared, show)
                 if compared is not None:
                     fill_comparison(compared, new, plots, show)
+                if judgement is not None:
+                    judgement.fill(new)
+                    _add_judgement(found, judgement, new, page())
         return report
+
+
+def _add_judgement(found: Calibrations, judgement: Any, folder: Path, page: Iterable[str]) -> None:
+    """The page, the numbers and the report of a folder with the judgement of the result."""
+    write_text(folder / PAGE, page)
+    numbers = calibrations_dict(found) | judgement.json
+    write_text(folder / RESULT, json_text(numbers))
+    report = (folder / REPORT).read_text(encoding="utf-8")
+    write_text(folder / REPORT, report + judgement.text)
 
 
 def require_solved(found: Calibrations) -> None:

@@ -4,6 +4,7 @@ adjusted network as a project.
 `check_targets` checks before an adjustment that its results can be written.
 """
 
+import dataclasses
 import os
 import re
 import sys
@@ -11,11 +12,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any, Protocol
 
 from jaxbundle import report
 from jaxbundle.adjustment.error_budget import Budget
 from jaxbundle.adjustment.orientation_covariance import orientation_covariance
 from jaxbundle.adjustment.result import Adjustment
+from jaxbundle.cli.certificate_options import JUDGEMENT_FILES
 from jaxbundle.commands.origins import network_files as network_files
 from jaxbundle.commands.origins import trace_files as trace_files
 from jaxbundle.commands.origins import trace_origin as trace_origin
@@ -34,7 +37,9 @@ from jaxbundle.network.tables import Network
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.plotting.files import FIGURES, draw_figures
 from jaxbundle.plotting.style import need_matplotlib
-from jaxbundle.report.page import UNKNOWN, Origin, compose, compose_failure
+from jaxbundle.report.budget import budget_lines
+from jaxbundle.report.page import UNKNOWN, Addition, Origin, compose, compose_failure
+from jaxbundle.report.page.adjustment import NO_ADDITION
 from jaxbundle.report.page.budget import describe_budget
 from jaxbundle.report.verdict import Verdict
 from jaxbundle.results import ReportedResult
@@ -51,12 +56,60 @@ FILES = (
     PAGE,
     RESULT,
     *(f"{name}.csv" for name in (*TABLES, BUDGET)),
+    *JUDGEMENT_FILES,
     *(f"{ADJUSTED}/{name}" for name in NETWORK_FILES),
     f"{ADJUSTED}/{PRECISION}",
     *FIGURES,
 )
 
 NOTHING: Mapping = MappingProxyType({})
+
+
+class Supplement(Protocol):
+    """What options add to a result: entries of its JSON, text after its report, findings and
+    sections of its page, files of its folder."""
+
+    @property
+    def json(self) -> Mapping[str, Any]: ...
+
+    @property
+    def text(self) -> str: ...
+
+    @property
+    def addition(self) -> Addition: ...
+
+    def fill(self, folder: Path) -> None: ...
+
+
+@dataclasses.dataclass(frozen=True)
+class BudgetSupplement:
+    """The error budget of `--budget`, and what follows it."""
+
+    budget: Budget | None = None
+    rest: Supplement | None = None
+
+    @property
+    def json(self) -> Mapping[str, Any]:
+        own = NOTHING if self.budget is None else {BUDGET: budget_dict(self.budget)}
+        return {**own, **(NOTHING if self.rest is None else self.rest.json)}
+
+    @property
+    def text(self) -> str:
+        own = "" if self.budget is None else "\n".join([*budget_lines(self.budget), ""])
+        return own + ("" if self.rest is None else self.rest.text)
+
+    @property
+    def addition(self) -> Addition:
+        own = describe_budget(self.budget)
+        return own if self.rest is None else own.followed_by(self.rest.addition)
+
+    def fill(self, folder: Path) -> None:
+        if self.budget is not None:
+            columns = self.budget.table()
+            write_csv(folder / f"{BUDGET}.csv", list(columns), table_rows(columns))
+        if self.rest is not None:
+            self.rest.fill(folder)
+
 
 # The beginning of JSON; a TOML table, `[project]`, does not match.
 JSON = re.compile(rb'\s*(\{\s*["}]|\[[\s\[]*([]{"\d-]|true|false|null))')
@@ -250,13 +303,13 @@ def write_targets(
     force: bool = False,
     html: str = "",
     origin: Origin = UNKNOWN,
-    budget: Budget | None = None,
+    more: Supplement | None = None,
     progress: Progress | None = None,
 ) -> None:
-    """Write JSON (`-`: standard output), page and folder of a result with its error `budget`, or
-    the reason for a failure."""
+    """Write JSON (`-`: standard output), page and folder of a result with what `more` options add,
+    or the reason for a failure."""
     solved = isinstance(result, Adjustment)
-    also = NOTHING if budget is None else {BUDGET: budget_dict(budget)}
+    also = NOTHING if more is None else more.json
 
     def text(brief: bool) -> str | Iterable[str]:
         if isinstance(result, Adjustment):
@@ -265,14 +318,14 @@ def write_targets(
 
     def page() -> Iterable[str]:
         if isinstance(result, Adjustment):
-            return compose(result, origin, also=describe_budget(budget))
+            return compose(result, origin, also=NO_ADDITION if more is None else more.addition)
         return compose_failure(result, origin)
 
     plots = plots and out is not None and solved and result.converged and can_plot()
     with write_result(json, text(brief), out, "adjust", FILES, force, html, page) as new:
         if new is not None:
             if isinstance(result, Adjustment):
-                fill_results(result, new, plots, "", also, budget, progress, origin.computed)
+                fill_results(result, new, plots, "", also, more, progress, origin.computed)
             else:
                 write_text(new / REPORT, f"{result}\n")
                 write_text(new / RESULT, text(False))
@@ -284,27 +337,26 @@ def fill_results(
     plots: bool,
     note: str = "",
     also: Mapping = NOTHING,
-    budget: Budget | None = None,
+    more: Supplement | None = None,
     progress: Progress | None = None,
     date: str = "",
     verdict: Verdict | None = None,
 ) -> None:
     """Write report, JSON, tables, the adjusted network and plots of a result into a folder.
 
-    `note`: text before the report; `also`: further JSON entries; `budget`: the error budget;
+    `note`: text before the report; `also`: further JSON entries; `more`: what options add;
     `date` of the computation, for the report; `verdict`: that of the command, if it has further
     tests."""
     tell = progress or (lambda *_: None)
     tell("writing the report", 0, 2)
-    told = report.text(result, budget=budget, date=date, verdict=verdict)
+    told = report_with(result, more, date, verdict)
     write_text(folder / REPORT, note + told)
     write_text(folder / RESULT, result_text(result, False, also))
     tell("writing the report", 1, 2)
     if result.converged:
         _write_tables(result, folder)
-        if budget is not None:
-            columns = budget.table()
-            write_csv(folder / f"{BUDGET}.csv", list(columns), table_rows(columns))
+        if more is not None:
+            more.fill(folder)
         fill_project(readjustable_network(result), folder / ADJUSTED)
         if (found := orientation_covariance(result)) is not None:
             unit = ANGLE_UNITS[result.network.angle_unit]
@@ -312,6 +364,16 @@ def fill_results(
     tell("writing the report", 2, 2)
     if plots:
         draw_figures(result, folder, progress)
+
+
+def report_with(
+    result: Adjustment, more: Supplement | None, date: str = "", verdict: Verdict | None = None
+) -> str:
+    """The report of a result, with what options add: findings in its verdict, text after it."""
+    if more is not None and result.converged and verdict is None and more.addition.findings:
+        verdict = more.addition.conclude(result)
+    told = report.text(result, date=date, verdict=verdict)
+    return told if more is None or not result.converged else told + more.text
 
 
 def why_not(result: Adjustment) -> str:

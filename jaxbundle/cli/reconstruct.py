@@ -7,6 +7,14 @@ import typer
 
 from jaxbundle.choices import CODED_TARGETS, FEATURES, MATCHED_PAIRS
 from jaxbundle.cli.app import Check, Correlated, Force, Html, Json, Quiet, app, choice
+from jaxbundle.cli.certificate_options import (
+    Accept,
+    CertificateFile,
+    CertificateOptions,
+    Details,
+    Lengths,
+)
+from jaxbundle.cli.judging import judge_of
 from jaxbundle.errors import InputError
 from jaxbundle.system.interrupts import advise
 
@@ -48,6 +56,10 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
     correlated: Correlated = True,
     json: Json = "",
     html: Html = "",
+    accept: Accept = None,
+    certificate: CertificateFile = "",
+    details: Details = None,
+    lengths: Lengths = None,
     brief: Annotated[
         bool, typer.Option("--brief", help="omit points and residuals from the JSON")
     ] = False,
@@ -81,6 +93,10 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
     files = [p for p in (*photos, control, distances) if p is not None and p.is_file()]
     # before the search, which opens every photograph; after it the photographs are inputs, too
     check_writable(json, out, COMMAND, FILES, files, force)
+    judged = CertificateOptions(accept, certificate, details, lengths)
+    judge = judge_of(
+        COMMAND, judged, {"--json": json, "--html": html}, out, files, models=["opencv"]
+    )
     found, _ = find_photographs(photos)
     check_writable(json, out, COMMAND, FILES, [*files, *(p.path for p in found)], force, html)
     with keep_matches(out, force) as store, staging(quiet or json == "-") as tell:
@@ -112,17 +128,23 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
             "--points": points,
             "--no-square-pixels": True if not square_pixels else None,
             "--no-correlated": True if not correlated else None,
+            **judged.settings,
         },
     )
+    judgement = judge.judge(result, origin)
     with staging(quiet or json == "-") as show:
-        write_reconstruction(result, json, out, brief, plots, force, html, origin, show)
+        write_reconstruction(result, json, out, brief, plots, force, html, origin, show, judgement)
+        judge.write(judgement)
     if not quiet and json != "-":
         for part in result.parts:
             print(f"{part.name}: {conclude_part(result, part).words}")
         print(result)
+        if judgement is not None:
+            print(judgement.text)
         print(out)
     if surface:
         _surface(out, photos[0], force, quiet)
+    judge.end(judgement)
 
 
 def _surface(out: Path, photos: Path, force: bool, quiet: bool) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from jaxbundle.cli.outputs import FILES as RESULTS
-from jaxbundle.cli.outputs import PAGE, can_plot, fill_results, write_result
+from jaxbundle.cli.outputs import PAGE, Supplement, can_plot, fill_results, write_result
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.colmap import FILES as COLMAP
 from jaxbundle.io.networks.colmap import fill_colmap
@@ -25,6 +25,7 @@ from jaxbundle.plotting.files import TRACKS, draw_pairs, draw_tracks
 from jaxbundle.reconstruction.page import compose_part, conclude_part, describe_part
 from jaxbundle.reconstruction.result import ReconstructedPart, Reconstruction
 from jaxbundle.report.page import UNKNOWN, Origin
+from jaxbundle.report.page.adjustment import NO_ADDITION
 from jaxbundle.types import Progress
 
 COMMAND, STORE, MODEL, CLOUD, PAIRS = "reconstruct", "matches", "colmap", "points.ply", "pairs.csv"
@@ -64,18 +65,23 @@ def write_reconstruction(
     html: str = "",
     origin: Origin = UNKNOWN,
     progress: Progress | None = None,
+    more: Supplement | None = None,
 ) -> None:
-    """Write JSON and page, and the folder with each part, its pairs and figures."""
+    """Write JSON and page, and the folder with each part, its pairs and figures, and what `more`
+    options add."""
     first, plots = found.parts[0], plots and can_plot()
     also = {"reconstruction": found.to_dict(), "verdict": verdict_dict(conclude_part(found, first))}
+    also |= {} if more is None else more.json
     text = result_text(first.adjustment, brief, also)
-    page = partial(compose_part, found, first, origin)
+    page = partial(
+        compose_part, found, first, origin, NO_ADDITION if more is None else more.addition
+    )
     with write_result(json, text, out, COMMAND, FILES, force, html, page) as new:
         if new is None:
             return
         verdict = f"{first.name}: {conclude_part(found, first).words}"
         told = f"{verdict}\n{found}\n\n{describe_part(found, first)}"
-        _write_part(found, first, new, plots, told, also, progress, origin.computed)
+        _write_part(found, first, new, plots, told, also, progress, origin.computed, more)
         for number, part in enumerate(found.parts[1:], 2):
             folder = new / f"part_{number}"
             folder.mkdir()
@@ -84,8 +90,8 @@ def write_reconstruction(
             )
             verdict = conclude_part(found, part)
             note = "\n".join([verdict.words, *own, describe_part(found, part)])
-            more = {"verdict": verdict_dict(verdict)}
-            _write_part(found, part, folder, plots, note, more, progress, origin.computed)
+            entries = {"verdict": verdict_dict(verdict)}
+            _write_part(found, part, folder, plots, note, entries, progress, origin.computed)
             write_text(folder / PAGE, compose_part(found, part, origin))
         if plots:
             draw_pairs(list(found.photographs), found.pairs, list(found.left_out), new, progress)
@@ -101,6 +107,7 @@ def _write_part(
     also: Mapping[str, Any],
     progress: Progress | None,
     date: str,
+    more: Supplement | None = None,
 ) -> None:
     fill_results(
         part.adjustment,
@@ -108,6 +115,7 @@ def _write_part(
         plots,
         note,
         also,
+        more,
         progress=progress,
         date=date,
         verdict=conclude_part(found, part),

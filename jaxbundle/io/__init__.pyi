@@ -41,12 +41,16 @@ from jaxbundle.io.networks.opensfm import write_opensfm as write_opensfm
 from jaxbundle.io.networks.photo_list import read_photo_list as read_photo_list
 from jaxbundle.io.networks.project import read_project as read_project
 from jaxbundle.io.networks.project import write_project as write_project
+from jaxbundle.io.networks.pycolmap_objects import from_pycolmap as from_pycolmap
+from jaxbundle.io.networks.pycolmap_objects import to_pycolmap as to_pycolmap
 from jaxbundle.io.networks.transforms import write_transforms as write_transforms
 from jaxbundle.io.rasters.correction import map_of as map_of
 from jaxbundle.io.rasters.maps import MapGrid as MapGrid
 from jaxbundle.io.rasters.maps import MapSystem as MapSystem
 from jaxbundle.io.results.coordinates import write_coordinates as write_coordinates
 from jaxbundle.io.results.dxf import write_dxf as write_dxf
+from jaxbundle.io.results.gis import write_geojson as write_geojson
+from jaxbundle.io.results.gis import write_geopackage as write_geopackage
 from jaxbundle.io.results.ply import write_ply as write_ply
 from jaxbundle.io.results.result_project import adjusted_network as adjusted_network
 from jaxbundle.io.results.result_project import readjustable_network as readjustable_network
@@ -71,6 +75,7 @@ __all__ = [
     "TARGETS",
     "adjusted_network",
     "convert",
+    "from_pycolmap",
     "map_of",
     "read_boards",
     "read_cameras",
@@ -85,6 +90,7 @@ __all__ = [
     "read_scanner",
     "read_target",
     "readjustable_network",
+    "to_pycolmap",
     "write_autocal",
     "write_bal",
     "write_bundler",
@@ -95,6 +101,8 @@ __all__ = [
     "write_coordinates",
     "write_corners",
     "write_dxf",
+    "write_geojson",
+    "write_geopackage",
     "write_jaicov",
     "write_kalibr",
     "write_micmac",

@@ -21,6 +21,7 @@ from jaxbundle.report.page import (
     Section,
     compose,
 )
+from jaxbundle.report.page.adjustment import NO_ADDITION
 from jaxbundle.report.page.columns import Column
 from jaxbundle.report.page.markup import facts, grid, items
 from jaxbundle.report.verdict import BAD, DOUBTFUL, GOOD, Verdict, conclude
@@ -32,10 +33,14 @@ CONTROL = ("Control",)
 
 
 def compose_part(
-    whole: Reconstruction, part: ReconstructedPart, origin: Origin = UNKNOWN
+    whole: Reconstruction,
+    part: ReconstructedPart,
+    origin: Origin = UNKNOWN,
+    also: Addition = NO_ADDITION,
 ) -> Iterator[str]:
-    """The page of a part of a `Reconstruction`: HTML, in pieces."""
-    return compose(part.adjustment, origin, also=_describe(whole, part))
+    """The page of a part of a `Reconstruction`: HTML, in pieces; `also`: further findings and
+    sections."""
+    return compose(part.adjustment, origin, also=_describe(whole, part).followed_by(also))
 
 
 def conclude_part(whole: Reconstruction, part: ReconstructedPart) -> Verdict:

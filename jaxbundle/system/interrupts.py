@@ -19,6 +19,7 @@ import time
 
 TYPE_CHECKING = False  # avoids importing typing
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from typing import NoReturn
 
 # Seconds for the main thread to handle a signal. It takes milliseconds unless it is in C++; short
@@ -30,8 +31,12 @@ GRACE = 0.3
 LONGEST_DEFERRAL = 10.0
 
 WORDS: dict[int, str] = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
-if os.name == "posix":
+if hasattr(signal, "SIGHUP"):
     WORDS[signal.SIGHUP] = "the terminal is gone"
+if hasattr(signal, "SIGBREAK"):  # Ctrl-Break of Windows
+    WORDS[signal.SIGBREAK] = "interrupted"
+# Windows writes signals to sockets only, other systems to pipes as well.
+SOCKETS = os.name == "nt"
 
 _advice = ""
 _status = 1
@@ -65,12 +70,28 @@ def handle_interrupts() -> None:
     _open_standard_streams()
     _screen = os.dup(2)
     atexit.register(_leave)  # the first to be registered is the last to be called
-    if os.name == "posix":
+    read, writer = _open_channel()
+    signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+    threading.Thread(target=_watch, args=(read,), daemon=True).start()
+
+
+def _open_channel() -> "tuple[Callable[[], bytes], int]":
+    """What reads a byte, and the descriptor to which Python writes one at a signal. A full channel
+    must not block the handler: one byte is enough."""
+    if not SOCKETS:
         reader, writer = os.pipe()
-        # A full pipe must not block the handler: one byte is enough.
         os.set_blocking(writer, False)
-        signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
-        threading.Thread(target=_watch, args=(reader,), daemon=True).start()
+        return lambda: os.read(reader, 1), writer
+    import socket
+
+    ours, theirs = socket.socketpair()
+    theirs.setblocking(False)
+    _kept.append(theirs)
+    return lambda: ours.recv(1), theirs.fileno()
+
+
+# Sockets that must stay open as long as the process.
+_kept: list[object] = []
 
 
 def advise(words: str) -> None:
@@ -92,13 +113,13 @@ def _handle(number: int, _frame: object) -> None:
         _end(number)
 
 
-def _watch(reader: int) -> None:
+def _watch(read: "Callable[[], bytes]") -> None:
     """Wait for the byte that Python writes on a signal, independently of the main thread."""
     import threading
 
     number = 0
     while number not in WORDS:
-        number = os.read(reader, 1)[0]
+        number = read()[0]
     time.sleep(GRACE)
     # The disk does not answer.
     last = threading.Timer(2 * LONGEST_DEFERRAL, _say_and_exit, (number,))

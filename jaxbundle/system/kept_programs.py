@@ -31,7 +31,8 @@ def keep_programs(folder: str | os.PathLike | None = None) -> bool:
     variable = "JAX_COMPILATION_CACHE_DIR"
     if folder is None:
         home = os.path.join(os.path.expanduser("~"), ".cache")
-        caches = os.environ.get("XDG_CACHE_HOME") or home
+        # LOCALAPPDATA: of Windows
+        caches = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or home
         folder = os.environ.get(variable) or os.path.join(caches, "jaxbundle")
     try:
         os.makedirs(folder, exist_ok=True)

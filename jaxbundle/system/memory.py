@@ -98,7 +98,36 @@ def _left_in(folder: Path, limit: str, usage: str, cached: str) -> float:
 
 
 def _of_the_machine() -> float:
-    return 1024 * _field(_read(Path("/proc/meminfo")), "MemAvailable:", math.inf)
+    """Bytes that are available: Linux and Windows say it; of other systems half of the memory is
+    taken, what a machine at work has free, and infinity where not even that is known."""
+    if sys.platform == "win32":
+        return _available_on_windows()
+    if text := _read(Path("/proc/meminfo")):
+        return 1024 * _field(text, "MemAvailable:", math.inf)
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2
+    except (AttributeError, ValueError, OSError):
+        return math.inf
+
+
+class MemoryStatus(ctypes.Structure):
+    """MEMORYSTATUSEX of the Windows API (sysinfoapi.h)."""
+
+    _fields_ = (
+        ("length", ctypes.c_uint32),
+        ("load", ctypes.c_uint32),
+        *((name, ctypes.c_uint64) for name in ("total", "available", "page_total", "page_left")),
+        *((name, ctypes.c_uint64) for name in ("virtual_total", "virtual_left", "extended_left")),
+    )
+
+
+def _available_on_windows() -> float:
+    status = MemoryStatus()
+    status.length = ctypes.sizeof(status)
+    kernel = getattr(getattr(ctypes, "windll", None), "kernel32", None)
+    if kernel is None or not kernel.GlobalMemoryStatusEx(ctypes.byref(status)):
+        return math.inf
+    return float(status.available)
 
 
 def _of_the_address_space() -> float:

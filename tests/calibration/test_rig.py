@@ -384,3 +384,21 @@ def test_what_is_no_rig_is_refused(rig):
         calibrate_rig(rig.cameras, model="brown")
     with pytest.raises(InputError, match="snooping must be one of pope, baarda or None"):
         calibrate_rig(rig.cameras, snooping="tau")
+
+
+def test_a_rig_is_judged_and_certified(rig):
+    import jaxbundle
+
+    cameras = jaxbundle.calibration.Calibrations(rig.cameras, rig)
+    worst = max(rig.sigma[name]["fx"] for name in rig.names)
+    base = rig.mountings[rig.names[1]].length_sigma
+    criteria = [
+        f"sigma(fx) <= {worst * (1 + 1e-12):.17g} px", f"sigma({rig.names[0]}:fx) < 1 px",
+        f"sigma(base) < {1.01e3 * base} mm", f"sigma(base) < {0.99e3 * base} mm",
+        "sigma(rotation) < 10 deg", "rms < 1 px", "epochs >= 3", f"redundancy >= {rig.redundancy}",
+    ]  # fmt: skip
+    for result in (rig, cameras):
+        found = jaxbundle.accept(result, criteria)
+        assert [row.met for row in found.rows] == [True, True, True, False, *[True] * 4]
+    page = jaxbundle.certificate(cameras).html()
+    assert 'id="mountings"' in page and page.count("Uncertainty budget") >= 1

@@ -141,6 +141,18 @@ def test_a_file_that_the_locale_cannot_name_is_bad_input(project):
     assert status == 2 and err.count("\n") == 1
 
 
+@pytest.mark.further
+@pytest.mark.parametrize("kind", ["ascii", "C"])
+def test_criteria_and_certificates(kind, project, tmp_path):
+    """Signs that the terminal lacks, in what is asked and in what is said."""
+    page = tmp_path / "certificate.html"
+    options = ("--accept", "sigma(c) ≤ 2 µm", "--certificate", page, "--no-second-minimum")
+    status, said, err = run("-m", "jaxbundle", "adjust", project, *options, "--quiet", kind=kind)
+    assert status == 4
+    assert "sigma(c) <= 2 um: 45" in err and err.count("\n") == 1
+    assert "Acceptance: 1 of 1 criteria not met" in said and "±" in page.read_text("utf-8")
+
+
 def test_results_can_be_printed_in_python(project):
     status, said, err = run("-c", PRINTED, project, kind="ascii")
     assert (status, err) == (0, "")

@@ -8,13 +8,16 @@ has no effect. The file may be renamed over meanwhile.
 import errno
 import os
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
+from importlib import import_module
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from jaxbundle.errors import InputError
 from jaxbundle.system.temporaries import defer_interrupts, temporary
 
+# Whether locks are those of Windows.
+USES_MSVCRT = os.name == "nt"
 # Errors of file systems without locks.
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
@@ -41,9 +44,13 @@ def hold_lock(
         with defer_interrupts():  # A lock is removed only by the process that holds it.
             held.enter_context(_acquire(lock, told, needed))
             # Removed before release: no other process locks a file about to vanish.
-            # Windows cannot remove open files: there it stays.
             held.enter_context(temporary(lock))
         yield
+    # Windows cannot remove open files: there it is removed now, unless another process has opened
+    # it meanwhile.
+    if USES_MSVCRT:
+        with suppress(OSError):
+            lock.unlink()
 
 
 def _acquire(lock: Path, told: str | Path, needed: bool) -> BinaryIO:
@@ -87,14 +94,13 @@ def _open(lock: Path, needed: bool) -> BinaryIO | None:
 
 
 def _lock(stream: BinaryIO) -> None:
-    try:
+    if not USES_MSVCRT:
         import fcntl
-    except ImportError:
-        import msvcrt
 
-        try:
-            msvcrt.locking(stream.fileno(), msvcrt.LK_NBLCK, 1)
-        except OSError as error:
-            raise BlockingIOError(error.errno, error.strerror) from None
-    else:
         fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return
+    msvcrt: Any = import_module("msvcrt")
+    try:
+        msvcrt.locking(stream.fileno(), msvcrt.LK_NBLCK, 1)
+    except OSError as error:
+        raise BlockingIOError(error.errno, error.strerror) from None

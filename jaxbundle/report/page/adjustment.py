@@ -43,6 +43,13 @@ class Addition(NamedTuple):
     tables: Mapping[str, Listing] = NOTHING
     name: str = ""
 
+    def followed_by(self, other: "Addition") -> "Addition":
+        """This addition with the findings and sections of another one after its own."""
+        return self._replace(
+            findings=(*self.findings, *other.findings),
+            sections=(*self.sections, *other.sections),
+        )
+
     def conclude(self, adjustment: "Adjustment") -> Verdict:
         """The verdict of the command on its adjustment."""
         return conclude(adjustment, self.findings, self.without, len(self.warnings))

@@ -74,7 +74,8 @@ def draw_curves(
     layout: ChartLayout = LAYOUT,
 ) -> str:
     """Curves over a common x; `logarithmic`: the axes, of x and y, whose values are log10 of what
-    they say; `mark`: an x with a vertical line, and its name."""
+    they say; `mark`: an x with a vertical line, and its name. Curves of one label have one
+    sample."""
     reach = [
         np.concatenate([c.y - band, c.y + band])
         for c in curves
@@ -98,7 +99,7 @@ def draw_curves(
         line = _places(x, y, curve.x, curve.y)
         parts.append(f'<polyline class="{curve.kind}" points="{line}"/>\n')
     return _svg(parts, layout) + _legend(
-        [(c.kind, c.label) for c in curves], None if mark is None else mark[1]
+        [*dict.fromkeys((c.kind, c.label) for c in curves)], None if mark is None else mark[1]
     )
 
 

@@ -1,0 +1,315 @@
+"""Acceptance: the quantities of a result against criteria."""
+
+import dataclasses
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from jaxbundle.cameras import get_model
+from jaxbundle.certificates.criteria import Criterion, read_criteria
+from jaxbundle.certificates.lengths import LengthTest, length_errors, read_lengths
+from jaxbundle.certificates.quantities import (
+    AXES,
+    QuantityValues,
+    find_quantity,
+    offered,
+    require_parameter,
+    unknown_quantity,
+)
+from jaxbundle.certificates.units import convert, kind_of
+from jaxbundle.display import print_in_one_screen
+from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.network.columns import count
+from jaxbundle.network.tables import EXTERIOR, Camera, Network
+from jaxbundle.report.layout import MISSING, significant, table
+from jaxbundle.results import ReportedResult, TableMethods
+
+# Arguments that are names of unknowns; of other quantities they are words.
+OF_UNKNOWNS = ("sigma", "sigma.rms", "value", "t", "correlation")
+
+
+@dataclasses.dataclass(frozen=True)
+class AcceptanceRow:
+    """One criterion: the `value` that decides, in the unit of the limit (the largest of several
+    for an upper limit, the smallest for a lower one); what it is `of`; the `number` of values;
+    whether all of them meet it; `why` there is no value."""
+
+    criterion: Criterion
+    value: float
+    of: str = ""
+    number: int = 1
+    met: bool = False
+    why: str = ""
+
+    @property
+    def line(self) -> str:
+        """The criterion and what was found, in words."""
+        if self.why:
+            return f"{self.criterion.text}: {self.why}"
+        where = f" ({self.of}" * bool(self.of)
+        where += f", {'largest' if self.criterion.upper else 'smallest'} of {self.number}" * (
+            bool(self.of) and self.number > 1
+        )
+        where += ")" * bool(self.of)
+        return f"{self.criterion.text}: {self.said}{where}"
+
+    @property
+    def said(self) -> str:
+        """The value with its unit; a dash without one."""
+        if self.why:
+            return MISSING
+        whole = self.value == round(self.value) and abs(self.value) < 1e9
+        value = f"{self.value:.0f}" if whole else significant(self.value, self.digits)
+        return f"{value} {self.criterion.unit}".strip()
+
+    @property
+    def digits(self) -> int:
+        """Three digits, or as many as show on which side of the limit the value is."""
+        limit = self.criterion.limit
+        for digits in range(3, 16):
+            shown = float(f"{self.value:.{digits - 1}e}")
+            if self.criterion.holds(shown) == self.criterion.holds(self.value) and (
+                shown != limit or self.value == limit
+            ):
+                return digits
+        return 15
+
+
+@print_in_one_screen
+@dataclasses.dataclass(frozen=True)
+class Acceptance(TableMethods):
+    """Criteria and whether a result meets them.
+
+    **Fields:** `rows`, one a criterion. `met`: all of them.
+    """
+
+    rows: tuple[AcceptanceRow, ...]
+
+    @property
+    def met(self) -> bool:
+        """Whether every criterion is met."""
+        return all(row.met for row in self.rows)
+
+    @property
+    def unmet(self) -> list[str]:
+        """A line for each criterion that is not met."""
+        return [f"not met: {row.line}" for row in self.rows if not row.met]
+
+    @property
+    def sentence(self) -> str:
+        """The result in words."""
+        failed = sum(not row.met for row in self.rows)
+        if not failed:
+            return f"{count(len(self.rows), 'criterion')} met".replace("criterions", "criteria")
+        return f"{failed} of {len(self.rows)} criteria not met"
+
+    def table(self) -> dict[str, np.ndarray]:
+        """A row a criterion: criterion, quantity, value, comparison, limit, unit, of, met, why."""
+        text = lambda words: np.array(list(words), dtype=object)
+        of = [row.criterion for row in self.rows]
+        return {
+            "criterion": text(one.text for one in of),
+            "quantity": text(one.quantity for one in of),
+            "value": np.array([row.value for row in self.rows]),
+            "comparison": text(one.comparison for one in of),
+            "limit": np.array([one.limit for one in of]),
+            "unit": text(one.unit for one in of),
+            "of": text(row.of for row in self.rows),
+            "met": np.array([row.met for row in self.rows]),
+            "why": text(row.why for row in self.rows),
+        }
+
+    def text_rows(self) -> list[tuple[str, ...]]:
+        """The rows as text, under `HEADER`."""
+        return [
+            (
+                row.criterion.text,
+                row.said,
+                row.why or row.of,
+                "met" if row.met else "not met",
+            )
+            for row in self.rows
+        ]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The rows as plain dicts and numbers, as in JSON."""
+        columns = {name: column.tolist() for name, column in self.table().items()}
+        return {
+            "met": self.met,
+            "criteria": [dict(zip(columns, r)) for r in zip(*columns.values())],
+        }
+
+    def __str__(self) -> str:
+        return "\n".join([f"Acceptance: {self.sentence}", *table(HEADER, self.text_rows(), "lrll")])
+
+
+HEADER = ("criterion", "value", "of", "verdict")
+
+
+def accept(
+    result: ReportedResult,
+    criteria: Iterable[str] | str,
+    *,
+    lengths: Any = None,
+) -> Acceptance:
+    """Whether a result meets acceptance criteria, such as `"sigma(c) < 2 um"`.
+
+    **Arguments:**
+
+    - `result`: of `adjust`, `calibrate`, `calibrate_rig`, `reconstruct`; of any other function the
+      quantities are the numbers of `to_dict()` by their path, such as `"counts.images > 3"`.
+    - `criteria`: texts QUANTITY COMPARISON NUMBER UNIT; quantities and units are listed in
+      docs/certificate.md. A quantity of several parameters, points or parts must meet the criterion
+      with each.
+    - `lengths`: calibrated lengths for `LME`, a table as in `jaxbundle.length_errors`, or its
+      `LengthTest`.
+
+    **Returns:** an `Acceptance`.
+
+    **Raises:** `InputError` for an unknown quantity, argument or unit; `NotSolvedError` for a
+    result without a solution.
+    """
+    found = read_criteria(criteria)
+    if not np.all(result.converged):
+        raise NotSolvedError("the result has no solution: there is nothing to accept")
+    test = lengths
+    if lengths is not None and not isinstance(lengths, LengthTest):
+        test = length_test_of(result, lengths)
+    return Acceptance(tuple(_judge(result, test, one) for one in found))
+
+
+def length_test_of(result: Any, lengths: Any, **options: Any) -> LengthTest:
+    """The test of calibrated lengths of a result, of the first of its parts that has them.
+
+    **Raises:** `InputError` as `length_errors`."""
+    parts = getattr(result, "parts", None)
+    if not parts:
+        return length_errors(result, lengths, **options)
+    known = read_lengths(lengths)
+    for part in parts[:-1]:
+        try:
+            return length_errors(part.adjustment, known, **options)
+        except InputError:
+            continue
+    return length_errors(parts[-1].adjustment, known, **options)
+
+
+def _judge(result: Any, test: LengthTest | None, one: Criterion) -> AcceptanceRow:
+    try:
+        found = find_quantity(result, test, one.name, one.argument)
+        values = _in_unit(found, one.unit)
+    except InputError as error:
+        raise InputError(f"criterion {one.text!r}: {error}") from None
+    except (LookupError, NotSolvedError) as error:
+        return AcceptanceRow(one, math.nan, why=str(error.args[0] if error.args else error))
+    # NaN decides: what cannot be compared is not accepted
+    worst = max if one.upper else min
+    unknown = [name for name, value in values.items() if math.isnan(value)]
+    of = unknown[0] if unknown else worst(values, key=lambda name: values[name])
+    return AcceptanceRow(
+        one, values[of], of, len(values), all(one.holds(value) for value in values.values()),
+        "it is not a number" if unknown else "",
+    )  # fmt: skip
+
+
+def _in_unit(found: QuantityValues, unit: str) -> dict[str, float]:
+    """Values in the unit of the limit."""
+    return {name: convert(v, found.unit, unit, found.pitch) for name, v in found.values.items()}
+
+
+def check_criteria(
+    texts: Sequence[str] | None,
+    command: str,
+    network: Network | None = None,
+    models: Sequence[str] = (),
+) -> list[Criterion]:
+    """Refuse criteria that cannot be decided, before the result is there.
+
+    **Arguments:** `command` whose result it will be; its `network`, or the camera `models`, where
+    they are known.
+
+    **Raises:** `InputError` naming the criterion, and what is known."""
+    criteria, known = read_criteria(texts or ()), offered(command)
+    for one in criteria:
+        try:
+            if one.name not in known:
+                forms = [quantity.form for quantity in known.values()]
+                raise InputError(unknown_quantity(one.name, forms))
+            cameras = network.cameras if network is not None else _of_models(models)
+            if one.name in OF_UNKNOWNS:
+                _check_unknown(one, cameras, network, command)
+            elif one.argument and not known[one.name].arguments:
+                raise InputError(f"it has no argument, but ({one.argument}) is given")
+            _check_unit(one, known[one.name].unit, network)
+        except InputError as error:
+            raise InputError(f"--accept {one.text!r}: {error}") from None
+    return criteria
+
+
+def _of_models(models: Sequence[str]) -> list[Camera]:
+    return [Camera("", model) for model in models]
+
+
+def _check_unknown(
+    one: Criterion, cameras: Sequence[Camera], network: Network | None, command: str
+) -> None:
+    """Refuse the name of an unknown that no camera, image or point has."""
+    if not one.argument:
+        raise InputError("a parameter is expected in parentheses, such as (c), (X0) or (Z)")
+    name = one.argument.rpartition(":")[2]
+    if command == "calibrate-rig" and name in ("base", "rotation"):
+        return
+    if name in (*EXTERIOR, *AXES) and command != "calibrate-rig":
+        return
+    if not cameras:
+        return
+    require_parameter(cameras, name)
+    if network is None or one.argument.count(":") == 1:
+        return
+    kind, _, rest = one.argument.partition(":")
+    id = rest.rpartition(":")[0]
+    ids = [camera.id for camera in network.cameras]
+    if rest and kind == "camera" and id not in ("*", *ids):
+        raise InputError(f"there is no camera {id!r}; known: {', '.join(ids)}")
+    chosen = [c for c in network.cameras if id in ("", "*", c.id)]
+    if one.name != "value" and not any(name in (*c.free, *c.unknowns) for c in chosen):
+        raise InputError(f"{name} is held, and not estimated: add it to free")
+
+
+def _check_unit(one: Criterion, words: str, network: Network | None) -> None:
+    """Refuse a unit of another kind than the quantity has."""
+    if words == "of NAME":
+        name = one.argument.rpartition(":")[2]
+        if name in EXTERIOR[3:] or name == "rotation":
+            words = "angle"
+        elif name in (*EXTERIOR[:3], *AXES, "base"):
+            words = "length"
+        else:
+            _check_unit_of_parameter(one, name, network)
+            return
+    kind = kind_of(one.unit)
+    if words == "length":
+        unit = "m" if network is None else network.object_unit
+        convert(1.0, unit, one.unit)
+        return
+    expected = {"": ("number",), "px": ("image", "length"), "angle": ("angle",)}
+    expected["px, length"] = ("image", "length")
+    if kind not in expected[words]:
+        given = {"": "", "px": "px", "px, length": "px", "angle": "deg"}[words]
+        convert(1.0, given, one.unit)
+
+
+def _check_unit_of_parameter(one: Criterion, name: str, network: Network | None) -> None:
+    if network is None:
+        return
+    for camera in network.cameras:
+        model = get_model(camera.model)
+        if name not in model.parameters:
+            continue
+        own = name in (*model.principal_distance, *model.principal_point)
+        unit = model.unit if own else ""
+        square = camera.pixel_size is not None
+        if not (square and {kind_of(unit), kind_of(one.unit)} == {"image", "length"}):
+            convert(1.0, unit, one.unit)

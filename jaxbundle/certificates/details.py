@@ -1,0 +1,204 @@
+"""What a certificate states that no adjustment knows: laboratory, customer, object, conditions,
+procedure, and the inputs of its budget that the adjustment holds.
+
+A TOML file, all of it optional:
+
+    [certificate]
+    number = "2026-014"
+    laboratory = "Measuring laboratory"
+    object = "Digital camera"
+    serial = "30412"
+
+    [evaluation]
+    coverage = 0.95
+    mpe = "20 um + L/50000"
+
+    [[input]]
+    name = "camera:cam:K3"
+    limits = 2e-9
+    distribution = "rectangular"
+
+The fields of `[certificate]` are those that ISO/IEC 17025 (2017), 7.8.2 and 7.8.4, wants in a
+calibration certificate; one that is missing is a line to fill in by hand.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from jaxbundle.adjustment.quality.fixed_quantities import split_name
+from jaxbundle.adjustment.uncertainty_budget import DIVISORS, HeldInput
+from jaxbundle.arguments import number, positive, show
+from jaxbundle.certificates.lengths import RULES
+from jaxbundle.errors import InputError
+from jaxbundle.io.text.csv_tables import read_toml
+from jaxbundle.network.columns import did_you_mean
+from jaxbundle.network.kinds.base import ANGLES
+from jaxbundle.network.units import ANGLE_UNITS
+
+# The fields of a certificate, with their titles.
+FIELDS = {
+    "number": "Certificate",
+    "laboratory": "Laboratory",
+    "address": "Address",
+    "accreditation": "Accreditation",
+    "customer": "Customer",
+    "object": "Object",
+    "manufacturer": "Manufacturer",
+    "type": "Type",
+    "serial": "Serial number",
+    "received": "Received",
+    "calibrated": "Date of calibration",
+    "place": "Place",
+    "conditions": "Environmental conditions",
+    "procedure": "Procedure",
+    "traceability": "Traceability",
+    "remarks": "Remarks",
+    "issued": "Date of issue",
+    "approved_by": "Approved by",
+}
+# Those that a certificate wants in any case: an empty line is printed for them.
+WANTED = (
+    "number", "laboratory", "customer", "object", "serial", "calibrated", "conditions",
+    "procedure", "traceability", "issued", "approved_by",
+)  # fmt: skip
+EVALUATION = (
+    "coverage", "measurands", "mpe", "rule", "volume", "horizontal_class", "vertical_class",
+)  # fmt: skip
+INPUT = ("name", "sigma", "limits", "expanded", "k", "distribution", "degrees", "words")
+
+
+@dataclasses.dataclass(frozen=True)
+class CertificateDetails:
+    """What a certificate states beside the result.
+
+    **Fields:** `fields` by their names in `FIELDS`; `coverage` probability; `measurands` by name,
+    empty: the free parameters of the cameras; `mpe`, `rule`, `volume` as in
+    `jaxbundle.length_errors`; `horizontal_class`, `vertical_class` as in
+    `jaxbundle.positional_accuracy`; `inputs`: held ones by name, as in
+    `jaxbundle.uncertainty_budget`, but angles in the unit of the network.
+    """
+
+    fields: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    coverage: float = 0.95
+    measurands: tuple[str, ...] = ()
+    mpe: str = ""
+    rule: str = RULES[0]
+    volume: tuple[float, ...] | None = None
+    horizontal_class: float | None = None
+    vertical_class: float | None = None
+    inputs: Mapping[str, HeldInput] = dataclasses.field(default_factory=dict)
+
+    def held(self, angle_unit: str) -> dict[str, HeldInput]:
+        """The held inputs, angles in radians."""
+        found = {}
+        for name, one in self.inputs.items():
+            angle = split_name(name)[2] in ANGLES
+            scale = ANGLE_UNITS[angle_unit] if angle else 1.0
+            found[name] = dataclasses.replace(one, uncertainty=one.uncertainty * scale)
+        return found
+
+
+NO_DETAILS = CertificateDetails()
+
+
+def read_details(given: Any) -> CertificateDetails:
+    """Details from the path of a TOML file, or its content as a dict.
+
+    **Raises:** `InputError` naming file, section and key."""
+    if given is None:
+        return NO_DETAILS
+    if isinstance(given, CertificateDetails):
+        return given
+    where = "details"
+    if isinstance(given, str | Path):
+        where, given = str(given), read_toml(Path(given))
+    if not isinstance(given, Mapping):
+        raise InputError(f"details: the path of a TOML file is expected, not {show(given)}")
+    _check_keys(given, ("certificate", "evaluation", "input"), where)
+    stated = _section(given, "certificate", where)
+    _check_keys(stated, FIELDS, f"{where}, [certificate]")
+    evaluation = _section(given, "evaluation", where)
+    _check_keys(evaluation, EVALUATION, f"{where}, [evaluation]")
+    inputs = given.get("input", [])
+    if not isinstance(inputs, list) or not all(isinstance(one, Mapping) for one in inputs):
+        raise InputError(f"{where}: [[input]] sections are expected")
+    return CertificateDetails(
+        fields={name: str(value) for name, value in stated.items()},
+        inputs=_inputs(inputs, where),
+        **_evaluation(evaluation, f"{where}, [evaluation]"),
+    )
+
+
+def _section(given: Mapping[str, Any], name: str, where: str) -> Mapping[str, Any]:
+    found = given.get(name, {})
+    if not isinstance(found, Mapping):
+        raise InputError(f"{where}: a section [{name}] is expected")
+    return found
+
+
+def _check_keys(given: Mapping[str, Any], known: Any, where: str) -> None:
+    for key in given:
+        if key not in known:
+            raise InputError(f"{where}: unknown key {key!r}{did_you_mean(key, list(known))}")
+
+
+def _evaluation(given: Mapping[str, Any], where: str) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    if "coverage" in given:
+        found["coverage"] = number(f"{where}, coverage", given["coverage"])
+        if not 0 < found["coverage"] < 1:
+            raise InputError(f"{where}, coverage: a probability between 0 and 1 is expected")
+    if "rule" in given and given["rule"] not in RULES:
+        raise InputError(f"{where}, rule: one of {', '.join(RULES)} is expected")
+    for name in ("mpe", "rule"):
+        if name in given:
+            found[name] = str(given[name])
+    for name in ("horizontal_class", "vertical_class"):
+        if name in given:
+            found[name] = positive(f"{where}, {name}", given[name])
+    if "measurands" in given:
+        names = given["measurands"]
+        if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
+            raise InputError(f"{where}, measurands: a list of names KIND:ID:NAME is expected")
+        for name in names:
+            split_name(name)
+        found["measurands"] = tuple(names)
+    if "volume" in given:
+        sides = given["volume"]
+        if not isinstance(sides, list) or len(sides) != 3:  # noqa: PLR2004 - width, depth, height
+            raise InputError(f"{where}, volume: three sides are expected, such as [2.0, 2.0, 1.5]")
+        found["volume"] = tuple(positive(f"{where}, volume", side) for side in sides)
+    return found
+
+
+def _inputs(given: list[Mapping[str, Any]], where: str) -> dict[str, HeldInput]:
+    found: dict[str, HeldInput] = {}
+    for row, one in enumerate(given, 1):
+        place = f"{where}, input {row}"
+        _check_keys(one, INPUT, place)
+        if "name" not in one:
+            raise InputError(f"{place}: name is missing, such as camera:cam:K3")
+        name = ":".join(split_name(str(one["name"])))
+        if name in found:
+            raise InputError(f"{place}: {name} is given twice")
+        found[name] = _input(one, place)
+    return found
+
+
+def _input(one: Mapping[str, Any], place: str) -> HeldInput:
+    given = [key for key in ("sigma", "limits", "expanded") if key in one]
+    if len(given) != 1:
+        raise InputError(f"{place}: one of sigma, limits, expanded is expected")
+    distribution = str(one.get("distribution", "rectangular" if "limits" in one else "normal"))
+    if distribution not in DIVISORS:
+        raise InputError(f"{place}, distribution: one of {', '.join(DIVISORS)} is expected")
+    value = positive(f"{place}, {given[0]}", one[given[0]])
+    if given[0] == "limits":
+        value /= DIVISORS[distribution]
+    if given[0] == "expanded":
+        value /= positive(f"{place}, k", one.get("k", 2.0))
+    degrees = positive(f"{place}, degrees", one["degrees"]) if "degrees" in one else math.inf
+    return HeldInput(value, distribution, degrees, str(one.get("words", "")))

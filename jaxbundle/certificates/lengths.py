@@ -1,0 +1,445 @@
+"""Length measurement errors: VDI/VDE 2634 Part 1, with a verdict after ISO 14253-1.
+
+Calibrated lengths that have no part in the adjustment are compared with those of its points:
+
+    E = L_measured − L_calibrated                         VDI/VDE 2634-1 (2002): Δl = l_m − l_k
+    MPE = min(A + L/K, B)                                 ISO 10360-2 (2009), forms of an MPE
+
+The characteristic is the largest |E| of all lengths, and every single one must keep the maximum
+permissible error. The uncertainty u of a test value is that of the calibrated length (ISO/TS 23165
+(2006)): errors of the measuring system are what is tested. By the decision rule of ISO 14253-1
+(2017) an error conforms where it is proven to, with a conformance probability of at least 95 %:
+
+    conformity:     |E| ≤ MPE − g        nonconformity:  |E| > MPE + g        g = z(95 %)·u
+
+and neither is proven in between. z = 1.645 is that of a normal distribution about one limit. Simple
+acceptance (g = 0) is the rule where both sides agreed to it.
+
+VDI/VDE 2634-1 wants at least seven lines in the measuring volume with at least five lengths each,
+the longest length of two thirds of the space diagonal; ISO 10360-2 three repetitions of each in
+seven positions. What a test has of these is listed beside what is wanted.
+"""
+
+import dataclasses
+import math
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbundle.adjustment.problem import coordinates
+from jaxbundle.adjustment.result import Adjustment
+from jaxbundle.arguments import at_least_zero, one_of, positive, show
+from jaxbundle.certificates.units import LENGTHS, convert
+from jaxbundle.display import print_in_one_screen
+from jaxbundle.errors import InputError
+from jaxbundle.io.text.csv_tables import read_csv
+from jaxbundle.leastsquares.indexing.rows import Values
+from jaxbundle.leastsquares.quality.distributions import normal_quantile
+from jaxbundle.network.columns import as_columns, count, did_you_mean, list_some
+from jaxbundle.report.layout import fixed, significant, table
+from jaxbundle.results import TableMethods
+
+CONFORMS, FAILS, OPEN = "conformity proven", "nonconformity proven", "neither proven"
+RULES = ("guard band", "simple acceptance")
+# Conformance probability of ISO 14253-1 (2017) unless both sides agree otherwise.
+PROBABILITY = 0.95
+# What VDI/VDE 2634-1 (2002) wants of a test, and ISO 10360-2 (2009) of repetitions.
+LEAST_LINES, LEAST_LENGTHS, LEAST_REACH, REPETITIONS = 7, 5, 2 / 3, 3
+MPE_FORM = re.compile(
+    r"""\s*(?P<a>\d+\.?\d*|\.\d+)\s*(?P<unit>[^\W\d]\w*)\s*
+    (?:\+\s*L\s*/\s*(?P<k>\d+\.?\d*(?:[eE]\d+)?)\s*)?
+    (?:(?:<=|≤|,?\s*max)\s*(?P<b>\d+\.?\d*|\.\d+)\s*(?P<b_unit>[^\W\d]\w*)\s*)?""",
+    re.VERBOSE,
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class PermissibleError:
+    """A maximum permissible error min(A + L/K, B), all lengths in one unit: `constant` A,
+    `per_length` 1/K, `ceiling` B; the `text` that it is from."""
+
+    constant: float
+    per_length: float = 0.0
+    ceiling: float = math.inf
+    text: str = ""
+
+    def __post_init__(self):
+        at_least_zero("constant", self.constant)
+        at_least_zero("per_length", self.per_length)
+        if not self.ceiling > 0:
+            raise InputError(f"ceiling must be positive, but is {show(self.ceiling)}")
+
+    def __call__(self, length: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """The permissible error of each length."""
+        return np.minimum(self.constant + self.per_length * np.asarray(length), self.ceiling)
+
+
+def read_mpe(text: str, unit: str) -> PermissibleError:
+    """A maximum permissible error from a text such as "20 um + L/50000", "50 um" or
+    "10 um + L/25000, max 80 um", in an object unit.
+
+    **Raises:** `InputError`."""
+    found = MPE_FORM.fullmatch(text) if isinstance(text, str) else None
+    if found is None:
+        raise InputError(
+            f"MPE {show(text)}: A UNIT + L/K is expected, such as '20 um + L/50000', or '50 um'"
+        )
+    if unit not in LENGTHS:
+        raise InputError(f"MPE {text!r}: the object unit {unit!r} is no length")
+    try:
+        constant = convert(float(found["a"]), found["unit"].replace("µ", "u"), unit)
+        ceiling = math.inf
+        if found["b"]:
+            ceiling = convert(float(found["b"]), found["b_unit"].replace("µ", "u"), unit)
+    except InputError as error:
+        raise InputError(f"MPE {text!r}: {error}") from None
+    per_length = 1 / positive("K of the MPE", float(found["k"])) if found["k"] else 0.0
+    return PermissibleError(constant, per_length, ceiling, " ".join(text.split()))
+
+
+@dataclasses.dataclass(frozen=True)
+class CalibratedLengths:
+    """Calibrated lengths between named points: `ends` [(from, to)], `value` and `sigma` (of the
+    calibration, k = 1) in the object unit, the `line` of each (empty: not stated); `source`."""
+
+    ends: tuple[tuple[str, str], ...]
+    value: Float[np.ndarray, " n"]
+    sigma: Float[np.ndarray, " n"]
+    line: tuple[str, ...] = ()
+    source: str = "lengths"
+
+    def __len__(self) -> int:
+        return len(self.ends)
+
+
+def read_lengths(given: Any) -> CalibratedLengths:
+    """Calibrated lengths from a table with the columns from, to, value, sigma and, if wanted, line:
+    the path of a CSV file, a dict of columns, a data frame.
+
+    **Raises:** `InputError` naming file and row."""
+    if isinstance(given, CalibratedLengths):
+        return given
+    name = "lengths"
+    if isinstance(given, str | Path):
+        name = str(given)
+        columns = read_csv(Path(given))
+    else:
+        columns = as_columns(given, name)
+    columns.check_names(("from", "to", "value", "sigma"), ("line",))
+    value = columns.numbers("value", required=True)
+    sigma = columns.numbers("sigma", required=True)
+    ends = tuple(zip(columns.ids("from"), columns.ids("to")))
+    for row, ((a, b), length, s) in enumerate(zip(ends, value, sigma)):
+        if a == b:
+            raise InputError(f"{columns.source(row)}: from and to are the same point {a!r}")
+        if not (length > 0 and math.isfinite(length)):
+            raise InputError(f"{columns.source(row)}: value must be positive, but is {length:g}")
+        if not (s >= 0 and math.isfinite(s)):
+            raise InputError(f"{columns.source(row)}: sigma must not be negative, but is {s:g}")
+    line = columns.ids("line") if "line" in columns.values else ("",) * len(ends)
+    return CalibratedLengths(ends, value, sigma, line, name)
+
+
+def require_points(lengths: CalibratedLengths, known: Sequence[str]) -> None:
+    """Refuse lengths of points that a network does not have.
+
+    **Raises:** `InputError`."""
+    there = set(known)
+    for name in (end for ends in lengths.ends for end in ends):
+        if name not in there:
+            raise InputError(
+                f"{lengths.source}: there is no point {name!r}{did_you_mean(name, known)}"
+            )
+
+
+@print_in_one_screen
+@dataclasses.dataclass(frozen=True)
+class LengthTest(TableMethods):
+    """Length measurement errors of calibrated lengths.
+
+    **Fields:** `lengths`, the calibrated ones that could be compared; `measured`, and `sigma` of
+    it by the adjustment; `mpe`, None without; `rule`: "guard band" (ISO 14253-1) or "simple
+    acceptance"; `missing`: lengths whose points were not measured; `diagonal` of the measuring
+    volume; `unit`.
+    """
+
+    lengths: CalibratedLengths
+    measured: Float[np.ndarray, " n"]
+    sigma: Float[np.ndarray, " n"]
+    unit: str
+    diagonal: float
+    mpe: PermissibleError | None = None
+    rule: str = RULES[0]
+    missing: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def error(self) -> Float[np.ndarray, " n"]:
+        """E = measured − calibrated."""
+        return self.measured - self.lengths.value
+
+    @property
+    def largest(self) -> float:
+        """The characteristic: the largest |E|."""
+        return float(np.abs(self.error).max())
+
+    @property
+    def rms(self) -> float:
+        """√(ΣE²/n)."""
+        return float(np.sqrt(np.mean(self.error**2)))
+
+    @property
+    def limit(self) -> Float[np.ndarray, " n"] | None:
+        """The permissible error of every length; None without an MPE."""
+        return None if self.mpe is None else self.mpe(self.lengths.value)
+
+    @property
+    def guard_band(self) -> Float[np.ndarray, " n"]:
+        """g of every length."""
+        if self.rule == RULES[1]:
+            return np.zeros(len(self.lengths))
+        return normal_quantile(PROBABILITY) * self.lengths.sigma
+
+    @property
+    def verdicts(self) -> tuple[str, ...]:
+        """The verdict on every length; empty without an MPE."""
+        if self.limit is None:
+            return ()
+        size, g = np.abs(self.error), self.guard_band
+        good, bad = size <= self.limit - g, size > self.limit + g
+        return tuple(CONFORMS if a else FAILS if b else OPEN for a, b in zip(good, bad))
+
+    @property
+    def verdict(self) -> str:
+        """The verdict on the test: nonconformity if one length proves it, conformity if all do;
+        empty without an MPE."""
+        found = self.verdicts
+        if not found:
+            return ""
+        return FAILS if FAILS in found else OPEN if OPEN in found else CONFORMS
+
+    @property
+    def converged(self) -> bool:
+        return True
+
+    def requirements(self) -> list[tuple[str, str, str, bool]]:
+        """What VDI/VDE 2634-1 wants of the arrangement: subject, wanted, found, whether it is
+        met; lines only where the table states them."""
+        per_line: dict[str, int] = {}
+        for line in self.lengths.line:
+            per_line[line] = per_line.get(line, 0) + 1
+        lines = {name: n for name, n in per_line.items() if name}
+        reach = float(self.lengths.value.max()) / self.diagonal if self.diagonal > 0 else math.nan
+        fewest = min(lines.values(), default=0)
+        stated = "not stated (column line)"
+        return [
+            (
+                "measuring lines",
+                f"≥ {LEAST_LINES}",
+                str(len(lines)) if lines else stated,
+                len(lines) >= LEAST_LINES,
+            ),
+            (
+                "test lengths of a line",
+                f"≥ {LEAST_LENGTHS}",
+                str(fewest) if lines else stated,
+                fewest >= LEAST_LENGTHS,
+            ),
+            (
+                "longest length to the space diagonal of the volume",
+                "≥ 2/3",
+                f"{reach:.2f}",
+                reach >= LEAST_REACH,
+            ),
+        ]
+
+    def table(self) -> dict[str, np.ndarray]:
+        """A row a length: from, to, line, calibrated, sigma_calibrated, measured, sigma_measured,
+        error, mpe, guard_band, verdict."""
+        a, b = zip(*self.lengths.ends)
+        text = lambda words: np.array(list(words), dtype=object)
+        none = np.full(len(self.lengths), np.nan)
+        return {
+            "from": text(a), "to": text(b), "line": text(self.lengths.line),
+            "calibrated": self.lengths.value, "sigma_calibrated": self.lengths.sigma,
+            "measured": self.measured, "sigma_measured": self.sigma, "error": self.error,
+            "mpe": none if self.limit is None else self.limit, "guard_band": self.guard_band,
+            "verdict": text(self.verdicts or ("",) * len(self.lengths)),
+        }  # fmt: skip
+
+    def rows(self) -> list[tuple[str, ...]]:
+        """`table` as text, under `HEADER`."""
+        places = _places(self)
+        limit = np.full(len(self.lengths), np.nan) if self.limit is None else self.limit
+        return [
+            (*ends, line, *(fixed(float(x), places) for x in numbers), verdict)
+            for ends, line, *numbers, verdict in zip(
+                self.lengths.ends,
+                self.lengths.line,
+                self.lengths.value,
+                self.measured,
+                self.error,
+                limit,
+                self.lengths.sigma,
+                self.sigma,
+                self.verdicts or ("",) * len(self.lengths),
+            )
+        ]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The test as plain dicts and numbers, as in JSON."""
+        columns = {name: column.tolist() for name, column in self.table().items()}
+        return {
+            "unit": self.unit, "number": len(self.lengths), "largest": self.largest,
+            "rms": self.rms, "mpe": None if self.mpe is None else self.mpe.text, "rule": self.rule,
+            "verdict": self.verdict or None, "missing": [list(ends) for ends in self.missing],
+            "lengths": [dict(zip(columns, row)) for row in zip(*columns.values())],
+        }  # fmt: skip
+
+    def __str__(self) -> str:
+        lines = [
+            f"Length measurement errors of {count(len(self.lengths), 'length')} in {self.unit}: "
+            f"largest |E| {significant(self.largest)}, RMS {significant(self.rms)}"
+            + (f"; {self.verdict} ({self.rule})" if self.verdict else ""),
+            *table(HEADER, self.rows(), "lllrrrrrrl"),
+        ]
+        if self.missing:
+            lines.append(f"not measured: {list_some(self.missing, 5, ' – '.join)}")
+        return "\n".join(lines)
+
+
+HEADER = ("from", "to", "line", "calibrated", "measured", "E", "MPE", "σ cal.", "σ", "verdict")
+
+
+def _places(test: LengthTest) -> int:
+    """Decimals: two digits of the smallest uncertainty, or of the largest error without any."""
+    known = test.lengths.sigma[test.lengths.sigma > 0]
+    size = float(known.min()) if len(known) else max(test.largest, 1e-12)
+    return int(np.clip(1 - math.floor(math.log10(size)), 0, 9))
+
+
+def length_errors(
+    given: Any,
+    lengths: Any,
+    *,
+    mpe: PermissibleError | str | None = None,
+    rule: str = RULES[0],
+    volume: Sequence[float] | None = None,
+) -> LengthTest:
+    """The length measurement errors of an adjustment, after VDI/VDE 2634 Part 1.
+
+    **Arguments:**
+
+    - `given`: an `Adjustment`, or a result that has one as `adjustment`.
+    - `lengths`: calibrated lengths that the adjustment does not have: the path of a table with the
+      columns from, to, value, sigma and, if wanted, line; or its columns.
+    - `mpe`: maximum permissible error, a text such as "20 um + L/50000".
+    - `rule`: "guard band" (ISO 14253-1) or "simple acceptance".
+    - `volume`: the sides of the measuring volume, object unit; by default those of the box about
+      the ends of the lengths.
+
+    **Returns:** a `LengthTest`.
+
+    **Raises:** `InputError` if no length has both of its points, if the scale of the network is
+    open, or for lengths that are observations of the adjustment; `NotSolvedError` without a
+    solution.
+    """
+    adjustment = getattr(given, "adjustment", given)
+    if not isinstance(adjustment, Adjustment):
+        raise InputError(f"a result of jaxbundle.adjust is expected, not {show(given)}")
+    one_of("rule", rule, RULES)
+    known = read_lengths(lengths)
+    if adjustment.counts.datum == 7:  # noqa: PLR2004 - three shifts, three rotations, scale
+        raise InputError(
+            f"{known.source}: the network has no scale: add a distance or control points"
+        )
+    unit = adjustment.network.object_unit
+    limit = read_mpe(mpe, unit) if isinstance(mpe, str) else mpe
+    rows_of = {
+        id: row
+        for row, (id, there) in enumerate(
+            zip(adjustment.problem.network.points.id, adjustment.located)
+        )
+        if there
+    }
+    _refuse_observed(adjustment, known)
+    there = [i for i, ends in enumerate(known.ends) if all(end in rows_of for end in ends)]
+    missing = tuple(ends for i, ends in enumerate(known.ends) if i not in set(there))
+    if not there:
+        raise InputError(
+            f"{known.source}: no length has both points in the result; missing are "
+            f"{list_some(sorted({e for ends in missing for e in ends if e not in rows_of}))}"
+        )
+    chosen = CalibratedLengths(
+        tuple(known.ends[i] for i in there),
+        known.value[there],
+        known.sigma[there],
+        tuple((known.line or ("",) * len(known))[i] for i in there),
+        known.source,
+    )
+    rows = np.array([[rows_of[end] for end in ends] for ends in chosen.ends])
+    between = lambda values: _distances(values, rows)
+    variance = np.diagonal(adjustment.covariance_of(between))
+    if adjustment.error_model is not None:
+        variance = np.fmax(variance, np.diagonal(adjustment.modelled_covariance_of(between)))
+    ends = adjustment.point_values[rows].reshape(-1, 3)
+    sides = np.ptp(ends, axis=0) if volume is None else np.asarray(volume, float)
+    return LengthTest(
+        chosen,
+        np.asarray(between(adjustment.values)),
+        np.sqrt(np.clip(variance, 0, None)),
+        unit,
+        float(np.linalg.norm(sides)),
+        limit,
+        rule,
+        missing,
+    )
+
+
+def _distances(values: Values, rows: np.ndarray) -> Float[Array, " n"]:
+    position = coordinates(values)
+    return jnp.linalg.norm(position[rows[:, 1]] - position[rows[:, 0]], axis=1)
+
+
+def _refuse_observed(adjustment: Adjustment, lengths: CalibratedLengths) -> None:
+    """A length that is an observation tests nothing."""
+    network = adjustment.problem.network
+    ids = network.points.id
+    observed = {frozenset((ids[a], ids[b])) for a, b in network.distances.points.tolist()}
+    for a, b in lengths.ends:
+        if frozenset((a, b)) in observed:
+            raise InputError(
+                f"{lengths.source}: {a} – {b} is a distance of the adjustment, which tests "
+                "nothing; leave it out of one of them"
+            )
+
+
+def join_length_tests(tests: Sequence[LengthTest] | Mapping[str, LengthTest]) -> LengthTest:
+    """Repetitions as one test, such as the three of ISO 10360-2: errors of all of them.
+
+    **Raises:** `InputError` without tests, or for different units, limits or rules."""
+    given = list(tests.values()) if isinstance(tests, Mapping) else list(tests)
+    if not given:
+        raise InputError("tests: at least one is expected")
+    first = given[0]
+    if any((t.unit, t.mpe, t.rule) != (first.unit, first.mpe, first.rule) for t in given):
+        raise InputError("tests of one unit, MPE and decision rule are expected")
+    lengths = CalibratedLengths(
+        tuple(ends for t in given for ends in t.lengths.ends),
+        np.concatenate([t.lengths.value for t in given]),
+        np.concatenate([t.lengths.sigma for t in given]),
+        tuple(line for t in given for line in t.lengths.line),
+        first.lengths.source,
+    )
+    return dataclasses.replace(
+        first,
+        lengths=lengths,
+        measured=np.concatenate([t.measured for t in given]),
+        sigma=np.concatenate([t.sigma for t in given]),
+        diagonal=max(t.diagonal for t in given),
+        missing=tuple(dict.fromkeys(ends for t in given for ends in t.missing)),
+    )

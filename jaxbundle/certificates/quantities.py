@@ -1,0 +1,551 @@
+"""The quantities of results that acceptance criteria may name.
+
+A quantity is one number or several, of all parameters, images, points or cameras it concerns: a
+criterion must hold for each of them.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from jaxbundle.adjustment.result import Adjustment
+from jaxbundle.adjustment.uncertainty_budget import unit_of_parameter
+from jaxbundle.calibration.result import Calibration
+from jaxbundle.calibration.rig.result import RigCalibration
+from jaxbundle.calibration.several import Calibrations
+from jaxbundle.cameras import get_model
+from jaxbundle.certificates.lengths import LengthTest
+from jaxbundle.certificates.units import NO_PITCH, PixelPitch
+from jaxbundle.errors import InputError
+from jaxbundle.network.columns import did_you_mean, list_some
+from jaxbundle.network.tables import EXTERIOR
+from jaxbundle.reconstruction.result import Reconstruction
+from jaxbundle.report.correlated import stated_sigma, stated_sigma_of
+from jaxbundle.types import present
+
+AXES = ("X", "Y", "Z")
+
+
+@dataclasses.dataclass(frozen=True)
+class Subject:
+    """What criteria are about: a result, and the test of calibrated lengths, if there is one."""
+
+    result: Any
+    lengths: LengthTest | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class QuantityValues:
+    """Values of a quantity by what they are of ("" for the whole), in `unit`."""
+
+    values: Mapping[str, float]
+    unit: str = ""
+    pitch: PixelPitch = NO_PITCH
+
+
+@dataclasses.dataclass(frozen=True)
+class Quantity:
+    """A quantity: its `form` for lists ("sigma(NAME)", in brackets what may be omitted), its `unit`
+    in words, what it is; `find` its values in a subject, by the argument."""
+
+    form: str
+    unit: str
+    words: str
+    find: Callable[[Subject, str], QuantityValues]
+
+    @property
+    def name(self) -> str:
+        return self.form.partition("(")[0].rstrip("[")
+
+    @property
+    def arguments(self) -> tuple[str, ...]:
+        """The arguments it may have; names of them in capitals."""
+        inside = self.form.partition("(")[2].rstrip(")]")
+        return tuple(inside.split("|")) if inside else ()
+
+
+def offered(kind: str) -> dict[str, Quantity]:
+    """The quantities of a command's result, by name: "adjust", "calibrate", "calibrate-rig",
+    "reconstruct"."""
+    every = {
+        "adjust": (OF_ADJUSTMENT,),
+        "calibrate": (OF_CALIBRATION, OF_ADJUSTMENT),
+        "calibrate-rig": (OF_RIG,),
+        "reconstruct": (OF_RECONSTRUCTION, OF_ADJUSTMENT),
+    }[kind]
+    found: dict[str, Quantity] = {}
+    for quantities in every:
+        for one in quantities:
+            found.setdefault(one.name, one)
+    return found
+
+
+def find_quantity(
+    result: Any, lengths: LengthTest | None, name: str, argument: str
+) -> QuantityValues:
+    """The values of a quantity in a result, of all of its parts.
+
+    **Raises:** `InputError` for an unknown quantity or argument; `LookupError` with the reason if
+    the result does not have it."""
+    groups = _parts_of(result)
+    for quantities, subjects in groups:
+        known = {one.name: one for one in quantities}
+        if name in known:
+            parts = {
+                label: known[name].find(Subject(one, lengths), argument)
+                for label, one in subjects.items()
+            }
+            return _join(parts)
+    if not groups:
+        return _by_path(result, name, argument)
+    known = {one.form for quantities, _ in groups for one in quantities}
+    raise InputError(unknown_quantity(name, sorted(known)))
+
+
+def unknown_quantity(name: str, forms: list[str]) -> str:
+    """The message for an unknown quantity, with the list."""
+    names = [form.partition("(")[0].rstrip("[") for form in forms]
+    mean = did_you_mean(name, names, listing=False)
+    return f"unknown quantity {name!r}{mean}; known: {list_some(forms, len(forms), str)}"
+
+
+def _parts_of(result: Any) -> list[tuple[tuple[Quantity, ...], dict[str, Any]]]:
+    """Quantities, and the results by name that have them, of a result and its parts."""
+    if isinstance(result, Adjustment):
+        return [(OF_ADJUSTMENT, {"": result})]
+    if isinstance(result, Calibration):
+        return [(OF_CALIBRATION, {"": result}), (OF_ADJUSTMENT, {"": result.adjustment})]
+    if isinstance(result, RigCalibration):
+        return [(OF_RIG, {"": result})]
+    if isinstance(result, Calibrations):
+        if result.rig is not None:
+            return [(OF_RIG, {"": result.rig})]
+        one = len(result.cameras) == 1
+        named = {"" if one else name: found for name, found in result.cameras.items()}
+        adjusted = {name: found.adjustment for name, found in named.items()}
+        return [(OF_CALIBRATION, named), (OF_ADJUSTMENT, adjusted)]
+    if isinstance(result, Reconstruction):
+        one = len(result.parts) == 1
+        parts = {"" if one else part.name: part.adjustment for part in result.parts}
+        return [(OF_RECONSTRUCTION, {"": result}), (OF_ADJUSTMENT, parts)]
+    return []
+
+
+def _join(parts: Mapping[str, QuantityValues]) -> QuantityValues:
+    """Values of several parts; their units are the same, or it is said."""
+    units = {found.unit for found in parts.values()}
+    if len(units) > 1:
+        raise LookupError(f"its parts have different units: {', '.join(sorted(units))}")
+    pitches = {found.pitch for found in parts.values()}
+    values = {
+        " ".join(word for word in (name, label) if word): value
+        for label, found in parts.items()
+        for name, value in found.values.items()
+    }
+    return QuantityValues(values, units.pop(), pitches.pop() if len(pitches) == 1 else NO_PITCH)
+
+
+def _by_path(result: Any, name: str, argument: str) -> QuantityValues:
+    """A number of `to_dict` by its path, such as `rms` or `counts.images`, of any other result."""
+    to_dict = getattr(result, "to_dict", None)
+    if to_dict is None:
+        raise InputError(f"a result of jaxbundle is expected, not {type(result).__name__}")
+    found = to_dict()
+    for part in name.split("."):
+        if not isinstance(found, Mapping) or part not in found:
+            keys = list(found) if isinstance(found, Mapping) else []
+            numbers = [k for k in keys if isinstance(found[k], int | float | Mapping)]
+            raise InputError(unknown_quantity(name, numbers))
+        found = found[part]
+    if isinstance(found, bool) or not isinstance(found, int | float) or argument:
+        raise InputError(f"{name}: is not one number of the result")
+    return QuantityValues({"": float(found)})
+
+
+# --- adjustment -----------------------------------------------------------------------------
+
+
+def _pitch(cameras: Any) -> PixelPitch:
+    """The pixel size where all cameras have the same square one."""
+    sizes = {camera.pixel_size for camera in cameras}
+    if len(sizes) == 1 and (size := next(iter(sizes))) is not None and size[0] == size[1]:
+        return PixelPitch(float(size[0]))
+    return NO_PITCH
+
+
+def _one(value: float, unit: str = "") -> QuantityValues:
+    return QuantityValues({"": float(value)}, unit)
+
+
+def _number(function: Callable[[Adjustment], float]) -> Callable[[Subject, str], QuantityValues]:
+    def find(subject: Subject, argument: str) -> QuantityValues:
+        _refuse_argument(argument)
+        return _one(function(subject.result))
+
+    return find
+
+
+def _refuse_argument(argument: str) -> None:
+    if argument:
+        raise InputError(f"it has no argument, but ({argument}) is given")
+
+
+def _split(argument: str) -> tuple[str, str, str]:
+    """KIND, ID and NAME of an argument: a parameter alone is that of all cameras, images or
+    points."""
+    kind, mark, rest = argument.partition(":")
+    id, second, name = rest.rpartition(":")
+    if mark and second and name and kind in ("camera", "image", "point"):
+        return kind, id, name
+    if mark:
+        raise InputError(
+            f"({argument}): a parameter, such as c, or KIND:ID:NAME is expected, such as "
+            "camera:cam:c, image:*:X0 or point:7:Z"
+        )
+    if not argument:
+        raise InputError("a parameter is expected in parentheses, such as (c), (X0) or (Z)")
+    if argument in EXTERIOR:
+        return "image", "*", argument
+    if argument in AXES:
+        return "point", "*", argument
+    return "camera", "*", argument
+
+
+def _parameters(
+    subject: Subject, argument: str, of_camera: Callable[[Mapping[str, Any]], float | None],
+    of_table: Callable[[Mapping[str, np.ndarray], str], np.ndarray] | None,
+    unit_less: bool = False,
+) -> QuantityValues:  # fmt: skip
+    """A number for each of the named unknowns that are estimated."""
+    adjustment: Adjustment = subject.result
+    kind, id, name = _split(argument)
+    network = adjustment.problem.network
+    if kind == "camera":
+        return _of_cameras(adjustment, id, name, of_camera, unit_less)
+    if of_table is None:
+        raise InputError("only parameters of cameras have it, such as c")
+    rows = adjustment.images if kind == "image" else adjustment.points
+    if name not in (EXTERIOR if kind == "image" else AXES):
+        known = ", ".join(EXTERIOR if kind == "image" else AXES)
+        raise InputError(f"there is no {name!r} of an {kind}; known: {known}")
+    values, ids = of_table(rows, name), [str(x) for x in rows["id"]]
+    if id not in ("*", *ids):
+        raise LookupError(f"there is no {kind} {id!r}")
+    free = stated_sigma(rows, name) > 0
+    chosen = {
+        f"{name} of {kind} {k}": float(v)
+        for k, v, is_free in zip(ids, values, free)
+        if is_free and id in ("*", k) and math.isfinite(v)
+    }
+    if not chosen:
+        raise LookupError(f"no {name} of an {kind} is estimated")
+    angle = name in EXTERIOR[3:]
+    return QuantityValues(chosen, network.angle_unit if angle else network.object_unit)
+
+
+def _of_cameras(
+    adjustment: Adjustment, id: str, name: str,
+    of_camera: Callable[[Mapping[str, Any]], float | None], unit_less: bool,
+) -> QuantityValues:  # fmt: skip
+    cameras = [c for c in adjustment.problem.network.cameras if id in ("*", c.id)]
+    if not cameras:
+        raise LookupError(f"there is no camera {id!r}")
+    values, units = {}, set()
+    for camera in cameras:
+        entry = adjustment.cameras[camera.id]["parameters"].get(name)
+        value = None if entry is None or not entry["free"] else of_camera(entry)
+        if value is not None:
+            values[f"{name} of camera {camera.id}"] = float(value)
+            units.add("" if unit_less else unit_of_parameter(camera.model, name))
+    if not values:
+        require_parameter(cameras, name)
+        raise LookupError(f"{name} is held, and not estimated")
+    if len(units) > 1:
+        raise LookupError(f"{name} has different units: {', '.join(sorted(units))}")
+    return QuantityValues(values, units.pop(), _pitch(cameras))
+
+
+def require_parameter(cameras: Any, name: str) -> None:
+    """Refuse a name that is no parameter of any of these cameras.
+
+    **Raises:** `InputError`."""
+    known = dict.fromkeys(p for c in cameras for p in get_model(c.model).parameters)
+    if name not in known:
+        raise InputError(
+            f"there is no parameter {name!r}{did_you_mean(name, known, listing=False)}; known: "
+            f"{', '.join([*known, *EXTERIOR, *AXES])}"
+        )
+
+
+def _sigma(subject: Subject, argument: str) -> QuantityValues:
+    return _parameters(subject, argument, stated_sigma_of, stated_sigma)
+
+
+def _value(subject: Subject, argument: str) -> QuantityValues:
+    return _parameters(
+        subject, argument, lambda entry: entry["value"], lambda rows, name: rows[name]
+    )
+
+
+def _t(subject: Subject, argument: str) -> QuantityValues:
+    return _parameters(subject, argument, lambda entry: entry["t"], None, unit_less=True)
+
+
+def _total_correlation(subject: Subject, argument: str) -> QuantityValues:
+    find = lambda entry: entry["total_correlation"]
+    return _parameters(subject, argument, find, None, unit_less=True)
+
+
+def _rms_sigma(subject: Subject, argument: str) -> QuantityValues:
+    found = _sigma(subject, argument)
+    values = np.array(list(found.values.values()))
+    return dataclasses.replace(found, values={"": float(np.sqrt(np.mean(values**2)))})
+
+
+def _image_rms(subject: Subject, argument: str) -> QuantityValues:
+    _refuse_argument(argument)
+    adjustment: Adjustment = subject.result
+    rows = adjustment.residuals
+    image = rows["kind"] == "image"
+    # two coordinates a point: the RMS of a coordinate
+    unit = str(rows["unit"][image][0])
+    cameras = adjustment.problem.network.cameras
+    pitch = _pitch(cameras)
+    v = rows["v"][image]
+    scale = {"µm": 1e-3, "um": 1e-3}.get(unit)
+    if scale is not None:
+        v, unit = v * scale, "mm"
+    return QuantityValues({"": float(np.sqrt(np.mean(v**2)))}, unit, pitch)
+
+
+def _least_redundancy(adjustment: Adjustment) -> float:
+    return float(adjustment.residuals["r"].min())
+
+
+def _differences(subject: Subject) -> tuple[dict[str, np.ndarray], str]:
+    adjustment: Adjustment = subject.result
+    found = adjustment.table("checks")
+    if not found:
+        raise LookupError("the result has no check points")
+    return found, adjustment.network.object_unit
+
+
+def _check_rms(subject: Subject, argument: str) -> QuantityValues:
+    table, unit = _differences(subject)
+    rms = {axis: _rms(table[f"d{axis}"]) for axis in AXES}
+    parts = {"": AXES, "3D": AXES, "H": AXES[:2], "V": AXES[2:], **{a: (a,) for a in AXES}}
+    if argument not in parts:
+        raise InputError(f"({argument}): one of X, Y, Z, H, V, 3D is expected")
+    return _one(math.sqrt(sum(rms[axis] ** 2 for axis in parts[argument])), unit)
+
+
+def _check_max(subject: Subject, argument: str) -> QuantityValues:
+    table, unit = _differences(subject)
+    if argument not in ("", *AXES):
+        raise InputError(f"({argument}): one of X, Y, Z is expected")
+    return QuantityValues(
+        {
+            f"{axis} of check point {id}": abs(float(d))
+            for axis in AXES
+            if argument in ("", axis)
+            for id, d in zip(table["id"], table[f"d{axis}"])
+            if math.isfinite(d)
+        },
+        unit,
+    )
+
+
+def _check_number(adjustment: Adjustment) -> float:
+    return 0 if adjustment.check_points is None else len(adjustment.check_points.id)
+
+
+def _rms(x: np.ndarray) -> float:
+    known = x[np.isfinite(x)]
+    return float(np.sqrt(np.mean(known**2))) if len(known) else 0.0
+
+
+def _control_rms(subject: Subject, argument: str) -> QuantityValues:
+    adjustment: Adjustment = subject.result
+    rows = adjustment.residuals
+    if argument not in ("", *AXES):
+        raise InputError(f"({argument}): one of X, Y, Z is expected")
+    own = rows["kind"] == "control"
+    if not own.any():
+        raise LookupError("the result has no control points with σ")
+    rms = [_rms(rows["v"][own & (rows["axis"] == a)]) for a in AXES if argument in ("", a)]
+    return _one(math.sqrt(sum(x * x for x in rms)), adjustment.network.object_unit)
+
+
+def _lengths(subject: Subject) -> LengthTest:
+    if subject.lengths is None:
+        raise LookupError("no calibrated lengths are given (--lengths)")
+    return subject.lengths
+
+
+def _lme(subject: Subject, argument: str) -> QuantityValues:
+    _refuse_argument(argument)
+    test = _lengths(subject)
+    errors = zip(test.lengths.ends, np.abs(test.error).tolist())
+    return QuantityValues({f"length {a} – {b}": error for (a, b), error in errors}, test.unit)
+
+
+def _lme_rms(subject: Subject, argument: str) -> QuantityValues:
+    _refuse_argument(argument)
+    return _one(_lengths(subject).rms, _lengths(subject).unit)
+
+
+def _lme_number(subject: Subject, argument: str) -> QuantityValues:
+    _refuse_argument(argument)
+    return _one(len(_lengths(subject).lengths))
+
+
+def _chi_squared(adjustment: Adjustment) -> float:
+    test = adjustment.global_test()
+    if test["passed"] is None:
+        raise LookupError("no χ² test is made: no a priori σ is stated")
+    return test["vtpv"] / test["high"]
+
+
+OF_ADJUSTMENT: tuple[Quantity, ...] = (
+    Quantity("sigma0", "", "σ0 of the adjustment", _number(lambda a: a.sigma0)),
+    Quantity("redundancy", "", "redundancy of the adjustment", _number(lambda a: a.redundancy)),
+    Quantity("chi2", "", "vᵀPv over the upper limit of its χ² test", _number(_chi_squared)),
+    Quantity("observations", "", "number of observations",
+             _number(lambda a: a.counts.observations)),
+    Quantity("images", "", "number of images", _number(lambda a: len(a.problem.network.images))),
+    Quantity("points", "", "number of points",
+             _number(lambda a: int((~a.problem.excluded).sum()))),
+    Quantity("removed", "", "observations removed as blunders", _number(lambda a: len(a.removed))),
+    Quantity("warnings", "", "number of warnings", _number(lambda a: len(a.warnings))),
+    Quantity("r", "", "smallest redundancy number", _number(_least_redundancy)),
+    Quantity("sigma(NAME)", "of NAME", "σ of an unknown, the largest of several", _sigma),
+    Quantity("sigma.rms(NAME)", "of NAME", "its root mean square over cameras, images, points",
+             _rms_sigma),
+    Quantity("value(NAME)", "of NAME", "the adjusted value", _value),
+    Quantity("t(NAME)", "", "value over σ of a camera parameter", _t),
+    Quantity("correlation(NAME)", "", "total correlation of a camera parameter",
+             _total_correlation),
+    Quantity("image.rms", "px, length", "RMS residual of an image coordinate", _image_rms),
+    Quantity("check.rms[(X|Y|Z|H|V|3D)]", "length", "RMS difference at check points, of all axes",
+             _check_rms),
+    Quantity("check.max[(X|Y|Z)]", "length", "largest difference at check points", _check_max),
+    Quantity("check.number", "", "number of check points", _number(_check_number)),
+    Quantity("control.rms[(X|Y|Z)]", "length", "RMS residual of control", _control_rms),
+    Quantity("LME", "length", "largest length measurement error (--lengths)", _lme),
+    Quantity("LME.rms", "length", "RMS of length measurement errors", _lme_rms),
+    Quantity("LME.number", "", "number of compared lengths", _lme_number),
+)  # fmt: skip
+
+
+# --- calibration ----------------------------------------------------------------------------
+
+
+def _calibrated(
+    function: Callable[[Calibration], float], unit: str = ""
+) -> Callable[[Subject, str], QuantityValues]:
+    def find(subject: Subject, argument: str) -> QuantityValues:
+        _refuse_argument(argument)
+        camera = present(subject.result).camera
+        return QuantityValues({"": float(function(subject.result))}, unit, _pitch([camera]))
+
+    return find
+
+
+OF_CALIBRATION: tuple[Quantity, ...] = (
+    Quantity("rms", "px", "RMS of an image point", _calibrated(lambda c: c.rms, "px")),
+    Quantity("views", "", "photographs used", _calibrated(lambda c: len(c.views))),
+    Quantity("coverage", "", "share of the image's cells with points",
+             _calibrated(lambda c: c.coverage.part)),
+    Quantity("mapping_error", "px", "expected mapping error over the image",
+             _calibrated(lambda c: c.mapping_error.rms, "px")),
+    Quantity("uncertainty.middle", "px", "σ of a projected point at infinity, middle",
+             _calibrated(lambda c: c.uncertainty().middle, "px")),
+    Quantity("uncertainty.corners", "px", "the same in the worst corner",
+             _calibrated(lambda c: c.uncertainty().corners, "px")),
+)  # fmt: skip
+
+
+# --- rigs -----------------------------------------------------------------------------------
+
+
+def _rig_number(
+    function: Callable[[RigCalibration], float],
+) -> Callable[[Subject, str], QuantityValues]:
+    def find(subject: Subject, argument: str) -> QuantityValues:
+        _refuse_argument(argument)
+        return _one(function(subject.result))
+
+    return find
+
+
+def _rig_rms(subject: Subject, argument: str) -> QuantityValues:
+    rig: RigCalibration = subject.result
+    if argument and argument not in rig.rms:
+        raise InputError(f"there is no camera {argument!r}{did_you_mean(argument, rig.rms)}")
+    chosen = {f"camera {n}": v for n, v in rig.rms.items() if argument in ("", n)}
+    return QuantityValues(chosen, "px", _pitch([one.camera for one in rig.cameras.values()]))
+
+
+def _rig_sigma(subject: Subject, argument: str) -> QuantityValues:
+    rig: RigCalibration = subject.result
+    if argument in ("base", "rotation"):
+        return _mountings(rig, argument)
+    camera, mark, name = argument.partition(":")
+    camera, name = (camera, name) if mark else ("*", argument)
+    if camera == "camera" and ":" in name:
+        camera, _, name = name.rpartition(":")
+    if camera not in ("*", *rig.names):
+        raise InputError(f"there is no camera {camera!r}{did_you_mean(camera, rig.names)}")
+    cameras = {n: rig.cameras[n].camera for n in rig.names if camera in ("*", n)}
+    values = {f"{name} of camera {n}": rig.sigma[n][name] for n in cameras if name in rig.sigma[n]}
+    if not values:
+        require_parameter(cameras.values(), name)
+        raise LookupError(f"{name} is held, and not estimated")
+    units = {unit_of_parameter(cameras[n].model, name) for n in cameras if name in rig.sigma[n]}
+    if len(units) > 1:
+        raise LookupError(f"{name} has different units: {', '.join(sorted(units))}")
+    return QuantityValues(values, units.pop(), _pitch(cameras.values()))
+
+
+def _mountings(rig: RigCalibration, what: str) -> QuantityValues:
+    if what == "base":
+        values = {f"base of {n}": m.length_sigma for n, m in rig.mountings.items()}
+        return QuantityValues(values, rig.object_unit)
+    # angles of a mounting are in degrees
+    values = {f"rotation of {n}": float(max(m.sigma[3:])) for n, m in rig.mountings.items()}
+    return QuantityValues(values, "deg")
+
+
+OF_RIG: tuple[Quantity, ...] = (
+    Quantity("sigma0", "", "σ0 of the common adjustment", _rig_number(lambda r: r.sigma0)),
+    Quantity("redundancy", "", "redundancy of the rig", _rig_number(lambda r: r.redundancy)),
+    Quantity("epochs", "", "epochs used", _rig_number(lambda r: len(r.epochs))),
+    Quantity("left_out", "", "epochs left out", _rig_number(lambda r: len(r.left_out))),
+    Quantity("rms[(CAMERA)]", "px", "RMS of an image point by camera", _rig_rms),
+    Quantity("sigma(NAME|CAMERA:NAME|base|rotation)", "of NAME",
+             "σ of a parameter, of the bases, of the rotations of the mountings", _rig_sigma),
+)  # fmt: skip
+
+
+# --- reconstruction -------------------------------------------------------------------------
+
+
+def _reconstructed(
+    function: Callable[[Reconstruction], float],
+) -> Callable[[Subject, str], QuantityValues]:
+    def find(subject: Subject, argument: str) -> QuantityValues:
+        _refuse_argument(argument)
+        return _one(function(subject.result))
+
+    return find
+
+
+OF_RECONSTRUCTION: tuple[Quantity, ...] = (
+    Quantity("parts", "", "parts of the reconstruction", _reconstructed(lambda r: len(r.parts))),
+    Quantity("left_out", "", "photographs left out", _reconstructed(lambda r: len(r.left_out))),
+    Quantity("misfit", "", "how many times worse than their σ measurements fit",
+             _reconstructed(lambda r: max((p.misfit for p in r.parts), default=math.nan))),
+)  # fmt: skip

@@ -1,0 +1,63 @@
+"""Units of acceptance criteria, and their conversion."""
+
+import math
+from typing import NamedTuple
+
+from jaxbundle.errors import InputError
+
+LENGTHS = {
+    "nm": 1e-9, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "mm": 1e-3, "cm": 1e-2, "dm": 1e-1, "m": 1.0,
+    "km": 1e3, "in": 0.0254, "ft": 0.3048, "ftUS": 1200 / 3937,
+}  # fmt: skip
+ANGLES = {
+    "rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": math.pi / 180, "arcmin": math.pi / 10800,
+    "arcsec": math.pi / 648000, "gon": math.pi / 200, "mgon": math.pi / 2e5,
+}  # fmt: skip
+RATIOS = {"": 1.0, "%": 1e-2, "ppm": 1e-6}
+PIXELS = {"px": 1.0, "mpx": 1e-3}
+KINDS = {"length": LENGTHS, "angle": ANGLES, "number": RATIOS, "image": PIXELS}
+
+
+class PixelPitch(NamedTuple):
+    """Millimetres of a pixel, of the cameras of a result; None if unknown, or if they differ."""
+
+    mm: float | None = None
+
+
+NO_PITCH = PixelPitch()
+
+
+def kind_of(unit: str) -> str:
+    """ "length", "angle", "number" or "image"; empty for a unit that is only a label."""
+    return next((kind for kind, known in KINDS.items() if unit in known), "")
+
+
+def convert(value: float, given: str, wanted: str, pitch: PixelPitch = NO_PITCH) -> float:
+    """A value in another unit; lengths in the image and pixels by the pixel size.
+
+    **Raises:** `InputError` naming the units that would do."""
+    if given == wanted:
+        return value
+    kinds = kind_of(given), kind_of(wanted)
+    if kinds[0] and kinds[0] == kinds[1]:
+        units = KINDS[kinds[0]]
+        return value * units[given] / units[wanted]
+    if {*kinds} == {"length", "image"} and pitch.mm is not None:
+        if kinds[0] == "image":
+            return value * PIXELS[given] * pitch.mm * 1e-3 / LENGTHS[wanted]
+        return value * LENGTHS[given] / (pitch.mm * 1e-3) / PIXELS[wanted]
+    raise InputError(_refusal(given, wanted))
+
+
+def _refusal(given: str, wanted: str) -> str:
+    expected = KINDS.get(kind_of(given))
+    known = [name for name in expected or () if name.isascii() and name]
+    said = "no unit" if not wanted else f"the unit {wanted!r}"
+    if expected is None:
+        return f"its unit is {given!r}, which is no length, but {said} is given"
+    if given == "" and wanted:
+        return f"it is a number without unit, but {said} is given"
+    more = ""
+    if {kind_of(given), kind_of(wanted)} == {"length", "image"}:
+        more = "; pixels and lengths need one pixel_size of all cameras"
+    return f"one of {', '.join(known)} is expected, but {said} is given{more}"

@@ -1,0 +1,322 @@
+"""Points, stations and error ellipses for geographic information systems: GeoJSON, GeoPackage.
+
+| layer | geometry | attributes |
+|---|---|---|
+| points | point Z | id, role, X, Y, Z, sX, sY, sZ, rays |
+| stations | point Z | id, camera, X0, Y0, Z0, omega, phi, kappa, their σ |
+| ellipses | polygon | id, of, a, b (semi-axes of the standard ellipse in plan), bearing, factor |
+
+The bearing is that of a, in degrees, clockwise from Y. An ellipse is drawn `factor` times larger
+than the standard one (39 % of probability, k = 1). The σ are those shown with the values. GeoJSON
+has WGS 84 longitude and latitude (RFC 7946, 4): the
+coordinates are transformed from their `crs` by pyproj (extra `geo`). A GeoPackage (OGC 12-128r18)
+keeps the coordinates of the project, with the number of their system; without one they are
+Cartesian and undefined (srs_id −1).
+"""
+
+import json
+import math
+import re
+import sqlite3
+import struct
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.arguments import positive
+from jaxbundle.errors import InputError
+from jaxbundle.io.text.csv_tables import write_text
+from jaxbundle.io.writing.replacing import replace_file
+from jaxbundle.network.tables import EXTERIOR
+
+if TYPE_CHECKING:
+    from jaxbundle.adjustment.result import Adjustment
+
+# Corners of a drawn ellipse: a circle of 36 differs from its polygon by 0.4 % of the radius.
+CORNERS = 36
+# "GPKG" as a number, and version 1.3 (OGC 12-128r18, requirement 2).
+APPLICATION, VERSION = 0x47504B47, 10300
+LAYERS = ("points", "stations", "ellipses")
+UNDEFINED = -1
+
+
+class Feature(NamedTuple):
+    """A feature: its layer, a point [3] or the ring of a polygon [n, 2], attributes."""
+
+    layer: str
+    place: Float[np.ndarray, "..."]
+    attributes: dict[str, Any]
+
+
+def write_geojson(
+    result: "Adjustment", path: str | Path, crs: str = "", factor: float | None = None
+) -> None:
+    """Write points, stations and error ellipses of a result as GeoJSON, for QGIS and the web.
+
+    **Arguments:** `crs` of the object coordinates, such as `"EPSG:25832"`; `factor` of the
+    ellipses: by default a round one, with which the largest is a fiftieth of the network.
+
+    **Raises:** `InputError` without `crs` or pyproj, for an unknown `crs`, or coordinates outside
+    of it; `NotSolvedError` without a solution.
+    """
+    transform = require_transformation(crs)
+    features = []
+    for one in collect_features(result, factor):
+        place = np.atleast_2d(one.place)
+        lonlat = np.column_stack(transform(place[:, 0], place[:, 1]))
+        if not np.isfinite(lonlat).all() or not (np.abs(lonlat) <= [180.0, 90.0]).all():
+            raise InputError(f"{crs}: the coordinates are outside of this system")
+        features.append({
+            "type": "Feature",
+            "id": f"{one.layer}/{one.attributes['id']}",
+            "geometry": _geometry(lonlat, place, one.layer),
+            "properties": {"layer": one.layer, **_plain(one.attributes)},
+        })  # fmt: skip
+    document = {"type": "FeatureCollection", "features": features}
+    write_text(Path(path), json.dumps(document, ensure_ascii=False) + "\n")
+
+
+def _geometry(
+    lonlat: Float[np.ndarray, "n 2"], place: Float[np.ndarray, "n d"], layer: str
+) -> dict[str, Any]:
+    # nine digits: a tenth of a millimetre
+    rounded = np.round(lonlat, 9).tolist()
+    if layer != "ellipses":
+        return {"type": "Point", "coordinates": [*rounded[0], float(place[0, 2])]}
+    # RFC 7946, 3.1.6: closed, the exterior ring counterclockwise
+    ring = rounded if _is_counterclockwise(lonlat) else rounded[::-1]
+    return {"type": "Polygon", "coordinates": [[*ring, ring[0]]]}
+
+
+def _is_counterclockwise(ring: Float[np.ndarray, "n 2"]) -> bool:
+    # about its centre: of map coordinates the area is in the last digits
+    x, y = (ring - ring.mean(0)).T
+    return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) > 0
+
+
+def write_geopackage(
+    result: "Adjustment", path: str | Path, crs: str = "", factor: float | None = None
+) -> None:
+    """Write points, stations and error ellipses of a result as the layers of a GeoPackage.
+
+    **Arguments:** as `write_geojson`; without `crs` the coordinates are Cartesian, of no known
+    system.
+
+    **Raises:** `InputError` for an unknown `crs`, or if the file cannot be written;
+    `NotSolvedError` without a solution.
+    """
+    system = check_crs(crs)
+    features = list(collect_features(result, factor))
+    with replace_file(path) as temporary:
+        try:
+            with closing(sqlite3.connect(temporary)) as database, database:
+                _fill(database, features, system)
+        except sqlite3.Error as error:
+            raise InputError(f"{path}: cannot be written: {error}") from None
+
+
+def check_crs(crs: str) -> int | None:
+    """The number of a coordinate system EPSG:NUMBER; None without one.
+
+    **Raises:** `InputError` for other texts."""
+    if not crs:
+        return None
+    found = re.fullmatch(r"(?i)epsg:(\d{4,6})", crs.strip())
+    if found is None:
+        raise InputError(f"crs {crs!r}: EPSG:NUMBER is expected, such as EPSG:25832")
+    return int(found[1])
+
+
+def require_transformation(crs: str) -> Any:
+    """The transformation of coordinates to longitude and latitude.
+
+    **Raises:** `InputError` without `crs` or pyproj, and for an unknown one."""
+    if check_crs(crs) is None:
+        raise InputError(
+            "GeoJSON has longitude and latitude (RFC 7946): give the crs of the coordinates, such "
+            "as EPSG:25832, or write a GeoPackage"
+        )
+    try:
+        import pyproj
+        from pyproj.exceptions import ProjError
+    except ImportError:
+        raise InputError("GeoJSON needs pyproj: pip install 'jaxbundle[geo]'") from None
+    try:
+        return pyproj.Transformer.from_crs(crs, "EPSG:4326", always_xy=True).transform
+    except ProjError as error:
+        raise InputError(f"crs {crs!r}: {' '.join(str(error).split())}") from None
+
+
+def collect_features(result: "Adjustment", factor: float | None = None) -> Iterator[Feature]:
+    """All features of a result.
+
+    **Raises:** `InputError` for a factor that is not positive; `NotSolvedError`."""
+    points, images = result.points, result.images
+    C = result.point_covariance
+    if (modelled := result.correlated_point_covariance) is not None:
+        size = lambda C: np.trace(C, axis1=1, axis2=2)[:, None, None]
+        C = np.where(size(modelled) > size(C), modelled, C)
+    place = result.point_values
+    known = np.asarray(np.isfinite(place).all(1))
+    for row in np.flatnonzero(known):
+        sigma = np.sqrt(np.clip(np.diagonal(C[row]), 0, None))
+        yield Feature("points", place[row], {
+            "id": str(points["id"][row]), "role": str(points["role"][row]),
+            **dict(zip("XYZ", place[row].tolist())),
+            **dict(zip(("sX", "sY", "sZ"), sigma.tolist())), "rays": int(points["rays"][row]),
+        })  # fmt: skip
+    cameras = [result.network.cameras[c].id for c in result.network.images.camera]
+    sigmas = [f"s{name}" for name in EXTERIOR]
+    for row, centre in enumerate(result.image_values[:, :3]):
+        yield Feature("stations", centre, {
+            "id": str(images["id"][row]), "camera": cameras[row],
+            **{name: float(images[name][row]) for name in (*EXTERIOR, *sigmas)},
+        })  # fmt: skip
+    ids = [str(id) for id in points["id"]]
+    yield from _ellipses(place, C, known, ids, factor)
+
+
+def _ellipses(
+    place: Float[np.ndarray, "n 3"],
+    C: Float[np.ndarray, "n 3 3"],
+    known: np.ndarray,
+    ids: Sequence[str],
+    factor: float | None,
+) -> Iterator[Feature]:
+    rows = [r for r in np.flatnonzero(known) if np.isfinite(C[r]).all() and C[r, 0, 0] > 0]
+    if not rows:
+        return
+    w, E = np.linalg.eigh(C[rows][:, :2, :2])
+    axes = np.sqrt(np.clip(w, 0, None))
+    if factor is None:
+        extent = float(np.ptp(place[known][:, :2], axis=0).max()) or 1.0
+        factor = _round_down(0.02 * extent / float(axes.max()))
+    factor = positive("factor", factor)
+    turn = 2 * np.pi * np.arange(CORNERS) / CORNERS
+    circle = np.stack([np.cos(turn), np.sin(turn)])
+    for row, axis, vectors in zip(rows, axes, E):
+        ring = place[row, :2] + factor * ((vectors * axis) @ circle).T
+        long = vectors[:, 1]
+        yield Feature("ellipses", ring, {
+            "id": ids[int(row)], "of": "point", "a": float(axis[1]), "b": float(axis[0]),
+            "bearing": math.degrees(math.atan2(long[0], long[1])) % 180.0, "factor": factor,
+        })  # fmt: skip
+
+
+def _round_down(x: float) -> float:
+    power = 10.0 ** np.floor(np.log10(x))
+    return float(max(step for step in (1, 2, 5) if step * power <= x * (1 + 1e-9)) * power)
+
+
+def _plain(attributes: dict[str, Any]) -> dict[str, Any]:
+    """Attributes without what JSON does not have."""
+    return {
+        name: None if isinstance(value, float) and not math.isfinite(value) else value
+        for name, value in attributes.items()
+    }
+
+
+# --- GeoPackage -----------------------------------------------------------------------------
+
+TABLES = """
+CREATE TABLE gpkg_spatial_ref_sys (
+  srs_name TEXT NOT NULL, srs_id INTEGER PRIMARY KEY, organization TEXT NOT NULL,
+  organization_coordsys_id INTEGER NOT NULL, definition TEXT NOT NULL, description TEXT);
+CREATE TABLE gpkg_contents (
+  table_name TEXT NOT NULL PRIMARY KEY, data_type TEXT NOT NULL, identifier TEXT UNIQUE,
+  description TEXT DEFAULT '', last_change DATETIME NOT NULL
+    DEFAULT (strftime('%Y-%m-%dT%H:%M:%fZ','now')),
+  min_x DOUBLE, min_y DOUBLE, max_x DOUBLE, max_y DOUBLE, srs_id INTEGER,
+  CONSTRAINT fk_gc_r_srs_id FOREIGN KEY (srs_id) REFERENCES gpkg_spatial_ref_sys(srs_id));
+CREATE TABLE gpkg_geometry_columns (
+  table_name TEXT NOT NULL, column_name TEXT NOT NULL, geometry_type_name TEXT NOT NULL,
+  srs_id INTEGER NOT NULL, z TINYINT NOT NULL, m TINYINT NOT NULL,
+  CONSTRAINT pk_geom_cols PRIMARY KEY (table_name, column_name),
+  CONSTRAINT uk_gc_table_name UNIQUE (table_name),
+  CONSTRAINT fk_gc_tn FOREIGN KEY (table_name) REFERENCES gpkg_contents(table_name),
+  CONSTRAINT fk_gc_srs FOREIGN KEY (srs_id) REFERENCES gpkg_spatial_ref_sys (srs_id));
+"""
+# The records that every GeoPackage has (requirement 11).
+SYSTEMS = (
+    ("Undefined Cartesian SRS", -1, "NONE", -1, "undefined", "undefined Cartesian coordinates"),
+    ("Undefined geographic SRS", 0, "NONE", 0, "undefined", "undefined geographic coordinates"),
+    (
+        "WGS 84 geodetic", 4326, "EPSG", 4326,
+        'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],'
+        'PRIMEM["Greenwich",0],UNIT["degree",0.0174532925199433],AUTHORITY["EPSG","4326"]]',
+        "longitude and latitude",
+    ),
+)  # fmt: skip
+
+
+def _fill(database: sqlite3.Connection, features: list[Feature], system: int | None) -> None:
+    database.execute(f"PRAGMA application_id = {APPLICATION}")
+    database.execute(f"PRAGMA user_version = {VERSION}")
+    for statement in TABLES.split(";"):
+        database.execute(statement)
+    add = "INSERT INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, ?)"
+    database.executemany(add, SYSTEMS)
+    srs = UNDEFINED if system is None else system
+    if system is not None and system != 4326:  # noqa: PLR2004 - WGS 84 is there already
+        name, definition = _definition(system)
+        database.execute(add, (name, system, "EPSG", system, definition, name))
+    for layer in LAYERS:
+        own = [one for one in features if one.layer == layer]
+        if own:
+            _add_layer(database, layer, own, srs)
+
+
+def _definition(system: int) -> tuple[str, str]:
+    """Name and WKT of a system; without pyproj only its number, by which programs know it."""
+    try:
+        import pyproj
+        from pyproj.exceptions import CRSError
+    except ImportError:
+        return f"EPSG:{system}", "undefined"
+    try:
+        found = pyproj.CRS.from_epsg(system)
+        return found.name, found.to_wkt("WKT1_GDAL")
+    except CRSError as error:
+        raise InputError(f"crs EPSG:{system}: {' '.join(str(error).split())}") from None
+
+
+def _add_layer(database: sqlite3.Connection, layer: str, features: list[Feature], srs: int) -> None:
+    kind, z = ("POLYGON", 0) if layer == "ellipses" else ("POINT", 1)
+    names = list(features[0].attributes)
+    types = ["TEXT" if isinstance(v, str) else "INTEGER" if isinstance(v, int) else "DOUBLE"
+             for v in features[0].attributes.values()]  # fmt: skip
+    columns = ", ".join(f'"{name}" {type}' for name, type in zip(names, types))
+    database.execute(
+        f'CREATE TABLE "{layer}" (fid INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, geom {kind}, '
+        f"{columns})"
+    )
+    corners = np.concatenate([np.atleast_2d(one.place)[:, :2] for one in features])
+    low, high = corners.min(0).tolist(), corners.max(0).tolist()
+    database.execute(
+        "INSERT INTO gpkg_contents (table_name, data_type, identifier, min_x, min_y, max_x, max_y, "
+        "srs_id) VALUES (?, 'features', ?, ?, ?, ?, ?, ?)",
+        (layer, layer, *low, *high, srs),
+    )
+    database.execute(
+        "INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, ?, ?, 0)", (layer, kind, srs, z)
+    )
+    marks = ", ".join("?" * (len(names) + 1))
+    listed = ", ".join(f'"{name}"' for name in names)
+    database.executemany(
+        f'INSERT INTO "{layer}" (geom, {listed}) VALUES ({marks})',
+        [(_blob(one, srs), *_plain(one.attributes).values()) for one in features],
+    )
+
+
+def _blob(one: Feature, srs: int) -> bytes:
+    """A geometry: the header of a GeoPackage (little-endian, no envelope), and ISO WKB."""
+    header = b"GP" + struct.pack("<BBi", 0, 1, srs)
+    if one.layer != "ellipses":
+        return header + struct.pack("<BI3d", 1, 1001, *one.place.tolist())
+    ring = one.place if _is_counterclockwise(one.place) else one.place[::-1]
+    ring = np.concatenate([ring, ring[:1]])
+    return header + struct.pack("<BIII", 1, 3, 1, len(ring)) + ring.astype("<f8").tobytes()

@@ -1,0 +1,191 @@
+"""Length measurement errors by hand, as in VDI/VDE 2634-1 and ISO 14253-1; accuracy of ASPRS."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import jaxbundle
+from jaxbundle.certificates.lengths import (
+    CONFORMS,
+    FAILS,
+    OPEN,
+    CalibratedLengths,
+    LengthTest,
+    PermissibleError,
+    join_length_tests,
+    length_errors,
+    read_lengths,
+    read_mpe,
+)
+from jaxbundle.certificates.positional import PositionalAccuracy, positional_accuracy
+from jaxbundle.errors import InputError
+
+
+def length_test(errors, sigma, mpe=None, **changes):
+    n = len(errors)
+    lengths = CalibratedLengths(
+        tuple((f"A{i}", f"B{i}") for i in range(n)), np.arange(1.0, n + 1),
+        np.full(n, sigma), tuple(f"line {i // 5}" for i in range(n)),
+    )  # fmt: skip
+    return LengthTest(
+        lengths, lengths.value + errors, np.full(n, 1e-5), "m", 2.0 * n, mpe, **changes
+    )
+
+
+def test_errors_by_hand():
+    """E = l_m − l_k; the characteristic is the largest |E|, not the mean."""
+    test = length_test(np.array([3e-5, -8e-5, 1e-5]), 0.0)
+    np.testing.assert_allclose(test.error, [3e-5, -8e-5, 1e-5], atol=1e-12)
+    assert test.largest == pytest.approx(8e-5, rel=1e-9)
+    assert test.rms == pytest.approx(np.sqrt((9 + 64 + 1) / 3) * 1e-5, rel=1e-9)
+    assert test.verdict == "" and test.verdicts == ()
+
+
+@pytest.mark.parametrize(
+    ("error", "verdict"),
+    [
+        (40e-6, CONFORMS), (-40e-6, CONFORMS), (43e-6, OPEN), (57e-6, OPEN), (59e-6, FAILS),
+        (-59e-6, FAILS),
+    ],
+)
+def test_the_decision_rule_of_iso_14253(error, verdict):
+    """MPE 50 µm, u = 5 µm: g = 1.645 · 5 = 8.2 µm: conformity to 41.8, nonconformity from 58.2."""
+    mpe = PermissibleError(50e-6)
+    test = length_test(np.array([error]), 5e-6, mpe)
+    assert test.guard_band[0] == pytest.approx(8.224e-6, rel=1e-3)
+    assert test.verdicts == (verdict,) and test.verdict == verdict
+    simple = dataclasses.replace(test, rule="simple acceptance")
+    assert simple.verdict == (CONFORMS if abs(error) <= 50e-6 else FAILS)
+
+
+def test_one_length_that_fails_fails_the_test():
+    mpe = PermissibleError(50e-6)
+    assert length_test(np.array([10e-6, 90e-6, 50e-6]), 5e-6, mpe).verdict == FAILS
+    assert length_test(np.array([10e-6, 20e-6, 50e-6]), 5e-6, mpe).verdict == OPEN
+
+
+def test_a_permissible_error_is_read():
+    """min(A + L/K, B), the forms of ISO 10360-2."""
+    assert read_mpe("50 um", "mm")(np.array([1000.0])) == pytest.approx(0.05)
+    mpe = read_mpe("20 um + L/50000, max 0.05 mm", "m")
+    np.testing.assert_allclose(mpe(np.array([0.5, 1.0, 9.0])), [30e-6, 40e-6, 50e-6])
+    for text in ("50", "L/1000", "50 deg", "50 um + L", "50 um +", ""):
+        with pytest.raises(InputError, match="MPE"):
+            read_mpe(text, "m")
+    with pytest.raises(InputError, match="is no length"):
+        read_mpe("50 um", "model")
+
+
+def test_the_arrangement_that_vdi_wants():
+    """Seven lines of five lengths, the longest two thirds of the diagonal."""
+    test = length_test(np.zeros(35), 0.0)
+    assert [met for *_, met in test.requirements()] == [True, True, False]
+    wide = dataclasses.replace(test, diagonal=50.0)
+    assert [met for *_, met in wide.requirements()] == [True, True, True]
+    few = length_test(np.zeros(9), 0.0)
+    assert [met for *_, met in few.requirements()][:2] == [False, False]
+
+
+def test_repetitions_are_joined():
+    one, two = length_test(np.array([1e-5]), 1e-6), length_test(np.array([-9e-5]), 1e-6)
+    assert join_length_tests([one, two, one]).largest == pytest.approx(9e-5)
+    with pytest.raises(InputError, match="one unit"):
+        join_length_tests([one, dataclasses.replace(two, unit="mm")])
+    with pytest.raises(InputError, match="at least one"):
+        join_length_tests([])
+
+
+@pytest.fixture(scope="module")
+def field():
+    """A test field with control, check points and calibrated lengths."""
+    camera = jaxbundle.Camera("cam", "brown", {"c": 20.0}, ("c", "x0", "y0"))
+    stations = jaxbundle.ring_of_stations(8, 3.0, 3.0, roll_every=2)
+    targets = jaxbundle.cloud_of_targets(20, (2.0, 2.0, 0.8), seed=3)
+    network = jaxbundle.simulate(
+        stations, targets, camera, noise=1e-3, seed=2, control=range(6), control_sigma=1e-4,
+        check=range(6, 10), distances=[(10, 11)], distance_sigma=1e-5,
+    )  # fmt: skip
+    return jaxbundle.adjust(network), targets
+
+
+def test_lengths_of_an_adjustment(field):
+    result, targets = field
+    pairs = [(12, 13), (13, 14), (15, 19)]
+    true = [np.linalg.norm(targets[a] - targets[b]) for a, b in pairs]
+    table = {
+        "from": [str(a + 1) for a, _ in pairs], "to": [str(b + 1) for _, b in pairs],
+        "value": true, "sigma": [1e-6] * 3,
+    }  # fmt: skip
+    test = length_errors(result, table, mpe="1 mm")
+    place = {id: i for i, id in enumerate(result.points["id"])}
+    P = result.point_values
+    expected = [np.linalg.norm(P[place[str(a + 1)]] - P[place[str(b + 1)]]) for a, b in pairs]
+    np.testing.assert_allclose(test.measured, expected)
+    # σ: from the joint covariance of both ends
+    a, b = (("point", table[end][0]) for end in ("from", "to"))
+    C = result.covariance(*((*p, axis) for p in (a, b) for axis in "XYZ"))
+    u = (P[place["14"]] - P[place["13"]]) / expected[0]
+    g = np.concatenate([-u, u])
+    assert test.sigma[0] == pytest.approx(np.sqrt(g @ C @ g), rel=1e-9)
+    assert (np.abs(test.error) < 5 * test.sigma).all() and test.verdict == CONFORMS
+    assert jaxbundle.accept(result, "LME < 1 mm", lengths=table).met
+    assert "no calibrated lengths" in jaxbundle.accept(result, "LME < 1 mm").unmet[0]
+    with pytest.raises(InputError, match="11 – 12 is a distance of the adjustment"):
+        length_errors(result, {"from": ["11"], "to": ["12"], "value": [1.0], "sigma": [1e-6]})
+    with pytest.raises(InputError, match="no length has both points"):
+        length_errors(result, {"from": ["x"], "to": ["12"], "value": [1.0], "sigma": [1e-6]})
+
+
+def test_bad_tables_of_lengths():
+    good = {"from": ["a"], "to": ["b"], "value": [1.0], "sigma": [0.0]}
+    assert len(read_lengths(good)) == 1
+    for change, why in (
+        ({"to": ["a"]}, "same point"), ({"value": [-1.0]}, "positive"),
+        ({"sigma": [-1.0]}, "sigma"),
+        ({"lin": [1]}, "unknown column 'lin'"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=why):
+            read_lengths(good | change)
+
+
+# --- check points ---------------------------------------------------------------------------
+
+
+def test_asprs_accuracy_by_hand():
+    """RMSE of the fit and of the survey add in squares, per axis and together."""
+    d = np.array([[0.03, -0.04, 0.05], [-0.03, 0.04, -0.05]])
+    sigma = np.full((2, 3), 0.02)
+    found = PositionalAccuracy(("a", "b"), d, sigma, "m", 0.06, 0.05)
+    np.testing.assert_allclose(found.rmse_axes, [0.03, 0.04, 0.05])
+    assert found.rmse_h == pytest.approx(np.sqrt(0.03**2 + 0.04**2 + 2 * 0.02**2))
+    assert found.rmse_v == pytest.approx(np.sqrt(0.05**2 + 0.02**2))
+    assert found.rmse_3d == pytest.approx(np.hypot(found.rmse_h, found.rmse_v))
+    assert found.verdict == "not met" and not found.enough
+    assert "meets the horizontal accuracy class of 6.00 cm" in found.statements()[0]
+    assert "does not meet the vertical" in found.statements()[1]
+    assert "30" in found.statements()[-1]
+    assert found.remarks() == []
+
+
+def test_asprs_heights_only_means_and_poor_surveys():
+    d = np.full((30, 3), np.nan)
+    d[:, 2] = 0.02
+    found = PositionalAccuracy(tuple(map(str, range(30))), d, np.full((30, 3), 0.015), "m")
+    assert found.number == (0, 30) and found.enough
+    assert found.rmse_v == pytest.approx(0.025)
+    assert len(found.statements()) == 1
+    said = " ".join(found.remarks())
+    assert "mean error in Z" in said and "vertical survey" in said
+
+
+def test_asprs_of_an_adjustment(field):
+    result, _ = field
+    found = positional_accuracy(result)
+    np.testing.assert_allclose(found.rmse_axes, result.check_points.rms)
+    rows = jaxbundle.accept(
+        result, ["check.rms < 1 m", "check.rms(H) < 1 m", "check.max < 1 m", "check.number > 3"]
+    ).rows  # fmt: skip
+    assert rows[0].value == pytest.approx(np.linalg.norm(found.rmse_axes))
+    assert rows[1].value == pytest.approx(np.hypot(*found.rmse_axes[:2]))
+    assert rows[2].value == pytest.approx(np.abs(result.check_points.difference).max())
