@@ -261,7 +261,7 @@ def turn_start(declared: Declared, plan: Plan, values: Values, start: Values) ->
 
 def _datum_places(
     datum: Datum, values: Values, start: Values
-) -> Iterator[tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, " n"]]]:
+) -> Iterator[tuple[Float[AnyArray, "n 3"], Float[AnyArray, "n 3"], Float[Array, " n"]]]:
     """Of every table of datum unknowns: places, those of the start values, and whether they are
     datum unknowns."""
     for name, weight in datum.weight.items():

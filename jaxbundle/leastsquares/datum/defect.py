@@ -178,7 +178,8 @@ def make_datum(
     held = {t: (1 - free[t]) * real[t][:, None] for t, rows in moves.items() if rows.any()}
     held = {t: mask for t, mask in held.items() if mask.any()}
     turned = _leaves_scale_only(survey.moves, gauge, weight)
-    return Datum(*jax.device_put((gauge, weight, pins, held)), turned)
+    gauge, weight, pins, held = jax.device_put((gauge, weight, pins, held))
+    return Datum(gauge, weight, pins, held, turned)
 
 
 def _leaves_scale_only(
