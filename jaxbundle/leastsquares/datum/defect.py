@@ -4,6 +4,7 @@ Computed once at the start values, on the host, from one compiled survey of the 
 table and their effect on observations.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from functools import reduce
 from typing import NamedTuple
@@ -178,8 +179,8 @@ def make_datum(
     held = {t: (1 - free[t]) * real[t][:, None] for t, rows in moves.items() if rows.any()}
     held = {t: mask for t, mask in held.items() if mask.any()}
     turned = _leaves_scale_only(survey.moves, gauge, weight)
-    gauge, weight, pins, held = jax.device_put((gauge, weight, pins, held))
-    return Datum(gauge, weight, pins, held, turned)
+    datum = Datum(*jax.device_put((gauge, weight, pins, held)))
+    return dataclasses.replace(datum, turned=turned)
 
 
 def _leaves_scale_only(
