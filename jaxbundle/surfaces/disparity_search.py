@@ -49,6 +49,9 @@ class DisparitySearchSettings:
     min_region: int = 80
     """Pixels of the smallest region of similar disparities that is kept. OpenCV recommends 50 to
     200. Half: 0.14 % wrong in the scene "repeated" instead of 0.10 %; double: no difference."""
+    max_left_right: float = 1.0
+    """Maximum difference between the disparity of a pixel and that of its match, searched from the
+    right image by itself, pixels."""
     repetition: float = 0.8
     """Correlation of a window with another on its row from which a texture repeats itself. In the
     scene "repeated" 0.6: 0.06 % of the points wrong by a pixel instead of 0.10 %; 0.95: 0.46 %."""
@@ -131,6 +134,29 @@ def semi_global(
         found = np.concatenate([*pool.map(match_strip, range(0, rows, strip))])
     found = found.astype(np.float32) / 16  # OpenCV's unit is 1/16 pixel
     return np.where((found >= 0) & (found <= span), found, np.nan)
+
+
+def search_both_ways(
+    left: RowImage,
+    right: RowImage,
+    span: int,
+    settings: DisparitySearchSettings = DisparitySearchSettings(),
+) -> RowImage:
+    """Disparities of the left image that a search from the right image confirms; NaN: none.
+
+    OpenCV's own check takes both directions from one search, whose paths are those of the left
+    image. A search of the mirrored pair has others: of the wrong disparities of real pairs, mostly
+    of pixels hidden in the right image, it finds a third to a half more, and loses 2 % of the right
+    ones."""
+    found = semi_global(left, right, span, settings)
+    mirrored = (np.ascontiguousarray(a[:, ::-1]) for a in (right, left))
+    other = semi_global(*mirrored, span, settings)[:, ::-1]
+    columns = np.arange(found.shape[1])
+    match = columns - np.rint(np.nan_to_num(found)).astype(int)
+    confirmed = np.take_along_axis(other, np.clip(match, 0, len(columns) - 1), axis=1)
+    with np.errstate(invalid="ignore"):
+        agree = (match >= 0) & (np.abs(confirmed - found) <= settings.max_left_right)
+    return np.where(agree, found, np.float32(np.nan))
 
 
 def find_repetitions(
