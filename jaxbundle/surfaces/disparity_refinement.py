@@ -1,8 +1,8 @@
 """Refinement of disparities by least squares at every pixel of a rectified pair.
 
-At each pixel windows of several sizes follow the disparities found, R(x, y) = right(x − d(x, y), y),
-and a correction is solved for, with a shift ε across the rows (`row_windows`). Rows are aligned, so
-that ε should be 0: ε in units of its σ gives a variance factor for each size (the median of ε²/σ²
+At each pixel windows of several sizes follow the disparities found, R(x, y) = right(x − d(x, y),
+y), and a correction is solved for, with a shift ε across the rows (`row_windows`). Rows are
+aligned, so that ε should be 0: ε in units of its σ gives a variance factor for each size (the median of ε²/σ²
 over that of χ²). Of the sizes h each pixel takes the one of the least mean square error
 
     V_h = σ_h² + B_h²,    B_h² = mean of (d_h − d₀)² − (σ₀² − σ_h²) around the pixel,
@@ -16,7 +16,8 @@ shape of the surface in it. The variance of a disparity is the sum of
 - what the scatter of disparities farther apart than a window has beyond these, the same for all
   pixels;
 - P·Δ² beside a step, a change of the disparity by Δ: P is the probability that the pixel is of the
-  other surface, or hidden in the other image. Where P is large, no disparity is given.
+  other surface, or hidden in the other image. It falls with the distance from the step, and is
+  smaller for a pixel whose window has texture of its own. Where it is large, no disparity is given.
 
 Sources: Kanade and Okutomi (1994), A stereo matching algorithm with an adaptive window (the choice
 of windows by noise and shape).
@@ -43,7 +44,7 @@ class DisparityRefinementSettings:
     """Least squares at every pixel, and the σ of the disparities; pixels where nothing is said."""
 
     half_windows: tuple[int, ...] = (2, 4, 7)
-    """Half the sides of the windows of least squares, ascending: of 5 × 5, 9 × 9, 15 × 15 pixels."""
+    """Half the sides of the windows of least squares, ascending: 5 × 5, 9 × 9, 15 × 15 pixels."""
     shape_half_window: int = 4
     """Half the side of the windows of all rounds but the last, of the means of similar disparities
     that the windows follow, and of the plane from which relief is measured."""
@@ -71,8 +72,14 @@ class DisparityRefinementSettings:
     """Distance from a step over which this probability falls to 1/e, pixels."""
     textured_outliers: float = 0.3
     """The probability of a window with texture of its own, relative to one without."""
-    max_outliers: float = 0.3
+    max_outliers: float = 0.25
     """Maximum probability of a wrong surface: where it is larger, there is no disparity."""
+    likely_outliers: float = 0.1
+    """Probability of a wrong surface from which its σ is at least that of a step of
+    `unseen_step`."""
+    unseen_step: float = 3.0
+    """Least height of a step, where a wrong surface is likely: half of the wrong disparities of
+    these pairs are off by more, often from a surface that has no disparities near."""
     block_side: int = 48
     """Side of the blocks whose scatter gives σ: three of the largest windows without overlap."""
     scatter_quantile: float = 0.25
@@ -117,6 +124,8 @@ def refine_disparities(
     d = np.where(good, found.disparity, np.float32(np.nan))
     relief = _measure_relief(d, settings.shape_half_window)
     sigma = _add_scatter(d, found, relief, settings)
+    likely = outliers > settings.likely_outliers
+    step = np.where(likely, np.maximum(step, settings.unseen_step), step)
     sigma = np.sqrt(sigma**2 + outliers * step**2)
     with np.errstate(invalid="ignore"):
         good &= sigma < settings.max_sigma
@@ -199,16 +208,23 @@ def _refine_piece(
     left, start, filled = left[piece], start[piece], filled[piece]
     known = np.isfinite(start)
     half, tolerance = settings.shape_half_window, settings.surface_tolerance
-    shape = _smooth(_remove_noise(start, known), known, half, tolerance)
-    for _ in range(settings.rounds - 1):
-        moved = RowWindows(left, spline.sample(rows, columns, shape, filled), known).correct(half)
-        delta = np.clip(np.nan_to_num(moved.delta), -settings.max_change, settings.max_change)
-        # a smooth shape and the windows' mean of what is left of it: no bias from curvature
-        shape = _smooth(np.where(known, shape + delta, np.nan), known, half, tolerance)
-    windows = RowWindows(left, spline.sample(rows, columns, shape, filled), known)
-    found = [windows.correct(half) for half in settings.half_windows]
-    own_texture = windows.find_own_texture(settings.half_windows[0], found[0].noise)
-    return [_accept(size, shape, start, settings) for size in found], own_texture
+    limit = settings.max_change
+    first_shape = _smooth(_remove_noise(start, known), known, half, tolerance)
+    follow = lambda shape: RowWindows(left, spline.sample(rows, columns, shape, filled), known)
+    first, found, own_texture = follow(first_shape), [], np.zeros(left.shape, bool)
+    # Every size has shapes of its own: where they differ, windows of some sizes are bent.
+    for size in settings.half_windows:
+        shape, windows = first_shape, first
+        for _ in range(settings.rounds - 1):
+            delta = np.clip(np.nan_to_num(windows.correct(size).delta), -limit, limit)
+            # a smooth shape and the windows' mean of what is left of it: no bias from curvature
+            shape = _smooth(np.where(known, shape + delta, np.nan), known, half, tolerance)
+            windows = follow(shape)
+        corrections = windows.correct(size)
+        if not found:
+            own_texture = windows.find_own_texture(size, corrections.noise)
+        found.append(_accept(corrections, shape, start, settings))
+    return found, own_texture
 
 
 def _accept(
