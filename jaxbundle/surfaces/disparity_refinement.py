@@ -2,8 +2,9 @@
 
 At each pixel windows of several sizes follow the disparities found, R(x, y) = right(x − d(x, y),
 y), and a correction is solved for, with a shift ε across the rows (`row_windows`). Rows are
-aligned, so that ε should be 0: ε in units of its σ gives a variance factor for each size (the median of ε²/σ²
-over that of χ²). Of the sizes h each pixel takes the one of the least mean square error
+aligned, so that ε should be 0: ε in units of its σ gives a variance factor for each size (the
+median of ε²/σ² over that of χ²). Of the sizes h each pixel takes the one of the least mean square
+error
 
     V_h = σ_h² + B_h²,    B_h² = mean of (d_h − d₀)² − (σ₀² − σ_h²) around the pixel,
 
@@ -84,7 +85,7 @@ class DisparityRefinementSettings:
     """Side of the blocks whose scatter gives σ: three of the largest windows without overlap."""
     scatter_quantile: float = 0.25
     """Quantile of the blocks that is used: the smoother part of the surface."""
-    added_sigma: float = 0.014
+    added_sigma: float = 0.005
     """σ added by interpolation and sampling: errors that depend on the fraction of the disparity
     are alike over whole surfaces, so that no scatter shows them."""
     max_sigma: float = 2.0
@@ -246,26 +247,36 @@ def _choose_windows(
     """Of every pixel the windows of the least mean square error."""
     smallest, factors = sizes[0], [robust_factor(s.across[np.isfinite(s.disparity)]) for s in sizes]
     noise = [size.sigma**2 for size in sizes]
-    shapes = []
+    # Beyond the noise: a mean of squares over the largest window, of differences that are alike over
+    # the smallest, has the relative standard deviation √(2/9).
+    reach, limit = max(settings.half_windows), 1 + np.sqrt(2 / 9)
+    shapes, bends = [], []
     for k in range(1, len(sizes)):
         with np.errstate(invalid="ignore"):
-            excess = np.maximum(factors[0] * noise[0] - factors[k] * noise[k], 0)
-            apart = (sizes[k].disparity - smallest.disparity) ** 2 - excess
-        shapes.append(np.maximum(_mean_of_known(apart, settings.shape_half_window), 0))
+            apart = (sizes[k].disparity - smallest.disparity) ** 2
+            expected = np.maximum(factors[0] * noise[0] - factors[k] * noise[k], 0)
+            apart, expected = (
+                _mean_of_known(np.where(np.isfinite(apart), a, np.nan), reach)
+                for a in (apart, expected)
+            )
+            shapes.append(np.maximum(apart - expected, 0))
+            bends.append(np.maximum(apart - limit * expected, 0))
     # what bends the surface moves a disparity by the square of the side of the window, so that its
     # variance grows by the fourth power
     halves = settings.half_windows
-    shapes.insert(0, shapes[0] * (halves[0] / halves[1]) ** 4)
-    best = np.full(smallest.disparity.shape, np.inf, np.float32)
+    for values in (shapes, bends):
+        values.insert(0, values[0] * (halves[0] / halves[1]) ** 4)
+    best: RowImage = np.full(smallest.disparity.shape, np.inf, np.float32)
     chosen = np.full((4, *best.shape), np.nan, np.float32)
-    for size, factor, variance, shape in zip(sizes, factors, noise, shapes):
+    for size, factor, variance, shape, bend in zip(sizes, factors, noise, shapes, bends):
         with np.errstate(invalid="ignore"):
-            error = factor * variance + shape
+            error = factor * variance + bend
             better = np.isfinite(size.disparity) & (error < best)
-        np.copyto(best, error, where=better)
+        best[better] = error[better]
         for out, values in zip(chosen, (size.disparity, variance, factor * variance, shape)):
-            np.copyto(out, values, where=better)
-    return _ChosenMatches(*chosen, factors[len(factors) // 2])
+            out[better] = values[better]
+    d, variance, scaled, bent = chosen
+    return _ChosenMatches(d, variance, scaled, bent, factors[len(factors) // 2])
 
 
 def _mean_of_known(a: RowImage, half: int) -> RowImage:

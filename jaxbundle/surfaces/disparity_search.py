@@ -149,8 +149,8 @@ def search_both_ways(
     of pixels hidden in the right image, it finds a third to a half more, and loses 2 % of the right
     ones."""
     found = semi_global(left, right, span, settings)
-    mirrored = (np.ascontiguousarray(a[:, ::-1]) for a in (right, left))
-    other = semi_global(*mirrored, span, settings)[:, ::-1]
+    mirror = lambda a: np.ascontiguousarray(a[:, ::-1])
+    other = semi_global(mirror(right), mirror(left), span, settings)[:, ::-1]
     columns = np.arange(found.shape[1])
     match = columns - np.rint(np.nan_to_num(found)).astype(int)
     confirmed = np.take_along_axis(other, np.clip(match, 0, len(columns) - 1), axis=1)
