@@ -11,9 +11,10 @@ error
 with d₀ by the smallest windows: what a larger window differs from them by beyond its noise is the
 shape of the surface in it. The variance of a disparity is the sum of
 
-- V_h, and the square of `added_sigma`;
-- r², the mean square of the disparities about their plane in a window of 9 × 9 pixels: relief that
-  no window follows;
+- V_h, and the square of `added_sigma`; instead of σ_h² 2·r² where that is larger, with r² the mean
+  square of the disparities about their plane in a window of 9 × 9 pixels: relief that no window
+  follows, by which a pixel and what its window shows both differ from the plane. r² contains the
+  noise;
 - what the scatter of disparities farther apart than a window has beyond these, the same for all
   pixels;
 - P·Δ² beside a step, a change of the disparity by Δ: P is the probability that the pixel is of the
@@ -314,8 +315,8 @@ def _add_scatter(
     d: RowImage, found: _ChosenMatches, relief: RowImage, settings: DisparityRefinementSettings
 ) -> RowImage:
     """σ by noise, shape, relief, and what the scatter of the disparities has beyond them."""
-    rest = found.shape + relief**2 + settings.added_sigma**2
-    sigma = np.sqrt(found.scaled_noise + rest)
+    added = found.shape + settings.added_sigma**2
+    sigma = np.sqrt(np.maximum(found.scaled_noise, 2 * relief**2) + added)
     apart = 2 * max(settings.half_windows) + 1  # windows that do not overlap
     side, quantile = settings.block_side, settings.scatter_quantile
     missing = missing_sigma(d, sigma, np.ones_like(sigma), apart, side, quantile)
@@ -323,7 +324,7 @@ def _add_scatter(
         return np.hypot(sigma, missing)
     # The shifts across the rows show only the noise. Where the scatter is not known, a factor below
     # 1 could not be told from one of windows that are bent.
-    return np.sqrt(np.maximum(found.scaled_noise, found.noise) + rest)
+    return np.maximum(sigma, np.sqrt(found.noise + added))
 
 
 def _fill_from_background(d: RowImage) -> RowImage:
