@@ -48,8 +48,8 @@ class DisparityRefinementSettings:
     half_windows: tuple[int, ...] = (2, 4, 7)
     """Half the sides of the windows of least squares, ascending: 5 × 5, 9 × 9, 15 × 15 pixels."""
     shape_half_window: int = 4
-    """Half the side of the windows of all rounds but the last, of the means of similar disparities
-    that the windows follow, and of the plane from which relief is measured."""
+    """Half the side of the windows in which relief is measured and steps are looked for, and at
+    least that of the means of similar disparities that windows follow."""
     rounds: int = 2
     """Corrections of the shape that a window follows; the last is the result."""
     surface_tolerance: float = 0.7
@@ -82,6 +82,9 @@ class DisparityRefinementSettings:
     unseen_step: float = 3.0
     """Least height of a step, where a wrong surface is likely: half of the wrong disparities of
     these pairs are off by more, often from a surface that has no disparities near."""
+    max_step: float = 5.5
+    """Greatest height of a step that is used: σ of a window with texture of its own beside any step
+    is then √(0.3·0.5·exp(−1/3.6))·5.5 = 1.9 pixels, and objects a few pixels wide are kept."""
     block_side: int = 48
     """Side of the blocks whose scatter gives σ: three of the largest windows without overlap."""
     scatter_quantile: float = 0.25
@@ -128,6 +131,7 @@ def refine_disparities(
     sigma = _add_scatter(d, found, relief, settings)
     likely = outliers > settings.likely_outliers
     step = np.where(likely, np.maximum(step, settings.unseen_step), step)
+    step = np.minimum(step, settings.max_step)
     sigma = np.sqrt(sigma**2 + outliers * step**2)
     with np.errstate(invalid="ignore"):
         good &= sigma < settings.max_sigma
@@ -165,7 +169,8 @@ def _match_windows(
     # In each round a pixel depends on a smooth shape, a window of least squares, and two pixels for
     # the gradients. The two pixels of the first median are left out: they change a disparity by
     # less than 1e-6 pixel.
-    reach = settings.shape_half_window + max(settings.half_windows) + 2
+    largest = max(settings.half_windows)
+    reach = max(settings.shape_half_window, largest) + largest + 2
     margin = settings.rounds * reach
     # many rounds have larger pieces: a third of one side, at least, is not margin
     sides = tuple(max(n, 3 * margin) for n in settings.piece)
@@ -220,7 +225,9 @@ def _refine_piece(
         for _ in range(settings.rounds - 1):
             delta = np.clip(np.nan_to_num(windows.correct(size).delta), -limit, limit)
             # a smooth shape and the windows' mean of what is left of it: no bias from curvature
-            shape = _smooth(np.where(known, shape + delta, np.nan), known, half, tolerance)
+            shape = _smooth(
+                np.where(known, shape + delta, np.nan), known, max(half, size), tolerance
+            )
             windows = follow(shape)
         corrections = windows.correct(size)
         if not found:
@@ -248,8 +255,8 @@ def _choose_windows(
     """Of every pixel the windows of the least mean square error."""
     smallest, factors = sizes[0], [robust_factor(s.across[np.isfinite(s.disparity)]) for s in sizes]
     noise = [size.sigma**2 for size in sizes]
-    # Beyond the noise: a mean of squares over the largest window, of differences that are alike over
-    # the smallest, has the relative standard deviation √(2/9).
+    # Beyond the noise: a mean of squares over the largest window, of differences that are alike
+    # over the smallest, has the relative standard deviation √(2/9).
     reach, limit = max(settings.half_windows), 1 + np.sqrt(2 / 9)
     shapes, bends = [], []
     for k in range(1, len(sizes)):
@@ -267,17 +274,16 @@ def _choose_windows(
     halves = settings.half_windows
     for values in (shapes, bends):
         values.insert(0, values[0] * (halves[0] / halves[1]) ** 4)
-    best: RowImage = np.full(smallest.disparity.shape, np.inf, np.float32)
-    chosen = np.full((4, *best.shape), np.nan, np.float32)
-    for size, factor, variance, shape, bend in zip(sizes, factors, noise, shapes, bends):
+    shape = smallest.disparity.shape
+    best, *chosen = (np.full(shape, value, np.float32) for value in (np.inf, *[np.nan] * 4))
+    for size, factor, variance, bent, bend in zip(sizes, factors, noise, shapes, bends):
         with np.errstate(invalid="ignore"):
             error = factor * variance + bend
             better = np.isfinite(size.disparity) & (error < best)
         best[better] = error[better]
-        for out, values in zip(chosen, (size.disparity, variance, factor * variance, shape)):
+        for out, values in zip(chosen, (size.disparity, variance, factor * variance, bent)):
             out[better] = values[better]
-    d, variance, scaled, bent = chosen
-    return _ChosenMatches(d, variance, scaled, bent, factors[len(factors) // 2])
+    return _ChosenMatches(*chosen, factor=factors[len(factors) // 2])
 
 
 def _mean_of_known(a: RowImage, half: int) -> RowImage:
