@@ -1,20 +1,24 @@
 """Dense matching of real rectified pairs with true disparities, compared with OpenCV's semi-global
 matching of the same pair and range.
 
-    python benchmarks/surface_pairs.py FOLDER [PAIR …] [--processes] [--json FILE]
+    python benchmarks/surface_pairs.py FOLDER [PAIR …] [--processes] [--outliers] [--json FILE]
 
-FOLDER has a folder for each pair, with the files of one of the public sets as they are: `im0`, `im1`
-and `disp0*.pfm` (Middlebury 2014, ETH3D), `view1`, `view5` and `disp1` (Middlebury 2005 and 2006, of
-a third of the size), `im2`, `im6` and `disp2` (2003 in `*4`, 2001 in `*8`), or `left`, `right` and
-`disparity.npz` (scikit-image). None is part of this repository.
+FOLDER has a folder for each pair, with the files of one of the public sets as they are: `im0`,
+`im1` and `disp0*.pfm` (Middlebury 2014, ETH3D), `view1`, `view5` and `disp1` (Middlebury 2005 and
+2006, of a third of the size), `im2`, `im6` and `disp2` (2003 in folders `*_4`, 2001 in `*_8`), or
+`left`, `right` and `disparity.npz` (scikit-image 0.16). None is part of this repository.
 
 Of every pair: the share of pixels with a disparity, of all with a true one and of those visible in
 both photographs (by the true disparities); of these disparities NMAD (1.4826 times the median
-deviation from the median), mean, and the shares wrong by more than 0.5, 1 and 2 pixels; errors over
-σ: robust σ and the shares beyond 3 and 5. True disparities of whole steps add the σ of their
-rounding. Seconds are of the processor, second call; `--processes` adds the first call of a process without
-programs of an earlier one and with them, their programs, and the memory beyond that of the
-imports.
+deviation from the median), median, and the shares wrong by more than 0.5, 1 and 2 pixels; errors
+over σ: robust σ and the shares beyond 3 and 5. True disparities of whole steps add the σ of their
+rounding. Seconds are of the processor, second call; `--processes` adds the first call of a process
+without programs of an earlier one and with them, their programs, and the memory beyond that of the
+imports. The last line has the means of all pairs.
+
+`--outliers` prints instead how many disparities of the search are wrong by more than a pixel, by
+the distance from the nearest step or gap, with texture of their own and without: what
+`outliers_at_step`, `outlier_range` and `textured_outliers` of `DisparityRefinementSettings` state.
 """
 
 import argparse
@@ -33,6 +37,13 @@ import machine
 import numpy as np
 
 import jaxbundle
+from jaxbundle.surfaces import dense
+from jaxbundle.surfaces.dense import DenseSettings
+from jaxbundle.surfaces.disparity_refinement import (
+    DisparityRefinementSettings,
+    _find_steps,
+    _match_windows,
+)
 from jaxbundle.surfaces.reconstruct import find_bounds, reconstruct_surface
 from jaxbundle.surfaces.views import FrameView
 
@@ -49,12 +60,11 @@ MARGIN = 4.0
 
 def read_pair(folder):
     """Grey photographs, true disparities (NaN: unknown), and the step they are rounded to."""
-    for left, right, truth, scale, step in SETS:
-        files = [sorted(folder.glob(f"{name}*")) for name in (left, right, truth)]
-        if all(files):
-            break
-    else:
+    found = [(files, scale, step) for *names, scale, step in SETS
+             if all(files := [sorted(folder.glob(f"{name}*")) for name in names])]  # fmt: skip
+    if not found:
         raise SystemExit(f"{folder}: no pair with true disparities")
+    files, scale, step = found[0]
     if scale is None:
         scale = float(folder.name.rsplit("_", 1)[-1])
         step = 1 / scale
@@ -142,6 +152,47 @@ def figures(pair, d, sigma):
     return found
 
 
+DISTANCES = (0, 1.1, 2.1, 3.1, 4.1, 6.1, 9, 12, 16, 25, np.inf)
+
+
+def outliers(pair):
+    """Pixels, and those wrong by more than a pixel, by texture and distance, as parts of all."""
+    settings = DenseSettings()
+    low, high = range_of(pair)
+    lowest = int(low)
+    right = np.full(pair.left.shape, np.nan, np.float32)
+    right[:, lowest:] = pair.right[:, : right.shape[1] - lowest]
+    images = SimpleNamespace(left=pair.left.astype(np.float32), right=right)
+    left, right = dense._prepare(images)
+    inside, span = np.isfinite(images.left), int(np.ceil(high)) - lowest
+    start = dense._search(left, right, inside, np.isfinite(images.right), span, settings)
+    sizes, textured = _match_windows(left, right, start, settings.refinement)
+    distance, _ = _find_steps(start, inside, settings.refinement)
+    far = np.isfinite(sizes[1].disparity) & (distance > DISTANCES[6])
+    # the common offset of a pair is one of its true disparities
+    offset = np.nanmedian((sizes[1].disparity + lowest - pair.true)[far])
+    error = start + lowest - pair.true - offset
+    known = np.isfinite(error)
+    bins = [np.where(known & (textured == own), np.digitize(distance, DISTANCES), 0)
+            for own in (True, False)]  # fmt: skip
+    count = lambda which: [np.bincount(b[which], minlength=len(DISTANCES))[1:] for b in bins]
+    return np.stack([count(known), count(known & (np.abs(error) > 1))]) / known.sum()
+
+
+def print_outliers(pairs):
+    """The table of all pairs, each of the same weight, beside the formula of the settings."""
+    shares, wrong = np.sum([outliers(pair) for pair in pairs], axis=0)
+    settings = DisparityRefinementSettings()
+    print("  distance  textured: %  wrong    others: %  wrong  formula")
+    for k, (low, high) in enumerate(zip(DISTANCES, DISTANCES[1:])):
+        middle = (low + min(high, 2 * low)) / 2
+        P = settings.outliers_at_step * np.exp(-middle / settings.outlier_range)
+        cells = "".join(f" {100 * shares[i, k] / shares.sum():12.1f} "
+                        f"{100 * wrong[i, k] / shares[i, k]:6.1f}" for i in (0, 1))  # fmt: skip
+        print(f"{low:4g}–{high:4g} {cells}  {100 * settings.textured_outliers * P:.1f}, "
+              f"{100 * P:.1f}")  # fmt: skip
+
+
 def measure(work, *arguments):
     """The result of a call, and its seconds of the processor and on the clock."""
     begin = time.process_time(), time.perf_counter()
@@ -178,6 +229,7 @@ def main():
     parser.add_argument("folder", type=Path)
     parser.add_argument("pairs", nargs="*", help="names of folders; all if none")
     parser.add_argument("--processes", action="store_true", help="first calls, too")
+    parser.add_argument("--outliers", action="store_true", help="wrong disparities by distance")
     parser.add_argument("--first", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("--json", type=machine.target, metavar="FILE",
                         help="write the figures; - for standard output")  # fmt: skip
@@ -188,6 +240,8 @@ def main():
         jaxbundle.keep_programs()
         print(json.dumps(first_call(given.folder / names[0])))
         return
+    if given.outliers:
+        return print_outliers([read_pair(given.folder / name) for name in names])
     told = {}
     for name in names:
         pair = read_pair(given.folder / name)
@@ -205,6 +259,12 @@ def main():
             for who, values in row.items():
                 print(f"  {who:16}" + "  ".join(f"{k} {v:.3g}" for k, v in values.items()),
                       flush=True)  # fmt: skip
+    for who in ("ours", "OpenCV"):
+        rows = [row[who] for row in told.values()]
+        means = {k: np.mean([row[k] for row in rows]) for k in rows[0]}
+        if given.json != "-":
+            print(f"mean of {len(rows)}, {who}: "
+                  + "  ".join(f"{k} {v:.3g}" for k, v in means.items()))  # fmt: skip
     machine.write_json(told | {"machine": machine.machine()}, given.json)
 
 

@@ -19,6 +19,10 @@ FILES = (
 )
 
 
+# Points of the largest cloud written as text by default: 10 MB, what editors and spreadsheets open.
+MAX_CSV_POINTS = 100_000
+
+
 EXAMPLE = (
     "examples/four_photographs --photos examples/four_photographs/photos --zmin -1.5 --zmax 3 "
     "--dense --out out/surface"
@@ -67,6 +71,13 @@ def surface(  # noqa: PLR0913 - the options of the command
             "the default is the UTM zone"
         ),
     ] = None,
+    csv: Annotated[
+        bool | None,
+        typer.Option(
+            help="write cloud.csv, too; by default up to 100 000 points, since cloud.ply has the "
+            "same columns in a fraction of the size"
+        ),
+    ] = None,
     json: Annotated[str, typer.Option(help="counts and accuracy as JSON; - prints only JSON")] = "",
     force: Force = False,
     quiet: Quiet = False,
@@ -108,8 +119,12 @@ def surface(  # noqa: PLR0913 - the options of the command
         )
     files = [str(file) for one in input for file in input_files(one)]
     told = f"{', '.join(stamp(files, in_words(now())))}\n{found.report()}"
+    if csv is None and len(found.cloud) > MAX_CSV_POINTS:
+        csv = False
+        told += "\ncloud.csv is not written, cloud.ply has its columns: --csv writes it"
     with replace_folder(out, "surface", FILES, force) as folder:
-        write_cloud_csv(found.cloud, folder / "cloud.csv")
+        if csv is not False:
+            write_cloud_csv(found.cloud, folder / "cloud.csv")
         write_cloud(found.cloud, folder / "cloud.ply")
         if found.dsm is not None:
             write_dsm(found.dsm, folder / "dsm.tif", folder / "dsm_sigma.tif")

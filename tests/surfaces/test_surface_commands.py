@@ -2,6 +2,7 @@
 RPC images whose orientation misses by pixels."""
 
 import json
+from types import SimpleNamespace
 
 import cv2
 import jax.numpy as jnp
@@ -10,11 +11,13 @@ import pytest
 import rasterio
 from surface_scenes import CAMERA, SIZE, hills, photographs, two_shapes
 
+import jaxbundle
 from jaxbundle.io.scanner.rpc import write_rpc
 from jaxbundle.planning.rendering import Scene, Sensor, render_rays
 from jaxbundle.planning.shapes import HeightField
 from jaxbundle.planning.texture import Texture
 from jaxbundle.pushbroom.rpc import Rpc
+from jaxbundle.surfaces.cloud import Cloud
 from jaxbundle.surfaces.point_files import read_cloud
 from jaxbundle.surfaces.scanner_inputs import from_map, map_coordinates
 from jaxbundle.surfaces.scanner_views import RpcView, neighbourhood
@@ -81,6 +84,25 @@ def test_a_project_becomes_a_cloud_and_a_dsm(project, tmp_path, command, monkeyp
     found = json.loads(told.out)
     assert found["points"] == len(read_cloud(thinned)) < len(cloud) / 4
     assert abs(found["comparison"]["median"]) < 0.05
+
+
+@pytest.mark.parametrize(
+    "points, options, written",
+    [(1000, [], True), (1001, [], False), (1001, ["--csv"], True), (1000, ["--no-csv"], False)],
+)
+def test_large_clouds_are_written_as_text_only_if_asked_for(
+    tmp_path, command, monkeypatch, points, options, written
+):
+    cloud = Cloud(np.zeros((points, 3)), np.zeros((points, 3, 3)), np.full(points, 2),
+                  np.zeros(points, int), np.zeros((points, 2)), ("a.jpg",))  # fmt: skip
+    found = SimpleNamespace(cloud=cloud, dsm=None, to_dict=dict, report=lambda: "some points")
+    monkeypatch.setattr(jaxbundle, "surface", lambda *_, **options: found)
+    monkeypatch.setattr("jaxbundle.cli.surface.MAX_CSV_POINTS", 1000)
+    told = command("surface", tmp_path, "--out", tmp_path / "out", *options)
+    assert told.status == 0, told.err
+    assert (tmp_path / "out" / "cloud.csv").exists() == written
+    assert ("cloud.csv is not written" in told.out) == (points > 1000 and not options)
+    assert len(read_cloud(tmp_path / "out" / "cloud.ply")) == points
 
 
 @pytest.mark.parametrize(
