@@ -57,8 +57,8 @@ class DisparityRefinementSettings:
     """Half the side of the windows in which relief is measured and steps are looked for, and at
     least that of the means of similar disparities that windows follow."""
     rounds: int = 2
-    """Corrections of the shape that a window follows; the last is the result. One was not enough with
-    windows of one size: RMS of errors over σ 1.14 on rendered photographs."""
+    """Corrections of the shape that a window follows; the last is the result. One was not enough
+    with windows of one size: RMS of errors over σ 1.14 on rendered photographs."""
     surface_tolerance: float = 0.7
     """Differences of the disparities of one surface within a window: σ of the weights of their
     means."""
@@ -83,8 +83,8 @@ class DisparityRefinementSettings:
     textured_outliers: float = 0.3
     """The probability of a window with texture of its own, relative to one without."""
     max_outliers: float = 0.25
-    """Maximum probability of a wrong surface: where it is larger, there is no disparity. 0.15: 72.4 %
-    of the pixels, 1.0 % wrong by two pixels, 2.8 % beyond 3 σ."""
+    """Maximum probability of a wrong surface: where it is larger, there is no disparity. 0.15:
+    72.4 % of the pixels, 1.0 % wrong by two pixels, 2.8 % beyond 3 σ."""
     likely_outliers: float = 0.1
     """Probability of a wrong surface from which its σ is at least that of a step of
     `unseen_step`."""

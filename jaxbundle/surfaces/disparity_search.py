@@ -53,8 +53,8 @@ class DisparitySearchSettings:
     200. Half: 0.14 % wrong in the scene "repeated" instead of 0.10 %; double: no difference."""
     max_left_right: float = 1.0
     """Maximum difference between the disparity of a pixel and that of its match, searched from the
-    right image by itself, pixels. On a real pair half: 1.3 % fewer pixels, 4.8 % of those left wrong
-    by two pixels (5.3); double: 0.5 % more, 5.7 %."""
+    right image by itself, pixels. On a real pair half: 1.3 % fewer pixels, 4.8 % of those left
+    wrong by two pixels (5.3); double: 0.5 % more, 5.7 %."""
     repetition: float = 0.8
     """Correlation of a window with another on its row from which a texture repeats itself. In the
     scene "repeated" 0.6: 0.06 % of the points wrong by a pixel instead of 0.10 %; 0.95: 0.46 %."""
