@@ -19,7 +19,7 @@ FILES = (
 )
 
 
-# Points of the largest cloud written as text by default: 10 MB, what editors and spreadsheets open.
+# Points of the largest dense cloud written as text by default: 10 MB, what editors and spreadsheets open.
 MAX_CSV_POINTS = 100_000
 
 
@@ -74,8 +74,8 @@ def surface(  # noqa: PLR0913 - the options of the command
     csv: Annotated[
         bool | None,
         typer.Option(
-            help="write cloud.csv, too; by default up to 100 000 points, since cloud.ply has the "
-            "same columns in a fraction of the size"
+            help="write cloud.csv, too; by default not of a dense cloud of more than 100 000 "
+            "points, since cloud.ply has the same columns in a fraction of the size"
         ),
     ] = None,
     json: Annotated[str, typer.Option(help="counts and accuracy as JSON; - prints only JSON")] = "",
@@ -119,7 +119,7 @@ def surface(  # noqa: PLR0913 - the options of the command
         )
     files = [str(file) for one in input for file in input_files(one)]
     told = f"{', '.join(stamp(files, in_words(now())))}\n{found.report()}"
-    if csv is None and len(found.cloud) > MAX_CSV_POINTS:
+    if csv is None and dense and len(found.cloud) > MAX_CSV_POINTS:
         csv = False
         told += "\ncloud.csv is not written, cloud.ply has its columns: --csv writes it"
     with replace_folder(out, "surface", FILES, force) as folder:

@@ -88,9 +88,15 @@ def test_a_project_becomes_a_cloud_and_a_dsm(project, tmp_path, command, monkeyp
 
 @pytest.mark.parametrize(
     "points, options, written",
-    [(1000, [], True), (1001, [], False), (1001, ["--csv"], True), (1000, ["--no-csv"], False)],
+    [
+        (1001, [], True),
+        (1000, ["--dense"], True),
+        (1001, ["--dense"], False),
+        (1001, ["--dense", "--csv"], True),
+        (1000, ["--no-csv"], False),
+    ],
 )
-def test_large_clouds_are_written_as_text_only_if_asked_for(
+def test_large_dense_clouds_are_written_as_text_only_if_asked_for(
     tmp_path, command, monkeypatch, points, options, written
 ):
     cloud = Cloud(np.zeros((points, 3)), np.zeros((points, 3, 3)), np.full(points, 2),
@@ -101,7 +107,7 @@ def test_large_clouds_are_written_as_text_only_if_asked_for(
     told = command("surface", tmp_path, "--out", tmp_path / "out", *options)
     assert told.status == 0, told.err
     assert (tmp_path / "out" / "cloud.csv").exists() == written
-    assert ("cloud.csv is not written" in told.out) == (points > 1000 and not options)
+    assert ("cloud.csv is not written" in told.out) == (points > 1000 and not written)
     assert len(read_cloud(tmp_path / "out" / "cloud.ply")) == points
 
 
