@@ -19,7 +19,8 @@ FILES = (
 )
 
 
-# Points of the largest dense cloud written as text by default: 10 MB, what editors and spreadsheets open.
+# Points of the largest dense cloud written as text by default: 10 MB, what editors and spreadsheets
+# open.
 MAX_CSV_POINTS = 100_000
 
 
