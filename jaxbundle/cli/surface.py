@@ -67,6 +67,12 @@ def surface(  # noqa: PLR0913 - the options of the command
             "the default is the UTM zone"
         ),
     ] = None,
+    csv: Annotated[
+        bool,
+        typer.Option(
+            help="write cloud.csv, too; cloud.ply has its columns in a fraction of the size"
+        ),
+    ] = True,
     json: Annotated[str, typer.Option(help="counts and accuracy as JSON; - prints only JSON")] = "",
     force: Force = False,
     quiet: Quiet = False,
@@ -109,7 +115,8 @@ def surface(  # noqa: PLR0913 - the options of the command
     files = [str(file) for one in input for file in input_files(one)]
     told = f"{', '.join(stamp(files, in_words(now())))}\n{found.report()}"
     with replace_folder(out, "surface", FILES, force) as folder:
-        write_cloud_csv(found.cloud, folder / "cloud.csv")
+        if csv:
+            write_cloud_csv(found.cloud, folder / "cloud.csv")
         write_cloud(found.cloud, folder / "cloud.ply")
         if found.dsm is not None:
             write_dsm(found.dsm, folder / "dsm.tif", folder / "dsm_sigma.tif")

@@ -28,7 +28,7 @@ from jaxbundle.surfaces.disparity_search import (
     RowMask,
     equalise_exposures,
     find_repetitions,
-    semi_global,
+    search_both_ways,
 )
 from jaxbundle.surfaces.rectification import RectificationSettings
 
@@ -84,7 +84,7 @@ def match_dense(pair: RowPair, span: int, settings: DenseSettings = DenseSetting
     start = _search(left, right, inside, np.isfinite(pair.right), span, settings)
     # parts visible in one image only match the repetition of their texture in the other
     start[find_repetitions(left, start, span, settings.search)] = np.nan
-    return refine_disparities(left, right, start, settings.refinement)
+    return refine_disparities(left, right, start, settings.refinement, inside)
 
 
 def _search(
@@ -99,14 +99,14 @@ def _search(
     a range beyond OpenCV's, at half its size."""
     if left.size * (span + 1) <= settings.max_searched and span <= MAX_SPAN:
         left, right = equalise_exposures(left, right, inside, right_inside, settings.search)
-        found = semi_global(left, right, span, settings.search)
+        found = search_both_ways(left, right, span, settings.search)
     else:
         half, right_half = _halve(left), _halve(right)
         whole, right_whole = (_halve(a.astype(np.float32)) == 1 for a in (inside, right_inside))
         coarse = _search(half, right_half, whole, right_whole, span // 2 + 1, settings)
         finer = refine_disparities(half, right_half, coarse, settings.refinement).disparity
         known = np.where(np.isfinite(finer), finer, coarse)
-        found = _double(known, left.shape, settings.refinement.min_step / 4)
+        found = _double(known, left.shape, settings.refinement.step / 2)
     return np.where(inside & (found <= span), found, np.nan)
 
 

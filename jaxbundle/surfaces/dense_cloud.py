@@ -7,7 +7,7 @@ are left out. Half of the variance of a match is due to the base image, common t
 line. So the errors of pairs k and l have the covariance ½·σₖ·σₗ·eₖ·eₗ.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -29,7 +29,7 @@ from jaxbundle.system.cores import available_cores
 def dense_cloud(
     base: FrameView,
     others: Sequence[FrameView],
-    guide: Guide,
+    find_guide: Callable[[], Guide | None],
     bounds: Bounds,
     step: int,
     settings: DenseSettings,
@@ -37,9 +37,9 @@ def dense_cloud(
     """The cloud; name and variance factor of each image used; those that cannot be rectified.
 
     All disparities between the bounds are searched, unless they are very many: then those near
-    the guide.
+    the guide, `find_guide()`, which is made only then.
     """
-    found_points, all_points = guide_points(base, guide), bound_points(base, bounds)
+    all_points = bound_points(base, bounds)
     columns, rows = base.size
     v, u = np.mgrid[0:rows:step, 0:columns:step].reshape(2, -1)
     uv = np.stack([u, v], 1).astype(float)
@@ -47,8 +47,12 @@ def dense_cloud(
     used, left_out = [], []
     for other in others:
         span = disparity_range(base, other, all_points)
-        X = all_points if span is not None and span < settings.max_disparities else found_points
-        rectified = rectify(base, other, X, settings.rectification)
+        narrow = span is not None and span < settings.max_disparities
+        guide = None if narrow else find_guide()
+        X = all_points if guide is None else guide_points(base, guide)
+        rectified = (
+            rectify(base, other, X, settings.rectification) if narrow or guide is not None else None
+        )
         if rectified is None:
             left_out.append(other.name)
             continue

@@ -1,14 +1,32 @@
 """Refinement of disparities by least squares at every pixel of a rectified pair.
 
-At each pixel a window follows the disparities found, R(x, y) = right(x − d(x, y), y), and a
-correction is solved for, with a shift ε across the rows (`row_windows`). Rows are aligned, so that
-ε should be 0: ε in units of its σ gives a variance factor (the median of ε²/σ² over that of χ²).
-What the scatter of disparities farther apart than a window has beyond that, due to the shape of the
-surface within the windows, is added, the same for all pixels. If noise dominates, the step is
-repeated with larger windows, as long as they contain one surface.
+At each pixel windows of several sizes follow the disparities found, R(x, y) = right(x − d(x, y),
+y), and a correction is solved for, with a shift ε across the rows (`row_windows`). Rows are
+aligned, so that ε should be 0: ε in units of its σ gives a variance factor for each size (the
+median of ε²/σ² over that of χ²). Of the sizes h each pixel takes the one of the least mean square
+error
+
+    V_h = σ_h² + B_h²,    B_h² = mean of (d_h − d₀)² − (σ₀² − σ_h²) around the pixel,
+
+with d₀ by the smallest windows: what a larger window differs from them by beyond its noise is the
+shape of the surface in it. The variance of a disparity is the sum of
+
+- V_h, and the square of `added_sigma`; instead of σ_h² 2·r² where that is larger, with r² the mean
+  square of the disparities about their plane in a window of 9 × 9 pixels: relief that no window
+  follows, by which a pixel and what its window shows both differ from the plane. r² contains the
+  noise;
+- what the scatter of disparities farther apart than a window has beyond these, the same for all
+  pixels;
+- P·Δ² beside a step, a change of the disparity by Δ: P is the probability that the pixel is of the
+  other surface, or hidden in the other image. It falls with the distance from the step, and is
+  smaller for a pixel whose window has texture of its own. Where it is large, no disparity is given.
+
+Sources: Kanade and Okutomi (1994), A stereo matching algorithm with an adaptive window (the choice
+of windows by noise and shape).
 """
 
 import dataclasses
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -18,7 +36,7 @@ from scipy import ndimage
 
 from jaxbundle.photographs.opencv import need_opencv
 from jaxbundle.surfaces.disparity_search import RowImage, RowMask
-from jaxbundle.surfaces.row_windows import correct
+from jaxbundle.surfaces.row_windows import RowCorrections, RowWindows
 from jaxbundle.surfaces.scatter import missing_sigma, robust_factor
 from jaxbundle.system.cores import available_cores
 
@@ -27,75 +45,79 @@ from jaxbundle.system.cores import available_cores
 class DisparityRefinementSettings:
     """Least squares at every pixel, and the σ of the disparities; pixels where nothing is said.
 
-    Figures "half …, double …" are of `benchmarks/surface_accuracy.py "no texture" --dense`: 66 870
-    points, RMS of errors over σ 1.003, robust 0.943, 0.106 % wrong by more than a pixel; those of
-    other values are printed by `benchmarks/surface_settings.py --dense`.
+    Figures are means of ten real pairs (`benchmarks/surface_pairs.py`): 74.8 % of the pixels have a
+    disparity, 1.3 % of them wrong by more than two pixels, 3.0 % of the errors beyond 3 σ.
     """
 
-    half_window: int = 4
-    """Half the side of the windows of least squares, 9 × 9 pixels. Half: 0.8 % more pixels, 0.089 %
-    wrong; double: 0.9 % fewer, 0.22 % wrong, since windows reach over steps."""
-    wide_half_window: int = 7
-    """Half the side of the windows where the texture is weak. Half (3) and double: RMS 1.015,
-    robust 0.967 and 0.951."""
-    weak_sigma: float = 0.05
-    """σ of a disparity above which the texture is weak. Half: robust RMS 0.949; double: 0.941."""
-    min_weak_share: float = 0.02
-    """Share of weak pixels below which no larger windows are tried: it only saves their time."""
+    half_windows: tuple[int, ...] = (2, 4, 7)
+    """Half the sides of the windows of least squares, ascending: 5 × 5, 9 × 9, 15 × 15 pixels. With
+    (2, 5, 10) 3.2 % of the errors are beyond 3 σ, with a fourth size, 12, 3.3 %, for 0.3 % more
+    pixels."""
+    shape_half_window: int = 4
+    """Half the side of the windows in which relief is measured and steps are looked for, and at
+    least that of the means of similar disparities that windows follow."""
     rounds: int = 2
-    """Corrections of the shape that a window follows; the last is the result. 1: RMS 1.14, only
-    98.1 % of the errors within 3 σ; 4: RMS 1.017, and more time."""
-    hole_sigma: float = 0.5
-    """σ of the disparity of a window that consists of gaps, by the root of their share. Determined
-    on rendered roofs. Half: 2.5 % more pixels, 0.22 % wrong; double: 4 % fewer, 0.027 % wrong."""
-    step_sigma: float = 0.3
-    """σ added to a window with a step in the surface. Determined on rendered roofs. Half: 0.7 %
-    fewer pixels, since windows with few gaps then count as steps, too; double: 1.7 % more, 98.6 %
-    within 0.2 pixel (99.5)."""
-    min_step: float = 2.5
-    """Change of disparities in a window that is a step in the surface. Half and double: the same
-    pixels within 0.02 %."""
-    block_side: int = 48
-    """Side of the blocks whose scatter gives σ: five windows without overlap on each side. Half:
-    RMS 1.023; double: 0.956."""
-    scatter_quantile: float = 0.25
-    """Quantile of the blocks that is used: the smoother part of the surface. Half: RMS 1.023;
-    double: 0.932."""
+    """Corrections of the shape that a window follows; the last is the result. One was not enough
+    with windows of one size: RMS of errors over σ 1.14 on rendered photographs."""
     surface_tolerance: float = 0.7
     """Differences of the disparities of one surface within a window: σ of the weights of their
-    means. Half: robust RMS 0.936; double: 0.942."""
+    means."""
     max_change: float = 1.0
-    """Maximum change of a disparity by least squares, which converges within about a pixel. Half:
-    0.15 % fewer pixels; double: no difference."""
+    """Maximum change of a disparity by least squares, which converges within about a pixel."""
     max_last_change: float = 0.5
-    """Maximum change by the last round. Half: 0.16 % fewer pixels; double: no difference."""
-    min_correlation: float = 0.5
-    """Minimum ρ of a window. 0.3: no difference; 0.8: 0.6 % fewer pixels, no fewer wrong."""
-    min_step_correlation: float = 0.9
-    """Minimum ρ of a window beside a step, where disparities of one side extend to the other. 0.35:
-    1.2 % more pixels, 0.13 % wrong; 0.95: 0.4 % fewer, 0.093 % wrong."""
+    """Maximum change by the last round."""
+    min_correlation: float = 0.3
+    """Minimum ρ of a window."""
     min_contrast_ratio: float = 0.2
-    """Minimum contrast h₁ of the left window relative to the right one (`row_windows`). Half: no
-    difference; double: 0.1 % fewer pixels."""
-    added_sigma: float = 0.014
+    """Minimum contrast h₁ of the left window relative to the right one (`row_windows`)."""
+    step: float = 1.5
+    """Difference of the disparities of neighbours, within 3 × 3 pixels, that is a step in the
+    surface: steeper surfaces than 37° of the disparities are rare, and hardly seen by both
+    images."""
+    outliers_at_step: float = 0.5
+    """Probability that a disparity beside a step, or beside pixels without disparity, is of the
+    other surface, if its window has no texture of its own. This and the two following are measured
+    on 25 real pairs with true disparities (`benchmarks/surface_pairs.py --outliers`)."""
+    outlier_range: float = 3.6
+    """Distance from a step over which this probability falls to 1/e, pixels."""
+    textured_outliers: float = 0.3
+    """The probability of a window with texture of its own, relative to one without."""
+    max_outliers: float = 0.25
+    """Maximum probability of a wrong surface: where it is larger, there is no disparity. 0.15:
+    72.4 % of the pixels, 1.0 % wrong by two pixels, 2.8 % beyond 3 σ."""
+    likely_outliers: float = 0.1
+    """Probability of a wrong surface from which its σ is at least that of a step of
+    `unseen_step`."""
+    unseen_step: float = 3.0
+    """Least height of a step, where a wrong surface is likely: half of the wrong disparities of
+    these pairs are off by more, often from a surface that has no disparities near."""
+    max_step: float = 5.5
+    """Greatest height of a step that is used: σ of a window with texture of its own beside any step
+    is then √(0.3·0.5·exp(−1/3.6))·5.5 = 1.9 pixels, and objects a few pixels wide are kept."""
+    block_side: int = 48
+    """Side of the blocks whose scatter gives σ: three of the largest windows without overlap."""
+    scatter_quantile: float = 0.25
+    """Quantile of the blocks that is used: the smoother part of the surface."""
+    added_sigma: float = 0.005
     """σ added by interpolation and sampling: errors that depend on the fraction of the disparity
-    are alike over whole surfaces, so that no scatter shows them. Half: RMS 1.005; double: 0.82, σ
-    too large."""
-    max_sigma: float = 0.5
-    """σ above which the texture does not determine a disparity. Half: 5 % fewer pixels, none wrong;
-    double: 0.118 % wrong."""
-    piece: tuple[int, int] = (256, 512)
-    """Rows and columns refined together, with their margins: few enough for a processor's cache."""
+    are alike over whole surfaces, so that no scatter shows them. 0.014: RMS of errors over σ 0.92
+    instead of 0.98 in the scene "two" of `benchmarks/surface_accuracy.py`."""
+    max_sigma: float = 2.0
+    """Maximum σ of a disparity, pixels. Half: 3 % fewer pixels, 1.0 % wrong by two pixels; double:
+    2 % more, 1.8 %."""
+    piece: tuple[int, int] = (512, 768)
+    """Rows and columns refined together, at most, with their margins of 32: an array of them has
+    1.6 MB. Half: a fifth more time, since more of them are margins."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Disparities:
-    """Disparity, its σ, ρ of the window; NaN: none. `factor`: of the variances of matching, which
-    σ contains."""
+    """Disparity and its σ, NaN: none; the probability that it is of another surface. `factor`: of
+    the variances of matching by the middle windows, which σ contains."""
 
     disparity: RowImage
     sigma: RowImage
-    rho: RowImage
+    outliers: RowImage
     factor: float
 
 
@@ -104,25 +126,260 @@ def refine_disparities(
     right: RowImage,
     start: RowImage,
     settings: DisparityRefinementSettings = DisparityRefinementSettings(),
+    inside: RowMask | None = None,
 ) -> Disparities:
-    """Least squares at every pixel with a disparity."""
-    spline = _RowSpline.fit(right)
-    known = np.isfinite(start)
-    half, wide_half = settings.half_window, settings.wide_half_window
-    found, stepped = _refine_with_windows(left, spline, start, half, known, settings)
+    """Least squares at every pixel with a disparity. `inside`: pixels of the left image, all if not
+    given."""
+    sizes, own_texture = _match_windows(left, right, start, settings)
+    found = _choose_windows(sizes, settings)
+    whole = np.ones(start.shape, bool) if inside is None else inside
+    distance, step = _find_steps(start, whole, settings)
+    outliers = settings.outliers_at_step * np.exp(-distance / settings.outlier_range)
+    outliers = np.where(own_texture, settings.textured_outliers * outliers, outliers)
+    # a step itself, and its neighbours: two surfaces in their smallest windows
+    good = np.isfinite(found.disparity) & (outliers <= settings.max_outliers) & (distance >= 1)
+    d = np.where(good, found.disparity, np.float32(np.nan))
+    relief = _measure_relief(d, settings.shape_half_window)
+    sigma = _add_scatter(d, found, relief, settings)
+    likely = outliers > settings.likely_outliers
+    step = np.where(likely, np.maximum(step, settings.unseen_step), step)
+    step = np.minimum(step, settings.max_step)
+    sigma = np.sqrt(sigma**2 + outliers * step**2)
     with np.errstate(invalid="ignore"):
-        weak = known & ~(found.sigma < settings.weak_sigma) & ~stepped
-    if weak.sum() > settings.min_weak_share * known.sum():
-        wide, over_step = _refine_with_windows(left, spline, start, wide_half, weak, settings)
+        good &= sigma < settings.max_sigma
+    keep = lambda a: np.where(good, a, np.float32(np.nan)).astype(np.float32)
+    return Disparities(keep(d), keep(sigma), keep(outliers), found.factor)
+
+
+class _SizeMatches(NamedTuple):
+    """Disparities by windows of one size (NaN: none), their σ without a variance factor, and shifts
+    across the rows over their σ."""
+
+    disparity: RowImage
+    sigma: RowImage
+    across: RowImage
+
+
+class _ChosenMatches(NamedTuple):
+    """Disparities, each by the windows of the size chosen for it; the variance by noise, without
+    and with its factor, and by the shape of the surface in the window; the factor of the middle
+    size."""
+
+    disparity: RowImage
+    noise: RowImage
+    scaled_noise: RowImage
+    shape: RowImage
+    factor: float
+
+
+def _match_windows(
+    left: RowImage, right: RowImage, start: RowImage, settings: DisparityRefinementSettings
+) -> tuple[list[_SizeMatches], RowMask]:
+    """Matches by all sizes of windows; which of the smallest have texture of their own."""
+    rows, columns = left.shape
+    spline, filled = _RowSpline.fit(right), _fill_from_background(start)
+    # In each round a pixel depends on a smooth shape, a window of least squares, and two pixels for
+    # the gradients. The two pixels of the first median are left out: they change a disparity by
+    # less than 1e-6 pixel.
+    largest = max(settings.half_windows)
+    reach = max(settings.shape_half_window, largest) + largest + 2
+    margin = settings.rounds * reach
+    # many rounds have larger pieces: a third of one side, at least, is not margin
+    most = [max(n, 3 * margin) - 2 * margin for n in settings.piece]
+    # pieces of one size without an almost empty last one
+    height, width = (-(-n // -(-n // m)) for n, m in zip(left.shape, most))
+    sides = height + 2 * margin, width + 2 * margin
+    made = np.full((len(settings.half_windows), 3, rows, columns), np.nan, np.float32)
+    own_texture = np.zeros(left.shape, bool)
+
+    def refine(corner: tuple[int, int]) -> None:
+        inner = tuple(slice(k, k + n) for k, n in zip(corner, (height, width)))
+        if not np.isfinite(start[inner]).any():
+            return
+        v, u = (
+            _reflect(np.arange(n) + k - margin, size)
+            for k, n, size in zip(corner, sides, left.shape)
+        )
+        found, textured = _refine_piece(left, spline, start, filled, v, u, settings)
+        place = own_texture[inner]
+        middle = tuple(slice(margin, margin + n) for n in place.shape)
+        place[:] = textured[middle]
+        for out, size in zip(made, found):
+            for values, piece in zip(out, size):
+                values[inner] = piece[middle]
+
+    corners = [(r, c) for r in range(0, rows, height) for c in range(0, columns, width)]
+    with ThreadPoolExecutor(available_cores()) as pool:
+        list(pool.map(refine, corners))
+    return [_SizeMatches(*size) for size in made], own_texture
+
+
+def _refine_piece(
+    left: RowImage,
+    spline: "_RowSpline",
+    start: RowImage,
+    filled: RowImage,
+    rows: Int[np.ndarray, " r"],
+    columns: Int[np.ndarray, " c"],
+    settings: DisparityRefinementSettings,
+) -> tuple[list[_SizeMatches], RowMask]:
+    """Matches of some rows and columns by all sizes of windows; which of the smallest have texture
+    of their own."""
+    piece = np.ix_(rows, columns)
+    left, start, filled = left[piece], start[piece], filled[piece]
+    known = np.isfinite(start)
+    half, tolerance = settings.shape_half_window, settings.surface_tolerance
+    limit = settings.max_change
+    first_shape = _smooth(_remove_noise(start, known), known, half, tolerance)
+    follow = lambda shape: RowWindows(left, spline.sample(rows, columns, shape, filled), known)
+    first, found, own_texture = follow(first_shape), [], np.zeros(left.shape, bool)
+    # Every size has shapes of its own: where they differ, windows of some sizes are bent.
+    for size in settings.half_windows:
+        shape, windows = first_shape, first
+        for _ in range(settings.rounds - 1):
+            delta = np.clip(np.nan_to_num(windows.correct(size).delta), -limit, limit)
+            # a smooth shape and the windows' mean of what is left of it: no bias from curvature
+            shape = _smooth(
+                np.where(known, shape + delta, np.nan), known, max(half, size), tolerance
+            )
+            windows = follow(shape)
+        corrections = windows.correct(size)
+        if not found:
+            own_texture = windows.find_own_texture(size, corrections.noise)
+        found.append(_accept(corrections, shape, start, settings))
+    return found, own_texture
+
+
+def _accept(
+    found: RowCorrections, shape: RowImage, start: RowImage, settings: DisparityRefinementSettings
+) -> _SizeMatches:
+    """The matches by windows of one size, NaN where they are not accepted."""
+    d = shape + found.delta
+    with np.errstate(invalid="ignore"):
+        good = np.abs(d - start) <= settings.max_change
+        good &= np.abs(found.delta) < settings.max_last_change
+        good &= found.rho >= settings.min_correlation
+        good &= found.contrast > settings.min_contrast_ratio
+    return _SizeMatches(np.where(good, d, np.nan), found.sigma, found.normalised_row_shift)
+
+
+def _choose_windows(
+    sizes: Sequence[_SizeMatches], settings: DisparityRefinementSettings
+) -> _ChosenMatches:
+    """Of every pixel the windows of the least mean square error."""
+    smallest, factors = sizes[0], [robust_factor(s.across[np.isfinite(s.disparity)]) for s in sizes]
+    noise = [size.sigma**2 for size in sizes]
+    # Beyond the noise: a mean of squares over the largest window, of differences that are alike
+    # over the smallest, has the relative standard deviation √(2/9).
+    reach, limit = max(settings.half_windows), 1 + np.sqrt(2 / 9)
+    shapes, bends = [], []
+    for k in range(1, len(sizes)):
         with np.errstate(invalid="ignore"):
-            narrow = np.nan_to_num(found.sigma, nan=settings.max_sigma)
-            better = weak & ~over_step & (wide.sigma < narrow)
-        mixed = {
-            name: np.where(better, getattr(wide, name), getattr(found, name))
-            for name in ("disparity", "sigma", "rho")
-        }
-        found = dataclasses.replace(found, **mixed)
-    return found
+            apart = (sizes[k].disparity - smallest.disparity) ** 2
+            expected = np.maximum(factors[0] * noise[0] - factors[k] * noise[k], 0)
+            apart, expected = (
+                _mean_of_known(np.where(np.isfinite(apart), a, np.nan), reach)
+                for a in (apart, expected)
+            )
+            shapes.append(np.maximum(apart - expected, 0))
+            bends.append(np.maximum(apart - limit * expected, 0))
+    # what bends the surface moves a disparity by the square of the side of the window, so that its
+    # variance grows by the fourth power
+    halves = settings.half_windows
+    for values in (shapes, bends):
+        values.insert(0, values[0] * (halves[0] / halves[1]) ** 4)
+    shape = smallest.disparity.shape
+    best, *chosen = (np.full(shape, value, np.float32) for value in (np.inf, *[np.nan] * 4))
+    for size, factor, variance, bent, bend in zip(sizes, factors, noise, shapes, bends):
+        with np.errstate(invalid="ignore"):
+            error = factor * variance + bend
+            better = np.isfinite(size.disparity) & (error < best)
+        best[better] = error[better]
+        for out, values in zip(chosen, (size.disparity, variance, factor * variance, bent)):
+            out[better] = values[better]
+    return _ChosenMatches(*chosen, factor=factors[len(factors) // 2])
+
+
+def _mean_of_known(a: RowImage, half: int) -> RowImage:
+    """Means of the known values in windows around each pixel; NaN where there are none."""
+    known = np.isfinite(a)
+    cv2 = need_opencv()
+    window = (2 * half + 1, 2 * half + 1)
+    total, weight = (
+        cv2.boxFilter(x, -1, window, normalize=False, borderType=cv2.BORDER_REFLECT_101)
+        for x in (np.where(known, a, 0).astype(a.dtype), known.astype(a.dtype))
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(weight > 0.5, total / weight, np.nan)
+
+
+def _measure_relief(d: RowImage, half: int) -> RowImage:
+    """Root mean squares of disparities about their planes in windows."""
+    cv2 = need_opencv()
+    # double precision: squares of disparities of hundreds of pixels, and relief of hundredths
+    d = d.astype(np.float64)
+    mean = _mean_of_known(d, half)
+    square = _mean_of_known(d * d, half) - mean * mean
+    # an unknown disparity has no effect on the slopes as the mean of those known
+    around = np.nan_to_num(np.where(np.isfinite(d), d, mean))
+    offset = np.arange(-half, half + 1, dtype=float)
+    spread = float(np.mean(offset**2))
+    slope, even = offset / (len(offset) * spread), np.full(len(offset), 1 / len(offset))
+    border = cv2.BORDER_REFLECT_101
+    along = cv2.sepFilter2D(around, cv2.CV_64F, slope, even, borderType=border)
+    across = cv2.sepFilter2D(around, cv2.CV_64F, even, slope, borderType=border)
+    return np.sqrt(np.maximum(square - spread * (along**2 + across**2), 0))
+
+
+def _add_scatter(
+    d: RowImage, found: _ChosenMatches, relief: RowImage, settings: DisparityRefinementSettings
+) -> RowImage:
+    """σ by noise, shape, relief, and what the scatter of the disparities has beyond them."""
+    added = found.shape + settings.added_sigma**2
+    sigma = np.sqrt(np.maximum(found.scaled_noise, 2 * relief**2) + added)
+    apart = 2 * max(settings.half_windows) + 1  # windows that do not overlap
+    side, quantile = settings.block_side, settings.scatter_quantile
+    missing = missing_sigma(d, sigma, np.ones_like(sigma), apart, side, quantile)
+    if missing is not None:
+        return np.hypot(sigma, missing)
+    # The shifts across the rows show only the noise. Where the scatter is not known, a factor below
+    # 1 could not be told from one of windows that are bent.
+    return np.maximum(sigma, np.sqrt(found.noise + added))
+
+
+def _fill_from_background(d: RowImage) -> RowImage:
+    """Unknown disparities as the smaller of the nearest known ones on their row: those hidden in
+    the other image are of the surface behind. 0 in rows without any."""
+    columns = np.arange(d.shape[1])
+    known = np.isfinite(d)
+    before = np.maximum.accumulate(np.where(known, columns, -1), axis=1)
+    after = np.minimum.accumulate(np.where(known, columns, len(columns))[:, ::-1], axis=1)[:, ::-1]
+    take = lambda at: np.take_along_axis(d, np.clip(at, 0, len(columns) - 1), axis=1)
+    beyond = np.float32(np.inf)
+    lower = np.minimum(
+        np.where(before >= 0, take(before), beyond),
+        np.where(after < len(columns), take(after), beyond),
+    )
+    return np.where(known, d, np.where(np.isfinite(lower), lower, 0)).astype(np.float32)
+
+
+def _find_steps(
+    d: RowImage, inside: RowMask, settings: DisparityRefinementSettings
+) -> tuple[RowImage, RowImage]:
+    """Distances to the nearest step of the disparities, or to the nearest pixel `inside` the image
+    without one; and the height of the highest step in a window."""
+    cv2 = need_opencv()
+    filled, known = _fill_from_background(d), np.isfinite(d)
+    span = lambda a, side: (
+        cv2.dilate(a, np.ones((side, side))),
+        cv2.erode(a, np.ones((side, side))),
+    )
+    high, low = (np.where(known, d, value).astype(np.float32) for value in (-1e4, 1e4))
+    at_step = known & (span(high, 3)[0] - span(low, 3)[1] > settings.step)
+    clear = ~(at_step | (inside & ~known))
+    distance = cv2.distanceTransform(clear.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    high, low = span(filled, 2 * settings.shape_half_window + 1)
+    return distance, np.maximum(high - filled, filled - low)
 
 
 class _RowSpline(NamedTuple):
@@ -140,9 +397,11 @@ class _RowSpline(NamedTuple):
         rows: Int[np.ndarray, " rows"],
         columns: Int[np.ndarray, " columns"],
         disparity: RowImage,
+        otherwise: RowImage,
     ) -> RowImage:
-        """Grey values at some rows, and at columns moved to the left by the disparities; beyond the
-        edge those of the edge."""
+        """Grey values at some rows, and at columns moved to the left by the disparities, or by
+        others where these are unknown; beyond the edge those of the edge."""
+        disparity = np.where(np.isfinite(disparity), disparity, otherwise)
         whole = np.floor(-disparity)
         t = -disparity - whole
         first = columns + whole.astype(np.int32)
@@ -159,124 +418,10 @@ class _RowSpline(NamedTuple):
         return found / 6
 
 
-def _refine_with_windows(
-    left: RowImage,
-    spline: _RowSpline,
-    start: RowImage,
-    half: int,
-    wanted: RowMask,
-    settings: DisparityRefinementSettings,
-) -> tuple[Disparities, RowMask]:
-    """Disparities by windows of 2·`half` + 1 pixels, with the factor of those wanted in σ; which
-    windows have a step of the surface in them."""
-    rows, columns = left.shape
-    # In each round a pixel depends on a smooth shape and a window of least squares, `half` each,
-    # and on two pixels for the gradients. The two pixels of the first median are left out: they
-    # change a disparity by less than 1e-6 pixel.
-    margin = 2 * settings.rounds * (half + 1)
-    # many rounds have larger pieces: a third of one side, at least, is not margin
-    sides = tuple(max(n, 3 * margin) for n in settings.piece)
-    height, width = (n - 2 * margin for n in sides)
-    d, sigma, rho, across = (np.full(left.shape, np.nan, np.float32) for _ in range(4))
-
-    def refine(corner: tuple[int, int]) -> None:
-        inner = tuple(slice(k, k + n) for k, n in zip(corner, (height, width)))
-        if not wanted[inner].any():
-            return
-        v, u = (
-            _reflect(np.arange(n) + k - margin, size)
-            for k, n, size in zip(corner, sides, left.shape)
-        )
-        found = _refine_piece(left, spline, start, v, u, half, settings)
-        for out, piece in zip((d, sigma, rho, across), found):
-            place = out[inner]
-            place[:] = piece[margin:, margin:][: place.shape[0], : place.shape[1]]
-
-    corners = [(r, c) for r in range(0, rows, height) for c in range(0, columns, width)]
-    with ThreadPoolExecutor(available_cores()) as pool:
-        list(pool.map(refine, corners))
-    good = np.isfinite(d)
-    factor, noise = _estimate_noise(np.where(wanted, d, np.nan), sigma, across, half, settings)
-    edges = _edge_variance(np.where(good, d, 0), good, half, settings)
-    sigma = np.sqrt(noise**2 + edges)
-    stepped = edges >= settings.step_sigma**2
-    with np.errstate(invalid="ignore"):
-        # beside a step the disparities of one side extend to the other
-        good &= ~stepped | (rho >= settings.min_step_correlation)
-        good &= sigma < settings.max_sigma
-    keep = lambda a: np.where(good, a, np.nan)
-    return Disparities(keep(d), keep(sigma), keep(rho), factor), stepped
-
-
-def _estimate_noise(
-    d: RowImage, sigma: RowImage, across: RowImage, half: int, settings: DisparityRefinementSettings
-) -> tuple[float, RowImage]:
-    """The variance factor, and σ of the disparities d."""
-    factor = robust_factor(across[np.isfinite(d)])
-    noise = np.hypot(np.sqrt(factor) * sigma, settings.added_sigma)
-    apart = 2 * half + 1  # windows that do not overlap
-    side, quantile = settings.block_side, settings.scatter_quantile
-    shape = missing_sigma(d, noise, np.ones_like(noise), apart, side, quantile)
-    if shape is not None:
-        return factor, np.hypot(noise, shape)
-    # The shifts across the rows show only the noise. Where the scatter is not known, a factor below
-    # 1 could not be told from one of windows that are bent.
-    factor = max(factor, 1.0)
-    return factor, np.hypot(np.sqrt(factor) * sigma, settings.added_sigma)
-
-
 def _reflect(index: Int[np.ndarray, " k"], n: int) -> Int[np.ndarray, " k"]:
     """Indices beyond the ends, reflected at the first and the last of `n`."""
     period = max(2 * (n - 1), 1)
     return (n - 1) - np.abs((n - 1) - index % period)
-
-
-def _refine_piece(
-    left: RowImage,
-    spline: _RowSpline,
-    start: RowImage,
-    rows: Int[np.ndarray, " r"],
-    columns: Int[np.ndarray, " c"],
-    half: int,
-    settings: DisparityRefinementSettings,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Disparities (NaN: none), their σ, ρ, and shifts across the rows over their σ, of some rows
-    and columns."""
-    piece = np.ix_(rows, columns)
-    left, start = left[piece], start[piece]
-    known = np.isfinite(start)
-    shape = _smooth(_remove_noise(start, known), known, half, settings.surface_tolerance)
-    moved = np.zeros_like(shape)
-    for number in range(settings.rounds):
-        if number > 0:
-            # a smooth shape and the windows' mean of what is left of it: no bias from curvature
-            shape = _smooth(
-                np.where(known, shape + moved, np.nan), known, half, settings.surface_tolerance
-            )
-        right = spline.sample(rows, columns, np.where(known, shape, 0))
-        found = correct(left, right, half)
-        delta, sigma, across, rho, contrast, textured = (np.asarray(a) for a in found)
-        moved = np.clip(np.nan_to_num(delta), -settings.max_change, settings.max_change)
-    with np.errstate(invalid="ignore"):
-        good = known & (np.abs(shape + moved - start) <= settings.max_change)
-        good &= np.abs(delta) < settings.max_last_change
-        good &= rho >= settings.min_correlation
-        good &= textured & (contrast > settings.min_contrast_ratio)
-    return np.where(good, shape + moved, np.nan), sigma, rho, across
-
-
-def _edge_variance(
-    d: RowImage, known: RowMask, half: int, settings: DisparityRefinementSettings
-) -> RowImage:
-    """The added variance of a window that extends beyond the surface: with pixels without
-    disparity, or of another surface."""
-    cv2 = need_opencv()
-    window = (2 * half + 1, 2 * half + 1)
-    holes = cv2.boxFilter((~known).astype(np.float32), -1, window)
-    high = cv2.dilate(np.where(known, d, -1e4).astype(np.float32), np.ones(window, np.uint8))
-    low = cv2.erode(np.where(known, d, 1e4).astype(np.float32), np.ones(window, np.uint8))
-    stepped = known & (high - low > settings.min_step)
-    return settings.hole_sigma**2 * holes + settings.step_sigma**2 * stepped
 
 
 def _remove_noise(disparity: RowImage, known: RowMask) -> RowImage:

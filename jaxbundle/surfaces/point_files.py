@@ -1,13 +1,17 @@
 """Clouds as PLY, LAS or LAZ, and DXF; in and out.
 
-PLY: binary, coordinates in double precision, colours, σ and rays. LAS 1.4 by laspy: coordinates to
-1/1000 of the median σ or better, σ as extra dimensions, the coordinate system. DXF by ezdxf: POINT
-entities on the layer POINTS.
+PLY: binary, coordinates in double precision, colours, σ, rays, base image and its pixel; the names
+of the base images are comments of its head. LAS 1.4 by laspy: coordinates to 1/1000 of the median σ
+or better, σ as extra dimensions, the coordinate system. DXF by ezdxf: POINT entities on the layer
+POINTS.
 """
 
+import dataclasses
 import io
+import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
 
@@ -27,13 +31,16 @@ from jaxbundle.system.foreign_parsers import foreign_parser
 COLOURS = ("red", "green", "blue")
 VERTEX = np.dtype([
     ("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("red", "u1"), ("green", "u1"), ("blue", "u1"),
-    *((name, "<f4") for name in SIGMAS), ("rays", "<i4"),
+    *((name, "<f4") for name in SIGMAS), ("rays", "<i4"), ("image", "<i4"), ("u", "<f4"),
+    ("v", "<f4"),
 ])  # fmt: skip
 PLY_TYPES = {"<f8": "double", "|u1": "uchar", "<f4": "float", "<i4": "int"}
 PLY_READ = {"double": "<f8", "float64": "<f8", "float": "<f4", "float32": "<f4", "uchar": "u1",
             "uint8": "u1", "char": "i1", "int8": "i1", "int": "<i4", "int32": "<i4",
             "uint": "<u4", "uint32": "<u4", "short": "<i2", "int16": "<i2", "ushort": "<u2",
             "uint16": "<u2"}  # fmt: skip
+# The name of a base image in the head, as a text of JSON: any character, in ASCII.
+PLY_IMAGE = "comment image "
 PLY_END = re.compile(rb"end_header\r?\n")
 BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
@@ -82,8 +89,11 @@ def _write_ply(cloud: Cloud, path: Path) -> None:
         rows[name] = colour[:, k]
     for k, name in enumerate(SIGMAS):
         rows[name] = cloud.sigma[:, k]
-    rows["rays"] = cloud.rays
-    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    rows["rays"], rows["image"] = cloud.rays, cloud.image
+    rows["u"], rows["v"] = cloud.uv.T
+    head = ["ply", "format binary_little_endian 1.0"]
+    head += [PLY_IMAGE + json.dumps(name) for name in cloud.images]
+    head += [f"element vertex {len(rows)}"]
     head += [f"property {PLY_TYPES[VERTEX[n].str]} {n}" for n in VERTEX.names or ()]
     write_bytes(path, ["\n".join([*head, "end_header\n"]).encode(), rows.tobytes()])
 
@@ -114,7 +124,24 @@ def _read_ply(path: Path) -> Cloud:
         colour = None
         if {*COLOURS} <= {*names}:
             colour = np.stack([columns[c] for c in COLOURS], 1).astype(np.uint8)
-    return make_cloud(Source(str(path), None, "point"), X, columns, colour)
+    cloud = make_cloud(Source(str(path), None, "point"), X, columns, colour)
+    return _add_base_images(cloud, lines, columns)
+
+
+def _add_base_images(
+    cloud: Cloud, lines: Sequence[str], columns: Mapping[str, np.ndarray]
+) -> Cloud:
+    """The base images and their pixels, if the head names the images: in files of this program."""
+    texts = [line.removeprefix(PLY_IMAGE) for line in lines if line.startswith(PLY_IMAGE)]
+    if not texts or not columns.keys() >= {"image", "u", "v"}:
+        return cloud
+    with suppress(ValueError):
+        names = tuple(str(json.loads(text)) for text in texts)
+        image = np.asarray(columns["image"]).astype(int)
+        if not len(image) or (image.min() >= 0 and image.max() < len(names)):
+            uv = np.column_stack([columns["u"], columns["v"]]).astype(float)
+            return dataclasses.replace(cloud, image=image, images=names, uv=uv)
+    return cloud
 
 
 def _ply_numbers(

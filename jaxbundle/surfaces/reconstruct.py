@@ -1,7 +1,8 @@
 """From oriented images to a cloud: pairs, guides, points, matches, base image by base image."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ from jaxtyping import Float, UInt8
 
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.surfaces.bounds import Bounds, bounds_from_geometry, bounds_from_points
-from jaxbundle.surfaces.cloud import Cloud, merge
+from jaxbundle.surfaces.cloud import Cloud, empty_cloud, merge
 from jaxbundle.surfaces.correlation import Pyramid, make_pyramid
 from jaxbundle.surfaces.dense import DenseSettings
 from jaxbundle.surfaces.dense_cloud import dense_cloud
@@ -162,9 +163,19 @@ def reconstruct_surface(
             "orientation and its units, --zmin and --zmax"
         )
     tell = progress or (lambda *_: None)
-    levels = max(_level(views, bounds, i, others, settings.guide) for i, others in partners.items())
-    pyramids = _Pyramids(views, levels, settings.max_pyramids)
-    guides = _make_guides(views, bounds, partners, pyramids, tell, dense, settings)
+    # every pixel of a photograph is searched between the bounds, without a guide, if their range is
+    # not too wide
+    beforehand = {
+        i: others
+        for i, others in partners.items()
+        if not (dense and isinstance(views[i], FrameView))
+    }
+    guides = _Guides(views, bounds, partners, dense, settings)
+    for done, i in enumerate(beforehand):
+        tell("depths", done, len(beforehand))
+        guides[i]
+    if beforehand:
+        tell("depths", len(beforehand), len(beforehand))
     # pixels between the points of a dense cloud, so that those of all base images fit into memory
     pixels = sum(views[i].size[0] * views[i].size[1] for i in partners)
     every = step or max(1, int(np.ceil(np.sqrt(pixels / settings.dense.max_points))))
@@ -175,16 +186,18 @@ def reconstruct_surface(
         tell("matching", done, len(partners))
         base, used = views[i], [views[j] for j in others]
         counts = {"points": 0, "matched": 0, "variance_factor": None, "rejected": {}}
-        if i in guides and dense:
+        if dense:
+            find_guide = partial(guides.__getitem__, i)
             cloud, counts, more = _match_every_pixel(
-                base, used, guides[i], bounds[i], every, settings.dense
+                base, used, find_guide, bounds[i], every, settings.dense
             )
             clouds.append(cloud)
             messages += more
-        elif i in guides:
-            group, others_guides = pyramids.select(i, others), [guides.get(j) for j in others]
+        elif (guide := guides[i]) is not None:
+            others_guides = [guides[j] for j in others]
+            group = guides.pyramids.select(i, others)
             cloud, counts = _match_interest_points(
-                base, used, group, guides[i], others_guides, points, step, settings
+                base, used, group, guide, others_guides, points, step, settings
             )
             clouds.append(cloud)
         told.append({"image": base.name, "with": [view.name for view in used], **counts})
@@ -236,17 +249,21 @@ def _match_interest_points(
 def _match_every_pixel(
     base: OrientedImage,
     others: Sequence[OrientedImage],
-    guide: Guide,
+    find_guide: Callable[[], Guide | None],
     bounds: Bounds,
     step: int,
     settings: DenseSettings,
 ) -> tuple[Cloud, dict[str, Any], list[str]]:
-    """The cloud of most pixels of an image, its counts, messages on images left out."""
+    """The cloud of most pixels of an image, its counts, messages on images left out.
+
+    **Arguments:** `find_guide()`: the guide of the image, made when it is needed."""
     if isinstance(base, FrameView):
         photographs = [view for view in others if isinstance(view, FrameView)]
-        cloud, used, left_out = dense_cloud(base, photographs, guide, bounds, step, settings)
-    else:
+        cloud, used, left_out = dense_cloud(base, photographs, find_guide, bounds, step, settings)
+    elif (guide := find_guide()) is not None:
         cloud, used, left_out = dense_ground_cloud(base, others, guide, bounds, step, settings)
+    else:
+        cloud, used, left_out = empty_cloud(base.name), [], []
     cloud = dataclasses.replace(cloud, colour=_colour(base, cloud.uv))
     columns, rows = base.size
     number = -(-columns // step) * -(-rows // step)
@@ -266,38 +283,49 @@ def _match_every_pixel(
     )
 
 
-def _make_guides(
-    views: Sequence[OrientedImage],
-    bounds: Sequence[Bounds],
-    partners: Mapping[int, Sequence[int]],
-    pyramids: _Pyramids,
-    tell: Progress,
-    dense: bool,
-    settings: SurfaceSettings,
-) -> dict[int, Guide]:
-    """Guides of every base and its partners; dense matching needs only those of the
-    bases, coarser ones."""
-    with_whom = {i: list(others) for i, others in partners.items()}
-    for i, others in partners.items():
-        for j in others:
-            if j not in partners and not dense:
-                with_whom.setdefault(j, []).append(i)
-    nodes = settings.dense.max_guide_nodes if dense else settings.guide.max_nodes
-    guide_settings = dataclasses.replace(settings.guide, max_nodes=nodes)
-    guides = {}
-    for done, (i, others) in enumerate(with_whom.items()):
-        tell("depths", done, len(with_whom))
-        guide = make_guide(
-            views[i],
-            [views[j] for j in others],
-            pyramids.select(i, others),
-            bounds[i],
-            guide_settings,
+class _Guides:
+    """Guides of base images and of their partners, made when they are asked for; None without
+    overlap. Dense matching needs only those of the bases, coarser ones."""
+
+    def __init__(
+        self,
+        views: Sequence[OrientedImage],
+        bounds: Sequence[Bounds],
+        partners: Mapping[int, Sequence[int]],
+        dense: bool,
+        settings: SurfaceSettings,
+    ) -> None:
+        self.views, self.bounds, self.settings = views, bounds, settings
+        self.partners = {i: list(others) for i, others in partners.items()}
+        for i, others in partners.items():
+            for j in others:
+                if j not in partners:
+                    self.partners.setdefault(j, []).append(i)
+        self.bases = partners
+        nodes = settings.dense.max_guide_nodes if dense else settings.guide.max_nodes
+        self.guide_settings = dataclasses.replace(settings.guide, max_nodes=nodes)
+        self.made: dict[int, Guide | None] = {}
+
+    @cached_property
+    def pyramids(self) -> _Pyramids:
+        """The pyramids of all images, of as many levels as any base image requires."""
+        levels = max(
+            _level(self.views, self.bounds, i, others, self.settings.guide)
+            for i, others in self.bases.items()
         )
-        if guide is not None:
-            guides[i] = guide
-    tell("depths", len(with_whom), len(with_whom))
-    return guides
+        return _Pyramids(self.views, levels, self.settings.max_pyramids)
+
+    def __getitem__(self, i: int) -> Guide | None:
+        if i not in self.made:
+            others = self.partners[i]
+            self.made[i] = make_guide(
+                self.views[i],
+                [self.views[j] for j in others],
+                self.pyramids.select(i, others),
+                self.bounds[i],
+                self.guide_settings,
+            )
+        return self.made[i]
 
 
 def _level(

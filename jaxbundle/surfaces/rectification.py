@@ -34,7 +34,7 @@ class RectificationSettings:
     """Margin at both ends of the disparities of known points, relative to their range: nodes of a
     guide miss the highest and lowest parts of a surface. The time grows with it. Half: the same
     pixels within 0.03 %, RMS 0.995; double: 0.3 % more, 1.02 (scene of
-    `DisparityRefinementSettings`)."""
+    `DisparitySearchSettings`)."""
     min_margin: float = 8.0
     """Minimum of this margin, pixels: for flat surfaces, whose points have no range. Half and
     double: as for the relative margin."""

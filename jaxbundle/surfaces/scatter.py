@@ -17,6 +17,8 @@ from scipy.optimize import brentq
 MIN_VALUES = 100
 # σ of a normal distribution by its median absolute deviation: 1/Φ⁻¹(¾) to five digits.
 NORMAL_SIGMA_BY_MAD = 1.4826
+# Median of χ² of one degree of freedom, 0.455.
+CHI2_MEDIAN = float(stats.chi2.median(1))
 
 
 def robust_sigma(values: Float[np.ndarray, " n"]) -> float:
@@ -29,7 +31,7 @@ def robust_factor(ratio: Float[np.ndarray, " n"], otherwise: float = 1.0) -> flo
     ratio = ratio[np.isfinite(ratio)]
     if len(ratio) <= MIN_VALUES:
         return otherwise
-    return float(np.median(ratio**2) / stats.chi2.median(1))
+    return float(np.median(ratio**2) / CHI2_MEDIAN)
 
 
 def scatter_factor(

@@ -90,13 +90,22 @@ def test_files_read_back_equal(plane, tmp_path, kind):
     np.testing.assert_allclose(back.X, plane.X, rtol=0, atol=rounded)
     np.testing.assert_allclose(back.sigma, plane.sigma, rtol=1e-6)
     assert (back.rays == plane.rays).all()
-    if kind == "csv":
+    if kind in ("csv", "ply"):
         assert [back.images[k] for k in back.image] == [plane.images[k] for k in plane.image]
-        np.testing.assert_array_equal(back.uv, plane.uv)
-    else:
+        exact = plane.uv if kind == "csv" else plane.uv.astype(np.float32)
+        np.testing.assert_array_equal(back.uv, exact)
+    if kind != "csv":
         np.testing.assert_array_equal(back.colour, plane.colour)
     if kind in ("las", "laz"):
         assert back.system == "EPSG:32633"
+
+
+def test_any_name_of_an_image_comes_back_from_ply(plane, tmp_path):
+    names = ("Bild ß\n1.jpg", 'end_header "2"')
+    path = tmp_path / "cloud.ply"
+    write_cloud(dataclasses.replace(plane, images=names, image=np.arange(len(plane)) % 2), path)
+    back = read_cloud(path)
+    assert back.images == names and (back.image == np.arange(len(plane)) % 2).all()
 
 
 def test_a_drawing_passes_the_audit(plane, tmp_path):
