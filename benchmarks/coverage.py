@@ -76,7 +76,7 @@ def main() -> int:
 def covered(result, camera, exact, targets) -> np.ndarray:
     """Shares of interior parameters, projection centres and points within 1.96 σ of the truth, by
     classical (first row) and correlated σ."""
-    names, C = result.camera_covariance("cam")
+    names, C = result.camera_covariance("cam", classical=True)
     K = result.correlated_camera_covariance("cam")
     p = result.camera_parameters("cam")
     interior = np.array([p[n] - camera.parameters.get(n, 0.0) for n in names])
@@ -87,12 +87,12 @@ def covered(result, camera, exact, targets) -> np.ndarray:
         (interior, diagonal(C), diagonal(K)),
         (
             stations,
-            diagonal(result.image_covariance)[:, :3],
+            diagonal(result.classical_image_covariance)[:, :3],
             diagonal(result.correlated_image_covariance)[:, :3],
         ),
         (
             points,
-            diagonal(result.point_covariance),
+            diagonal(result.classical_point_covariance),
             diagonal(result.correlated_point_covariance),
         ),
     ]
@@ -101,7 +101,7 @@ def covered(result, camera, exact, targets) -> np.ndarray:
 
 def interior_squares(result, camera) -> list[float]:
     """d²/n of the interior parameters against the truth, classical and correlated."""
-    names, C = result.camera_covariance("cam")
+    names, C = result.camera_covariance("cam", classical=True)
     p = result.camera_parameters("cam")
     d = np.array([p[n] - camera.parameters.get(n, 0.0) for n in names])
     found = []

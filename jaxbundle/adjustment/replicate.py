@@ -10,6 +10,9 @@ from jaxbundle.adjustment.quality.correlated_errors import CorrelationSettings
 from jaxbundle.adjustment.quality.replication import (
     MIN_IMAGES,
     Replication,
+    difference_of,
+    effects_of_halves,
+    expected_band,
     random_halves,
 )
 from jaxbundle.adjustment.result import Adjustment
@@ -65,14 +68,19 @@ def replicate(
         )
     if not any(given.camera_covariance(camera.id)[0] for camera in network.cameras):
         raise InputError("no camera has a free parameter: there is nothing to compare")
-    splits, failed = [], []
+    whole = given.cofactors.solution
+    splits, failed, of_splits = [], [], []
     for number, second in enumerate(random_halves(network, by, repeat, seed)):
         if progress is not None:
             progress("adjusting halves", number, repeat)
         try:
-            splits.append(given.compare_halves(second))
+            names, D = effects_of_halves(whole, given.problem, second)
         except NotSolvedError as error:
             failed.append(f"split {number + 1}: {error}")
+        else:
+            splits.append(difference_of(whole, names, D, given.error_model))
+            of_splits.append(D)
     if not splits:
         raise NotSolvedError(f"no halves of the network can be adjusted alone: {failed[0]}")
-    return Replication(by, tuple(splits), tuple(failed), given.error_model)
+    band = None if given.error_model is None else expected_band(given.error_model, of_splits)
+    return Replication(by, tuple(splits), tuple(failed), given.error_model, band)

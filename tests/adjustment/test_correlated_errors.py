@@ -65,7 +65,7 @@ def test_sizes_are_found_and_sigma_hold(clean):
     classical, correlated, found = [], [], []
     for seed in range(10):
         result = jaxbundle.adjust(disturbed(clean, seed, affine=0.4), correlated=True)
-        names, C = result.camera_covariance("cam")
+        names, C = result.camera_covariance("cam", classical=True)
         values = result.camera_parameters("cam")
         d = np.array([values[name] for name in names]) - true
         K = result.correlated_camera_covariance("cam")
@@ -164,11 +164,12 @@ def test_a_saved_result_keeps_error_model_and_halves(shaken, tmp_path, monkeypat
     assert told[0] == told[1] and json.loads(told[0])["replication"]["by"] == "photographs"
     name = ("camera", "cam", "fx")
     function = lambda values: values["camera"][0, :2]
-    modelled = [one.modelled_covariance_of(function) for one in (shaken, again)]
+    modelled = [one.covariance_of(function) for one in (shaken, again)]
     np.testing.assert_allclose(*modelled, rtol=1e-9)
     f = shaken.cameras["cam"]["parameters"]["fx"]
     assert np.sqrt(modelled[0][0, 0]) == pytest.approx(f["sigma_correlated"], rel=0.1)
-    assert np.sqrt(shaken.covariance(name)[0, 0]) == pytest.approx(f["sigma"])
+    assert np.sqrt(shaken.covariance(name)[0, 0]) == pytest.approx(np.sqrt(modelled[0][0, 0]))
+    assert np.sqrt(shaken.covariance(name, classical=True)[0, 0]) == pytest.approx(f["sigma"])
 
 
 def test_comparisons_use_sigma_under_correlated_errors(clean, shaken, tmp_path):
@@ -177,7 +178,7 @@ def test_comparisons_use_sigma_under_correlated_errors(clean, shaken, tmp_path):
     plain = [jaxbundle.adjust(one.network) for one in (shaken, other)]
     with_model, without = jaxbundle.compare(shaken, other), jaxbundle.compare(*plain)
     camera = with_model.kind == "camera"
-    C = [one.modelled_camera_covariance("cam")[1] for one in (shaken, other)]
+    C = [one.camera_covariance("cam")[1] for one in (shaken, other)]
     np.testing.assert_allclose(with_model.sigma[camera] ** 2, np.diag(sum(C)), rtol=0.1)
     assert with_model.modelled == ("a", "b") and not without.modelled
     assert with_model.tests["camera cam"].f < without.tests["camera cam"].f / 3
