@@ -59,7 +59,7 @@ class CorrelationSettings:
 
     min_images: int = 8
     knots: tuple[int, int] = (11, 9)
-    octaves: int = 1
+    octaves: int = 3
     min_points_of_knot: int = 4
     reach: float = 0.6
     estimation: ErrorSettings = ErrorSettings()
