@@ -83,4 +83,5 @@ def replicate(
     if not splits:
         raise NotSolvedError(f"no halves of the network can be adjusted alone: {failed[0]}")
     band = None if given.error_model is None else expected_band(given.error_model, of_splits)
-    return Replication(by, tuple(splits), tuple(failed), given.error_model, band)
+    unit = given.image_unit
+    return Replication(by, tuple(splits), tuple(failed), given.error_model, band, unit)

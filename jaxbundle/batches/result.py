@@ -127,7 +127,7 @@ class BatchCalibration(TableMethods):
     def _components(self, i: int) -> list[dict[str, Any]]:
         sizes = present(self.component_sizes)[i]
         return [
-            {"name": name, "size": float(size), "unit": "px"}
+            {"name": name, "sigma": float(size), "unit": "px"}
             for name, size in zip(COMPONENTS, sizes)
             if np.isfinite(size)
         ]

@@ -555,7 +555,7 @@ def rig_dict(rig: "RigCalibration", brief: bool = False) -> dict:
         "quality": {name: _rig_quality(rig, name) for name in rig.names},
         "error_components": []
         if rig.error_model is None
-        else [size._asdict() for size in rig.error_model.sizes],
+        else [size.to_dict(rig.image_unit) for size in rig.error_model.sizes],
     } | ({} if brief else {"residuals": residuals})
 
 

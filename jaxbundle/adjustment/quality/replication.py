@@ -95,13 +95,15 @@ class Replication(TableMethods):
     """The result of `replicate`: `by` what the halves were formed, the difference of each split,
     the error `model` of the whole network, and splits that could not be adjusted, with the
     reason; `band`: in which the mean d²/n of the covariance of the error model lies with 95 % if
-    the model holds, from simulated errors (None where they were not simulated)."""
+    the model holds, from simulated errors (None where they were not simulated); `image_unit`: that
+    of the components."""
 
     by: str
     splits: tuple[HalvesDifference, ...]
     failed: tuple[str, ...]
     model: ErrorModel | None
     band: tuple[float, float] | None = None
+    image_unit: str = "px"
 
     @property
     def dof(self) -> int:
@@ -183,7 +185,7 @@ class Replication(TableMethods):
         return self.brief() | {
             "error_components": []
             if self.model is None
-            else [size._asdict() for size in self.model.sizes],
+            else [size.to_dict(self.image_unit) for size in self.model.sizes],
             "parameters": rows_of(self.table()),
         }
 

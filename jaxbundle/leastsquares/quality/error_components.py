@@ -73,6 +73,8 @@ class ErrorComponent(NamedTuple):
     root: Any
 
 
+# The unit of components in that of image coordinates.
+IMAGE = "image"
 # The name of a component whose size is not estimated: independent errors of some rows, σ0 times
 # their a priori σ; its θ is added to that of all independent errors.
 OTHERS = "other observations"
@@ -89,6 +91,18 @@ class ErrorSize(NamedTuple):
     size: float
     sigma: float
     score: float
+
+    def to_dict(self, image_unit: str) -> dict[str, str | float]:
+        """As in JSON: `sigma` is the size, the standard deviation of the effect of the component
+        on an observation; `sigma_of_sigma` that of the estimate."""
+        unit = image_unit if self.unit == IMAGE else self.unit
+        return {
+            "name": self.name,
+            "sigma": self.size,
+            "unit": unit,
+            "score": self.score,
+            "sigma_of_sigma": self.sigma,
+        }
 
 
 @dataclasses.dataclass(frozen=True)
