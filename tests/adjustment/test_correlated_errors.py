@@ -14,6 +14,7 @@ from jaxbundle.adjustment.quality.replication import compared_parameters
 from jaxbundle.leastsquares.quality import error_components
 from jaxbundle.network.undetermined import keep_images
 from jaxbundle.planning import grid_of_targets, ring_of_stations
+from jaxbundle.report import correlated
 from jaxbundle.report.page import compose
 
 IMAGES, SIGMA = 12, 0.2
@@ -221,3 +222,93 @@ def test_splines_are_a_partition_of_one_and_kernels_are_positive():
     X = rng.normal(size=(40, 3))
     K = wendland(np.linalg.norm(X[:, None] - X, axis=2))
     assert np.linalg.eigvalsh(K).min() > 0 and wendland(np.array([0.0, 1.0, 2.0])).sum() == 1
+
+
+def test_everything_that_states_a_sigma_asks_the_error_model(shaken):
+    """Blocks, functions, the error budget and designs with the sizes that were found agree."""
+    f = shaken.cameras["cam"]["parameters"]["fx"]
+    blocks = shaken.camera_covariance("cam")[1], shaken.camera_covariance("cam", classical=True)[1]
+    np.testing.assert_allclose(
+        [f["sigma_correlated"], f["sigma"]], [np.sqrt(C[0, 0]) for C in blocks]
+    )
+    names = [("image", shaken.network.images.id[2], name) for name in ("X0", "Y0", "kappa")]
+    C = shaken.covariance(*names, classical=True)
+    np.testing.assert_allclose(
+        C, shaken.classical_image_covariance[2][np.ix_([0, 1, 5], [0, 1, 5])], rtol=1e-6
+    )
+    # blocks of the along-track component are from random combinations, functions are not
+    C = np.sqrt(np.diag(shaken.covariance(*names)))
+    of_image = np.sqrt(np.diagonal(shaken.image_covariance[2]))[[0, 1, 5]]
+    np.testing.assert_allclose(C, of_image, rtol=0.05)
+    assert (C > 1.5 * np.sqrt(np.diag(shaken.covariance(*names, classical=True)))).any()
+    budget = jaxbundle.sensitivity(shaken, {"camera:cam:k3": 1e-3}, of="camera:cam:fx")
+    np.testing.assert_allclose(budget.sigma, f["sigma_correlated"], rtol=0.05)
+    sizes = {size.name: size.size for size in shaken.error_model.sizes}
+    start = dataclasses.replace(shaken.problem.data, start=shaken.values)
+    design = jaxbundle.precision(shaken.problem, start, names=(names[0],), errors=sizes)
+    np.testing.assert_allclose(np.sqrt(design.covariance[0, 0]), C[0], rtol=0.05)
+    np.testing.assert_allclose(design.cameras[0, 0], f["sigma_correlated"], rtol=0.05)
+    with pytest.raises(jaxbundle.InputError, match="no component principal"):
+        jaxbundle.precision(shaken.problem, start, errors={"principal": 0.1})
+
+
+def test_check_points_share_the_errors_of_the_network(clean):
+    """One by one, the errors of a component displace network and check points: the sum of squares
+    is the covariance of a model with this component alone."""
+    role = np.array(clean.points.role, dtype=object)
+    role[[10, 40]] = "check"
+    given = clean.replace(points=dataclasses.replace(clean.points, role=tuple(role)))
+    result = jaxbundle.adjust(given, correlated=True)
+    model, size = result.error_model, 0.01
+    theta = np.zeros(len(model.theta))
+    number = [c.name for c in model.components].index("principal point by photograph")
+    theta[1 + number] = size**2
+    result.keep(dataclasses.replace(model, theta=theta), None)
+    found = result.check_points
+    rays, squares = given.observations, np.zeros((2, 3, 3))
+    for image in range(IMAGES):
+        for axis in (0, 1):
+            xy = rays.xy.copy()
+            xy[rays.image == image, axis] += size
+            moved = given.replace(observations=dataclasses.replace(rays, xy=xy))
+            d = jaxbundle.adjust(moved).check_points.position - found.position
+            squares += d[:, :, None] * d[:, None]
+    np.testing.assert_allclose(
+        np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)),
+        np.sqrt(np.diagonal(squares, axis1=1, axis2=2)),
+        rtol=0.02,
+    )
+
+
+def test_the_band_of_replication_is_that_of_the_model(clean, shaken):
+    """Its simulated halves have d²/n about 1, more widely with sizes estimated from few
+    photographs."""
+    for given in (clean, shaken):
+        found = jaxbundle.replicate(given, by="photographs", repeat=2)
+        low, high = found.band
+        assert 0.1 < low < 0.9 and 1.1 < high < 5
+        told = found.to_dict()
+        np.testing.assert_allclose(told["expected"], [found.dof * low, found.dof * high])
+        assert found.expected in str(found) and found.expected in found.sentence
+        assert {"name", "sigma", "unit", "score"} < set(told["error_components"][1])
+
+
+def test_what_components_mean_is_said(shaken):
+    (said,) = [line for line in correlated.remarks(shaken) if "shear" in line]
+    size = next(s for s in shaken.error_model.sizes if s.name.startswith("affine"))
+    assert f"{size.size:.2g} px" in said
+    assert said in " ".join(shaken.report().split())
+    assert any(said in finding.words for finding in shaken.verdict.findings)
+    told = {c["name"]: c for c in shaken.to_dict(brief=True)["error_components"]}
+    assert told[size.name]["sigma"] == size.size and told[size.name]["unit"] == "px"
+
+
+def test_components_that_chance_explains_are_left_out(clean):
+    equations = jaxbundle.adjust(clean, correlated=True).error_model.equations
+    assert equations.critical == pytest.approx(1.645, abs=1e-3)
+    rng, T = np.random.default_rng(0), equations.T
+    # forms of independent errors: mean T_0, covariance 2·T
+    forms = T[:, 0] + rng.normal(size=(300, len(T))) @ np.linalg.cholesky(2 * T).T
+    share = np.mean([equations.solve(q)[0][1:] > 0 for q in forms])
+    # 5 % of each, by itself
+    assert 0.01 < share < 0.08
