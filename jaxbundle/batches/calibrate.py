@@ -127,9 +127,9 @@ def calibrate_batch(  # noqa: PLR0913 keyword arguments of a public function
     def run(portion: Portion) -> Rows:
         solve = partial(solve_portion, key, max_iterations, batch.size)
         rows = solve(portion)
-        if snooping is not None:
-            rows = _snoop(key, solve, portion, rows, snooping, significance)
-        return rows if correlated is None else rows | _sums(key, portion, rows)
+        return (
+            rows if snooping is None else _snoop(key, solve, portion, rows, snooping, significance)
+        )
 
     portions, parts, done = [], [], 0
     # threads, not processes: compiled code leaves Python alone, and the programs are shared
@@ -140,11 +140,16 @@ def calibrate_batch(  # noqa: PLR0913 keyword arguments of a public function
             for portion in batch.portions(on_cpu)
         ]
         for portion, future in zip(portions, solving):
-            solved = future.result()
-            parts.append(_without_padding(portion, batch.xy.shape[1:3], solved))
+            parts.append(future.result())
             done += len(portion.cameras)
             if progress is not None:
                 progress("calibrating", done, len(batch))
+    if correlated is not None:
+        # one after the other: large products use all cores, and two programs that wait for the
+        # same threads never end
+        parts = [rows | _sums(key, portion, rows) for portion, rows in zip(portions, parts)]
+    shape = batch.xy.shape[1:3]
+    parts = [_without_padding(portion, shape, rows) for portion, rows in zip(portions, parts)]
     order = np.argsort(np.concatenate([portion.cameras for portion in portions]))
     rows = {name: np.concatenate([p[name] for p in parts])[order] for name in parts[0]}
     if snooping is not None:

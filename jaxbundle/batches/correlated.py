@@ -96,7 +96,9 @@ def component_sums(
     WJ = jnp.einsum("veap,vapk->vek", W, J)
     remains = J - jnp.einsum("veap,vek->vapk", W, WJ)
     Z, R = _orthonormal_of_all(remains)
-    field, by_view = _fields(jnp.asarray(seen.xy), used, octaves)
+    # at computed coordinates, which have no share of the residuals (`correlated_errors.image_rows`)
+    computed = jnp.asarray(seen.xy) + v.swapaxes(1, 2)
+    field, by_view = _fields(computed, used, octaves)
     # W·F and Z·F: of the field [views, rows, axis, spline], of the five columns of every view
     WB = jnp.einsum("veap,vps->veas", W, field).reshape(views, POSE, -1)
     ZB = jnp.einsum("vkap,vps->kas", Z, field).reshape(Z.shape[1], -1)

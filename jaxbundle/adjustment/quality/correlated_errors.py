@@ -130,16 +130,22 @@ def first_row_of_rays(found: Solution, problem: NetworkProblem) -> Int[np.ndarra
 
 
 def image_rows(found: Solution, problem: NetworkProblem) -> ImageRows:
-    """The rows of the image points that take part."""
+    """The rows of the image points that take part, at their computed image coordinates.
+
+    At the measured ones a component such as x·∂v/∂c would contain the errors themselves, and its
+    quadratic form vᵀv: a principal distance that changes between photographs leaves so little in
+    residuals that 0.5 pixels of it were found in 1280 views with independent errors of 0.2."""
     row, weight = first_row_of_rays(found, problem), problem.image_weights
     used = (weight > 0).all(1)
     number = sum(np.asarray(v).size for v in found.residuals.values())
+    v = problem.image_points(found.residuals) / np.where(weight > 0, weight, 1.0)
+    xy = problem.image_coordinates() + v  # computed − measured
     return ImageRows(
         row[used],
         problem.image[used],
         problem.point[used],
         problem.camera[used],
-        problem.image_coordinates()[used],
+        xy[used],
         1 / weight[used],
         number,
     )

@@ -31,6 +31,8 @@ def rig_errors(rig: Rig, found: Solution, settings: CorrelationSettings) -> Erro
     for table, own in rig.sets:
         row[own] = starts[table.image_set] + 2 * np.arange(len(own))
     used = used_rays(rig, found.problem)
+    # computed − measured
+    xy = rig.xy + rig.in_order(found.residuals) * rig.sigma
     epochs = len(rig.epochs)
     image = rig.camera * epochs + rig.epoch
     rays = ImageRows(
@@ -39,7 +41,7 @@ def rig_errors(rig: Rig, found: Solution, settings: CorrelationSettings) -> Erro
         # a body moves between epochs, but its points and their errors are the same
         rig.point[used],
         rig.camera[used],
-        rig.xy[used],
+        xy[used],
         rig.sigma[used],
         len(stack_rows(found, found.residuals)),
     )
