@@ -140,9 +140,10 @@ class Replication(TableMethods):
     @property
     def sentence(self) -> str:
         """The factor in words; why there is none."""
+        what = "jobs" if self.by == "jobs" else f"halves by {self.by}"
         if not self.splits:
-            return f"halves by {self.by} cannot be compared: {'; '.join(self.failed)}"
-        said = f"halves by {self.by} differ by d²/n {self.ratio:.2f} of classical σ"
+            return f"{what} cannot be compared: {'; '.join(self.failed)}"
+        said = f"{what} differ by d²/n {self.ratio:.2f} of classical σ"
         if self.model is not None:
             said += f", {self.ratio_correlated:.2f} of σ under correlated errors"
         return f"{said} (n = {self.dof}; {self.expected} expected)"
@@ -191,8 +192,11 @@ class Replication(TableMethods):
 
     def __str__(self) -> str:
         number = count(len(self.splits), "split")
+        what = f"Halves by {self.by}: {number}"
+        if self.by == "jobs":
+            what = f"Jobs of one camera: {count(len(self.splits), 'pair')}"
         lines = [
-            f"Halves by {self.by}: {number}, {count(self.dof, 'parameter')}",
+            f"{what}, {count(self.dof, 'parameter')}",
             f"d²/n with classical σ              {self.ratio:.2f}",
         ]
         if self.model is not None:
