@@ -28,7 +28,6 @@ from jaxbundle.batches.compiled import ProgramKey, exterior_slopes
 from jaxbundle.batches.normal import POSE, CameraUnknowns, Sightings, design
 from jaxbundle.cameras import CameraModel
 from jaxbundle.geometry import matrix_from_quaternion
-from jaxbundle.leastsquares.quality.distributions import normal_quantile
 from jaxbundle.leastsquares.quality.error_components import SizeEquations
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
@@ -298,7 +297,7 @@ def batch_errors(
     shown[:, 5] = views > 1
     shown &= np.isfinite(q) & np.isfinite(T).all(2)
     theta = np.full((cameras, k), np.nan)
-    critical = normal_quantile(1 - settings.estimation.significance)
+    critical = settings.estimation.critical(k - 1)
     if together:
         good = shown.all(1)
         if good.any():

@@ -305,10 +305,11 @@ def test_what_components_mean_is_said(shaken):
 
 def test_components_that_chance_explains_are_left_out(clean):
     equations = jaxbundle.adjust(clean, correlated=True).error_model.equations
-    assert equations.critical == pytest.approx(1.645, abs=1e-3)
+    # Šidák's level of five components
+    assert equations.critical == pytest.approx(2.319, abs=1e-3)
     rng, T = np.random.default_rng(0), equations.T
     # forms of independent errors: mean T_0, covariance 2·T
     forms = T[:, 0] + rng.normal(size=(300, len(T))) @ np.linalg.cholesky(2 * T).T
-    share = np.mean([equations.solve(q)[0][1:] > 0 for q in forms])
-    # 5 % of each, by itself
-    assert 0.01 < share < 0.08
+    share = np.mean([(equations.solve(q)[0][1:] > 0).any() for q in forms])
+    # 5 % ± 1.3 % if they were normal and apart; forms of few squares are skew, but these are not
+    assert 0.01 < share < 0.1

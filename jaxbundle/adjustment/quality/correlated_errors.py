@@ -49,9 +49,9 @@ class CorrelationSettings:
     - `knots`: columns (x) and rows (y) of the finest splines of a field, over the measured part of
       the image whatever its sides.
     - `octaves`: of the field, each with splines half as fine as the one before, and the same
-      variance. What a lens model lacks has no known scale: with the finest splines alone the
-      variance found is spread evenly over all of them, and unknowns of the camera, which take up
-      the coarse part, get too little of it.
+      variance; four end with those of the whole image. What a lens model lacks has no known scale:
+      with the finest splines alone the variance found is spread evenly over all of them, and
+      unknowns of the camera, which take up the coarse part, get too little of it.
     - `min_points_of_knot`: image points for each, so that residuals show the field.
     - `reach`: distance of stations at which errors along a track are independent, in units of the
       median distance to the points. Half and double have scores of the same size in five real sets.
@@ -59,7 +59,7 @@ class CorrelationSettings:
 
     min_images: int = 8
     knots: tuple[int, int] = (11, 9)
-    octaves: int = 3
+    octaves: int = 4
     min_points_of_knot: int = 4
     reach: float = 0.6
     estimation: ErrorSettings = ErrorSettings()

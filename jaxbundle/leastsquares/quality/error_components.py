@@ -54,7 +54,7 @@ from jaxbundle.leastsquares.indexing.rows import (
     prepare,
     restore_order,
 )
-from jaxbundle.leastsquares.quality.distributions import normal_quantile
+from jaxbundle.leastsquares.quality.distributions import level_of_one, normal_quantile
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import present
@@ -112,9 +112,10 @@ class ErrorSettings:
     - `max_columns`: roots of more columns are replaced by random combinations: a column is a
       solution of the normal equations (10 ms for 60 images and 26 000 points), so that these take
       ten seconds.
-    - `significance`: a component is left out if its size could be chance at this level (one-sided).
-      θ ≥ 0 makes chance add to σ, never take from them: 18 % in a network of twelve photographs
-      with independent errors if all θ > 0 are taken, and less than 5 % at this level.
+    - `significance`: a component is left out if its size could be chance (one-sided, at this level
+      for all components together). θ ≥ 0 makes chance add to σ, never take from them: 18 % to those
+      of the stations of twelve photographs with independent errors if all θ > 0 are taken, 10 % at
+      this level for each of them, 3 % for all together.
     - `draws`: their number. Variances from 100 are right to √(2/100) = 14 %, σ to 7 %.
     - `seed`: of the combinations.
     """
@@ -123,6 +124,10 @@ class ErrorSettings:
     significance: float = 0.05
     draws: int = 100
     seed: int = 0
+
+    def critical(self, components: int) -> float:
+        """The quantile of the normal distribution that a θ must exceed, in its σ."""
+        return normal_quantile(1 - level_of_one(self.significance, components))
 
 
 DEFAULTS = ErrorSettings()
@@ -330,7 +335,9 @@ def fit_error_model(
         own.append(blocks)
     # random combinations, on one side of the traces, make it unsymmetric
     T[1:, 1:] = (T[1:, 1:] + T[1:, 1:].T) / 2
-    system = SizeEquations(T, _has_others(components), normal_quantile(1 - settings.significance))
+    has_others = _has_others(components)
+    critical = settings.critical(len(components) - has_others)
+    system = SizeEquations(T, has_others, critical)
     theta, score = system.solve(quadratic_forms(components, v))
     given, independent = _independent_part(components, theta, len(v))
     F = F[: len(F) - system.has_others]
