@@ -55,7 +55,8 @@ def replicate(
       or the path of a saved adjustment (`Adjustment.save`). Several of them are jobs, for which
       `by`, `repeat` and `seed` mean nothing.
     - `by`: `"points"`, `"photographs"` (of calibrations also called `"views"`): random halves;
-      `"runs"`: the first half of the photographs, in their order, against the second.
+      `"runs"`: the first half of the photographs of each camera, in their order, against the
+      second.
     - `repeat`: number of random splits; runs have one. `seed`: of them.
     - `settings`: of the error components.
     - `progress(stage, done, total)`: called before every split.

@@ -230,7 +230,12 @@ def random_halves(
     """Which image points belong to the second half, for every split."""
     rng, rays = np.random.default_rng(seed), network.observations
     if by == "runs":
-        yield rays.image >= len(network.images) // 2
+        # of each camera by itself: photographs of several may follow each other
+        camera, later = network.images.camera, np.zeros(len(network.images), bool)
+        for c in np.unique(camera):
+            own = np.flatnonzero(camera == c)
+            later[own[len(own) // 2 :]] = True
+        yield later[rays.image]
         return
     number, of = (
         (len(network.points), rays.point) if by == "points" else (len(network.images), rays.image)

@@ -438,12 +438,13 @@ def _significant(
 ) -> Float[np.ndarray, " k"]:
     """θ ≥ 0 of the components whose θ is at least `critical` times the σ that it has in the system
     of all that are left, if errors are independent; the least significant is left out first."""
-    kept = np.arange(len(q))
+    # the mean square of all residuals: θ_0 may be zero, where others are in every observation
+    kept, white = np.arange(len(q)), max(q[0] / T[0, 0], 0.0)
     while True:
         part = T[np.ix_(kept, kept)]
         theta = _nonnegative(part, q[kept])
-        # the covariance of q is 2·T·θ_0² for independent errors
-        sigma = theta[0] * np.sqrt(2 * np.diag(np.linalg.pinv(part, 1e-10, hermitian=True)))
+        # the covariance of q is 2·T·σ0⁴ for independent errors
+        sigma = white * np.sqrt(2 * np.diag(np.linalg.pinv(part, 1e-10, hermitian=True)))
         short = theta[1:] < critical * sigma[1:]
         if not short.any():
             found = np.zeros(len(q))
