@@ -466,7 +466,7 @@ class Adjustment:
     @functools.cached_property
     def image_covariance(self) -> Float[np.ndarray, "images 6 6"]:
         """Covariance of X0, Y0, Z0, ω, φ, κ, angles by their exact Jacobian; radians."""
-        return self._of_images(self.errors)
+        return self._of_images(self._errors_of_blocks)
 
     @functools.cached_property
     def classical_image_covariance(self) -> Float[np.ndarray, "images 6 6"]:
@@ -516,6 +516,11 @@ class Adjustment:
         there is one, else of independent errors. Whatever states a σ asks it."""
         # Without a factor for cofactors there is no model, but covariances of single unknowns.
         return self.error_model or IndependentErrors(self.inspection.solution, self.sigma0**2)
+
+    @property
+    def _errors_of_blocks(self) -> Errors:
+        """The same for covariances of whole tables, which need a factor for cofactors."""
+        return self.error_model or self.independent_errors
 
     @property
     def independent_errors(self) -> IndependentErrors:
@@ -603,7 +608,7 @@ class Adjustment:
     @functools.cached_property
     def point_covariance(self) -> Float[np.ndarray, "points 3 3"]:
         """Marginal covariance of every point; zero where it is fixed, NaN without coordinates."""
-        return self._of_points(self.errors)
+        return self._of_points(self._errors_of_blocks)
 
     @functools.cached_property
     def classical_point_covariance(self) -> Float[np.ndarray, "points 3 3"]:
@@ -632,7 +637,7 @@ class Adjustment:
     def far_points(self) -> FarPoints | None:
         """The points adjusted at any distance because their rays are nearly parallel; None if there
         are none."""
-        return find_far_points(self.cofactors, self.errors)
+        return find_far_points(self.cofactors, self._errors_of_blocks)
 
     def camera_parameters(self, camera: str) -> dict[str, float]:
         """All parameters of a camera by name."""
@@ -645,7 +650,7 @@ class Adjustment:
     ) -> tuple[list[str], Float[np.ndarray, "n n"]]:
         """Names and covariance of the free parameters of a camera; `classical`: of independent
         errors, also where an error model is known."""
-        errors = self.independent_errors if classical else self.errors
+        errors = self.independent_errors if classical else self._errors_of_blocks
         table, row = self.problem.table_of_camera(self._camera(camera))
         names, free = self.problem.free_parameters(self._camera(camera))
         return [names[i] for i in free], errors.covariance(table.name)[row][np.ix_(free, free)]

@@ -320,3 +320,22 @@ def test_components_that_chance_explains_are_left_out(clean):
     share = np.mean([(equations.solve(q)[0][1:] > 0).any() for q in forms])
     # 5 % of components that share nothing; these do, and are left out one after the other
     assert 0.01 < share < 0.15
+
+
+def test_finished_jobs_of_one_camera_are_compared(clean, shaken, tmp_path):
+    """A result, a saved one and a network; another principal point in one of them is seen."""
+    rays = clean.observations
+    moved = clean.replace(observations=dataclasses.replace(rays, xy=rays.xy + [30.0, 0.0]))
+    adjusted = jaxbundle.adjust(disturbed(moved, 6, affine=0.4))
+    shaken.save(tmp_path / "first.npz")
+    found = jaxbundle.replicate([tmp_path / "first.npz", adjusted, disturbed(clean, 7, affine=0.4)])
+    assert found.by == "jobs" and len(found.splits) == 3 and found.dof == len(CAMERA.free)
+    first = found.splits[0]
+    k = first.names.index(("cam", "cx"))
+    assert abs(first.difference[k] - 30) < 4 * first.sigma_correlated[k]
+    assert abs(first.difference[k]) > 5 * first.sigma_correlated[k]
+    same = found.splits[1]
+    assert same.d2_correlated / len(same.names) < 3 < same.d2 / len(same.names)
+    C = [one.camera_covariance("cam")[1] for one in (shaken, adjusted.with_correlated_errors())]
+    np.testing.assert_allclose(first.correlated, sum(C), rtol=1e-6)
+    assert "jobs differ by" in found.sentence and "Jobs of one camera: 3 pairs" in str(found)

@@ -383,3 +383,37 @@ def test_what_is_no_rig_is_refused(rig):
         calibrate_rig(rig.cameras, model="brown")
     with pytest.raises(InputError, match="snooping must be one of pope, baarda or None"):
         calibrate_rig(rig.cameras, snooping="tau")
+
+
+def test_a_rig_has_the_errors_that_its_photographs_share(both):
+    """An affine distortion of each photograph, twelve times the noise: σ of mountings and cameras
+    under it beside the classical ones; without such errors they are the classical ones."""
+    rng, views = np.random.default_rng(5), pair()
+    shaken = {}
+    for name, given in views.items():
+        x = (given.xy - np.nanmean(given.xy, (0, 1))) / 240
+        a = 0.6 * rng.normal(size=(VIEWS, 1, 1))
+        shaken[name] = dataclasses.replace(given, xy=given.xy + a * x * [1, -1])
+    options = {"snooping": None, "cross_validation": False, "correlated": True}
+    rig = calibrate_cameras(shaken, rig=True, **options).rig
+    sizes = {size.name: size for size in rig.error_model.sizes}
+    found = [size for name, size in sizes.items() if name.startswith("affine by photograph of ")]
+    assert len(found) == 2 and all(0.3 < size.size < 1.2 and size.score > 4 for size in found)
+    told = rig_dict(rig, brief=True)
+    assert {c["name"] for c in told["error_components"]} == set(sizes)
+    for name in rig.names:
+        for parameter, entry in told["cameras"][name].items():
+            if entry["sigma"]:
+                assert entry["sigma_correlated"] == rig.correlated_sigma[name][parameter]
+        assert rig.stated_sigma[name]["fx"] == rig.correlated_sigma[name]["fx"]
+        assert rig.correlated_sigma[name]["fx"] > 1.2 * rig.sigma[name]["fx"]
+    mounting, classical = (m["right"] for m in (rig.mountings, rig.classical_mountings))
+    error = np.concatenate([mounting.base - BASE, mounting.angles - ANGLES]) / mounting.sigma
+    assert np.abs(error).max() < 3.5
+    entry = told["mountings"]["right"]
+    np.testing.assert_allclose(entry["sigma_base"], classical.sigma[:3])
+    np.testing.assert_allclose(entry["sigma_base_correlated"], mounting.sigma[:3])
+    plain = calibrate_cameras(views, rig=True, **options).rig
+    np.testing.assert_allclose(
+        plain.covariance("right"), plain.covariance("right", classical=True), rtol=0.5
+    )
