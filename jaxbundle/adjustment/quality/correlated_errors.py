@@ -10,8 +10,8 @@ Components of real photographs (`leastsquares.quality.error_components` estimate
 | affine | shear and ratio of scales, the same | image unit |
 | along tracks | of images of one point, alike from stations near to each other | a priori σ |
 
-Fields are sums of cubic B-splines on the sensor, in octaves of the same variance. Along a track the errors of two images are correlated by
-Wendland's function (1995) of the distance of their stations.
+Fields are sums of cubic B-splines on the sensor, in octaves of the same variance. Along a track the
+errors of two images are correlated by Wendland's function (1995) of the distance of their stations.
 """
 
 import dataclasses
