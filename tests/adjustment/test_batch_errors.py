@@ -33,7 +33,10 @@ def network():
     x, y = ((rays.xy - rays.xy.mean(0)) / 900).T
     xy = rays.xy + a[rays.image, None] * np.stack([x, -y], 1)
     rays = dataclasses.replace(rays, xy=xy, sigma=np.ones_like(rays.sigma))
-    return exact.replace(points=points, observations=rays, datum="control")
+    # the domain of a batch
+    return exact.replace(
+        points=points, observations=rays, datum="control", residuals="measured"
+    )
 
 
 def of_batch(network, **options):
