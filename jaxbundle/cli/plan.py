@@ -27,7 +27,7 @@ def plan(  # noqa: PLR0913 - the options of the command
         int | None,
         typer.Option(help="bases and strips between control points; default: nine in all"),
     ] = None,
-    error: Annotated[
+    errors: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME=SIZE",
@@ -65,7 +65,7 @@ def plan(  # noqa: PLR0913 - the options of the command
         control_sigma=control_sigma,
         control_every=control_every,
         network=network,
-        errors=_sizes(error or ()),
+        errors=_sizes(errors or ()),
     )
     written = None
     if out is not None:
@@ -85,7 +85,7 @@ def _sizes(given: Sequence[str]) -> dict[str, float]:
         except ValueError:
             mark = ""
         if not mark:
-            raise InputError(f"--error {text!r}: NAME=SIZE is expected, a size in mm")
+            raise InputError(f"--errors {text!r}: NAME=SIZE is expected, a size in mm")
     return found
 
 

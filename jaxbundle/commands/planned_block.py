@@ -40,7 +40,7 @@ class PlannedBlock(TableMethods):
     sigma_image: float
     control_sigma: float
     control_every: int | None
-    errors: Mapping[str, float] = MappingProxyType({})
+    errors: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
     @property
     def field_of_view(self) -> FieldOfView:

@@ -203,20 +203,23 @@ def joint_components(
     return [found.get(c.name) or c._replace(root=below(c.root)) for c in known]
 
 
-class Scene(NamedTuple):
+class StationsAndPoints(NamedTuple):
     """Adjusted `stations` of all images, and `points`."""
 
     stations: Float[np.ndarray, "images 3"]
     points: Float[np.ndarray, "points 3"]
 
 
-def _scene(found: Solution) -> Scene:
+def _scene(found: Solution) -> StationsAndPoints:
     X = np.asarray(found.values["point"])[:, :3]
-    return Scene(np.asarray(found.values["image"].position), X)
+    return StationsAndPoints(np.asarray(found.values["image"].position), X)
 
 
 def components_of(
-    rays: ImageRows, scene: Scene, cameras: Sequence[Camera], settings: CorrelationSettings
+    rays: ImageRows,
+    scene: StationsAndPoints,
+    cameras: Sequence[Camera],
+    settings: CorrelationSettings,
 ) -> list[ErrorComponent]:
     """The components of image points."""
     import scipy.sparse as sp
@@ -358,7 +361,7 @@ def wendland(distance: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     return np.clip(1 - distance, 0, None) ** 4 * (4 * distance + 1)
 
 
-def _along_tracks(rays: ImageRows, scene: Scene, reach: float) -> ErrorComponent | None:
+def _along_tracks(rays: ImageRows, scene: StationsAndPoints, reach: float) -> ErrorComponent | None:
     """The correlation of the images of a point by the distance of their stations, in units of their
     a priori σ."""
     import scipy.sparse as sp

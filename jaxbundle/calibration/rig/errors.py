@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from jaxbundle.adjustment.quality.correlated_errors import (
     CorrelationSettings,
     ImageRows,
-    Scene,
+    StationsAndPoints,
     components_of,
     with_others,
 )
@@ -49,14 +49,14 @@ def rig_errors(rig: Rig, found: Solution, settings: CorrelationSettings) -> Erro
     return fit_error_model(found, components, settings.estimation) if components else None
 
 
-def _scene(found: Solution) -> Scene:
+def _scene(found: Solution) -> StationsAndPoints:
     """The stations of all photographs in the frames of their bodies, X0_e + M_eᵀ·b_k, and the
     points."""
     position, rotation = (np.asarray(x) for x in found.values["epoch"])
     base = np.asarray(found.values["mounting"].position)
     turned = np.einsum("eij,ki->kej", np.asarray(_matrices(rotation)), base)
     X = np.asarray(found.values["point"])[:, :3]
-    return Scene((position + turned).reshape(-1, 3), X)
+    return StationsAndPoints((position + turned).reshape(-1, 3), X)
 
 
 @compile_once
