@@ -70,11 +70,16 @@ def replicate(
     open_one = partial(
         _adjusted, settings, format=format, overrides=overrides, control=control, snooping=snooping
     )
-    if isinstance(given, Sequence) and not isinstance(given, str):
-        if len(given) > 1:
-            return _compare_jobs([open_one(one) for one in given])
-        (given,) = given or (None,)
-    given = open_one(given)
+    several = [*given] if isinstance(given, Sequence) and not isinstance(given, str) else [given]
+    if len(several) != 1:
+        return _compare_jobs([open_one(one) for one in several])
+    return _compare_halves(open_one(several[0]), by, repeat, seed, progress)
+
+
+def _compare_halves(
+    given: Adjustment, by: str, repeat: int, seed: int, progress: Progress | None
+) -> Replication:
+    """`repeat` splits of one network."""
     network = given.problem.network
     if len(network.images) < 2 * MIN_IMAGES and by != "points":
         raise InputError(
@@ -122,6 +127,8 @@ def _adjusted(
 
 def _compare_jobs(results: Sequence[Adjustment]) -> Replication:
     """The differences of the interior orientations of finished jobs, each with each."""
+    if not results:
+        raise InputError("no network is given")
     splits, failed = [], []
     for (i, one), (j, other) in combinations(enumerate(results, 1), 2):
         try:

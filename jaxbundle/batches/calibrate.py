@@ -227,11 +227,9 @@ def _under_errors(
     batch: Batch, rows: Rows, solved: Bool[np.ndarray, " cameras"], together: bool
 ) -> Rows:
     """σ under errors that image points share; `together`: of the same size in all cameras."""
-    sums = ComponentSums(
-        *(rows.pop(name) for name in ("T", "q", "interior_parts")),
-        rows.pop("pose_parts").swapaxes(1, 2),
-    )
-    sums.q[~solved] = np.nan
+    T, q, interior = (rows.pop(name) for name in ("T", "q", "interior_parts"))
+    q[~solved] = np.nan
+    sums = ComponentSums(T, q, interior, rows.pop("pose_parts").swapaxes(1, 2))
     views = rows["views"].sum(1)
     points = (rows["redundancy"] + len(batch.free) + 6 * views) // 2
     found = batch_errors(sums, views, points, together)

@@ -147,8 +147,8 @@ def _exterior_orientation(
 
 
 def _pose(
-    quaternion: Float[Array, "4"],
-    shift: Float[Array, "3"],
+    quaternion: Float[AnyArray, "4"],
+    shift: Float[AnyArray, "3"],
     axes: Float[AnyArray, "3 3"],
     middle: Float[AnyArray, "3"],
     change: Float[Array, "6"],

@@ -51,10 +51,10 @@ class ComponentSums(NamedTuple):
     """Of a camera: T [k, k] and q [k] of the components; by component the covariance of the
     interior orientation, and the variances of X0, Y0, Z0, ω, φ, κ, for θ = 1."""
 
-    T: Float[Array, "k k"]
-    q: Float[Array, " k"]
-    interior: Float[Array, "k n n"]
-    pose: Float[Array, "k views 6"]
+    T: Float[AnyArray, "*cameras k k"]
+    q: Float[AnyArray, "*cameras k"]
+    interior: Float[AnyArray, "*cameras k n n"]
+    pose: Float[AnyArray, "*cameras k views 6"]
 
 
 @partial(compile_once, static=(0, 1))

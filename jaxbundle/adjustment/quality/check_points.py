@@ -76,7 +76,8 @@ def intersect_check_points(
     )
     checks = shifted_problem(network, problem, inspection.adjusted)
     # With estimated variance components the rays of check points have the estimated σ as well.
-    system = rescale(checks, groups(checks), factors)
+    data = rescale(checks, groups(checks), factors).data
+    system = dataclasses.replace(checks, data=data)
     determined = determine(inspection.solution, system)
     position = np.asarray(determined.values["point"]) + problem.origin
     if isinstance(errors, IndependentErrors):

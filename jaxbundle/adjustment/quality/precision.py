@@ -225,7 +225,7 @@ def image_variances(
 
 
 def _camera_sigma(
-    problem: NetworkProblem, values: Values, own: Mapping[str, Float[Array, "rows k k"]]
+    problem: NetworkProblem, values: Values, own: Mapping[str, Float[AnyArray, "rows k k"]]
 ) -> Float[Array, "cameras parameters"]:
     sigma = jnp.zeros_like(problem.interior_orientation(values))
     for table in problem.cameras:
