@@ -88,6 +88,7 @@ if TYPE_CHECKING:
 MAX_SPLITS = 3
 # What a result keeps and what follows from its error model.
 UNDER_ERRORS = (
+    "check_points",
     "_modelled",
     "cameras",
     "control_prediction",
@@ -501,6 +502,8 @@ class Adjustment:
         """Take over an error model and halves that were computed before (`load_adjustment`);
         None: they are computed when they are needed."""
         if model is not None:
+            for name in UNDER_ERRORS:
+                self.__dict__.pop(name, None)
             self.__dict__["_modelled"] = model, ""
         if halves is not None:
             self.__dict__["replication"] = halves
