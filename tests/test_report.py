@@ -237,7 +237,8 @@ def test_check_points(convergent4):
     found = CheckPoints(
         id=("101", "102"), position=np.arange(6.0).reshape(2, 3),
         difference=np.array([[1e-3, 2e-3, -2e-3], [-1e-3, 0, 0]]),
-        covariance=np.stack([np.eye(3), 4 * np.eye(3)]), rays=np.array([3, 4]),
+        covariance=convergent4.sigma0**2 * np.stack([np.eye(3), 4 * np.eye(3)]),
+        rays=np.array([3, 4]),
     )  # fmt: skip
     changed = again(convergent4)
     changed.check_points = found
@@ -245,7 +246,7 @@ def test_check_points(convergent4):
     changed.check = (SimpleNamespace(sigma=np.full((2, 3), np.nan)), None)
     table = rows(section(changed.report(), "Check points: intersected − given, in model"), "point")
     assert [float(x) for x in table[0][1:4]] == [0.001, 0.002, -0.002]
-    assert float(table[1][4]) == pytest.approx(2, rel=6e-3)
+    assert float(table[1][4]) == pytest.approx(2 * convergent4.sigma0, rel=6e-3)
     rms = next(row for row in table if row[0] == "RMS")
     np.testing.assert_allclose([float(x) for x in rms[1:4]], found.rms, atol=1e-6)
 
