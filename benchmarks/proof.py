@@ -135,11 +135,10 @@ def halves_table(found: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
 
 def components(result: Mapping[str, Any]) -> str:
     """The sizes of what image points share, in words."""
-    units = {"image": "px", "σ": "σ"}
     sizes = [
-        f"{one['name']} {one['size']:.2g} ± {one['sigma']:.1g} {units[one['unit']]}"
+        f"{one['name']} {one['sigma']:.2g} ± {one['sigma_of_sigma']:.1g} {one['unit']}"
         for one in result["error_components"]
-        if one["size"] > 0
+        if one["sigma"] > 0
     ]
     ratio = result["sigma_ratio"]
     return paragraph(

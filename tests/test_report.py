@@ -237,7 +237,8 @@ def test_check_points(convergent4):
     found = CheckPoints(
         id=("101", "102"), position=np.arange(6.0).reshape(2, 3),
         difference=np.array([[1e-3, 2e-3, -2e-3], [-1e-3, 0, 0]]),
-        cofactor=np.stack([np.eye(3), 4 * np.eye(3)]), rays=np.array([3, 4]),
+        covariance=convergent4.sigma0**2 * np.stack([np.eye(3), 4 * np.eye(3)]),
+        rays=np.array([3, 4]),
     )  # fmt: skip
     changed = again(convergent4)
     changed.check_points = found

@@ -200,9 +200,7 @@ class FramedAdjustment:
     ) -> tuple[np.ndarray, np.ndarray]:
         """The unknowns and their covariance."""
         chosen = self.choose_rows(rows, angles)
-        return np.asarray(_call(chosen, self.result.values)), self.result.modelled_covariance_of(
-            chosen
-        )
+        return np.asarray(_call(chosen, self.result.values)), self.result.covariance_of(chosen)
 
 
 @compile_once

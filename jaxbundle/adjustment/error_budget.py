@@ -32,6 +32,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.results.budget_json import budget_dict
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
 from jaxbundle.leastsquares.problem import with_data, with_factor
+from jaxbundle.leastsquares.quality.error_components import Errors, IndependentErrors
 from jaxbundle.leastsquares.quality.sensitivity import follow
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.report.budget import HEADER
@@ -47,7 +48,8 @@ class Budget(TableMethods):
     """Effects of errors of held quantities on results.
 
     **Fields:** `results` and `causes`, with names and descriptions; `sigma` of every result from
-    the measurements (a posteriori; for a design a priori); `effects` of an error of one σ of each
+    the measurements (a posteriori, under the error model of the adjustment if it has one; for a
+    design a priori); `effects` of an error of one σ of each
     cause on each result, signed if cause and result are one number each; else the root of the sum
     of squares over independent errors, or the root mean square over images or points. Angles in
     radians; `angle_scale`: factor to the unit of tables.
@@ -133,10 +135,10 @@ def sensitivity(
     **Raises:** `InputError` for an unknown name, an estimated quantity in `held`, or a σ that is
     not positive; `NotSolvedError` without a solution.
     """
-    inspection, sigma0, unit = inspection_of(given)
+    inspection, errors, unit = inspection_of(given)
     found = inspection.solution
     causes = find_causes(inspection.problem, found.values, held)
-    results = request_results(inspection, of)
+    results = request_results(inspection, errors, of)
     errors = [change for cause in causes for change in cause.errors]
     # dx = −H⁻¹·(∂g/∂θ)·σ for every error at once, then along the results: no adjustment is
     # repeated.
@@ -149,7 +151,7 @@ def sensitivity(
             for a, b in zip(ends, ends[1:])
         ]
     )
-    return Budget(results.asked, tuple(causes), sigma0 * results.sigma, by_cause, unit)
+    return Budget(results.asked, tuple(causes), results.sigma, by_cause, unit)
 
 
 def root_sum_of_squares(effects: Float[np.ndarray, " k"]) -> float:
@@ -157,9 +159,9 @@ def root_sum_of_squares(effects: Float[np.ndarray, " k"]) -> float:
     return float(effects[0]) if len(effects) == 1 else float(np.sqrt((effects**2).sum()))
 
 
-def inspection_of(given: Any) -> tuple[Inspection, float, float]:
-    """The inspection of an adjustment or a design, its σ0, and the factor from radians to its unit
-    of angles.
+def inspection_of(given: Any) -> tuple[Inspection, Errors, float]:
+    """The inspection of an adjustment or a design, the errors of its observations (of a design a
+    priori), and the factor from radians to its unit of angles.
 
     **Raises:** `InputError` for other arguments, or if no factor fits into memory."""
     if isinstance(given, NetworkProblem):
@@ -168,9 +170,11 @@ def inspection_of(given: Any) -> tuple[Inspection, float, float]:
             raise InputError("the network is too large for its covariance; use a part of it")
         # Residuals of a design are 0: its response has no part of second order.
         given = with_data(given, predict(given, given.data))
-        return Inspection(given, given.data.start), 1.0, 1 / ANGLE_UNITS[given.network.angle_unit]
+        found = Inspection(given, given.data.start)
+        unit = 1 / ANGLE_UNITS[given.network.angle_unit]
+        return found, IndependentErrors(found.solution, 1.0), unit
     if not isinstance(given, Adjustment):
         raise InputError(
             f"a result of jaxbundle.adjust or jaxbundle.make_problem is expected, not {show(given)}"
         )
-    return given.cofactors, given.sigma0, given.angle_scale
+    return given.cofactors, given.errors, given.angle_scale

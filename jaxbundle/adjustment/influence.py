@@ -18,6 +18,7 @@ from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.adjustment.result_tables import observations
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.quality.error_components import IndependentErrors
 from jaxbundle.leastsquares.quality.sensitivity import pull_back
 from jaxbundle.report.layout import significant, table
 from jaxbundle.results import ResultMethods, data_frame, rows_of
@@ -90,8 +91,8 @@ def influence(given: Adjustment | NetworkProblem, of: Any = CAMERAS) -> Influenc
     **Raises:** `InputError` for an unknown name, and for results that are means over images or
     points; `NotSolvedError` without a solution.
     """
-    inspection, sigma0, _ = inspection_of(given)
-    results = request_results(inspection, of)
+    inspection, errors, _ = inspection_of(given)
+    results = request_results(inspection, errors, of)
     if any(len(range(one.numbers.stop)[one.numbers]) > 1 for one in results.asked):
         raise InputError(
             "influence: name single results, such as point:7:Z; a mean over all has no derivative"
@@ -114,10 +115,12 @@ def influence(given: Adjustment | NetworkProblem, of: Any = CAMERAS) -> Influenc
         name: np.concatenate([column(*part[:4]) for part in parts])[used]
         for name, column in COLUMNS.items()
     }
-    size = np.maximum(results.sigma, 1e-300)
+    # in units of the classical σ, of which each observation has its share
+    unit = request_results(inspection, IndependentErrors(found, 1.0), of).sigma
+    size = np.maximum(unit, 1e-300)
     return Influence(
         results.asked,
-        sigma0 * results.sigma,
+        results.sigma,
         columns,
         (effects / size)[used],
         (effects * inverse_sigma[:, None])[used],

@@ -131,8 +131,8 @@ def _restore_error_model(found: Stored, result: Adjustment) -> ErrorModel | None
     components = tuple(error_components(solution, result.problem, result.correlations))
     if tuple(component.name for component in components) != stored.names:
         raise ValueError
-    sizes = stored.theta, stored.theta_sigma, stored.score
-    return ErrorModel(solution, components, *sizes, stored.own)
+    sizes = stored.theta, stored.theta_covariance, stored.score
+    return ErrorModel(solution, components, *sizes, stored.own, stored.equations)
 
 
 def _tree(like: Any, leaves: Sequence[np.ndarray]) -> Any:

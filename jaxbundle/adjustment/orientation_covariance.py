@@ -39,7 +39,7 @@ def orientation_covariance(
     for n, (name, row, column) in enumerate(places):
         rows[name][n, row, column] = 1.0
     # One row of the identity per unknown: the full inverse is never formed, only these columns.
-    C = result.sigma0**2 * result.cofactors.solution.propagate_rows(rows)
+    C = result.errors.propagate_rows(rows)
     used = np.concatenate([free.ravel(), np.ones(len(places) - free.size)])
     from scipy.linalg import block_diag  # imported here: slow, and rarely needed
 

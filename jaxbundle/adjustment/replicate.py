@@ -2,14 +2,23 @@
 (`adjustment.quality.replication`)."""
 
 from collections.abc import Sequence
+from functools import partial
+from itertools import combinations
 from pathlib import Path
 
+import numpy as np
+
 from jaxbundle.adjustment.adjust import adjust
+from jaxbundle.adjustment.load_saved import load_adjustment
 from jaxbundle.adjustment.quality.correlated_errors import DEFAULTS as CORRELATIONS
 from jaxbundle.adjustment.quality.correlated_errors import CorrelationSettings
 from jaxbundle.adjustment.quality.replication import (
     MIN_IMAGES,
+    HalvesDifference,
     Replication,
+    difference_of,
+    effects_of_halves,
+    expected_band,
     random_halves,
 )
 from jaxbundle.adjustment.result import Adjustment
@@ -20,9 +29,11 @@ from jaxbundle.io.formats import as_network
 from jaxbundle.network.tables import Network
 from jaxbundle.types import Progress
 
+Given = Adjustment | Network | str | Path
+
 
 def replicate(
-    given: Adjustment | Network | str | Path,
+    given: Given | Sequence[Given],
     *,
     by: str = "photographs",
     repeat: int = 1,
@@ -34,14 +45,18 @@ def replicate(
     settings: CorrelationSettings = CORRELATIONS,
     progress: Progress | None = None,
 ) -> Replication:
-    """Adjust disjoint halves of a network and compare the interior orientations they give.
+    """Adjust disjoint halves of a network and compare the interior orientations they give; or those
+    of two or more finished jobs of one camera, each with each.
 
     **Arguments:**
 
     - `given`: a result; or a network, or the path of one (`format`, `overrides` and `control` as of
-      `jaxbundle.read_network`), which is adjusted first, with `snooping` as of `jaxbundle.adjust`.
+      `jaxbundle.read_network`), which is adjusted first, with `snooping` as of `jaxbundle.adjust`;
+      or the path of a saved adjustment (`Adjustment.save`). Several of them are jobs, for which
+      `by`, `repeat` and `seed` mean nothing.
     - `by`: `"points"`, `"photographs"` (of calibrations also called `"views"`): random halves;
-      `"runs"`: the first half of the photographs, in their order, against the second.
+      `"runs"`: the first half of the photographs of each camera, in their order, against the
+      second.
     - `repeat`: number of random splits; runs have one. `seed`: of them.
     - `settings`: of the error components.
     - `progress(stage, done, total)`: called before every split.
@@ -52,11 +67,19 @@ def replicate(
     one_of("by", by, REPLICATION)
     repeat = 1 if by == "runs" else integer("repeat", repeat, least=1)
     seed = integer("seed", seed, least=0)
-    if not isinstance(given, Adjustment):
-        known = as_network(given, format=format, overrides=overrides, control=control)
-        given = adjust(known, snooping=snooping)
-    if given.correlations != settings:
-        given = given.with_changes(correlations=settings)
+    open_one = partial(
+        _adjusted, settings, format=format, overrides=overrides, control=control, snooping=snooping
+    )
+    several = [*given] if isinstance(given, Sequence) and not isinstance(given, str) else [given]
+    if len(several) != 1:
+        return _compare_jobs([open_one(one) for one in several])
+    return _compare_halves(open_one(several[0]), by, repeat, seed, progress)
+
+
+def _compare_halves(
+    given: Adjustment, by: str, repeat: int, seed: int, progress: Progress | None
+) -> Replication:
+    """`repeat` splits of one network."""
     network = given.problem.network
     if len(network.images) < 2 * MIN_IMAGES and by != "points":
         raise InputError(
@@ -65,14 +88,88 @@ def replicate(
         )
     if not any(given.camera_covariance(camera.id)[0] for camera in network.cameras):
         raise InputError("no camera has a free parameter: there is nothing to compare")
-    splits, failed = [], []
+    whole = given.cofactors.solution
+    splits, failed, of_splits = [], [], []
     for number, second in enumerate(random_halves(network, by, repeat, seed)):
         if progress is not None:
             progress("adjusting halves", number, repeat)
         try:
-            splits.append(given.compare_halves(second))
+            names, D = effects_of_halves(whole, given.problem, second)
         except NotSolvedError as error:
             failed.append(f"split {number + 1}: {error}")
+        else:
+            splits.append(difference_of(whole, names, D, given.error_model))
+            of_splits.append(D)
     if not splits:
         raise NotSolvedError(f"no halves of the network can be adjusted alone: {failed[0]}")
-    return Replication(by, tuple(splits), tuple(failed), given.error_model)
+    band = None if given.error_model is None else expected_band(given.error_model, of_splits)
+    unit = given.image_unit
+    return Replication(by, tuple(splits), tuple(failed), given.error_model, band, unit)
+
+
+def _adjusted(
+    settings: CorrelationSettings,
+    given: Given,
+    *,
+    format: str | None,
+    overrides: Sequence[str],
+    control: str | Path | None,
+    snooping: str | None,
+) -> Adjustment:
+    """A result with an error model."""
+    if isinstance(given, str | Path) and Path(given).suffix == ".npz":
+        given = load_adjustment(given)
+    if not isinstance(given, Adjustment):
+        known = as_network(given, format=format, overrides=overrides, control=control)
+        given = adjust(known, snooping=snooping)
+    return given if given.correlations == settings else given.with_changes(correlations=settings)
+
+
+def _compare_jobs(results: Sequence[Adjustment]) -> Replication:
+    """The differences of the interior orientations of finished jobs, each with each."""
+    if not results:
+        raise InputError("no network is given")
+    splits, failed = [], []
+    for (i, one), (j, other) in combinations(enumerate(results, 1), 2):
+        try:
+            splits.append(_difference_of_jobs(one, other))
+        except NotSolvedError as error:
+            failed.append(f"jobs {i} and {j}: {error}")
+    if not splits:
+        raise NotSolvedError(f"nothing can be compared: {failed[0]}")
+    model = next((one.error_model for one in results if one.error_model is not None), None)
+    return Replication("jobs", tuple(splits), tuple(failed), model, None, results[0].image_unit)
+
+
+def _difference_of_jobs(one: Adjustment, other: Adjustment) -> HalvesDifference:
+    """Second − first of the free parameters of the cameras of both; two jobs of one camera each are
+    of the same one, whatever its name."""
+    ids = [[camera.id for camera in r.problem.network.cameras] for r in (one, other)]
+    pairs = [(id, id) for id in ids[0] if id in ids[1]]
+    if len(ids[0]) == len(ids[1]) == 1:
+        pairs = [(ids[0][0], ids[1][0])]
+    names, difference, classical, correlated = [], [], [], []
+    for a, b in pairs:
+        free = [r.camera_covariance(id)[0] for r, id in ((one, a), (other, b))]
+        common = [name for name in free[0] if name in free[1]]
+        p, q = one.camera_parameters(a), other.camera_parameters(b)
+        names += [(a, name) for name in common]
+        difference += [q[name] - p[name] for name in common]
+        for blocks, only in ((classical, True), (correlated, False)):
+            C = np.zeros((len(common), len(common)))
+            for result, id in ((one, a), (other, b)):
+                known, own = result.camera_covariance(id, classical=only)
+                at = [list(known).index(name) for name in common]
+                C += own[np.ix_(at, at)]
+            blocks.append(C)
+    if not names:
+        raise NotSolvedError("they have no camera of the same name with a free parameter")
+    from scipy.linalg import block_diag  # imported here: slow, and rarely needed
+
+    modelled = one.error_model is not None or other.error_model is not None
+    return HalvesDifference(
+        tuple(names),
+        np.array(difference),
+        block_diag(*classical),
+        block_diag(*correlated) if modelled else None,
+    )

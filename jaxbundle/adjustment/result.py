@@ -62,7 +62,7 @@ from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.iterations.solver import Minimum
 from jaxbundle.leastsquares.iterations.stopping import SINGULAR, TERMINATIONS
 from jaxbundle.leastsquares.iterations.stopping import converged as reached_minimum
-from jaxbundle.leastsquares.quality.error_components import ErrorModel
+from jaxbundle.leastsquares.quality.error_components import ErrorModel, Errors, IndependentErrors
 from jaxbundle.leastsquares.quality.global_test import chi_squared_test, is_tested
 from jaxbundle.leastsquares.quality.names import Name
 from jaxbundle.leastsquares.quality.reliability import Reliability
@@ -77,7 +77,7 @@ from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.orientation.swapped_control import CONTRADICTORY_CONTROL
 from jaxbundle.results import data_frame, finite
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray, present
+from jaxbundle.types import AnyArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -86,6 +86,20 @@ if TYPE_CHECKING:
 
 # Random halves that are tried for the replication of a result.
 MAX_SPLITS = 3
+# What a result keeps and what follows from its error model.
+UNDER_ERRORS = (
+    "check_points",
+    "_modelled",
+    "cameras",
+    "control_prediction",
+    "errors",
+    "far_points",
+    "image_covariance",
+    "images",
+    "point_covariance",
+    "points",
+    "replication",
+)
 
 
 @print_anywhere
@@ -192,7 +206,7 @@ class Adjustment:
             changed.findings = findings
         if correlations is not None:
             changed.correlations = correlations
-            for name in ("cameras", "images", "points", "_modelled", "replication"):
+            for name in UNDER_ERRORS:
                 changed.__dict__.pop(name, None)
         if halves_by is not None:
             changed.halves_by = halves_by
@@ -412,7 +426,10 @@ class Adjustment:
         self._require_solved()
         if self.check is None:
             return None
-        return intersect_check_points(self.inspection, *self.check, self.sigma_factors)
+        settings = self.correlations or CORRELATIONS
+        return intersect_check_points(
+            self.inspection, *self.check, self.sigma_factors, self.errors, settings
+        )
 
     @functools.cached_property
     def control_prediction(self) -> ControlPrediction | None:
@@ -421,7 +438,7 @@ class Adjustment:
         self._require_solved()
         if self.problem.reduction not in FACTORS:
             return None
-        return predict_control(self.inspection, self.sigma0)
+        return predict_control(self.inspection, self.sigma0, self.error_model)
 
     # --- unknowns ---------------------------------------------------------------------------
 
@@ -450,14 +467,22 @@ class Adjustment:
     @functools.cached_property
     def image_covariance(self) -> Float[np.ndarray, "images 6 6"]:
         """Covariance of X0, Y0, Z0, ω, φ, κ, angles by their exact Jacobian; radians."""
-        Q = self.cofactors.image_cofactors
-        # Q of X0 and δθ to that of X0 and ω, φ, κ: A = diag(I, ∂(ω, φ, κ)/∂δθ).
-        A = np.zeros((len(Q), 6, 6))
+        return self._of_images(self._errors_of_blocks)
+
+    @functools.cached_property
+    def classical_image_covariance(self) -> Float[np.ndarray, "images 6 6"]:
+        """`image_covariance` of independent errors."""
+        return self._of_images(self.independent_errors)
+
+    def _of_images(self, errors: Errors) -> Float[np.ndarray, "images 6 6"]:
+        C = errors.covariance("image")
+        # C of X0 and δθ to that of X0 and ω, φ, κ: A = diag(I, ∂(ω, φ, κ)/∂δθ).
+        A = np.zeros((len(C), 6, 6))
         A[:, :3, :3] = np.eye(3)
         A[:, 3:, 3:] = self.angle_jacobian
         free = self.problem.table("image").free
-        Q = Q * free[:, :, None] * free[:, None, :]
-        return self.sigma0**2 * A @ Q @ A.transpose(0, 2, 1)
+        C = C * free[:, :, None] * free[:, None, :]
+        return A @ C @ A.transpose(0, 2, 1)
 
     # --- correlated errors ------------------------------------------------------------------
 
@@ -477,6 +502,8 @@ class Adjustment:
         """Take over an error model and halves that were computed before (`load_adjustment`);
         None: they are computed when they are needed."""
         if model is not None:
+            for name in UNDER_ERRORS:
+                self.__dict__.pop(name, None)
             self.__dict__["_modelled"] = model, ""
         if halves is not None:
             self.__dict__["replication"] = halves
@@ -485,6 +512,25 @@ class Adjustment:
     def error_model(self) -> ErrorModel | None:
         """Errors that image points share; None if they were not requested, or cannot be found."""
         return self._modelled[0]
+
+    @functools.cached_property
+    def errors(self) -> Errors:
+        """The covariance of everything that follows from the observations: by the error model where
+        there is one, else of independent errors. Whatever states a σ asks it."""
+        # Without a factor for cofactors there is no model, but covariances of single unknowns.
+        return self.error_model or IndependentErrors(self.inspection.solution, self.sigma0**2)
+
+    @property
+    def _errors_of_blocks(self) -> Errors:
+        """The same for covariances of whole tables, which need a factor for cofactors."""
+        return self.error_model or self.independent_errors
+
+    @property
+    def independent_errors(self) -> IndependentErrors:
+        """The classical covariance, σ0² times the cofactors.
+
+        **Raises:** `NotSolvedError` without a factor for cofactors."""
+        return IndependentErrors(self.cofactors.solution, self.sigma0**2)
 
     @property
     def why_no_error_model(self) -> str:
@@ -522,35 +568,16 @@ class Adjustment:
     @property
     def correlated_image_covariance(self) -> Float[np.ndarray, "images 6 6"] | None:
         """`image_covariance` under the error model; None without one."""
-        if self.error_model is None:
-            return None
-        A = np.zeros((len(self.angle_jacobian), 6, 6))
-        A[:, :3, :3] = np.eye(3)
-        A[:, 3:, 3:] = self.angle_jacobian
-        return A @ self.error_model.covariance("image") @ A.transpose(0, 2, 1)
+        return None if self.error_model is None else self.image_covariance
 
     @property
     def correlated_point_covariance(self) -> Float[np.ndarray, "points 3 3"] | None:
         """`point_covariance` under the error model; None without one."""
-        if self.error_model is None:
-            return None
-        C = self.error_model.covariance("point")
-        C = self.problem.cofactors_of_coordinates(self.values["point"], C)
-        return self._where_known(np.asarray(C))
-
-    def modelled_camera_covariance(self, camera: str) -> tuple[list[str], Float[np.ndarray, "n n"]]:
-        """`camera_covariance` under the error model, or the classical one without."""
-        names, C = self.camera_covariance(camera)
-        modelled = self.correlated_camera_covariance(camera)
-        return names, C if modelled is None else modelled
+        return None if self.error_model is None else self.point_covariance
 
     def correlated_camera_covariance(self, camera: str) -> Float[np.ndarray, "n n"] | None:
         """`camera_covariance` under the error model, of the same parameters; None without one."""
-        if self.error_model is None:
-            return None
-        table, row = self.problem.table_of_camera(self._camera(camera))
-        _, free = self.problem.free_parameters(self._camera(camera))
-        return self.error_model.covariance(table.name)[row][np.ix_(free, free)]
+        return None if self.error_model is None else self.camera_covariance(camera)[1]
 
     @property
     def sigma_ratio(self) -> float:
@@ -561,13 +588,10 @@ class Adjustment:
             return 1.0
         cameras = [camera.id for camera in self.problem.network.cameras]
         interior = [
-            (
-                self.camera_covariance(c)[1][None],
-                present(self.correlated_camera_covariance(c))[None],
-            )
+            (self.camera_covariance(c, classical=True)[1][None], self.camera_covariance(c)[1][None])
             for c in cameras
         ]
-        exterior = [(self.image_covariance, present(self.correlated_image_covariance))]
+        exterior = [(self.classical_image_covariance, self.image_covariance)]
         medians = []
         for pairs in (interior, exterior):
             variances = [
@@ -587,7 +611,17 @@ class Adjustment:
     @functools.cached_property
     def point_covariance(self) -> Float[np.ndarray, "points 3 3"]:
         """Marginal covariance of every point; zero where it is fixed, NaN without coordinates."""
-        return self._where_known(self.sigma0**2 * self.cofactors.point_cofactors)
+        return self._of_points(self._errors_of_blocks)
+
+    @functools.cached_property
+    def classical_point_covariance(self) -> Float[np.ndarray, "points 3 3"]:
+        """`point_covariance` of independent errors."""
+        return self._of_points(self.independent_errors)
+
+    def _of_points(self, errors: Errors) -> Float[np.ndarray, "points 3 3"]:
+        # Of far points the engine's are those of direction and inverse distance.
+        C = self.problem.cofactors_of_coordinates(self.values["point"], errors.covariance("point"))
+        return self._where_known(np.asarray(C))
 
     def _where_known(
         self, of_points: Float[np.ndarray, "points ..."]
@@ -606,7 +640,7 @@ class Adjustment:
     def far_points(self) -> FarPoints | None:
         """The points adjusted at any distance because their rays are nearly parallel; None if there
         are none."""
-        return find_far_points(self.cofactors, self.sigma0)
+        return find_far_points(self.cofactors, self._errors_of_blocks)
 
     def camera_parameters(self, camera: str) -> dict[str, float]:
         """All parameters of a camera by name."""
@@ -614,10 +648,15 @@ class Adjustment:
         table, row = self.problem.table_of_camera(c)
         return dict(zip(table.parameters, np.asarray(self.values[table.name])[row].tolist()))
 
-    def camera_covariance(self, camera: str) -> tuple[list[str], Float[np.ndarray, "n n"]]:
-        """Names and covariance of the free parameters of a camera."""
-        names, Q = self.camera_cofactor(camera)
-        return names, self.sigma0**2 * Q
+    def camera_covariance(
+        self, camera: str, *, classical: bool = False
+    ) -> tuple[list[str], Float[np.ndarray, "n n"]]:
+        """Names and covariance of the free parameters of a camera; `classical`: of independent
+        errors, also where an error model is known."""
+        errors = self.independent_errors if classical else self._errors_of_blocks
+        table, row = self.problem.table_of_camera(self._camera(camera))
+        names, free = self.problem.free_parameters(self._camera(camera))
+        return [names[i] for i in free], errors.covariance(table.name)[row][np.ix_(free, free)]
 
     def camera_cofactor(self, camera: str) -> tuple[list[str], Float[np.ndarray, "n n"]]:
         """Names and cofactors of the free parameters of a camera."""
@@ -641,9 +680,12 @@ class Adjustment:
         ]
         return sorted(found, key=lambda item: item[0])
 
-    def covariance(self, *names: tuple[str, str, str]) -> Float[np.ndarray, "n n"]:
+    def covariance(
+        self, *names: tuple[str, str, str], classical: bool = False
+    ) -> Float[np.ndarray, "n n"]:
         """Covariance of any unknowns by name, e.g. `("camera", "cam", "c")`,
-        `("image", "12", "kappa")` (radians), `("point", "7", "Z")`.
+        `("image", "12", "kappa")` (radians), `("point", "7", "Z")`; `classical` as of
+        `covariance_of`.
 
         **Raises:** `InputError` without names, for a name that does not have three parts, or for a
         point excluded by data snooping; `KeyError` for an unknown name."""
@@ -654,21 +696,18 @@ class Adjustment:
         def pick(values: Values):
             return jnp.stack([value_of(self.problem, name, values) for name in wanted])
 
-        return self.covariance_of(pick)
+        return self.covariance_of(pick, classical=classical)
 
-    def covariance_of(self, function: Callable[[Values], jax.Array]) -> Float[np.ndarray, "n n"]:
-        """Covariance of any differentiable function of the adjusted unknowns (`Values` → [n])."""
-        self._require_solved()
-        return self.sigma0**2 * self.inspection.propagate(function)
-
-    def modelled_covariance_of(
-        self, function: Callable[[Values], jax.Array]
+    def covariance_of(
+        self, function: Callable[[Values], jax.Array], *, classical: bool = False
     ) -> Float[np.ndarray, "n n"]:
-        """`covariance_of` under the error model, or the classical one without."""
-        if self.error_model is None:
-            return self.covariance_of(function)
-        slopes = self.cofactors.solution.slopes(function)
-        return self.error_model.propagate_rows({t: np.asarray(x) for t, x in slopes.items()})
+        """Covariance of any differentiable function of the adjusted unknowns (`Values` → [n]):
+        lengths, angles, projections; `classical`: of independent errors, also where an error model
+        is known."""
+        self._require_solved()
+        if classical:
+            return self.sigma0**2 * self.inspection.propagate(function)
+        return self.errors.propagate(function)
 
     # --- tables -----------------------------------------------------------------------------
 

@@ -81,13 +81,12 @@ def images(adjustment: "Adjustment") -> dict[str, np.ndarray]:
     problem = adjustment.problem
     scale = np.array([1, 1, 1, *[adjustment.angle_scale] * 3])
     values = adjustment.image_values * scale
-    sigma = np.sqrt(np.clip(np.diagonal(adjustment.image_covariance, axis1=1, axis2=2), 0, None))
-    sigma = sigma * scale
+    sigma = _sigma(adjustment.classical_image_covariance) * scale
     table = {"id": np.array(problem.network.images.id, dtype=object)}
     table |= {name: values[:, i] for i, name in enumerate(EXTERIOR)}
     table |= {f"s{name}": sigma[:, i] for i, name in enumerate(EXTERIOR)}
     if (C := adjustment.correlated_image_covariance) is not None:
-        sigma = np.sqrt(np.diagonal(C, axis1=1, axis2=2)) * scale
+        sigma = _sigma(C) * scale
         table |= {f"s{name}_correlated": sigma[:, i] for i, name in enumerate(EXTERIOR)}
     return table | _rays_and_rms(adjustment, problem.image, len(values))
 
@@ -95,7 +94,7 @@ def images(adjustment: "Adjustment") -> dict[str, np.ndarray]:
 def points(adjustment: "Adjustment") -> dict[str, np.ndarray]:
     """Columns id, role, X, Y, Z, sX, sY, sZ, rays, rms (of v of its image points, image unit)."""
     problem, network = adjustment.problem, adjustment.problem.network
-    sigma = np.sqrt(np.clip(np.diagonal(adjustment.point_covariance, axis1=1, axis2=2), 0, None))
+    sigma = _sigma(adjustment.classical_point_covariance)
     table = {
         "id": np.array(network.points.id, dtype=object),
         "role": np.array(network.points.role, dtype=object),
@@ -103,9 +102,14 @@ def points(adjustment: "Adjustment") -> dict[str, np.ndarray]:
     table |= {axis: adjustment.point_values[:, i] for i, axis in enumerate("XYZ")}
     table |= {f"s{axis}": sigma[:, i] for i, axis in enumerate("XYZ")}
     if (C := adjustment.correlated_point_covariance) is not None:
-        sigma = np.sqrt(np.diagonal(C, axis1=1, axis2=2))
+        sigma = _sigma(C)
         table |= {f"s{axis}_correlated": sigma[:, i] for i, axis in enumerate("XYZ")}
     return table | _rays_and_rms(adjustment, problem.point, len(network.points))
+
+
+def _sigma(C: Float[np.ndarray, "n k k"]) -> Float[np.ndarray, "n k"]:
+    """σ of covariance blocks; rounding of a zero is zero."""
+    return np.sqrt(np.clip(np.diagonal(C, axis1=1, axis2=2), 0, None))
 
 
 def far_points(adjustment: "Adjustment") -> dict[str, np.ndarray]:
@@ -272,7 +276,7 @@ def checks(adjustment: "Adjustment") -> dict[str, np.ndarray]:
     found = adjustment.check_points
     if found is None:
         return {}
-    sigma = adjustment.sigma0 * np.sqrt(np.diagonal(found.cofactor, axis1=1, axis2=2))
+    sigma = _sigma(found.covariance)
     table = {"id": np.array(found.id, dtype=object)}
     table |= {axis: found.position[:, i] for i, axis in enumerate("XYZ")}
     table |= {f"d{axis}": found.difference[:, i] for i, axis in enumerate("XYZ")}

@@ -19,7 +19,7 @@ from jaxbundle.adjustment.quality.replication import HalvesDifference, Replicati
 from jaxbundle.adjustment.second_minima.evidence import SecondMinimum
 from jaxbundle.cameras import CameraModel, get_model, is_own
 from jaxbundle.io.results.stored_tree import fingerprint, write_tree
-from jaxbundle.leastsquares.quality.error_components import ErrorSettings
+from jaxbundle.leastsquares.quality.error_components import ErrorSettings, SizeEquations
 from jaxbundle.leastsquares.quality.names import Name
 from jaxbundle.network.blunders import Removed, Suspect
 from jaxbundle.network.kinds import KINDS
@@ -74,9 +74,10 @@ class StoredErrorModel:
 
     names: tuple[str, ...]
     theta: np.ndarray
-    theta_sigma: np.ndarray
+    theta_covariance: np.ndarray
     score: np.ndarray
     own: tuple[dict[str, np.ndarray], ...]
+    equations: SizeEquations | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,6 +112,7 @@ CLASSES = (
     CorrelationSettings,
     ErrorSettings,
     StoredErrorModel,
+    SizeEquations,
     Replication,
     HalvesDifference,
     SecondMinimum,
@@ -187,7 +189,8 @@ def _error_model(adjustment: Any) -> StoredErrorModel | None:
     if model is None:
         return None
     names = tuple(component.name for component in model.components)
-    return StoredErrorModel(names, model.theta, model.theta_sigma, model.score, model.own)
+    sizes = model.theta, model.theta_covariance, model.score
+    return StoredErrorModel(names, *sizes, model.own, model.equations)
 
 
 def _state(problem: NetworkProblem, minimum: Any) -> State:

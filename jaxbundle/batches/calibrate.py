@@ -19,6 +19,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxbundle.adjustment.quality.correlated_errors import DEFAULTS
 from jaxbundle.arguments import integer, one_of
 from jaxbundle.batches.camera import (
     CONVERGED,
@@ -30,6 +31,7 @@ from jaxbundle.batches.camera import (
     WEAK,
 )
 from jaxbundle.batches.compiled import ProgramKey, Rows, in_double, solve_portion, tests_of_points
+from jaxbundle.batches.correlated import ComponentSums, batch_errors, sums_of_portion
 from jaxbundle.batches.input import Batch, Portion
 from jaxbundle.batches.misfit import far_outside, misfits, remarks
 from jaxbundle.batches.normal import CameraUnknowns
@@ -45,7 +47,16 @@ from jaxbundle.types import Progress
 
 # Poses in the form of the solver, only for data snooping.
 OF_A_START = ("quaternion", "shift")
-OF_A_VIEW = ("position", "angles", "sigma_position", "sigma_angles", "rotation")
+OF_A_VIEW = (
+    "position",
+    "angles",
+    "sigma_position",
+    "sigma_angles",
+    "rotation",
+    "pose_parts",
+    "sigma_position_correlated",
+    "sigma_angles_correlated",
+)
 # Statuses of cameras with residuals that data snooping can test.
 TESTED = (CONVERGED, LIMIT, SINGULAR)
 
@@ -62,6 +73,7 @@ def calibrate_batch(  # noqa: PLR0913 keyword arguments of a public function
     max_iterations: int = 100,
     snooping: str | None = None,
     significance: float = 0.001,
+    correlated: str | None = None,
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> BatchCalibration:
@@ -85,6 +97,9 @@ def calibrate_batch(  # noqa: PLR0913 keyword arguments of a public function
     - `snooping`: `"pope"`: remove, camera by camera, blunders at the level `significance`, the
       probability of removing anything from a camera without blunders; before that, points more than
       one image size outside the image.
+    - `correlated`: also σ under errors that image points share, from the residuals of all cameras
+      (`"batch"`: cameras of one type and use) or of each by itself (`"camera"`), which shows errors
+      by view the less, the fewer views it has; eight of them or more.
     - `threads`: portions solved at the same time on a CPU; default: the number of cores.
     - `progress(stage, done, total)`: called after every portion.
 
@@ -98,6 +113,7 @@ def calibrate_batch(  # noqa: PLR0913 keyword arguments of a public function
     max_iterations = integer("max_iterations", max_iterations)
     one_of("snooping", snooping, TESTS, none=True)
     check_test(snooping, significance)
+    one_of("correlated", correlated, ("batch", "camera"), none=True)
     threads = available_cores() if threads is None else integer("threads", threads)
     batch = Batch.check(object_points, image_points, image_size, model, visible, free, start)
     camera_model = get_model(model)
@@ -124,16 +140,34 @@ def calibrate_batch(  # noqa: PLR0913 keyword arguments of a public function
             for portion in batch.portions(on_cpu)
         ]
         for portion, future in zip(portions, solving):
-            solved = future.result()
-            parts.append(_without_padding(portion, batch.xy.shape[1:3], solved))
+            parts.append(future.result())
             done += len(portion.cameras)
             if progress is not None:
                 progress("calibrating", done, len(batch))
+    if correlated is not None:
+        # one after the other: large products use all cores, and two programs that wait for the
+        # same threads never end
+        parts = [rows | _sums(key, portion, rows) for portion, rows in zip(portions, parts)]
+    shape = batch.xy.shape[1:3]
+    parts = [_without_padding(portion, shape, rows) for portion, rows in zip(portions, parts)]
     order = np.argsort(np.concatenate([portion.cameras for portion in portions]))
     rows = {name: np.concatenate([p[name] for p in parts])[order] for name in parts[0]}
     if snooping is not None:
         rows["removed"] |= far
-    return _result(camera_model, batch, rows)
+    return _result(camera_model, batch, rows, correlated)
+
+
+def _sums(key: ProgramKey, portion: Portion, rows: Rows) -> Rows:
+    """What the error components of the cameras of a portion are estimated from."""
+    weight = np.asarray(portion.seen.weight) * rows["views"][:, :, None]
+    if "removed" in rows:
+        weight = weight * ~rows["removed"]
+    seen = in_double(dataclasses.replace(portion.seen, weight=weight))
+    at = CameraUnknowns(rows["interior"], rows["quaternion"], rows["shift"])
+    octaves, reach = tuple(DEFAULTS.octaves_of_knots), DEFAULTS.reach
+    found = sums_of_portion(key, octaves, reach, seen, at, portion.axes, portion.middle)
+    T, q, interior, pose = (np.array(x) for x in found)
+    return {"T": T, "q": q, "interior_parts": interior, "pose_parts": pose.swapaxes(1, 2)}
 
 
 def _without_padding(portion: Portion, shape: tuple[int, int], solved: Rows) -> Rows:
@@ -153,7 +187,9 @@ def _without_padding(portion: Portion, shape: tuple[int, int], solved: Rows) -> 
     return rows
 
 
-def _result(model: CameraModel, batch: Batch, rows: Rows) -> BatchCalibration:
+def _result(
+    model: CameraModel, batch: Batch, rows: Rows, correlated: str | None
+) -> BatchCalibration:
     """Rows in the order of the cameras; NaN for no result."""
     ended = np.where(batch.finite, rows["status"], NOT_FINITE)
     solved = ended == CONVERGED
@@ -167,7 +203,9 @@ def _result(model: CameraModel, batch: Batch, rows: Rows) -> BatchCalibration:
     # the last RMS of those at the limit: the residuals may fit perfectly where nothing is
     # determined
     rms = np.where(ended == LIMIT, rows["rms"], np.nan)
-    for name in OF_A_VIEW:
+    if correlated is not None:
+        rows |= _under_errors(batch, rows, solved, correlated == "batch")
+    for name in {*OF_A_VIEW} & {*rows}:
         rows[name][~rows["views"]] = np.nan
     for values in rows.values():
         if np.issubdtype(values.dtype, np.floating):
@@ -183,6 +221,26 @@ def _result(model: CameraModel, batch: Batch, rows: Rows) -> BatchCalibration:
     rows["remark"] = np.where(weak != "", weak, rows["remark"])
     free = tuple(model.parameters[column] for column in batch.free)
     return BatchCalibration(model=key_of(model), parameters=free, **rows)
+
+
+def _under_errors(
+    batch: Batch, rows: Rows, solved: Bool[np.ndarray, " cameras"], together: bool
+) -> Rows:
+    """σ under errors that image points share; `together`: of the same size in all cameras."""
+    T, q, interior = (rows.pop(name) for name in ("T", "q", "interior_parts"))
+    q[~solved] = np.nan
+    sums = ComponentSums(T, q, interior, rows.pop("pose_parts").swapaxes(1, 2))
+    views = rows["views"].sum(1)
+    points = (rows["redundancy"] + len(batch.free) + 6 * views) // 2
+    found = batch_errors(sums, views, points, together)
+    diagonal = np.diagonal(found.covariance, axis1=1, axis2=2)
+    return {
+        "covariance_correlated": found.covariance,
+        "sigma_correlated": np.sqrt(diagonal),
+        "sigma_position_correlated": np.sqrt(found.pose[..., :3]),
+        "sigma_angles_correlated": np.sqrt(found.pose[..., 3:]),
+        "component_sizes": found.sizes,
+    }
 
 
 def _undetermined(

@@ -141,11 +141,30 @@ def _exterior_orientation(
     ray = M'·A·(X − X̄) + t, so that M = M'·A and X0 = X̄ − Mᵀ·t; A: the object's principal axes.
     """
 
-    def pose(change: Float[Array, "6"]) -> tuple[Array, Array]:
-        M = matrix_from_rotation_vector(change[3:]) @ matrix_from_quaternion(quaternion) @ axes
-        X0 = middle - M.T @ (shift + change[:3])
-        return jnp.concatenate([X0, omega_phi_kappa_from_matrix(M)]), M
-
-    J, _ = jax.jacfwd(pose, has_aux=True)(jnp.zeros(6))
-    orientation, M = pose(jnp.zeros(6))
+    orientation, M = _pose(quaternion, shift, axes, middle, jnp.zeros(6))
+    J = exterior_slopes(quaternion, shift, axes, middle)
     return M, orientation[:3], orientation[3:], jnp.sqrt(jnp.diagonal(J @ Q @ J.T))
+
+
+def _pose(
+    quaternion: Float[AnyArray, "4"],
+    shift: Float[AnyArray, "3"],
+    axes: Float[AnyArray, "3 3"],
+    middle: Float[AnyArray, "3"],
+    change: Float[Array, "6"],
+) -> tuple[Array, Array]:
+    """X0, (ω, φ, κ) and M of a view after a change (δt, δθ)."""
+    M = matrix_from_rotation_vector(change[3:]) @ matrix_from_quaternion(quaternion) @ axes
+    X0 = middle - M.T @ (shift + change[:3])
+    return jnp.concatenate([X0, omega_phi_kappa_from_matrix(M)]), M
+
+
+def exterior_slopes(
+    quaternion: Float[AnyArray, "4"],
+    shift: Float[AnyArray, "3"],
+    axes: Float[AnyArray, "3 3"],
+    middle: Float[AnyArray, "3"],
+) -> Float[Array, "6 6"]:
+    """The derivatives of X0 and ω, φ, κ of a view by (δt, δθ)."""
+    pose = partial(_pose, quaternion, shift, axes, middle)
+    return jax.jacfwd(pose, has_aux=True)(jnp.zeros(6))[0]

@@ -10,11 +10,14 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 from jaxbundle.arguments import show as quoted
 from jaxbundle.batches.camera import CONVERGED, SOLVED, STATUS
+from jaxbundle.batches.correlated import COMPONENTS
 from jaxbundle.batches.population import Population
 from jaxbundle.cameras import CameraModel
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
+from jaxbundle.report.layout import significant
 from jaxbundle.results import TableMethods
+from jaxbundle.types import present
 
 
 @print_in_one_screen
@@ -43,6 +46,10 @@ class BatchCalibration(TableMethods):
     - `redundancy`, `iterations` (evaluations of the normal equations).
     - `views`: the used views. A view with fewer than 4 points of a planar object (6 of a spatial
       one), or with all of them on a line (in a plane), is excluded.
+    - `sigma_correlated`, `covariance_correlated`, `sigma_position_correlated`,
+      `sigma_angles_correlated`: under errors that image points share; `component_sizes` of them in
+      pixels, in the order of `jaxbundle.batches.correlated.COMPONENTS` (NaN: not looked for); None
+      if not requested.
     - `removed`: the image points removed by data snooping; None without it.
     - `position`, `angles`: X0, Y0, Z0 in the unit of the object; ω, φ, κ in radians, with
       `sigma_position`, `sigma_angles`; `rotation`: the matrices M.
@@ -68,6 +75,11 @@ class BatchCalibration(TableMethods):
     sigma_angles: Float[np.ndarray, "cameras views 3"]
     rotation: Float[np.ndarray, "cameras views 3 3"]
     removed: Bool[np.ndarray, "cameras views points"] | None = None
+    covariance_correlated: Float[np.ndarray, "cameras k k"] | None = None
+    sigma_correlated: Float[np.ndarray, "cameras k"] | None = None
+    sigma_position_correlated: Float[np.ndarray, "cameras views 3"] | None = None
+    sigma_angles_correlated: Float[np.ndarray, "cameras views 3"] | None = None
+    component_sizes: Float[np.ndarray, "cameras components"] | None = None
 
     @property
     def converged(self) -> Bool[np.ndarray, " cameras"]:
@@ -93,6 +105,7 @@ class BatchCalibration(TableMethods):
                     "remark": str(self.remark[k]),
                     "values": self.values[k].tolist(),
                     "sigma": self.sigma[k].tolist(),
+                    **self._correlated(k),
                     "sigma0": float(self.sigma0[k]),
                     "rms": float(self.rms[k]),
                     "redundancy": int(self.redundancy[k]),
@@ -102,11 +115,41 @@ class BatchCalibration(TableMethods):
             ],
         }
 
+    def _correlated(self, i: int) -> dict[str, Any]:
+        """σ of a camera under correlated errors and their sizes; nothing where not requested."""
+        if self.sigma_correlated is None:
+            return {}
+        return {
+            "sigma_correlated": self.sigma_correlated[i].tolist(),
+            "error_components": self._components(i),
+        }
+
+    def _components(self, i: int) -> list[dict[str, Any]]:
+        sizes = present(self.component_sizes)[i]
+        return [
+            {"name": name, "sigma": float(size), "unit": "px"}
+            for name, size in zip(COMPONENTS, sizes)
+            if np.isfinite(size)
+        ]
+
+    @property
+    def sigma_ratio(self) -> float:
+        """The median of σ under correlated errors over classical σ; NaN where not requested."""
+        if self.sigma_correlated is None:
+            return float("nan")
+        ratio = self.sigma_correlated / self.sigma
+        return float(np.nanmedian(ratio)) if np.isfinite(ratio).any() else float("nan")
+
     def __str__(self) -> str:
         names, counts = np.unique(self.status, return_counts=True)
         states = ", ".join(f"{count} {name}" for name, count in zip(names, counts))
         rms = f"median RMS {np.nanmedian(self.rms):.4g} px" if self.solved.any() else "no result"
         said = [f"{len(self)} cameras, model {self.model}: {states}; {rms}"]
+        if np.isfinite(self.sigma_ratio):
+            said.append(
+                f"σ under correlated errors {significant(self.sigma_ratio, 3)} times the classical "
+                "ones (median)"
+            )
         if self.removed is not None:
             said.append(f"{int(self.removed.sum())} image points removed by data snooping")
         remarks, first, counts = np.unique(self.remark, return_index=True, return_counts=True)
@@ -147,8 +190,15 @@ class BatchCalibration(TableMethods):
             "sigma0": float(self.sigma0[i]),
             "parameters": {name: {"value": v, "sigma": s} for name, v, s in estimates},
         }
+        if self.sigma_correlated is not None:
+            for name, s in zip(self.parameters, self.sigma_correlated[i].tolist()):
+                row["parameters"][name]["sigma_correlated"] = s
+            row["error_components"] = self._components(i)
         if not brief:
             names = ("position", "angles", "sigma_position", "sigma_angles")
+            if self.sigma_correlated is not None:
+                names += ("sigma_position_correlated", "sigma_angles_correlated")
+                row["covariance_correlated"] = present(self.covariance_correlated)[i].tolist()
             columns = zip(*(getattr(self, name)[i][:views].tolist() for name in names))
             row |= {
                 "covariance": self.covariance[i].tolist(),
@@ -169,7 +219,8 @@ class BatchCalibration(TableMethods):
 
     def table(self) -> dict[str, np.ndarray]:
         """One row per camera: status, remark, rms and sigma0 (pixels), redundancy, iterations,
-        views, points removed where there was data snooping, every parameter and its σ."""
+        views, points removed where there was data snooping, every parameter and its σ, also under
+        correlated errors where requested."""
         columns = {
             "status": self.status,
             "remark": self.remark,
@@ -183,6 +234,8 @@ class BatchCalibration(TableMethods):
             columns["removed"] = self.removed.sum((1, 2))
         for k, name in enumerate(self.parameters):
             columns |= {name: self.values[:, k], f"sigma_{name}": self.sigma[:, k]}
+            if self.sigma_correlated is not None:
+                columns[f"sigma_{name}_correlated"] = self.sigma_correlated[:, k]
         return columns
 
     def _repr_html_(self) -> str:

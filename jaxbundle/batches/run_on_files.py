@@ -7,6 +7,7 @@ so that a run can be interrupted at any time. Each line contains its `settings`
 and the fingerprint of its `data`; lines with other ones are not accepted as results.
 """
 
+import dataclasses
 import itertools
 import os
 from collections import Counter
@@ -42,6 +43,7 @@ def run_batch(  # noqa: PLR0913 keyword arguments of a public function
     max_iterations: int = 100,
     snooping: str | None = None,
     significance: float = 0.001,
+    correlated: bool = False,
     board: Board | None = None,
     rig: bool = False,
     pixel_size: float | None = None,
@@ -64,6 +66,8 @@ def run_batch(  # noqa: PLR0913 keyword arguments of a public function
     - `model`, `free`: as in `calibrate_batch`, for the cameras.
     - `max_iterations`: for each camera and each network.
     - `snooping`, `significance`: data snooping, `"pope"`, of every camera and every network.
+    - `correlated`: σ under errors that image points share as well, of every camera from its own
+      views (`calibrate_batch`, `"camera"`), and of every network.
     - `board`: the board in the photographs; every folder without a network is then one of
       photographs of one camera. Found corners are stored in `FILE.corners` beside the file.
     - `rig`: such a folder has a folder for every camera of a rig; simultaneous photographs have
@@ -95,6 +99,7 @@ def run_batch(  # noqa: PLR0913 keyword arguments of a public function
     asked = BatchSettings.check(
         model, free, board, rig, pixel_size, settings, max_iterations, snooping, significance, brief
     )
+    asked = dataclasses.replace(asked, correlated=correlated)
     for path in inputs:
         if not os.path.exists(path):
             raise InputError(f"{path}: no such file or folder")

@@ -82,6 +82,7 @@ class BatchSettings:
     overrides: tuple[str, ...]
     adjusting: Mapping[str, Any]
     brief: bool
+    correlated: bool = False
 
     @classmethod
     def check(
@@ -138,7 +139,14 @@ class BatchSettings:
         return {name: document[name] for name in (*SECTIONS, SIGMA_IMAGE) if name in document}
 
     def as_rigs(self) -> RigSettings:
-        """The settings of cameras and rigs that are adjusted as networks."""
+        """The settings of cameras and rigs that are adjusted as networks.
+
+        **Raises:** `InputError` for correlated errors of them."""
+        if self.correlated:
+            raise InputError(
+                "correlated: not for rigs, rolling shutters and models in mm; use calibrate or "
+                "calibrate-rig, or leave it out"
+            )
         sections = self.sections()
         sigma = sections.pop(SIGMA_IMAGE, None)
         return rig_settings(
@@ -152,12 +160,23 @@ class BatchSettings:
     def of_cameras(self) -> dict:
         """Settings of the lines of cameras and rigs."""
         found = {"model": self.named, "free": list(free_parameters(self.model, self.free))}
-        found |= {**self.adjusting, "brief": self.brief, **self.sections()}
+        found |= {**self.adjusting, **self._asked, "brief": self.brief, **self.sections()}
         return found | ({} if self.pixel_size is None else {"pixel_size": self.pixel_size})
 
     def of_networks(self) -> dict:
         """Settings of the lines of networks."""
-        return {**self.adjusting, **({"set": list(self.overrides)} if self.overrides else {})}
+        found = {**self.adjusting, **self._asked}
+        return found | ({"set": list(self.overrides)} if self.overrides else {})
+
+    @property
+    def _asked(self) -> dict:
+        # lines of earlier versions do not have it
+        return {"correlated": True} if self.correlated else {}
+
+    @property
+    def of_batch(self) -> dict[str, Any]:
+        """Options of `calibrate_batch`."""
+        return {**self.adjusting, "correlated": "camera" if self.correlated else None}
 
 
 def plan_works(
@@ -193,7 +212,7 @@ def plan_works(
 
 
 def _stack(stack: CameraStack, name: str, settings: BatchSettings) -> Work:
-    brief, of_rigs = settings.brief, settings.as_rigs()
+    brief = settings.brief
     keys = tuple(f"{name}#{camera}" for camera in stack.ids)
 
     def cameras(chosen: Sequence[int], _: ShareDone) -> list[dict]:
@@ -201,7 +220,7 @@ def _stack(stack: CameraStack, name: str, settings: BatchSettings) -> Work:
             **stack.arguments(np.asarray(chosen)),
             model=settings.model,
             free=settings.free,
-            **settings.adjusting,
+            **settings.of_batch,
         )
         return [batch.row(i, brief) for i in range(len(chosen))]
 
@@ -210,12 +229,14 @@ def _stack(stack: CameraStack, name: str, settings: BatchSettings) -> Work:
 
     if settings.are_plain() and not stack.of_rigs:
         return Work(keys, settings.of_cameras(), stack.fingerprint, cameras)
+    of_rigs = settings.as_rigs()
     return Work(keys, settings.of_cameras(), stack.fingerprint, rigs, portion=RIGS_A_WRITE)
 
 
 def _detect(found: PhotographFolders, keys: tuple[str, ...], settings: BatchSettings) -> Work:
-    brief, of_rigs = settings.brief, settings.as_rigs()
-    options = {"model": settings.model, "free": settings.free, **settings.adjusting}
+    brief, plain = settings.brief, settings.are_plain()
+    of_rigs = None if plain else settings.as_rigs()
+    options = {"model": settings.model, "free": settings.free, **settings.of_batch}
 
     def solve(chosen: Sequence[int], tell: ShareDone) -> list[dict]:
         measured = found.measure(chosen, tell)
@@ -225,7 +246,7 @@ def _detect(found: PhotographFolders, keys: tuple[str, ...], settings: BatchSett
             if isinstance(why, str)
         }
         views = {i: one for i, one in measured.items() if not isinstance(one, str)}
-        if settings.are_plain():
+        if of_rigs is None:
             for i, batch, place in calibrate_views(views, options):
                 rows[i] = batch.row(place, brief, len(views[i]))
         else:
@@ -238,7 +259,7 @@ def _detect(found: PhotographFolders, keys: tuple[str, ...], settings: BatchSett
 
     # the board is a setting of the lines: other corners are found with another one
     lines = settings.of_cameras() | {"board": repr(found.board)}
-    portion = sys.maxsize if settings.are_plain() else RIGS_A_WRITE
+    portion = sys.maxsize if plain else RIGS_A_WRITE
     return Work(keys, lines, found.fingerprint, solve, "its photographs", portion=portion)
 
 
@@ -277,7 +298,8 @@ def shorten(row: dict, brief: bool) -> dict:
 
 def _network(path: str, name: str, settings: BatchSettings) -> Work:
     solve = lambda chosen, _: [
-        network_row(path, settings.overrides, **settings.adjusting) for _ in chosen
+        network_row(path, settings.overrides, correlated=settings.correlated, **settings.adjusting)
+        for _ in chosen
     ]
     return Work((name,), settings.of_networks(), lambda _: of_input(path), solve, "its files", True)
 

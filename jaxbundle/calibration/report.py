@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from jaxbundle.calibration.rig.mounting import Mounting
     from jaxbundle.calibration.rig.result import RigCalibration
     from jaxbundle.calibration.several import Calibrations
+    from jaxbundle.leastsquares.quality.error_components import ErrorModel
 
 MAPS_HEADER = ("point held in", "middle", "corners")
 
@@ -481,7 +482,7 @@ def mounting_rows(m: "Mounting", unit: str) -> list[tuple[str, str, str, str]]:
 
 def rig_parameter_rows(rig: "RigCalibration", name: str) -> list[tuple[str, str, str]]:
     """The free parameters of a camera in the rig: name, value, σ."""
-    return [(n, *estimate(rig.parameters[name][n], s)) for n, s in rig.sigma[name].items()]
+    return [(n, *estimate(rig.parameters[name][n], s)) for n, s in rig.stated_sigma[name].items()]
 
 
 def _mounting_dict(m: "Mounting") -> dict:
@@ -496,6 +497,24 @@ def _mounting_dict(m: "Mounting") -> dict:
         "length": m.length,
         "sigma_length": m.length_sigma,
     }
+
+
+def _correlated_mounting(m: "Mounting", model: "ErrorModel | None") -> dict:
+    """σ of a mounting under correlated errors; nothing without a model."""
+    if model is None:
+        return {}
+    return {
+        "sigma_base_correlated": m.sigma[:3].tolist(),
+        "sigma_angles_correlated": m.sigma[3:].tolist(),
+        "covariance_correlated": m.covariance.tolist(),
+        "sigma_length_correlated": m.length_sigma,
+    }
+
+
+def _correlated_sigma(rig: "RigCalibration", camera: str, parameter: str) -> dict:
+    """σ of a parameter under correlated errors; nothing without a model, or where it is held."""
+    sigma = rig.correlated_sigma[camera].get(parameter)
+    return {} if rig.error_model is None or sigma is None else {"sigma_correlated": sigma}
 
 
 def rig_dict(rig: "RigCalibration", brief: bool = False) -> dict:
@@ -514,7 +533,10 @@ def rig_dict(rig: "RigCalibration", brief: bool = False) -> dict:
         "redundancy": rig.redundancy,
         "removed": [{"kind": r.kind, "name": r.name, "test": r.test} for r in rig.removed],
         "rms": rig.rms,
-        "mountings": {name: _mounting_dict(m) for name, m in rig.mountings.items()},
+        "mountings": {
+            name: _mounting_dict(m) | _correlated_mounting(rig.mountings[name], rig.error_model)
+            for name, m in rig.classical_mountings.items()
+        },
         "boards": {
             "bodies": [list(body) for body in rig.bodies],
             "places": {name: _mounting_dict(m) for name, m in rig.placements.items()},
@@ -525,11 +547,15 @@ def rig_dict(rig: "RigCalibration", brief: bool = False) -> dict:
         "cameras": {
             name: {
                 n: {"value": value, "sigma": rig.sigma[name].get(n)}
+                | _correlated_sigma(rig, name, n)
                 for n, value in rig.parameters[name].items()
             }
             for name in rig.names
         },
         "quality": {name: _rig_quality(rig, name) for name in rig.names},
+        "error_components": []
+        if rig.error_model is None
+        else [size.to_dict(rig.image_unit) for size in rig.error_model.sizes],
     } | ({} if brief else {"residuals": residuals})
 
 

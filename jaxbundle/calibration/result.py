@@ -69,8 +69,8 @@ class Calibration(TableMethods):
 
     @functools.cached_property
     def sigma(self) -> dict[str, float]:
-        """σ of the free parameters by name."""
-        names, C = self.adjustment.camera_covariance(self.name)
+        """Classical σ of the free parameters by name."""
+        names, C = self.adjustment.camera_covariance(self.name, classical=True)
         return dict(zip(names, np.sqrt(np.diagonal(C)).tolist()))
 
     @functools.cached_property
@@ -275,13 +275,19 @@ class Calibration(TableMethods):
         return as_dict(self, brief)
 
     def table(self) -> dict[str, np.ndarray]:
-        """One row a parameter: columns parameter, value, sigma (NaN: not estimated)."""
+        """One row a parameter: columns parameter, value, sigma (NaN: not estimated), under
+        correlated errors, where these are known, sigma_correlated."""
         names = list(self.parameters)
-        return {
+        column = lambda found: np.array([found.get(name, np.nan) for name in names], dtype=float)
+        table = {
             "parameter": np.array(names, dtype=object),
-            "value": np.array([self.parameters[name] for name in names], dtype=float),
-            "sigma": np.array([self.sigma.get(name, np.nan) for name in names], dtype=float),
+            "value": column(self.parameters),
+            "sigma": column(self.sigma),
         }
+        if self.adjustment.error_model is not None:
+            free, C = self.adjustment.camera_covariance(self.name)
+            table["sigma_correlated"] = column(dict(zip(free, np.sqrt(np.diagonal(C)))))
+        return table
 
     def __str__(self) -> str:
         if not self.converged:

@@ -1,5 +1,6 @@
 """`jaxbundle plan`: plan an aerial block."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -25,6 +26,14 @@ def plan(  # noqa: PLR0913 - the options of the command
     control_every: Annotated[
         int | None,
         typer.Option(help="bases and strips between control points; default: nine in all"),
+    ] = None,
+    errors: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=SIZE",
+            help="errors that image points share, mm, by name as adjust lists them, such as "
+            "'principal point by photograph=0.001'; repeatable",
+        ),
     ] = None,
     network: Annotated[
         bool, typer.Option(help="σ from the covariance of a simulated block")
@@ -56,6 +65,7 @@ def plan(  # noqa: PLR0913 - the options of the command
         control_sigma=control_sigma,
         control_every=control_every,
         network=network,
+        errors=_sizes(errors or ()),
     )
     written = None
     if out is not None:
@@ -63,6 +73,20 @@ def plan(  # noqa: PLR0913 - the options of the command
     print_result(found, json)
     if written is not None and json != "-":
         print(f"{'written':22}{written}")
+
+
+def _sizes(given: Sequence[str]) -> dict[str, float]:
+    """The sizes of error components, by name."""
+    found = {}
+    for text in given:
+        name, mark, size = text.rpartition("=")
+        try:
+            found[name.strip()] = float(size)
+        except ValueError:
+            mark = ""
+        if not mark:
+            raise InputError(f"--errors {text!r}: NAME=SIZE is expected, a size in mm")
+    return found
 
 
 def _require_pair(option: str, text: str) -> tuple[float, float]:

@@ -12,6 +12,9 @@ from jaxbundle.cli.app import Control, Force, Format, Input, Json, Quiet, Settin
 @app.command(example="out/board/network --by views --repeat 4", once=True)
 def replicate(  # noqa: PLR0913 - the options of the command
     input: Input,
+    more: Annotated[
+        list[str] | None, typer.Argument(help="further finished jobs of the same camera")
+    ] = None,
     by: Annotated[str, choice(REPLICATION, "what the halves do not share")] = "photographs",
     repeat: Annotated[int, typer.Option(min=1, help="random halves; runs have one")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="of the random halves")] = 0,
@@ -27,16 +30,17 @@ def replicate(  # noqa: PLR0913 - the options of the command
 
     The difference of the interior orientations of two halves over its covariance, d²/n, is about 1
     where σ are right; stated are that of independent errors, and that of errors which image points
-    share.
+    share. Of several inputs, jobs of one camera, the interior orientations are compared each with
+    each.
     """
     from jaxbundle.cli.outputs import check_writable, print_result
     from jaxbundle.cli.progress import staging
 
     jaxbundle.use_cores()
-    check_writable(json, None, "replicate", (), [input], force)
+    check_writable(json, None, "replicate", (), [input, *(more or ())], force)
     with staging(quiet or json == "-") as show:
         found = jaxbundle.replicate(
-            input,
+            [input, *more] if more else input,
             by=by,
             repeat=repeat,
             seed=seed,

@@ -65,7 +65,7 @@ def open_calibration(
     if isinstance(given, Camera):
         return given, None
     if isinstance(given, Calibration):
-        return given.camera, given.adjustment.modelled_camera_covariance(given.camera.id)
+        return given.camera, given.adjustment.camera_covariance(given.camera.id)
     if isinstance(given, tuple) and len(given) == 2 and isinstance(given[0], Camera):
         return given
     if not isinstance(given, str | Path):

@@ -1,7 +1,9 @@
 """`plan`: an aerial block of vertical photographs."""
 
 import dataclasses
+from collections.abc import Mapping
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -29,7 +31,7 @@ MAX_PHOTOGRAPHS = 2000
 @dataclasses.dataclass(frozen=True)
 class PlannedBlock(TableMethods):
     """A planned block: its `design`, and the values it was planned with (mm in the image, metres on
-    the ground)."""
+    the ground; `errors`: sizes of errors that image points share, by name)."""
 
     design: BlockDesign
     c: float
@@ -38,6 +40,7 @@ class PlannedBlock(TableMethods):
     sigma_image: float
     control_sigma: float
     control_every: int | None
+    errors: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
     @property
     def field_of_view(self) -> FieldOfView:
@@ -67,7 +70,7 @@ class PlannedBlock(TableMethods):
                 f"{self.design.photographs} photographs: too many for a covariance; give "
                 "--no-network, or plan a part of the area"
             )
-        return expected_precision(self.network)
+        return expected_precision(self.network, self.errors)
 
     def table(self) -> dict[str, np.ndarray]:
         """One row a figure of the block: columns quantity, value (object unit; of the pixel on the
@@ -149,6 +152,7 @@ def plan(  # noqa: PLR0913 (public: the options of the command, all but four by 
     control_sigma: float = 0.05,
     control_every: int | None = None,
     network: bool = True,
+    errors: Mapping[str, float] = MappingProxyType({}),
 ) -> PlannedBlock:
     """Plan a block of vertical photographs: strips, photographs, expected precision.
 
@@ -161,6 +165,8 @@ def plan(  # noqa: PLR0913 (public: the options of the command, all but four by 
     - `forward`, `side`: overlaps, parts of 1.
     - `control_sigma`: σ of control points (m); `control_every`: bases and strips between them, by
       default nine in all.
+    - `errors`: sizes (mm) of errors that image points share, by name as `adjust` lists them, such
+      as `{"principal point by photograph": 0.001}`: σ of the simulated block under them.
     - `network`: simulate the block and compute its σ; otherwise `PlannedBlock.network` and
       `precision` do when they are used.
 
@@ -178,7 +184,9 @@ def plan(  # noqa: PLR0913 (public: the options of the command, all but four by 
         forward_overlap=forward,
         side_overlap=side,
     )
-    block = PlannedBlock(design, c, image, area, sigma_image, control_sigma, control_every)
+    block = PlannedBlock(
+        design, c, image, area, sigma_image, control_sigma, control_every, dict(errors)
+    )
     if network:
         block.precision  # noqa: B018 - computed now, kept by the property
     return block

@@ -5,6 +5,8 @@ With V and W of their own observations and Q of the solution,
     Q_XX = V⁻¹ + V⁻¹·Wᵀ·Q·W·V⁻¹.
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,11 +22,24 @@ from jaxbundle.system.programs import compile_once
 from jaxbundle.types import present
 
 
-def determine(
-    found: Solution, problem: Problem
-) -> tuple[Values, Float[np.ndarray, "rows width width"]]:
-    """The eliminated rows of a problem whose other tables are those of a solution, and their
-    cofactors.
+class DeterminedRows(NamedTuple):
+    """Excluded rows from the solution: `values` of the tables; of each row V⁻¹ (`inverse`), and
+    V⁻¹·Wᵀ as `functions` [width, rows, width] of the changes of the tables of the solution."""
+
+    values: Values
+    inverse: Float[np.ndarray, "rows width width"]
+    functions: tuple[dict[str, Float[np.ndarray, "width rows width"]], ...]
+
+    def cofactors(self, found: Solution) -> Float[np.ndarray, "rows width width"]:
+        """V⁻¹ is the intersection with images given; V⁻¹WᵀQWV⁻¹ what their own uncertainty adds,
+        in the datum of the adjustment, by propagation of three linear functions for each point."""
+        return np.array(
+            [V + found.propagate_rows(rows) for V, rows in zip(self.inverse, self.functions)]
+        )
+
+
+def determine(found: Solution, problem: Problem) -> DeterminedRows:
+    """The eliminated rows of a problem whose other tables are those of a solution.
 
     **Arguments:** `problem`: with the kept tables of the solution's problem, at their adjusted
     values and with the same free unknowns.
@@ -32,7 +47,7 @@ def determine(
     plan, e = problem.plan, present(problem.plan.eliminated)
     data = pad_data(problem, problem.data)
     values, inverse, spread = _intersect(problem.declared, plan, data)
-    number, cofactors = problem.table(e).rows, []
+    number, every = problem.table(e).rows, []
     blank = {t.name: np.zeros((t.rows, t.space.width)) for t in found.problem.tables}
     by_row = {g: _by_row(at, W) for (g, W), at in zip(spread.items(), plan.incidences.values())}
     start = pad_values(problem, problem.data.start)
@@ -46,11 +61,10 @@ def determine(
             tables = changes_of_tables(plan, start, change)
             tables.pop(e)
             functions.append(blank | {t: np.asarray(x)[: len(blank[t])] for t, x in tables.items()})
-        rows = {t: np.stack([f[t] for f in functions]) for t in blank}
-        # V⁻¹ is the intersection with images given; V⁻¹WᵀQWV⁻¹ what their own uncertainty adds, in
-        # the datum of the adjustment, by propagation of three linear functions for each point.
-        cofactors.append(np.asarray(inverse[row]) + found.propagate_rows(rows))
-    return without_filling(problem, values), np.array(cofactors)
+        every.append({t: np.stack([f[t] for f in functions]) for t in blank})
+    return DeterminedRows(
+        without_filling(problem, values), np.asarray(inverse)[:number], tuple(every)
+    )
 
 
 def _by_row(

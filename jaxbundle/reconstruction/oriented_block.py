@@ -308,8 +308,8 @@ class OrientedBlock:
             for k, row in enumerate(rows):
                 D[k] = derivative(jnp.asarray(np.append(table[row], lengths[row])))
         AD = self.A @ D
-        Q = self.result.cofactors.solution.joint_cofactors("point", rows)
-        return self.result.sigma0**2 * np.einsum("nij,njmk,mlk->niml", AD, Q, AD)
+        C = self.result.errors.joint_covariance("point", rows)
+        return np.einsum("nij,njmk,mlk->niml", AD, C, AD)
 
     def removed_image_points(self) -> list[tuple[str, str]]:
         """Image and point, by id, of the image points without weight."""

@@ -50,6 +50,7 @@ from jaxbundle.reconstruction.result import (
 from jaxbundle.reconstruction.satellite_positions import find_positions
 from jaxbundle.reconstruction.settings import ReconstructionSettings
 from jaxbundle.reconstruction.starting import is_plausible, start_again, start_values
+from jaxbundle.report.correlated import stated_sigma_of
 from jaxbundle.system.cores import available_cores, can_run_two_programs
 from jaxbundle.tiepoints import track_measurement
 from jaxbundle.tiepoints.camera_starts import start_cameras
@@ -437,7 +438,7 @@ class _ReconstructionRun:
         part = ReconstructedPart(name, result, weighted.factors, block, control, no_control)
         if part.misfit >= DOUBTFUL_MISFIT:
             self._warn(f"{name}: {misfit_in_words(part)}", part.misfit)
-        for said in (*self._compare_with_files(weighted.adjustment), *doubts):
+        for said in (*self._compare_with_files(result), *doubts):
             self._warn(f"{name}: {said}")
         return part, dict(oriented.images_not_placed)
 
@@ -447,11 +448,12 @@ class _ReconstructionRun:
         said = []
         for id, adjusted in principal_distances(result).items():
             file = stated.get(id)
-            if file is None or not adjusted["sigma"]:
+            own = stated_sigma_of(adjusted)
+            if file is None or not own:
                 continue
             # the file's value is also an observation of the adjustment, which draws the result
             # towards it: a contradiction is larger than it looks, and the test is cautious
-            sigma = np.hypot(file.sigma, adjusted["sigma"])
+            sigma = np.hypot(file.sigma, own)
             off = abs(adjusted["value"] - file.value)
             if off > square_pixels.CRITICAL_DEVIATION * sigma:
                 said.append(

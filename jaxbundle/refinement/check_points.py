@@ -63,7 +63,8 @@ def intersect(found: RefinementInspection, rays: Rays) -> RefinementCheckPoints:
     inputs, adjusted = found.declared.inputs, found.solution.values
     checks = declare(inputs, rays, inputs.points.X[rays.points], adjusted)
     problem, start = checks.problem, checks.problem.data.start
-    values, Q = determine(found.solution, problem)
+    determined = determine(found.solution, problem)
+    values, Q = determined.values, determined.cofactors(found.solution)
     known, axes = problem.table("point").free > 0, start["point"].axes
     change = np.asarray(values["point"].position - start["point"].position)
     sigma = found.sigma0 * np.sqrt(np.diagonal(Q, axis1=1, axis2=2))

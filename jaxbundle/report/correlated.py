@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.leastsquares.quality.error_components import IMAGE
 from jaxbundle.report.layout import clean, heading, paragraph, significant, table
 from jaxbundle.types import present
 
@@ -33,6 +34,18 @@ REPLICATION_LEGEND = (
     "photographs: they cannot show these errors."
 )
 DIFFERENCE_HEADER = ("parameter", "difference", "σ", "in σ", "σ correlated", "in it")
+# What a component says about camera or measurement, with its size, and what can be done about it.
+REMARKS = {
+    "field on the sensor": "a field of {} common to all photographs, which the lens model does not "
+    "have: choose a richer lens model",
+    "principal point by photograph": "the principal point moves by {} between photographs",
+    "principal distance by photograph": "the principal distance changes between photographs, by {} "
+    "at the edge of the image: hold focus and zoom",
+    "affine by photograph": "shear and ratio of scales change between photographs, by {} at the "
+    "edge of the image: a moving shutter, or film that is not flat",
+    "along tracks": "errors of {} along the tracks of points, alike from stations near to each "
+    "other: measured against one image",
+}
 # σ under correlated errors over classical ones from which the difference is a finding: five in a
 # hundred exceed 1.96 classical σ where the model is right, thirteen at this ratio.
 NOTABLE_RATIO = 1.3
@@ -81,11 +94,24 @@ def component_rows(adjustment: "Adjustment") -> list[tuple[str, str, str, str, s
             size.name,
             significant(size.size, 3),
             significant(size.sigma, 2),
-            unit if size.unit == "image" else "a priori σ",
+            unit if size.unit == IMAGE else "a priori σ",
             "" if number == 0 else f"{size.score:.1f}",
         )
         for number, size in enumerate(present(adjustment.error_model).sizes)
     ]
+
+
+def remarks(adjustment: "Adjustment") -> list[str]:
+    """What the components that were found say, in sentences, the most significant first."""
+    unit, said = adjustment.image_unit, []
+    sizes = present(adjustment.error_model).sizes[1:]
+    for size in sorted(sizes, key=lambda one: -one.score):
+        name, of, camera = size.name.partition(" of ")
+        if size.size > 0 and name in REMARKS:
+            amount = f"{significant(size.size, 2)} {unit if size.unit == IMAGE else 'a priori σ'}"
+            camera = f"camera {clean(camera)}: " if of else ""
+            said.append(camera + REMARKS[name].format(amount))
+    return said
 
 
 def sigma_rows(adjustment: "Adjustment") -> list[tuple[str, str, str, str]]:
@@ -164,7 +190,8 @@ def correlated_lines(adjustment: "Adjustment") -> list[str]:
     if adjustment.error_model is None:
         return []
     lines = [*heading(TITLE), *table(COMPONENT_HEADER, component_rows(adjustment), "lrrlr"), ""]
-    lines += paragraph(LEGEND)
+    lines += [line for said in remarks(adjustment) for line in paragraph(f"- {said}", 0, 2)]
+    lines += ["", *paragraph(LEGEND)]
     if words := not_looked_for(adjustment):
         lines += paragraph(words)
     lines += ["", *table(SIGMA_HEADER, sigma_rows(adjustment), "lrrr")]

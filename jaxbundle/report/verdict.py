@@ -16,7 +16,7 @@ from jaxbundle.leastsquares.quality.distributions import level_of_one
 from jaxbundle.leastsquares.quality.global_test import contradicts
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import ESTIMATED
-from jaxbundle.report.correlated import has_shared_errors
+from jaxbundle.report.correlated import has_shared_errors, remarks
 from jaxbundle.report.head import chi_squared, open_datum
 from jaxbundle.report.layout import clean, significant
 from jaxbundle.report.observations import count_weak, critical_value
@@ -152,11 +152,9 @@ def _correlated(adjustment: "Adjustment") -> list[Finding]:
     """σ that shared errors make larger, and halves of the network that contradict each other."""
     found = []
     if adjustment.error_model is not None:
-        ratio, components = adjustment.sigma_ratio, adjustment.error_model.sizes[1:]
-        named = max(components, key=lambda size: size.score, default=None)
+        ratio, said = adjustment.sigma_ratio, remarks(adjustment)
         words = f"σ under correlated errors are {significant(ratio, 2)} times the classical ones"
-        if named is not None and named.size > 0:
-            words += f"; most of all a {named.name}"
+        words += f"; {'; '.join(said[:2])}" if said else ""
         state = NOTED if has_shared_errors(adjustment) else GOOD
         brief = f"σ {significant(ratio, 2)} times larger under correlated errors"
         found.append(Finding("Correlated errors", state, words, brief))

@@ -134,3 +134,23 @@ def test_control_keeps_its_sigma_under_errors_of_image_points(network, tmp_path)
 def test_good_control_is_not_called_wrong(network):
     said = [one for one in jaxbundle.adjust(network).verdict.findings if one.about == "Control"]
     assert "contradicted" not in said[0].words
+
+
+def test_predictions_under_an_error_model(network):
+    """With independent errors of σ0 alone they are the classical ones; by a component of errors of
+    one measurement, (1 − H)⁻¹·M·Σ·M·(1 − H)⁻¹."""
+    result = jaxbundle.adjust(network, correlated=True)
+    model, classical = result.error_model, jaxbundle.adjust(network).control_prediction
+    theta = np.zeros(len(model.theta))
+    theta[0] = result.sigma0**2
+    result.keep(dataclasses.replace(model, theta=theta), None)
+    found = result.control_prediction
+    np.testing.assert_allclose(found.error, classical.error, rtol=1e-9)
+    np.testing.assert_allclose(found.sigma, classical.sigma, rtol=1e-6)
+    np.testing.assert_allclose(found.image_sigma, classical.image_sigma, rtol=1e-6)
+    larger = jaxbundle.adjust(network, correlated=True)
+    theta = theta.copy()
+    theta[1:] = 4 * result.sigma0**2 * (np.arange(1, len(theta)) == 1)
+    larger.keep(dataclasses.replace(model, theta=theta), None)
+    grown = larger.control_prediction.image_sigma / classical.image_sigma
+    assert np.nanmin(grown) > 1

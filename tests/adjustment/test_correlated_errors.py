@@ -14,6 +14,8 @@ from jaxbundle.adjustment.quality.replication import compared_parameters
 from jaxbundle.leastsquares.quality import error_components
 from jaxbundle.network.undetermined import keep_images
 from jaxbundle.planning import grid_of_targets, ring_of_stations
+from jaxbundle.report import correlated
+from jaxbundle.report.layout import significant
 from jaxbundle.report.page import compose
 
 IMAGES, SIGMA = 12, 0.2
@@ -65,7 +67,7 @@ def test_sizes_are_found_and_sigma_hold(clean):
     classical, correlated, found = [], [], []
     for seed in range(10):
         result = jaxbundle.adjust(disturbed(clean, seed, affine=0.4), correlated=True)
-        names, C = result.camera_covariance("cam")
+        names, C = result.camera_covariance("cam", classical=True)
         values = result.camera_parameters("cam")
         d = np.array([values[name] for name in names]) - true
         K = result.correlated_camera_covariance("cam")
@@ -86,8 +88,9 @@ def square(d, C):
 def test_a_field_on_the_sensor_is_found(clean):
     result = jaxbundle.adjust(disturbed(clean, 3, field=0.3), correlated=True)
     sizes = {size.name: size for size in result.error_model.sizes}
-    assert sizes["field on the sensor"].score > 4
-    assert abs(sizes["field on the sensor"].size / 0.3 - 1) < 0.4
+    field = sizes["field on the sensor"]
+    # waves are coarse, and the lens model takes up a part of them: their size is uncertain
+    assert field.score > 4 and abs(field.size - 0.3) < 2.5 * field.sigma < 0.35
     told = result.to_dict()
     json.dumps(told, allow_nan=False)
     assert {c["name"] for c in told["error_components"]} == set(sizes)
@@ -164,11 +167,12 @@ def test_a_saved_result_keeps_error_model_and_halves(shaken, tmp_path, monkeypat
     assert told[0] == told[1] and json.loads(told[0])["replication"]["by"] == "photographs"
     name = ("camera", "cam", "fx")
     function = lambda values: values["camera"][0, :2]
-    modelled = [one.modelled_covariance_of(function) for one in (shaken, again)]
+    modelled = [one.covariance_of(function) for one in (shaken, again)]
     np.testing.assert_allclose(*modelled, rtol=1e-9)
     f = shaken.cameras["cam"]["parameters"]["fx"]
     assert np.sqrt(modelled[0][0, 0]) == pytest.approx(f["sigma_correlated"], rel=0.1)
-    assert np.sqrt(shaken.covariance(name)[0, 0]) == pytest.approx(f["sigma"])
+    assert np.sqrt(shaken.covariance(name)[0, 0]) == pytest.approx(np.sqrt(modelled[0][0, 0]))
+    assert np.sqrt(shaken.covariance(name, classical=True)[0, 0]) == pytest.approx(f["sigma"])
 
 
 def test_comparisons_use_sigma_under_correlated_errors(clean, shaken, tmp_path):
@@ -177,7 +181,7 @@ def test_comparisons_use_sigma_under_correlated_errors(clean, shaken, tmp_path):
     plain = [jaxbundle.adjust(one.network) for one in (shaken, other)]
     with_model, without = jaxbundle.compare(shaken, other), jaxbundle.compare(*plain)
     camera = with_model.kind == "camera"
-    C = [one.modelled_camera_covariance("cam")[1] for one in (shaken, other)]
+    C = [one.camera_covariance("cam")[1] for one in (shaken, other)]
     np.testing.assert_allclose(with_model.sigma[camera] ** 2, np.diag(sum(C)), rtol=0.1)
     assert with_model.modelled == ("a", "b") and not without.modelled
     assert with_model.tests["camera cam"].f < without.tests["camera cam"].f / 3
@@ -220,3 +224,118 @@ def test_splines_are_a_partition_of_one_and_kernels_are_positive():
     X = rng.normal(size=(40, 3))
     K = wendland(np.linalg.norm(X[:, None] - X, axis=2))
     assert np.linalg.eigvalsh(K).min() > 0 and wendland(np.array([0.0, 1.0, 2.0])).sum() == 1
+
+
+def test_everything_that_states_a_sigma_asks_the_error_model(shaken):
+    """Blocks, functions, the error budget and designs with the sizes that were found agree."""
+    f = shaken.cameras["cam"]["parameters"]["fx"]
+    blocks = shaken.camera_covariance("cam")[1], shaken.camera_covariance("cam", classical=True)[1]
+    np.testing.assert_allclose(
+        [f["sigma_correlated"], f["sigma"]], [np.sqrt(C[0, 0]) for C in blocks]
+    )
+    names = [("image", shaken.network.images.id[2], name) for name in ("X0", "Y0", "kappa")]
+    C = shaken.covariance(*names, classical=True)
+    np.testing.assert_allclose(
+        C, shaken.classical_image_covariance[2][np.ix_([0, 1, 5], [0, 1, 5])], rtol=1e-6
+    )
+    # blocks of the along-track component are from random combinations, functions are not
+    C = np.sqrt(np.diag(shaken.covariance(*names)))
+    of_image = np.sqrt(np.diagonal(shaken.image_covariance[2]))[[0, 1, 5]]
+    np.testing.assert_allclose(C, of_image, rtol=0.05)
+    assert (C > 1.5 * np.sqrt(np.diag(shaken.covariance(*names, classical=True)))).any()
+    budget = jaxbundle.sensitivity(shaken, {"camera:cam:k3": 1e-3}, of="camera:cam:fx")
+    np.testing.assert_allclose(budget.sigma, f["sigma_correlated"], rtol=0.05)
+    sizes = {size.name: size.size for size in shaken.error_model.sizes}
+    start = dataclasses.replace(shaken.problem.data, start=shaken.values)
+    design = jaxbundle.precision(shaken.problem, start, names=(names[0],), errors=sizes)
+    np.testing.assert_allclose(np.sqrt(design.covariance[0, 0]), C[0], rtol=0.05)
+    np.testing.assert_allclose(design.cameras[0, 0], f["sigma_correlated"], rtol=0.05)
+    with pytest.raises(jaxbundle.InputError, match="no component principal"):
+        jaxbundle.precision(shaken.problem, start, errors={"principal": 0.1})
+
+
+def test_check_points_share_the_errors_of_the_network():
+    """One by one, the errors of a component displace network and check points: the sum of squares
+    is the covariance of a model with this component alone. Without distortion, by which errors of
+    measured coordinates are magnified in residuals of corrected ones."""
+    stations = ring_of_stations(IMAGES, 5.0, 6.0, roll_every=2)
+    targets = grid_of_targets(9, 7, 0.6, relief=0.6)
+    camera = dataclasses.replace(CAMERA, parameters=CAMERA.parameters | {"k1": 0.0})
+    clean = jaxbundle.simulate(stations, targets, camera, noise=SIGMA / 200, seed=1)
+    role = np.array(clean.points.role, dtype=object)
+    role[[10, 40]] = "check"
+    given = clean.replace(points=dataclasses.replace(clean.points, role=tuple(role)))
+    result = jaxbundle.adjust(given, correlated=True)
+    model, size = result.error_model, 0.1  # far above what is left by the end of iterations
+    theta = np.zeros(len(model.theta))
+    number = [c.name for c in model.components].index("principal point by photograph")
+    theta[1 + number] = size**2
+    result.keep(dataclasses.replace(model, theta=theta), None)
+    found = result.check_points
+    rays, squares = given.observations, np.zeros((2, 3, 3))
+    for image in range(IMAGES):
+        for axis in (0, 1):
+            xy = rays.xy.copy()
+            xy[rays.image == image, axis] += size
+            moved = given.replace(observations=dataclasses.replace(rays, xy=xy))
+            d = jaxbundle.adjust(moved).check_points.position - found.position
+            squares += d[:, :, None] * d[:, None]
+    np.testing.assert_allclose(
+        np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)),
+        np.sqrt(np.diagonal(squares, axis1=1, axis2=2)),
+        rtol=0.02,
+    )
+
+
+def test_the_band_of_replication_is_that_of_the_model(clean, shaken):
+    """Its simulated halves have d²/n about 1, more widely with sizes estimated from few
+    photographs."""
+    for given in (clean, shaken):
+        found = jaxbundle.replicate(given, by="photographs", repeat=2)
+        low, high = found.band
+        assert 0.1 < low < 0.9 and 1.1 < high < 5
+        told = found.to_dict()
+        np.testing.assert_allclose(told["expected"], [found.dof * low, found.dof * high])
+        assert found.expected in str(found) and found.expected in found.sentence
+        assert {"name", "sigma", "unit", "score"} < set(told["error_components"][1])
+
+
+def test_what_components_mean_is_said(shaken):
+    (said,) = [line for line in correlated.remarks(shaken) if "shear" in line]
+    size = next(s for s in shaken.error_model.sizes if s.name.startswith("affine"))
+    assert f"{significant(size.size, 2)} px" in said
+    assert said in " ".join(shaken.report().split())
+    assert any(said in finding.words for finding in shaken.verdict.findings)
+    told = {c["name"]: c for c in shaken.to_dict(brief=True)["error_components"]}
+    assert told[size.name]["sigma"] == size.size and told[size.name]["unit"] == "px"
+
+
+def test_components_that_chance_explains_are_left_out(clean):
+    equations = jaxbundle.adjust(clean, correlated=True).error_model.equations
+    # Šidák's level of five components
+    assert equations.critical == pytest.approx(2.319, abs=1e-3)
+    rng, T = np.random.default_rng(0), equations.T
+    # forms of independent errors: mean T_0, covariance 2·T
+    forms = T[:, 0] + rng.normal(size=(300, len(T))) @ np.linalg.cholesky(2 * T).T
+    share = np.mean([(equations.solve(q)[0][1:] > 0).any() for q in forms])
+    # 5 % of components that share nothing; these do, and are left out one after the other
+    assert 0.01 < share < 0.15
+
+
+def test_finished_jobs_of_one_camera_are_compared(clean, shaken, tmp_path):
+    """A result, a saved one and a network; another principal point in one of them is seen."""
+    rays = clean.observations
+    moved = clean.replace(observations=dataclasses.replace(rays, xy=rays.xy + [30.0, 0.0]))
+    adjusted = jaxbundle.adjust(disturbed(moved, 6, affine=0.4))
+    shaken.save(tmp_path / "first.npz")
+    found = jaxbundle.replicate([tmp_path / "first.npz", adjusted, disturbed(clean, 7, affine=0.4)])
+    assert found.by == "jobs" and len(found.splits) == 3 and found.dof == len(CAMERA.free)
+    first = found.splits[0]
+    k = first.names.index(("cam", "cx"))
+    assert abs(first.difference[k] - 30) < 4 * first.sigma_correlated[k]
+    assert abs(first.difference[k]) > 5 * first.sigma_correlated[k]
+    same = found.splits[1]
+    assert same.d2_correlated / len(same.names) < 3 < same.d2 / len(same.names)
+    C = [one.camera_covariance("cam")[1] for one in (shaken, adjusted.with_correlated_errors())]
+    np.testing.assert_allclose(first.correlated, sum(C), rtol=1e-6)
+    assert "jobs differ by" in found.sentence and "Jobs of one camera: 3 pairs" in str(found)

@@ -398,7 +398,7 @@ def test_compare_tells_what_is_expected(calibration, tmp_path, monkeypatch, caps
     assert "expected by the σ of both" in said and "largest    expected" in said
     ((camera, (names, C)),) = read_calibrated(file)
     # that of errors which image points share: twelve views show them
-    expected = calibration.adjustment.modelled_camera_covariance(calibration.name)
+    expected = calibration.adjustment.camera_covariance(calibration.name)
     assert calibration.adjustment.error_model is not None
     assert tuple(names) == tuple(expected[0]) and camera.image_size == (480, 360)
     np.testing.assert_allclose(C, expected[1], rtol=1e-9, atol=1e-20)

@@ -402,3 +402,41 @@ def test_a_rig_is_judged_and_certified(rig):
         assert [row.met for row in found.rows] == [True, True, True, False, *[True] * 4]
     page = jaxbundle.certificate(cameras).html()
     assert 'id="mountings"' in page and page.count("Uncertainty budget") >= 1
+
+
+def test_a_rig_has_the_errors_that_its_photographs_share(both):
+    """An affine distortion of each photograph, far above the noise: σ of mountings and cameras
+    under it beside the classical ones; without such errors they are the classical ones."""
+    rng, views = np.random.default_rng(5), pair()
+    shaken, true = {}, []
+    for name, given in views.items():
+        x = (given.xy - np.nanmean(given.xy, (0, 1))) / 240
+        a = 0.6 * rng.normal(size=(VIEWS, 1, 1))
+        # one of two affine distortions, at the edge of the measured area
+        half = np.nanmax(np.ptp(given.xy.reshape(-1, 2), axis=0)) / 2
+        true.append(np.sqrt(np.mean(a**2) / 2) * half / 240)
+        shaken[name] = dataclasses.replace(given, xy=given.xy + a * x * [1, -1])
+    options = {"snooping": None, "cross_validation": False, "correlated": True}
+    rig = calibrate_cameras(shaken, rig=True, **options).rig
+    sizes = {size.name: size for size in rig.error_model.sizes}
+    found = [size for name, size in sizes.items() if name.startswith("affine by photograph of ")]
+    np.testing.assert_allclose([size.size for size in found], true, rtol=0.4)
+    assert all(size.score > 4 for size in found)
+    told = rig_dict(rig, brief=True)
+    assert {c["name"] for c in told["error_components"]} == set(sizes)
+    for name in rig.names:
+        for parameter, entry in told["cameras"][name].items():
+            if entry["sigma"]:
+                assert entry["sigma_correlated"] == rig.correlated_sigma[name][parameter]
+        assert rig.stated_sigma[name]["fx"] == rig.correlated_sigma[name]["fx"]
+        assert rig.correlated_sigma[name]["fx"] > 1.2 * rig.sigma[name]["fx"]
+    mounting, classical = (m["right"] for m in (rig.mountings, rig.classical_mountings))
+    error = np.concatenate([mounting.base - BASE, mounting.angles - ANGLES]) / mounting.sigma
+    assert np.abs(error).max() < 3.5
+    entry = told["mountings"]["right"]
+    np.testing.assert_allclose(entry["sigma_base"], classical.sigma[:3])
+    np.testing.assert_allclose(entry["sigma_base_correlated"], mounting.sigma[:3])
+    plain = calibrate_cameras(views, rig=True, **options).rig
+    np.testing.assert_allclose(
+        plain.covariance("right"), plain.covariance("right", classical=True), rtol=0.5
+    )

@@ -20,6 +20,7 @@ from jaxbundle.io.results.result_json import result_text
 from jaxbundle.leastsquares.any_distance import LARGEST_DISTANCE, AnyDistance, derivative
 from jaxbundle.leastsquares.indexing.rows import lay_out_data, residuals
 from jaxbundle.leastsquares.problem import pad_data, pad_values
+from jaxbundle.leastsquares.quality.error_components import IndependentErrors
 from jaxbundle.leastsquares.spaces import Vector
 
 NEAR, FAR = 24, 8
@@ -151,7 +152,7 @@ def _distances_of(inspection):
 @pytest.mark.further
 def test_sigma_of_direction_and_inverse_distance_are_those_of_a_sample(moderate):
     found = moderate[1]
-    far = find_far_points(found, 1.0)
+    far = find_far_points(found, IndependentErrors(found.solution, 1.0))
     draws = sample(found.problem, found.adjusted, ("point",), draws=40)["point"][:, NEAR:, :3]
     inverse = 1 / np.linalg.norm(draws, axis=2)
     ratio = inverse.std(0, ddof=1) / far.sigma_inverse_distance

@@ -1,7 +1,13 @@
 """Check points: intersected with the adjusted orientations, compared with their given coordinates.
 
 They are excluded from the adjustment. Their σ includes that of the rays and the uncertainty of
-orientations and cameras (`leastsquares/excluded_rows.py`).
+orientations and cameras (`leastsquares/excluded_rows.py`),
+
+    dX = V⁻¹·(Eᵀe − Wᵀ·dx),        V = EᵀE of their own rays, with the errors e
+
+Under an error model the rays of a check point share errors with those of the network, which its
+orientations have absorbed: the principal point of a photograph that is shifted moves the check
+point no more than a tie point.
 """
 
 import dataclasses
@@ -10,25 +16,34 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.adjustment.problem import shifted_problem
+from jaxbundle.adjustment.problem import NetworkProblem, shifted_problem
+from jaxbundle.adjustment.quality.correlated_errors import CorrelationSettings, joint_components
 from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.adjustment.quality.variance_groups import groups
 from jaxbundle.display import print_in_one_screen
-from jaxbundle.leastsquares.excluded_rows import determine
+from jaxbundle.leastsquares.excluded_rows import DeterminedRows, determine
+from jaxbundle.leastsquares.quality.error_components import (
+    ErrorModel,
+    Errors,
+    IndependentErrors,
+    effects,
+    first_rows,
+)
 from jaxbundle.leastsquares.quality.variance_components import rescale
+from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.network.tables import Distances, Observations, Points
 
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class CheckPoints:
-    """Intersected check points: coordinates, cofactors (times σ0² for variances), differences from
-    the given coordinates (NaN on axes with an infinite σ, which were not given)."""
+    """Intersected check points: coordinates, their covariance, differences from the given
+    coordinates (NaN on axes with an infinite σ, which were not given)."""
 
     id: tuple[str, ...]
     position: Float[np.ndarray, "points 3"]
     difference: Float[np.ndarray, "points 3"]
-    cofactor: Float[np.ndarray, "points 3 3"]
+    covariance: Float[np.ndarray, "points 3 3"]
     rays: np.ndarray
 
     @property
@@ -44,9 +59,13 @@ def intersect_check_points(
     points: Points,
     observations: Observations,
     factors: Mapping[str, float],
+    errors: Errors,
+    settings: CorrelationSettings,
 ) -> CheckPoints:
-    """Intersect the check points of a network with its adjusted orientations; `factors`: those of
-    the groups of observations, as in the weights of the problem (variance components)."""
+    """Intersect the check points of a network with its adjusted orientations.
+
+    **Arguments:** `factors`: those of the groups of observations, as in the weights of the problem
+    (variance components); `errors` of the observations, of an error model with its `settings`."""
     # As tie points of a problem of their own, whose orientations are those of the adjustment with
     # their covariance: check points have no part in what they check.
     problem, role = inspection.problem, ("tie",) * len(points)
@@ -57,13 +76,47 @@ def intersect_check_points(
     )
     checks = shifted_problem(network, problem, inspection.adjusted)
     # With estimated variance components the rays of check points have the estimated σ as well.
-    system = rescale(checks, groups(checks), factors)
-    values, cofactor = determine(inspection.solution, system)
-    position = np.asarray(values["point"]) + problem.origin
+    data = rescale(checks, groups(checks), factors).data
+    system = dataclasses.replace(checks, data=data)
+    determined = determine(inspection.solution, system)
+    position = np.asarray(determined.values["point"]) + problem.origin
+    if isinstance(errors, IndependentErrors):
+        covariance = errors.variance * determined.cofactors(inspection.solution)
+    else:
+        covariance = _modelled_covariance(inspection, system, determined, errors, settings)
     return CheckPoints(
         points.id,
         position,
         np.where(np.isposinf(points.sigma), np.nan, position - points.position),
-        cofactor,
+        covariance,
         np.bincount(observations.point, minlength=len(points)),
     )
+
+
+def _modelled_covariance(
+    inspection: Inspection,
+    checks: NetworkProblem,
+    determined: DeterminedRows,
+    model: ErrorModel,
+    settings: CorrelationSettings,
+) -> Float[np.ndarray, "points 3 3"]:
+    """The covariance of check points by the errors of the network and of their own rays."""
+    own = Solution(checks, determined.values)
+    components = joint_components(
+        (inspection.solution, inspection.problem), (own, checks), settings
+    )
+    joint = dataclasses.replace(model, components=tuple(components))
+    starts = first_rows(own)
+    size = sum(np.asarray(v).size for v in own.residuals.values())
+    number = len(determined.inverse)
+    D = np.zeros((number, 3, size))
+    for name, E in own.by_eliminated.items():
+        point = checks.point[checks.image_rows[name]]
+        for axis in range(E.shape[1]):
+            rows = starts[name] + E.shape[1] * np.arange(len(E)) + axis
+            D[point, :, rows] = np.einsum("nij,nj->ni", determined.inverse[point], E[:, axis])
+    found = np.zeros((number, 3, 3))
+    for k in range(number):
+        of_network = effects(inspection.solution, determined.functions[k])
+        found[k] = joint.of_effects(np.concatenate([-of_network, D[k]], 1))
+    return found

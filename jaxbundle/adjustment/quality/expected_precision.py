@@ -5,16 +5,21 @@ whose residuals agree with its σ.
 """
 
 import dataclasses
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.adjustment.problem import make_problem
+from jaxbundle.adjustment.quality.correlated_errors import stated_errors
 from jaxbundle.adjustment.quality.inspection import Inspection
+from jaxbundle.adjustment.quality.precision import predict
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
-from jaxbundle.leastsquares.problem import with_factor
+from jaxbundle.leastsquares.problem import with_data, with_factor
+from jaxbundle.leastsquares.quality.error_components import Errors, IndependentErrors
+from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.network.check import check_network
 from jaxbundle.network.tables import Network
 
@@ -39,8 +44,11 @@ class ExpectedPrecision:
         }
 
 
-def expected_precision(network: Network) -> ExpectedPrecision:
-    """The a priori precision of a network with start values.
+def expected_precision(
+    network: Network, errors: Mapping[str, float] | None = None
+) -> ExpectedPrecision:
+    """The a priori precision of a network with start values; `errors`: sizes of errors that image
+    points share, by name (`stated_errors`).
 
     **Raises:** `InputError` for a network that cannot be adjusted.
     """
@@ -50,12 +58,17 @@ def expected_precision(network: Network) -> ExpectedPrecision:
     found = Inspection(problem, problem.data.start)
     if not found.determined:
         raise InputError("the planned network is not fully determined; plan more overlap")
-    sigma = lambda Q: np.sqrt(np.clip(np.diagonal(np.asarray(Q), axis1=1, axis2=2), 0, None))
+    operator: Errors = IndependentErrors(found.solution, 1.0)
+    if errors:
+        # of image coordinates as they are expected: components refer to places on the sensor
+        given = with_data(problem, predict(problem, problem.data))
+        operator = stated_errors(Solution(given, given.data.start), given, errors)
+    sigma = lambda C: np.sqrt(np.clip(np.diagonal(np.asarray(C), axis1=1, axis2=2), 0, None))
     points = problem.network.points
     return ExpectedPrecision(
         points.id,
         points.role,
-        sigma(found.point_cofactors),
-        sigma(found.image_cofactors)[:, :3],
+        sigma(operator.covariance("point")),
+        sigma(operator.covariance("image"))[:, :3],
         problem.counts.redundancy,
     )

@@ -9,6 +9,7 @@ from jaxbundle.adjustment.problem import coordinates
 from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.leastsquares.any_distance import is_at_infinity, shares
+from jaxbundle.leastsquares.quality.error_components import Errors
 from jaxbundle.types import present
 
 
@@ -20,7 +21,7 @@ class FarPoints:
     **Attributes:** `id`; `origin` [3] of the directions; `direction` [n, 3], unit
     vectors; `sigma_direction` [n, 2], the semi-axes of its ellipse across the ray, the larger one
     first (radians); `inverse_distance` and its σ (1/object unit), 0 and NaN for a point held at
-    infinity; `at_infinity`. σ are those of the inspection, times `sigma0`.
+    infinity; `at_infinity`. σ are those of the errors of the observations.
     """
 
     id: tuple[str, ...]
@@ -45,7 +46,7 @@ class FarPoints:
         return np.stack([_inverse(w + s), _inverse(np.maximum(w - s, 0.0))], 1)
 
 
-def find_far_points(inspection: Inspection, sigma0: float) -> FarPoints | None:
+def find_far_points(inspection: Inspection, errors: Errors) -> FarPoints | None:
     """The points at any distance of a solution; None if there are none."""
     problem = inspection.problem
     rows = np.flatnonzero(problem.at_any_distance & ~problem.excluded)
@@ -57,11 +58,11 @@ def find_far_points(inspection: Inspection, sigma0: float) -> FarPoints | None:
     X = np.asarray(coordinates(inspection.adjusted))[rows]
     s = present(problem.lengths)[rows]
     across, along = shares(X, s)
-    Q = sigma0**2 * np.asarray(inspection.solution.cofactor("point"))[rows]
-    ellipse = np.linalg.eigvalsh(Q[:, :2, :2])[:, ::-1] * across[:, None] ** 2
+    C = errors.covariance("point")[rows]
+    ellipse = np.linalg.eigvalsh(C[:, :2, :2])[:, ::-1] * across[:, None] ** 2
     there = is_at_infinity(X, s)
     r = np.linalg.norm(X, axis=1)
-    sigma = along * np.sqrt(np.clip(Q[:, 2, 2], 0, None))
+    sigma = along * np.sqrt(np.clip(C[:, 2, 2], 0, None))
     ids = problem.network.points.id
     return FarPoints(
         tuple(ids[p] for p in rows),

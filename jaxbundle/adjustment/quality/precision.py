@@ -13,7 +13,7 @@ second order (weights, P).
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -25,14 +25,16 @@ from jaxtyping import Array, Float, Int
 
 from jaxbundle import cameras
 from jaxbundle.adjustment.problem import NetworkProblem
+from jaxbundle.adjustment.quality.correlated_errors import stated_errors
 from jaxbundle.adjustment.solve import check_given
 from jaxbundle.adjustment.unknowns import angles_near, find_unknowns, value_of
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
 from jaxbundle.leastsquares.indexing.rows import Data, Values
-from jaxbundle.leastsquares.problem import complete_data, with_factor
+from jaxbundle.leastsquares.problem import complete_data, with_data, with_factor
 from jaxbundle.leastsquares.quality.precision import precision as engine_precision
 from jaxbundle.leastsquares.quality.precision import redundancy as engine_redundancy
+from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.leastsquares.spaces import Pose
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
@@ -60,6 +62,7 @@ def precision(
     *,
     names: tuple[tuple[str, str, str], ...] = (),
     sigma0: float | Float[AnyArray, ""] = 1.0,
+    errors: Mapping[str, float] | None = None,
 ) -> Precision:
     """The precision of a design, differentiable to any order.
 
@@ -74,12 +77,16 @@ def precision(
     - `names`: unknowns for the covariance, as in `Adjustment.covariance`:
       `("camera", "cam", "c")`, `("image", "12", "kappa")`, `("point", "7", "Z")`.
     - `sigma0`: of the unit weight; 1: a priori.
+    - `errors`: sizes of errors that image points share, by name as an adjustment lists them
+      (`ErrorModel.sizes`, `error_components` in the JSON), such as
+      `{"principal point by photograph": 0.2}`, in the unit of the images: those of a camera from
+      earlier jobs. Outside of `jax.jit` and derivatives only.
 
     **Returns:** a `Precision`; all NaN if the design leaves unknowns undetermined, or a
     camera has no image of one of its targets.
 
-    **Raises:** `InputError` if no factor of the network fits into memory; `KeyError` for an unknown
-    name.
+    **Raises:** `InputError` if no factor of the network fits into memory, and for unknown `errors`;
+    `KeyError` for an unknown name.
     """
     # Without the factor of the normal matrix there are no cofactors: it is planned for, even where
     # the iterations of an adjustment would do without.
@@ -92,18 +99,47 @@ def precision(
     def named(values: Values) -> Float[Array, " names"]:
         return jnp.stack([value_of(problem, name, values) for name in wanted])
 
+    if errors is not None:
+        return _under_errors(problem, data, named if wanted else None, float(sigma0), errors)
     found = engine_precision(problem, predict(problem, data), named if wanted else None)
-    of_points = problem.cofactors_of_coordinates(data.start["point"], found.own["point"])
+    return _precision_of(problem, data, found.own, found.covariance, sigma0)
+
+
+def _precision_of(
+    problem: NetworkProblem,
+    data: Data,
+    own: Mapping[str, Float[AnyArray, "rows width width"]],
+    covariance: Float[AnyArray, "names names"],
+    sigma0: float | Float[AnyArray, ""],
+) -> Precision:
+    """The precision by the covariance blocks `own` of all tables, for σ0 = 1."""
+    of_points = problem.cofactors_of_coordinates(data.start["point"], own["point"])
     rotation = data.start["image"].rotation
     return Precision(
-        images=_root(image_variances(problem.network.images.angles, rotation, found.own["image"]))
+        images=_root(image_variances(problem.network.images.angles, rotation, own["image"]))
         * sigma0,
-        cameras=_camera_sigma(problem, data.start, found.own) * sigma0,
+        cameras=_camera_sigma(problem, data.start, own) * sigma0,
         points=_root(jnp.diagonal(of_points, axis1=1, axis2=2)) * sigma0,
-        covariance=found.covariance * jnp.square(sigma0),
+        covariance=covariance * jnp.square(sigma0),
         point_covariance=of_points * jnp.square(sigma0),
-        centre_covariance=found.own["image"][:, :3, :3] * jnp.square(sigma0),
+        centre_covariance=own["image"][:, :3, :3] * jnp.square(sigma0),
     )
+
+
+def _under_errors(
+    problem: NetworkProblem,
+    data: Data,
+    named: Callable[[Values], Array] | None,
+    sigma0: float,
+    sizes: Mapping[str, float],
+) -> Precision:
+    """The precision under errors of these sizes that image points share."""
+    given = with_data(problem, predict(problem, data))
+    found = Solution(given, data.start)
+    model = stated_errors(found, given, sizes, sigma0)
+    own = {table.name: model.covariance(table.name) for table in problem.tables}
+    covariance = np.zeros((0, 0)) if named is None else model.propagate(named)
+    return _precision_of(problem, data, own, covariance, 1.0)
 
 
 def redundancy(problem: NetworkProblem, data: Data | None = None) -> dict[str, Float[Array, "n r"]]:
@@ -189,7 +225,7 @@ def image_variances(
 
 
 def _camera_sigma(
-    problem: NetworkProblem, values: Values, own: Mapping[str, Float[Array, "rows k k"]]
+    problem: NetworkProblem, values: Values, own: Mapping[str, Float[AnyArray, "rows k k"]]
 ) -> Float[Array, "cameras parameters"]:
     sigma = jnp.zeros_like(problem.interior_orientation(values))
     for table in problem.cameras:

@@ -22,7 +22,7 @@ of a block that fall into parts.
 """
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -50,6 +50,8 @@ MIN_IMAGES = 3
 # share of a half in the information on a camera, and far above the rounding of the normal
 # equations, 1e-16.
 FAINT = 1e-4
+# Simulations at once: 80 MB of errors for 100 000 rows.
+PORTION = 100
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,12 +94,16 @@ class HalvesDifference:
 class Replication(TableMethods):
     """The result of `replicate`: `by` what the halves were formed, the difference of each split,
     the error `model` of the whole network, and splits that could not be adjusted, with the
-    reason."""
+    reason; `band`: in which the mean d²/n of the covariance of the error model lies with 95 % if
+    the model holds, from simulated errors (None where they were not simulated); `image_unit`: that
+    of the components."""
 
     by: str
     splits: tuple[HalvesDifference, ...]
     failed: tuple[str, ...]
     model: ErrorModel | None
+    band: tuple[float, float] | None = None
+    image_unit: str = "px"
 
     @property
     def dof(self) -> int:
@@ -134,12 +140,18 @@ class Replication(TableMethods):
     @property
     def sentence(self) -> str:
         """The factor in words; why there is none."""
+        what = "jobs" if self.by == "jobs" else f"halves by {self.by}"
         if not self.splits:
-            return f"halves by {self.by} cannot be compared: {'; '.join(self.failed)}"
-        said = f"halves by {self.by} differ by d²/n {self.ratio:.2f} of classical σ"
+            return f"{what} cannot be compared: {'; '.join(self.failed)}"
+        said = f"{what} differ by d²/n {self.ratio:.2f} of classical σ"
         if self.model is not None:
             said += f", {self.ratio_correlated:.2f} of σ under correlated errors"
-        return f"{said} (n = {self.dof}; 1 expected)"
+        return f"{said} (n = {self.dof}; {self.expected} expected)"
+
+    @property
+    def expected(self) -> str:
+        """The d²/n that is expected, in words."""
+        return "1" if self.band is None else f"{self.band[0]:.2f} to {self.band[1]:.2f}"
 
     def table(self) -> dict[str, np.ndarray]:
         """One row a parameter of a split: columns split, camera, parameter, difference, sigma,
@@ -155,12 +167,14 @@ class Replication(TableMethods):
 
     def brief(self) -> dict[str, Any]:
         """`by`, the compared parameters `dof` of a split, and the means of `d2`, `d2_correlated`
-        over the splits, with those of each: as in the JSON of an adjustment."""
+        over the splits, with those of each, and the interval in which the latter is `expected`: as
+        in the JSON of an adjustment."""
         return {
             "by": self.by,
             "dof": self.dof,
             "d2": self.d2,
             "d2_correlated": self.d2_correlated,
+            "expected": None if self.band is None else [self.dof * d2 for d2 in self.band],
             "splits": [
                 {"d2": split.d2, "d2_correlated": split.d2_correlated} for split in self.splits
             ],
@@ -172,18 +186,23 @@ class Replication(TableMethods):
         return self.brief() | {
             "error_components": []
             if self.model is None
-            else [size._asdict() for size in self.model.sizes],
+            else [size.to_dict(self.image_unit) for size in self.model.sizes],
             "parameters": rows_of(self.table()),
         }
 
     def __str__(self) -> str:
         number = count(len(self.splits), "split")
+        what = f"Halves by {self.by}: {number}"
+        if self.by == "jobs":
+            what = f"Jobs of one camera: {count(len(self.splits), 'pair')}"
         lines = [
-            f"Halves by {self.by}: {number}, {count(self.dof, 'parameter')}",
+            f"{what}, {count(self.dof, 'parameter')}",
             f"d²/n with classical σ              {self.ratio:.2f}",
         ]
         if self.model is not None:
             lines.append(f"d²/n with σ of correlated errors   {self.ratio_correlated:.2f}")
+        if self.band is not None:
+            lines.append(f"expected of these, with 95 %       {self.expected}")
         return "\n".join([*lines, *(f"not adjusted: {why}" for why in self.failed)])
 
     def report(self) -> str:
@@ -211,7 +230,12 @@ def random_halves(
     """Which image points belong to the second half, for every split."""
     rng, rays = np.random.default_rng(seed), network.observations
     if by == "runs":
-        yield rays.image >= len(network.images) // 2
+        # of each camera by itself: photographs of several may follow each other
+        camera, later = network.images.camera, np.zeros(len(network.images), bool)
+        for c in np.unique(camera):
+            own = np.flatnonzero(camera == c)
+            later[own[len(own) // 2 :]] = True
+        yield later[rays.image]
         return
     number, of = (
         (len(network.points), rays.point) if by == "points" else (len(network.images), rays.image)
@@ -233,6 +257,28 @@ def compare_halves(
 
     **Raises:** `NotSolvedError` if a half has too few photographs, or is not determined.
     """
+    return difference_of(whole, *effects_of_halves(whole, problem, second), model)
+
+
+def difference_of(
+    whole: Solution,
+    names: tuple[tuple[str, str], ...],
+    effects: Float[np.ndarray, "n rows"],
+    model: ErrorModel | None,
+) -> HalvesDifference:
+    """The difference of two halves from its `effects_of_halves`."""
+    correlated = None if model is None else model.of_effects(effects)
+    difference = -effects @ stack_rows(whole, whole.residuals)
+    return HalvesDifference(names, difference, whole.sigma0**2 * effects @ effects.T, correlated)
+
+
+def effects_of_halves(
+    whole: Solution, problem: NetworkProblem, second: Bool[np.ndarray, " rays"]
+) -> tuple[tuple[tuple[str, str], ...], Float[np.ndarray, "n rows"]]:
+    """Camera and name of the parameters that both halves determine, and D of their differences: the
+    effects of one σ of every observation.
+
+    **Raises:** `NotSolvedError` as `compare_halves`."""
     halves = [problem.used & ~second, problem.used & second]
     names = compared_parameters(problem, halves)
     if not names:
@@ -249,12 +295,35 @@ def compare_halves(
             raise NotSolvedError("a half does not determine its unknowns")
         of_half = effects(alone, _unit_rows(problem, names))
         D.append(of_half * _row_scale(whole, problem, scale))
-    between = D[0] - D[1]
-    white = between @ between.T
-    correlated = None if model is None else model.of_effects(between)
-    found = tuple((camera, name) for camera, name, _ in names)
-    difference = -between @ stack_rows(whole, whole.residuals)
-    return HalvesDifference(found, difference, whole.sigma0**2 * white, correlated)
+    return tuple((camera, name) for camera, name, _ in names), D[0] - D[1]
+
+
+def expected_band(
+    model: ErrorModel,
+    effects: Sequence[Float[np.ndarray, "n rows"]],
+    draws: int = 400,
+    seed: int = 0,
+) -> tuple[float, float]:
+    """The interval in which the mean d²/n of some splits lies with 95 % if the error model holds:
+    errors drawn from it, with the sizes estimated again from each draw.
+
+    **Arguments:** `effects`: D of the difference of each split; `draws`: the quantile of 2.5 % of
+    400 is the tenth value, known to a third of the distance to the mean."""
+    rng = np.random.default_rng(seed)
+    parts = [model.parts_of(D) for D in effects]
+    ratios = []
+    for first in range(0, draws, PORTION):
+        errors, theta = model.draw(min(PORTION, draws - first), rng)
+        of_splits = [
+            [
+                squared_difference(D @ e, np.tensordot(t, C, 1)) / len(D)
+                for D, C in zip(effects, parts)
+            ]
+            for e, t in zip(errors, theta)
+        ]
+        ratios += np.mean(of_splits, 1).tolist()
+    low, high = np.quantile(ratios, [0.025, 0.975])
+    return float(low), float(high)
 
 
 def compared_parameters(

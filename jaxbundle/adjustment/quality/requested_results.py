@@ -18,6 +18,7 @@ from jaxbundle.arguments import show
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.indexing.rows import Values
+from jaxbundle.leastsquares.quality.error_components import Errors
 from jaxbundle.leastsquares.quality.names import Name
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.system.programs import compile_once
@@ -46,19 +47,20 @@ class RequestedResult:
 
 @dataclasses.dataclass(frozen=True)
 class RequestedResults:
-    """The requested `function(values) -> [numbers]`, and the σ of each result for σ0 = 1."""
+    """The requested `function(values) -> [numbers]`, and the σ of each result."""
 
     asked: tuple[RequestedResult, ...]
     function: Callable[[Values], jax.Array]
     sigma: Float[np.ndarray, " results"]
 
 
-def request_results(inspection: Inspection, of: Any = WORDS) -> RequestedResults:
-    """The named results: words, KIND:ID:NAME (a text or a tuple), or a function of `Values`.
+def request_results(inspection: Inspection, errors: Errors, of: Any = WORDS) -> RequestedResults:
+    """The named results: words, KIND:ID:NAME (a text or a tuple), or a function of `Values`; their
+    σ by the errors of the observations.
 
     **Raises:** `InputError` for an unknown name, or if nothing is left."""
     if callable(of):
-        return _of_function(inspection, of)
+        return _of_function(errors, of)
     single = isinstance(of, tuple) and len(of) == 3 and of[0] in ("camera", "image", "point")
     given = (of,) if isinstance(of, str) or single else of
     if not isinstance(given, Sequence):
@@ -68,7 +70,7 @@ def request_results(inspection: Inspection, of: Any = WORDS) -> RequestedResults
     parts, asked, sigmas, first = [], [], [], 0
     words = given == WORDS
     for one in given:
-        found = _part(inspection, one)
+        found = _part(inspection, errors, one)
         if found is None:
             if words:
                 continue
@@ -87,7 +89,7 @@ def request_results(inspection: Inspection, of: Any = WORDS) -> RequestedResults
 
 class _Part(NamedTuple):
     """A `function` of the values that gives `size` numbers; name, words and whether it is an angle
-    of each result that is made of them; the σ of these results for σ0 = 1. With fewer results than
+    of each result that is made of them; the σ of these results. With fewer results than
     numbers, the numbers are rows of an image or point: every result takes one column of them."""
 
     function: Callable[[Values], Float[AnyArray, " size"]]
@@ -96,15 +98,15 @@ class _Part(NamedTuple):
     sigma: Float[np.ndarray, " results"]
 
 
-def _part(inspection: Inspection, one: Any) -> _Part | None:
+def _part(inspection: Inspection, errors: Errors, one: Any) -> _Part | None:
     """The results of a word or a name; None if all of them are held."""
     problem = inspection.problem
     if one == CAMERAS:
-        return _of_cameras(inspection)
+        return _of_cameras(inspection, errors)
     if one == IMAGES:
-        return _of_images(inspection)
+        return _of_images(inspection, errors)
     if one == POINTS:
-        return _of_points(inspection)
+        return _of_points(inspection, errors)
     name = Name(*split_name(one))
     try:
         value_of(problem, name, inspection.adjusted)
@@ -112,22 +114,23 @@ def _part(inspection: Inspection, one: Any) -> _Part | None:
         raise InputError(f"of: {error.args[0]}") from None
     require_located(problem, name)
     function = lambda values: jnp.atleast_1d(value_of(problem, name, values))
-    sigma = np.sqrt(np.clip(np.diagonal(inspection.propagate(function)), 0, None))
+    sigma = np.sqrt(np.clip(np.diagonal(errors.propagate(function)), 0, None))
     angle = name.kind == "image" and name.parameter in EXTERIOR[3:]
     return _Part(function, [(":".join(split_name(one)), str(name), angle)], 1, sigma)
 
 
-def _of_cameras(inspection: Inspection) -> _Part | None:
+def _of_cameras(inspection: Inspection, errors: Errors) -> _Part | None:
     problem, places, names, sigmas = inspection.problem, [], [], []
     for c, camera in enumerate(problem.network.cameras):
         parameters, free = problem.free_parameters(c)
         every = get_model(camera.model).parameters
-        Q = inspection.camera_cofactors[c]
+        table, row = problem.table_of_camera(c)
+        C = errors.covariance(table.name)[row]
         for k in free:
             places.append((c, every.index(parameters[k])))
             name = Name("camera", camera.id, parameters[k])
             names.append((f"camera:{camera.id}:{parameters[k]}", str(name), False))
-            sigmas.append(np.sqrt(max(Q[k, k], 0.0)))
+            sigmas.append(np.sqrt(max(C[k, k], 0.0)))
     if not places:
         return None
     rows, columns = np.array(places).T
@@ -137,7 +140,7 @@ def _of_cameras(inspection: Inspection) -> _Part | None:
     )
 
 
-def _of_images(inspection: Inspection) -> _Part | None:
+def _of_images(inspection: Inspection, errors: Errors) -> _Part | None:
     problem = inspection.problem
     rows = np.flatnonzero((problem.table("image").free > 0).any(1))
     if not len(rows):
@@ -151,7 +154,7 @@ def _of_images(inspection: Inspection) -> _Part | None:
 
     angles, rotation = problem.network.images.angles, inspection.adjusted["image"].rotation
     # The mean variance over all images, not the variance of a mean: the RMS σ of an image.
-    variance = _variances(angles, rotation, inspection.image_cofactors)
+    variance = _variances(angles, rotation, errors.covariance("image"))
     variance = np.asarray(variance)[rows]
     names = [(f"images:{p}", f"{p} of images, RMS", p in EXTERIOR[3:]) for p in EXTERIOR]
     return _Part(poses, names, 6 * len(rows), np.sqrt(np.clip(variance.mean(0), 0, None)))
@@ -160,20 +163,22 @@ def _of_images(inspection: Inspection) -> _Part | None:
 _variances = compile_once(image_variances, ())
 
 
-def _of_points(inspection: Inspection) -> _Part | None:
+def _of_points(inspection: Inspection, errors: Errors) -> _Part | None:
     problem = inspection.problem
     rows = np.flatnonzero((problem.table("point").free > 0).any(1))
     if not len(rows):
         return None
-    variance = np.diagonal(inspection.point_cofactors[rows], axis1=1, axis2=2)
+    # of far points those of the engine are of direction and inverse distance
+    C = problem.cofactors_of_coordinates(inspection.adjusted["point"], errors.covariance("point"))
+    variance = np.diagonal(np.asarray(C)[rows], axis1=1, axis2=2)
     names = [(f"points:{axis}", f"{axis} of points, RMS", False) for axis in "XYZ"]
     sigma = np.sqrt(np.clip(variance.mean(0), 0, None))
     return _Part(lambda values: coordinates(values)[rows].ravel(), names, 3 * len(rows), sigma)
 
 
-def _of_function(inspection: Inspection, of: Callable[..., Any]) -> RequestedResults:
+def _of_function(errors: Errors, of: Callable[..., Any]) -> RequestedResults:
     function = lambda values: jnp.ravel(of(values))
-    sigma = np.sqrt(np.clip(np.diagonal(inspection.propagate(function)), 0, None))
+    sigma = np.sqrt(np.clip(np.diagonal(errors.propagate(function)), 0, None))
     number = range(len(sigma))
     asked = tuple(
         RequestedResult(str(k + 1), f"result {k + 1}", False, slice(k, k + 1)) for k in number

@@ -19,12 +19,14 @@ from jaxbundle.calibration.result import Calibration
 from jaxbundle.calibration.rig.advice import advise_rig
 from jaxbundle.calibration.rig.connections import Connections
 from jaxbundle.calibration.rig.declare import Rig, used_rays
+from jaxbundle.calibration.rig.errors import rig_errors
 from jaxbundle.calibration.rig.mounting import POSE, Mounting, mounting_of, placement_of
 from jaxbundle.calibration.rig.quality import rig_coverage, rig_points, rig_uncertainty
 from jaxbundle.cameras import get_model
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.io.networks.rig_result import network_of_rig
 from jaxbundle.leastsquares import Result
+from jaxbundle.leastsquares.quality.error_components import ErrorModel, Errors, IndependentErrors
 from jaxbundle.network.blunders import Removed, either_of
 from jaxbundle.network.tables import EXTERIOR, Camera, Network, units_of
 from jaxbundle.results import TableMethods
@@ -47,6 +49,8 @@ class RigCalibration(TableMethods):
       body that nothing relates; `advice`;
     - `epochs`; `left_out`, and `contradicting` ones that were kept: epoch and reason; `removed` by
       data snooping; `residuals`: a table like that of an `Adjustment`; `rms` (pixels) by camera;
+    - `error_model`: of errors that image points share; `covariance`, `mountings`, `placements` and
+      `uncertainty` are under it, `sigma` and `classical_mountings` are not;
     - `rig`: the input, `result`: that of the engine (`jaxbundle.leastsquares.Result`); `sigma0`,
       `redundancy`, `converged`.
     """
@@ -65,7 +69,7 @@ class RigCalibration(TableMethods):
     ):
         self.cameras, self.rig, self.result = cameras, rig, result
         self._maps: dict[tuple, UncertaintyMap] = {}
-        self._covariances: dict[tuple[str, ...], np.ndarray] = {}
+        self._covariances: dict[tuple, np.ndarray] = {}
         self.left_out, self.contradicting = tuple(left_out), tuple(contradicting)
         self.ties = () if connections is None else connections.ties
         self.separate = () if connections is None else connections.separate
@@ -204,19 +208,57 @@ class RigCalibration(TableMethods):
 
     @functools.cached_property
     def sigma(self) -> dict[str, dict[str, float]]:
-        """σ of the free parameters of every camera, a posteriori."""
+        """Classical σ of the free parameters of every camera, a posteriori."""
+        return self._sigma(classical=True)
+
+    @functools.cached_property
+    def correlated_sigma(self) -> dict[str, dict[str, float]]:
+        """`sigma` under the error model; the same without one."""
+        return self._sigma(classical=False)
+
+    @property
+    def stated_sigma(self) -> dict[str, dict[str, float]]:
+        """The larger of both, which is shown."""
+        return {
+            name: {n: max(s, self.correlated_sigma[name][n]) for n, s in found.items()}
+            for name, found in self.sigma.items()
+        }
+
+    def _sigma(self, classical: bool) -> dict[str, dict[str, float]]:
         found = {}
         for k, name in enumerate(self.names):
             table = self.result.problem.table(self.rig.row_of(k)[0])
-            sigma = np.sqrt(np.clip(np.diagonal(self.covariance(name))[POSE:], 0, None)).tolist()
+            C = self.covariance(name, classical=classical)
+            sigma = np.sqrt(np.clip(np.diagonal(C)[POSE:], 0, None)).tolist()
             free = self.rig.cameras[k].free
             found[name] = {n: s for n, s in zip(table.parameters, sigma) if n in free}
         return found
 
-    def covariance(self, *names: str) -> Float[np.ndarray, "k k"]:
+    @functools.cached_property
+    def error_model(self) -> ErrorModel | None:
+        """Errors that image points share, if they were looked for in the cameras by themselves;
+        None where they cannot be found."""
+        settings = [one.adjustment.correlations for one in self.cameras.values()]
+        if not self.converged or any(one is None for one in settings):
+            return None
+        return rig_errors(self.rig, self.result.solution, present(settings[0]))
+
+    @functools.cached_property
+    def errors(self) -> Errors:
+        """The covariance of everything that follows from the observations: by the error model where
+        there is one, else of independent errors."""
+        return self.error_model or self._independent
+
+    @property
+    def _independent(self) -> IndependentErrors:
+        return IndependentErrors(self.result.solution, self.sigma0**2)
+
+    def covariance(self, *names: str, classical: bool = False) -> Float[np.ndarray, "k k"]:
         """The joint covariance of cameras: for each the mounting (δb, δθ) and the parameters that
-        are free in some camera of its model; zero for held ones."""
-        if names not in self._covariances:
+        are free in some camera of its model; zero for held ones. `classical`: of independent
+        errors, also where an error model is known."""
+        key = (classical or self.error_model is None, *names)
+        if key not in self._covariances:
             problem = self.result.problem
             places = [
                 (self.names.index(name), *self.rig.row_of(self.names.index(name))) for name in names
@@ -229,17 +271,26 @@ class RigCalibration(TableMethods):
                 rows[table][start + POSE : start + width, row] = np.eye(width - POSE)
             # unit rows for the wanted unknowns: only these columns of the cofactor matrix are
             # computed
-            Q = self.result.solution.propagate_rows(rows)
-            self._covariances[names] = self.sigma0**2 * Q
-        return self._covariances[names]
+            errors = self._independent if classical else self.errors
+            self._covariances[key] = errors.propagate_rows(rows)
+        return self._covariances[key]
 
     @functools.cached_property
     def mountings(self) -> dict[str, Mounting]:
         """The mounting of every camera but the reference, the first."""
+        return self._mountings(classical=False)
+
+    @functools.cached_property
+    def classical_mountings(self) -> dict[str, Mounting]:
+        """`mountings` with the covariance of independent errors."""
+        return self._mountings(classical=True)
+
+    def _mountings(self, classical: bool) -> dict[str, Mounting]:
         found = {}
         for k, name in enumerate(self.names[1:], 1):
             at = jax.tree.map(lambda x, k=k: x[k], self.values("mounting"))
-            found[name] = mounting_of(at, self.covariance(name)[:POSE, :POSE])
+            C = self.covariance(name, classical=classical)
+            found[name] = mounting_of(at, C[:POSE, :POSE])
         return found
 
     @functools.cached_property
@@ -250,7 +301,7 @@ class RigCalibration(TableMethods):
         if self.rig.place is None:
             return {}
         centroids = present(self.rig.centroids)
-        covariance, values = self.result["board"].covariance, self.values("board")
+        covariance, values = self.errors.covariance("board"), self.values("board")
         return {
             name: placement_of(
                 jax.tree.map(lambda x, j=j: x[j], values),

@@ -88,7 +88,8 @@ def result_dict(adjustment: "Adjustment", brief: bool = False) -> dict:
     if adjustment.control_prediction is not None:
         head |= {"control_prediction": _predicted(adjustment)}
     if adjustment.error_model is not None:
-        head |= {"error_components": [size._asdict() for size in adjustment.error_model.sizes]}
+        sizes, unit = adjustment.error_model.sizes, adjustment.image_unit
+        head |= {"error_components": [size.to_dict(unit) for size in sizes]}
         head |= {"sigma_ratio": adjustment.sigma_ratio}
     if adjustment.replication is not None:
         head |= {"replication": adjustment.replication.brief()}

@@ -28,13 +28,13 @@ what its residuals should show.
 """
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxbundle.leastsquares.datum.conditions import (
     of_groups,
@@ -54,6 +54,7 @@ from jaxbundle.leastsquares.indexing.rows import (
     prepare,
     restore_order,
 )
+from jaxbundle.leastsquares.quality.distributions import level_of_one, normal_quantile
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import present
@@ -72,9 +73,13 @@ class ErrorComponent(NamedTuple):
     root: Any
 
 
+# The unit of components in that of image coordinates.
+IMAGE = "image"
 # The name of a component whose size is not estimated: independent errors of some rows, σ0 times
 # their a priori σ; its θ is added to that of all independent errors.
 OTHERS = "other observations"
+# That of the independent part, in units of the a priori σ.
+INDEPENDENT = "independent errors"
 
 
 class ErrorSize(NamedTuple):
@@ -87,6 +92,18 @@ class ErrorSize(NamedTuple):
     sigma: float
     score: float
 
+    def to_dict(self, image_unit: str) -> dict[str, str | float]:
+        """As in JSON: `sigma` is the size, the standard deviation of the effect of the component
+        on an observation; `sigma_of_sigma` that of the estimate."""
+        unit = image_unit if self.unit == IMAGE else self.unit
+        return {
+            "name": self.name,
+            "sigma": self.size,
+            "unit": unit,
+            "score": self.score,
+            "sigma_of_sigma": self.sigma,
+        }
+
 
 @dataclasses.dataclass(frozen=True)
 class ErrorSettings:
@@ -95,38 +112,118 @@ class ErrorSettings:
     - `max_columns`: roots of more columns are replaced by random combinations: a column is a
       solution of the normal equations (10 ms for 60 images and 26 000 points), so that these take
       ten seconds.
+    - `significance`: a component is left out if its size could be chance (one-sided, at this level
+      for all components together). θ ≥ 0 makes chance add to σ, never take from them: 18 % to those
+      of the stations of twelve photographs with independent errors if all θ > 0 are taken, 10 % at
+      this level for each of them, 3 % for all together.
     - `draws`: their number. Variances from 100 are right to √(2/100) = 14 %, σ to 7 %.
     - `seed`: of the combinations.
     """
 
     max_columns: int = 1000
+    significance: float = 0.05
     draws: int = 100
     seed: int = 0
+
+    def critical(self, components: int) -> float:
+        """The quantile of the normal distribution that a θ must exceed, in its σ."""
+        return normal_quantile(1 - level_of_one(self.significance, components))
 
 
 DEFAULTS = ErrorSettings()
 
 
 @dataclasses.dataclass(frozen=True)
+class SizeEquations:
+    """T·θ = q of an error model; `has_others`: the last component is `OTHERS`, whose θ follows
+    from σ0² = q_0/T_00; `critical`: components with a smaller θ over its σ are left out."""
+
+    T: Float[np.ndarray, "k k"]
+    has_others: bool
+    critical: float = 0.0
+
+    @property
+    def reduced(self) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "m k"]]:
+        """T of the estimated sizes, and the matrix that gives their q."""
+        part = np.eye(len(self.T))
+        if not self.has_others:
+            return self.T, part
+        # V_0 without the given rows, whose part of the forms is known
+        part[-1, 0] = -1
+        T = part.T @ self.T @ part
+        onto = part.T[:-1].copy()
+        onto[:, 0] -= T[:-1, -1] / self.T[0, 0]
+        return T[:-1, :-1], onto
+
+    def solve(
+        self, q: Float[np.ndarray, " k"]
+    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+        """θ ≥ 0 and the scores, of all components."""
+        T, onto = self.reduced
+        forms = onto @ q
+        theta, score = _significant(T, forms, self.critical), _scores(T, forms)
+        if self.has_others:
+            theta = np.append(theta, q[0] / self.T[0, 0] - theta[0])
+            score = np.append(score, 0.0)
+        return theta, score
+
+
+@dataclasses.dataclass(frozen=True)
+class IndependentErrors:
+    """The classical covariance of a solved problem: independent observations with σ times one
+    factor, of which `variance` is the square. It answers what an `ErrorModel` answers."""
+
+    found: Solution
+    variance: float
+
+    def covariance(self, table: str) -> Float[np.ndarray, "rows width width"]:
+        """The covariance blocks of all rows of a table."""
+        return self.variance * np.asarray(self.found.cofactor(table))
+
+    def propagate_rows(
+        self, rows: Mapping[str, Float[np.ndarray, "n rows width"]]
+    ) -> Float[np.ndarray, "n n"]:
+        """The covariance of linear functions of the changes of tables (`Solution.slopes`)."""
+        return self.variance * self.found.propagate_rows(rows)
+
+    def propagate(self, function: Callable[[Values], Array]) -> Float[np.ndarray, "n n"]:
+        """The covariance of a differentiable function (`Values` → [n]) of the unknowns."""
+        return self.variance * self.found.propagate(function)
+
+    def joint_covariance(
+        self, table: str, rows: Sequence[int]
+    ) -> Float[np.ndarray, "n width n width"]:
+        """The covariance of some rows of a table among each other."""
+        return self.variance * self.found.joint_cofactors(table, rows)
+
+
+@dataclasses.dataclass(frozen=True)
 class ErrorModel:
     """The covariance of the observations of a solved problem. `theta` [k]: of the independent part
-    and of the `components`; `own`: by table the blocks [rows, width, width] of the covariance of
-    the unknowns that a component of θ = 1 gives, in the order of `components`."""
+    and of the `components`, with their covariance; `own`: by table the blocks [rows, width, width]
+    of the covariance of the unknowns that a component of θ = 1 gives, in the order of `components`;
+    `equations` of the θ, None where they are stated."""
 
     found: Solution
     components: tuple[ErrorComponent, ...]
     theta: Float[np.ndarray, " k"]
-    theta_sigma: Float[np.ndarray, " k"]
+    theta_covariance: Float[np.ndarray, "k k"]
     score: Float[np.ndarray, " k"]
     own: tuple[dict[str, Float[np.ndarray, "rows width width"]], ...]
+    equations: SizeEquations | None = None
+
+    @property
+    def theta_sigma(self) -> Float[np.ndarray, " k"]:
+        """σ of the θ."""
+        return np.sqrt(np.diag(self.theta_covariance))
 
     @property
     def sizes(self) -> tuple[ErrorSize, ...]:
         """√θ of the independent part, as a factor of the a priori σ, and of all components."""
-        names = [("independent errors", "σ"), *((c.name, c.unit) for c in self.components)]
+        names = [(INDEPENDENT, "σ"), *((c.name, c.unit) for c in self.components)]
         names = [one for one in names if one[0] != OTHERS]
         # σ of √θ: σ_θ/(2√θ), but at most √σ_θ, its value at θ = 0
-        theta, spread = self.theta[: len(names)], self.theta_sigma[: len(names)]
+        theta, spread = (x[: len(names)] for x in (self.theta, self.theta_sigma))
         root, most = np.sqrt(theta), np.sqrt(spread)
         sigma = np.minimum(spread, 2 * root * most) / np.where(root > 0, 2 * root, 1.0)
         sigma = np.where(root > 0, sigma, most)
@@ -146,14 +243,75 @@ class ErrorModel:
         """The covariance of linear functions of the changes of tables (`Solution.slopes`)."""
         return self.of_effects(effects(self.found, rows))
 
+    def propagate(self, function: Callable[[Values], Array]) -> Float[np.ndarray, "n n"]:
+        """The covariance of a differentiable function (`Values` → [n]) of the unknowns."""
+        slopes = self.found.slopes(function)
+        return self.propagate_rows({table: np.asarray(x) for table, x in slopes.items()})
+
+    def joint_covariance(
+        self, table: str, rows: Sequence[int]
+    ) -> Float[np.ndarray, "n width n width"]:
+        """The covariance of some rows of a table among each other."""
+        given = self.found.problem.table(table)
+        width, number = given.space.width, len(rows) * given.space.width
+        one = np.zeros((number, given.rows, width))
+        one[np.arange(number), np.repeat(rows, width), np.tile(np.arange(width), len(rows))] = 1.0
+        return self.propagate_rows({table: one}).reshape(len(rows), width, len(rows), width)
+
+    def draw(
+        self, number: int, rng: np.random.Generator
+    ) -> tuple[Float[np.ndarray, "n rows"], Float[np.ndarray, "n k"]]:
+        """Normal errors of all rows with this covariance, and the θ that would be estimated from
+        the residuals they leave."""
+        size = len(stack_rows(self.found, self.found.residuals))
+        _, independent = _independent_part(self.components, self.theta, size)
+        errors = np.sqrt(independent) * rng.standard_normal((number, size))
+        for t, component in zip(self.theta[1:], self.components):
+            if t > 0 and component.name != OTHERS:
+                z = rng.standard_normal((component.root.shape[1], number))
+                errors += np.sqrt(t) * np.asarray(component.root @ z).T
+        forms = quadratic_forms(self.components, remove_fit(self.found, errors)[0])
+        return errors, np.array([present(self.equations).solve(q)[0] for q in forms])
+
+    def covariances_of_residuals(self, rows: Int[np.ndarray, "n k"]) -> Float[np.ndarray, "n k k"]:
+        """The covariance M·Σ·M of the residuals of groups of rows (`first_rows`), in units of their
+        a priori σ."""
+        size = len(stack_rows(self.found, self.found.residuals))
+        (n, k), found = rows.shape, np.zeros((*rows.shape, rows.shape[1]))
+        # so many columns have 80 MB for 100 000 rows
+        together = max(100 // k, 1)
+        for first in range(0, n, together):
+            some = rows[first : first + together]
+            unit = np.zeros((some.size, size))
+            unit[np.arange(some.size), some.ravel()] = 1.0
+            C = self.of_effects(remove_fit(self.found, unit)[0]).reshape(len(some), k, len(some), k)
+            number = np.arange(len(some))
+            found[first : first + together] = C[number, :, number]
+        return found
+
     def of_effects(self, D: Float[np.ndarray, "n rows"]) -> Float[np.ndarray, "n n"]:
         """The covariance D·Σ·Dᵀ of linear functions D of the errors, in units of their σ."""
         C = self.theta[0] * D @ D.T
-        for theta, component in zip(self.theta[1:], self.components):
-            if theta != 0:
-                B = np.asarray(component.root.T @ D.T)
-                C = C + theta * B.T @ B
+        for t, component in zip(self.theta[1:], self.components):
+            if t != 0:
+                C = C + t * _of_component(component, D)
         return C
+
+    def parts_of(self, D: Float[np.ndarray, "n rows"]) -> Float[np.ndarray, "k n n"]:
+        """D·V_k·Dᵀ of the independent part and of every component."""
+        return np.stack([D @ D.T, *(_of_component(c, D) for c in self.components)])
+
+
+def _of_component(
+    component: ErrorComponent, D: Float[np.ndarray, "n rows"]
+) -> Float[np.ndarray, "n n"]:
+    """D·V·Dᵀ of V = F·Fᵀ."""
+    B = np.asarray(component.root.T @ D.T)
+    return B.T @ B
+
+
+# What gives the covariance of functions of the unknowns.
+Errors = ErrorModel | IndependentErrors
 
 
 def fit_error_model(
@@ -163,41 +321,82 @@ def fit_error_model(
     rng = np.random.default_rng(settings.seed)
     F, number = [component.root.tocsr() for component in components], len(components) + 1
     v = stack_rows(found, found.residuals)
-    T, q = np.zeros((number, number)), np.zeros(number)
-    T[0, 0], q[0] = found.problem.counts.redundancy, v @ v
+    T = np.zeros((number, number))
+    T[0, 0] = found.problem.counts.redundancy
     own: list[dict[str, np.ndarray]] = []
     for k, root in enumerate(F, 1):
-        q[k] = np.sum((root.T @ v) ** 2)
         blocks: dict[str, np.ndarray] = {}
         for columns in _columns(root, settings, rng):
             remaining, changes = remove_fit(found, columns)
             T[0, k] += np.sum(columns * remaining)
             T[1:, k] += [np.sum((other.T @ remaining.T) ** 2) for other in F]
-            for table, x in changes.items():
-                more = np.einsum("cni,cnj->nij", x, x)
-                blocks[table] = blocks[table] + more if table in blocks else more
+            _add_squares(blocks, changes)
         T[k, 0] = T[0, k]
         own.append(blocks)
     # random combinations, on one side of the traces, make it unsymmetric
     T[1:, 1:] = (T[1:, 1:] + T[1:, 1:].T) / 2
-    given = np.zeros(len(v), bool)
-    if components and components[-1].name == OTHERS:
-        # V_0 without the given rows, whose part of the forms is known
-        given[F[-1].nonzero()[0]] = True
-        F = F[:-1]
-        part = np.eye(number)
-        part[-1, 0] = -1
-        T, q = part.T @ T @ part, part.T @ q
-        T, q = T[:-1, :-1], q[:-1] - found.sigma0**2 * T[:-1, -1]
-    theta = _nonnegative(T, q)
-    score = _scores(T, q)
-    independent = np.where(given, found.sigma0**2, theta[0])
-    covariance = _covariance_of_sizes(found, F, theta, independent, given, T, rng)
-    sigma = np.sqrt(np.diag(covariance))
-    if given.any():
-        more = found.sigma0**2 - theta[0], 0.0, 0.0
-        theta, sigma, score = (np.append(x, y) for x, y in zip((theta, sigma, score), more))
-    return ErrorModel(found, tuple(components), theta, sigma, score, tuple(own))
+    has_others = _has_others(components)
+    critical = settings.critical(len(components) - has_others)
+    system = SizeEquations(T, has_others, critical)
+    theta, score = system.solve(quadratic_forms(components, v))
+    given, independent = _independent_part(components, theta, len(v))
+    F = F[: len(F) - system.has_others]
+    estimated = theta[: len(F) + 1]
+    covariance = _covariance_of_sizes(
+        found, F, estimated, independent, given, system.reduced[0], rng
+    )
+    if system.has_others:
+        # θ of the given rows is σ0² − θ_0, so that their sum is σ0² whatever θ_0 is
+        onto = np.concatenate([np.eye(len(covariance)), -np.eye(len(covariance))[:1]])
+        covariance = onto @ covariance @ onto.T
+    return ErrorModel(found, tuple(components), theta, covariance, score, tuple(own), system)
+
+
+def stated_error_model(
+    found: Solution,
+    components: Sequence[ErrorComponent],
+    theta: Float[np.ndarray, " k"],
+    settings: ErrorSettings = DEFAULTS,
+) -> ErrorModel:
+    """The error model of components of known sizes, such as those of a camera from earlier jobs, in
+    a solution or a design; `theta`: of the independent part and of the components."""
+    rng, own = np.random.default_rng(settings.seed), []
+    for t, component in zip(theta[1:], components):
+        blocks: dict[str, np.ndarray] = {}
+        for columns in _columns(component.root.tocsr(), settings, rng) if t > 0 else ():
+            _add_squares(blocks, remove_fit(found, columns)[1])
+        own.append(blocks)
+    none = np.zeros(len(theta))
+    return ErrorModel(found, tuple(components), theta, np.diag(none), none, tuple(own))
+
+
+def _add_squares(blocks: dict[str, np.ndarray], changes: Mapping[str, np.ndarray]) -> None:
+    """Add the blocks of X·Xᵀ of some columns of X."""
+    for table, x in changes.items():
+        more = np.einsum("cni,cnj->nij", x, x)
+        blocks[table] = blocks[table] + more if table in blocks else more
+
+
+def _has_others(components: Sequence[ErrorComponent]) -> bool:
+    return bool(components) and components[-1].name == OTHERS
+
+
+def _independent_part(
+    components: Sequence[ErrorComponent], theta: Float[np.ndarray, " k"], size: int
+) -> tuple[Bool[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:
+    """Which rows are those of `OTHERS`; the variances of the independent errors of all rows."""
+    given = np.zeros(size, bool)
+    if _has_others(components):
+        given[components[-1].root.nonzero()[0]] = True
+    return given, np.where(given, theta[0] + theta[-1], theta[0])
+
+
+def quadratic_forms(
+    components: Sequence[ErrorComponent], v: Float[np.ndarray, "*draws rows"]
+) -> Float[np.ndarray, "*draws k"]:
+    """q of residuals v: vᵀv, and vᵀV_k·v of the components."""
+    of = lambda root: np.sum(np.asarray(root.T @ v.T) ** 2, 0)
+    return np.stack([np.sum(v**2, -1), *(of(c.root) for c in components)], -1)
 
 
 def _columns(
@@ -232,6 +431,26 @@ def _nonnegative(
     L = E[:, some] * np.sqrt(w[some])
     right = (E[:, some].T @ (q / scale)) / np.sqrt(w[some])
     return nnls(L.T, right)[0] / scale
+
+
+def _significant(
+    T: Float[np.ndarray, "k k"], q: Float[np.ndarray, " k"], critical: float
+) -> Float[np.ndarray, " k"]:
+    """θ ≥ 0 of the components whose θ is at least `critical` times the σ that it has in the system
+    of all that are left, if errors are independent; the least significant is left out first."""
+    # the mean square of all residuals: θ_0 may be zero, where others are in every observation
+    kept, white = np.arange(len(q)), max(q[0] / T[0, 0], 0.0)
+    while True:
+        part = T[np.ix_(kept, kept)]
+        theta = _nonnegative(part, q[kept])
+        # the covariance of q is 2·T·σ0⁴ for independent errors
+        sigma = white * np.sqrt(2 * np.diag(np.linalg.pinv(part, 1e-10, hermitian=True)))
+        short = theta[1:] < critical * sigma[1:]
+        if not short.any():
+            found = np.zeros(len(q))
+            found[kept] = theta
+            return found
+        kept = np.delete(kept, 1 + np.argmin(theta[1:] / np.maximum(sigma[1:], 1e-300)))
 
 
 def _scores(T: Float[np.ndarray, "k k"], q: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:

@@ -196,6 +196,7 @@ def correlated_errors(adjustment: "Adjustment") -> Iterator[Section]:
     elif adjustment.error_model is not None:
         parts = [
             grid(correlated.COMPONENT_HEADER, correlated.component_rows(adjustment)),
+            *(paragraph(said) for said in correlated.remarks(adjustment)),
             paragraph(correlated.LEGEND),
         ]
         if words := correlated.not_looked_for(adjustment):

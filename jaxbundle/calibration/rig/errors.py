@@ -1,0 +1,64 @@
+"""Errors that image points of a rig share, as of one camera
+(`adjustment.quality.correlated_errors`): photographs are those of a camera at an epoch."""
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbundle.adjustment.quality.correlated_errors import (
+    CorrelationSettings,
+    ImageRows,
+    StationsAndPoints,
+    components_of,
+    with_others,
+)
+from jaxbundle.calibration.rig.declare import Rig, used_rays
+from jaxbundle.geometry import matrix_from_quaternion
+from jaxbundle.leastsquares.quality.error_components import (
+    ErrorModel,
+    first_rows,
+    fit_error_model,
+    stack_rows,
+)
+from jaxbundle.leastsquares.solution import Solution
+from jaxbundle.system.programs import compile_once
+from jaxbundle.types import AnyArray
+
+
+def rig_errors(rig: Rig, found: Solution, settings: CorrelationSettings) -> ErrorModel | None:
+    """The error model of an adjusted rig; None where its image points cannot show any component."""
+    starts, row = first_rows(found), np.zeros(len(rig.xy), int)
+    for table, own in rig.sets:
+        row[own] = starts[table.image_set] + 2 * np.arange(len(own))
+    used = used_rays(rig, found.problem)
+    # computed − measured
+    xy = rig.xy + rig.in_order(found.residuals) * rig.sigma
+    epochs = len(rig.epochs)
+    image = rig.camera * epochs + rig.epoch
+    rays = ImageRows(
+        row[used],
+        image[used],
+        # a body moves between epochs, but its points and their errors are the same
+        rig.point[used],
+        rig.camera[used],
+        xy[used],
+        rig.sigma[used],
+        len(stack_rows(found, found.residuals)),
+    )
+    components = with_others(components_of(rays, _scene(found), rig.cameras, settings), rays, found)
+    return fit_error_model(found, components, settings.estimation) if components else None
+
+
+def _scene(found: Solution) -> StationsAndPoints:
+    """The stations of all photographs in the frames of their bodies, X0_e + M_eᵀ·b_k, and the
+    points."""
+    position, rotation = (np.asarray(x) for x in found.values["epoch"])
+    base = np.asarray(found.values["mounting"].position)
+    turned = np.einsum("eij,ki->kej", np.asarray(_matrices(rotation)), base)
+    X = np.asarray(found.values["point"])[:, :3]
+    return StationsAndPoints((position + turned).reshape(-1, 3), X)
+
+
+@compile_once
+def _matrices(rotation: Float[AnyArray, "n 4"]) -> Float[Array, "n 3 3"]:
+    return jax.vmap(matrix_from_quaternion)(rotation)
