@@ -50,7 +50,7 @@ from jaxbundle.cameras import CameraModel, get_model
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.leastsquares.quality.distributions import normal_quantile, t_quantile
-from jaxbundle.leastsquares.quality.error_components import OTHERS, effects
+from jaxbundle.leastsquares.quality.error_components import OTHERS, IndependentErrors, effects
 from jaxbundle.leastsquares.quality.sensitivity import pull_back
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.report.layout import estimate, significant, table
@@ -341,7 +341,7 @@ def uncertainty_budget(
     if not 0 < coverage < 1:
         raise InputError(f"coverage must be between 0 and 1, but is {coverage:g}")
     inspection = adjustment.cofactors
-    results = request_results(inspection, of)
+    results = request_results(inspection, IndependentErrors(inspection.solution, 1.0), of)
     if any(len(range(one.numbers.stop)[one.numbers]) > 1 for one in results.asked):
         raise InputError("name single results, such as point:7:Z; a mean over all has no budget")
     measurands = _measurands(adjustment, results, units)

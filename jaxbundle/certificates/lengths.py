@@ -383,9 +383,9 @@ def length_errors(
     )
     rows = np.array([[rows_of[end] for end in ends] for ends in chosen.ends])
     between = lambda values: _distances(values, rows)
-    variance = np.diagonal(adjustment.covariance_of(between))
+    variance = np.diagonal(adjustment.covariance_of(between, classical=True))
     if adjustment.error_model is not None:
-        variance = np.fmax(variance, np.diagonal(adjustment.modelled_covariance_of(between)))
+        variance = np.fmax(variance, np.diagonal(adjustment.covariance_of(between)))
     ends = adjustment.point_values[rows].reshape(-1, 3)
     sides = np.ptp(ends, axis=0) if volume is None else np.asarray(volume, float)
     return LengthTest(
