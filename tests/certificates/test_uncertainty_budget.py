@@ -196,10 +196,10 @@ def test_errors_that_image_points_share_are_lines_of_their_own(convergent4):
     targets = jaxbundle.cloud_of_targets(30, (2.0, 2.0, 0.8), seed=3)
     camera = jaxbundle.Camera("cam", "brown", {"c": 20.0}, ("c", "x0", "y0"))
     network = jaxbundle.simulate(stations, targets, camera, noise=1e-3, seed=2)
-    shift = 4e-3 * rng.standard_normal((10, 2))  # a principal point for each photograph
-    rays = network.observations
+    # an affine distortion of each photograph: orientations do not take it up
+    rays, affine = network.observations, 3e-4 * rng.standard_normal((10, 1))
     moved = jaxbundle.network.tables.Observations(
-        rays.image, rays.point, rays.xy + shift[rays.image], rays.sigma
+        rays.image, rays.point, rays.xy * (1 + affine[rays.image] * [1, -1]), rays.sigma
     )
     result = jaxbundle.adjust(network.replace(observations=moved), correlated=True)
     budget = uncertainty_budget(result)
