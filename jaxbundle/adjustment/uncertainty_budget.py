@@ -196,14 +196,40 @@ class UncertaintyBudget(TableMethods):
             total = max(combined[m] ** 2, 1e-300)
             for line in self.lines:
                 u = line.contribution[m]
-                rows.append((
-                    one.name, line.words, line.number, line.kind, line.distribution, line.degrees,
-                    line.uncertainty, line.unit, line.sensitivity[m], u, u * u / total, nan, nan,
-                ))  # fmt: skip
-            rows.append((
-                one.name, TOTAL, sum(line.number for line in self.lines), "", "", degrees[m], nan,
-                one.unit, nan, combined[m], 1.0, k[m], expanded[m],
-            ))  # fmt: skip
+                rows.append(
+                    (
+                        one.name,
+                        line.words,
+                        line.number,
+                        line.kind,
+                        line.distribution,
+                        line.degrees,
+                        line.uncertainty,
+                        line.unit,
+                        line.sensitivity[m],
+                        u,
+                        u * u / total,
+                        nan,
+                        nan,
+                    )
+                )
+            rows.append(
+                (
+                    one.name,
+                    TOTAL,
+                    sum(line.number for line in self.lines),
+                    "",
+                    "",
+                    degrees[m],
+                    nan,
+                    one.unit,
+                    nan,
+                    combined[m],
+                    1.0,
+                    k[m],
+                    expanded[m],
+                )
+            )
         text = {"measurand", "input", "type", "distribution", "unit"}
         kinds = {name: object if name in text else float for name in COLUMN_NAMES}
         return {n: np.array(c, kinds[n]) for n, c in zip(COLUMN_NAMES, zip(*rows))}
@@ -224,16 +250,18 @@ class UncertaintyBudget(TableMethods):
         total, found = max(self.combined[m] ** 2, 1e-300), []
         for line in self.lines:
             u = float(line.contribution[m])
-            found.append((
-                f"{line.number} × {line.words}" if line.number > 1 else line.words,
-                line.kind,
-                line.distribution,
-                "∞" if math.isinf(line.degrees) else f"{line.degrees:.0f}",
-                f"{significant(line.uncertainty)} {line.unit}".strip(),
-                significant(float(line.sensitivity[m])),
-                significant(u),
-                f"{100 * u * u / total:.1f}",
-            ))  # fmt: skip
+            found.append(
+                (
+                    f"{line.number} × {line.words}" if line.number > 1 else line.words,
+                    line.kind,
+                    line.distribution,
+                    "∞" if math.isinf(line.degrees) else f"{line.degrees:.0f}",
+                    f"{significant(line.uncertainty)} {line.unit}".strip(),
+                    significant(float(line.sensitivity[m])),
+                    significant(u),
+                    f"{100 * u * u / total:.1f}",
+                )
+            )
         return found
 
     def result_rows(self) -> list[tuple[str, ...]]:
@@ -245,31 +273,47 @@ class UncertaintyBudget(TableMethods):
         ):
             value, said = estimate(one.value, float(U), 2)
             shown = "∞" if nu > MANY_DEGREES else f"{nu:.0f}"
-            rows.append((
-                one.words, value, said, one.unit, significant(float(u)), f"{k:.2f}", shown,
-            ))  # fmt: skip
+            rows.append(
+                (
+                    one.words,
+                    value,
+                    said,
+                    one.unit,
+                    significant(float(u)),
+                    f"{k:.2f}",
+                    shown,
+                )
+            )
         return rows
 
     def to_dict(self) -> dict[str, Any]:
         """The budgets as plain dicts and numbers, as in JSON."""
         lines = [
             {
-                "input": line.words, "number": line.number, "type": line.kind,
-                "distribution": line.distribution, "degrees": line.degrees,
-                "uncertainty": line.uncertainty, "unit": line.unit,
+                "input": line.words,
+                "number": line.number,
+                "type": line.kind,
+                "distribution": line.distribution,
+                "degrees": line.degrees,
+                "uncertainty": line.uncertainty,
+                "unit": line.unit,
             }
             for line in self.lines
-        ]  # fmt: skip
+        ]
         found = {}
         for m, one in enumerate(self.measurands):
             parts = [(line.sensitivity[m], line.contribution[m]) for line in self.lines]
             found[one.name] = {
-                "value": one.value, "unit": one.unit, "combined": float(self.combined[m]),
-                "degrees": float(self.degrees[m]), "k": float(self.k[m]),
-                "expanded": float(self.expanded[m]), "sigma": float(self.sigma[m]),
+                "value": one.value,
+                "unit": one.unit,
+                "combined": float(self.combined[m]),
+                "degrees": float(self.degrees[m]),
+                "k": float(self.k[m]),
+                "expanded": float(self.expanded[m]),
+                "sigma": float(self.sigma[m]),
                 "sensitivity": [float(c) for c, _ in parts],
                 "contribution": [float(u) for _, u in parts],
-            }  # fmt: skip
+            }
         return {"coverage": self.coverage, "inputs": lines, "measurands": found}
 
     def single_inputs(self) -> list[dict[str, Any]]:
@@ -294,9 +338,20 @@ RESULT_HEADER = ("quantity", "value", "U", "unit", "u", "k", "ν_eff")
 # Cornish 1960), 2.4/ν of 1.96 at 95 %.
 MANY_DEGREES = 2000
 COLUMN_NAMES = (
-    "measurand", "input", "number", "type", "distribution", "degrees", "uncertainty", "unit",
-    "sensitivity", "contribution", "share", "k", "expanded",
-)  # fmt: skip
+    "measurand",
+    "input",
+    "number",
+    "type",
+    "distribution",
+    "degrees",
+    "uncertainty",
+    "unit",
+    "sensitivity",
+    "contribution",
+    "share",
+    "k",
+    "expanded",
+)
 
 
 def coverage_factor(coverage: float, degrees: float) -> float:

@@ -209,9 +209,13 @@ def _judge(result: Any, test: LengthTest | None, one: Criterion) -> AcceptanceRo
     unknown = [name for name, value in values.items() if math.isnan(value)]
     of = unknown[0] if unknown else worst(values, key=lambda name: values[name])
     return AcceptanceRow(
-        one, values[of], of, len(values), all(one.holds(value) for value in values.values()),
+        one,
+        values[of],
+        of,
+        len(values),
+        all(one.holds(value) for value in values.values()),
         "it is not a number" if unknown else "",
-    )  # fmt: skip
+    )
 
 
 def _in_unit(found: QuantityValues, unit: str) -> dict[str, float]:

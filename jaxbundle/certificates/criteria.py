@@ -75,9 +75,13 @@ def read_criterion(text: str) -> Criterion:
     if not math.isfinite(limit):
         raise InputError(f"criterion {show(text)}: the limit must be a finite number")
     return Criterion(
-        " ".join(text.split()), found["name"], found["argument"] or "",
-        COMPARISONS[found["comparison"]], limit, unit,
-    )  # fmt: skip
+        " ".join(text.split()),
+        found["name"],
+        found["argument"] or "",
+        COMPARISONS[found["comparison"]],
+        limit,
+        unit,
+    )
 
 
 def read_criteria(texts: Iterable[str] | str) -> list[Criterion]:

@@ -61,12 +61,27 @@ FIELDS = {
 }
 # Those that a certificate wants in any case: an empty line is printed for them.
 WANTED = (
-    "number", "laboratory", "customer", "object", "serial", "calibrated", "conditions",
-    "procedure", "traceability", "issued", "approved_by",
-)  # fmt: skip
+    "number",
+    "laboratory",
+    "customer",
+    "object",
+    "serial",
+    "calibrated",
+    "conditions",
+    "procedure",
+    "traceability",
+    "issued",
+    "approved_by",
+)
 EVALUATION = (
-    "coverage", "measurands", "mpe", "rule", "volume", "horizontal_class", "vertical_class",
-)  # fmt: skip
+    "coverage",
+    "measurands",
+    "mpe",
+    "rule",
+    "volume",
+    "horizontal_class",
+    "vertical_class",
+)
 INPUT = ("name", "sigma", "limits", "expanded", "k", "distribution", "degrees", "words")
 
 

@@ -264,12 +264,18 @@ class LengthTest(TableMethods):
         text = lambda words: np.array(list(words), dtype=object)
         none = np.full(len(self.lengths), np.nan)
         return {
-            "from": text(a), "to": text(b), "line": text(self.lengths.line),
-            "calibrated": self.lengths.value, "sigma_calibrated": self.lengths.sigma,
-            "measured": self.measured, "sigma_measured": self.sigma, "error": self.error,
-            "mpe": none if self.limit is None else self.limit, "guard_band": self.guard_band,
+            "from": text(a),
+            "to": text(b),
+            "line": text(self.lengths.line),
+            "calibrated": self.lengths.value,
+            "sigma_calibrated": self.lengths.sigma,
+            "measured": self.measured,
+            "sigma_measured": self.sigma,
+            "error": self.error,
+            "mpe": none if self.limit is None else self.limit,
+            "guard_band": self.guard_band,
             "verdict": text(self.verdicts or ("",) * len(self.lengths)),
-        }  # fmt: skip
+        }
 
     def rows(self) -> list[tuple[str, ...]]:
         """`table` as text, under `HEADER`."""
@@ -294,11 +300,16 @@ class LengthTest(TableMethods):
         """The test as plain dicts and numbers, as in JSON."""
         columns = {name: column.tolist() for name, column in self.table().items()}
         return {
-            "unit": self.unit, "number": len(self.lengths), "largest": self.largest,
-            "rms": self.rms, "mpe": None if self.mpe is None else self.mpe.text, "rule": self.rule,
-            "verdict": self.verdict or None, "missing": [list(ends) for ends in self.missing],
+            "unit": self.unit,
+            "number": len(self.lengths),
+            "largest": self.largest,
+            "rms": self.rms,
+            "mpe": None if self.mpe is None else self.mpe.text,
+            "rule": self.rule,
+            "verdict": self.verdict or None,
+            "missing": [list(ends) for ends in self.missing],
             "lengths": [dict(zip(columns, row)) for row in zip(*columns.values())],
-        }  # fmt: skip
+        }
 
     def __str__(self) -> str:
         lines = [

@@ -195,14 +195,22 @@ class PositionalAccuracy(TableMethods):
         """The accuracy as plain dicts and numbers, as in JSON."""
         columns = {name: column.tolist() for name, column in self.table().items()}
         return {
-            "standard": STANDARD, "unit": self.unit, "number": list(self.number),
-            "RMSE_H": self.rmse_h, "RMSE_V": self.rmse_v, "RMSE_3D": self.rmse_3d,
-            "fit": self.rmse_axes.tolist(), "survey": list(self.survey), "mean": self.mean.tolist(),
-            "horizontal_class": self.horizontal_class, "vertical_class": self.vertical_class,
-            "verdict": self.verdict or None, "statements": self.statements(),
+            "standard": STANDARD,
+            "unit": self.unit,
+            "number": list(self.number),
+            "RMSE_H": self.rmse_h,
+            "RMSE_V": self.rmse_v,
+            "RMSE_3D": self.rmse_3d,
+            "fit": self.rmse_axes.tolist(),
+            "survey": list(self.survey),
+            "mean": self.mean.tolist(),
+            "horizontal_class": self.horizontal_class,
+            "vertical_class": self.vertical_class,
+            "verdict": self.verdict or None,
+            "statements": self.statements(),
             "remarks": self.remarks(),
             "points": [dict(zip(columns, row)) for row in zip(*columns.values())],
-        }  # fmt: skip
+        }
 
     def __str__(self) -> str:
         lines = table(SUMMARY_HEADER, self.summary(), "lrrr")

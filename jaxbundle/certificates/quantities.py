@@ -215,10 +215,12 @@ def _split(argument: str) -> tuple[str, str, str]:
 
 
 def _parameters(
-    subject: Subject, argument: str, of_camera: Callable[[Mapping[str, Any]], float | None],
+    subject: Subject,
+    argument: str,
+    of_camera: Callable[[Mapping[str, Any]], float | None],
     of_table: Callable[[Mapping[str, np.ndarray], str], np.ndarray] | None,
     unit_less: bool = False,
-) -> QuantityValues:  # fmt: skip
+) -> QuantityValues:
     """A number for each of the named unknowns that are estimated."""
     adjustment: Adjustment = subject.result
     kind, id, name = _split(argument)
@@ -247,9 +249,12 @@ def _parameters(
 
 
 def _of_cameras(
-    adjustment: Adjustment, id: str, name: str,
-    of_camera: Callable[[Mapping[str, Any]], float | None], unit_less: bool,
-) -> QuantityValues:  # fmt: skip
+    adjustment: Adjustment,
+    id: str,
+    name: str,
+    of_camera: Callable[[Mapping[str, Any]], float | None],
+    unit_less: bool,
+) -> QuantityValues:
     cameras = [c for c in adjustment.problem.network.cameras if id in ("*", c.id)]
     if not cameras:
         raise LookupError(f"there is no camera {id!r}")
@@ -413,31 +418,40 @@ OF_ADJUSTMENT: tuple[Quantity, ...] = (
     Quantity("sigma0", "", "σ0 of the adjustment", _number(lambda a: a.sigma0)),
     Quantity("redundancy", "", "redundancy of the adjustment", _number(lambda a: a.redundancy)),
     Quantity("chi2", "", "vᵀPv over the upper limit of its χ² test", _number(_chi_squared)),
-    Quantity("observations", "", "number of observations",
-             _number(lambda a: a.counts.observations)),
+    Quantity(
+        "observations", "", "number of observations", _number(lambda a: a.counts.observations)
+    ),
     Quantity("images", "", "number of images", _number(lambda a: len(a.problem.network.images))),
-    Quantity("points", "", "number of points",
-             _number(lambda a: int((~a.problem.excluded).sum()))),
+    Quantity("points", "", "number of points", _number(lambda a: int((~a.problem.excluded).sum()))),
     Quantity("removed", "", "observations removed as blunders", _number(lambda a: len(a.removed))),
     Quantity("warnings", "", "number of warnings", _number(lambda a: len(a.warnings))),
     Quantity("r", "", "smallest redundancy number", _number(_least_redundancy)),
     Quantity("sigma(NAME)", "of NAME", "σ of an unknown, the largest of several", _sigma),
-    Quantity("sigma.rms(NAME)", "of NAME", "its root mean square over cameras, images, points",
-             _rms_sigma),
+    Quantity(
+        "sigma.rms(NAME)",
+        "of NAME",
+        "its root mean square over cameras, images, points",
+        _rms_sigma,
+    ),
     Quantity("value(NAME)", "of NAME", "the adjusted value", _value),
     Quantity("t(NAME)", "", "value over σ of a camera parameter", _t),
-    Quantity("correlation(NAME)", "", "total correlation of a camera parameter",
-             _total_correlation),
+    Quantity(
+        "correlation(NAME)", "", "total correlation of a camera parameter", _total_correlation
+    ),
     Quantity("image.rms", "px, length", "RMS residual of an image coordinate", _image_rms),
-    Quantity("check.rms[(X|Y|Z|H|V|3D)]", "length", "RMS difference at check points, of all axes",
-             _check_rms),
+    Quantity(
+        "check.rms[(X|Y|Z|H|V|3D)]",
+        "length",
+        "RMS difference at check points, of all axes",
+        _check_rms,
+    ),
     Quantity("check.max[(X|Y|Z)]", "length", "largest difference at check points", _check_max),
     Quantity("check.number", "", "number of check points", _number(_check_number)),
     Quantity("control.rms[(X|Y|Z)]", "length", "RMS residual of control", _control_rms),
     Quantity("LME", "length", "largest length measurement error (--lengths)", _lme),
     Quantity("LME.rms", "length", "RMS of length measurement errors", _lme_rms),
     Quantity("LME.number", "", "number of compared lengths", _lme_number),
-)  # fmt: skip
+)
 
 
 # --- calibration ----------------------------------------------------------------------------
@@ -457,15 +471,31 @@ def _calibrated(
 OF_CALIBRATION: tuple[Quantity, ...] = (
     Quantity("rms", "px", "RMS of an image point", _calibrated(lambda c: c.rms, "px")),
     Quantity("views", "", "photographs used", _calibrated(lambda c: len(c.views))),
-    Quantity("coverage", "", "share of the image's cells with points",
-             _calibrated(lambda c: c.coverage.part)),
-    Quantity("mapping_error", "px", "expected mapping error over the image",
-             _calibrated(lambda c: c.mapping_error.rms, "px")),
-    Quantity("uncertainty.middle", "px", "σ of a projected point at infinity, middle",
-             _calibrated(lambda c: c.uncertainty().middle, "px")),
-    Quantity("uncertainty.corners", "px", "the same in the worst corner",
-             _calibrated(lambda c: c.uncertainty().corners, "px")),
-)  # fmt: skip
+    Quantity(
+        "coverage",
+        "",
+        "share of the image's cells with points",
+        _calibrated(lambda c: c.coverage.part),
+    ),
+    Quantity(
+        "mapping_error",
+        "px",
+        "expected mapping error over the image",
+        _calibrated(lambda c: c.mapping_error.rms, "px"),
+    ),
+    Quantity(
+        "uncertainty.middle",
+        "px",
+        "σ of a projected point at infinity, middle",
+        _calibrated(lambda c: c.uncertainty().middle, "px"),
+    ),
+    Quantity(
+        "uncertainty.corners",
+        "px",
+        "the same in the worst corner",
+        _calibrated(lambda c: c.uncertainty().corners, "px"),
+    ),
+)
 
 
 # --- rigs -----------------------------------------------------------------------------------
@@ -525,9 +555,13 @@ OF_RIG: tuple[Quantity, ...] = (
     Quantity("epochs", "", "epochs used", _rig_number(lambda r: len(r.epochs))),
     Quantity("left_out", "", "epochs left out", _rig_number(lambda r: len(r.left_out))),
     Quantity("rms[(CAMERA)]", "px", "RMS of an image point by camera", _rig_rms),
-    Quantity("sigma(NAME|CAMERA:NAME|base|rotation)", "of NAME",
-             "σ of a parameter, of the bases, of the rotations of the mountings", _rig_sigma),
-)  # fmt: skip
+    Quantity(
+        "sigma(NAME|CAMERA:NAME|base|rotation)",
+        "of NAME",
+        "σ of a parameter, of the bases, of the rotations of the mountings",
+        _rig_sigma,
+    ),
+)
 
 
 # --- reconstruction -------------------------------------------------------------------------
@@ -546,6 +580,10 @@ def _reconstructed(
 OF_RECONSTRUCTION: tuple[Quantity, ...] = (
     Quantity("parts", "", "parts of the reconstruction", _reconstructed(lambda r: len(r.parts))),
     Quantity("left_out", "", "photographs left out", _reconstructed(lambda r: len(r.left_out))),
-    Quantity("misfit", "", "how many times worse than their σ measurements fit",
-             _reconstructed(lambda r: max((p.misfit for p in r.parts), default=math.nan))),
-)  # fmt: skip
+    Quantity(
+        "misfit",
+        "",
+        "how many times worse than their σ measurements fit",
+        _reconstructed(lambda r: max((p.misfit for p in r.parts), default=math.nan)),
+    ),
+)

@@ -6,13 +6,29 @@ from typing import NamedTuple
 from jaxbundle.errors import InputError
 
 LENGTHS = {
-    "nm": 1e-9, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "mm": 1e-3, "cm": 1e-2, "dm": 1e-1, "m": 1.0,
-    "km": 1e3, "in": 0.0254, "ft": 0.3048, "ftUS": 1200 / 3937,
-}  # fmt: skip
+    "nm": 1e-9,
+    "um": 1e-6,
+    "µm": 1e-6,
+    "μm": 1e-6,
+    "mm": 1e-3,
+    "cm": 1e-2,
+    "dm": 1e-1,
+    "m": 1.0,
+    "km": 1e3,
+    "in": 0.0254,
+    "ft": 0.3048,
+    "ftUS": 1200 / 3937,
+}
 ANGLES = {
-    "rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": math.pi / 180, "arcmin": math.pi / 10800,
-    "arcsec": math.pi / 648000, "gon": math.pi / 200, "mgon": math.pi / 2e5,
-}  # fmt: skip
+    "rad": 1.0,
+    "mrad": 1e-3,
+    "urad": 1e-6,
+    "deg": math.pi / 180,
+    "arcmin": math.pi / 10800,
+    "arcsec": math.pi / 648000,
+    "gon": math.pi / 200,
+    "mgon": math.pi / 2e5,
+}
 RATIOS = {"": 1.0, "%": 1e-2, "ppm": 1e-6}
 PIXELS = {"px": 1.0, "mpx": 1e-3}
 KINDS = {"length": LENGTHS, "angle": ANGLES, "number": RATIOS, "image": PIXELS}

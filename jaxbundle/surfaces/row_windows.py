@@ -51,9 +51,17 @@ class RowWindows:
         L, R, x, y = (a * self.weight for a in (L, R, x, y))
         self.first = {"L": L, "R": R, "x": x, "y": y}
         self.second = {
-            "LL": L * L, "RR": R * R, "LR": L * R, "xx": x * x, "xy": x * y, "xR": x * R,
-            "yy": y * y, "yR": y * R, "xL": x * L, "yL": y * L,
-        }  # fmt: skip
+            "LL": L * L,
+            "RR": R * R,
+            "LR": L * R,
+            "xx": x * x,
+            "xy": x * y,
+            "xR": x * R,
+            "yy": y * y,
+            "yR": y * R,
+            "xL": x * L,
+            "yL": y * L,
+        }
 
     def _contrast_ratio(self, L: Piece, R: Piece) -> Piece:
         """Contrast of the left image by that of the right one, in windows of 15 × 15 pixels,

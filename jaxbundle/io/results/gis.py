@@ -70,12 +70,14 @@ def write_geojson(
         lonlat = np.column_stack(transform(place[:, 0], place[:, 1]))
         if not np.isfinite(lonlat).all() or not (np.abs(lonlat) <= [180.0, 90.0]).all():
             raise InputError(f"{crs}: the coordinates are outside of this system")
-        features.append({
-            "type": "Feature",
-            "id": f"{one.layer}/{one.attributes['id']}",
-            "geometry": _geometry(lonlat, place, one.layer),
-            "properties": {"layer": one.layer, **_plain(one.attributes)},
-        })  # fmt: skip
+        features.append(
+            {
+                "type": "Feature",
+                "id": f"{one.layer}/{one.attributes['id']}",
+                "geometry": _geometry(lonlat, place, one.layer),
+                "properties": {"layer": one.layer, **_plain(one.attributes)},
+            }
+        )
     document = {"type": "FeatureCollection", "features": features}
     write_text(Path(path), json.dumps(document, ensure_ascii=False) + "\n")
 
@@ -164,18 +166,29 @@ def collect_features(result: "Adjustment", factor: float | None = None) -> Itera
     known = np.asarray(np.isfinite(place).all(1))
     for row in np.flatnonzero(known):
         sigma = np.sqrt(np.clip(np.diagonal(C[row]), 0, None))
-        yield Feature("points", place[row], {
-            "id": str(points["id"][row]), "role": str(points["role"][row]),
-            **dict(zip("XYZ", place[row].tolist())),
-            **dict(zip(("sX", "sY", "sZ"), sigma.tolist())), "rays": int(points["rays"][row]),
-        })  # fmt: skip
+        yield Feature(
+            "points",
+            place[row],
+            {
+                "id": str(points["id"][row]),
+                "role": str(points["role"][row]),
+                **dict(zip("XYZ", place[row].tolist())),
+                **dict(zip(("sX", "sY", "sZ"), sigma.tolist())),
+                "rays": int(points["rays"][row]),
+            },
+        )
     cameras = [result.network.cameras[c].id for c in result.network.images.camera]
     sigmas = [f"s{name}" for name in EXTERIOR]
     for row, centre in enumerate(result.image_values[:, :3]):
-        yield Feature("stations", centre, {
-            "id": str(images["id"][row]), "camera": cameras[row],
-            **{name: float(images[name][row]) for name in (*EXTERIOR, *sigmas)},
-        })  # fmt: skip
+        yield Feature(
+            "stations",
+            centre,
+            {
+                "id": str(images["id"][row]),
+                "camera": cameras[row],
+                **{name: float(images[name][row]) for name in (*EXTERIOR, *sigmas)},
+            },
+        )
     ids = [str(id) for id in points["id"]]
     yield from _ellipses(place, C, known, ids, factor)
 
@@ -201,10 +214,18 @@ def _ellipses(
     for row, axis, vectors in zip(rows, axes, E):
         ring = place[row, :2] + factor * ((vectors * axis) @ circle).T
         long = vectors[:, 1]
-        yield Feature("ellipses", ring, {
-            "id": ids[int(row)], "of": "point", "a": float(axis[1]), "b": float(axis[0]),
-            "bearing": math.degrees(math.atan2(long[0], long[1])) % 180.0, "factor": factor,
-        })  # fmt: skip
+        yield Feature(
+            "ellipses",
+            ring,
+            {
+                "id": ids[int(row)],
+                "of": "point",
+                "a": float(axis[1]),
+                "b": float(axis[0]),
+                "bearing": math.degrees(math.atan2(long[0], long[1])) % 180.0,
+                "factor": factor,
+            },
+        )
 
 
 def _round_down(x: float) -> float:
@@ -245,12 +266,15 @@ SYSTEMS = (
     ("Undefined Cartesian SRS", -1, "NONE", -1, "undefined", "undefined Cartesian coordinates"),
     ("Undefined geographic SRS", 0, "NONE", 0, "undefined", "undefined geographic coordinates"),
     (
-        "WGS 84 geodetic", 4326, "EPSG", 4326,
+        "WGS 84 geodetic",
+        4326,
+        "EPSG",
+        4326,
         'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],'
         'PRIMEM["Greenwich",0],UNIT["degree",0.0174532925199433],AUTHORITY["EPSG","4326"]]',
         "longitude and latitude",
     ),
-)  # fmt: skip
+)
 
 
 def _fill(database: sqlite3.Connection, features: list[Feature], system: int | None) -> None:
@@ -287,8 +311,10 @@ def _definition(system: int) -> tuple[str, str]:
 def _add_layer(database: sqlite3.Connection, layer: str, features: list[Feature], srs: int) -> None:
     kind, z = ("POLYGON", 0) if layer == "ellipses" else ("POINT", 1)
     names = list(features[0].attributes)
-    types = ["TEXT" if isinstance(v, str) else "INTEGER" if isinstance(v, int) else "DOUBLE"
-             for v in features[0].attributes.values()]  # fmt: skip
+    types = [
+        "TEXT" if isinstance(v, str) else "INTEGER" if isinstance(v, int) else "DOUBLE"
+        for v in features[0].attributes.values()
+    ]
     columns = ", ".join(f'"{name}" {type}' for name, type in zip(names, types))
     database.execute(
         f'CREATE TABLE "{layer}" (fid INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, geom {kind}, '

@@ -50,9 +50,21 @@ KEYS = Keys(
     ),
     {
         **dict.fromkeys(
-            ("isis_camera_version", "name_platform", "image_identifier", "naif_keywords",
-             "interpolation_method", "number_of_*", "dt_ephemeris", "t0_ephemeris", "dt_quaternion",
-             "t0_quaternion", "b_summing", "exposure_duration", "starting_ephemeris_time"),
+            (
+                "isis_camera_version",
+                "name_platform",
+                "image_identifier",
+                "naif_keywords",
+                "interpolation_method",
+                "number_of_*",
+                "dt_ephemeris",
+                "t0_ephemeris",
+                "dt_quaternion",
+                "t0_quaternion",
+                "b_summing",
+                "exposure_duration",
+                "starting_ephemeris_time",
+            ),
             "names and sources; times that stand in the tables as well",
         ),
         **dict.fromkeys(
@@ -60,7 +72,7 @@ KEYS = Keys(
             "heights of the terrain, the sun; velocities stand in the table of positions",
         ),
     },
-)  # fmt: skip
+)
 # The model of frame cameras (`io.networks.csm_frame`).
 FRAME_MODEL = "USGS_ASTRO_FRAME_SENSOR_MODEL"
 
