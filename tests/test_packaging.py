@@ -143,7 +143,8 @@ def test_addresses_are_in_one_place():
 
 
 def test_workflows_are_valid_and_test_every_python():
-    yaml = pytest.importorskip("yaml")
+    import yaml
+
     pythons = set()
     for path in sorted((ROOT / ".github" / "workflows").glob("*.yml")):
         document = yaml.safe_load(path.read_text(encoding="utf-8"))
@@ -172,7 +173,9 @@ def test_workflows_run_tests_that_are_there():
 def rendered_recipe() -> dict:
     """The conda recipe as conda-build's templates give it (functions load_file_data,
     load_file_regex)."""
-    jinja2, yaml = pytest.importorskip("jinja2"), pytest.importorskip("yaml")
+    import jinja2
+    import yaml
+
     folder = ROOT / "packaging" / "conda"
 
     def load_file_data(name, from_recipe_dir):

@@ -13,25 +13,11 @@ from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.geometry.pose_conventions import cv_pose
 
-# OpenCV's order of coefficients, of which a vector has 4, 5, 8, 12 or 14.
-COEFFICIENTS = (
-    "k1",
-    "k2",
-    "p1",
-    "p2",
-    "k3",
-    "k4",
-    "k5",
-    "k6",
-    "s1",
-    "s2",
-    "s3",
-    "s4",
-    "taux",
-    "tauy",
-)
-LENGTHS = (5, 8, 12, 14)
 INTERIOR = ("fx", "fy", "cx", "cy")
+# OpenCV's order of coefficients, of which a vector has 4, 5, 8, 12 or 14: those of the model, and
+# the tilt of the sensor.
+COEFFICIENTS = (*get_model("opencv").parameters[len(INTERIOR) :], "taux", "tauy")
+LENGTHS = (5, 8, 12, 14)
 
 
 class OpenCVCalibration(tuple):

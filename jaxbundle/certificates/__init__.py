@@ -7,8 +7,8 @@ jaxbundle.certificate(result, details="details.toml").save("certificate.html")
 from jaxbundle.lazy import import_on_use
 
 _HOME = {
+    "jaxbundle.adjustment.budget_inputs": ("HeldInput",),
     "jaxbundle.adjustment.uncertainty_budget": (
-        "HeldInput",
         "UncertaintyBudget",
         "uncertainty_budget",
     ),

@@ -1,6 +1,6 @@
 # Written by `make stubs` from the names in __init__.py.
 # ruff: noqa: I001
-from jaxbundle.adjustment.uncertainty_budget import HeldInput as HeldInput
+from jaxbundle.adjustment.budget_inputs import HeldInput as HeldInput
 from jaxbundle.adjustment.uncertainty_budget import UncertaintyBudget as UncertaintyBudget
 from jaxbundle.adjustment.uncertainty_budget import uncertainty_budget as uncertainty_budget
 from jaxbundle.certificates.acceptance import Acceptance as Acceptance

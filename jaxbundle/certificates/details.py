@@ -28,8 +28,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from jaxbundle.adjustment.budget_inputs import DIVISORS, HeldInput
 from jaxbundle.adjustment.quality.fixed_quantities import split_name
-from jaxbundle.adjustment.uncertainty_budget import DIVISORS, HeldInput
 from jaxbundle.arguments import number, positive, show
 from jaxbundle.certificates.lengths import RULES
 from jaxbundle.errors import InputError

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxbundle.adjustment.budget_inputs import unit_of_parameter
 from jaxbundle.adjustment.result import Adjustment
-from jaxbundle.adjustment.uncertainty_budget import unit_of_parameter
 from jaxbundle.calibration.result import Calibration
 from jaxbundle.calibration.rig.result import RigCalibration
 from jaxbundle.calibration.several import Calibrations

@@ -8,7 +8,7 @@ import pytest
 
 import jaxbundle
 from jaxbundle.leastsquares import problem as engine
-from jaxbundle.leastsquares.quality.error_components import first_rows
+from jaxbundle.leastsquares.quality.error_effects import first_rows
 from jaxbundle.leastsquares.solution import Solution, find_minimum
 from jaxbundle.report.page import compose
 

@@ -19,16 +19,8 @@ DETAILS = {
 
 
 @pytest.fixture(scope="module")
-def document():
-    """Of the field of test_lengths.py."""
-    camera = jaxbundle.Camera("cam", "brown", {"c": 20.0}, ("c", "x0", "y0"))
-    stations = jaxbundle.ring_of_stations(8, 3.0, 3.0, roll_every=2)
-    targets = jaxbundle.cloud_of_targets(20, (2.0, 2.0, 0.8), seed=3)
-    network = jaxbundle.simulate(
-        stations, targets, camera, noise=1e-3, seed=2, control=range(6), control_sigma=1e-4,
-        check=range(6, 10), distances=[(10, 11)], distance_sigma=1e-5,
-    )  # fmt: skip
-    result = jaxbundle.adjust(network)
+def document(field):
+    result, targets = field
     length = float(np.linalg.norm(targets[12] - targets[13]))
     lengths = {
         "from": ["13", "no"], "to": ["14", "14"], "value": [length, 1.0], "sigma": [1e-6] * 2,

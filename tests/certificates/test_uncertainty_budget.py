@@ -9,10 +9,8 @@ from adjustment_checks import linearise, synthetic
 
 import jaxbundle
 from jaxbundle.adjustment.adjust import adjust
+from jaxbundle.adjustment.budget_inputs import BudgetLine, HeldInput, Measurand
 from jaxbundle.adjustment.uncertainty_budget import (
-    BudgetLine,
-    HeldInput,
-    Measurand,
     UncertaintyBudget,
     coverage_factor,
     uncertainty_budget,

@@ -147,7 +147,7 @@ def test_cameras_that_meet_only_by_way_of_a_third(tmp_path):
 
 @pytest.mark.parametrize("text", [True, False])
 def test_colmap_reads_the_same(tmp_path, text):
-    pycolmap = pytest.importorskip("pycolmap")
+    import pycolmap
     net = scene()
     write_colmap(net, tmp_path / "m", text=text)
     model = pycolmap.Reconstruction(tmp_path / "m")

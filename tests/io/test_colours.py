@@ -52,7 +52,7 @@ def test_from_colmap_through_every_format_and_back(tmp_path, kind):
 
 
 def test_colmap_itself_sees_them(tmp_path):
-    pycolmap = pytest.importorskip("pycolmap")
+    import pycolmap
     for kind in ("colmap", "colmap-text"):
         model = pycolmap.Reconstruction(write(kind, coloured(), tmp_path)[0])
         found = {id: point.color.tolist() for id, point in model.points3D.items()}

@@ -149,7 +149,7 @@ def test_stereo_by_opencv(tmp_path, suffix):
 
 
 def test_colmap_itself_has_the_same_network(tmp_path):
-    pycolmap = pytest.importorskip("pycolmap")
+    import pycolmap
     net = full_network("opencv")
     for kind in ("colmap", "colmap-text"):
         path, _ = write(kind, net, tmp_path)

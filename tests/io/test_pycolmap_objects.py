@@ -1,6 +1,7 @@
 """Networks and reconstructions of pycolmap in memory."""
 
 import numpy as np
+import pycolmap
 import pytest
 from exchange_cases import assert_same, network
 from numpy.testing import assert_allclose
@@ -8,7 +9,6 @@ from numpy.testing import assert_allclose
 import jaxbundle
 from jaxbundle.errors import InputError
 
-pycolmap = pytest.importorskip("pycolmap")
 NAMES = ("a.jpg", "b.jpg", "c d.jpg")
 
 

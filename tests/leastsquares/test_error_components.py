@@ -8,11 +8,9 @@ from jaxbundle import leastsquares as ls
 from jaxbundle.leastsquares.quality.error_components import (
     ErrorComponent,
     ErrorSettings,
-    effects,
     fit_error_model,
-    remove_fit,
-    stack_rows,
 )
+from jaxbundle.leastsquares.quality.error_effects import effects, remove_fit, stack_rows
 
 RANGE = ls.Kind(
     "distance", lambda a, b, d: ((a - b) @ (a - b)) ** 0.5 - d, of=("point", "point")

@@ -22,13 +22,8 @@ from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.adjustment.quality.variance_groups import groups
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.leastsquares.excluded_rows import DeterminedRows, determine
-from jaxbundle.leastsquares.quality.error_components import (
-    ErrorModel,
-    Errors,
-    IndependentErrors,
-    effects,
-    first_rows,
-)
+from jaxbundle.leastsquares.quality.error_components import ErrorModel, Errors, IndependentErrors
+from jaxbundle.leastsquares.quality.error_effects import effects, first_rows
 from jaxbundle.leastsquares.quality.variance_components import rescale
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.network.tables import Distances, Observations, Points

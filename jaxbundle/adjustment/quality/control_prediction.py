@@ -23,7 +23,8 @@ from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.adjustment.quality.correlated_errors import first_row_of_rays
 from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.leastsquares.quality.distributions import chi2_tail, f_tail
-from jaxbundle.leastsquares.quality.error_components import ErrorModel, first_rows
+from jaxbundle.leastsquares.quality.error_components import ErrorModel
+from jaxbundle.leastsquares.quality.error_effects import first_rows
 from jaxbundle.leastsquares.quality.reliability import MIN_REDUNDANCY
 
 # An axis with a larger part of an open direction, of length 1, is not predicted: 1 % of an error as

@@ -30,10 +30,10 @@ from jaxbundle.leastsquares.quality.error_components import (
     ErrorComponent,
     ErrorModel,
     ErrorSettings,
-    first_rows,
     fit_error_model,
     stated_error_model,
 )
+from jaxbundle.leastsquares.quality.error_effects import first_rows
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Camera

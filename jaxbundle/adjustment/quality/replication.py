@@ -34,7 +34,8 @@ from jaxbundle.errors import NotSolvedError
 from jaxbundle.leastsquares import problem as engine
 from jaxbundle.leastsquares.quality.correlation import squared_difference
 from jaxbundle.leastsquares.quality.distributions import chi2_tail
-from jaxbundle.leastsquares.quality.error_components import ErrorModel, effects, stack_rows
+from jaxbundle.leastsquares.quality.error_components import ErrorModel
+from jaxbundle.leastsquares.quality.error_effects import effects, stack_rows
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.network.columns import count
 from jaxbundle.network.tables import Network

@@ -14,12 +14,8 @@ from jaxbundle.adjustment.quality.correlated_errors import (
 )
 from jaxbundle.calibration.rig.declare import Rig, used_rays
 from jaxbundle.geometry import matrix_from_quaternion
-from jaxbundle.leastsquares.quality.error_components import (
-    ErrorModel,
-    first_rows,
-    fit_error_model,
-    stack_rows,
-)
+from jaxbundle.leastsquares.quality.error_components import ErrorModel, fit_error_model
+from jaxbundle.leastsquares.quality.error_effects import first_rows, stack_rows
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
