@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxbundle.calibration.page import compose_calibration, compose_calibrations
-from jaxbundle.calibration.report import calibrations_dict as calibrations_dict
+from jaxbundle.calibration.several_report import calibrations_dict as calibrations_dict
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.io import adjusted_network, write_opencv

@@ -9,14 +9,16 @@ from jaxbundle.calibration.quality import Coverage, UncertaintyMap
 from jaxbundle.calibration.report import (
     MAPS_HEADER,
     MODELS_HEADER,
-    MOUNTED,
-    correlation_rows,
     map_rows,
     model_rows,
     models_legend,
+    photograph_facts,
+)
+from jaxbundle.calibration.rig.report import (
+    MOUNTED,
+    correlation_rows,
     mounting_rows,
     mounting_titles,
-    photograph_facts,
     rig_facts,
     rig_parameter_rows,
 )

@@ -1,6 +1,5 @@
 """The report of a calibration and its JSON: photographs, camera, quality, adjustment."""
 
-import dataclasses
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -8,16 +7,12 @@ import numpy as np
 
 from jaxbundle.calibration.verdict import (
     conclude_calibration,
-    conclude_calibrations,
     coverage_in_words,
     cross_validation_in_words,
 )
 from jaxbundle.io.results.result_json import result_dict, verdict_dict
-from jaxbundle.io.text.csv_tables import table_rows
 from jaxbundle.measure.boards import Board, BoardSet
 from jaxbundle.measure.views import BoardViews
-from jaxbundle.network.columns import count
-from jaxbundle.report import observations
 from jaxbundle.report.layout import (
     WITHOUT_SIGMA,
     clean,
@@ -37,10 +32,6 @@ if TYPE_CHECKING:
     from jaxbundle.calibration.model_choice import ModelComparison
     from jaxbundle.calibration.quality import Coverage, UncertaintyMap
     from jaxbundle.calibration.result import Calibration
-    from jaxbundle.calibration.rig.mounting import Mounting
-    from jaxbundle.calibration.rig.result import RigCalibration
-    from jaxbundle.calibration.several import Calibrations
-    from jaxbundle.leastsquares.quality.error_components import ErrorModel
 
 MAPS_HEADER = ("point held in", "middle", "corners")
 
@@ -202,8 +193,8 @@ def _quality_dict(calibration: "Calibration") -> dict:
     return {
         "rms": calibration.rms,
         "distances": calibration.distances.tolist(),
-        "coverage": _coverage_dict(covered),
-        "uncertainty": _maps_dict(calibration.reported_maps),
+        "coverage": coverage_dict(covered),
+        "uncertainty": maps_dict(calibration.reported_maps),
         "mapping_error": _mapping_error_dict(calibration.mapping_error),
         "bias": None
         if bias is None
@@ -329,7 +320,7 @@ def choice_dict(found: "ModelComparison") -> dict:
     }
 
 
-def _coverage_dict(covered: "Coverage") -> dict:
+def coverage_dict(covered: "Coverage") -> dict:
     return {
         "part": covered.part,
         "reach": covered.reach,
@@ -338,7 +329,7 @@ def _coverage_dict(covered: "Coverage") -> dict:
     }
 
 
-def _maps_dict(maps: Sequence["UncertaintyMap"]) -> list[dict]:
+def maps_dict(maps: Sequence["UncertaintyMap"]) -> list[dict]:
     number = lambda x: float(x) if np.isfinite(x) else None
     return [
         {
@@ -363,209 +354,3 @@ def _mapping_error_dict(error: "MappingError | None") -> dict | None:
             "measured": _mapping_error_dict(error.measured),
         }
     )
-
-
-def _rig_quality(rig: "RigCalibration", name: str) -> dict:
-    return {
-        "coverage": _coverage_dict(rig.coverage(name)),
-        "uncertainty": _maps_dict(rig.reported_maps(name)),
-    }
-
-
-def several_text(found: "Calibrations") -> str:
-    """The verdict on several cameras, and what it follows from."""
-    _, words, findings = conclude_calibrations(found)
-    rows = [("Verdict", words), *((clean(one.about), one.words) for one in findings)]
-    lines = [f"Calibration of {len(found.cameras)} cameras", "=" * 100, *facts(rows)]
-    return "\n".join(line.rstrip() for line in lines) + "\n"
-
-
-def rig_text(rig: "RigCalibration") -> str:
-    """The mountings of a rig and its cameras in the common adjustment."""
-    unit = clean(rig.object_unit)
-    lines = [f"Rig of {len(rig.cameras)} cameras, reference {clean(rig.names[0])}", "=" * 100]
-    lines += facts(rig_facts(rig, unit))
-    for title, m in mounting_titles(rig).items():
-        lines += heading(title)
-        lines += table(("", "value", "σ", "unit"), mounting_rows(m, unit), "lrrl")
-        lines += ["", "Correlations", *table(("", *MOUNTED), correlation_rows(m), "l" + "r" * 6)]
-    lines += heading("Advice on the mountings")
-    for item in rig.advice:
-        lines += paragraph(f"- {item}", hanging=2)
-    for name in rig.names:
-        lines += heading(f"Camera {clean(name)} in the rig")
-        lines += table(("parameter", "value", "σ"), rig_parameter_rows(rig, name), "lrr")
-        said = coverage_in_words(rig.coverage(name))
-        lines += [
-            "",
-            *paragraph(f"{said.capitalize()}. Uncertainty of a projected point (σ, pixels):"),
-        ]
-        lines += table(MAPS_HEADER, map_rows(rig.reported_maps(name), unit), "lrr")
-    # residuals with |τ| above 3 are listed: one in 370 without blunders
-    lines += observations.residuals(rig, 3.0, "pope")
-    lines += [*observations.redundancy(rig), *observations.removals(rig)]
-    return "\n".join(line.rstrip() for line in lines) + "\n"
-
-
-def rig_facts(rig: "RigCalibration", unit: str) -> list[tuple[str, str]]:
-    """Epochs, σ0, RMS, the board, and excluded or contradicting epochs."""
-    odd = (*rig.left_out, *rig.contradicting)
-    return [
-        ("Epochs", f"{len(rig.epochs)} used, {len(rig.left_out)} left out"),
-        ("σ0", f"{rig.sigma0:.4f}, redundancy {rig.redundancy}"),
-        ("RMS", ", ".join(f"{clean(name)} {rms:.4f} px" for name, rms in rig.rms.items())),
-        (
-            "Board",
-            "its points estimated, inner constraints"
-            if rig.rig.points_free
-            else "exact"
-            if rig.rig.point_sigma is None
-            else f"known with σ {rig.rig.point_sigma:g} {unit}",
-        ),
-        *_tied_facts(rig),
-        *((clean(epoch), clean(why)) for epoch, why in odd),
-    ]
-
-
-def _tied_facts(rig: "RigCalibration") -> list[tuple[str, str]]:
-    """Which boards are fixed to each other, and which cameras only the motion of the rig ties."""
-    words = lambda names: ", ".join(map(clean, names))
-    found = [("Fixed to each other", words(body)) for body in rig.bodies if len(body) > 1]
-    for tie in rig.ties:
-        (one, other), (first, second) = tie.cameras, tie.boards
-        left = f"; {count(tie.open, 'direction')} left open" if tie.open else ""
-        found.append(
-            (
-                "Tied by motion",
-                f"{words(one)} ({words(first)}) and {words(other)} ({words(second)}), "
-                f"{tie.epochs} epochs{left}",
-            )
-        )
-    return found
-
-
-# Base and angles of a mounting.
-MOUNTED = ("bx", "by", "bz", "ω", "φ", "κ")
-
-
-def mounting_titles(rig: "RigCalibration") -> dict[str, "Mounting"]:
-    """The mountings and the places of the boards by whose they are, and in whose frame."""
-    found = {
-        f"Mounting of {clean(name)} in the frame of {clean(rig.names[0])}": mounting
-        for name, mounting in rig.mountings.items()
-    }
-    first = {name: body[0] for body in rig.bodies for name in body}
-    return found | {
-        f"Board {clean(name)} in the frame of board {clean(first[name])}": place
-        for name, place in rig.placements.items()
-    }
-
-
-def correlation_rows(m: "Mounting") -> list[tuple[str, ...]]:
-    """Correlations of base and angles, below the diagonal."""
-    return [
-        (name, *(fixed(x, 2) for x in row[:k]), *[""] * (6 - k))
-        for k, (name, row) in enumerate(zip(MOUNTED, m.correlation))
-        if k
-    ]
-
-
-def mounting_rows(m: "Mounting", unit: str) -> list[tuple[str, str, str, str]]:
-    """Base and angles of a mounting: name, value, σ, unit."""
-    units = [unit] * 3 + ["deg"] * 3
-    rows = [
-        (label, *estimate(value, sigma), what)
-        for label, value, sigma, what in zip(MOUNTED, [*m.base, *m.angles], m.sigma, units)
-    ]
-    return [*rows, ("length", *estimate(m.length, m.length_sigma), unit)]
-
-
-def rig_parameter_rows(rig: "RigCalibration", name: str) -> list[tuple[str, str, str]]:
-    """The free parameters of a camera in the rig: name, value, σ."""
-    return [(n, *estimate(rig.parameters[name][n], s)) for n, s in rig.stated_sigma[name].items()]
-
-
-def _mounting_dict(m: "Mounting") -> dict:
-    return {
-        "base": m.base.tolist(),
-        "sigma_base": m.sigma[:3].tolist(),
-        "angles": m.angles.tolist(),
-        "sigma_angles": m.sigma[3:].tolist(),
-        "rotation": m.rotation.tolist(),
-        "covariance": m.covariance.tolist(),
-        "correlation": m.correlation.tolist(),
-        "length": m.length,
-        "sigma_length": m.length_sigma,
-    }
-
-
-def _correlated_mounting(m: "Mounting", model: "ErrorModel | None") -> dict:
-    """σ of a mounting under correlated errors; nothing without a model."""
-    if model is None:
-        return {}
-    return {
-        "sigma_base_correlated": m.sigma[:3].tolist(),
-        "sigma_angles_correlated": m.sigma[3:].tolist(),
-        "covariance_correlated": m.covariance.tolist(),
-        "sigma_length_correlated": m.length_sigma,
-    }
-
-
-def _correlated_sigma(rig: "RigCalibration", camera: str, parameter: str) -> dict:
-    """σ of a parameter under correlated errors; nothing without a model, or where it is held."""
-    sigma = rig.correlated_sigma[camera].get(parameter)
-    return {} if rig.error_model is None or sigma is None else {"sigma_correlated": sigma}
-
-
-def rig_dict(rig: "RigCalibration", brief: bool = False) -> dict:
-    """The rig as plain dicts and numbers: object unit, degrees, pixels; residuals, in the unit of
-    the models, as of `adjust`; `brief` leaves them out."""
-    found = {} if brief else rig.residuals
-    residuals = [dict(zip(found, row)) for row in table_rows(found)]
-    return {
-        "reference": rig.names[0],
-        "epochs": list(rig.epochs),
-        "left_out": dict(rig.left_out),
-        "contradicting": dict(rig.contradicting),
-        "sigma0": rig.sigma0,
-        "observations": rig.result.counts.observations,
-        "unknowns": rig.result.counts.unknowns,
-        "redundancy": rig.redundancy,
-        "removed": [{"kind": r.kind, "name": r.name, "test": r.test} for r in rig.removed],
-        "rms": rig.rms,
-        "mountings": {
-            name: _mounting_dict(m) | _correlated_mounting(rig.mountings[name], rig.error_model)
-            for name, m in rig.classical_mountings.items()
-        },
-        "boards": {
-            "bodies": [list(body) for body in rig.bodies],
-            "places": {name: _mounting_dict(m) for name, m in rig.placements.items()},
-        },
-        "ties_by_motion": [dataclasses.asdict(tie) for tie in rig.ties],
-        "separate_boards": [list(names) for names in rig.separate],
-        "advice": rig.advice,
-        "cameras": {
-            name: {
-                n: {"value": value, "sigma": rig.sigma[name].get(n)}
-                | _correlated_sigma(rig, name, n)
-                for n, value in rig.parameters[name].items()
-            }
-            for name in rig.names
-        },
-        "quality": {name: _rig_quality(rig, name) for name in rig.names},
-        "error_components": []
-        if rig.error_model is None
-        else [size.to_dict(rig.image_unit) for size in rig.error_model.sizes],
-    } | ({} if brief else {"residuals": residuals})
-
-
-def calibrations_dict(found: "Calibrations", brief: bool = False) -> dict:
-    """The JSON of one calibration, or of several under their names, with the rig."""
-    if len(found.cameras) == 1:
-        return next(iter(found.cameras.values())).to_dict(brief)
-    parts = {name: one.to_dict(brief) for name, one in found.cameras.items()}
-    verdict = verdict_dict(conclude_calibrations(found))
-    document = {"converged": found.converged, "verdict": verdict, "calibrations": parts}
-    if found.rig is not None:
-        document["rig"] = rig_dict(found.rig, brief)
-    return document

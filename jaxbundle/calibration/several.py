@@ -33,7 +33,7 @@ class Calibrations(TableMethods):
     def to_dict(self, brief: bool = False) -> dict[str, Any]:
         """The result as plain dicts and numbers, as in JSON: of one camera, or of several by name,
         with their rig."""
-        from jaxbundle.calibration.report import calibrations_dict
+        from jaxbundle.calibration.several_report import calibrations_dict
 
         return calibrations_dict(self, brief)
 
@@ -53,7 +53,8 @@ class Calibrations(TableMethods):
 
     def report(self) -> str:
         """The verdict on several cameras, the report of their rig, and those of all cameras."""
-        from jaxbundle.calibration.report import rig_text, several_text
+        from jaxbundle.calibration.rig.report import rig_text
+        from jaxbundle.calibration.several_report import several_text
 
         parts = [] if len(self.cameras) == 1 else [several_text(self)]
         parts += [] if self.rig is None else [rig_text(self.rig)]

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from jaxbundle.adjustment.uncertainty_budget import HEADER as BUDGET_HEADER
 from jaxbundle.adjustment.uncertainty_budget import RESULT_HEADER
-from jaxbundle.calibration.report import (
+from jaxbundle.calibration.rig.report import (
     MOUNTED,
     correlation_rows,
     mounting_rows,

@@ -10,7 +10,7 @@ import rig_scenes as scenes
 from rig_scenes import BACK, CHAIN, REAR
 
 import jaxbundle
-from jaxbundle.calibration.report import rig_dict, rig_text
+from jaxbundle.calibration.rig.report import rig_dict, rig_text
 from jaxbundle.io import read_boards, read_network
 from jaxbundle.measure import Board
 

@@ -13,7 +13,7 @@ from jaxbundle import CameraModel
 from jaxbundle.batches.calibrate import calibrate_batch
 from jaxbundle.calibration import calibrate, calibrate_rig
 from jaxbundle.calibration.files import json_text
-from jaxbundle.calibration.report import rig_dict, rig_text
+from jaxbundle.calibration.rig.report import rig_dict, rig_text
 from jaxbundle.calibration.start import start_values
 from jaxbundle.cameras import opencv
 from jaxbundle.errors import InputError

@@ -15,9 +15,9 @@ from test_calibrate import VIEWS
 from jaxbundle.batches.epochs import epoch_keys
 from jaxbundle.calibration import BoardViews, calibrate_cameras, calibrate_rig
 from jaxbundle.calibration.files import calibrations_dict, fill_rig, json_text, save_rig_plots
-from jaxbundle.calibration.report import rig_dict, rig_text
 from jaxbundle.calibration.rig.calibrate import require_solved
 from jaxbundle.calibration.rig.declare import Rig, adjust_rig, declare_rig, leave_out
+from jaxbundle.calibration.rig.report import rig_dict, rig_text
 from jaxbundle.cameras import get_model, image_ray, project
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.geometry import (

@@ -400,13 +400,13 @@ class RigCalibration(TableMethods):
 
     def report(self) -> str:
         """The full report as text."""
-        from jaxbundle.calibration.report import rig_text
+        from jaxbundle.calibration.rig.report import rig_text
 
         return rig_text(self)
 
     def to_dict(self, brief: bool = False) -> dict[str, Any]:
         """The result as plain dicts and numbers, as in JSON."""
-        from jaxbundle.calibration.report import rig_dict
+        from jaxbundle.calibration.rig.report import rig_dict
 
         return rig_dict(self, brief)
 
