@@ -35,7 +35,9 @@ class _Staged(Progress):
         super().update(task_id, description=description, **options)
 
     def stop(self) -> None:
-        super().stop()
+        # Before Rich 14 a bar that is not shown ends with an empty line.
+        if not self.disable:
+            super().stop()
         if self.stages is not None:
             self.stages.end()
 
