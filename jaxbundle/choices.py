@@ -96,7 +96,16 @@ ORDERS = {
 DESIGNED = ("position", "direction", "roll", "targets")
 
 BOARDS = ("chessboard", "circles", "asymmetric-circles", "charuco", "aprilgrid")
-CODED_TARGETS = ("aruco", "apriltag", "aprilgrid", "charuco", "ring12", "ring14")
+CODED_TARGETS = (
+    "aruco",
+    "apriltag",
+    "aprilgrid",
+    "charuco",
+    "ring12",
+    "ring14",
+    "ring16",
+    "ring20",
+)
 # OpenCV's dictionaries of square markers.
 DICTIONARIES = (
     *(f"DICT_{n}X{n}_{words}" for n in (4, 5, 6, 7) for words in (50, 100, 250, 1000)),
@@ -104,6 +113,8 @@ DICTIONARIES = (
     *(f"DICT_APRILTAG_{family}" for family in ("16h5", "25h9", "36h10", "36h11")),
 )  # fmt: skip
 FEATURES = ("sift", "akaze", "orb")
+# Tie points of a reconstruction: of features, or the coded targets alone.
+TIE_POINTS = (*FEATURES, "none")
 # Selections of photograph pairs for matching.
 MATCHED_PAIRS = ("auto", "all", "sequence", "place", "alike")
 

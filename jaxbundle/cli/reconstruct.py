@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from jaxbundle.choices import CODED_TARGETS, FEATURES, MATCHED_PAIRS
+from jaxbundle.choices import CODED_TARGETS, MATCHED_PAIRS, TIE_POINTS
 from jaxbundle.cli.app import Check, Correlated, Force, Html, Json, Quiet, app, choice
 from jaxbundle.cli.certificate_options import (
     Accept,
@@ -44,15 +44,22 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
         str | None,
         typer.Option(help=f"coded targets: {', '.join(CODED_TARGETS)}; :OPTION after it"),
     ] = None,
+    uncoded: Annotated[
+        bool, typer.Option("--uncoded", help="with ring-coded targets: plain discs, too")
+    ] = False,
     distances: Annotated[
         Path | None, typer.Option(help="scale bars: table from,to,value,sigma between named points")
     ] = None,
-    features: Annotated[str, choice(FEATURES)] = "sift",
+    features: Annotated[str, choice(TIE_POINTS)] = "sift",
     pairs: Annotated[str, choice(MATCHED_PAIRS, "matched")] = "auto",
     points: Annotated[int, typer.Option(min=20, help="desired tie points per photograph")] = 1500,
     square_pixels: Annotated[
         bool, typer.Option(help="observe fy/fx as 1; otherwise both focal lengths are unknown")
     ] = True,
+    camera_per_folder: Annotated[
+        bool,
+        typer.Option("--camera-per-folder", help="every folder has a camera of its own"),
+    ] = False,
     correlated: Correlated = True,
     json: Json = "",
     html: Html = "",
@@ -107,11 +114,13 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
             control=known,
             name=name,
             targets=targets,
+            uncoded=uncoded,
             distances=bars,
             features=features,
             pairs=pairs,
             points=points,
             square_pixels=square_pixels,
+            camera_per_folder=camera_per_folder,
             correlated=correlated,
             store=store,
             progress=tell,

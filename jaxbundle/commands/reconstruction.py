@@ -29,11 +29,13 @@ def reconstruct(  # noqa: PLR0913 (public: the options of the command, all but o
     check: Sequence[str] = (),
     name: str = "",
     targets: str | None = None,
+    uncoded: bool = False,
     distances: Sequence[dict] | str | Path = (),
     features: str | None = None,
     pairs: str | None = None,
     points: int | None = None,
     square_pixels: bool = True,
+    camera_per_folder: bool = False,
     correlated: bool = True,
     settings: ReconstructionSettings = DEFAULT,
     store: str | Path | None = None,
@@ -50,11 +52,14 @@ def reconstruct(  # noqa: PLR0913 (public: the options of the command, all but o
       measurements; `control_sigma`: σ of those without their own, metres, or "SIGMA,HEIGHT";
       `check`: names, or `"every 3rd"`: only compared with the result.
     - `name` of the job; default: the folder.
-    - `targets`: kind of coded targets; `distances`: scale bars, rows `from`, `to`, `value`, `sigma`
+    - `targets`: kind of coded targets; `uncoded`: discs without a code, too, once the photographs
+      are oriented; `distances`: scale bars, rows `from`, `to`, `value`, `sigma`
       between named points, or their table.
-    - `features`: `"sift"`, `"akaze"` or `"orb"`; `pairs`: which photographs are matched; `points`:
-      desired tie points per photograph. They replace those of `settings`.
+    - `features`: `"sift"`, `"akaze"`, `"orb"`, or `"none"`: the coded targets alone; `pairs`: which
+      photographs are matched; `points`: desired tie points per photograph. They replace those of
+      `settings`.
     - `square_pixels`: observe fy/fx as 1; otherwise both focal lengths are unknown.
+    - `camera_per_folder`: photographs of two folders were taken with two cameras.
     - `correlated`: state σ under errors that image points share, and compare halves by photographs,
       of eight photographs or more (`Adjustment.error_model`, `Adjustment.replication`).
     - `store`: folder of features and matches, for a repeated run.
@@ -66,8 +71,14 @@ def reconstruct(  # noqa: PLR0913 (public: the options of the command, all but o
     if targets is not None:
         check_kind(targets)
         settings = replace(settings, targets=targets)
-    if features is not None:
+    if features == "none":
+        settings = replace(settings, natural_points=False)
+    elif features is not None:
         settings = replace(settings, detection=FeatureSettings(features))
+    if truth("camera_per_folder", camera_per_folder):
+        settings = replace(settings, camera_per_folder=True)
+    if truth("uncoded", uncoded):
+        settings = replace(settings, uncoded=True)
     if pairs is not None:
         settings = replace(settings, pairs=pairs)
     if points is not None:

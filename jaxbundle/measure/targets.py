@@ -227,6 +227,8 @@ def _iterate(
         g, J, d, sector, minor = _blurred_disc(theta, places, settings.sectors)
         reach = settings.reach * np.exp(theta[7]) + 1
         weight = consistent * ((d < min(reach, 0.8 * minor)) & (d > -min(reach, MARGIN)))
+        if not weight.any():
+            raise InputError("no pixel is at the edge of the target")
         r = weight * (grey - g)
         A = J * (weight * scale[:, None])
         change = scale * np.linalg.solve(_normal_matrix(A), A @ r)

@@ -57,7 +57,7 @@ class GeographicPosition:
 class Exif:
     """Size in pixels; the camera; focal length in mm, and its equivalent for
     35 mm film; pixels per mm in the focal plane; orientation (1: as on the sensor); time; whether
-    the photograph was `cropped` to another shape."""
+    the photograph was `cropped` to another shape; `serial` number of the camera."""
 
     size: tuple[int, int]
     make: str = ""
@@ -70,6 +70,7 @@ class Exif:
     place: GeographicPosition | None = None
     attitude: CameraAttitude | None = None
     cropped: bool = False
+    serial: str = ""
 
     @property
     def camera(self) -> str:
@@ -133,7 +134,8 @@ def read_exif(path: str | Path) -> Exif:
     return Exif(
         size=size,
         make=_text(head.get(Tag.Make)),
-        model=_text(head.get(Tag.Model)),
+        model=_text(head.get(Tag.Model)) or _text(head.get(Tag.UniqueCameraModel)),
+        serial=_text(details.get(Tag.BodySerialNumber)) or _text(head.get(Tag.CameraSerialNumber)),
         focal_length=_positive(details.get(Tag.FocalLength)),
         focal_length_35=_positive(details.get(Tag.FocalLengthIn35mmFilm)),
         resolution=resolution / unit if resolution and unit else None,

@@ -1,6 +1,7 @@
 """Points with names in photographs: coded targets, control points, ends of scale bars."""
 
 import dataclasses
+import itertools
 import math
 from collections import Counter
 from collections.abc import Sequence
@@ -18,6 +19,8 @@ from jaxbundle.photographs.reading import image_errors, read_photograph
 from jaxbundle.reconstruction.control import Control
 from jaxbundle.reconstruction.photographs import Photograph
 from jaxbundle.system.threads import map_in_threads
+from jaxbundle.tiepoints.features import Features
+from jaxbundle.tiepoints.matching import FeatureMatches
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,23 +48,37 @@ def no_named_points() -> NamedMeasurements:
     return NamedMeasurements(np.zeros(0, int), (), np.zeros((0, 2)), np.zeros((0, 2)))
 
 
+@dataclasses.dataclass(frozen=True)
+class Discs:
+    """Uncoded discs of every photograph: pixels and their σ."""
+
+    xy: tuple[Float[np.ndarray, "_ 2"], ...]
+    sigma: tuple[Float[np.ndarray, "_ 2"], ...]
+
+    def __len__(self) -> int:
+        return sum(map(len, self.xy))
+
+
 def find_named(
     photographs: Sequence[Photograph],
     targets: str | None,
     control: Control | None,
     workers: int | None = None,
-) -> tuple[NamedMeasurements, list[str]]:
-    """The coded targets of all photographs and the measurements of control points; notes.
-    `workers`: photographs in work at once, at most; default: one for each core.
+    uncoded: bool = False,
+) -> tuple[NamedMeasurements, Discs | None, list[str]]:
+    """The coded targets of all photographs and the measurements of control points; uncoded discs,
+    if they are looked for; notes. `workers`: photographs in work at once, at most; default: one for
+    each core.
 
     **Raises:** `InputError` if control points are measured in unknown photographs only.
     """
     image, name, xy, sigma, notes = [], [], [], [], []
+    discs = None
     if targets:
         columns, rows = max((p.size for p in photographs), key=math.prod)
         need = memory_of_targets(rows, columns, targets)
         at_once = photographs_at_once(rows * columns, need, workers)
-        find = lambda photograph: _find_targets(photograph, targets)
+        find = lambda photograph: _find_targets(photograph, targets, uncoded)
         of_photographs = map_in_threads(find, photographs, at_once)
         for k, points in enumerate(of_photographs):
             if points is None:
@@ -77,6 +94,12 @@ def find_named(
             f"{n} measurements of coded targets are left out: {why}" for why, n in left_out.items()
         ]
         notes.append(f"{len(set(name))} coded targets ({targets}) in {len(set(image))} photographs")
+        if uncoded:
+            found = [getattr(points, "uncoded", None) for points in of_photographs]
+            discs = Discs(
+                tuple(np.zeros((0, 2)) if p is None else p.xy for p in found),
+                tuple(np.zeros((0, 2)) if p is None else p.sigma for p in found),
+            )
     if control is not None and control.sightings:
         index = {p.name: k for k, p in enumerate(photographs)}
         unknown = sorted({file for file, _ in control.sightings if file not in index})
@@ -95,9 +118,44 @@ def find_named(
                 xy.append(place)
                 sigma.append((s, s))
     if not name:
-        return no_named_points(), notes
+        return no_named_points(), discs, notes
     columns = np.array(image), tuple(name), np.array(xy, float), np.array(sigma, float)
-    return NamedMeasurements(*columns), notes
+    return NamedMeasurements(*columns), discs, notes
+
+
+def join_named(one: NamedMeasurements, other: NamedMeasurements) -> NamedMeasurements:
+    """The measurements of both."""
+    return NamedMeasurements(
+        np.concatenate([one.image, other.image]),
+        (*one.name, *other.name),
+        np.concatenate([one.xy, other.xy]),
+        np.concatenate([one.sigma, other.sigma]),
+    )
+
+
+def named_as_features(named: NamedMeasurements, photographs: int) -> list[Features]:
+    """Named points as features, which have neither size nor descriptor."""
+    places = [named.xy[named.image == k] for k in range(photographs)]
+    nothing = lambda xy: (np.ones(len(xy)), np.zeros(len(xy)), np.zeros((len(xy), 1), np.uint8))
+    return [Features(xy, *nothing(xy)) for xy in places]
+
+
+def match_named(named: NamedMeasurements, photographs: int, least: int) -> list[FeatureMatches]:
+    """Pairs of photographs with at least so many common names, as matches of
+    `named_as_features`."""
+    names = np.array(named.name, object)
+    row = [
+        {name: k for k, name in enumerate(names[named.image == image])}
+        for image in range(photographs)
+    ]
+    matches = []
+    for i, j in itertools.combinations(range(photographs), 2):
+        rows = np.array([(a, row[j][name]) for name, a in row[i].items() if name in row[j]])
+        if len(rows) >= least:
+            # by their names they are certain
+            sure = np.zeros(len(rows)), np.ones(len(rows), bool)
+            matches.append(FeatureMatches((i, j), rows, *sure))
+    return matches
 
 
 def name_unused(
@@ -139,7 +197,7 @@ def name_unused(
     return notes
 
 
-def _find_targets(photograph: Photograph, kind: str) -> NamedPoints | None:
+def _find_targets(photograph: Photograph, kind: str, uncoded: bool) -> NamedPoints | None:
     """The coded targets of a photograph; None if it cannot be read: it is left out later, with
     the reason."""
     try:
@@ -147,7 +205,7 @@ def _find_targets(photograph: Photograph, kind: str) -> NamedPoints | None:
     except InputError:
         return None
     with image_errors(photograph.path):
-        return find_coded_targets(grey, kind)
+        return find_coded_targets(grey, kind, uncoded=uncoded)
 
 
 def read_distances(path: str | Path) -> list[dict]:

@@ -43,7 +43,8 @@ def photograph_network(
     """The network of the photographs with measurements; image coordinates in pixels.
 
     **Arguments:** `aspect_sigma`: of fy/fx about 1; infinite: not observed."""
-    rows = np.unique(measured.image).tolist()
+    # without tie points of features the named ones connect the photographs
+    rows = np.unique(measured.image if len(measured) else extra.named.image).tolist()
     of = [cameras.camera_of[k] for k in rows]
     used = sorted(set(of))
     free = [cameras.cameras[c] for c in used]

@@ -115,10 +115,14 @@ class Cameras:
     lens: tuple[int, ...] = (0,)
 
 
-def assign_cameras(photographs: Sequence[Photograph], given: Camera | None = None) -> Cameras:
-    """Photographs of one make, model, focal length and size share a camera, of model `opencv`.
+def assign_cameras(
+    photographs: Sequence[Photograph], given: Camera | None = None, per_folder: bool = False
+) -> Cameras:
+    """Photographs of one make, model, serial number, focal length and size share a camera, of model
+    `opencv`.
 
-    **Arguments:** `given`: a calibrated camera, shared by all photographs.
+    **Arguments:** `given`: a calibrated camera, shared by all photographs; `per_folder`: those of
+    every folder have a camera of their own.
 
     **Raises:** `InputError` if the given camera has another size.
     """
@@ -131,7 +135,8 @@ def assign_cameras(photographs: Sequence[Photograph], given: Camera | None = Non
     for k, photograph in enumerate(photographs):
         exif = photograph.exif
         focal = round(exif.focal_length or 0.0, 1), round(exif.focal_length_35 or 0.0)
-        groups.setdefault((exif.camera, *focal, exif.size), []).append(k)
+        own = photograph.path.parent.resolve() if per_folder else ""
+        groups.setdefault((exif.camera, exif.serial, own, *focal, exif.size), []).append(k)
     cameras, stated, of = [], [], [0] * len(photographs)
     # the key of a lens is that of a camera with the sides in order
     lenses: dict[tuple, int] = {}
@@ -143,6 +148,8 @@ def assign_cameras(photographs: Sequence[Photograph], given: Camera | None = Non
         columns, rows_of_image = exif.size
         f = told.value if told else 1.2 * max(exif.size)
         id = (exif.camera or "camera") + (f" {number + 1}" if len(groups) > 1 else "")
+        if per_folder and len(groups) == len({key[2] for key in groups}):
+            id = photographs[rows[0]].path.parent.resolve().name
         centre = {"cx": (columns - 1) / 2, "cy": (rows_of_image - 1) / 2}
         cameras.append(
             Camera(id, "opencv", {"fx": f, "fy": f, **centre}, image_size=(columns, rows_of_image))

@@ -30,7 +30,14 @@ from jaxbundle.reconstruction.control import Control
 from jaxbundle.reconstruction.folding import refuse_folded, refuse_superimposed
 from jaxbundle.reconstruction.georeferencing import georeference
 from jaxbundle.reconstruction.misplaced import NamedPairs
-from jaxbundle.reconstruction.named import find_named, name_unused
+from jaxbundle.reconstruction.named import (
+    Discs,
+    find_named,
+    join_named,
+    match_named,
+    name_unused,
+    named_as_features,
+)
 from jaxbundle.reconstruction.network import FurtherData, photograph_network, track_name
 from jaxbundle.reconstruction.oriented_block import MIN_CONTROL, FrameData
 from jaxbundle.reconstruction.parts import SMALLEST_PART, group_connected, why_alone
@@ -50,6 +57,7 @@ from jaxbundle.reconstruction.result import (
 from jaxbundle.reconstruction.satellite_positions import find_positions
 from jaxbundle.reconstruction.settings import ReconstructionSettings
 from jaxbundle.reconstruction.starting import is_plausible, start_again, start_values
+from jaxbundle.reconstruction.uncoded_targets import find_uncoded, name_uncoded
 from jaxbundle.report.correlated import stated_sigma_of
 from jaxbundle.system.cores import available_cores, can_run_two_programs
 from jaxbundle.tiepoints import track_measurement
@@ -59,7 +67,7 @@ from jaxbundle.tiepoints.features import Features, memory_of_features
 from jaxbundle.tiepoints.matching import FeatureMatches
 from jaxbundle.tiepoints.still import without_marks
 from jaxbundle.tiepoints.store import Store
-from jaxbundle.tiepoints.track_measurement import Measurements, measure_tracks
+from jaxbundle.tiepoints.track_measurement import Measurements, measure_tracks, no_measurements
 from jaxbundle.tiepoints.tracks import choose_tracks, make_tracks
 from jaxbundle.tiepoints.verification import Pair
 from jaxbundle.tiepoints.verified_pairs import (
@@ -97,8 +105,10 @@ def reconstruct(
     """
     require_x64()
     photographs, left_out = find_photographs(given)
-    cameras = assign_cameras(photographs, camera)
-    named, notes = find_named(photographs, settings.targets, control, settings.workers)
+    cameras = assign_cameras(photographs, camera, settings.camera_per_folder)
+    named, discs, notes = find_named(
+        photographs, settings.targets, control, settings.workers, settings.uncoded
+    )
     notes += name_other_files(given)
     positions, said = find_positions(photographs, control)
     notes += said
@@ -128,7 +138,7 @@ def reconstruct(
     stored = Store(store, settings.detection, settings.matching)
     run = _ReconstructionRun(photographs, left_out, cameras, settings, stored, progress, further)
     run.notes += notes
-    run.frame, run.system, run.title = frame, system, name
+    run.frame, run.system, run.title, run.discs = frame, system, name, discs
     return run.run()
 
 
@@ -154,6 +164,7 @@ class _ReconstructionRun:
         self.warnings: list[tuple[float, str]] = []
         self.matched_pairs: set[tuple[int, int]] = set()
         self.frame: FrameData | None = None
+        self.discs: Discs | None = None
         self.system = self.title = ""
 
     def run(self) -> Reconstruction:
@@ -181,7 +192,9 @@ class _ReconstructionRun:
         )
 
     def _match(self) -> tuple[list[Features], list[FeatureMatches]]:
-        """Features and matches, without those of duplicates and marks."""
+        """Features and matches, without those of duplicates and marks; or the named points."""
+        if not self.settings.natural_points:
+            return self._match_named()
         features = self._detect()
         settings = self.settings
         prints = [p.fingerprint for p in self.photographs]
@@ -216,6 +229,20 @@ class _ReconstructionRun:
                 f"matches of marks at the same pixels of {marked} photographs (a date, a name, "
                 "dirt on the sensor) are not used"
             )
+        return features, matches
+
+    def _match_named(self) -> tuple[list[Features], list[FeatureMatches]]:
+        """Named points as features and matches."""
+        named, least = self.further.named, self.settings.min_common_targets
+        features = named_as_features(named, len(self.names))
+        for name, of_photograph in zip(self.names, features):
+            if (number := len(of_photograph)) < least:
+                self.left_out.setdefault(
+                    name, f"{count(number, 'coded target')}, at least {least} are needed"
+                )
+        self._require_two()
+        matches = match_named(named, len(self.names), least)
+        self.matched_pairs = {m.images for m in matches}
         return features, matches
 
     def _detect(self) -> list[Features]:
@@ -380,6 +407,8 @@ class _ReconstructionRun:
     def _measure(self, features: Sequence[Features], pairs: Sequence[Pair]) -> Measurements:
         """The tracks of pairs, measured."""
         settings, sizes = self.settings, [photograph.size for photograph in self.photographs]
+        if not settings.natural_points:
+            return no_measurements()
         tracks, xy = make_tracks(features, pairs), [f.xy for f in features]
         chosen = choose_tracks(tracks, xy, sizes, settings.points, settings.tracks)
         done = iter(range(1, len(features) + 1))
@@ -404,6 +433,8 @@ class _ReconstructionRun:
         self._begin("start values")
         named = {(self.names[p.images[0]], self.names[p.images[1]]): p for p in inside}
         oriented, weighted, note = self._adjust_first(network, measured, named)
+        if self.discs is not None:
+            oriented, weighted, note = self._complete(name, weighted, measured, named)
         weighted, note = self._check_ratios(oriented, weighted, measured, note)
         self._begin("")
         # before control, which fits a folded part as well as it can
@@ -441,6 +472,29 @@ class _ReconstructionRun:
         for said in (*self._compare_with_files(result), *doubts):
             self._warn(f"{name}: {said}")
         return part, dict(oriented.images_not_placed)
+
+    def _complete(
+        self,
+        name: str,
+        weighted: WeightedAdjustment,
+        measured: Measurements,
+        pairs: NamedPairs,
+    ) -> tuple[Oriented, WeightedAdjustment, str]:
+        """The adjustment with uncoded targets, and a note on attitudes."""
+        assert self.discs is not None, "asked where discs were looked for"
+        self._begin("uncoded targets")
+        settings, discs = self.settings, self.discs
+        found = find_uncoded(weighted.adjustment, self.names, discs.xy, settings.uncoded_targets)
+        plain = name_uncoded(found, discs.xy, discs.sigma)
+        self.notes.append(
+            f"{name}: {count(len(set(plain.name)), 'uncoded target')} in "
+            f"{len(plain)} of {len(discs)} discs"
+        )
+        extra = dataclasses.replace(self.further, named=join_named(self.further.named, plain))
+        network = photograph_network(
+            self.photographs, self.cameras, measured, extra, name, settings.aspect_sigma
+        )
+        return self._adjust_first(network, measured, pairs)
 
     def _compare_with_files(self, result: Adjustment) -> list[str]:
         """Principal distances that contradict those of the files, in words."""

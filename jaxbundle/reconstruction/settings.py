@@ -9,6 +9,7 @@ from jaxbundle.reconstruction.adjusting import WeightingSettings
 from jaxbundle.reconstruction.folding import SuperpositionSettings
 from jaxbundle.reconstruction.oriented_block import ControlSettings
 from jaxbundle.reconstruction.starting import BlockStartSettings
+from jaxbundle.reconstruction.uncoded_targets import UncodedSettings
 from jaxbundle.tiepoints.camera_starts import CameraStartSettings
 from jaxbundle.tiepoints.duplicates import DuplicateSettings
 from jaxbundle.tiepoints.features import FeatureSettings
@@ -36,8 +37,18 @@ class ReconstructionSettings:
     """Threads, all cores if 0."""
     significance: float = 0.001
     """Significance of data snooping: the probability that a good measurement is removed."""
+    camera_per_folder: bool = False
+    """The photographs of every folder have a camera of their own. Otherwise those of one make,
+    model, serial number, focal length and size share one."""
     targets: str | None = None
     """Kind of coded targets (`measure.coded_targets`)."""
+    natural_points: bool = True
+    """Tie points of features; otherwise the coded targets alone."""
+    uncoded: bool = False
+    """Discs without a code, too, once the photographs are oriented (ring-coded targets)."""
+    min_common_targets: int = 8
+    """Common targets that a pair needs where no features are used: five orient it, and three more
+    show whether they do. Features need more, some of which are wrong (`verification`)."""
     aspect_sigma: float = 2e-4
     """σ with which fy/fx of an unknown camera is observed as 1, infinite: not at all. Sensors have
     square pixels: for two reflex cameras, in 39 photographs of a panel of surveyed targets, fy/fx
@@ -57,6 +68,7 @@ class ReconstructionSettings:
     loops: LoopSettings = LoopSettings()
     tracks: TrackSettings = TrackSettings()
     track_matching: TrackMatchingSettings = TrackMatchingSettings()
+    uncoded_targets: UncodedSettings = UncodedSettings()
     start_values: BlockStartSettings = BlockStartSettings()
     weighting: WeightingSettings = WeightingSettings()
     superposition: SuperpositionSettings = SuperpositionSettings()
@@ -65,5 +77,9 @@ class ReconstructionSettings:
     def __post_init__(self):
         one_of("pairs", self.pairs, MATCHED_PAIRS)
         integer("points", self.points)
+        if not self.natural_points and self.targets is None:
+            raise InputError("features none: the targets that take their place are missing")
+        if self.uncoded and not (self.targets or "").startswith("ring"):
+            raise InputError("uncoded: ring-coded targets are expected, such as ring14")
         if not self.aspect_sigma > 0:
             raise InputError(f"aspect_sigma: expected a positive number, got {self.aspect_sigma}")

@@ -110,6 +110,15 @@ class Measurements:
         return Measurements(*(getattr(self, f.name)[rows] for f in dataclasses.fields(self)))
 
 
+def no_measurements() -> Measurements:
+    """No measurements."""
+    none = np.zeros(0, int)
+    places = np.zeros((0, 2))
+    return Measurements(
+        none, none, places, places, none, np.zeros(0, bool), np.zeros((0, 3), np.uint8)
+    )
+
+
 @dataclasses.dataclass(frozen=True)
 class _TrackFeatures:
     """The features of all tracks, by measurement; `is_template`, `level` as of `Measurements`;

@@ -293,7 +293,7 @@ def test_ring_coded_targets(negative):
                 u, v = np.rint(centres[m]).astype(int)
                 box = (slice(max(v - 23, 0), v + 24), slice(max(u - 23, 0), u + 24))
                 keep[box] = grey[box]
-            found = find_coded_targets(255 - keep if negative else keep, "ring12")
+            found = find_coded_targets(255 - keep if negative else keep, "ring12:codes")
             assert sorted(found.names) == ["189", "45"]
             for m in (n, n + 1):
                 place = found.names.index(str((45, 189)[m % 2]))

@@ -1,5 +1,6 @@
 """Cameras by what photographs say of themselves."""
 
+import dataclasses
 from pathlib import Path
 
 import pytest
@@ -38,3 +39,17 @@ def test_one_camera_for_each_focal_length_and_format(exif, ids, of, lens):
             (rows - 1) / 2,
         )
         assert camera.image_size == exif[of.index(k)].size
+
+
+def test_two_cameras_of_one_model():
+    """By their serial numbers, or by the folders of their photographs."""
+    exif = [dataclasses.replace(WIDE, serial=serial) for serial in ("1", "2", "1")]
+    assert assign_cameras(photographs(*exif)).camera_of == (0, 1, 0)
+    left, right = (
+        dataclasses.replace(p, path=Path(side) / p.path)
+        for p, side in zip(photographs(WIDE, WIDE), ("left", "right"))
+    )
+    assert assign_cameras([left, right]).camera_of == (0, 0)
+    found = assign_cameras([left, right], per_folder=True)
+    assert [camera.id for camera in found.cameras] == ["left", "right"]
+    assert found.camera_of == found.lens == (0, 1)

@@ -104,7 +104,7 @@ def test_measurements_in_missing_photographs_are_reported(tmp_path):
     """The others are used; if none is left another folder was given."""
     text = "id,X,Y,Z,image,u,v\nA,1,2,3,a.jpg,10,20\nA,1,2,3,b.jpg,11,21\nB,4,2,3,b.jpg,1,2\n"
     control = read_control_measurements(written(tmp_path, text))
-    found, notes = find_named([SimpleNamespace(name="a.jpg")], None, control)
+    found, _, notes = find_named([SimpleNamespace(name="a.jpg")], None, control)
     assert found.name == ("A",) and notes == ["control measured in missing photographs: 'b.jpg'"]
     with pytest.raises(InputError, match="measured in none of the photographs, but in a.jpg, b"):
         find_named([SimpleNamespace(name="c.jpg")], None, control)
