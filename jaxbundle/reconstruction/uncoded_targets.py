@@ -8,13 +8,13 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.orientation import batched
 from jaxbundle.reconstruction.named import NamedMeasurements
-from jaxbundle.tiepoints.verified_pairs import ideal_features
+from jaxbundle.tiepoints.verified_pairs import central_distance, ideal_features
 
 Places = Sequence[Float[np.ndarray, "_ 2"]]
 
@@ -81,23 +81,15 @@ class _Search:
         ]
         of = [cameras[c] for c in network.images.camera]
         self.ideal = [ideal_features(camera, discs[k]) for camera, k in zip(of, self.rows)]
-        # a pixel in units of c, at the middle of the photograph
-        pixel = np.array([[0.0, 0.0], [1.0, 0.0]])
-        self.pixel = np.array(
-            [
-                np.linalg.norm(
-                    np.diff(ideal_features(c, pixel + np.array(c.image_size) / 2), axis=0)
-                )
-                for c in of
-            ]
-        )
+        self.pixel = 1 / np.array([central_distance(camera) for camera in of])
         self.ray = [self._rays(k) for k in range(len(self.rows))]
-        self.free = [np.isfinite(xy).all(1) for xy in self.ideal]
-        self.tree = [
-            KDTree(np.where(np.isfinite(xy), xy, np.inf)[ok]) if ok.any() else None
-            for xy, ok in zip(self.ideal, self.free)
+        self.free: list[Bool[np.ndarray, " _"]] = [
+            np.asarray(np.isfinite(xy).all(1)) for xy in self.ideal
         ]
-        self.row_of = [np.flatnonzero(ok) for ok in self.free]
+        self.there = [np.flatnonzero(free) for free in self.free]
+        self.tree = [
+            KDTree(xy[rows]) if len(rows) else None for xy, rows in zip(self.ideal, self.there)
+        ]
         self.found: list[tuple[int, int, int]] = []
         self.points = 0
 
@@ -162,7 +154,7 @@ class _Search:
             reach = self.settings.tolerance * self.pixel[k]
             distance, at = tree.query(xy, distance_upper_bound=reach)
             ok = np.isfinite(distance)
-            row = self.row_of[k][np.where(ok, at, 0)]
+            row = self.there[k][np.where(ok, at, 0)]
             ok &= self.free[k][row]
             hits[ok, k] = row[ok]
             misfit[ok] += distance[ok] / self.pixel[k]

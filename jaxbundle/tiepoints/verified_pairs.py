@@ -108,7 +108,7 @@ def verify(
     ideal = [ideal_features(cameras[c], f.xy) for c, f in zip(camera_of, features)]
     # the longer side in units of c
     size = np.array(
-        [max(present_size(cameras[c])) / _central_distance(cameras[c]) for c in camera_of]
+        [max(present_size(cameras[c])) / central_distance(cameras[c]) for c in camera_of]
     )
     matches = [m for m in matches if len(m.rows)]
     # 64 pairs at once fill eight runs of eight lanes; in between the progress is shown
@@ -153,7 +153,7 @@ def present_size(camera: Camera) -> tuple[int, int]:
     return camera.image_size
 
 
-def _central_distance(camera: Camera) -> float:
+def central_distance(camera: Camera) -> float:
     """The principal distance in pixels, from the images of two points near the centre."""
     columns, rows = present_size(camera)
     middle = np.array([[columns / 2 - 0.5, rows / 2 - 0.5], [columns / 2 + 0.5, rows / 2 - 0.5]])
