@@ -105,6 +105,10 @@ _HOME = {
         "Surface",
         "surface",
     ),
+    "jaxbundle.commands.video_frames": (
+        "VideoFrames",
+        "frames",
+    ),
     "jaxbundle.errors": (
         "InputError",
         "NotSolvedError",

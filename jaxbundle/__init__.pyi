@@ -82,6 +82,8 @@ from jaxbundle.commands.reconstruction import reconstruct as reconstruct
 from jaxbundle.commands.stability_of_cameras import stability as stability
 from jaxbundle.commands.surface import Surface as Surface
 from jaxbundle.commands.surface import surface as surface
+from jaxbundle.commands.video_frames import VideoFrames as VideoFrames
+from jaxbundle.commands.video_frames import frames as frames
 from jaxbundle.errors import InputError as InputError
 from jaxbundle.errors import NotSolvedError as NotSolvedError
 from jaxbundle.float64 import enable_x64 as enable_x64
@@ -157,6 +159,7 @@ __all__ = [
     "Surface",
     "UncertaintyBudget",
     "Values",
+    "VideoFrames",
     "accept",
     "add_further",
     "adjust",
@@ -180,6 +183,7 @@ __all__ = [
     "enable_x64",
     "example",
     "explore",
+    "frames",
     "from_pycolmap",
     "grid_of_targets",
     "influence",

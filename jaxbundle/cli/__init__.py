@@ -22,6 +22,7 @@ COMMANDS = (
     "reconstruct",
     "orient",
     "adjust",
+    "frames",
     "calibrate",
     "calibrate-rig",
     "batch",
