@@ -1,5 +1,6 @@
 """`jaxbundle frames`: photographs out of videos."""
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -26,6 +27,9 @@ def frames(
     from jaxbundle.cli.outputs import check_json_target, print_result
     from jaxbundle.cli.progress import staging
 
+    # FFmpeg's own lines about a damaged file, beside the error of the command; read by OpenCV when
+    # it is imported
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     check_json_target(json, videos)
     try:
         begin = [int(word) for word in first.split(",")] if first else ()
