@@ -43,7 +43,8 @@ def unit(x):
 
 
 @pytest.mark.parametrize("indices", [
-    (1.0, GLASS, WATER), (1.0, WATER, WATER), (WATER, GLASS, 1.0), (1.0, GLASS, 1.0), (1.3, 1.1, 1.5),
+    (1.0, GLASS, WATER), (1.0, WATER, WATER), (WATER, GLASS, 1.0), (1.0, GLASS, 1.0),
+    (1.3, 1.1, 1.5),
 ])  # fmt: skip
 def test_a_flat_port_sends_the_point_back_along_the_ray_it_came_from(indices):
     random = np.random.default_rng(1)
@@ -136,9 +137,10 @@ def test_iterations_are_enough(monkeypatch):
         dome.append((*unit(random.normal(size=3)) * 10 ** random.uniform(0.1, 3), *centre))
     flat, dome = (tuple(np.array(x).T) for x in (flat, dome))
     air = (1.0, GLASS, WATER)
+    x, y, z, distance, thickness = flat
+    window = ((0.0, 0.0, -1.0), distance, thickness, air)
     run = lambda: [
-        np.stack(refraction.refract_flat((flat[0], flat[1], flat[2] - flat[3] - flat[4]), (0.0, 0.0, -1.0),
-                              flat[3], flat[4], air)),
+        np.stack(refraction.refract_flat((x, y, z - distance - thickness), *window)),
         np.stack(refraction.refract_dome(dome[:3], dome[3:], 1.0, 0.1, air)),
     ]  # fmt: skip
     few = run()

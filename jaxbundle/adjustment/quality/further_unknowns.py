@@ -13,11 +13,14 @@ from jaxbundle.geometry import matrix_from_quaternion, omega_phi_kappa_near
 from jaxbundle.leastsquares.declarations import Table
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.leastsquares.spaces import PoseValue, Rotation, Space
+from jaxbundle.network.kinds.interfaces import PORT
 from jaxbundle.network.kinds.rigs import MOUNTING
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
 ANGLES = ("omega", "phi", "kappa")
+# Frames that are relative to a camera, not to the origin of object space.
+IN_CAMERA = (MOUNTING, PORT)
 
 
 class Estimate(NamedTuple):
@@ -36,13 +39,12 @@ def estimates(
     found: Solution, names: Collection[str], sigma0: float, origin: Float[np.ndarray, "3"]
 ) -> list[Estimate]:
     """All unknowns of some tables. Frames and poses are given as X0, Y0, Z0 in object space
-    (mountings in the reference camera), ω, φ, κ."""
+    (mountings and ports in a camera), ω, φ, κ."""
     every = []
     for table in (t for t in found.problem.tables if t.name in names):
         values, Q = found.values[table.name], np.asarray(found.cofactor(table.name))
         shown, A = map(np.array, _read_rows(table.space, values))
-        # Frames are in object space, relative to the origin; a mounting is relative to a camera.
-        if isinstance(values, PoseValue) and table.name != MOUNTING:
+        if isinstance(values, PoseValue) and table.name not in IN_CAMERA:
             shown[:, :3] += origin
         variance = np.einsum("nij,njk,nik->ni", A, Q, A)
         sigma = sigma0 * np.sqrt(np.clip(variance, 0, None))

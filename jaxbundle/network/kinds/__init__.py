@@ -10,6 +10,7 @@ from jaxbundle.network.kinds.differences import Differences as Differences
 from jaxbundle.network.kinds.exterior_orientation import ExteriorPriors as ExteriorPriors
 from jaxbundle.network.kinds.figures import Figures as Figures
 from jaxbundle.network.kinds.figures import Shapes as Shapes
+from jaxbundle.network.kinds.interfaces import Interfaces as Interfaces
 from jaxbundle.network.kinds.lines import Edges as Edges
 from jaxbundle.network.kinds.rigs import Rigs as Rigs
 from jaxbundle.network.kinds.rolling_shutter import RollingShutter as RollingShutter
@@ -23,6 +24,7 @@ KINDS = {
         Attitudes,
         Rigs,
         RollingShutter,
+        Interfaces,
         Differences,
         Angles,
         Figures,
