@@ -15,12 +15,13 @@ from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.leastsquares.spaces import PoseValue, Rotation, Space
 from jaxbundle.network.kinds.interfaces import PORT
 from jaxbundle.network.kinds.rigs import MOUNTING
+from jaxbundle.network.kinds.robot_poses import ON_BASE, ON_HAND
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
 ANGLES = ("omega", "phi", "kappa")
-# Frames that are relative to a camera, not to the origin of object space.
-IN_CAMERA = (MOUNTING, PORT)
+# Frames that are relative to a camera, or a robot, not to the origin of object space.
+RELATIVE = (MOUNTING, PORT, ON_HAND, ON_BASE)
 
 
 class Estimate(NamedTuple):
@@ -39,12 +40,13 @@ def estimates(
     found: Solution, names: Collection[str], sigma0: float, origin: Float[np.ndarray, "3"]
 ) -> list[Estimate]:
     """All unknowns of some tables. Frames and poses are given as X0, Y0, Z0 in object space
-    (mountings and ports in a camera), ω, φ, κ."""
+    (mountings, ports and cameras of a robot in
+    their own frames), ω, φ, κ."""
     every = []
     for table in (t for t in found.problem.tables if t.name in names):
         values, Q = found.values[table.name], np.asarray(found.cofactor(table.name))
         shown, A = map(np.array, _read_rows(table.space, values))
-        if isinstance(values, PoseValue) and table.name not in IN_CAMERA:
+        if isinstance(values, PoseValue) and table.name not in RELATIVE:
             shown[:, :3] += origin
         variance = np.einsum("nij,njk,nik->ni", A, Q, A)
         sigma = sigma0 * np.sqrt(np.clip(variance, 0, None))

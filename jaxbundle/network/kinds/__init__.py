@@ -13,6 +13,7 @@ from jaxbundle.network.kinds.figures import Shapes as Shapes
 from jaxbundle.network.kinds.interfaces import Interfaces as Interfaces
 from jaxbundle.network.kinds.lines import Edges as Edges
 from jaxbundle.network.kinds.rigs import Rigs as Rigs
+from jaxbundle.network.kinds.robot_poses import RobotPoses as RobotPoses
 from jaxbundle.network.kinds.rolling_shutter import RollingShutter as RollingShutter
 from jaxbundle.network.kinds.ties import Ties as Ties
 
@@ -23,6 +24,7 @@ KINDS = {
         Antennas,
         Attitudes,
         Rigs,
+        RobotPoses,
         RollingShutter,
         Interfaces,
         Differences,
