@@ -100,8 +100,10 @@ def boards_from_one_camera(data, frames):
             data["distortion"][c],
         )  # fmt: skip
         R = data["start_R"][c].T
+        place = R @ t.ravel() + data["start_C"][c]
         # as if the water were air a board appears at 3/4 of its depth
-        found[f] = (R @ cv2.Rodrigues(turn)[0], R @ t.ravel() + data["start_C"][c])
+        place[2] += (place[2] - 1.0) / 3
+        found[f] = (R @ cv2.Rodrigues(turn)[0], place)
     return found
 
 
@@ -122,7 +124,8 @@ def network_of(data):
         ))  # fmt: skip
         angles = np.asarray(omega_phi_kappa_from_matrix(D @ data["start_R"][c]))
         row = dict(zip(("X0", "Y0", "Z0", "omega", "phi", "kappa"), (*data["start_C"][c], *angles)))
-        row |= dict.fromkeys(("sX0", "sY0", "sZ0", "somega", "sphi", "skappa"), 0.0 if not c else None)
+        held = 0.0 if not c else None  # the first gives the datum
+        row |= dict.fromkeys(("sX0", "sY0", "sZ0", "somega", "sphi", "skappa"), held)
         images.append({"id": f"im{c}", "camera": f"cam{c}"} | row)
     frames = np.unique(rows[:, 1].astype(int))
     boards = boards_from_one_camera(data, frames)
@@ -201,7 +204,8 @@ def main() -> None:
     ours = errors(data, K, np.diag([1.0, -1.0, -1.0]) @ M, result.image_values[:, :3],
                   unknowns["value"])  # fmt: skip
     peer = errors(data, *(data[f"peer_{n}"] for n in ("K", "R", "C", "water")))
-    print(f"AquaCal: {float(data['peer_seconds']):.1f} s, {float(data['peer_seconds']) / (done - start):.0f} times ours")
+    seconds = float(data["peer_seconds"])
+    print(f"AquaCal: {seconds:.1f} s, {seconds / (done - start):.0f} times ours")
     print("largest errors:  focal length %  principal point px  rotation °  position mm  water mm")
     for name, found in (("jaxbundle", ours), ("AquaCal", peer)):
         print(f"{name:16}" + "".join(f"{x:14.4f}" for x in found))

@@ -4,13 +4,20 @@ import dataclasses
 
 import numpy as np
 import pytest
-from further_checks import check_jacobians, sample
+from further_checks import check_jacobians
 from scipy.spatial.transform import Rotation
 
 import jaxbundle
 from jaxbundle.errors import InputError
-from jaxbundle.geometry import matrix_from_omega_phi_kappa, matrix_from_quaternion
-from jaxbundle.network.kinds.fit_hand_eye import Rigid, solve
+from jaxbundle.geometry import (
+    matrix_from_omega_phi_kappa,
+    matrix_from_quaternion,
+    omega_phi_kappa_from_matrix,
+)
+from jaxbundle.io.results.result_project import adjusted_network
+from jaxbundle.leastsquares.problem import with_data
+from jaxbundle.leastsquares.solution import find_minimum
+from jaxbundle.network.kinds.fit_hand_eye import Rigid, motions, solve
 from jaxbundle.planning.stations import Stations, stations_looking_at
 
 N, SIGMA_P, SIGMA_R = 12, 2e-4, 3e-4
@@ -96,6 +103,60 @@ def test_clean_data_give_the_truth(seen, type):
     np.testing.assert_allclose(place, X.t, atol=1e-10)
 
 
+def skew(v):
+    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+
+
+def tsai_lenz(A, B):
+    """Tsai and Lenz (1989): modified Rodrigues vectors, then the shifts."""
+    vector = lambda R: 2 * np.array([
+        np.sin(np.linalg.norm(v) / 2) * v / np.linalg.norm(v)
+        for v in Rotation.from_matrix(R).as_rotvec()
+    ])  # fmt: skip
+    a, b = vector(A.R), vector(B.R)
+    rows = np.concatenate([skew(x + y) for x, y in zip(a, b)])
+    p = np.linalg.lstsq(rows, (a - b).ravel() * -1.0)[0]
+    half = p / np.sqrt(1 + p @ p)  # sin(θ/2) along the axis
+    R = Rotation.from_quat([*half, np.sqrt(1 - half @ half)]).as_matrix()
+    t = np.linalg.lstsq((A.R - np.eye(3)).reshape(-1, 3), (B.t @ R.T - A.t).ravel())[0]
+    return Rigid(R, t)
+
+
+def daniilidis(A, B):
+    """Daniilidis (1999), equations 31 to 35: dual quaternions."""
+    def dual(T):
+        q = Rotation.from_matrix(T.R).as_quat(scalar_first=True)
+        q *= np.where(q[:, :1] < 0, -1.0, 1.0)
+        vector = 0.5 * (q[:, :1] * T.t + np.cross(T.t, q[:, 1:]))
+        return q[:, 1:], vector
+
+    rows = []
+    for a, a2, b, b2 in zip(*dual(A), *dual(B)):
+        one, other = np.c_[a - b, skew(a + b)], np.c_[a2 - b2, skew(a2 + b2)]
+        rows += [np.c_[one, np.zeros((3, 4))], np.c_[other, one]]
+    u, v = np.linalg.svd(np.concatenate(rows))[2][-2:].reshape(2, 2, 4).swapaxes(0, 1)
+    # λ₁·v₁ + λ₂·v₂ with |q| = 1 and q·q' = 0
+    (u1, u2), (w1, w2) = u, v
+    best = []
+    for s in np.roots([u1 @ w1, u1 @ w2 + u2 @ w1, u2 @ w2]).real:
+        size = s * s * (u1 @ u1) + 2 * s * (u1 @ u2) + u2 @ u2
+        best.append((size, s))
+    size, s = max(best)
+    q, q2 = (s * u1 + u2) / np.sqrt(size), (s * w1 + w2) / np.sqrt(size)
+    R = Rotation.from_quat(q, scalar_first=True).as_matrix()
+    t = 2 * (q[0] * q2[1:] - q2[0] * q[1:] + np.cross(q[1:], q2[1:]))
+    return Rigid(R, t)
+
+
+@pytest.mark.parametrize("method", [tsai_lenz, daniilidis])
+def test_other_closed_forms_agree_on_clean_data(seen, method):
+    """The peers of the noisy test are right, and so is ours."""
+    A, B, _ = robot(seen.truth, hands(seen)).further[0].poses(seen.truth)
+    found = method(*motions(A, B))
+    np.testing.assert_allclose(found.R, X.R, atol=1e-9)
+    np.testing.assert_allclose(found.t, X.t, atol=1e-9)
+
+
 def error(found, true):
     turn = Rotation.from_matrix(found.R @ true.R.T).magnitude()
     return np.linalg.norm(found.t - true.t), turn
@@ -103,10 +164,8 @@ def error(found, true):
 
 @pytest.mark.further
 def test_noisy_data_are_better_than_closed_forms(seen):
-    """Of Park and Martin here, of Tsai and Lenz and of Daniilidis by OpenCV: the errors of the
-    camera on the hand over 40 draws; σ is that of the errors."""
-    import cv2
-
+    """Of Park and Martin, Tsai and Lenz, Daniilidis: the errors of the camera on the hand over 40
+    draws; σ is that of the errors."""
     ours, closed, places, sigma = [], [], [], []
     for draw in range(40):
         random = np.random.default_rng(draw)
@@ -124,12 +183,9 @@ def test_noisy_data_are_better_than_closed_forms(seen):
         sigma.append([one[f"{a}0"]["sigma"] / result.sigma0 for a in "XYZ"])
         # the closed forms get the poses of the images without the robot
         alone = jaxbundle.adjust(network.replace(further=()))
-        A, B, _ = network.further[0].poses(alone_network(alone))
+        A, B, _ = network.further[0].poses(adjusted_network(alone))
         of_draw = [error(solve(A, B)[0], X)]
-        back = B.inverse
-        for method in (cv2.CALIB_HAND_EYE_TSAI, cv2.CALIB_HAND_EYE_DANIILIDIS):
-            R, t = cv2.calibrateHandEye([*A.R], [*A.t], [*back.R], [*back.t], method=method)
-            of_draw.append(error(Rigid(R, t.ravel()), X))
+        of_draw += [error(method(*motions(A, B)), X) for method in (tsai_lenz, daniilidis)]
         closed.append(of_draw)
     ours, closed = np.sqrt(np.mean(np.square(ours), 0)), np.sqrt(np.mean(np.square(closed), 0))
     assert (ours < 0.95 * closed).all(), (ours, closed)
@@ -137,31 +193,33 @@ def test_noisy_data_are_better_than_closed_forms(seen):
     assert 0.8 < z.std() < 1.2 and np.abs(z.mean(0)).max() < 4 / np.sqrt(40)
 
 
-def alone_network(result):
-    from jaxbundle.io.results.result_project import adjusted_network
-
-    return adjusted_network(result)
-
-
 @pytest.mark.further
 @pytest.mark.parametrize("type", ["eye-in-hand", "eye-to-hand"])
 def test_sigma_is_that_of_a_sample(seen, type):
     """200 draws of all image points and robot poses."""
     problem = jaxbundle.make_problem(robot(seen.truth, hands(seen, type), type=type))
-    names = problem.further_tables
-    found = sample_with_rotations(problem, names)
+    names, random, data = problem.further_tables, np.random.default_rng(8), problem.data
+    found = {name: [] for name in names}
+    normal = lambda sigma, n: sigma * random.normal(size=(n, 3))
+    for _ in range(200):
+        xy = data.measured["image"]
+        p, R = (np.asarray(x) for x in data.measured["robot positions"])
+        turn = Rotation.from_rotvec(normal(SIGMA_R, N)).as_matrix()
+        measured = data.measured | {
+            "image": xy + 0.004 * random.normal(size=np.shape(xy)),
+            "robot positions": (p + normal(SIGMA_P, N), R),
+            "robot rotations": (p, turn @ R),
+        }
+        changed = with_data(problem, dataclasses.replace(data, measured=measured))
+        values = find_minimum(changed, data.start).values
+        for name in names:
+            found[name].append(np.asarray(values[name].position))
     result = jaxbundle.adjust(robot(seen.network, hands(seen, type, noise=1.0), type=type))
     for name in names:
         one = next(iter(result.further_unknowns[name].values()))
         sigma = np.array([one[f"{a}0"]["sigma"] for a in "XYZ"]) / result.sigma0
-        ratio = found[name][:, 0].std(0, ddof=1) / sigma
+        ratio = np.array(found[name])[:, 0].std(0, ddof=1) / sigma
         assert (ratio > 0.88).all() and (ratio < 1.12).all(), (name, ratio)
-
-
-def sample_with_rotations(problem, names):
-    """Noise of the robot of its σ: `sample` draws for the first array, the positions; attitudes are
-    turned here."""
-    return sample(problem, problem.data.start, names, draws=200)
 
 
 def test_repeatability_is_a_variance_component(seen):
@@ -185,7 +243,7 @@ def motion(angle, axis, shift):
     random = np.random.default_rng(5)
     R = Rotation.from_rotvec(angle * random.uniform(-1, 1, (N, 1)) * axis).as_matrix()
     place = np.array([0.0, 0.0, 0.6]) + shift * random.uniform(-1, 1, (N, 3))
-    angles = np.array([jaxbundle.geometry.omega_phi_kappa_from_matrix(r.T) for r in R])
+    angles = np.array([omega_phi_kappa_from_matrix(r.T) for r in R])
     return Stations(np.einsum("nij,nj->ni", R, place), angles)
 
 
@@ -197,7 +255,8 @@ def test_degenerate_motions_are_named():
     axis = X.R @ [0, 0, 1]  # of the camera, in the hand
     with pytest.raises(InputError) as told:
         jaxbundle.adjust(network)
-    named = np.array([float(x) for x in str(told.value).split("axes, (")[1].split(")")[0].split(",")])
+    text = str(told.value).split("axes, (")[1].split(")")[0]
+    named = np.array([float(x) for x in text.split(",")])
     assert abs(named @ axis) > 0.999
     shifted = simulate(motion(0.0, np.array([0.0, 0.0, 1.0]), 0.1))
     with pytest.raises(InputError, match="never turns.*position of the camera on the hand is not"):
@@ -212,8 +271,6 @@ def test_degenerate_motions_are_named():
 def test_what_is_given_of_the_camera_makes_parallel_axes_enough():
     """A σ of its height along the axis; the rest is found."""
     planar = simulate(motion(0.5, np.array([0.0, 0.0, 1.0]), 0.1))
-    from jaxbundle.geometry import omega_phi_kappa_from_matrix
-
     angles = np.asarray(omega_phi_kappa_from_matrix(X.R.T))
     inf = float("inf")
     given = {"position": (X.t + 0.002).tolist(), "angles": (angles + 0.01).tolist(),
@@ -233,8 +290,6 @@ def test_forms_of_attitudes(seen):
     rest = {k: v for k, v in rows.items() if k[0] != "q"}
     given = {"qw": rows["qw"], **rows}
     (expected,) = robot(seen.network, given).further
-    from jaxbundle.geometry import omega_phi_kappa_from_matrix
-
     angles = np.array([omega_phi_kappa_from_matrix(m.T) for m in R.as_matrix()])
     degrees = seen.network.replace(angle_unit="deg")
     for names, values in (
