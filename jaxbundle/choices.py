@@ -95,6 +95,8 @@ ORDERS = {
 # Variables of a first-order design.
 DESIGNED = ("position", "direction", "roll", "targets")
 
+# Where the camera of a robot is.
+HAND_EYE = ("eye-in-hand", "eye-to-hand")
 BOARDS = ("chessboard", "circles", "asymmetric-circles", "charuco", "aprilgrid")
 CODED_TARGETS = ("aruco", "apriltag", "aprilgrid", "charuco", "ring12", "ring14")
 # OpenCV's dictionaries of square markers.

@@ -24,6 +24,7 @@ COMMANDS = (
     "adjust",
     "calibrate",
     "calibrate-rig",
+    "hand-eye",
     "batch",
     "design",
     "plan",

@@ -346,3 +346,41 @@ def test_in_a_project_and_back(seen, tmp_path):
     np.testing.assert_allclose(again.rotation, one.rotation, atol=1e-14)
     np.testing.assert_allclose(again.sigma, one.sigma)
     assert again.settings == one.settings and again.image == one.image
+
+
+def test_the_command_and_the_function(seen, tmp_path, command, capsys):
+    """A project and a table of poses: matrices, σ, the repeatability of the robot."""
+    rows = hands(seen, noise=1.0)
+    path = jaxbundle.write_project(seen.network, tmp_path / "board")
+    table = tmp_path / "robot.csv"
+    lines = [",".join(rows)] + [",".join(map(str, row)) for row in zip(*rows.values())]
+    table.write_text("\n".join(lines))
+    found = jaxbundle.hand_eye(path, table, sigma_position=SIGMA_P, sigma_angle=SIGMA_R)
+    T = found.camera()
+    place, turn = error(Rigid(T[:3, :3], T[:3, 3]), X)
+    sigma = np.sqrt(np.diag(found.covariance()))
+    assert place < 4 * np.linalg.norm(sigma[:3]) and turn < 4 * np.linalg.norm(sigma[3:])
+    np.testing.assert_allclose(found.frame[:3, :3], Y.R, atol=2e-3)
+    assert found.repeatability["robot positions"] == pytest.approx(SIGMA_P, rel=0.5)
+    told = command("hand-eye", path, "--poses", table, "--sigma-position", SIGMA_P,
+                   "--sigma-angle", SIGMA_R, "--json", tmp_path / "out.json")  # fmt: skip
+    assert told.status == 0 and "repeatability, robot positions" in told.out
+    with pytest.raises(InputError, match="repeatability"):
+        jaxbundle.hand_eye(path, table)
+
+
+@pytest.mark.further
+def test_photographs_of_a_board(tmp_path):
+    """Calibrated with the robot: its poses by the photographs themselves."""
+    board = jaxbundle.Board(9, 6, 0.03)
+    alone = jaxbundle.calibrate(["examples/board"], board, cross_validation=False)
+    network = adjusted_network(alone.adjustment)
+    made = type("Made", (), {"truth": network})
+    rows = hands(made, noise=1.0)
+    found = jaxbundle.hand_eye(
+        ["examples/board"], rows, board=board, sigma_position=SIGMA_P,
+        sigma_angle=float(np.degrees(SIGMA_R)),
+    )  # fmt: skip
+    T = found.camera()
+    place, turn = error(Rigid(T[:3, :3], T[:3, 3]), X)
+    assert place < 2e-3 and turn < 2e-3

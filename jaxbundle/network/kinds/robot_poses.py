@@ -29,6 +29,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxbundle.arguments import one_of, positive
+from jaxbundle.choices import HAND_EYE
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.quaternions import (
     matrix_from_quaternion,
@@ -61,7 +62,7 @@ from jaxbundle.network.tables import Network
 from jaxbundle.network.units import ANGLE_UNITS
 
 SECTION = "hand_eye"
-IN_HAND, TO_HAND = "eye-in-hand", "eye-to-hand"
+IN_HAND, TO_HAND = HAND_EYE
 # Tables: the camera on the hand or the base, and the base or the hand in object space.
 ON_HAND, ON_BASE = "camera on the hand", "camera on the base"
 BASE, HAND = "robot base", "robot hand"
