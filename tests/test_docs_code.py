@@ -48,6 +48,19 @@ def test_start():
     assert page["result"].redundancy == 23
 
 
+def test_refraction():
+    page = run_page("refraction")
+    water = page["result"].further_unknowns["interface"]["water"]["Z0"]
+    assert abs(water["value"] - 1) < 4 * water["sigma"]
+
+
+def test_hand_eye():
+    page = run_page("hand_eye")
+    camera = page["found"].camera()
+    sigma = page["found"].covariance().diagonal()[:3] ** 0.5
+    assert (abs(camera[:3, 3] - [0, 0, 0.1]) < 4 * sigma).all()
+
+
 SIZE = (1920, 1080)
 
 

@@ -175,7 +175,7 @@ def predict(problem: NetworkProblem, data: Data) -> Data:
         image, *between, camera, point = seen.rows
         interior, bend = data.start[table.name], None
         if isinstance(seen.kind.residual, RefractedImagePoint):
-            bend = Bend(seen.kind.residual.refraction, problem.table(seen.kind.of[1]).space)
+            bend = RayBending(seen.kind.residual.refraction, problem.table(seen.kind.of[1]).space)
         found = _project(
             cameras.get_model(table.model),
             bend,
@@ -188,7 +188,7 @@ def predict(problem: NetworkProblem, data: Data) -> Data:
     return dataclasses.replace(data, measured=measured)
 
 
-class Bend(NamedTuple):
+class RayBending(NamedTuple):
     """How an interface, whose table has this space, refracts a ray."""
 
     refraction: Refraction
@@ -198,7 +198,7 @@ class Bend(NamedTuple):
 @partial(compile_once, static=(0, 1))
 def _project(
     model: cameras.CameraModel,
-    bend: Bend | None,
+    bend: RayBending | None,
     values: Values,
     interior: Float[Array, "rows parameters"],
     rows: tuple[Int[Array, " rays"], ...],
