@@ -268,6 +268,7 @@ def test_degenerate_motions_are_named():
         jaxbundle.adjust(few)
 
 
+@pytest.mark.further
 def test_what_is_given_of_the_camera_makes_parallel_axes_enough():
     """A σ of its height along the axis; the rest is found."""
     planar = simulate(motion(0.5, np.array([0.0, 0.0, 1.0]), 0.1))
@@ -302,6 +303,7 @@ def test_forms_of_attitudes(seen):
         np.testing.assert_allclose(found.sigma[:, 3:], np.radians(0.1))
 
 
+@pytest.mark.further
 def test_a_covariance_says_what_its_sigmas_say(seen):
     rows = hands(seen, noise=1.0)
     one = jaxbundle.adjust(robot(seen.network, rows))

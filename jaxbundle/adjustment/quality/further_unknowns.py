@@ -13,6 +13,7 @@ from jaxbundle.geometry import matrix_from_quaternion, omega_phi_kappa_near
 from jaxbundle.leastsquares.declarations import Table
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.leastsquares.spaces import PoseValue, Rotation, Space
+from jaxbundle.network.kinds.base import INSTRUMENT_ANGLES
 from jaxbundle.network.kinds.interfaces import PORT
 from jaxbundle.network.kinds.rigs import MOUNTING
 from jaxbundle.network.kinds.robot_poses import ON_BASE, ON_HAND
@@ -92,7 +93,8 @@ def _labels(table: Table, size: int) -> tuple[Sequence[str], tuple[bool, ...]]:
     if isinstance(table.space, Rotation):
         return ANGLES, (True,) * 3
     named = len(table.parameters) == size
-    return table.parameters if named else [str(k + 1) for k in range(size)], (False,) * size
+    labels = table.parameters if named else [str(k + 1) for k in range(size)]
+    return labels, tuple(label in INSTRUMENT_ANGLES for label in labels)
 
 
 def _angles(q: Float[AnyArray, "4"], near: Float[AnyArray, "3"]) -> Float[Array, "3"]:

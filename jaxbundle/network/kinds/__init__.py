@@ -3,6 +3,7 @@
 
 from jaxbundle.network.kinds.antennas import Antennas as Antennas
 from jaxbundle.network.kinds.attitudes import Attitudes as Attitudes
+from jaxbundle.network.kinds.azimuths import Azimuths as Azimuths
 from jaxbundle.network.kinds.base import Further as Further
 from jaxbundle.network.kinds.camera_parameters import CameraParameters as CameraParameters
 from jaxbundle.network.kinds.differences import Angles as Angles
@@ -16,6 +17,7 @@ from jaxbundle.network.kinds.rigs import Rigs as Rigs
 from jaxbundle.network.kinds.robot_poses import RobotPoses as RobotPoses
 from jaxbundle.network.kinds.rolling_shutter import RollingShutter as RollingShutter
 from jaxbundle.network.kinds.ties import Ties as Ties
+from jaxbundle.network.kinds.tilts import Tilts as Tilts
 
 # By the name of their table.
 KINDS = {
@@ -23,6 +25,8 @@ KINDS = {
     for kind in (
         Antennas,
         Attitudes,
+        Tilts,
+        Azimuths,
         Rigs,
         RobotPoses,
         RollingShutter,

@@ -35,6 +35,8 @@ LENGTHS = frozenset(
 )
 # Of residuals of a pose: position and rotation.
 POSE_UNITS = (*["length"] * 3, *["angle"] * 3)
+# Errors of instruments that are angles, in tables of numbers.
+INSTRUMENT_ANGLES = ("declination", "zero right", "zero up", "zero view")
 # Unknowns of further tables that are lengths or angles: their σ are compared with the point
 # distance and with a radian; those of indices of refraction with 1.
 ANGLES = frozenset(
@@ -45,6 +47,7 @@ ANGLES = frozenset(
         "turn x",
         "turn y",
         "turn z",
+        *INSTRUMENT_ANGLES,
         "index",
         "index_window",
         "index_camera",
