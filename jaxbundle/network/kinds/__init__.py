@@ -16,6 +16,7 @@ from jaxbundle.network.kinds.lines import Edges as Edges
 from jaxbundle.network.kinds.rigs import Rigs as Rigs
 from jaxbundle.network.kinds.robot_poses import RobotPoses as RobotPoses
 from jaxbundle.network.kinds.rolling_shutter import RollingShutter as RollingShutter
+from jaxbundle.network.kinds.surface_points import SurfacePoints as SurfacePoints
 from jaxbundle.network.kinds.ties import Ties as Ties
 from jaxbundle.network.kinds.tilts import Tilts as Tilts
 
@@ -35,6 +36,7 @@ KINDS = {
         Angles,
         Figures,
         Shapes,
+        SurfacePoints,
         Edges,
         Ties,
         CameraParameters,

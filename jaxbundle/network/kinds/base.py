@@ -82,6 +82,8 @@ class Further(abc.ABC):
     """The field of measurements; none for conditions."""
     GIVES_SCALE: ClassVar[bool] = False
     """Whether the rows may contain lengths that give a network its scale."""
+    FILES: ClassVar[tuple[str, ...]] = ()
+    """Keys of files in the tables of `settings`."""
     CHANGES_IMAGE_POINTS: ClassVar[bool] = False
     """Whether image points depend on the tables of this kind."""
     ANGLES_IN_SETTINGS: ClassVar[bool] = False
