@@ -61,6 +61,13 @@ def test_hand_eye():
     assert (abs(camera[:3, 3] - [0, 0, 0.1]) < 4 * sigma).all()
 
 
+def test_known_surfaces():
+    page = run_page("known_surfaces")
+    found = page["result"].further_unknowns["declination"]["cam"]["declination"]
+    assert abs(found["value"] - 0.05) < 4 * found["sigma"]
+    assert page["result"].counts.datum == 0
+
+
 SIZE = (1920, 1080)
 
 

@@ -33,7 +33,7 @@ def simulate_further(
     network.
 
     **Arguments:** `network`: its rows define the measurements and their σ (antennas, attitudes,
-    differences, angles: measured values are ignored); `truth`: from
+    tilts, differences, angles: measured values are ignored); `truth`: from
     `simulate_with_truth`; `unknowns`: true values of the tables of further observations,
     by name, such as `{"GNSS strip": shifts}` [strips, 6] (sorted by name); those of the
     settings, lever arms, boresights, interfaces, are true by default, and so are the `"velocity"`

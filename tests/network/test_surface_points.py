@@ -115,9 +115,7 @@ def test_a_known_plane(made):
     offset = (X[near] - X[7]) @ normal
     plane = {"plane": X[7].tolist(), "normal": (3 * normal).tolist()}
     network = on(made.network, 0.5, near, wall=plane)
-    problem = jaxbundle.make_problem(network)
-    seen = next(o for o in problem.observations if o.name.startswith("points on known planes"))
-    assert seen.number == 5 and np.abs(offset).max() < 0.5
+    assert np.abs(offset).max() < 0.5
     with pytest.raises(InputError, match="planes with a common point give no scale"):
         jaxbundle.make_problem(network)
     length = np.linalg.norm(X[0] - X[30])
