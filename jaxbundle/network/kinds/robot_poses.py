@@ -35,7 +35,6 @@ from jaxbundle.geometry.quaternions import (
     matrix_from_quaternion,
     matrix_from_rotation_vector,
     quaternion_from_matrix,
-    rotation_vector_from_matrix,
 )
 from jaxbundle.geometry.rotations import matrix_from_omega_phi_kappa
 from jaxbundle.leastsquares.datum.motions import move_pose
@@ -71,6 +70,8 @@ QUATERNION = ("qw", "qx", "qy", "qz")
 ATTITUDES = (QUATERNION, ("rx", "ry", "rz"), ("roll", "pitch", "yaw"), ("omega", "phi", "kappa"))
 COVARIANCE = tuple(f"c{i + 1}{j + 1}" for i in range(6) for j in range(i, 6))
 FEWEST = 3
+# Of half of a rotation of 180°, whose axis is undetermined: no division by 0 there.
+SMALLEST_COSINE = 1e-12
 # Within so many σ of a rotation the axes of the motions of a robot are parallel.
 PARALLEL = 3.0
 
@@ -90,8 +91,15 @@ class HandPose:
         else:
             at = eye.place(image.ray(frame.centre))
             R = eye.rotation.matrix().T @ image.rotation.matrix() @ frame.rotation.matrix().T
-        turn = rotation_vector_from_matrix(R @ given[1].T)
-        return jnp.concatenate([jnp.stack(at) - given[0], turn])
+        return jnp.concatenate([jnp.stack(at) - given[0], small_turn(R @ given[1].T)])
+
+
+def small_turn(D: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    """2·sin(θ/2) along the axis of a rotation: its rotation vector to 1e-5 of a degree's, and not
+    0 for the opposite attitude; four branches of quaternions would be compiled for the vector."""
+    sine = jnp.stack([D[2, 1] - D[1, 2], D[0, 2] - D[2, 0], D[1, 0] - D[0, 1]])
+    # 1 + tr D = 4·cos²(θ/2)
+    return sine / jnp.sqrt(jnp.maximum(1 + jnp.trace(D), SMALLEST_COSINE))
 
 
 @dataclasses.dataclass(frozen=True)
