@@ -95,6 +95,10 @@ _HOME = {
     ),
     "jaxbundle.commands.examples": ("example",),
     "jaxbundle.commands.exploring": ("explore",),
+    "jaxbundle.commands.hand_eye": (
+        "HandEye",
+        "hand_eye",
+    ),
     "jaxbundle.commands.planned_block": (
         "PlannedBlock",
         "plan",

@@ -76,6 +76,8 @@ from jaxbundle.commands.comparison import CalibrationComparison as CalibrationCo
 from jaxbundle.commands.comparison import compare as compare
 from jaxbundle.commands.examples import example as example
 from jaxbundle.commands.exploring import explore as explore
+from jaxbundle.commands.hand_eye import HandEye as HandEye
+from jaxbundle.commands.hand_eye import hand_eye as hand_eye
 from jaxbundle.commands.planned_block import PlannedBlock as PlannedBlock
 from jaxbundle.commands.planned_block import plan as plan
 from jaxbundle.commands.reconstruction import reconstruct as reconstruct
@@ -141,6 +143,7 @@ __all__ = [
     "Conditions",
     "Data",
     "Design",
+    "HandEye",
     "Influence",
     "InputError",
     "LengthTest",
@@ -186,6 +189,7 @@ __all__ = [
     "frames",
     "from_pycolmap",
     "grid_of_targets",
+    "hand_eye",
     "influence",
     "join_processes",
     "keep_programs",

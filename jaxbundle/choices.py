@@ -95,6 +95,8 @@ ORDERS = {
 # Variables of a first-order design.
 DESIGNED = ("position", "direction", "roll", "targets")
 
+# Where the camera of a robot is.
+HAND_EYE = ("eye-in-hand", "eye-to-hand")
 BOARDS = ("chessboard", "circles", "asymmetric-circles", "charuco", "aprilgrid")
 CODED_TARGETS = (
     "aruco",

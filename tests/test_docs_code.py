@@ -48,6 +48,26 @@ def test_start():
     assert page["result"].redundancy == 23
 
 
+def test_refraction():
+    page = run_page("refraction")
+    water = page["result"].further_unknowns["interface"]["water"]["Z0"]
+    assert abs(water["value"] - 1) < 4 * water["sigma"]
+
+
+def test_hand_eye():
+    page = run_page("hand_eye")
+    camera = page["found"].camera()
+    sigma = page["found"].covariance().diagonal()[:3] ** 0.5
+    assert (abs(camera[:3, 3] - [0, 0, 0.1]) < 4 * sigma).all()
+
+
+def test_known_surfaces():
+    page = run_page("known_surfaces")
+    found = page["result"].further_unknowns["declination"]["cam"]["declination"]
+    assert abs(found["value"] - 0.05) < 4 * found["sigma"]
+    assert page["result"].counts.datum == 0
+
+
 SIZE = (1920, 1080)
 
 

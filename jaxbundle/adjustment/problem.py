@@ -26,7 +26,6 @@ from jaxbundle.network.datum_words import open_directions_in_words
 from jaxbundle.network.declare import DeclaredNetwork, declare, order_cameras
 from jaxbundle.network.kinds.base import among
 from jaxbundle.network.kinds.image_points import image_coordinates
-from jaxbundle.network.kinds.rolling_shutter import RollingShutter
 from jaxbundle.network.retraction import TurnAboutSeen
 from jaxbundle.network.tables import Network, require_network
 from jaxbundle.network.undetermined import split_check_points
@@ -351,9 +350,9 @@ def _datum(
 def shifted_problem(network: Network, like: NetworkProblem, values: Values) -> NetworkProblem:
     """A problem of other points of the network with the orientations and cameras of `values`,
     without priors and datum: for excluded points."""
-    # Of all further kinds only the rolling shutter changes where a point is seen.
-    shutters = tuple(one for one in network.further if isinstance(one, RollingShutter))
-    declared = declare(network.replace(further=shutters), like.origin)
+    # Of further kinds those that change where a point is seen.
+    further = tuple(one for one in network.further if one.CHANGES_IMAGE_POINTS)
+    declared = declare(network.replace(further=further), like.origin)
     known: dict[str, Any] = {name: jax.tree.map(np.asarray, rows) for name, rows in values.items()}
     tables = tuple(
         table if table.name == "point" else dataclasses.replace(table, value=known[table.name])

@@ -25,6 +25,7 @@ COMMANDS = (
     "frames",
     "calibrate",
     "calibrate-rig",
+    "hand-eye",
     "batch",
     "design",
     "plan",

@@ -40,7 +40,6 @@ from jaxbundle.network.kinds.distances import declare_distances
 from jaxbundle.network.kinds.exterior_orientation import declare_exterior_orientation
 from jaxbundle.network.kinds.image_points import declare_image_points
 from jaxbundle.network.kinds.interior_orientation import declare_interior_orientation
-from jaxbundle.network.kinds.rolling_shutter import RollingShutter
 from jaxbundle.network.motions import SIMILARITY, SIMILARITY_AT_ANY_DISTANCE
 from jaxbundle.network.tables import EXTERIOR, Network
 from jaxbundle.network.user_observations import place, split
@@ -95,11 +94,10 @@ def declare(
         *declare_interior_orientation(network, cameras),
         *declare_distances(network),
     ]
-    # A rolling shutter is declared even where all of its rows are left out: image points touch its
-    # tables.
-    shutters = [one.among(network) for one in network.further if isinstance(one, RollingShutter)]
-    others = [one for one in among(network) if not isinstance(one, RollingShutter)]
-    declared = [one.declare(network, origin) for one in (*shutters, *others)]
+    # What image points touch is declared even where all of its rows are left out.
+    touched = [one.among(network) for one in network.further if one.CHANGES_IMAGE_POINTS]
+    others = [one for one in among(network) if not one.CHANGES_IMAGE_POINTS]
+    declared = [one.declare(network, origin) for one in (*touched, *others)]
     # Observations of users come last, and resolve ids of any table above.
     own_tables, own_observations = split(also)
     further = own_tables + [table for one in declared for table in one.tables]

@@ -16,6 +16,7 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from jaxbundle.cameras import CameraModel, default_parameters, get_model, image_ray
+from jaxbundle.network.kinds.interfaces import Interfaces
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import Index
@@ -73,6 +74,9 @@ def sights(network: Network, tolerance: float = TOLERANCE) -> Sights:
         if not len(rows):
             continue
         d[rows], sigma[rows] = rays_of(camera, rays.xy[rows], rays.sigma[rows])
+        for interfaces in network.further:
+            if isinstance(interfaces, Interfaces):
+                d[rows] = interfaces.directions(camera.id, d[rows])
         away = np.arctan2(np.hypot(d[rows, 0], d[rows, 1]), -d[rows, 2])
         # The 95 % quantile: a few image points far outside are blunders, not the extent.
         if np.isfinite(away).any():

@@ -17,7 +17,7 @@ from jaxbundle.leastsquares.declarations import Kind, ObservationSet, Table
 from jaxbundle.leastsquares.indexing.rows import evaluate, scalars
 from jaxbundle.leastsquares.spaces import Space
 from jaxbundle.network.declare import declare
-from jaxbundle.network.kinds import RollingShutter
+from jaxbundle.network.kinds import Further
 from jaxbundle.network.tables import Network, require_network
 from jaxbundle.planning.stations import LARGEST_SEED
 from jaxbundle.system.programs import compile_once
@@ -28,18 +28,19 @@ def simulate_further(
 ) -> Network:
     """The network with its further observations simulated from a truth, with noise of their σ.
 
-    With a rolling shutter image points are shifted: those of the truth are moved to the image of
-    the moving camera, and keep their noise of the network.
+    With a rolling shutter or refracting interfaces image points are shifted: those of the truth are
+    moved to the image of the moving camera, or of the refracted ray, and keep their noise of the
+    network.
 
     **Arguments:** `network`: its rows define the measurements and their σ (antennas, attitudes,
-    differences, angles: measured values are ignored); `truth`: from
+    tilts, differences, angles: measured values are ignored); `truth`: from
     `simulate_with_truth`; `unknowns`: true values of the tables of further observations,
     by name, such as `{"GNSS strip": shifts}` [strips, 6] (sorted by name); those of the
-    settings, lever arms and boresights, are true by default, and so are the `"velocity"`
+    settings, lever arms, boresights, interfaces, are true by default, and so are the `"velocity"`
     [images, 6] (object unit and radians per second) and the line times of a rolling shutter.
 
-    **Raises:** `InputError` for a missing table; for a rolling shutter also if network
-    and truth have different image points.
+    **Raises:** `InputError` for a missing table; for a rolling shutter and interfaces also if
+    network and truth have different image points.
     """
     require_x64()
     random = np.random.default_rng(integer("seed", seed, least=0, most=LARGEST_SEED))
@@ -52,8 +53,8 @@ def simulate_further(
         values = {t.name: t.value for t in declared.tables}
         known |= set(values)
         values |= {name: v for name, v in (unknowns or {}).items() if name in values}
-        if isinstance(rows, RollingShutter):
-            shift = _expose_moving(truth, rows, values) - truth.observations.xy
+        if rows.CHANGES_IMAGE_POINTS:
+            shift = _image_points(truth, rows, values) - truth.observations.xy
             network = _shift(network, truth, shift)
         if field:
             rows = rows.among(truth)
@@ -69,11 +70,11 @@ def simulate_further(
     return network.replace(further=tuple(made))
 
 
-def _expose_moving(
-    truth: Network, rows: RollingShutter, values: dict[str, PyTree]
+def _image_points(
+    truth: Network, rows: Further, values: dict[str, PyTree]
 ) -> Float[np.ndarray, "rays 2"]:
-    """The image points of the truth in the moving camera: an image point is exposed with
-    its line, which depends on the image point."""
+    """The image points of the truth in the moving camera, where an image point is exposed with
+    its line, which depends on the image point; or through its interfaces."""
     truth = truth.replace(further=(rows,), residuals="measured")
     # A fixed point: each round divides the error by the ratio of the readout to the motion of the
     # image. 1e-13 of the coordinates is rounding; where fifty rounds do not reach it, the ratio is

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import jaxbundle
+from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.leastsquares.equations.normal import zero_tangent
 from jaxbundle.leastsquares.indexing.rows import fill_places, lay_out_data, residuals
 from jaxbundle.leastsquares.iterations.retraction import retract
@@ -22,6 +23,8 @@ EPOCHS, SIGMA = 4, 0.002
 pytestmark = pytest.mark.further  # minutes of compiling
 # In three problems: of all kinds in one, XLA compiles the derivatives in minutes and 6 GB.
 TABLES_OF = {
+    "robot": ("robot_poses", "hand_eye", "tilts", "tilt", "azimuths", "azimuth"),
+    "water": ("interfaces", "surface_points", "surfaces"),
     "navigation": ("antennas", "antenna", "attitudes", "attitude", "exterior_priors"),
     "rigs": ("rigs", "rig", "camera_parameters", "ties", "velocities", "rolling_shutter"),
     "object": ("differences", "angles", "figures", "shapes", "edges"),
@@ -40,6 +43,16 @@ def rows(images):
         "antennas": antenna
         | {"image": images, "rXY": [0.8] * 8, "rXZ": [-0.3] * 8, "strip": list("aaaabbbb")},
         "antenna": {"free": ["shift"], "sigma": {"shift": 0.05}},
+        "hand_eye": {"sigma_position": 0.01, "sigma_angle": 0.002},
+        "interfaces": [{"interface": "port", "type": "flat", "camera": "left", "Z": -0.1,
+                        "thickness": 0.01, "index_window": 1.5, "index": 1.33, "sZ": 0.01,
+                        "somega": 0.01, "sphi": 0.01, "sindex": 0.01}],
+        "tilts": {"image": images} | dict.fromkeys(("right", "view"), [0.0] * 8)
+        | dict.fromkeys(("sright", "sview"), [1e-3] * 8),
+        "tilt": {"free": ["view"], "sigma": {"view": 0.01}},
+        "azimuth": {"free": ["declination"], "sigma": {"declination": 0.01}},
+        "surface_points": {"surface": ["floor"] * 9, "point": plane, "sigma": [0.01] * 9},
+        "surfaces": {"floor": {"mesh": ([[-3, -3, -1], [3, -3, -1], [0, 4, -1]], [[0, 1, 2]])}},
         "attitudes": {"image": images}
         | {a: [0.0] * 8 for a in angles} | {f"s{a}": [1e-3] * 8 for a in angles},
         "attitude": {"free": ["boresight"], "sigma": {"boresight": 0.01}},
@@ -100,6 +113,14 @@ def problem(request, network_and_truth):
         for line, points in enumerate([(0, 1, 2), (6, 7, 8)])
         for k, (i, p) in enumerate(zip(seen.image, seen.point)) if p in points
     ]  # fmt: skip
+    exterior = np.concatenate([truth.images.position, truth.images.angles], 1)
+    tables["robot_poses"] = {"image": images} | dict(
+        zip(("X", "Y", "Z", "omega", "phi", "kappa"), exterior.T)
+    )
+    M = [np.asarray(matrix_from_omega_phi_kappa(a)) for a in truth.images.angles]
+    tables["azimuths"] = {"image": images, "sigma": [1e-3] * 8, "value": [
+        float(np.arctan2(-m[2, 0], -m[2, 1])) for m in M
+    ]}  # fmt: skip
     of_this = {name: tables[name] for name in TABLES_OF[request.param]}
     edges = make_further({"edges": of_this.pop("edges")}, 1.0) if "edges" in of_this else ()
     given = network.replace(further=tuple(make_further(of_this, 1.0)))

@@ -13,11 +13,16 @@ from jaxbundle.geometry import matrix_from_quaternion, omega_phi_kappa_near
 from jaxbundle.leastsquares.declarations import Table
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.leastsquares.spaces import PoseValue, Rotation, Space
+from jaxbundle.network.kinds.base import INSTRUMENT_ANGLES
+from jaxbundle.network.kinds.interfaces import PORT
 from jaxbundle.network.kinds.rigs import MOUNTING
+from jaxbundle.network.kinds.robot_poses import ON_BASE, ON_HAND
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
 ANGLES = ("omega", "phi", "kappa")
+# Frames that are relative to a camera, or a robot, not to the origin of object space.
+RELATIVE = (MOUNTING, PORT, ON_HAND, ON_BASE)
 
 
 class Estimate(NamedTuple):
@@ -36,13 +41,13 @@ def estimates(
     found: Solution, names: Collection[str], sigma0: float, origin: Float[np.ndarray, "3"]
 ) -> list[Estimate]:
     """All unknowns of some tables. Frames and poses are given as X0, Y0, Z0 in object space
-    (mountings in the reference camera), ω, φ, κ."""
+    (mountings, ports and cameras of a robot in
+    their own frames), ω, φ, κ."""
     every = []
     for table in (t for t in found.problem.tables if t.name in names):
         values, Q = found.values[table.name], np.asarray(found.cofactor(table.name))
         shown, A = map(np.array, _read_rows(table.space, values))
-        # Frames are in object space, relative to the origin; a mounting is relative to a camera.
-        if isinstance(values, PoseValue) and table.name != MOUNTING:
+        if isinstance(values, PoseValue) and table.name not in RELATIVE:
             shown[:, :3] += origin
         variance = np.einsum("nij,njk,nik->ni", A, Q, A)
         sigma = sigma0 * np.sqrt(np.clip(variance, 0, None))
@@ -88,7 +93,8 @@ def _labels(table: Table, size: int) -> tuple[Sequence[str], tuple[bool, ...]]:
     if isinstance(table.space, Rotation):
         return ANGLES, (True,) * 3
     named = len(table.parameters) == size
-    return table.parameters if named else [str(k + 1) for k in range(size)], (False,) * size
+    labels = table.parameters if named else [str(k + 1) for k in range(size)]
+    return labels, tuple(label in INSTRUMENT_ANGLES for label in labels)
 
 
 def _angles(q: Float[AnyArray, "4"], near: Float[AnyArray, "3"]) -> Float[Array, "3"]:

@@ -15,7 +15,7 @@ second order (weights, P).
 import dataclasses
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -35,7 +35,8 @@ from jaxbundle.leastsquares.problem import complete_data, with_data, with_factor
 from jaxbundle.leastsquares.quality.precision import precision as engine_precision
 from jaxbundle.leastsquares.quality.precision import redundancy as engine_redundancy
 from jaxbundle.leastsquares.solution import Solution
-from jaxbundle.leastsquares.spaces import Pose
+from jaxbundle.leastsquares.spaces import Pose, Space
+from jaxbundle.network.kinds.interfaces import MEDIA, RefractedImagePoint, Refraction
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
@@ -169,32 +170,57 @@ def predict(problem: NetworkProblem, data: Data) -> Data:
         if table.image_set not in measured:
             continue
         # A rolling shutter has further tables between image and camera; the prediction is that of
-        # the middle line.
-        image, *_, camera, point = problem.observations_of(table.image_set).rows
-        interior = data.start[table.name]
-        found = _project(cameras.get_model(table.model), data.start, interior, image, camera, point)
+        # the middle line. Those of a refracting interface bend the ray.
+        seen = problem.observations_of(table.image_set)
+        image, *between, camera, point = seen.rows
+        interior, bend = data.start[table.name], None
+        if isinstance(seen.kind.residual, RefractedImagePoint):
+            bend = RayBending(seen.kind.residual.refraction, problem.table(seen.kind.of[1]).space)
+        found = _project(
+            cameras.get_model(table.model),
+            bend,
+            data.start,
+            interior,
+            (image, camera, point, *(between[:1] if bend else ())),
+        )
         given = measured[table.image_set]
         measured[table.image_set] = (found, given[1]) if isinstance(given, tuple) else found
     return dataclasses.replace(data, measured=measured)
 
 
-@partial(compile_once, static=0)
+class RayBending(NamedTuple):
+    """How an interface, whose table has this space, refracts a ray."""
+
+    refraction: Refraction
+    space: Space
+
+
+@partial(compile_once, static=(0, 1))
 def _project(
     model: cameras.CameraModel,
+    bend: RayBending | None,
     values: Values,
     interior: Float[Array, "rows parameters"],
-    image: Int[Array, " rays"],
-    camera: Int[Array, " rays"],
-    point: Int[Array, " rays"],
+    rows: tuple[Int[Array, " rays"], ...],
 ) -> Float[Array, "rays 2"]:
-    """The image coordinates of a set of image points."""
+    """The image coordinates of a set of image points: `rows` of image, camera, point, and of the
+    interface where there is one."""
 
-    def project_point(pose: Any, interior: Any, X: Any) -> Float[Array, "2"]:
-        return jnp.stack(cameras.project(model, interior, *Pose().prepare(pose).ray(X)))
+    def project_point(pose: Any, interior: Any, X: Any, *through: Any) -> Float[Array, "2"]:
+        ray = Pose().prepare(pose).ray(X)
+        if bend is not None:
+            interface, medium = through
+            block = bend.space.prepare(interface)
+            ray = bend.refraction(Pose().prepare(pose), block, tuple(medium), tuple(X))
+        return jnp.stack(cameras.project(model, interior, *ray))
 
-    poses = jax.tree.map(lambda rows: jnp.asarray(rows)[image], values["image"])
+    image, camera, point, *interface = rows
+    of = lambda name, row: jax.tree.map(lambda rows: jnp.asarray(rows)[row], values[name])
     points = jnp.asarray(values["point"])[point, :3]
-    return jax.vmap(project_point)(poses, jnp.asarray(interior)[camera], points)
+    through = [of(name, interface[0]) for name in (bend.refraction.table, MEDIA)] if bend else []
+    return jax.vmap(project_point)(
+        of("image", image), jnp.asarray(interior)[camera], points, *through
+    )
 
 
 @partial(compile_once, static=())
@@ -229,7 +255,7 @@ def _camera_sigma(
 ) -> Float[Array, "cameras parameters"]:
     sigma = jnp.zeros_like(problem.interior_orientation(values))
     for table in problem.cameras:
-        moves = map(np.array, problem.table(table.name).vector.moves)
+        moves = (np.array(x, int) for x in problem.table(table.name).vector.moves)
         sigma = _with_cameras(sigma, own[table.name], np.asarray(table.cameras), *moves)
     return sigma
 

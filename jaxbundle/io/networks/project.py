@@ -109,6 +109,7 @@ def read_project(
     """
     path = project_file(Path(path))
     document = apply_overrides(_read_document(path), overrides, (*SETTINGS, *TABLES))
+    _resolve_files(document, path.parent)
     document["project"].setdefault("name", path.resolve().parent.name)
     tables = {
         table: _read_table(document, table, path)
@@ -126,6 +127,15 @@ def read_project(
     return network_of(
         document, {k: v for k, v in tables.items() if v is not None}, str(path), models
     )
+
+
+def _resolve_files(document: Document, folder: Path) -> None:
+    """Files that sections name are relative to the project."""
+    for kind in KINDS.values():
+        for one in document.get(kind.SECTION, {}).values() if kind.FILES else ():
+            for key in kind.FILES:
+                if isinstance(one, dict) and isinstance(one.get(key), str):
+                    one[key] = str(folder / one[key])
 
 
 def _is_absent(document: Document, table: str) -> bool:

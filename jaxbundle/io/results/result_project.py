@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from jaxbundle.cameras import get_model
 from jaxbundle.network.camera_tables import with_start
-from jaxbundle.network.kinds import CameraParameters, ExteriorPriors, Further, RollingShutter
+from jaxbundle.network.kinds import CameraParameters, ExteriorPriors, Further, Interfaces
 from jaxbundle.network.kinds.base import among
 from jaxbundle.network.tables import ESTIMATED, Camera, Images, Network, Points
 from jaxbundle.network.undetermined import keep_points, without_distances
@@ -26,9 +26,9 @@ def adjusted_network(adjustment: "Adjustment") -> Network:
     further kinds are dropped: their information is already in the adjusted values and would count
     twice. Only priors required by a camera model, such as a grid of splines, stay, of the values
     that were observed: without them it has no solution. So the datum is inner; a second adjustment
-    changes nothing. σ of image coordinates are the given ones, even if variance components were
-    estimated. Check points are left out, and so are points without coordinates: at infinity, or
-    excluded by data snooping.
+    changes nothing. Refracting interfaces are held at their adjusted values. σ of image coordinates
+    are the given ones, even if variance components were estimated. Check points are left out, and
+    so are points without coordinates: at infinity, or excluded by data snooping.
     """
     problem = adjustment.problem
     network = problem.network
@@ -65,7 +65,7 @@ def adjusted_network(adjustment: "Adjustment") -> Network:
         observations=rays.take(used),
         datum="inner",
         datum_points=(),
-        further=(),
+        further=_interfaces_at_solution(adjustment),
         warnings=(),
         notes=("the adjusted network",),
     )
@@ -119,6 +119,17 @@ def readjustable_network(adjustment: "Adjustment") -> Network:
     )
     adjusted = without_distances(adjusted, distance_weight <= 0)
     return keep_points(adjusted, np.asarray(np.isfinite(adjustment.point_values).all(1)))
+
+
+def _interfaces_at_solution(adjustment: "Adjustment") -> tuple[Further, ...]:
+    """The interfaces of a network as they were estimated: without them rays would be straight."""
+    found = adjustment.further_unknowns
+    radians = 1 / adjustment.angle_scale
+    return tuple(
+        one.at(found, radians)
+        for one in adjustment.problem.network.further
+        if isinstance(one, Interfaces)
+    )
 
 
 def _unobserved(camera: Camera, adjustment: "Adjustment") -> Camera:
@@ -213,7 +224,7 @@ def _further(adjustment: "Adjustment") -> list[Further]:
     problem = adjustment.problem
     network = problem.network
     # the engine's sets in the order of declaration, the user's own before those of the network
-    kinds = sorted(among(network), key=lambda table: not isinstance(table, RollingShutter))
+    kinds = sorted(among(network), key=lambda table: not table.CHANGES_IMAGE_POINTS)
     numbers = [len(table.declare(network, problem.origin).observations) for table in kinds]
     own = len(problem.further_sets) - sum(numbers)
     names, tables = iter(problem.further_sets[own:]), []

@@ -26,13 +26,33 @@ LENGTHS = frozenset(
         "shift y",
         "shift z",
         "R",
+        "X",
+        "Y",
+        "Z",
+        "thickness",
+        "radius",
     )
 )
 # Of residuals of a pose: position and rotation.
 POSE_UNITS = (*["length"] * 3, *["angle"] * 3)
+# Errors of instruments that are angles, in tables of numbers.
+INSTRUMENT_ANGLES = ("declination", "zero right", "zero up", "zero view")
 # Unknowns of further tables that are lengths or angles: their σ are compared with the point
-# distance and with a radian.
-ANGLES = frozenset(("omega", "phi", "kappa", "turn x", "turn y", "turn z"))
+# distance and with a radian; those of indices of refraction with 1.
+ANGLES = frozenset(
+    (
+        "omega",
+        "phi",
+        "kappa",
+        "turn x",
+        "turn y",
+        "turn z",
+        *INSTRUMENT_ANGLES,
+        "index",
+        "index_window",
+        "index_camera",
+    )
+)
 
 
 class Contribution(NamedTuple):
@@ -62,6 +82,10 @@ class Further(abc.ABC):
     """The field of measurements; none for conditions."""
     GIVES_SCALE: ClassVar[bool] = False
     """Whether the rows may contain lengths that give a network its scale."""
+    FILES: ClassVar[tuple[str, ...]] = ()
+    """Keys of files in the tables of `settings`."""
+    CHANGES_IMAGE_POINTS: ClassVar[bool] = False
+    """Whether image points depend on the tables of this kind."""
     ANGLES_IN_SETTINGS: ClassVar[bool] = False
     """Whether `settings` hold angles, which are in the unit of the network."""
 

@@ -2,7 +2,7 @@
 
 Residuals are computed minus observed. Only this module defines how an image coordinate depends on
 the unknowns. Measurements in rows of lines exposed one after the other have the line beside them
-(`rolling_shutter`).
+(`rolling_shutter`); through refracting interfaces the ray is that of `interfaces`.
 """
 
 import dataclasses
@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from jaxbundle import cameras
 from jaxbundle.leastsquares.declarations import Kind, Local, ObservationSet
 from jaxbundle.leastsquares.spaces import Change, Posed, Triple, turn_by
+from jaxbundle.network.kinds.interfaces import MEDIA, Interfaces, RefractedImagePoint, Refraction
 from jaxbundle.network.kinds.rolling_shutter import READ_OUT, VELOCITIES, RollingShutter
 from jaxbundle.types import Scalar, present
 
@@ -100,19 +101,24 @@ def image_points(
     camera: str,
     poses: tuple[str, ...] = ("image",),
     moving: bool = False,
+    refraction: Refraction | None = None,
 ) -> Kind:
     """Image points of the cameras of one model, whose table is `camera`; `domain`: "corrected" or
     "measured"; `poses`: the tables of poses on the way from the object to the camera; `moving`: for
-    cameras with a rolling shutter."""
+    cameras with a rolling shutter; `refraction`: through interfaces."""
     between = (VELOCITIES, READ_OUT) if moving else ()
+    if refraction is not None:
+        between = (refraction.table, MEDIA)
     of = (*poses, *between, camera, "point")
     only = camera == "camera"
     name = "image coordinates" if only else f"image coordinates of {cameras.get_model(model).name}"
-    residual = (MovingImagePoint if moving else ImagePoint)(model, domain)
+    residual: Any = (MovingImagePoint if moving else ImagePoint)(model, domain)
+    if refraction is not None:
+        residual = RefractedImagePoint(model, domain, refraction)
     # A spline of hundreds of parameters: an image point depends on a few of them, and only those
     # get derivatives and blocks (`leastsquares.equations.local`).
     formula, local = cameras.get_model(model).local, None
-    if formula is not None and domain == "measured" and not moving:
+    if formula is not None and domain == "measured" and not between:
         local = Local(
             of.index(camera), formula.number, ColumnsOfImagePoint(model), LocalImagePoint(model)
         )
@@ -127,6 +133,8 @@ def declare_image_points(
     images, rays = network.images, network.observations
     shutter = next((f for f in network.further if isinstance(f, RollingShutter)), None)
     line = None if shutter is None else shutter.lines(network)
+    interfaces = next((f for f in network.further if isinstance(f, Interfaces)), None)
+    refraction = None if interfaces is None else interfaces.refraction
     camera = images.camera[rays.image]
     row_of_camera = np.zeros(len(network.cameras), np.int64)
     for table in tables:
@@ -136,9 +144,17 @@ def declare_image_points(
         rows = np.flatnonzero(np.isin(camera, table.cameras))
         if not len(rows):
             continue
-        kind = image_points(table.model, network.residuals, table.name, moving=line is not None)
-        moving = () if line is None else (rays.image, camera)
-        touched = (rays.image, *moving, row_of_camera[camera], rays.point)
+        kind = image_points(
+            table.model,
+            network.residuals,
+            table.name,
+            moving=line is not None,
+            refraction=refraction,
+        )
+        between = () if line is None else (rays.image, camera)
+        if interfaces is not None:
+            between = (interfaces.rows_of_cameras(network)[camera],) * 2
+        touched = (rays.image, *between, row_of_camera[camera], rays.point)
         measured = rays.xy[rows] if line is None else (rays.xy[rows], line[rows])
         sets.append(
             kind(

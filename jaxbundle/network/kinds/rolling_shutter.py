@@ -67,6 +67,7 @@ class RollingShutter(Further):
     strip: tuple[str, ...]
 
     TABLE, SECTION, IMAGES = "velocities", SECTION, ("image",)
+    CHANGES_IMAGE_POINTS = True
 
     @classmethod
     def from_columns(

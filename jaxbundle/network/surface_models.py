@@ -1,0 +1,225 @@
+"""Known surfaces in object space: meshes of triangles (PLY, OBJ), grids of heights (rasters), and
+what of them is near a point."""
+
+import os
+from collections.abc import Iterator
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxbundle.errors import InputError
+from jaxbundle.system.file_content import check_plain
+from jaxbundle.system.foreign_parsers import foreign_parser
+
+# Triangles near the start value of a point, of which the nearest counts: one and the 12 that share
+# a corner with it in a regular mesh, rounded up.
+CANDIDATES = 16
+# Of so many with the smallest bound of the distance the exact one is computed; long thin triangles
+# have small bounds and large distances.
+BOUNDED = 128
+# Nodes of a grid on either side of the start value of a point.
+REACH = 4
+PLY_TYPES = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
+}
+
+
+class Mesh(NamedTuple):
+    """Vertices and triangles (rows of vertices)."""
+
+    vertices: Float[np.ndarray, "n 3"]
+    triangles: Int[np.ndarray, "m 3"]
+
+
+class HeightGrid(NamedTuple):
+    """Heights [rows, columns], NaN for voids; the place of the first node, and the steps along X of
+    columns and along Y of rows."""
+
+    heights: Float[np.ndarray, "rows columns"]
+    origin: tuple[float, float]
+    step: tuple[float, float]
+
+
+def read_mesh(path: str | Path) -> Mesh:
+    """A mesh of a .ply or .obj file; polygons become fans of triangles.
+
+    **Raises:** `InputError`."""
+    check_plain(path)
+    if not os.path.isfile(path):
+        raise InputError(f"{path}: no such file; expected a mesh, .ply or .obj")
+    return _read_mesh(str(path), os.stat(path).st_mtime_ns)
+
+
+@lru_cache(maxsize=4)
+def _read_mesh(path: str, _: int) -> Mesh:
+    content = Path(path).read_bytes()
+    with foreign_parser(path, "a mesh of triangles, .ply or .obj"):
+        mesh = _ply(content) if content[:3] == b"ply" else _obj(content)
+    m, n = mesh.triangles, len(mesh.vertices)
+    if not len(m) or m.min() < 0 or m.max() >= n or not np.isfinite(mesh.vertices).all():
+        raise InputError(
+            f"{path}: expected vertices and faces of them, got {n} vertices and {len(m)} triangles"
+            + (" that name others" if len(m) else "")
+        )
+    return mesh
+
+
+def _obj(content: bytes) -> Mesh:
+    vertices, faces = [], []
+    for line in content.decode("utf-8", "replace").splitlines():
+        key, *words = line.split() or [""]
+        if key == "v":
+            vertices.append([float(word) for word in words[:3]])
+        elif key == "f":
+            found = [int(word.split("/")[0]) for word in words]
+            # counted from 1, or backwards from the last
+            faces.append([k - 1 if k > 0 else len(vertices) + k for k in found])
+    return Mesh(np.array(vertices, float).reshape(-1, 3), _fans(faces))
+
+
+def _fans(faces: list) -> Int[np.ndarray, "m 3"]:
+    fans = [(f[0], b, c) for f in faces for b, c in zip(f[1:], f[2:])]
+    return np.array(fans, np.int64).reshape(-1, 3)
+
+
+def _ply(content: bytes) -> Mesh:
+    head, _, body = content.partition(b"end_header\n")
+    lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
+    form = next(words[1] for words in lines if words[:1] == ["format"])
+    elements: list[tuple[str, int, list]] = []
+    for words in lines:
+        if words[:1] == ["element"]:
+            elements.append((words[1], int(words[2]), []))
+        elif words[:1] == ["property"]:
+            elements[-1][2].append(words[1:])
+    order = ">" if form == "binary_big_endian" else "<"
+    at, vertices, faces = 0, np.zeros((0, 3)), []
+    texts = iter(body.split()) if form == "ascii" else None
+    for name, number, properties in elements:
+        types = [order + PLY_TYPES[p[0]] for p in properties if p[0] != "list"]
+        plain = len(types) == len(properties)
+        if texts is not None:
+            rows = [[_text_value(texts, p) for p in properties] for _ in range(number)]
+        elif plain:
+            dtype = np.dtype([(f"f{k}", t) for k, t in enumerate(types)])
+            rows = [list(row) for row in np.frombuffer(body, dtype, number, at).tolist()]
+            at += number * dtype.itemsize
+        else:
+            rows, at = _binary_rows(body, at, number, properties, order)
+        names = [p[-1] for p in properties]
+        if name == "vertex":
+            columns = [names.index(axis) for axis in "xyz"]
+            vertices = np.array([[row[c] for c in columns] for row in rows], float)
+        elif name == "face":
+            k = next(k for k, p in enumerate(properties) if p[-1].startswith("vertex_ind"))
+            faces = [row[k] for row in rows]
+    return Mesh(vertices, _fans(faces))
+
+
+def _text_value(texts: Iterator[bytes], property: list[str]) -> float | list[int]:
+    if property[0] != "list":
+        return float(next(texts))
+    return [int(next(texts)) for _ in range(int(next(texts)))]
+
+
+def _binary_rows(
+    body: bytes, at: int, number: int, properties: list, order: str
+) -> tuple[list, int]:
+    rows = []
+    for _ in range(number):
+        row: list = []
+        for p in properties:
+            count = 1
+            if p[0] == "list":
+                size = np.dtype(order + PLY_TYPES[p[1]])
+                count = int(np.frombuffer(body, size, 1, at)[0])
+                at += size.itemsize
+            dtype = np.dtype(order + PLY_TYPES[p[-2]])
+            values = np.frombuffer(body, dtype, count, at).tolist()
+            at += count * dtype.itemsize
+            row.append(values if p[0] == "list" else values[0])
+        rows.append(row)
+    return rows, at
+
+
+def read_grid(path: str | Path) -> HeightGrid:
+    """The heights of a raster in the coordinates of its map, north up.
+
+    **Raises:** `InputError`, also without the package rasterio."""
+    check_plain(path)
+    if not os.path.isfile(path):
+        raise InputError(f"{path}: no such file; expected a raster of heights")
+    return _read_grid(str(path), os.stat(path).st_mtime_ns)
+
+
+@lru_cache(maxsize=4)
+def _read_grid(path: str, _: int) -> HeightGrid:
+    try:
+        import rasterio
+    except ImportError:
+        raise InputError("rasters need rasterio: pip install 'jaxbundle[geo]'") from None
+    with foreign_parser(path, "a raster of heights"), rasterio.open(path) as source:
+        heights = source.read(1, masked=True).astype(float).filled(np.nan)
+        place = source.transform
+    if place.b or place.d:
+        raise InputError(f"{path}: the grid is rotated; expected rows along X, columns along Y")
+    # heights are of the centres of pixels
+    origin = (place.c + 0.5 * place.a, place.f + 0.5 * place.e)
+    return HeightGrid(heights, origin, (place.a, place.e))
+
+
+def triangles_near(
+    mesh: Mesh, X: Float[np.ndarray, "points 3"]
+) -> Float[np.ndarray, "points candidates 3 3"]:
+    """The corners of the triangles nearest to points."""
+    corners = mesh.vertices[mesh.triangles]
+    middle = corners.mean(1)
+    reach = np.linalg.norm(corners - middle[:, None], axis=2).max(1)
+    chosen = []
+    for P in X:
+        bound = np.linalg.norm(middle - P, axis=1) - reach
+        some = np.argpartition(bound, min(BOUNDED, len(bound)) - 1)[:BOUNDED]
+        near = some[np.argsort(distances_to_triangles(P, corners[some]))[:CANDIDATES]]
+        # a small mesh: the last one again
+        chosen.append(np.resize(near, CANDIDATES) if len(near) < CANDIDATES else near)
+    return corners[np.array(chosen, int)]
+
+
+def distances_to_triangles(
+    P: Float[np.ndarray, "3"], corners: Float[np.ndarray, "k 3 3"]
+) -> Float[np.ndarray, " k"]:
+    """The distances of a point from triangles."""
+    p, q = corners, np.roll(corners, -1, 1)
+    side, away = q - p, P - p
+    normal = np.cross(side[:, 0], side[:, 1])
+    size = np.linalg.norm(normal, axis=1)
+    inside = ((np.cross(side, away) * normal[:, None]).sum(2) >= 0).all(1) & (size > 0)
+    length = (side * side).sum(2)
+    t = np.clip((away * side).sum(2) / np.where(length > 0, length, 1.0), 0, 1)
+    edges = np.linalg.norm(away - t[..., None] * side, axis=2).min(1)
+    off = np.abs((away[:, 0] * normal).sum(1)) / np.where(size > 0, size, 1.0)
+    return np.where(inside, off, edges)
+
+
+def heights_near(
+    grid: HeightGrid, X: Float[np.ndarray, "points 3"]
+) -> tuple[Float[np.ndarray, "points nodes nodes"], Float[np.ndarray, "points 2"]]:
+    """A part of a grid around every point, and the place of its first node; NaN beyond edges."""
+    padded = np.pad(grid.heights, REACH, constant_values=np.nan)
+    cell = np.floor((X[:, :2] - grid.origin) / grid.step).astype(int)
+    shape = np.array(grid.heights.shape[::-1])
+    inside = np.clip(cell, -1, shape - 1)
+    parts, first = [], inside - REACH + 1
+    for column, row in inside + 1:
+        parts.append(padded[row : row + 2 * REACH, column : column + 2 * REACH])
+    return np.array(parts), np.array(grid.origin) + first * np.array(grid.step)
