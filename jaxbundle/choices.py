@@ -113,7 +113,7 @@ CLOUD_FILES = (".csv", ".ply", ".las", ".laz", ".dxf")
 # The point that replaces those of a cube.
 CUBE_POINTS = ("mean", "corner", "best")
 
-Resampling = Literal["nearest", "bilinear", "cubic"]
+Resampling = Literal["nearest", "bilinear", "cubic", "lanczos"]
 RESAMPLINGS: tuple[Resampling, ...] = get_args(Resampling)
 AttitudeError = Literal["bias", "white"]
 # One error per image, or one per record of the attitude table.
