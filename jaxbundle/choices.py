@@ -115,6 +115,9 @@ CUBE_POINTS = ("mean", "corner", "best")
 
 Resampling = Literal["nearest", "bilinear", "cubic", "lanczos"]
 RESAMPLINGS: tuple[Resampling, ...] = get_args(Resampling)
+# Of maps in GeoTIFF, without loss.
+Compression = Literal["none", "deflate", "lzw", "zstd"]
+COMPRESSIONS: tuple[Compression, ...] = get_args(Compression)
 AttitudeError = Literal["bias", "white"]
 # One error per image, or one per record of the attitude table.
 ATTITUDE_ERRORS: tuple[AttitudeError, ...] = get_args(AttitudeError)

@@ -19,7 +19,7 @@ from jaxbundle.commands.scanner_inputs import (
 )
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
-from jaxbundle.io.rasters.correction import map_of, write_corrected
+from jaxbundle.io.rasters.correction import Correction, map_of, write_corrected
 from jaxbundle.io.rasters.error_maps import write_error_map
 from jaxbundle.io.rasters.maps import MapSystem, describe_distance
 from jaxbundle.io.rasters.scenes import read_scene, write_taken
@@ -128,9 +128,8 @@ def correct(  # noqa: PLR0913 (public: the options of the command, all but three
         surface,
         system,
         grid,
-        cast(Resampling, resampling),
+        Correction(cast(Resampling, resampling), occlusion),
         lambda _, done, total: progress("blocks", done, total),
-        occlusion,
     )
     rms = None
     if true is not None and errors is not None:

@@ -20,7 +20,7 @@ from jaxbundle.io.scanner.writing import write_scanner_image
 from jaxbundle.io.text.csv_tables import write_csv
 from jaxbundle.pushbroom import rpc
 from jaxbundle.pushbroom.ground_to_image import make_search
-from jaxbundle.pushbroom.rectification import BLOCK_SIZE, NODE_STEP, block_places
+from jaxbundle.pushbroom.rectification import BLOCK_SIZE, NODE_STEP, TOLERANCE, block_places
 from jaxbundle.pushbroom.rpc.fitting import fit_image
 from jaxbundle.pushbroom.rpc.image import RpcImage
 from jaxbundle.pushbroom.surfaces import Height

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.io.rasters.map_blocks import write_map
+from jaxbundle.io.rasters.map_blocks import MapBands, write_map
 from jaxbundle.io.rasters.maps import MapGrid, MapSystem
 from jaxbundle.io.rasters.reading import rasterio
 from jaxbundle.io.rasters.writing import write_raster
@@ -47,7 +47,8 @@ def write_error_map(
         squares.append((np.nansum(length**2), np.isfinite(length).sum()))
         return np.stack([*errors, length])
 
-    write_map(target, system, grid, surface, 3, "float32", block, progress, BANDS)
+    bands = MapBands(3, "float32", names=BANDS)
+    write_map(target, system, grid, surface, bands, block, progress)
     total, count = np.sum(squares, axis=0) if squares else (0.0, 0)
     return float(np.sqrt(total / count)) if count else np.nan
 

@@ -109,6 +109,15 @@ def read_values(
     return values.astype(float).filled(np.nan)
 
 
+def read_plain(path: str | Path, source: "DatasetReader", window: Window) -> np.ndarray:
+    """The stored values of all bands, without a look at no-data.
+
+    **Raises:** as `read_pixels`."""
+    check_pixels(path, source, None, window)
+    with raster_parser(path):
+        return source.read(window=window)
+
+
 def check_pixels(
     path: str | Path,
     source: "DatasetReader",
@@ -166,12 +175,15 @@ def check_raw(path: str | Path, source: "DatasetReader") -> None:
         )
 
 
-def as_type(values: np.ndarray, dtype: np.dtype | str) -> np.ndarray:
-    """Values as stored: whole numbers are rounded and clipped to the range, NaN becomes 0."""
+def as_type(values: np.ndarray, dtype: np.dtype | str, missing: float | None = None) -> np.ndarray:
+    """Values as stored: whole numbers are rounded and clipped to the range, NaN becomes `missing`;
+    None: NaN stays, and is 0 of whole numbers."""
     if np.issubdtype(dtype, np.floating):
-        return values.astype(dtype)
+        filled = values if missing is None else np.where(np.isnan(values), missing, values)
+        return filled.astype(dtype)
     limits = np.iinfo(dtype)
-    return np.clip(np.rint(np.nan_to_num(values)), limits.min, limits.max).astype(dtype)
+    filled = np.where(np.isnan(values), missing or 0, np.rint(values))
+    return np.clip(filled, limits.min, limits.max).astype(dtype)
 
 
 def read_terrain(
