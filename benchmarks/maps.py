@@ -25,10 +25,11 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import machine
 import numpy as np
 
-# Values of a band change by 64 a line or pixel, so that whole numbers resolve a 64th of a pixel, and
+# Values of a band change by 64 a line or pixel, so that whole numbers resolve a 64th of it, and
 # begin anew every 1000 lines.
 STEPS, FOLD = 64.0, 64_000
-GDAL = {"gdal, 1 thread": (1, 0.125), "gdal, 2 threads": (2, 0.125), "gdal, 2 threads, 0.02": (2, 0.02)}  # fmt: skip
+GDAL = {"gdal, 1 thread": (1, 0.125), "gdal, 2 threads": (2, 0.125),
+        "gdal, 2 threads, 0.02": (2, 0.02)}  # fmt: skip
 
 
 def scanner(size):

@@ -118,6 +118,11 @@ RESAMPLINGS: tuple[Resampling, ...] = get_args(Resampling)
 # Of maps in GeoTIFF, without loss.
 Compression = Literal["none", "deflate", "lzw", "zstd"]
 COMPRESSIONS: tuple[Compression, ...] = get_args(Compression)
+# σ that the planimetric σ of a map is propagated from.
+MAP_ERRORS = (
+    "attitude_bias", "attitude_drift", "attitude_white", "position_bias", "position_drift",
+    "position_white", "image", "height", "ground",
+)  # fmt: skip
 AttitudeError = Literal["bias", "white"]
 # One error per image, or one per record of the attitude table.
 ATTITUDE_ERRORS: tuple[AttitudeError, ...] = get_args(AttitudeError)

@@ -405,6 +405,11 @@ def _places(
     return *project_from(image, search, tuple(ground), *_spread(starts)), ground
 
 
+def block_heights(surface: GroundSurface, nodes: MapNodes) -> Float[np.ndarray, "rows columns"]:
+    """The heights of the pixels of a block, NaN where the terrain has none."""
+    return np.asarray(_heights(surface, nodes).height)
+
+
 @partial(compile_once, static=())
 def _heights(surface: GroundSurface, nodes: MapNodes) -> BlockHeights:
     """Heights of the pixels of a block, NaN where the terrain has none."""
@@ -417,7 +422,7 @@ def _heights(surface: GroundSurface, nodes: MapNodes) -> BlockHeights:
 def _heights_of(surface: GroundSurface, nodes: MapNodes) -> Float[Array, "rows columns"]:
     if isinstance(surface, Terrain):
         x, y, _ = surface.grid(tuple(nodes.X))
-        return bilinear(surface.heights, *_spread(jnp.stack([x, y])))
+        return jnp.asarray(bilinear(surface.heights, *_spread(jnp.stack([x, y]))))
     return jnp.broadcast_to(_level(surface), (BLOCK_SIZE, BLOCK_SIZE)) * 1.0
 
 

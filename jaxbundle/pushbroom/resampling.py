@@ -80,7 +80,8 @@ def _convolve(
     rows, columns, bands = pixels.shape
     working = working_type(pixels.dtype)
     i, j = jnp.floor(row), jnp.floor(column)
-    down, right = ([w[..., None] for w in weights(v.astype(working))] for v in (row - i, column - j))
+    of = lambda place: [jnp.asarray(w)[..., None] for w in weights(place.astype(working))]
+    down, right = of(jnp.asarray(row - i)), of(jnp.asarray(column - j))
     # the index of a position that is NaN must be valid; its weights keep the value NaN
     i, j = (jnp.nan_to_num(v).astype(jnp.int32) - before for v in (i, j))
     flat = pixels.reshape(-1, bands)

@@ -23,6 +23,7 @@ from jaxbundle.io.rasters.reading import (
     as_type,
     check_raw,
     open_raster,
+    rasterio,
     read_plain,
     read_values,
 )
@@ -135,7 +136,9 @@ def write_corrected(
 
     **Raises:** `InputError` if the raster does not have the size of the image, or cannot be read.
     """
-    with open_raster(source) as bands:
+    # 256 MB of GDAL's blocks: those of a row of blocks of the map, of an image in tiles; by default
+    # they grow to 5 % of the memory of the machine
+    with rasterio().Env(GDAL_CACHEMAX=256), open_raster(source) as bands:
         if not isinstance(image, RpcImage):
             check_raw(source, bands)
         if (bands.height, bands.width) != (image.lines, image.pixels):
@@ -163,7 +166,8 @@ class _Pixels:
     """
 
     def __init__(self, path: str | Path, raster: "DatasetReader", correction: Correction):
-        self._path, self._raster, self._kind = path, raster, correction.resampling
+        self._path, self._raster = path, raster
+        self._kind: Resampling = correction.resampling
         self._reading = threading.Lock()  # GDAL: one thread at a time in a data set
         dtype = np.dtype(raster.dtypes[0])
         if dtype.kind not in "uif" or len(set(raster.dtypes)) > 1:
@@ -198,7 +202,7 @@ class _Pixels:
     def at(self, image: PushbroomImage | RpcImage, places: Places) -> np.ndarray | None:
         """The values [bands, rows, columns] of all bands at the positions of a block; None if
         no data."""
-        line, pixel = places
+        line, pixel = map(np.asarray, places)
         dtype = np.dtype(self.bands.dtype)
         found = np.full((*line.shape, self.bands.count), self.bands.missing, dtype)
         # 2²² values of all bands are at most 32 MB in memory for each of the two workers
@@ -257,9 +261,7 @@ def _resample(
     # a copy in floating point only where it is needed
     values = jax.lax.cond(
         has_gaps,
-        lambda: resample_pixels(
-            jnp.where(lacking, jnp.nan, pixels.astype(working)), *place, kind
-        ),
+        lambda: resample_pixels(jnp.where(lacking, jnp.nan, pixels.astype(working)), *place, kind),
         lambda: resample_pixels(pixels, *place, kind),
     )
     known = ~jnp.isnan(values)

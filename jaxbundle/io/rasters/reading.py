@@ -192,7 +192,8 @@ def read_terrain(
     extent: Extent | None = None,
     above_geoid: bool = False,
 ) -> Terrain:
-    """The terrain model of the first band of a raster; its heights are those above `earth`.
+    """The terrain model of the first band of a raster, or of a folder of tiles; its heights are
+    those above `earth`.
 
     Scale, offset and no-data of the band are applied, and so is the unit of a vertical system. A
     projected system is resampled to longitude and latitude first (bilinear, about the same
@@ -207,7 +208,9 @@ def read_terrain(
     package = rasterio()
     from rasterio.vrt import WarpedVRT
 
-    with open_raster(path) as source:
+    from jaxbundle.io.rasters.mosaics import as_one_raster  # which opens tiles with this module
+
+    with as_one_raster(path) as file, open_raster(file) as source:
         check_georeference(path, source)
         height = HeightScale(source.scales[0], source.offsets[0])
         if earth is None:
