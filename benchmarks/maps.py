@@ -118,9 +118,10 @@ def gdal(folder, resampling, threads, tolerance):
     with rasterio.open(folder / "ours.tif") as same:
         profile = same.profile | {"compress": None, "BIGTIFF": "IF_SAFER"}
     start = time.perf_counter()
-    with rasterio.open(folder / "image.tif") as source, rasterio.open(
-        folder / "gdal.tif", "w", **profile
-    ) as target:
+    # its cache as large as that of `correct`
+    with rasterio.Env(GDAL_CACHEMAX=256), rasterio.open(
+        folder / "image.tif"
+    ) as source, rasterio.open(folder / "gdal.tif", "w", **profile) as target:
         every = [*range(1, source.count + 1)]
         reproject(
             rasterio.band(source, every), rasterio.band(target, every), rpcs=source.rpcs,
@@ -142,7 +143,7 @@ def distance(folder, name, number=20_000):
     jaxbundle.enable_x64()
     from jaxbundle.geometry.ellipsoid import WGS84
     from jaxbundle.io import read_rpc
-    from jaxbundle.io.rasters.reading import read_terrain
+    from jaxbundle.io.rasters.terrain_models import read_terrain
     from jaxbundle.pushbroom.rpc.polynomials import project_points
     from jaxbundle.pushbroom.terrain import bilinear
 

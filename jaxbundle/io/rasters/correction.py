@@ -147,7 +147,7 @@ def write_corrected(
                 f"{'image of the RPC' if isinstance(image, RpcImage) else 'scanner file'} has "
                 f"{image.lines} of {image.pixels}"
             )
-        pixels = _Pixels(source, bands, correction)
+        pixels = _SourcePixels(source, bands, correction)
 
         def block(nodes: MapNodes) -> np.ndarray | None:
             given = image, search, surface, nodes
@@ -158,7 +158,7 @@ def write_corrected(
         write_map(target, system, grid, surface, pixels.bands, block, progress, format, checkpoint)
 
 
-class _Pixels:
+class _SourcePixels:
     """The pixels of a raster, resampled for blocks of a map; from several threads.
 
     **Raises:** `InputError` if its bands are of several types, of complex numbers, or if the value
