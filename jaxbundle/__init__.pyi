@@ -82,6 +82,8 @@ from jaxbundle.commands.reconstruction import reconstruct as reconstruct
 from jaxbundle.commands.stability_of_cameras import stability as stability
 from jaxbundle.commands.surface import Surface as Surface
 from jaxbundle.commands.surface import surface as surface
+from jaxbundle.commands.surface_change import ChangeResult as ChangeResult
+from jaxbundle.commands.surface_change import change as change
 from jaxbundle.errors import InputError as InputError
 from jaxbundle.errors import NotSolvedError as NotSolvedError
 from jaxbundle.float64 import enable_x64 as enable_x64
@@ -135,6 +137,7 @@ __all__ = [
     "CameraDescription",
     "CameraModel",
     "Certificate",
+    "ChangeResult",
     "CloudResult",
     "Conditions",
     "Data",
@@ -170,6 +173,7 @@ __all__ = [
     "calibrate_rigs",
     "camera",
     "certificate",
+    "change",
     "check_gradients",
     "check_network",
     "cloud",

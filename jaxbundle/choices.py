@@ -123,6 +123,8 @@ MAP_ERRORS = (
     "attitude_bias", "attitude_drift", "attitude_white", "position_bias", "position_drift",
     "position_white", "image", "height", "ground",
 )  # fmt: skip
+# Stated errors of a surface that is compared with another.
+SURFACE_ERRORS = ("cell", "vertical", "horizontal", "tilt")
 AttitudeError = Literal["bias", "white"]
 # One error per image, or one per record of the attitude table.
 ATTITUDE_ERRORS: tuple[AttitudeError, ...] = get_args(AttitudeError)

@@ -35,6 +35,7 @@ COMMANDS = (
     "convert",
     "surface",
     "cloud",
+    "change",
     "pushbroom",
     "example",
     "completion",
