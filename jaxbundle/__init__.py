@@ -105,6 +105,10 @@ _HOME = {
     ),
     "jaxbundle.commands.reconstruction": ("reconstruct",),
     "jaxbundle.commands.stability_of_cameras": ("stability",),
+    "jaxbundle.commands.surface_change": (
+        "ChangeResult",
+        "change",
+    ),
     "jaxbundle.commands.surface": (
         "Surface",
         "surface",

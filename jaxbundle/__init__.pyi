@@ -84,6 +84,8 @@ from jaxbundle.commands.reconstruction import reconstruct as reconstruct
 from jaxbundle.commands.stability_of_cameras import stability as stability
 from jaxbundle.commands.surface import Surface as Surface
 from jaxbundle.commands.surface import surface as surface
+from jaxbundle.commands.surface_change import ChangeResult as ChangeResult
+from jaxbundle.commands.surface_change import change as change
 from jaxbundle.commands.video_frames import VideoFrames as VideoFrames
 from jaxbundle.commands.video_frames import frames as frames
 from jaxbundle.errors import InputError as InputError
@@ -139,6 +141,7 @@ __all__ = [
     "CameraDescription",
     "CameraModel",
     "Certificate",
+    "ChangeResult",
     "CloudResult",
     "Conditions",
     "Data",
@@ -176,6 +179,7 @@ __all__ = [
     "calibrate_rigs",
     "camera",
     "certificate",
+    "change",
     "check_gradients",
     "check_network",
     "cloud",

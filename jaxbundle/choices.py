@@ -126,8 +126,18 @@ CLOUD_FILES = (".csv", ".ply", ".las", ".laz", ".dxf")
 # The point that replaces those of a cube.
 CUBE_POINTS = ("mean", "corner", "best")
 
-Resampling = Literal["nearest", "bilinear", "cubic"]
+Resampling = Literal["nearest", "bilinear", "cubic", "lanczos"]
 RESAMPLINGS: tuple[Resampling, ...] = get_args(Resampling)
+# Of maps in GeoTIFF, without loss.
+Compression = Literal["none", "deflate", "lzw", "zstd"]
+COMPRESSIONS: tuple[Compression, ...] = get_args(Compression)
+# σ that the planimetric σ of a map is propagated from.
+MAP_ERRORS = (
+    "attitude_bias", "attitude_drift", "attitude_white", "position_bias", "position_drift",
+    "position_white", "image", "height", "ground",
+)  # fmt: skip
+# Stated errors of a surface that is compared with another.
+SURFACE_ERRORS = ("cell", "vertical", "horizontal", "tilt")
 AttitudeError = Literal["bias", "white"]
 # One error per image, or one per record of the attitude table.
 ATTITUDE_ERRORS: tuple[AttitudeError, ...] = get_args(AttitudeError)

@@ -37,6 +37,7 @@ COMMANDS = (
     "convert",
     "surface",
     "cloud",
+    "change",
     "pushbroom",
     "example",
     "completion",

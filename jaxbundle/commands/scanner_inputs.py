@@ -9,7 +9,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid, earth_fixed
 from jaxbundle.io.rasters.extent import image_extent, rpc_extent
 from jaxbundle.io.rasters.geoid import add_geoid
-from jaxbundle.io.rasters.reading import read_terrain
+from jaxbundle.io.rasters.terrain_models import read_terrain
 from jaxbundle.io.scanner.read import EXPECTED_PRODUCTS, PRODUCTS, read_scanner
 from jaxbundle.io.scanner.rpc_images import RpcInput, has_rpc_only, read_rpc_image
 from jaxbundle.io.scanner.scanner import ScannerInput

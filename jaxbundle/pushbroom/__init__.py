@@ -18,9 +18,11 @@ from jaxbundle.lazy import import_on_use
 
 # By module; __init__.pyi has their types: `make stubs` writes it.
 _HOME = {
-    "jaxbundle.commands.scanner_images": (
+    "jaxbundle.commands.corrected_maps": (
         "CorrectedImage",
         "correct",
+    ),
+    "jaxbundle.commands.scanner_images": (
         "refine",
         "simulate",
     ),
@@ -78,6 +80,10 @@ _HOME = {
         "locate_lines",
         "locate_point",
         "locate_points",
+    ),
+    "jaxbundle.pushbroom.map_accuracy": (
+        "MapErrors",
+        "covariance_lattice",
     ),
     "jaxbundle.pushbroom.noise": (
         "Noise",

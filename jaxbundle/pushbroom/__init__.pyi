@@ -1,7 +1,7 @@
 # Written by `make stubs` from the names in __init__.py.
 # ruff: noqa: I001
-from jaxbundle.commands.scanner_images import CorrectedImage as CorrectedImage
-from jaxbundle.commands.scanner_images import correct as correct
+from jaxbundle.commands.corrected_maps import CorrectedImage as CorrectedImage
+from jaxbundle.commands.corrected_maps import correct as correct
 from jaxbundle.commands.scanner_images import refine as refine
 from jaxbundle.commands.scanner_images import simulate as simulate
 from jaxbundle.commands.scanner_info import ScannerInfo as ScannerInfo
@@ -42,6 +42,8 @@ from jaxbundle.pushbroom.image import pose_at as pose_at
 from jaxbundle.pushbroom.image_to_ground import locate_lines as locate_lines
 from jaxbundle.pushbroom.image_to_ground import locate_point as locate_point
 from jaxbundle.pushbroom.image_to_ground import locate_points as locate_points
+from jaxbundle.pushbroom.map_accuracy import MapErrors as MapErrors
+from jaxbundle.pushbroom.map_accuracy import covariance_lattice as covariance_lattice
 from jaxbundle.pushbroom.noise import Noise as Noise
 from jaxbundle.pushbroom.noise import add_errors as add_errors
 from jaxbundle.pushbroom.orbit import state_orbit as state_orbit
@@ -90,6 +92,7 @@ __all__ = [
     "Ground",
     "Height",
     "LineTimes",
+    "MapErrors",
     "NODE_STEP",
     "Noise",
     "Offsets",
@@ -119,6 +122,7 @@ __all__ = [
     "closed_form",
     "compare_with_rpc",
     "correct",
+    "covariance_lattice",
     "fit_bias",
     "fit_image",
     "fit_rpc",

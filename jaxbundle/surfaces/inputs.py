@@ -53,6 +53,27 @@ def read_views(
     return views, network, tuple(messages)
 
 
+def read_orientations(path: str | Path) -> tuple[FrameView, ...]:
+    """The oriented images of a network without their photographs, which have the size of their
+    cameras; images without orientation are left out.
+
+    **Raises:** `InputError` if fewer than two are oriented, or a camera has no size.
+    """
+    network = read_oriented(path)
+    images = network.images
+    known = np.asarray(np.isfinite(np.concatenate([images.position, images.angles], 1)).all(1))
+    network = network.replace(images=images.take(known))
+    if known.sum() < 2:
+        raise InputError(f"{path}: {known.sum()} oriented images; a surface has at least two")
+    greys = []
+    for camera in (network.cameras[c] for c in network.images.camera):
+        if camera.image_size is None:
+            raise InputError(f"{path}: camera {camera.id}: image_size is missing, in pixels")
+        columns, rows = camera.image_size
+        greys.append(np.broadcast_to(np.uint8(0), (rows, columns)))
+    return frame_views(network, greys, joint=_read_joint_covariance(Path(path), network))
+
+
 def _read_joint_covariance(path: Path, network: Network) -> OrientationCovariance | None:
     """The covariance of the orientations beside a project, if an adjustment has written it."""
     folder = path if path.is_dir() else path.parent

@@ -9,7 +9,7 @@ diag(σ²) for k = l by the σ of images.csv, assumed uncorrelated, which is not
 adjustment: the true part may be smaller or larger. σ of 0, or none, adds nothing.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
@@ -42,32 +42,63 @@ def orientation_covariance(
 ) -> Float[np.ndarray, "n 3 3"]:
     """The covariance of points due to that of the orientations of their images."""
     C = np.zeros((len(X), 3, 3))
+
+    def add(rows: slice, factor: Float[np.ndarray, "n 3 k"]) -> None:
+        C[rows] = factor @ np.swapaxes(factor, 1, 2)
+
+    _each_factor(views, X, used, add)
+    return C
+
+
+def orientation_modes(
+    views: Sequence[OrientedImage],
+    X: Float[np.ndarray, "n 3"],
+    used: Bool[np.ndarray, "n views"],
+    direction: Float[np.ndarray, "n 3"],
+) -> Float[np.ndarray, "n k"]:
+    """The errors of points along a direction for a unit of each independent error of the
+    orientations, S·W: points that share images share them, and M·Mᵀ is their covariance."""
+    parts: dict[int, np.ndarray] = {}
+
+    def add(rows: slice, factor: Float[np.ndarray, "n 3 k"]) -> None:
+        parts[rows.start] = np.einsum("ni,nik->nk", direction[rows], factor)
+
+    _each_factor(views, X, used, add)
+    return np.concatenate([parts[k] for k in sorted(parts)]) if parts else np.zeros((len(X), 0))
+
+
+def _each_factor(
+    views: Sequence[OrientedImage],
+    X: Float[np.ndarray, "n 3"],
+    used: Bool[np.ndarray, "n views"],
+    add: Callable[[slice, Float[np.ndarray, "n 3 k"]], None],
+) -> None:
+    """Call `add` with rows of the points and their S·W; not at all without σ of orientations."""
     uncertain = {
         k: view
         for k, view in enumerate(views)
         if isinstance(view, FrameView) and is_uncertain(view)
     }
-    if uncertain:
-        joint = np.block(
-            [
-                [_covariance(view, other) for other in uncertain.values()]
-                for view in uncertain.values()
-            ]
-        )
-        # C of a point is S·W·(S·W)ᵀ, symmetric and positive whatever the rounding
-        root = _square_root(joint)
-        # the matrices S of 32 768 points and four photographs take 20 MB a core
-        together = 1 << 15
+    if not uncertain:
+        return
+    joint = np.block(
+        [[_covariance(view, other) for other in uncertain.values()] for view in uncertain.values()]
+    )
+    # C of a point is S·W·(S·W)ᵀ, symmetric and positive whatever the rounding
+    root = _square_root(joint)
+    # held parameters have no errors; 1e-12 of a variance is its rounding
+    scale = np.maximum(np.sqrt(np.diagonal(joint)), 1e-300)
+    root = root[:, np.max(np.abs(root / scale[:, None]), axis=0) > 1e-6]
+    # the matrices S of 32 768 points and four photographs take 20 MB a core
+    together = 1 << 15
 
-        def add(first: int) -> None:
-            rows = slice(first, first + together)
-            T = _differentiate_points(views, uncertain, X[rows], used[rows])
-            factor = (T.reshape(-1, len(root)) @ root).reshape(len(T), 3, -1)
-            C[rows] = factor @ np.swapaxes(factor, 1, 2)
+    def compute(first: int) -> None:
+        rows = slice(first, first + together)
+        T = _differentiate_points(views, uncertain, X[rows], used[rows])
+        add(rows, (T.reshape(-1, len(root)) @ root).reshape(len(T), 3, -1))
 
-        with ThreadPoolExecutor(available_cores()) as pool:
-            list(pool.map(add, range(0, len(X), together)))
-    return C
+    with ThreadPoolExecutor(available_cores()) as pool:
+        list(pool.map(compute, range(0, len(X), together)))
 
 
 def _square_root(C: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:

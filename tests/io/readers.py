@@ -479,7 +479,7 @@ def _dem(folder, crs="EPSG:4326", origin=(13.0, 41.0), step=0.01, name="dem.tif"
 def _terrain(folder: Path, earth=True):
     from jaxbundle.geometry.ellipsoid import WGS84
     from jaxbundle.io.rasters.extent import Extent
-    from jaxbundle.io.rasters.reading import read_terrain
+    from jaxbundle.io.rasters.terrain_models import read_terrain
 
     dem = next(p for p in folder.iterdir() if p.suffix != ".xml")
     if not earth:
@@ -522,7 +522,7 @@ def _(folder):
 
 def _asc(folder: Path):
     from jaxbundle.geometry.ellipsoid import WGS84
-    from jaxbundle.io.rasters.reading import read_terrain
+    from jaxbundle.io.rasters.terrain_models import read_terrain
 
     return read_terrain(folder / "dem.asc", WGS84)
 

@@ -370,7 +370,7 @@ def test_a_damaged_statement_of_kept_corners(tmp_path):
 
 def test_a_terrain_model_of_one_column_is_named(tmp_path):
     from jaxbundle.geometry.ellipsoid import WGS84
-    from jaxbundle.io.rasters.reading import read_terrain
+    from jaxbundle.io.rasters.terrain_models import read_terrain
 
     path = tmp_path / "dem.asc"
     rows = "\n".join(map(str, range(100, 120)))

@@ -10,7 +10,7 @@ from full_disk import files_end_at
 from jaxbundle.errors import InputError
 from jaxbundle.io.rasters import correction, error_maps
 from jaxbundle.io.rasters import writing as raster_writing
-from jaxbundle.io.rasters.map_blocks import write_map
+from jaxbundle.io.rasters.map_blocks import MapBands, write_map
 from jaxbundle.io.rasters.maps import MapGrid, MapSystem
 from jaxbundle.pushbroom.surfaces import Plane
 from jaxbundle.system.temporaries import defer
@@ -18,8 +18,8 @@ from jaxbundle.system.temporaries import defer
 
 def write(target):
     values = np.random.default_rng(1).integers(0, 255, (1, 256, 256), dtype=np.uint8)
-    write_map(target, MapSystem(None, None), MapGrid(0.0, 0.0, 1.0, 600, 600), Plane(0.0), 1,
-              "uint8", lambda nodes: values.astype(float))  # fmt: skip
+    write_map(target, MapSystem(None, None), MapGrid(0.0, 0.0, 1.0, 600, 600), Plane(0.0),
+              MapBands(1, "uint8"), lambda nodes: values.astype(float))  # fmt: skip
 
 
 @pytest.mark.parametrize("cache", [64, 2**20], ids=["at closing", "at a block"])

@@ -16,7 +16,7 @@ from jaxbundle import cli
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import ellipsoid as el
 from jaxbundle.io.rasters.extent import Extent, image_extent
-from jaxbundle.io.rasters.reading import read_terrain
+from jaxbundle.io.rasters.terrain_models import read_terrain
 from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.pushbroom.earth_frames import EarthOrientation, to_earth, turn_quaternions
 from jaxbundle.pushbroom.surfaces import Ground

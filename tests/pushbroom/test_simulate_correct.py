@@ -13,7 +13,7 @@ from scipy.ndimage import binary_erosion
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.rasters import correction
-from jaxbundle.io.rasters.correction import map_of, write_corrected
+from jaxbundle.io.rasters.correction import Correction, map_of, write_corrected
 from jaxbundle.io.rasters.maps import MapGrid, MapSystem
 from jaxbundle.pushbroom.flight import Flight, measured_image, take_image, true_image
 from jaxbundle.pushbroom.ground_to_image import make_search, project_points
@@ -106,7 +106,7 @@ def test_a_corrected_image_is_the_scene(tmp_path):
     told = []
     write_corrected(
         source, tmp_path / "map.tif", image, make_search(image, None), surface, system, grid,
-        "cubic", lambda *k: told.append(k),
+        Correction("cubic"), lambda *k: told.append(k),
     )  # fmt: skip
     with rasterio.open(tmp_path / "map.tif") as result:
         found, origin = result.read(), result.transform

@@ -24,7 +24,10 @@ ImageFile = Annotated[
 Level = Annotated[
     float | None, typer.Option("--height", help="metres above the ellipsoid; Z in a local frame")
 ]
-Dem = Annotated[Path | None, typer.Option(help="terrain raster, heights like --height")]
+Dem = Annotated[
+    Path | None,
+    typer.Option(help="terrain raster, VRT, or folder of tiles, heights like --height"),
+]
 Geoid = Annotated[
     Path | None,
     typer.Option(

@@ -5,9 +5,11 @@ from typing import Annotated
 
 import typer
 
-from jaxbundle.choices import RESAMPLINGS
+from jaxbundle.choices import COMPRESSIONS, MAP_ERRORS, RESAMPLINGS
 from jaxbundle.cli.app import Quiet, choice
 from jaxbundle.cli.pushbroom.app import Dem, Geoid, ImageFile, Level, pushbroom
+from jaxbundle.errors import InputError
+from jaxbundle.system.interrupts import advise
 
 
 @pushbroom.command(example="out/flight/scanner.toml out/flight/image.tif --out out/map.tif")
@@ -35,6 +37,39 @@ def correct(  # noqa: PLR0913 - the options of the command
     occlusion: Annotated[
         bool, typer.Option("--occlusion", help="no data where terrain of --dem hides the ground")
     ] = False,
+    tolerance: Annotated[
+        float,
+        typer.Option(
+            min=0, help="of interpolated image positions, pixels; 0: project every pixel of the map"
+        ),
+    ] = 0.02,
+    nodata: Annotated[
+        float | None, typer.Option(help="no-data value; default: of the image, else 0 or NaN")
+    ] = None,
+    compress: Annotated[
+        str | None, choice(COMPRESSIONS, "default: none, deflate with --cog")
+    ] = None,
+    overviews: Annotated[
+        bool, typer.Option("--overviews", help="add overviews to the map")
+    ] = False,
+    cog: Annotated[
+        bool, typer.Option("--cog", help="write a Cloud Optimized GeoTIFF, with overviews")
+    ] = False,
+    checkpoint: Annotated[
+        Path | None,
+        typer.Option(help="file of finished blocks: an interrupted run resumes from it"),
+    ] = None,
+    sigma: Annotated[
+        Path | None, typer.Option(help="GeoTIFF of the planimetric σ of the map, from --error")
+    ] = None,
+    error: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=SIGMA",
+            help=f"σ for --sigma, may be repeated: {', '.join(MAP_ERRORS)} (degrees, metres, per "
+            "second, pixels); default with RPC: ground, as its file states",
+        ),
+    ] = None,
     truth: Annotated[
         Path | None, typer.Option(help="scanner file of the truth, for --error-map")
     ] = None,
@@ -48,7 +83,11 @@ def correct(  # noqa: PLR0913 - the options of the command
     from jaxbundle.cli.progress import staging
     from jaxbundle.cli.pushbroom.shared import keep_inputs, warn
 
-    keep_inputs([scanner, image, dem, truth], out=out, error_map=error_map)
+    outputs = {"out": out, "error_map": error_map, "sigma": sigma, "checkpoint": checkpoint}
+    keep_inputs([scanner, image, dem, truth], **outputs)
+    errors = _errors(error or [])
+    if checkpoint is not None:
+        advise(f"run the same command again to resume; finished blocks are kept in {checkpoint}")
     with staging(quiet) as show:
         found = line_scanners.correct(
             scanner,
@@ -61,6 +100,14 @@ def correct(  # noqa: PLR0913 - the options of the command
             geoid=geoid,
             resampling=resampling,
             occlusion=occlusion,
+            tolerance=tolerance,
+            nodata=nodata,
+            compress=compress,
+            overviews=overviews,
+            cog=cog,
+            checkpoint=checkpoint,
+            sigma=sigma,
+            errors=errors,
             truth=truth,
             error_map=error_map,
             progress=show,
@@ -68,3 +115,17 @@ def correct(  # noqa: PLR0913 - the options of the command
         )
     if not quiet:
         print(f"{found}{'' if truth is None else f' against {truth}'}")
+
+
+def _errors(given: list[str]) -> dict[str, float]:
+    """σ by name."""
+    found = {}
+    for text in given:
+        name, _, value = text.partition("=")
+        try:
+            found[name] = float(value)
+        except ValueError:
+            raise InputError(
+                f"--error {text}: NAME=SIGMA is expected, such as {MAP_ERRORS[0]}=0.001"
+            ) from None
+    return found

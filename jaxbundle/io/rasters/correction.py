@@ -1,29 +1,48 @@
 """A raster corrected to a map: GeoTIFF, block by block, a few blocks in memory at a time."""
 
+import dataclasses
 import itertools
 import threading
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Bool, Float, Num
 
 from jaxbundle.choices import Resampling
 from jaxbundle.errors import InputError
-from jaxbundle.io.rasters.map_blocks import write_map
+from jaxbundle.io.rasters.checkpoints import Checkpoint
+from jaxbundle.io.rasters.map_blocks import PLAIN, MapBands, MapFormat, write_map
 from jaxbundle.io.rasters.maps import MapGrid, MapSystem, contiguous, grid_around
-from jaxbundle.io.rasters.reading import Window, check_raw, open_raster, read_values
+from jaxbundle.io.rasters.reading import (
+    Window,
+    as_type,
+    check_raw,
+    open_raster,
+    rasterio,
+    read_plain,
+    read_values,
+)
 from jaxbundle.pushbroom.ground_to_image import Search
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.image_to_ground import locate_lines
-from jaxbundle.pushbroom.rectification import BLOCK_SIZE, MapNodes, block_places
-from jaxbundle.pushbroom.resampling import resample
+from jaxbundle.pushbroom.rectification import (
+    BLOCK_SIZE,
+    TOLERANCE,
+    MapNodes,
+    Places,
+    block_places,
+)
+from jaxbundle.pushbroom.resampling import REACH, resample_pixels, working_type
 from jaxbundle.pushbroom.rpc.image import RpcImage, locate_rpc_lines
 from jaxbundle.pushbroom.surfaces import GroundSurface
 from jaxbundle.pushbroom.terrain import Terrain
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray, Progress
+from jaxbundle.types import AnyArray, Progress, Scalar
 
 if TYPE_CHECKING:
     from rasterio.io import DatasetReader
@@ -31,7 +50,6 @@ if TYPE_CHECKING:
 # Rows and columns of a block.
 Part = tuple[slice, slice]
 
-_resample = compile_once(resample, 3)
 _locate = compile_once(locate_lines, ())
 _locate_rpc = compile_once(locate_rpc_lines, ())
 
@@ -80,6 +98,21 @@ def map_of(
     return MapGrid(grid.x - size, grid.y + size, size, grid.columns + 2, grid.rows + 2)
 
 
+@dataclasses.dataclass(frozen=True)
+class Correction:
+    """How an image is corrected: kernel, `tolerance` of interpolated positions (pixels of the
+    image), whether hidden terrain has no data, and the value of no data (None: that of the image,
+    NaN, or 0 of whole numbers)."""
+
+    resampling: Resampling = "bilinear"
+    occlusion: bool = False
+    tolerance: float = TOLERANCE
+    nodata: float | None = None
+
+
+BILINEAR = Correction()
+
+
 def write_corrected(
     source: str | Path,
     target: str | Path,
@@ -88,19 +121,24 @@ def write_corrected(
     surface: GroundSurface,
     system: MapSystem,
     grid: MapGrid,
-    resampling: Resampling = "bilinear",
+    correction: Correction = BILINEAR,
     progress: Progress | None = None,
-    occlusion: bool = False,
+    stored: tuple[MapFormat, Checkpoint | None] = (PLAIN, None),
 ) -> None:
     """Write the raster `source`, taken by the image, as the map `target`.
 
-    All bands, in the type of the source, with its scales and offsets; NaN or 0 (declared as no
-    data) outside the image, where the source has no data, and, with `occlusion`, also for hidden
-    terrain.
+    All bands, in the type of the source, with its scales and offsets; no data outside the image,
+    where the source has no data, and, with `occlusion`, also for hidden terrain. Where the value of
+    no data is that of the source or a given one, pixels that show it by chance have the nearest
+    other value; else 0 of the source, which may be its undeclared border, is no data of the map.
+
+    **Arguments:** `stored`: the format of the map, and its checkpoint.
 
     **Raises:** `InputError` if the raster does not have the size of the image, or cannot be read.
     """
-    with open_raster(source) as bands:
+    # 256 MB of GDAL's blocks: those of a row of blocks of the map, of an image in tiles; by default
+    # they grow to 5 % of the memory of the machine
+    with rasterio().Env(GDAL_CACHEMAX=256), open_raster(source) as bands:
         if not isinstance(image, RpcImage):
             check_raw(source, bands)
         if (bands.height, bands.width) != (image.lines, image.pixels):
@@ -109,50 +147,132 @@ def write_corrected(
                 f"{'image of the RPC' if isinstance(image, RpcImage) else 'scanner file'} has "
                 f"{image.lines} of {image.pixels}"
             )
-        reading = threading.Lock()  # GDAL: one thread at a time in a data set
+        pixels = _SourcePixels(source, bands, correction)
 
-        def block(nodes: MapNodes) -> Float[np.ndarray, "bands rows columns"] | None:
-            places = block_places(image, search, surface, nodes, occlusion)
-            if places is None:
-                return None
-            return _values(source, bands, reading, image, places, resampling)
+        def block(nodes: MapNodes) -> np.ndarray | None:
+            given = image, search, surface, nodes
+            places = block_places(*given, correction.occlusion, correction.tolerance)
+            return None if places is None else pixels.at(image, places)
 
-        write_map(
-            target,
-            system,
-            grid,
-            surface,
-            bands.count,
-            bands.dtypes[0],
-            block,
-            progress,
-            scales=(bands.scales, bands.offsets),
+        format, checkpoint = stored
+        write_map(target, system, grid, surface, pixels.bands, block, progress, format, checkpoint)
+
+
+class _SourcePixels:
+    """The pixels of a raster, resampled for blocks of a map; from several threads.
+
+    **Raises:** `InputError` if its bands are of several types, of complex numbers, or if the value
+    of no data is none of their type.
+    """
+
+    def __init__(self, path: str | Path, raster: "DatasetReader", correction: Correction):
+        self._path, self._raster = path, raster
+        self._kind: Resampling = correction.resampling
+        self._reading = threading.Lock()  # GDAL: one thread at a time in a data set
+        dtype = np.dtype(raster.dtypes[0])
+        if dtype.kind not in "uif" or len(set(raster.dtypes)) > 1:
+            raise InputError(
+                f"{path}: bands of {', '.join(dict.fromkeys(raster.dtypes))}; all of one type, of "
+                "whole or floating point numbers, are expected: convert them with gdal_translate "
+                "-ot, or correct each band alone"
+            )
+        flags = raster.mask_flag_enums
+        values = set(raster.nodatavals)
+        self._missing = next(iter(values)) if len(values) == 1 else None
+        one = all([flag.name for flag in band] == ["nodata"] for band in flags)
+        none = all([flag.name for flag in band] == ["all_valid"] for band in flags)
+        self._masked = not (none or (one and self._missing is not None))
+        if none:
+            self._missing = None
+        given = correction.nodata if correction.nodata is not None else self._missing
+        if given is not None and as_type(np.array(given), dtype) != given and not np.isnan(given):
+            raise InputError(f"--nodata {given:g}: {path} has values of {dtype}; give one of these")
+        if given is not None and np.isnan(given) and dtype.kind != "f":
+            raise InputError(f"--nodata {given:g}: {path} has values of {dtype}; give one of these")
+        self.bands = MapBands(
+            raster.count,
+            str(dtype),
+            given,
+            tuple(name or "" for name in raster.descriptions),
+            (raster.scales, raster.offsets),
+            raster.colorinterp,
         )
+        self._keeps_apart = given is not None and dtype.kind != "f"
 
+    def at(self, image: PushbroomImage | RpcImage, places: Places) -> np.ndarray | None:
+        """The values [bands, rows, columns] of all bands at the positions of a block; None if
+        no data."""
+        line, pixel = map(np.asarray, places)
+        dtype = np.dtype(self.bands.dtype)
+        found = np.full((*line.shape, self.bands.count), self.bands.missing, dtype)
+        # 2²² values of all bands are at most 32 MB in memory for each of the two workers
+        most, reach = 2**22 / self.bands.count, REACH[self._kind]
+        seen = False
+        for part, window in _parts(line, pixel, image, most, reach):
+            pixels = self._read(window)
+            (top, _), (left, _) = window
+            values, any_ = _resample(
+                self._kind,
+                str(dtype),
+                self._keeps_apart,
+                pixels,
+                (np.nan if self._missing is None or self._masked else self._missing),
+                self.bands.missing,
+                (line[part] - top, pixel[part] - left),
+            )
+            found[part] = values
+            seen |= bool(any_)
+        return np.moveaxis(found, -1, 0) if seen else None
 
-def _values(
-    source: str | Path,
-    bands: "DatasetReader",
-    reading: threading.Lock,
-    image: PushbroomImage | RpcImage,
-    places: tuple[Float[AnyArray, "rows columns"], Float[AnyArray, "rows columns"]],
-    resampling: Resampling,
-) -> Float[np.ndarray, "bands rows columns"]:
-    """All bands at the positions of a block."""
-    line, pixel = (np.asarray(p) for p in places)
-    values = np.full((bands.count, *line.shape), np.nan)
-    # 2²² values of all bands are 32 MB of doubles in memory for each of the two workers.
-    for part, window in _parts(line, pixel, image, 2**22 / bands.count):
+    def _read(self, window: Window) -> np.ndarray:
+        """The pixels [rows, columns, bands] of a window, NaN where they are masked.
+
+        Widened to a multiple of 128, or of an eighth of the size: the compiled program is one for
+        every shape, and there are only a few shapes then."""
         # only reading is locked, the other worker computes meanwhile
-        with reading:
-            seen = read_values(source, bands, None, window)
-        # Widened to a multiple of 128, or of an eighth of the size: the compiled program is one for
-        # every shape, and there are only a few shapes then.
-        pad = [(0, -n % max(128, 2 ** (n.bit_length() - 3))) for n in seen.shape[1:]]
-        seen = np.pad(seen, [(0, 0), *pad], mode="edge")
-        (top, _), (left, _) = window
-        values[:, *part] = _resample(seen, line[part] - top, pixel[part] - left, resampling)
-    return values
+        with self._reading:
+            if self._masked:
+                values = read_values(self._path, self._raster, None, window)
+            else:
+                values = read_plain(self._path, self._raster, window)
+        pad = [(0, -n % max(128, 2 ** (n.bit_length() - 3))) for n in values.shape[1:]]
+        return np.pad(np.moveaxis(values, 0, -1), [*pad, (0, 0)], mode="edge")
+
+
+@partial(compile_once, static=(0, 1, 2))
+def _resample(
+    kind: Resampling,
+    dtype: str,
+    keeps_apart: bool,
+    pixels: Num[AnyArray, "rows columns bands"],
+    source_missing: Scalar,
+    missing: Scalar,
+    place: tuple[Float[AnyArray, "*shape"], Float[AnyArray, "*shape"]],
+) -> tuple[Num[Array, "*shape bands"], Bool[Array, ""]]:
+    """The stored values at positions, and whether there are any.
+
+    **Arguments:** `keeps_apart`: a value that is by chance that of no data, `missing`, is changed
+    by one; `source_missing`: the value of no data of the pixels, NaN for none.
+    """
+    working = working_type(pixels.dtype)
+    lacking = pixels == jnp.asarray(source_missing).astype(pixels.dtype)
+    lacking &= ~jnp.isnan(source_missing)
+    has_gaps = jnp.any(lacking)
+    # a copy in floating point only where it is needed
+    values = jax.lax.cond(
+        has_gaps,
+        lambda: resample_pixels(jnp.where(lacking, jnp.nan, pixels.astype(working)), *place, kind),
+        lambda: resample_pixels(pixels, *place, kind),
+    )
+    known = ~jnp.isnan(values)
+    if np.dtype(dtype).kind == "f":
+        return jnp.where(known, values, missing).astype(dtype), jnp.any(known)
+    limits = np.iinfo(dtype)
+    whole = jnp.clip(jnp.round(values), float(limits.min), float(limits.max))
+    if keeps_apart:
+        beside = jnp.where(missing < limits.max, missing + 1, missing - 1)
+        whole = jnp.where(whole == missing, beside, whole)
+    return jnp.where(known, whole, missing).astype(dtype), jnp.any(known)
 
 
 def _parts(
@@ -160,6 +280,7 @@ def _parts(
     pixel: Float[np.ndarray, "rows columns"],
     image: PushbroomImage | RpcImage,
     most: float,
+    reach: int,
     part: Part = (slice(0, BLOCK_SIZE), slice(0, BLOCK_SIZE)),
 ) -> Iterator[tuple[Part, Window]]:
     """Quarters of a block, quartered again until each covers at most `most` pixels of the image.
@@ -170,8 +291,8 @@ def _parts(
     seen = line[part], pixel[part]
     if not np.isfinite(seen[0]).any():
         return
-    # the cubic kernel, the widest, reaches 2 pixels beyond a position; 3 leave one for rounding
-    margin = 3
+    # one pixel more than the kernel reaches, for rounding
+    margin = reach + 1
     lines, pixels = (
         (max(int(np.nanmin(v)) - margin, 0), min(int(np.nanmax(v)) + margin + 1, size))
         for v, size in zip(seen, (image.lines, image.pixels))
@@ -186,4 +307,4 @@ def _parts(
         [slice(s.start, s.start + side // 2), slice(s.start + side // 2, s.stop)] for s in part
     ]
     for rows, columns in itertools.product(*halves):
-        yield from _parts(line, pixel, image, most, (rows, columns))
+        yield from _parts(line, pixel, image, most, reach, (rows, columns))

@@ -6,17 +6,24 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.io.rasters.map_blocks import write_map
+from jaxbundle.io.rasters.map_blocks import MapBands, write_map
 from jaxbundle.io.rasters.maps import MapGrid, MapSystem
 from jaxbundle.io.rasters.reading import rasterio
 from jaxbundle.io.rasters.writing import write_raster
 from jaxbundle.pushbroom.ground_to_image import Search
 from jaxbundle.pushbroom.image import PushbroomImage
-from jaxbundle.pushbroom.rectification import MapNodes, block_errors, block_places
+from jaxbundle.pushbroom.map_accuracy import CovarianceLattice, interpolate_covariances
+from jaxbundle.pushbroom.rectification import (
+    MapNodes,
+    block_errors,
+    block_heights,
+    block_places,
+)
 from jaxbundle.pushbroom.rpc.image import RpcImage
 from jaxbundle.pushbroom.surfaces import GroundSurface
 from jaxbundle.types import Progress
 
+SIGMAS = "sigma east [m]", "sigma north [m]", "planimetric sigma [m]"
 BANDS = "east [m]", "north [m]", "error [m]"
 
 
@@ -47,7 +54,37 @@ def write_error_map(
         squares.append((np.nansum(length**2), np.isfinite(length).sum()))
         return np.stack([*errors, length])
 
-    write_map(target, system, grid, surface, 3, "float32", block, progress, BANDS)
+    bands = MapBands(3, "float32", names=BANDS)
+    write_map(target, system, grid, surface, bands, block, progress)
+    total, count = np.sum(squares, axis=0) if squares else (0.0, 0)
+    return float(np.sqrt(total / count)) if count else np.nan
+
+
+def write_sigma_map(
+    target: str | Path,
+    image: PushbroomImage | RpcImage,
+    search: Search | None,
+    lattice: CovarianceLattice,
+    surface: GroundSurface,
+    system: MapSystem,
+    grid: MapGrid,
+    progress: Progress | None = None,
+) -> float:
+    """Write the planimetric σ of every pixel of a map: east, north, and the root of the sum of
+    their squares, metres; NaN outside the image. Returns the RMS of the last."""
+    squares = []
+
+    def block(nodes: MapNodes) -> Float[np.ndarray, "3 rows columns"] | None:
+        places = block_places(image, search, surface, nodes)
+        if places is None:
+            return None
+        height = block_heights(surface, nodes)
+        east, north, _ = interpolate_covariances(lattice, *places, height)
+        squares.append((np.nansum(east + north), np.isfinite(east).sum()))
+        return np.sqrt(np.stack([east, north, east + north]))
+
+    bands = MapBands(3, "float32", names=SIGMAS)
+    write_map(target, system, grid, surface, bands, block, progress)
     total, count = np.sum(squares, axis=0) if squares else (0.0, 0)
     return float(np.sqrt(total / count)) if count else np.nan
 

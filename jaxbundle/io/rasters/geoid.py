@@ -14,7 +14,7 @@ from jaxtyping import Float
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.io.rasters.extent import Extent
-from jaxbundle.io.rasters.reading import read_terrain
+from jaxbundle.io.rasters.terrain_models import read_terrain
 from jaxbundle.pushbroom.terrain import Terrain, make_terrain
 
 

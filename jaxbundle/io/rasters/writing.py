@@ -9,7 +9,7 @@ import os
 import shutil
 import threading
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +19,7 @@ import numpy as np
 from jaxbundle.errors import InputError
 from jaxbundle.io.rasters.reading import open_plain, rasterio
 from jaxbundle.io.writing.replacing import disk_of, replace_file
+from jaxbundle.system.temporaries import temporary
 
 if TYPE_CHECKING:
     from rasterio.io import DatasetWriter
@@ -57,11 +58,13 @@ def write_raster(
     height: int,
     count: int,
     dtype: np.dtype | str,
+    finish: Callable[[Path], None] | None = None,
     **profile: Any,
 ) -> Iterator[RasterWriter]:
     """A GeoTIFF to write, which gets its name when it is completely on the disk.
 
-    **Arguments:** as of `rasterio.open`.
+    **Arguments:** as of `rasterio.open`; `finish` is called with the complete file before it gets
+    its name, and may replace it by one of the same values (`add_overviews`, `make_cog`).
 
     **Raises:** `InputError` if it cannot be written, naming it and its disk.
     """
@@ -70,11 +73,11 @@ def write_raster(
     with suppress(OSError):
         if needed > shutil.disk_usage(Path(os.path.realpath(target)).parent).free:
             raise _unwritable(target, f"{needed / 1e6:.6g} MB are needed")
-    with replace_file(target) as temporary:
+    with replace_file(target) as name:
         try:
             with _silence:
                 raster = open_plain(
-                    temporary,
+                    name,
                     "w",
                     driver="GTiff",
                     width=width,
@@ -90,16 +93,59 @@ def write_raster(
             finally:
                 with _silence:
                     raster.close()
-            with _silence, open_plain(temporary) as raster:
-                whole = all(
-                    _checksum(raster.read(window=window)) == sum
-                    for window, sum in writer.sums.items()
-                )
+            whole = _is_whole(name, writer.sums)
+            if whole and finish is not None:
+                with _silence:
+                    finish(name)
+                whole = _is_whole(name, writer.sums)
         except package.errors.RasterioError as error:
             why = error.__cause__ or error
             raise _unwritable(target, " ".join(str(why).split()).rstrip(".")) from None
         if not whole:
             raise _unwritable(target, "the written data are not on the disk")
+
+
+def add_overviews(path: Path, size: tuple[int, int], nearest: bool, least: int = 256) -> None:
+    """Add overviews to a GeoTIFF: half the size, a quarter and so on, each pixel the mean of those
+    with data that it covers, or one of them (`nearest`).
+
+    **Arguments:** `least`: rows and columns down to which the overviews go, those of a tile.
+    """
+    package = rasterio()
+    factors = []
+    while max(size) > least * 2 ** len(factors):
+        factors.append(2 ** (len(factors) + 1))
+    if not factors:
+        return
+    kinds = package.enums.Resampling
+    with open_plain(path, "r+") as raster:
+        raster.build_overviews(factors, kinds.nearest if nearest else kinds.average)
+
+
+def make_cog(path: Path, compress: str, block: int, nearest: bool) -> None:
+    """Replace a GeoTIFF with its overviews by a Cloud Optimized GeoTIFF of the same values."""
+    import rasterio.shutil
+
+    other = path.with_name(f"{path.stem}.cog{path.suffix}")
+    with temporary(other):
+        options = {"compress": compress, "predictor": "yes"} if compress != "none" else {}
+        rasterio.shutil.copy(
+            path,
+            other,
+            driver="COG",
+            BLOCKSIZE=block,
+            OVERVIEWS="AUTO",
+            OVERVIEW_RESAMPLING="nearest" if nearest else "average",
+            BIGTIFF="IF_SAFER",
+            **options,
+        )
+        os.replace(other, path)
+
+
+def _is_whole(path: Path, sums: Mapping[tuple, int]) -> bool:
+    """Whether a file has the values that were written, by the checksum of every block."""
+    with _silence, open_plain(path) as raster:
+        return all(_checksum(raster.read(window=window)) == sum for window, sum in sums.items())
 
 
 def _unwritable(target: str | Path, why: str) -> InputError:

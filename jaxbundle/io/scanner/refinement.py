@@ -57,7 +57,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.formats import read_network
 from jaxbundle.io.rasters.extent import image_extent, joint_extent, rpc_extent
 from jaxbundle.io.rasters.geoid import add_geoid
-from jaxbundle.io.rasters.reading import read_terrain
+from jaxbundle.io.rasters.terrain_models import read_terrain
 from jaxbundle.io.scanner.refinement_images import read_images
 from jaxbundle.io.scanner.refinement_points import read_points
 from jaxbundle.io.text.sections import TomlSection, read_sections

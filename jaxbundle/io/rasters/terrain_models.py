@@ -1,0 +1,158 @@
+"""Terrain models as rasters: heights above the ellipsoid or a geoid, in any coordinate system."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.ellipsoid import Ellipsoid
+from jaxbundle.io.rasters.extent import Extent
+from jaxbundle.io.rasters.mosaics import as_one_raster
+from jaxbundle.io.rasters.reading import (
+    GEOGRAPHIC,
+    check_georeference,
+    open_raster,
+    raster_parser,
+    rasterio,
+    read_values,
+)
+from jaxbundle.io.rasters.vertical import KNOWN_SYSTEM, HeightScale, with_vertical_unit
+from jaxbundle.pushbroom.terrain import Terrain, make_terrain
+from jaxbundle.system.file_content import naming_file
+from jaxbundle.system.foreign_parsers import foreign_parser
+
+if TYPE_CHECKING:
+    from rasterio.io import DatasetReader
+
+
+def read_terrain(
+    path: str | Path,
+    earth: Ellipsoid | None,
+    extent: Extent | None = None,
+    above_geoid: bool = False,
+) -> Terrain:
+    """The terrain model of the first band of a raster, or of a folder of tiles; its heights are
+    those above `earth`.
+
+    Scale, offset and no-data of the band are applied, and so is the unit of a vertical system. A
+    projected system is resampled to longitude and latitude first (bilinear, about the same
+    spacing). With `earth` None its x and y are those of the local frame. Otherwise
+    only the `extent` is read.
+
+    **Arguments:** `above_geoid`: the caller will add the geoid (`add_geoid`).
+
+    **Raises:** `InputError` if it cannot be read, has no georeference, or no heights in the extent;
+    for a vertical system of heights above a geoid that nobody adds.
+    """
+    package = rasterio()
+    from rasterio.vrt import WarpedVRT
+
+    with as_one_raster(path) as file, open_raster(file) as source:
+        check_georeference(path, source)
+        height = HeightScale(source.scales[0], source.offsets[0])
+        if earth is None:
+            return _terrain(source, earth, path, extent, height)
+        if source.crs is None:
+            raise InputError(
+                f"{path}: the raster has no coordinate system; add one, such as with "
+                "gdal_translate -a_srs EPSG:4326"
+            )
+        height = with_vertical_unit(path, source.crs.to_wkt(), height, above_geoid)
+        if source.crs.is_geographic:
+            return _terrain(source, earth, path, extent, height)
+        degrees = _degrees_around(path, source)
+        with raster_parser(path):
+            warped = WarpedVRT(
+                source,
+                crs=degrees,
+                dtype="float64",
+                nodata=np.nan,
+                resampling=package.enums.Resampling.bilinear,
+            )
+        with warped:
+            return _terrain(warped, earth, path, extent, height)
+
+
+def _degrees_around(path: str | Path, source: "DatasetReader") -> str:
+    """Longitude and latitude with the jump of longitudes opposite to a raster."""
+    import pyproj
+
+    left, bottom, right, top = source.bounds
+    with foreign_parser(path, KNOWN_SYSTEM):
+        back = pyproj.Transformer.from_crs(source.crs.to_wkt(), GEOGRAPHIC, always_xy=True)
+        middle, _ = back.transform((left + right) / 2, (bottom + top) / 2)
+    return (
+        f"+proj=longlat +datum=WGS84 +lon_wrap={middle:.0f}"
+        if np.isfinite(middle)
+        else (GEOGRAPHIC)
+    )
+
+
+def _terrain(
+    source: "DatasetReader",
+    earth: Ellipsoid | None,
+    path: str | Path,
+    extent: Extent | None,
+    height: HeightScale,
+) -> Terrain:
+    """The terrain model of a raster, whole or the `extent` of it."""
+    transform = source.transform
+    if transform.b or transform.d:
+        raise InputError(f"{path}: the raster is rotated; make it north up with gdalwarp")
+    step = transform.a, transform.e
+    first = (0, 0)
+    if earth is None or extent is None:
+        heights = _heights(path, source, None, height)
+    else:
+        heights, first = _cut(source, path, extent, height)
+    unit = 1.0 if earth is None else np.pi / 180
+    x, y = transform.c + (first[1] + 0.5) * step[0], transform.f + (first[0] + 0.5) * step[1]
+    if not np.isfinite(heights).any():
+        there = "" if extent is None else f" where the image looks, {extent}"
+        raise InputError(f"{path}: no height{there}; give a model that covers the image")
+    with naming_file(path):
+        return make_terrain(heights, (unit * x, unit * y), (unit * step[0], unit * step[1]), earth)
+
+
+def _cut(
+    source: "DatasetReader", path: str | Path, extent: Extent, height: HeightScale
+) -> tuple[Float[np.ndarray, "rows columns"], tuple[int, int]]:
+    """The heights of the extent and a cell around it, and the row and column of the first."""
+    (dx, dy), (x0, y0) = (source.transform.a, source.transform.e), source.transform[2:6:3]
+    rows, columns = source.shape
+    bounds = source.bounds
+    # rows count from the north, or from the south
+    y = np.sort([(v - y0) / dy for v in (extent.south, extent.north)])
+    top, bottom = max(int(np.floor(y[0])) - 2, 0), min(int(np.ceil(y[1])) + 2, rows)
+    turn = 360 / abs(dx)
+    # the turn that brings the extent nearest to the raster
+    middle = ((extent.west + extent.east) / 2 - x0) / dx
+    shift = turn * np.round((columns / 2 - middle) / turn)
+    x = np.sort([(v - x0) / dx + shift for v in (extent.west, extent.east)])
+    left, right = int(np.floor(x[0])) - 2, int(np.ceil(x[1])) + 2
+    # 1e-3 columns: the spacing in the file has some ten digits
+    seam = abs(turn - columns) < 1e-3 and (left < 0 or right > columns)
+    if not (seam and right - left < columns):
+        seam, left, right = False, max(left, 0), min(right, columns)
+    if min(right - left, bottom - top) < 2:
+        covered = Extent(bounds.left, min(bounds[1::2]), bounds.right, max(bounds[1::2]))
+        raise InputError(
+            f"{path}: the model has {covered}; the image looks at {extent}: give a model that "
+            "covers the image"
+        )
+    # the last column of a model of the whole Earth is beside its first
+    parts = [(left % columns, columns), (0, right % columns)] if seam else [(left, right)]
+    heights = [_heights(path, source, ((top, bottom), part), height) for part in parts]
+    return np.concatenate(heights, axis=1), (top, left)
+
+
+def _heights(
+    path: str | Path,
+    source: "DatasetReader",
+    window: tuple[tuple[int, int], tuple[int, int]] | None,
+    height: HeightScale,
+) -> Float[np.ndarray, "rows columns"]:
+    values = read_values(path, source, 1, window)
+    return height.scale * values + height.offset
