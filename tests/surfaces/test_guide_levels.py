@@ -58,3 +58,6 @@ def test_the_normal_at_an_edge_is_the_line_of_sight_at_height_zero():
     normal = guide._normals(base, uv, X, q, rate, max_change=1.0)
     np.testing.assert_allclose(abs(normal[:, 2:4] @ sight), 1, atol=1e-12)
     np.testing.assert_allclose(abs(normal[:, 0, 2]), 1, atol=1e-12)
+    # Nodes at one place span no plane.
+    none = guide._normals(base, 0 * uv, 0 * X, 0 * q, rate, max_change=1.0)
+    np.testing.assert_allclose(abs(none @ sight), 1, atol=1e-12)
