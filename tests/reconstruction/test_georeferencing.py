@@ -17,7 +17,7 @@ from jaxbundle.cli.reconstruct_files import write_reconstruction
 from jaxbundle.errors import InputError
 from jaxbundle.network.kinds import Antennas
 from jaxbundle.photographs.exif import Exif
-from jaxbundle.reconstruction import georeferencing
+from jaxbundle.reconstruction import georeferencing, page
 from jaxbundle.reconstruction.block import (
     BlockFacts,
     CameraPositions,
@@ -254,6 +254,14 @@ def test_sigma_of_positions_is_the_median_of_those_given():
     found = camera_positions(result)
     np.testing.assert_allclose(found.sigma, sigma[1])
     np.testing.assert_allclose(found.rms, 1.0)
+    # priors of the images: of those that have one; a held position is no measurement
+    images = SimpleNamespace(id=tuple("abcde"), position=np.zeros((5, 3)), sigma=np.ones((5, 6)))
+    images.sigma[:3, :3], images.sigma[3], images.sigma[4] = sigma, np.nan, 0.0
+    result.problem.network = SimpleNamespace(further=(), images=images)
+    result.image_values = np.ones((5, 6))
+    found = camera_positions(result)
+    np.testing.assert_allclose(found.sigma, sigma[1])
+    assert found.difference.keys() == set("abc") and np.isnan(found.offset).all()
 
 
 def test_report_page_and_json_show_control_and_block(drone, spoilt, tmp_path):
@@ -302,6 +310,21 @@ def test_control_that_is_not_used_is_reported_with_the_reason():
     part = SimpleNamespace(name="part 1", block=block, control=None, no_control="expected 3, got 2")
     whole = SimpleNamespace(name="survey", parts=(part,))
     assert "Control is not used: expected 3, got 2" in describe_part(whole, part)
+    assert describe_part(whole, part).splitlines()[0] == "survey"
+
+
+def test_a_part_of_several_has_its_name_and_says_how_many_there_are():
+    """Numbers of a report without them would be taken for those of all photographs."""
+    block = SimpleNamespace(facts=lambda: [("Photographs", "3")])
+    images = SimpleNamespace(network=SimpleNamespace(images=range(3)))
+    part = SimpleNamespace(
+        name="part 2", block=block, control=None, no_control="", adjustment=images
+    )
+    whole = SimpleNamespace(name="survey", parts=(None, part), photographs=range(7), left_out={})
+    assert describe_part(whole, part).splitlines()[0] == "survey, part 2"
+    told = page._judge_photographs(whole, part)
+    assert told.words == "3 of 7 photographs in this part, 2 unconnected parts"
+    assert told.state == page.DOUBTFUL
 
 
 @pytest.mark.further

@@ -47,6 +47,20 @@ def test_the_photographs_are_matched_with_the_cameras_that_the_matches_gave(run,
         assert run.cameras.cameras == (camera,) and run.cameras.camera_of == (0, 0, 0)
 
 
+@pytest.mark.parametrize("wrong, warned", [(0, False), (1, False), (20, True)])
+def test_many_contradictory_pairs_are_warned_of(run, monkeypatch, wrong, warned):
+    """A few are wrong matches; many, an object that repeats itself."""
+    pairs = [SimpleNamespace(images=(0, 1))] * 20
+    run.cameras = Cameras((), (), (), True, ())
+    monkeypatch.setattr(reconstruct, "verify", lambda *_: pairs)
+    found = pairs, [SimpleNamespace(images=(1, 2))] * wrong
+    monkeypatch.setattr(reconstruct, "without_contradicted", lambda *_: found)
+    assert run._verify([], []) == pairs
+    assert bool(run.notes) == (wrong > 0)
+    said = " ".join(words for _, words in run.warnings)
+    assert (f"{wrong} of {20 + wrong} pairs contradict others" in said) == warned
+
+
 @pytest.mark.parametrize("confirmed", [True, False])
 def test_pixels_are_released_only_if_both_halves_of_the_photographs_agree(
     run, monkeypatch, confirmed
