@@ -75,6 +75,11 @@ def test_bounds_are_found_without_heights():
     assert not told and bounds[0].q[0] < q.min() and q.max() < bounds[0].q[1]
     bounds, told = find_bounds(views, NONE)
     assert "--zmin" in told[0] and bounds[0].q[0] < q.min() and q.max() < bounds[0].q[1]
+    assert "in 2 image(s)" in told[0]
+    # Given heights bound the search: nothing is guessed, but of an image that is between them.
+    assert find_bounds(views, NONE, (-1.5, 3.0))[1] == ()
+    (said,) = find_bounds(views, NONE, (-1.5, 12.0))[1]
+    assert "in 2 image(s)" in said and "the heights are all around it" in said
 
 
 def test_the_bounds_of_heights_are_those_along_the_ray(pair):
