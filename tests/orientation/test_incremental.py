@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 import jaxbundle
+from jaxbundle.network.tables import Points
 from jaxbundle.orientation import incremental
+from jaxbundle.orientation import network as start_values
 from jaxbundle.orientation.one_place import name_one_place
 from jaxbundle.orientation.settings import DEFAULTS
 from jaxbundle.planning.stations import Stations
@@ -47,3 +49,64 @@ def test_one_place_is_shown_by_five_points(common):
     keep = (rays.image == 0) | (rays.point < common)
     network = network.replace(observations=rays.take(keep))
     assert bool(name_one_place(network)) == (common == 5)
+
+
+def test_control_is_a_start_value_if_it_is_as_exact_as_start_values():
+    """Handheld control, which is not, is intersected like a tie point; fixed points have no σ."""
+    weak = 10.0 / DEFAULTS.extent_to_misfit * np.array([0.0, 0.9, 1.1, 0.0])
+    sigma = np.stack([np.full(4, 0.01), weak, np.full(4, 0.01)], 1)
+    X = np.array([[0, 0, 0], [10, 0, 0], [0, 5, 0], [5, 5, 1.0]])
+    sigma[3] = np.nan
+    points = Points(tuple("abcd"), ("control", "control", "control", "fixed"), X, sigma)
+    assert incremental.are_held(points).tolist() == [True, True, False, True]
+
+
+def test_points_of_parallel_rays_are_far_away_in_their_direction():
+    """The others, whose rays do not intersect yet, stay unknown."""
+    X0 = np.array([[-1.0, 0, 0], [0, 0, 0], [1, 0, 0]])
+    down = np.array([0.0, 0, -1])
+    near = np.array([0.5, 1.0, -4.0]) - X0
+    near /= np.linalg.norm(near, axis=1, keepdims=True)
+    seen = SimpleNamespace(
+        image=np.tile(np.arange(3), 2), point=np.repeat([0, 1], 3), points=4,
+        ray=np.concatenate([np.tile(down, (3, 1)), near]),
+    )  # fmt: skip
+    model = incremental.Model(
+        X0, np.tile(np.eye(3), (3, 1, 1)), np.ones(3, bool), np.zeros((4, 3)),
+        np.array([False, False, True, True]), np.zeros(4, bool),
+    )  # fmt: skip
+    incremental.place_far_points(seen, model)
+    assert model.known.tolist() == [True, False, True, True]
+    spread = np.sqrt(2 / 3)  # of the stations, about their mean at the origin
+    np.testing.assert_allclose(model.X[0], DEFAULTS.far_distance * spread * down)
+
+
+def test_only_rays_that_another_one_checks_count(monkeypatch):
+    """The only ray of a point may be anything, and meets it."""
+    seen = SimpleNamespace(
+        image=np.array([0, 1, 1, 2]), point=np.array([0, 0, 1, 0]), images=3, points=2,
+        tolerance=np.ones(3),
+    )  # fmt: skip
+    model = SimpleNamespace(control=np.zeros(2, bool), placed=np.array([True, True, False]))
+    monkeypatch.setattr(start_values, "misclosures", lambda *_: np.array([0.0, 0.0, 5.0, 0.0]))
+    number, share = start_values._count_agreeing(seen, model)
+    assert number == 2 and share.tolist() == [1.0, 1.0, 0.0]
+
+
+@pytest.mark.parametrize("placed, again", [(2, False), (3, True), (5, True)])
+def test_an_image_that_few_rays_agree_with_is_placed_again(monkeypatch, placed, again):
+    """If two others check its points."""
+    share = np.append(np.ones(placed - 1), 0.1 * DEFAULTS.doubtful_share)
+    rays = iter([10, 12])
+    monkeypatch.setattr(start_values, "_count_agreeing", lambda *_: (next(rays), share))
+    monkeypatch.setattr(start_values, "_have_poses", lambda _: np.zeros(placed, bool))
+    for name in ("grow", "finish"):
+        monkeypatch.setattr(start_values, name, lambda *_, **options: None)
+    better = SimpleNamespace(placed=np.ones(placed, bool))
+    removed = []
+    model = SimpleNamespace(
+        placed=np.ones(placed, bool), copy_without=lambda rows: removed.append(rows) or better
+    )
+    found = start_values._place_doubtful_again(None, None, model, None, DEFAULTS)
+    assert found is (better if again else model)
+    assert [rows.tolist() for rows in removed] == [[False] * (placed - 1) + [True]] * again

@@ -2,6 +2,7 @@
 
 import dataclasses
 from itertools import combinations
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxbundle
 from jaxbundle.errors import InputError
+from jaxbundle.tiepoints import camera_starts
 from jaxbundle.tiepoints.camera_starts import start_cameras
 from jaxbundle.tiepoints.closure import (
     ClosureMinimum,
@@ -145,6 +147,28 @@ def test_rotations_close_with_the_right_principal_distance_and_distortion():
     begin = dataclasses.replace(camera, parameters=told | {"cx": 0.0, "cy": 0.0})
     by_pairs = estimate_interior(begin, xy, known=True).camera.parameters
     assert few.parameters["fx"] == pytest.approx(by_pairs["fx"], rel=1e-12)
+
+
+def test_a_lens_is_found_from_the_pairs_of_its_own_photographs(monkeypatch):
+    """A pair of two lenses determines neither of them alone."""
+    def estimate(camera, pairs, *_):
+        used.append([len(a) for a, _ in pairs])
+        return SimpleNamespace(camera=camera, pairs=[])
+
+    used = []
+    monkeypatch.setattr(camera_starts, "estimate_interior", estimate)
+    monkeypatch.setattr(camera_starts, "_choose_pairs", lambda pairs, *_: pairs)
+    start = {"fx": F, "fy": F, "cx": 599.5, "cy": 449.5, "k1": 0.0}
+    cameras = [jaxbundle.Camera(id, "opencv", start, image_size=SIZE) for id in "abc"]
+    features = [features_at(np.zeros((40, 2)))] * 5
+    numbers = {(0, 1): 10, (0, 2): 12, (1, 3): 14, (2, 3): 16, (3, 4): 18}
+    matches = [
+        FeatureMatches(pair, np.zeros((n, 2), int), np.full(n, 0.5), np.ones(n, bool))
+        for pair, n in numbers.items()
+    ]
+    # photographs 0, 1 and 2 are of the cameras a and b, which share a lens
+    start_cameras(cameras, [0, 0, 1, 2, 2], [0, 0, 1], [False] * 3, features, matches)
+    assert used == [[10, 12], [18]]
 
 
 def test_a_first_principal_distance_without_loops_is_passed_over(monkeypatch):
