@@ -9,7 +9,7 @@ import pytest
 from jaxbundle.errors import InputError
 from jaxbundle.network import Camera
 from jaxbundle.network.build import make_cameras, make_further, make_network
-from jaxbundle.network.columns import Columns, RepeatedIds, did_you_mean
+from jaxbundle.network.columns import Columns, RepeatedIds, did_you_mean, list_some
 from jaxbundle.network.tables import EXTERIOR, Source
 from jaxbundle.network.units import to_image_unit
 
@@ -164,6 +164,8 @@ def test_a_bad_camera_is_refused(camera, said):
     ({"points": {"id": "p"}}, "points: column 'id' must be a sequence"),
     ({"cameras": []}, "no camera is given"),
     ({"cameras": [CAMERAS[0]] * 2}, "camera 'a' is already"),
+    ({"datum_points": "p"}, "datum_points must be a list of ids, not 'p'"),
+    ({"datum_points": 3}, "datum_points must be a list of ids, not 3"),
     ({"image_unit": "px"}, "camera 'a': pixel_size is needed to convert between pixels and mm"),
 ])  # fmt: skip
 def test_bad_arguments_are_refused(change, said):
@@ -268,3 +270,10 @@ def test_ids_that_repeat_are_looked_up_once():
         table.indices("image", "image", {"a": 0, "c": 2}, "images")
     with pytest.raises(InputError, match="t, row 2: point '9' is unknown"):
         table.indices("point", "point", {"7": 0, "8": 1}, "points")
+
+
+def test_a_message_lists_five_names_and_counts_the_others():
+    """More would hide what it says about them."""
+    assert list_some("abcde") == "'a', 'b', 'c', 'd', 'e'"
+    assert list_some("abcdefg") == "'a', 'b', 'c', 'd', 'e' and 2 more"
+    assert list_some(range(4), 2, str) == "0, 1 and 2 more"

@@ -158,6 +158,8 @@ def test_datum_points_of_a_datum_by_control_are_warned_of():
         given["points"][k] |= {"role": "control", **SIGMA}
     checked = check_network(make_network(**{**given, "datum": "control", "datum_points": ["p5"]}))
     assert any("datum_points are not used" in warning for warning in checked.notes)
+    for change in ({"datum_points": ()}, {"datum": "inner"}):
+        assert check_network(checked.replace(notes=(), **change)).notes == ()
 
 
 @pytest.mark.parametrize("table", ["images", "points"])
@@ -347,6 +349,14 @@ def test_too_few_observations_are_counted():
 def test_points_behind_their_camera_are_warned_of():
     checked = check_network(broken("points", 3, Z=60.0))
     assert "3 image points behind the camera: point 'p3' in image 'i0'" in checked.notes[0]
+    assert "'i2'; check" in checked.notes[0]
+    # of more the first three
+    given = tables()
+    for k in (3, 4):
+        given["points"][k]["Z"] = 60.0
+    (note,) = check_network(make_network(**given)).notes
+    assert "6 image points behind the camera" in note and note.count("point 'p") == 3
+    assert " …; check the start values" in note
 
 
 def test_the_side_of_a_point_agrees_with_the_rotation_matrix():

@@ -115,6 +115,11 @@ def test_added_angles_have_the_unit_of_the_network(flown):
     with pytest.raises(InputError, match="in the unit of the network, deg.*got angle_unit 'rad'"):
         boresight = {"boresight": [0.1, 0.0, 0.0]}
         jaxbundle.add_further(network, attitudes=row, attitude=boresight, angle_unit="rad")
+    # Settings without angles are in no unit of angles.
+    velocities, section = {"image": [network.images.id[0]]}, {"line_time": LINE}
+    jaxbundle.add_further(
+        network, velocities=velocities, rolling_shutter=section, angle_unit="rad"
+    )
 
 
 def test_further_observations_are_added_in_place_of_their_kind(flown):

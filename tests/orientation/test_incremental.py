@@ -110,3 +110,53 @@ def test_an_image_that_few_rays_agree_with_is_placed_again(monkeypatch, placed, 
     found = start_values._place_doubtful_again(None, None, model, None, DEFAULTS)
     assert found is (better if again else model)
     assert [rows.tolist() for rows in removed] == [[False] * (placed - 1) + [True]] * again
+
+
+@pytest.mark.parametrize("oriented", [True, False])
+def test_a_pair_continues_an_oriented_part_only_if_it_can_be_joined_to_it(monkeypatch, oriented):
+    """However many rays agree with the model that grows from it."""
+    seen = SimpleNamespace(
+        image=np.array([0, 1, 1, 2, 2, 2]), point=np.zeros(6, int), images=3, points=1,
+        tolerance=np.ones(3),
+    )  # fmt: skip
+    model = incremental.Model.empty(seen)
+    model.placed[0] = oriented
+    grown = []
+
+    def misclosures(seen, part):  # first all rays agree, then those of one image
+        grown.append(part)
+        return np.where((len(grown) == 1) | (seen.image == 1), 0.0, 9.0)
+
+    pairs = [(1, 2, np.eye(3), np.eye(3), np.array([1.0, 0, 0]))] * 2
+    monkeypatch.setattr(start_values, "good_pairs", lambda *_: pairs)
+    monkeypatch.setattr(start_values, "grow", lambda *_: None)
+    monkeypatch.setattr(start_values, "misclosures", misclosures)
+    monkeypatch.setattr(
+        start_values, "join", lambda seen, model, part: None if part is grown[0] else model
+    )
+    found = start_values._grow_from_a_pair(seen, model, None, DEFAULTS)
+    assert found is grown[1 if oriented else 0]
+
+
+@pytest.mark.parametrize("missed, suspect", [(1, False), (2, True)])
+def test_control_that_rays_miss_is_suspect_if_no_datum_is_left_without_it(
+    monkeypatch, missed, suspect
+):
+    """Of five control points one is in no image: with one missed, three are left, which give a
+    datum; with two, only two."""
+    n = 5
+    X = np.array([[0, 0, 0], [10, 0, 0], [0, 10, 0], [5, 5, 1], [2, 3, 0.0]])
+    points = Points(tuple("abcde"), ("control",) * n, X, np.full((n, 3), 0.01))
+    point = np.repeat(np.arange(n - 1), 2)
+    seen = SimpleNamespace(image=np.tile([0, 1], n - 1), point=point, images=2, points=n)
+    model = SimpleNamespace(placed=np.ones(2, bool))
+    network = SimpleNamespace(points=points, further=(), warn=lambda said: said)
+    result = start_values.Oriented(network, "in the frame given", {}, {}, ())
+    for name, found in {
+        "check_tables": network, "sights": seen, "_orient": (model, ""), "_result": result,
+        "_are_gross": point < missed, "name_contradiction": "", "_control_contradicts": False,
+    }.items():  # fmt: skip
+        monkeypatch.setattr(start_values, name, lambda *_, found=found, **options: found)
+    told = start_values.find_start_values(network)
+    assert bool(told.finding) == suspect
+    assert not suspect or "the control points 'a', 'b' contradict" in told.finding

@@ -68,3 +68,21 @@ def test_the_normal_at_an_edge_is_the_line_of_sight_at_height_zero():
     # Nodes at one place span no plane.
     none = guide._normals(base, 0 * uv, 0 * X, 0 * q, rate, max_change=1.0)
     np.testing.assert_allclose(abs(none @ sight), 1, atol=1e-12)
+
+
+def test_a_node_far_from_its_neighbours_follows_them():
+    """By more than so many pixels of the other image: at twice the size of a pixel, of level 1. A
+    poor match is no node either."""
+    base = SimpleNamespace(points=lambda uv, q: np.column_stack([uv, q]))
+    settings, level, shape = guide.GuideSettings(), 1, (5, 6)
+    limit = 2 * settings.max_deviation / 0.5  # of q, of which one unit is half a pixel
+    q, rho = np.full(shape, 7.0), np.full(shape, 0.9)
+    q[1, 1], q[3, 4], q[2, 3] = 7 + 0.9 * limit, 7 - 1.1 * limit, 7 + 1e-3
+    rho[2, 3] = settings.min_correlation - 0.01
+    v, u = np.indices(shape).reshape(2, -1)
+    found = guide.NodeMatches(q.ravel(), np.full(q.size, 0.5), rho.ravel())
+    smooth = guide._smooth(base, level, 1.0 * np.stack([u, v], 1), shape, found, settings)
+    bad = np.zeros(shape, bool)
+    bad[3, 4] = bad[2, 3] = True
+    np.testing.assert_array_equal(smooth.good, ~bad)
+    np.testing.assert_allclose(smooth.q, np.where(bad, 7.0, q))

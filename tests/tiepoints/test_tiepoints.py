@@ -370,6 +370,17 @@ def test_features_lie_at_the_centres_of_blobs(monkeypatch):
     assert np.abs(np.median(e, axis=0)).max() < 0.05
 
 
+@pytest.mark.parametrize("number, searches", [(99, 2), (101, 1)])
+def test_fewer_than_a_third_of_the_features_are_searched_again(monkeypatch, number, searches):
+    """The time of such a photograph doubles; that of others does not."""
+    searched = []
+    search = lambda *given: searched.append(given[-1]) or ([None] * number, [])
+    monkeypatch.setattr("jaxbundle.tiepoints.features._search", search)
+    settings = FeatureSettings(number=300)
+    find_features(np.zeros((64, 64), np.uint8), settings)
+    assert searched == [settings.contrast, settings.faint_contrast][:searches]
+
+
 def test_faint_features_are_searched_where_there_are_few():
     """Blobs of six grey values: below the contrast of distinct features."""
     true = np.stack(np.meshgrid(np.arange(20, 300, 20), np.arange(20, 220, 20)), -1).reshape(-1, 2)
