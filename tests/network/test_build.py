@@ -277,3 +277,19 @@ def test_a_message_lists_five_names_and_counts_the_others():
     assert list_some("abcde") == "'a', 'b', 'c', 'd', 'e'"
     assert list_some("abcdefg") == "'a', 'b', 'c', 'd', 'e' and 2 more"
     assert list_some(range(4), 2, str) == "0, 1 and 2 more"
+
+
+def test_tables_of_no_kind_are_refused():
+    with pytest.raises(InputError, match="unknown table 'antenas'; did you mean 'antennas'"):
+        make_further({"antenas": []}, 1.0)
+
+
+def test_ids_of_any_kind_are_looked_up_as_text():
+    """An array of objects may mix numbers and texts."""
+    of = {"a": 0, "3": 1, "7": 2}
+    for ids in (np.array(["a", 3, 7.0], object), ["a", 3, 7.0], np.array(["a", "3", "7"])):
+        rows = Columns({"image": ids}, Source("t")).indices("image", "image", of, "images")
+        assert rows.tolist() == [0, 1, 2]
+    for ids in (np.array([7, 3, 7]), np.array([7.0, 3.0, 7.0])):
+        rows = Columns({"image": ids}, Source("t")).indices("image", "image", of, "images")
+        assert rows.tolist() == [2, 1, 2]

@@ -86,3 +86,10 @@ def test_a_node_far_from_its_neighbours_follows_them():
     bad[3, 4] = bad[2, 3] = True
     np.testing.assert_array_equal(smooth.good, ~bad)
     np.testing.assert_allclose(smooth.q, np.where(bad, 7.0, q))
+
+
+def test_an_image_that_no_other_overlaps_has_no_guide(monkeypatch):
+    monkeypatch.setattr(guide, "_prepare_searches", lambda *_: ([], 8))
+    base, pyramid = SimpleNamespace(size=(640, 480)), SimpleNamespace(levels=[None] * 3)
+    bounds = lambda uv: np.tile([1.0, 2.0], (len(uv), 1))
+    assert guide.make_guide(base, [], [pyramid, []], bounds) is None
