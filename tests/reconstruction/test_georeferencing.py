@@ -127,8 +127,9 @@ def test_every_point_and_every_measurement_is_predicted(spoilt):
     assert points["gcp04"].wrong_measurements == [image]
     # of used points it is the deletion residual, which a coordinate with σ enlarges
     used = [p for p in points.values() if p.used]
-    larger = [np.abs(p.prediction) > np.abs(p.residual) * (1 - 1e-6) for p in used]
-    assert np.mean(larger) > 0.9
+    larger = np.abs([p.prediction for p in used]) / np.abs([p.residual for p in used])
+    # by 1/r of the redundancy number r of a coordinate, a few tenths with nine points
+    assert (larger > 1.02).mean() > 0.9
     told = points["gcp06"].numbers()
     json.dumps(told, allow_nan=False)
     assert told["prediction"]["sigma"]["X"] > 0
