@@ -1,8 +1,12 @@
 """Which names of points are exchanged, from two lists of them in different frames."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from jaxbundle.network.tables import Points
+from jaxbundle.orientation import alignment
 from jaxbundle.orientation.alignment import similarity, similarity_of_most
 from jaxbundle.orientation.swapped_control import contradiction
 
@@ -120,3 +124,19 @@ def test_the_similarity_of_most_points_is_not_spoilt_by_a_third_of_wrong_ones():
     np.testing.assert_allclose(POINTS @ A.T + t, POINTS @ expected[0].T + expected[1], atol=1e-12)
     on_a_line = np.arange(5.0)[:, None] * [1.0, 2.0, 3.0]
     assert similarity_of_most(on_a_line, on_a_line) is None
+
+
+@pytest.mark.parametrize("mirrored, said", [(0.15, True), (0.25, False)])
+def test_control_is_a_mirror_image_if_it_fits_five_times_better_as_one(
+    monkeypatch, mirrored, said
+):
+    """With a misfit that is small for its extent."""
+    monkeypatch.setattr(alignment, "_misfit", lambda source, target: (
+        1.0 if (target == X).all() else mirrored
+    ))  # fmt: skip
+    X = POINTS[:6] * 10
+    points = Points(tuple("abcdef"), ("control",) * 6, X, np.full((6, 3), 0.01))
+    network = SimpleNamespace(points=points, object_unit="m")
+    model = SimpleNamespace(known=np.ones(6, bool), X=X)
+    told = alignment.describe_mirror(network, model)
+    assert ("the 6 control points fit the images only as a mirror image (by 0.15 m" in told) == said

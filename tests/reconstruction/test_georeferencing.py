@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from drone_block import CONTROL, NAMES, OFFSET, SATELLITE, drone_block, swapped
 
+from jaxbundle import Camera
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.cli.outputs import write_targets
 from jaxbundle.cli.reconstruct_files import write_reconstruction
@@ -296,6 +297,17 @@ def test_report_page_and_json_show_control_and_block(drone, spoilt, tmp_path):
     with (folder / "control.csv").open() as file:
         rows = {row["id"]: row for row in csv.DictReader(file)}
     assert rows["gcp06"]["used"] == "False" and "left out" in rows["gcp06"]["verdict"]
+
+
+def test_distances_in_images_are_told_in_pixels():
+    """Image coordinates of metric cameras are in mm, of others in pixels already."""
+    cameras = (
+        Camera("metric", "brown", {"c": 24.0}, pixel_size=(0.005, 0.005)),
+        Camera("pixels", "opencv", {"fx": 900.0, "fy": 900.0}, pixel_size=(0.005, 0.005)),
+    )
+    network = SimpleNamespace(cameras=cameras, images=SimpleNamespace(camera=np.array([0, 1, 0])))
+    found = georeferencing._pixels(SimpleNamespace(problem=SimpleNamespace(network=network)))
+    np.testing.assert_allclose(found, [0.005, 1.0, 0.005])
 
 
 def test_the_time_of_computation_is_in_whole_seconds():
