@@ -8,7 +8,7 @@ import pytest
 
 from jaxbundle.errors import InputError
 from jaxbundle.network import Camera
-from jaxbundle.network.build import make_cameras, make_further, make_network
+from jaxbundle.network.build import _colours, make_cameras, make_further, make_network
 from jaxbundle.network.columns import Columns, RepeatedIds, did_you_mean, list_some
 from jaxbundle.network.tables import EXTERIOR, Source
 from jaxbundle.network.units import to_image_unit
@@ -293,3 +293,15 @@ def test_ids_of_any_kind_are_looked_up_as_text():
     for ids in (np.array([7, 3, 7]), np.array([7.0, 3.0, 7.0])):
         rows = Columns({"image": ids}, Source("t")).indices("image", "image", of, "images")
         assert rows.tolist() == [2, 1, 2]
+
+
+@pytest.mark.parametrize("bad", [-1, 256, 1.5])
+def test_colours_are_whole_numbers_of_eight_bits(bad):
+    """Points without one are grey."""
+    colours = {"red": [0, 7, None], "green": [255, 8, None], "blue": [128, 9, None]}
+    points = {"id": ["a", "b", "c"], "role": ["tie"] * 3} | dict.fromkeys("XYZ", [0.0] * 3)
+    found = _colours(Columns(points | colours, Source("points")))
+    assert found.tolist() == [[0, 255, 128], [7, 8, 9], [128] * 3]
+    colours["green"] = [255, bad, None]
+    with pytest.raises(InputError, match=f"points, row 2: green is {bad}.*from 0 to 255"):
+        _colours(Columns(points | colours, Source("points")))
