@@ -403,6 +403,8 @@ def test_the_memory_of_a_search_is_what_was_measured_and_hardly_more():
     assert memory_of_features(3600, 3600, FeatureSettings()) == pytest.approx(
         memory_of_features(1800, 1800, settings)
     )
+    # a small photograph is not enlarged
+    assert memory_of_features(600, 900, FeatureSettings()) == memory_of_features(600, 900, settings)
 
 
 def test_tracks_without_contradictions():
