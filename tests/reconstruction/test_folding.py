@@ -1,5 +1,6 @@
 """Photographs that should show common points and do not."""
 
+from contextlib import nullcontext
 from itertools import combinations
 from types import SimpleNamespace
 
@@ -112,3 +113,20 @@ def test_the_pair_with_most_expected_points_is_named_first(monkeypatch):
     assert len(said) == 3
     for words, (one, other), number in zip(said, pairs, (6 * n, 4 * n, 2 * n)):
         assert f"0 of {number} points expected in both {one} and {other} were found" in words
+
+
+@pytest.mark.parametrize("agreeing, refused", [(11, True), (13, False)])
+def test_a_result_that_most_measurements_contradict_is_refused(agreeing, refused):
+    """A third of those of points with two rays in its photographs, 36: another photograph has more,
+    and some points are seen once."""
+    image = np.repeat([0, 1, 2], [18, 20, 90])
+    track = np.concatenate([np.arange(18), np.arange(20), np.arange(90)])
+    measured = SimpleNamespace(image=image, track=track)
+    network = SimpleNamespace(images=SimpleNamespace(id=("a.jpg", "b.jpg")))
+    weighted = SimpleNamespace(
+        adjustment=SimpleNamespace(network=network), agreeing_rays=agreeing
+    )
+    names = ["a.jpg", "b.jpg", "c.jpg"]
+    error = pytest.raises(NotSolvedError, match="only 11 of 36 measurements in 2 photographs")
+    with error if refused else nullcontext():
+        folding.refuse_folded(weighted, measured, names)

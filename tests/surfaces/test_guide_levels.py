@@ -86,6 +86,7 @@ def test_a_node_far_from_its_neighbours_follows_them():
     bad[3, 4] = bad[2, 3] = True
     np.testing.assert_array_equal(smooth.good, ~bad)
     np.testing.assert_allclose(smooth.q, np.where(bad, 7.0, q))
+    assert smooth.step == 2 * settings.spacing
 
 
 def test_an_image_that_no_other_overlaps_has_no_guide(monkeypatch):
@@ -93,3 +94,14 @@ def test_an_image_that_no_other_overlaps_has_no_guide(monkeypatch):
     base, pyramid = SimpleNamespace(size=(640, 480)), SimpleNamespace(levels=[None] * 3)
     bounds = lambda uv: np.tile([1.0, 2.0], (len(uv), 1))
     assert guide.make_guide(base, [], [pyramid, []], bounds) is None
+
+
+@pytest.mark.parametrize("size, length, level", [
+    ((400, 300), 10, 0), ((400, 300), 100, 1), ((400, 190), 100, 0),
+    ((4000, 4000), 10, 4),  # 250 pixels, three times the least side or less
+    ((4000, 4000), 4000, 5), ((4000, 4000), 10**6, 5),
+])  # fmt: skip
+def test_the_coarsest_level_has_short_segments_and_a_small_image(size, length, level):
+    """Of 64 positions and 300 pixels at most, and not below 100 pixels."""
+    settings = guide.GuideSettings(coarse_side=100, max_coarse_steps=64)
+    assert guide.coarsest_level(size, length, settings) == level
