@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 import jaxbundle
 from jaxbundle.errors import InputError
-from jaxbundle.tiepoints import camera_starts
+from jaxbundle.orientation import batched
+from jaxbundle.tiepoints import camera_starts, verification
 from jaxbundle.tiepoints.camera_starts import start_cameras
 from jaxbundle.tiepoints.closure import (
     ClosureMinimum,
@@ -216,6 +217,8 @@ def test_numbers_of_matches_and_loops_follow_from_one_another():
     oriented = VerificationSettings().min_matches
     assert MarkSettings().min_moved == oriented
     assert CoplanaritySettings().min_matches * 2 / 3 == oriented
+    # two right matches of which half are right: one chance in 1e5 that no trial has them
+    assert 0.75 ** VerificationSettings().rotation_trials == pytest.approx(1e-5, rel=0.05)
     all_pairs = list(combinations(range(4), 2))
     assert ClosureSettings().min_loops == count_independent(all_pairs) == 2 + 1
 
@@ -229,7 +232,7 @@ def test_matches_need_rays_in_both_photographs():
     assert _with_ideal(ideal, matches).rows[:, 0].tolist() == [0, 3]
 
 
-def test_verification_keeps_true_matches_and_names_what_is_degenerate(cloud):
+def test_verification_keeps_true_matches_and_names_what_is_degenerate(cloud, monkeypatch):
     rng, X, views = cloud
     noise = lambda xy: xy + 3e-4 * rng.normal(size=xy.shape)
     a, b = (noise(seen(X, *views[k])) for k in (0, 3))
@@ -241,7 +244,19 @@ def test_verification_keeps_true_matches_and_names_what_is_degenerate(cloud):
     foreign = rng.uniform(-0.5, 0.5, (2, 60, 2))
     first = [a, noise(seen(X, X0, M)), noise(seen(flat, *views[0])), foreign[0]]
     second = [b, turned, noise(seen(flat, *views[2])), foreign[1]]
+    run, programs = batched.run_in_lanes, []
+
+    def run_in_lanes(program, lanes, *arrays):
+        programs.append((id(program), lanes, tuple(np.shape(a)[1:] for a in arrays)))
+        return run(program, lanes, *arrays)
+
+    monkeypatch.setattr(batched, "run_in_lanes", run_in_lanes)
     found = verify_pairs(first, second, np.full(4, 2e-3))
+    # the programs that are compiled ahead of the matches are those that these need
+    needed = {*programs}
+    programs.clear()
+    verification.prepare()
+    assert {*programs} <= needed and len(programs) == 2
     good, M, base, angle, kind, _ = found[0]
     assert good[~wrong].mean() > 0.97 and good[wrong].mean() < 0.2
     true = views[3][1] @ views[0][1].T
