@@ -222,9 +222,10 @@ class Solution:
     @property
     def determined(self) -> bool:
         """Whether no unknown is so weak that its σ is rounding noise."""
-        # NaN pivots, of a matrix that is not positive definite, are no better than small ones.
+        # NaN pivots, of a matrix that is not positive definite, make the smallest one NaN, which is
+        # not greater than anything.
         pivots = np.abs(np.asarray(self.factor.reduced.pivots))
-        return bool(np.isfinite(pivots).all() and pivots.min(initial=1.0) ** 2 > PIVOT)
+        return bool(pivots.min(initial=1.0) ** 2 > PIVOT)
 
     @functools.cached_property
     def cofactors(self) -> Cofactors:

@@ -88,10 +88,10 @@ def refine(
         np.full(n, np.nan),
         np.full(n, int(MatchingStatus.OUTSIDE)),
     )
-    known = is_inside(base, uv, half) & np.isfinite(A).all((1, 2))
+    known = is_inside(base, uv, half)
     # how far the corners of the windows are from their middle, along the rows or the columns; half
-    # a pixel more, as pieces begin at whole pixels
-    reach = half * np.abs(np.where(known[:, None, None], A, 0.0)).sum(2).max(1) + 0.5
+    # a pixel more, as pieces begin at whole pixels; NaN, where A does not exist, is within nothing
+    reach = half * np.abs(A).sum(2).max(1) + 0.5
     held = -1.0
     for stretch in (settings.max_stretch, max(settings.max_stretch, np.sqrt(2) * MAX_SCALE)):
         margin = int(np.ceil(stretch * half)) + settings.search_margin

@@ -32,7 +32,7 @@ from jaxbundle.geometry import (
 from jaxbundle.leastsquares.datum.conditions import generators, move_to_datum, s_transform
 from jaxbundle.leastsquares.datum.defect import find_open_motions, survey_motions
 from jaxbundle.leastsquares.equations.normal import zero_tangent
-from jaxbundle.leastsquares.problem import pad_data, pad_values, without_filling
+from jaxbundle.leastsquares.problem import pad_data, pad_values, with_motions_at, without_filling
 from jaxbundle.network.datum_words import open_directions_in_words
 
 
@@ -121,6 +121,19 @@ def test_defect(name):
 
 
 program = eqx.filter_jit(generators)
+
+
+def test_open_motions_turn_about_the_control_point_where_it_is():
+    """An adjustment moves it, and the rotations and the scale that it leaves open with it."""
+    network, defect = CASES["a control point"]
+    problem = make_problem(network)
+    X = np.array(problem.data.start["point"])
+    X[0] += [0.3, -0.2, 0.1]
+    values = {**problem.data.start, "point": X}
+    there = with_motions_at(problem, values)
+    assert there.plan.datum.gauge.shape == (7, defect)
+    along = np.asarray(program(there.declared, values)["point"]) @ there.plan.datum.gauge
+    assert np.abs(along[0]).max() < 1e-9 * np.abs(along).max()
 
 
 def test_words():

@@ -43,6 +43,12 @@ def test_refused(given, words):
         adjusted(**given)
 
 
+def test_an_observation_of_a_table_that_is_not_there():
+    between = ls.Kind("difference", lambda a, b, dh: b - a - dh, of=("height", "heights"))
+    with pytest.raises(InputError, match="difference: there is no table 'heights'; known: height"):
+        ls.adjust([ls.Table("height", START)], [between(ENDS, RISE)])
+
+
 def test_lists_labels_and_what_is_left_out():
     """The second difference, masked and of no weight, says nothing: the first and third remain."""
     rise = np.ma.array(RISE, mask=[0, 1, 0])

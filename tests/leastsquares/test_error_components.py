@@ -5,12 +5,14 @@ import pytest
 import scipy.sparse as sp
 
 from jaxbundle import leastsquares as ls
+from jaxbundle.leastsquares.problem import make_problem
 from jaxbundle.leastsquares.quality.error_components import (
     ErrorComponent,
     ErrorSettings,
     fit_error_model,
 )
 from jaxbundle.leastsquares.quality.error_effects import effects, remove_fit, stack_rows
+from jaxbundle.leastsquares.solution import Solution
 
 RANGE = ls.Kind(
     "distance", lambda a, b, d: ((a - b) @ (a - b)) ** 0.5 - d, of=("point", "point")
@@ -132,3 +134,30 @@ def test_scores_are_standard_normal_without_shared_errors(network):
     assert (np.abs(scores.mean(0)) < 0.5).all() and (np.abs(scores.std(0) - 1) < 0.4).all()
     assert abs(np.mean([s[0] for s in sizes]) - 1) < 0.1
     assert model.sizes[0].name == "independent errors" and model.score[0] == 0
+
+
+def test_effects_on_rows_that_stay_in_the_reduced_system_are_those_of_dense_algebra():
+    """Points 1 and 3 are tied by a difference, so that they are not eliminated with the others."""
+    n, shifts = 5, 3
+    point, shift = (a.ravel() for a in np.meshgrid(np.arange(n), np.arange(shifts), indexing="ij"))
+    view = ls.Kind("view", lambda p, s, y: p + s - y, of=("point", "shift"))
+    tie = ls.Kind("tie", lambda a, b, d: b - a - d, of=("point", "point"))
+    problem = make_problem(
+        [ls.Table("point", np.zeros(n)), ls.Table("shift", np.zeros(shifts), free=[0, 1, 1])],
+        [view((point, shift), np.zeros(len(point)), sigma=0.5), tie(([1], [3]), [0.0])],
+        eliminate="point",
+    )  # fmt: skip
+    assert problem.plan.eliminated == "point" and problem.kept_rows.tolist() == [0, 1, 0, 1, 0]
+    A = np.zeros((len(point) + 1, n + shifts))
+    rows = np.arange(len(point))
+    A[rows, point] = A[rows, n + shift] = 1 / 0.5
+    A[-1, [1, 3]] = -1, 1
+    A = np.delete(A, n, axis=1)  # the first shift is held
+    e = np.random.default_rng(2).normal(size=(3, len(A)))
+    found = Solution(problem, {t.name: t.value for t in problem.tables})
+    left, tables = remove_fit(found, e)
+    x = e @ np.linalg.pinv(A).T
+    np.testing.assert_allclose(left, e - x @ A.T, atol=1e-10)
+    np.testing.assert_allclose(tables["point"].reshape(3, n), x[:, :n], atol=1e-10)
+    np.testing.assert_allclose(tables["shift"].reshape(3, shifts)[:, 1:], x[:, n:], atol=1e-10)
+    assert not tables["shift"].reshape(3, shifts)[:, 0].any()

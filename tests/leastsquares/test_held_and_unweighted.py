@@ -78,3 +78,15 @@ def test_a_residual_without_weight_does_not_count_whatever_it_is():
     """Also beside correlated ones, whose whitening is a product."""
     found = whiten((1.0, np.nan, 3.0), ((2.0, 0.0, 0.0), (0.0, 0.0, 0.0), (1.0, 0.0, 4.0)))
     np.testing.assert_array_equal(found, [2.0, 0.0, 13.0])
+
+
+def test_without_redundancy_weakness_is_judged_by_the_given_sigma():
+    """There is no σ0 of residuals."""
+    level = ls.Kind("level", lambda x, m: x - m, of=("height",))
+    # a fiftieth of the extent is the limit
+    sigma = np.array([[1e-3], [0.015], [0.03]])
+    heights = ls.Table("height", np.zeros((3, 1)), labels=list("abc"))
+    problem = make_problem([heights], [level((np.arange(3),), np.zeros((3, 1)), sigma=sigma)])
+    found = Solution(problem, {"height": heights.value})
+    weak = find_weak(found, {"height": np.ones((3, 1))}, np.nan)
+    assert weak.names == ("1 of height c",) and weak.worst == pytest.approx(0.03)

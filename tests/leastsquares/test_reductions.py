@@ -44,7 +44,8 @@ def turned(motion, X):
     return jnp.stack([c * X[0] + s * X[1], c * X[1] - s * X[0]]) + motion[:2]
 
 
-DISTANCE = Kind("distance", distance, of=("station", "point", "factor"), invariant=True)
+# The border has groups before and after that of the band, in the order of names.
+DISTANCE = Kind("distance", distance, of=("station", "point", "unit"), invariant=True)
 DIRECTION = Kind("direction", direction, of=("station", "point"), invariant=True)
 PLACE = Kind("place", lambda station, e, x: station[:2] + e - x, of=("station", "shift"))
 MOTIONS = Motions(("E", "N", "turn"), (
@@ -66,7 +67,7 @@ def traverse(reduction=None):
     known = np.arange(0, STATIONS, 2)
     return make_problem(
         [Table("station", near(station)), Table("point", near(X)), Table("shift", np.zeros((1, 2))),
-         Table("factor", np.array([1.0]))],
+         Table("unit", np.array([1.0]))],
         [DISTANCE((row, point, 0 * row), near(np.hypot(*d.T), NOISE), sigma=NOISE),
          DIRECTION((row, point), near(np.arctan2(*d.T) - station[row, 2], NOISE), sigma=NOISE),
          PLACE((known, 0 * known), near(station[known, :2]), sigma=0.01)],

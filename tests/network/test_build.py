@@ -8,8 +8,8 @@ import pytest
 
 from jaxbundle.errors import InputError
 from jaxbundle.network import Camera
-from jaxbundle.network.build import make_cameras, make_further, make_network
-from jaxbundle.network.columns import Columns, RepeatedIds, did_you_mean
+from jaxbundle.network.build import _colours, make_cameras, make_further, make_network
+from jaxbundle.network.columns import Columns, RepeatedIds, did_you_mean, list_some
 from jaxbundle.network.tables import EXTERIOR, Source
 from jaxbundle.network.units import to_image_unit
 
@@ -164,6 +164,8 @@ def test_a_bad_camera_is_refused(camera, said):
     ({"points": {"id": "p"}}, "points: column 'id' must be a sequence"),
     ({"cameras": []}, "no camera is given"),
     ({"cameras": [CAMERAS[0]] * 2}, "camera 'a' is already"),
+    ({"datum_points": "p"}, "datum_points must be a list of ids, not 'p'"),
+    ({"datum_points": 3}, "datum_points must be a list of ids, not 3"),
     ({"image_unit": "px"}, "camera 'a': pixel_size is needed to convert between pixels and mm"),
 ])  # fmt: skip
 def test_bad_arguments_are_refused(change, said):
@@ -268,3 +270,38 @@ def test_ids_that_repeat_are_looked_up_once():
         table.indices("image", "image", {"a": 0, "c": 2}, "images")
     with pytest.raises(InputError, match="t, row 2: point '9' is unknown"):
         table.indices("point", "point", {"7": 0, "8": 1}, "points")
+
+
+def test_a_message_lists_five_names_and_counts_the_others():
+    """More would hide what it says about them."""
+    assert list_some("abcde") == "'a', 'b', 'c', 'd', 'e'"
+    assert list_some("abcdefg") == "'a', 'b', 'c', 'd', 'e' and 2 more"
+    assert list_some(range(4), 2, str) == "0, 1 and 2 more"
+
+
+def test_tables_of_no_kind_are_refused():
+    with pytest.raises(InputError, match="unknown table 'antenas'; did you mean 'antennas'"):
+        make_further({"antenas": []}, 1.0)
+
+
+def test_ids_of_any_kind_are_looked_up_as_text():
+    """An array of objects may mix numbers and texts."""
+    of = {"a": 0, "3": 1, "7": 2}
+    for ids in (np.array(["a", 3, 7.0], object), ["a", 3, 7.0], np.array(["a", "3", "7"])):
+        rows = Columns({"image": ids}, Source("t")).indices("image", "image", of, "images")
+        assert rows.tolist() == [0, 1, 2]
+    for ids in (np.array([7, 3, 7]), np.array([7.0, 3.0, 7.0])):
+        rows = Columns({"image": ids}, Source("t")).indices("image", "image", of, "images")
+        assert rows.tolist() == [2, 1, 2]
+
+
+@pytest.mark.parametrize("bad", [-1, 256, 1.5])
+def test_colours_are_whole_numbers_of_eight_bits(bad):
+    """Points without one are grey."""
+    colours = {"red": [0, 7, None], "green": [255, 8, None], "blue": [128, 9, None]}
+    points = {"id": ["a", "b", "c"], "role": ["tie"] * 3} | dict.fromkeys("XYZ", [0.0] * 3)
+    found = _colours(Columns(points | colours, Source("points")))
+    assert found.tolist() == [[0, 255, 128], [7, 8, 9], [128] * 3]
+    colours["green"] = [255, bad, None]
+    with pytest.raises(InputError, match=f"points, row 2: green is {bad}.*from 0 to 255"):
+        _colours(Columns(points | colours, Source("points")))

@@ -12,7 +12,7 @@ from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.network import Camera, Network
 from jaxbundle.network.build import make_network
-from jaxbundle.network.check import check_network, split_check_points
+from jaxbundle.network.check import _note_points_behind, check_network, split_check_points
 from jaxbundle.network.rules import check_camera
 from jaxbundle.network.undetermined import label_connected_parts
 from jaxbundle.planning.simulate import simulate
@@ -158,6 +158,8 @@ def test_datum_points_of_a_datum_by_control_are_warned_of():
         given["points"][k] |= {"role": "control", **SIGMA}
     checked = check_network(make_network(**{**given, "datum": "control", "datum_points": ["p5"]}))
     assert any("datum_points are not used" in warning for warning in checked.notes)
+    for change in ({"datum_points": ()}, {"datum": "inner"}):
+        assert check_network(checked.replace(notes=(), **change)).notes == ()
 
 
 @pytest.mark.parametrize("table", ["images", "points"])
@@ -228,6 +230,8 @@ def test_points_with_too_few_rays_are_left_out_with_a_warning():
     assert len(checked.observations) == 5 * 3 + 1
     assert checked.points.id[checked.observations.point[-1]] == "p4"
     assert "1 point without any ray: 'p5'" in checked.notes[0]
+    # nothing is lost of points that rays do not determine
+    assert [left.measured for left in checked.left_out] == [False, False]
     assert "1 tie point with a single ray: 'p6'" in checked.notes[1]
     assert checked.points.source(5) == "points, row 8"
     assert check_network(checked).notes == checked.notes
@@ -286,6 +290,7 @@ def test_images_without_enough_points_are_left_out_by_name(said, keep):
     assert found.images.id == ("i0", "i2") and len(found.points) == 8
     (left,) = found.left_out
     assert (left.thing, left.names) == ("image", ("i1",)) and "too few points" in left.why
+    assert left.measured  # a photograph is always lost
     assert "left out 1 image" in " ".join(found.notes)
     given["images"][1] |= {"sX0": 0.1, "sY0": 0.1}
     kept = "i1" in check_network(make_network(**given)).images.id
@@ -347,6 +352,17 @@ def test_too_few_observations_are_counted():
 def test_points_behind_their_camera_are_warned_of():
     checked = check_network(broken("points", 3, Z=60.0))
     assert "3 image points behind the camera: point 'p3' in image 'i0'" in checked.notes[0]
+    assert "'i2'; check" in checked.notes[0]
+    # a fisheye sees them
+    fisheye = Camera("cam", "kannala-brandt", {"fx": 100.0, "fy": 100.0})
+    assert _note_points_behind(broken("points", 3, Z=60.0).replace(cameras=(fisheye,))).notes == ()
+    # of more the first three
+    given = tables()
+    for k in (3, 4):
+        given["points"][k]["Z"] = 60.0
+    (note,) = check_network(make_network(**given)).notes
+    assert "6 image points behind the camera" in note and note.count("point 'p") == 3
+    assert " …; check the start values" in note
 
 
 def test_the_side_of_a_point_agrees_with_the_rotation_matrix():
@@ -451,6 +467,14 @@ def test_fields_of_a_camera_of_another_kind(field, value, message):
     fields = {"id": "cam", "model": "brown", "parameters": {"c": 20.0}} | {field: value}
     with pytest.raises(InputError, match=re.escape(message)):
         check_camera(Camera(**fields))
+
+
+@pytest.mark.parametrize("sigma, said", [({}, "(sigma: none)"), ({"c": 0.1}, "(sigma: c)")])
+def test_an_observed_parameter_has_a_sigma(sigma, said):
+    camera = Camera("cam", "brown", {"c": 20.0}, ("c", "x0"), sigma=sigma, observed={"x0": 0.1})
+    with pytest.raises(InputError, match="observed is given for 'x0', which has no sigma") as error:
+        check_camera(camera)
+    assert said in str(error.value)
 
 
 def far_away(shift=0.0, scale=1.0):

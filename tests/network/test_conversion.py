@@ -9,7 +9,7 @@ from jaxbundle.cameras.convert_fit import rays_of
 from jaxbundle.errors import InputError
 from jaxbundle.network import Camera
 from jaxbundle.network.build import make_network
-from jaxbundle.network.conversion import convert_cameras, convert_one
+from jaxbundle.network.conversion import _convert, convert_cameras, convert_one
 
 SIZES = dict(image_size=(1280, 720), pixel_size=(0.005, 0.005))
 BROWN = Camera("a", "brown", dict(c=5.0, x0=0.01, y0=-0.02, K1=2e-3, K2=-3e-5, P1=1e-4),
@@ -79,3 +79,15 @@ def test_one_camera_and_what_is_refused():
         convert_one(Camera("a", "brown", {"c": 5.0}, image_size=(10, 10)), "opencv")
     with pytest.raises(InputError, match="unknown camera model 'opencx'.*'opencv'"):
         convert_cameras(network(BROWN), "opencx")
+
+
+@pytest.mark.parametrize("measured", [False, True])
+def test_a_camera_is_converted_over_its_image_or_where_points_are_measured(measured):
+    """Over the whole image, if its size is known, unless only its measured part is asked for: in
+    the middle other polynomials fit best."""
+    corner = np.array([[-3.2, -1.8], [3.2, 1.8]])
+    found = [
+        _convert(BROWN, "opencv", 0.0, part * corner, measured)[0].parameters
+        for part in (1.0, 0.5)
+    ]
+    assert (found[0] == found[1]) == (not measured)

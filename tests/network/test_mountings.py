@@ -16,6 +16,8 @@ from jaxbundle.geometry import (
     omega_phi_kappa_from_matrix,
 )
 from jaxbundle.network.build import make_further
+from jaxbundle.network.kinds.mountings import observe_mountings, read_mountings
+from jaxbundle.network.kinds.rigs import MountedPose, _start
 from jaxbundle.planning.stations import Stations
 
 T = np.array([0.3, 0.02, -0.01])
@@ -182,6 +184,44 @@ def test_what_is_known_of_some_axes_alone(simulated):
     assert sigma[[0, 2]].min() > 2e-5
 
 
+@pytest.mark.parametrize("given, known", [
+    ({"position": T.tolist()}, True),  # held
+    ({"position": T.tolist(), "sigma_position": 0.1}, True),  # whatever the angles are
+    ({"position": T.tolist(), "sigma_position": [0.1, 0.1, float("inf")]}, False),
+    ({"angles": ANGLES.tolist()}, False),
+])  # fmt: skip
+def test_a_mounting_of_known_position_has_a_base(given, known):
+    """All three coordinates of it: with one unknown the base may have any length above."""
+    (mounting,) = read_mountings("rig", {"right": given}, 1.0).values()
+    assert mounting.length == (pytest.approx(np.linalg.norm(T)) if known else None)
+
+
+def test_mountings_with_sigma_are_observed_and_held_ones_are_not():
+    """Those with a covariance on their own: their axes are not independent."""
+    C = np.diag([1e-6] * 6)
+    given = {
+        "held": GIVEN, "weighted": GIVEN | {"sigma_position": 1e-3, "sigma_angle": 1e-3},
+        "correlated": GIVEN | {"covariance": C.tolist()},
+    }  # fmt: skip
+    found = observe_mountings([1, 2, 3], [*read_mountings("rig", given, 1.0).values()])
+    rows = {one.name: one.rows[0].tolist() for one in found}
+    assert rows == {"given mountings": [2], "correlated mountings": [3]}
+
+
+@pytest.mark.parametrize("sigma", [{}, {"sigma_position": 1e-3, "sigma_angle": 1e-3}])
+def test_a_mounting_starts_where_the_images_are_unless_it_is_held(sigma):
+    """A weighted one may be far from them; where nothing connects a camera with the reference,
+    there is nothing else."""
+    (known,) = read_mountings("rig", {"right": GIVEN | sigma}, 1.0).values()
+    images = MountedPose(T + 0.1, np.eye(3))
+    start, alone = _start(images, known), _start(None, known)
+    held = not sigma
+    np.testing.assert_allclose(start.position, T if held else images.position)
+    np.testing.assert_allclose(start.rotation, R if held else images.rotation, atol=1e-12)
+    np.testing.assert_allclose(alone.position, T)
+    np.testing.assert_allclose(alone.rotation, R, atol=1e-12)
+
+
 def test_start_values_have_the_scale_of_the_base(simulated):
     """Without any start value, twice: the object is as large as the base says."""
     for factor in (1.0, 1000.0):
@@ -219,6 +259,8 @@ def test_jacobians(simulated):
     ({"mounting": {"right": GIVEN | {"covariance": [[0] * 6] * 6}}}, "positive definite"),
     ({"mounting": {"right": GIVEN | {"covariance": np.eye(6).tolist(), "sigma_angle": 1}}},
      "covariance, or sigma_position"),
+    *(({"mounting": {"right": {one: [1, 2, 3], "covariance": np.eye(6).tolist()}}}, "give both")
+      for one in ("position", "angles")),
     ({"mounting": {"rihgt": GIVEN}}, "no rig has a camera 'rihgt'.*right"),
     ({"mounting": {"left": GIVEN}}, "'left' is the reference camera"),
     ({"bases": [{"cameras": ["left", "left"], "length": 1, "sigma": 1}]}, "two names"),

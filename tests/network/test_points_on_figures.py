@@ -8,6 +8,7 @@ import jaxbundle
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.network.build import make_further
+from jaxbundle.network.kinds.figures import Figures
 from jaxbundle.network.kinds.fit_figures import FEWEST, fit
 
 random = np.random.default_rng(11)
@@ -229,3 +230,12 @@ def test_too_few_points_are_refused(simulated):
     network = simulated.network.replace(further=make_further(given, 1.0))
     with pytest.raises(InputError, match="sphere 'the sphere' has 3 usable points; at least 4"):
         jaxbundle.make_problem(network)
+
+
+@pytest.mark.parametrize("type, residuals", [("plane", 1), ("line", 2)])
+def test_a_condition_has_the_sigma_of_its_point(type, residuals):
+    """In every direction across the figure."""
+    sigma, rows = np.array([0.01, 0.5]), np.arange(2)
+    found = Figures._observe_points(type, (type,), (0 * rows,), rows, sigma)
+    expected = np.tile(1 / sigma[:, None], (1, residuals))
+    np.testing.assert_allclose(found.weight(residuals), expected)

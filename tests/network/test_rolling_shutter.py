@@ -14,6 +14,7 @@ from jaxbundle.cameras import get_model, project
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.network.build import make_further
+from jaxbundle.network.undetermined import equations_of
 
 LINE = 3e-5
 CAMERA = jaxbundle.Camera(
@@ -110,11 +111,19 @@ def test_added_angles_have_the_unit_of_the_network(flown):
     row |= dict.fromkeys(("somega", "sphi", "skappa"), [1.0])
     (rows,) = jaxbundle.add_further(network, attitudes=row).further
     np.testing.assert_allclose(rows.angles, np.pi / 2)
+    # three angles of one image
+    equations = equations_of(network.replace(further=(rows,)), "IMAGES")
+    assert equations.tolist() == [3] + [0] * (len(network.images) - 1)
     (rows,) = jaxbundle.add_further(network, attitudes=row, angle_unit="gon").further
     np.testing.assert_allclose(rows.angles, 0.45 * np.pi)
     with pytest.raises(InputError, match="in the unit of the network, deg.*got angle_unit 'rad'"):
         boresight = {"boresight": [0.1, 0.0, 0.0]}
         jaxbundle.add_further(network, attitudes=row, attitude=boresight, angle_unit="rad")
+    # Settings without angles are in no unit of angles.
+    velocities, section = {"image": [network.images.id[0]]}, {"line_time": LINE}
+    jaxbundle.add_further(
+        network, velocities=velocities, rolling_shutter=section, angle_unit="rad"
+    )
 
 
 def test_further_observations_are_added_in_place_of_their_kind(flown):

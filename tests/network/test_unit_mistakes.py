@@ -9,7 +9,7 @@ import pytest
 import jaxbundle
 from jaxbundle import Camera, InputError, grid_of_targets, ring_of_stations, simulate
 from jaxbundle.network.check import check_tables
-from jaxbundle.network.unit_mistakes import name_pixels
+from jaxbundle.network.unit_mistakes import LIMITS, name_pixels
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.orientation.angle_units import name_angle_unit
 
@@ -142,6 +142,11 @@ def test_c_in_pixels_is_a_likely_cause_where_nothing_is_known_of_the_pixels():
     each = dataclasses.replace(images, camera=np.arange(len(images)) % 2)
     both = given.replace(cameras=(given.cameras[0], two), images=each)
     assert name_pixels(both).endswith("so with 1 other camera")
+
+
+def test_half_of_the_points_of_an_image_are_within_a_third_of_its_longer_side():
+    """Of 3:2, evenly covered: a circle of half the area, π·r² = 1/2 · 2/3."""
+    assert LIMITS.half_of_points == pytest.approx(np.sqrt(1 / (3 * np.pi)), rel=0.05)
 
 
 def test_blunders_are_no_unit():

@@ -4,7 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from orientation_scenes import batch, mahalanobis, pairs
+from orientation_scenes import batch, image_points, mahalanobis, pairs
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -177,3 +177,26 @@ def test_against_scipy():
 def test_an_unknown_method_is_refused():
     with pytest.raises(ValueError, match="seven"):
         relative_orientation(np.zeros((8, 2)), np.zeros((8, 2)), method="seven")
+
+
+def test_points_are_coplanar_if_a_plane_fits_nearly_as_well_as_the_orientation():
+    """Up to six times the variance, each with its redundancy: n − 5 of one misclosure a point,
+    2·n − 8 of two differences that contain the errors of both images. Points with more and more
+    relief."""
+    rng, noise = np.random.default_rng(7), 1e-4
+    xy1, _, M, b = pairs(N, n, seed=6)
+    rays = np.concatenate([xy1, -np.ones((N, n, 1))], 2)
+    relief = np.geomspace(1e-4, 1e-2, N)[:, None, None] * rng.normal(size=(N, n, 1))
+    xy2 = image_points(M, b, rays * 6 * (1 + relief)) + noise * rng.normal(size=xy1.shape)
+    found = five(xy1, xy2)
+    ratio = []
+    for a, (x, y), vtpv in zip(rays * [1, 1, -1], xy2.swapaxes(1, 2), found.vtpv):
+        nil = np.zeros((n, 3))
+        A = np.block([[a, nil, -x[:, None] * a[:, :2]], [nil, a, -y[:, None] * a[:, :2]]])
+        h = np.append(np.linalg.lstsq(A, np.concatenate([x, y]), rcond=None)[0], 1).reshape(3, 3)
+        image = a @ h.T
+        off = image[:, :2] / image[:, 2:] - np.stack([x, y], 1)
+        ratio.append((off**2).sum() / (2 * (2 * n - 8)) / (vtpv / (n - 5)))
+    sure = np.abs(np.log(np.array(ratio) / 6)) > 0.2
+    assert sure.mean() > 0.8 and 0.1 < (np.array(ratio) < 6)[sure].mean() < 0.9
+    np.testing.assert_array_equal(found.flat[sure], np.array(ratio)[sure] < 6)

@@ -1,8 +1,12 @@
 """Which names of points are exchanged, from two lists of them in different frames."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from jaxbundle.network.tables import Points
+from jaxbundle.orientation import alignment
 from jaxbundle.orientation.alignment import similarity, similarity_of_most
 from jaxbundle.orientation.swapped_control import contradiction
 
@@ -120,3 +124,41 @@ def test_the_similarity_of_most_points_is_not_spoilt_by_a_third_of_wrong_ones():
     np.testing.assert_allclose(POINTS @ A.T + t, POINTS @ expected[0].T + expected[1], atol=1e-12)
     on_a_line = np.arange(5.0)[:, None] * [1.0, 2.0, 3.0]
     assert similarity_of_most(on_a_line, on_a_line) is None
+
+
+@pytest.mark.parametrize("mirrored, said", [(0.15, True), (0.25, False)])
+def test_control_is_a_mirror_image_if_it_fits_five_times_better_as_one(
+    monkeypatch, mirrored, said
+):
+    """With a misfit that is small for its extent."""
+    monkeypatch.setattr(alignment, "_misfit", lambda source, target: (
+        1.0 if (target == X).all() else mirrored
+    ))  # fmt: skip
+    X = POINTS[:6] * 10
+    points = Points(tuple("abcdef"), ("control",) * 6, X, np.full((6, 3), 0.01))
+    network = SimpleNamespace(points=points, object_unit="m")
+    model = SimpleNamespace(known=np.ones(6, bool), X=X)
+    told = alignment.describe_mirror(network, model)
+    assert ("the 6 control points fit the images only as a mirror image (by 0.15 m" in told) == said
+
+
+@pytest.mark.parametrize("known, expected", [
+    ({"control": 1.0, "rays": 2.0, "points": 3.0}, 1.0), ({"rays": 2.0, "points": 3.0}, 2.0),
+    ({"points": 3.0}, 3.0), ({}, None),
+])  # fmt: skip
+def test_a_model_is_moved_by_the_best_that_is_known_of_its_frame(monkeypatch, known, expected):
+    """Control points and stations, else rays to control, else all points but check points."""
+    numbers = {4: "control", 5: "points"}  # three control points and a station; three and two ties
+    moved = lambda name: (known[name] * np.eye(3), np.zeros(3)) if name in known else None
+    by_points = lambda source, target: moved(numbers[len(source)])
+    monkeypatch.setattr(alignment, "similarity", by_points)
+    monkeypatch.setattr(alignment, "_by_rays", lambda *_: moved("rays"))
+    X, roles = POINTS[:6], ("control",) * 3 + ("check",) + ("tie",) * 2
+    points = Points(tuple("abcdef"), roles, X, np.full((6, 3), 0.01))
+    images = SimpleNamespace(position=np.array([[0.0, 0, 9], [np.nan] * 3]))
+    model = SimpleNamespace(
+        known=np.ones(6, bool), X=X, X0=np.zeros((2, 3)), placed=np.ones(2, bool),
+        transform=lambda A, t: A[0, 0],
+    )  # fmt: skip
+    network = SimpleNamespace(points=points, images=images)
+    assert alignment.move_to_given_frame(network, None, model) == expected

@@ -243,3 +243,36 @@ def test_of_other_principal_distances_those_that_explain_most_are_adjusted(monke
     settings = starting.BlockStartSettings(max_others=2)
     best = [*starting.start_values(SimpleNamespace(images=range(8)), (), {}, settings)]
     assert [len(one.network.observations) for one in best] == [300, 200]
+
+
+def test_estimated_factors_of_sigma_are_in_the_result():
+    """With them there is no test of σ0, which would confirm what it was estimated from."""
+    changed = lambda **changes: SimpleNamespace(converged=True, changes=changes)
+    found = SimpleNamespace(converged=True, with_changes=changed)
+    weighted = adjusting.WeightedAdjustment(found, {"of level 0": 1.5}, 9)
+    assert weighted.adjustment.changes == {"sigma_factors": {"image points of level 0": 1.5}}
+    failed = SimpleNamespace(converged=False)
+    assert adjusting.WeightedAdjustment(failed, {"of level 0": 1.5}, 9).adjustment is failed
+
+
+def test_points_without_rays_are_no_points_of_three(monkeypatch):
+    """The last ones of a network, too."""
+    camera = Camera("cam", "brown", {"c": 24.0}, free=("c",))
+    network = simulate(ring_of_stations(4, 2.5, 6.0), grid_of_targets(4, 4, 0.5), camera, noise=0.0)
+    keep = (network.observations.point < 14) & (
+        (network.observations.point > 0) | (network.observations.image < 2)
+    )
+    network = network.replace(observations=network.observations.take(keep))
+    given = []
+
+    def weight(network, *_):
+        given.append(network.points.id)
+        found = SimpleNamespace(converged=len(given) > 1, removed=(), network=network)
+        found.with_changes = lambda **_: found
+        return adjusting.WeightedAdjustment(found, {}, 9)
+
+    monkeypatch.setattr(adjusting, "_weight", weight)
+    monkeypatch.setattr(adjusting, "_count_agreeing", lambda *_: 9)
+    kinds = np.zeros(len(network.observations), int)
+    adjusting.adjust_weighted(network, kinds, {0: "all"}, 0.001, print)
+    assert given == [network.points.id, network.points.id[1:14]]

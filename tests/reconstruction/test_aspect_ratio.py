@@ -87,6 +87,21 @@ def test_what_only_one_half_of_the_photographs_says_is_not_believed():
     assert halves[0].deviation > 5 * halves[0].sigma and abs(halves[1].deviation) < 1e-3
 
 
+def test_only_the_focal_lengths_of_released_cameras_are_no_longer_one_unknown():
+    """Of a lens in portrait format fy lies along the other axis. Its distortion is one all the
+    same, and other lenses are not concerned."""
+    given = [("a", "a2", "fx"), ("a", "a2", "k1"), ("b", "b2", "fx")]
+    columns = dict(zip(("camera", "other", "parameter"), map(list, zip(*given))))
+    observed = {"camera": ["a", "b"], "parameter": ["fy/fx"] * 2, "value": [1.0] * 2,
+                "sigma": [2e-4] * 2}  # fmt: skip
+    further = make_further({"ties": columns, "camera_parameters": observed}, 1.0)
+    left = release(photographs().replace(further=further), ["a2", "a"]).further
+    tables = {one.TABLE: one for one in left}
+    ties, parameters = tables["ties"], tables["camera_parameters"]
+    assert [*zip(ties.camera, ties.other, ties.parameter)] == given[1:]
+    assert list(parameters.camera) == ["b"]
+
+
 @pytest.mark.parametrize("one, other, confirmed", [
     ((2e-3, 1e-4), (1.5e-3, 1e-4), True),
     ((2e-3, 1e-4), (9e-4, 1e-4), False),  # farther apart than one is from 1

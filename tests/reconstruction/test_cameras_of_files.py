@@ -3,10 +3,13 @@
 import dataclasses
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
+from jaxbundle.errors import InputError
 from jaxbundle.photographs.exif import Exif
-from jaxbundle.reconstruction.photographs import Photograph, assign_cameras
+from jaxbundle.reconstruction.photographs import Photograph, assign_cameras, find_photographs
 
 
 def photographs(*exif):
@@ -53,3 +56,22 @@ def test_two_cameras_of_one_model():
     found = assign_cameras([left, right], per_folder=True)
     assert [camera.id for camera in found.cameras] == ["left", "right"]
     assert found.camera_of == found.lens == (0, 1)
+
+
+def test_files_that_cannot_be_used_are_left_out_with_the_reason(tmp_path):
+    """Icons, damaged files, copies; the reason does not repeat the path."""
+    random = np.random.default_rng(0)
+    for name, size in {"a": 64, "b": 64, "icon": 63}.items():
+        grey = random.integers(0, 256, (size, 80), np.uint8)
+        cv2.imwrite(str(tmp_path / f"{name}.png"), grey)
+    (tmp_path / "copy.png").write_bytes((tmp_path / "a.png").read_bytes())
+    (tmp_path / "damaged.png").write_bytes((tmp_path / "a.png").read_bytes()[:20])
+    found, left_out = find_photographs([tmp_path])
+    assert [photograph.name for photograph in found] == ["a.png", "b.png"]
+    assert left_out.keys() == {"icon.png", "copy.png", "damaged.png"}
+    assert left_out["icon.png"] == "80 × 63 pixels are too few"
+    assert left_out["copy.png"] == "the same file as a.png"
+    assert str(tmp_path) not in left_out["damaged.png"]
+    (tmp_path / "b.png").unlink()
+    with pytest.raises(InputError, match=r"1 of 4 photographs .*icon.png \(80 × 63 pixels are"):
+        find_photographs([tmp_path])

@@ -8,7 +8,7 @@ import pytest
 from jaxbundle.network.tables import Points
 from jaxbundle.orientation.control_consistency import Discrepancies
 from jaxbundle.reconstruction import control_choice
-from jaxbundle.reconstruction.oriented_block import ControlSettings
+from jaxbundle.reconstruction.oriented_block import ControlSettings, MeasuredPoint
 
 
 @pytest.mark.parametrize("agree", [True, False])
@@ -90,3 +90,31 @@ def test_control_without_sigma_is_not_held_exactly_beside_fixed_points():
     measured = dict.fromkeys(control.id, ray)
     found = control_choice.choose_control(block, control, measured, order, assessed, 0.01)
     assert (found.sigma[1:] > 0.2).all()
+
+
+@pytest.mark.parametrize("agree, used, reason", [
+    ([True, False], True, ""),  # the other one is wrong
+    ([True, True], False, "its 2 rays do not meet"),  # which of them is right?
+    ([False, False], False, "its 2 rays do not meet"),
+    ([True], True, ""),
+    ([False], False, "its only ray, in a.jpg, misses its coordinates by 9 px, 2.5 m"),
+])  # fmt: skip
+def test_coordinates_settle_which_ray_is_right(agree, used, reason):
+    """Of several that do not meet, if exactly one passes them; a single one must pass them."""
+    n, rays = len(agree), np.array(agree)
+    control = Points(("A",), ("control",), np.zeros((1, 3)), np.full((1, 3), 0.02))
+    block = SimpleNamespace(
+        settings=ControlSettings(), misses=lambda *_: np.where(rays, 0.0, 9.0),
+        pixel_length=lambda *_: np.full(n, 1.0), distances=lambda *_: np.full(n, 2.5),
+        name_of=lambda *_: "a.jpg",
+    )  # fmt: skip
+    point = MeasuredPoint(
+        np.arange(n), np.zeros(n, int), np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 2, 3)),
+        np.full(n, 0.5), np.zeros(n, bool), np.full(3, np.nan),
+    )  # fmt: skip
+    choice = control_choice.ControlChoice(
+        {"A": point}, np.zeros(1, bool), control.sigma, {}, {}, None
+    )
+    control_choice._settle_by_coordinates(block, choice, 0, control, np.zeros(3))
+    assert choice.used.tolist() == [used] and choice.reasons.get("A", "") == reason
+    assert choice.points["A"].good.tolist() == (agree if used else [False] * n)

@@ -1,6 +1,8 @@
 """Photographs that should show common points and do not."""
 
+from contextlib import nullcontext
 from itertools import combinations
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ import pytest
 from jaxbundle import Camera, adjust, grid_of_targets, simulate
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.planning.stations import stations_looking_at
+from jaxbundle.reconstruction import folding
 from jaxbundle.reconstruction.folding import count_shared_points, refuse_superimposed
 
 EACH = 3
@@ -89,3 +92,41 @@ def test_a_blurred_photograph_with_few_points_is_no_contradiction(whole):
     assert (common[1:, 0] < 0.1 * number[1:, 0]).all()
     names = blurred.network.images.id
     assert refuse_superimposed(blurred, blurred.network, ALL, names) == []
+
+
+def test_the_pair_with_most_expected_points_is_named_first(monkeypatch):
+    """Of contradictory pairs it is the clearest; those that were not compared say nothing."""
+    settings = folding.SuperpositionSettings(max_pairs=9)
+    n = 2 * settings.min_points
+    expected = np.zeros((4, 4), int)
+    for i, j, number in ((0, 1, n), (0, 2, 3 * n), (1, 2, 2 * n), (0, 3, 9 * n)):
+        expected[i, j] = expected[j, i] = number
+    found = expected, np.zeros((4, 4), int)
+    monkeypatch.setattr(folding, "count_shared_points", lambda *_: found)
+    names = ["a.jpg", "b.jpg", "c.jpg", "d.jpg"]
+    network = SimpleNamespace(images=SimpleNamespace(id=tuple(names)))
+    matched = {(0, 1), (0, 2), (1, 2)}
+    said = folding.refuse_superimposed(
+        SimpleNamespace(network=network), None, matched, names, settings
+    )
+    pairs = [("a.jpg", "c.jpg"), ("b.jpg", "c.jpg"), ("a.jpg", "b.jpg")]
+    assert len(said) == 3
+    for words, (one, other), number in zip(said, pairs, (6 * n, 4 * n, 2 * n)):
+        assert f"0 of {number} points expected in both {one} and {other} were found" in words
+
+
+@pytest.mark.parametrize("agreeing, refused", [(11, True), (13, False)])
+def test_a_result_that_most_measurements_contradict_is_refused(agreeing, refused):
+    """A third of those of points with two rays in its photographs, 36: another photograph has more,
+    and some points are seen once."""
+    image = np.repeat([0, 1, 2], [18, 20, 90])
+    track = np.concatenate([np.arange(18), np.arange(20), np.arange(90)])
+    measured = SimpleNamespace(image=image, track=track)
+    network = SimpleNamespace(images=SimpleNamespace(id=("a.jpg", "b.jpg")))
+    weighted = SimpleNamespace(
+        adjustment=SimpleNamespace(network=network), agreeing_rays=agreeing
+    )
+    names = ["a.jpg", "b.jpg", "c.jpg"]
+    error = pytest.raises(NotSolvedError, match="only 11 of 36 measurements in 2 photographs")
+    with error if refused else nullcontext():
+        folding.refuse_folded(weighted, measured, names)

@@ -22,7 +22,7 @@ SIZE = (3000, 2000)
 FILE = StatedDistance(2350.0, 117.5, "focal length and sensor")
 
 
-def network(stated, aspect_sigma=2e-4, lens=(0, 1)):
+def network(stated, aspect_sigma=2e-4, lens=(0, 1), positions=None):
     """Two cameras, whose start values come from matches, with two photographs each."""
     cameras = tuple(
         Camera(id, "opencv", {"fx": 2100.0, "fy": 2100.0, "cx": 1499.5, "cy": 999.5, "k1": 0.05},
@@ -35,7 +35,7 @@ def network(stated, aspect_sigma=2e-4, lens=(0, 1)):
     measured = Measurements(track, image, xy, np.full((n, 2), 0.1), np.zeros(n, int),
                             image == 0, np.zeros((n, 3), np.uint8))  # fmt: skip
     of = Cameras(cameras, (0, 0, 1, 1), stated, False, (), lens)
-    further = FurtherData(no_named_points())
+    further = FurtherData(no_named_points(), positions=positions)
     return photograph_network(photographs, of, measured, further, "part", aspect_sigma)
 
 
@@ -101,3 +101,10 @@ def test_a_start_from_matches_far_from_the_file_is_not_believed(
     if used != from_matches:
         assert found.parameters["k1"] == 0.0
         assert "but 2350 px by the files: that of the files is used" in said
+
+
+def test_what_nothing_scales_has_no_unit_of_length():
+    """Photographs alone show a model of any size; satellite positions are in metres."""
+    alone, placed = network((None, None)), network((None, None), positions=(np.eye(4, 3),) * 2)
+    assert (alone.object_unit, alone.datum) == ("unit", "inner")
+    assert (placed.object_unit, placed.datum) == ("m", "control")

@@ -1,5 +1,6 @@
 """Rays of named points in an adjusted block, compared with exact projections."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ import pytest
 from jaxbundle import Camera
 from jaxbundle.cameras import get_model, project
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
+from jaxbundle.reconstruction.block import _pixel_angle
 from jaxbundle.reconstruction.named import NamedMeasurements
 from jaxbundle.reconstruction.oriented_block import FrameData, OrientedBlock
 
@@ -82,3 +84,11 @@ def test_a_measurement_outside_the_range_of_its_camera_has_no_ray():
     assert point.good.tolist() == [True, False] and np.isnan(point.rays[1]).all()
     assert block.misses(point, X)[0] < 1e-6 and np.isinf(block.misses(point, X)[1])
     assert block.ground_sample_distance == pytest.approx(50.0 / F, rel=0.02)
+
+
+@pytest.mark.parametrize("camera", [PERSPECTIVE, DISTORTED])
+def test_the_angle_of_a_pixel_is_that_in_the_middle_of_the_image(camera):
+    """1/f, where there is no distortion; without a size of the image, of the first pixel."""
+    assert _pixel_angle(camera) == pytest.approx(1 / F, rel=1e-5)
+    nowhere = dataclasses.replace(PERSPECTIVE, image_size=None)
+    assert _pixel_angle(nowhere) == pytest.approx(1 / F, rel=1e-5)

@@ -1,10 +1,12 @@
 """Principal distances that are tried when the first fails."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
 
 from jaxbundle import Camera
+from jaxbundle.network.build import make_further
 from jaxbundle.reconstruction import starting
 
 
@@ -23,6 +25,22 @@ def test_other_distances_of_cameras_that_files_do_not_tell(monkeypatch):
     for one, distances in zip(found, expected, strict=True):
         np.testing.assert_allclose([*one.values()], [*distances.values()])
     assert list(starting._try_other_distances(network, [], settings)) == []
+
+
+def test_the_observed_principal_distance_moves_with_its_start_value():
+    """With the same relative σ; the ratio of the axes of a pixel, observed too, remains 1."""
+    camera = lambda id: Camera(id, "opencv", {"fx": 1000.0, "fy": 1000.0, "k1": 0.1})
+    columns = {"camera": ["a", "a", "b"], "parameter": ["fx", "fy/fx", "fx"],
+               "value": [1000.0, 1.0, 1000.0], "sigma": [50.0, 2e-4, 50.0]}  # fmt: skip
+    given = (*make_further({"camera_parameters": columns}, 1.0),)
+    network = dataclasses.make_dataclass("Network", ["cameras", "further"], namespace={
+        "replace": lambda self, **changed: dataclasses.replace(self, **changed)
+    })((camera("a"), camera("b")), given)  # fmt: skip
+    found = starting._with_distances(network, {"a": 1600.0})
+    assert [c.parameters["fx"] for c in found.cameras] == [1600.0, 1000.0]
+    (observed,) = found.further
+    np.testing.assert_allclose(observed.value, [1600.0, 1.0, 1000.0])
+    np.testing.assert_allclose(observed.sigma, [80.0, 2e-4, 50.0])
 
 
 def adjusted_to(ratio, stated, side=4000):

@@ -1,5 +1,6 @@
 """Stages of a reconstruction whose parts are given."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
@@ -45,6 +46,47 @@ def test_the_photographs_are_matched_with_the_cameras_that_the_matches_gave(run,
         run.cameras = Cameras((guess,), (0, 0, 0), (None,), calibrated, ())
         run._find_cameras([], [])
         assert run.cameras.cameras == (camera,) and run.cameras.camera_of == (0, 0, 0)
+
+
+@pytest.mark.parametrize("wrong, warned", [(0, False), (1, False), (20, True)])
+def test_many_contradictory_pairs_are_warned_of(run, monkeypatch, wrong, warned):
+    """A few are wrong matches; many, an object that repeats itself."""
+    pairs = [SimpleNamespace(images=(0, 1))] * 20
+    run.cameras = Cameras((), (), (), True, ())
+    monkeypatch.setattr(reconstruct, "verify", lambda *_: pairs)
+    found = pairs, [SimpleNamespace(images=(1, 2))] * wrong
+    monkeypatch.setattr(reconstruct, "without_contradicted", lambda *_: found)
+    assert run._verify([], []) == pairs
+    assert bool(run.notes) == (wrong > 0)
+    said = " ".join(words for _, words in run.warnings)
+    assert (f"{wrong} of {20 + wrong} pairs contradict others" in said) == warned
+
+
+@dataclasses.dataclass
+class Connection:
+    images: tuple[int, int]
+
+
+@pytest.mark.parametrize("left, parts", [(2, 1), (3, 2)])
+def test_what_is_left_of_a_part_is_another_one_if_it_is_large_enough(run, monkeypatch, left, parts):
+    """Of three photographs or more; fewer are left out with the reason that the first part gave."""
+    n = 5 + left
+    run.photographs = [SimpleNamespace(name=f"{k}.jpg") for k in range(n)]
+    run.names = [photograph.name for photograph in run.photographs]
+    pairs = [Connection((k, k + 1)) for k in range(n - 1)]
+    made = []
+
+    def make(group, *_):
+        made.append(group)
+        reasons = {f"{k}.jpg": "elsewhere" for k in group[5:]} if len(made) == 1 else {}
+        network = SimpleNamespace(images=group)
+        return SimpleNamespace(adjustment=SimpleNamespace(network=network)), reasons
+
+    monkeypatch.setattr(run, "_make_part", make)
+    assert len(run._make_parts([], [], pairs)) == parts
+    assert made == [[*range(n)], [*range(5, n)]][:parts]
+    expected = {f"{k}.jpg": "elsewhere" for k in range(5, n)} if parts == 1 else {}
+    assert run.left_out == expected
 
 
 @pytest.mark.parametrize("confirmed", [True, False])

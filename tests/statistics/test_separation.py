@@ -3,6 +3,7 @@
 import numpy as np
 
 from jaxbundle.leastsquares.equations.separation import choose_together, find_alternatives
+from jaxbundle.leastsquares.quality.correlation import correlation_matrix, total_correlation
 
 CRITICAL, APART = 4.0, 3.29
 
@@ -64,3 +65,18 @@ def test_what_cannot_mask_each_other_goes_together():
     # 0.3·50 could make a test of 15 out of nothing, so 20 is in doubt and 30 is not.
     assert choose(0.3) == [0, 2, 4]
     assert choose(1.0) == [0, 4]
+
+
+def test_correlations_of_a_covariance_matrix():
+    """Held unknowns have none; a total correlation is that of an unknown with all others together,
+    1 − σ²(given the others)/σ²."""
+    rng = np.random.default_rng(3)
+    A = rng.normal(size=(9, 4))
+    C = np.zeros((5, 5))
+    C[np.ix_([0, 1, 3, 4], [0, 1, 3, 4])] = A.T @ A
+    found = correlation_matrix(C)
+    expected, free = np.eye(5), [0, 1, 3, 4]
+    expected[np.ix_(free, free)] = np.corrcoef(np.concatenate([A, -A]), rowvar=False)
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    alone = 1 / np.diag(np.linalg.inv(A.T @ A))
+    np.testing.assert_allclose(total_correlation(A.T @ A), 1 - alone / np.diag(A.T @ A))

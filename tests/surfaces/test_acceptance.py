@@ -61,12 +61,37 @@ def test_an_image_is_shifted_by_what_its_matches_are_beside_their_lines(monkeypa
         np.testing.assert_allclose(other.shift, [-found, 2.0])
 
 
+@pytest.mark.parametrize("likely", [30, 11])
+def test_only_corners_that_correlate_say_how_far_an_image_is_shifted(monkeypatch, likely):
+    """The others are somewhere; fewer than twelve say nothing."""
+    n, across = 80, np.array([0.0, 1.0])
+    uv = np.column_stack([np.arange(n), np.zeros(n)]).astype(float)
+    rho = np.where(np.arange(n) < likely, 0.9, 0.3)
+
+    def refine(base, other, uv, start, *_):
+        off = np.where(uv[:, 0] < likely, 0.5, 9.0)
+        good = np.full(len(uv), int(MatchingStatus.CONVERGED))
+        return SimpleNamespace(status=good, rho=np.ones(len(uv)), uv=start + off[:, None] * across)
+
+    monkeypatch.setattr(relative, "search", lambda *_: (np.ones(n), rho, None))
+    monkeypatch.setattr(relative, "windows", lambda *_: SimpleNamespace(A=None))
+    monkeypatch.setattr(relative, "positions", lambda base, other, uv, q: uv[:, None])
+    monkeypatch.setattr(relative, "refine", refine)
+    base = SimpleNamespace(points=lambda uv, q: None)
+    given = base, None, (None, [None]), uv, np.ones((n, 2)), across, relative.AlignmentSettings()
+    assert relative._median_offset(*given) == (0.5 if likely == 30 else None)
+
+
 @pytest.mark.parametrize("side", [-1, 1])
 def test_windows_at_the_edge_of_the_other_image_are_not_matched(side):
     """Beyond it there are no grey values; they would be those of the edge."""
     image = SimpleNamespace(grey=np.random.default_rng(0).uniform(size=(60, 60)), size=(60, 60))
     start = np.array([[29.5 + side * 25.0, 30.0]])
-    found = refine(image, image, np.array([[30.0, 30.0]]), start, np.eye(2)[None], 4)
+    base = np.array([[30.0, 30.0]])
+    found = refine(image, image, base, start, np.eye(2)[None], 4)
+    assert found.status == int(MatchingStatus.OUTSIDE) and np.isnan(found.rho).all()
+    # nor are windows of no shape, as beside the end of the range of a camera
+    found = refine(image, image, base, base, np.full((1, 2, 2), np.nan), 4)
     assert found.status == int(MatchingStatus.OUTSIDE) and np.isnan(found.rho).all()
 
 

@@ -79,6 +79,12 @@ def test_lonely_and_weak_points_go(plane):
     assert len(kept) > 0.97 * len(plane) and kept.X[:, 2].max() < 45
     assert len(drop_weak(plane, 0.06)) == len(plane) // 2
     assert set(drop_weak(plane, least_rays=3).rays) == {3, 4}
+    # A point has no eight neighbours among eight: nothing is said of its distance from the others.
+    assert len(drop_isolated(plane.take(np.arange(8)))) == 8
+    without = dataclasses.replace(plane, covariance=np.full_like(plane.covariance, np.nan))
+    with pytest.raises(InputError, match="the cloud has no σ: columns sX, sY, sZ"):
+        drop_weak(without, 0.06)
+    assert len(drop_weak(without, least_rays=3)) == (plane.rays > 2).sum()
 
 
 @pytest.mark.parametrize("kind", ["csv", "ply", "las", "laz"])
@@ -106,6 +112,18 @@ def test_any_name_of_an_image_comes_back_from_ply(plane, tmp_path):
     write_cloud(dataclasses.replace(plane, images=names, image=np.arange(len(plane)) % 2), path)
     back = read_cloud(path)
     assert back.images == names and (back.image == np.arange(len(plane)) % 2).all()
+
+
+@pytest.mark.parametrize("wrong", [-1, 2])
+def test_a_cloud_that_numbers_an_image_it_does_not_name_is_one_without_images(
+    plane, tmp_path, wrong
+):
+    """Its points are read all the same; −1 would be the last image, and 2 of two an error later."""
+    path, few = tmp_path / "cloud.ply", plane.take(np.arange(3))
+    write_cloud(dataclasses.replace(few, image=np.array([0, 1, wrong])), path)
+    back = read_cloud(path)
+    assert back.images == ("",) and not back.image.any() and np.isnan(back.uv).all()
+    np.testing.assert_array_equal(back.X, few.X)
 
 
 def test_a_drawing_passes_the_audit(plane, tmp_path):
@@ -166,6 +184,18 @@ def test_heights_of_a_dsm_are_as_good_as_its_sigma_says(plane, tmp_path):
         assert raster.descriptions == ("sigma of height",)
 
 
+def test_a_height_far_from_the_others_of_its_cell_is_left_out():
+    """By more than three σ; a cell of equal heights is given the σ of a slope, 0.3 of its size."""
+    X = np.array([[0.5 + k / 100, 0.5, 30.0] for k in range(8)])
+    n, C = len(X) + 1, np.tile(np.eye(3), (len(X) + 1, 1, 1))
+    for up, count in ((0.85, 9), (0.95, 8)):
+        points = np.vstack([X, [0.5, 0.5, 30 + up]])
+        cloud = Cloud(points, C, np.full(n, 2), np.zeros(n, int), np.zeros((n, 2)), ("a",))
+        dsm = make_dsm(cloud, 1.0)
+        assert dsm.count.tolist() == [[count]]
+        np.testing.assert_allclose(dsm.height, 30 + (up / 9 if count == 9 else 0))
+
+
 def test_gaps_of_a_dsm_are_filled_inside_only(plane):
     hole = ((plane.X[:, :2] - [500_000, 5_000_000] > 9.9) &
             (plane.X[:, :2] - [500_000, 5_000_000] < 12.1)).all(1)  # fmt: skip
@@ -216,15 +246,28 @@ def test_the_report_counts_by_classes(plane):
     check = np.array([[500_010, 5_000_010, 31.0], [500_020, 5_000_010, 33.0]])
     at = at_check_points(plane, check, 2.0)
     assert at["points"] == 2 and at["rms_Z"] < 0.05
+    # The six points of two rows are twice the unknowns of their plane; five are too few.
+    X = np.array([[x, y, 2 * x - y + 7.0] for x in (-1, 0, 1) for y in (-1, 1)])
+    six = Cloud(X, np.zeros((6, 3, 3)), np.full(6, 2), np.zeros(6, int), np.zeros((6, 2)), ("a",))
+    at = at_check_points(six, np.array([[0.0, 0.0, 6.5]]), 2.0)
+    assert at["points"] == 1 and at["mean_Z"] == pytest.approx(0.5)
+    assert at_check_points(six.take(np.arange(5)), np.zeros((1, 3)), 2.0)["points"] == 0
     assert to_plane(plane.X)["rms"] == pytest.approx(0.05 * np.sqrt(2.5) / np.sqrt(1.05), rel=0.05)
 
 
 def test_the_report_says_what_its_sigma_contains(plane):
+    image = {"image": "a", "with": ["b"], "matched": 4, "points": 9, "variance_factor": 1.25,
+             "rejected": {"narrow angle": 5}}  # fmt: skip
     told = text_of({
-        "points": len(plane), "rays": {}, "images": [], "accuracy": accuracy_of(plane),
+        "points": len(plane), "rays": {}, "images": [image], "accuracy": accuracy_of(plane),
         "sigma_includes": ["matching", "orientation"],
+        "check_points": {"points": 3, "rms_Z": 0.25, "mean_Z": -0.125, "largest_Z": 0.5},
     })  # fmt: skip
     assert "σ contains: matching, orientation" in told.splitlines() and "holds" not in told
+    row = told.splitlines().index("a with b: 4 of 9 points, variance factor 1.25")
+    assert told.splitlines()[row + 1].split() == ["5", "narrow", "angle"]
+    checked = "3 check points: RMS of heights 0.25, mean -0.125, largest 0.5"
+    assert told.splitlines()[-1] == checked
 
 
 def test_clouds_are_compared_along_normals(plane):

@@ -6,9 +6,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from jaxbundle.errors import InputError
 from jaxbundle.surfaces import matching
 from jaxbundle.surfaces.bounds import bounds_from_points
-from jaxbundle.surfaces.pairs import choose_partners, score
+from jaxbundle.surfaces.pairs import choose_partners, parse_partners, score
+from jaxbundle.surfaces.reconstruct import ground_bounds
+from jaxbundle.surfaces.scanner_views import RpcView
 
 HEIGHT = 100.0
 
@@ -95,3 +98,32 @@ def test_the_scatter_of_points_in_one_column_of_the_grid(monkeypatch):
     settings = dataclasses.replace(matching.MatchingSettings(), block_side=3)
     assert matching._shape_variance(table, found, 0.5, settings) is None
     assert shapes == [(n, 1)]
+
+
+def test_pairs_are_given_by_names_the_base_first():
+    names = ["a.jpg", "b.jpg", "c.jpg"]
+    found = parse_partners(["b.jpg, a.jpg", "a.jpg,b.jpg,c.jpg", "b.jpg,c.jpg,a.jpg"], names)
+    assert found == {1: [0, 2], 0: [1, 2]}
+
+
+@pytest.mark.parametrize("text, said", [
+    ("a.jpg", "BASE,OTHER"), (" , ", "BASE,OTHER"),
+    ("a.jpg,d.jpg", "no image 'd.jpg'"), ("a.jpg,b.jpg,a.jpg", "cannot be matched with itself"),
+])  # fmt: skip
+def test_pairs_that_are_none_are_refused(text, said):
+    with pytest.raises(InputError, match=said):
+        parse_partners([text], ["a.jpg", "b.jpg"])
+
+
+def test_bounds_of_satellite_images_are_given_or_those_of_their_coefficients():
+    """Heights that all of them have; a line scanner has no range of its own."""
+    rpc = [object.__new__(RpcView) for _ in range(2)]
+    for view, middle in zip(rpc, (200.0, 230.0)):
+        view.rpc = SimpleNamespace(height_offset=middle, height_scale=100.0)
+    scanner = Vertical(0.0)
+    found, said = ground_bounds([scanner, *rpc], None)
+    assert "heights from 130 to 300 are searched" in said[0] and len(found) == 3
+    assert [bounds.q for bounds in found] == [(130.0, 300.0)] * 3
+    assert ground_bounds([scanner], (0.0, 9.0))[1] == ()
+    with pytest.raises(InputError, match="line scanner images need --zmin and --zmax"):
+        ground_bounds([scanner], None)

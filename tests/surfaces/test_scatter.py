@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from jaxbundle.surfaces.scatter import missing_sigma, scatter_factor
+from jaxbundle.surfaces.scatter import (
+    CHI2_MEDIAN,
+    MIN_VALUES,
+    _blocks,
+    missing_sigma,
+    robust_factor,
+    scatter_factor,
+)
 
 SIDE, MEDIAN = 16, 0.5
 
@@ -39,3 +46,24 @@ def test_few_values_tell_nothing():
     d = np.full((256, 256), np.nan)
     d[::4, ::4] = smooth_surface(0.02, 4)[::4, ::4]
     assert missing_sigma(d, np.full_like(d, 0.02), np.ones_like(d), 1, SIDE, MEDIAN) is None
+
+
+def test_every_third_difference_is_used():
+    """Of n columns there are n − 3 steps, each with the σ √(1 + 9 + 9 + 1)·σ; those of a surface of
+    second order are noise alone."""
+    step, sigma, blocks = 2, 0.1, 2
+    a = np.random.default_rng(5).normal(size=(SIDE, blocks * SIDE + 3 * step))
+    found = np.concatenate(_blocks(a, np.full_like(a, sigma), step, SIDE), axis=1)
+    third = a
+    for _ in range(3):
+        third = third[:, step:] - third[:, :-step]
+    np.testing.assert_allclose(found**2, third**2 / (20 * sigma**2))
+
+
+def test_a_factor_of_few_values_is_the_given_one():
+    """The median of squares of normal errors is that of χ² with one degree of freedom, 0.4549."""
+    ratio = 2.0 * np.random.default_rng(6).normal(size=20_000)
+    assert robust_factor(ratio) == pytest.approx(4, rel=0.05)
+    assert pytest.approx(0.4549, abs=1e-4) == CHI2_MEDIAN
+    few = np.append(ratio[:MIN_VALUES], np.nan)
+    assert robust_factor(few, 1.7) == 1.7 and robust_factor(few) == 1.0

@@ -71,6 +71,8 @@ def test_a_project_becomes_a_cloud_and_a_dsm(project, tmp_path, command, monkeyp
     for row in report["images"]:
         assert row["matched"] + sum(row["rejected"].values()) == row["points"]
     assert "project.toml" in first and "computed 2001-09-09 01:46 UTC, jaxbundle" in first
+    # the step is the given one: nothing was thinned
+    assert not any("--step 1 takes all" in said for said in report["warnings"])
     assert report["check_points"]["points"] == 9 and report["check_points"]["rms_Z"] < 0.05
     with rasterio.open(out / "dsm.tif") as raster, rasterio.open(out / "orthophoto.tif") as photo:
         assert raster.res == photo.res == (0.25, 0.25) and photo.dtypes == ("uint8",)

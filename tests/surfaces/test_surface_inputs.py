@@ -3,6 +3,7 @@ colours, large rasters by blocks."""
 
 import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -89,6 +90,30 @@ def test_one_input_is_an_image_by_its_name_or_a_project():
         assert scanner_inputs.is_ground_image(Path(name)), name
     for name in ("project", "images.csv", "project.toml"):
         assert not scanner_inputs.is_ground_image(Path(name)), name
+
+
+@pytest.mark.parametrize("name, kind", [
+    ("a.tif", "rpc"), ("a.RPB", "rpc"), ("a_RPC.TXT", "rpc"), ("rpc.xml", "rpc"),
+    ("attitude.XML", "scanner"), ("a.toml", "scanner"), ("a.json", "scanner"),
+    ("a.dim", "scanner"), ("a.IMD", "scanner"),
+])  # fmt: skip
+def test_a_file_is_read_as_what_its_name_says_or_its_content(tmp_path, monkeypatch, name, kind):
+    """XML is of polynomials or of a scanner: the first, if it can be read as such."""
+    path, raster = tmp_path / name, tmp_path / "a.tif"
+    path.write_bytes(b"")
+
+    def read_rpc(given):
+        if given.name == "attitude.XML":
+            raise InputError("no coefficients")
+        return "rpc"
+
+    scanner = SimpleNamespace(image="image", earth="earth")
+    monkeypatch.setattr(scanner_inputs, "read_rpc", read_rpc)
+    monkeypatch.setattr(scanner_inputs, "find_coefficients", lambda given: given)
+    monkeypatch.setattr(scanner_inputs, "read_scanner", lambda _: scanner)
+    monkeypatch.setattr(scanner_inputs, "find_raster", lambda *_: raster)
+    expected = "rpc" if kind == "rpc" else ("image", "earth")
+    assert scanner_inputs._orientation(path, None) == (expected, raster)
 
 
 def test_a_joint_covariance_of_orientations_and_camera_moves_points_as_it_says(tmp_path):

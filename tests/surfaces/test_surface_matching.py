@@ -11,9 +11,10 @@ from surface_scenes import CAMERA, F, hills, photographs, two_shapes
 from jaxbundle.measure.least_squares_matching import MatchingStatus
 from jaxbundle.surfaces import correlation
 from jaxbundle.surfaces.correlation import find_peaks, make_pyramid, slide
-from jaxbundle.surfaces.dense_cloud import combine
+from jaxbundle.surfaces.dense_cloud import _inverse_distance, combine
+from jaxbundle.surfaces.disparity_refinement import Disparities
 from jaxbundle.surfaces.reconstruct import find_bounds, reconstruct_surface
-from jaxbundle.surfaces.rectification import rectify
+from jaxbundle.surfaces.rectification import RectifiedPair, rectify
 from jaxbundle.surfaces.subpixel_matching import refine
 from jaxbundle.surfaces.views import FrameView, is_inside, line_of_sight, steps_on_plane
 from jaxbundle.types import present
@@ -75,6 +76,11 @@ def test_bounds_are_found_without_heights():
     assert not told and bounds[0].q[0] < q.min() and q.max() < bounds[0].q[1]
     bounds, told = find_bounds(views, NONE)
     assert "--zmin" in told[0] and bounds[0].q[0] < q.min() and q.max() < bounds[0].q[1]
+    assert "in 2 image(s)" in told[0]
+    # Given heights bound the search: nothing is guessed, but of an image that is between them.
+    assert find_bounds(views, NONE, (-1.5, 3.0))[1] == ()
+    (said,) = find_bounds(views, NONE, (-1.5, 12.0))[1]
+    assert "in 2 image(s)" in said and "the heights are all around it" in said
 
 
 def test_the_bounds_of_heights_are_those_along_the_ray(pair):
@@ -247,6 +253,24 @@ def test_one_camera_before_the_other_cannot_be_rectified(pair):
     views, truth, _ = pair
     below = FrameView("below", views[0].grey, CAMERA, views[0].X0 - [0, 0, 2], np.eye(3))
     assert rectify(views[0], below, truth[0].reshape(-1, 3)) is None
+
+
+def test_disparities_are_interpolated_on_one_surface_only():
+    """Between two surfaces, or beside a gap, the value is that of the nearest pixel: a mean of both
+    would be a point in the air."""
+    row = np.array([2.0, 2.5, 2.75, 9.0, np.nan, 3.0])
+    nothing = np.zeros((4, 6))
+    found = Disparities(np.tile(row, (4, 1)), nothing + 0.1, nothing, 1.0)
+    f, b = 10.0, 2.0
+    pair = RectifiedPair(nothing, nothing, np.zeros(2), 0, np.zeros(3), np.eye(3), f, b)
+    x = np.array([0.25, 1.5, 2.25, 2.75, 3.25, 4.25, 5.5])
+    d = np.column_stack([x / f, np.full(len(x), 1.5 / f), np.ones(len(x))])
+    base = SimpleNamespace(X0=np.zeros(3))
+    q, sigma = _inverse_distance(base, d, pair, found, 1.0)
+    nan = np.nan
+    # 1/depth = disparity/(f·b); outside the image there is none
+    np.testing.assert_allclose(q * f * b, [2.125, 2.625, 2.75, 9.0, 9.0, nan, nan])
+    np.testing.assert_allclose(sigma * f * b, [0.1] * 6 + [nan])
 
 
 def test_pairs_that_disagree_are_left_out_where_no_third_decides():

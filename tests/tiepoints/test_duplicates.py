@@ -73,3 +73,11 @@ def test_a_chain_of_nearly_equal_photographs_keeps_every_second_one(original):
     pairs = [every_match(i, j, NUMBER) for i in range(4) for j in range(i + 1, 4)]
     found = find_duplicates(pairs, moved, [SIZE] * 4)
     assert {k: v[0] for k, v in found.items()} == {1: 0, 3: 2}
+
+
+@pytest.mark.parametrize("rows, found", [(2000, True), (1990, True), (1900, False)])
+def test_photographs_of_another_shape_do_not_show_the_same(original, rows, found):
+    """Stretched to the same frame their features would; whole pixels of a reduced one are no other
+    shape."""
+    stretched = (original + 0.5) * [1, rows / 2000] - 0.5
+    assert bool(look(original, stretched, (3000, rows))) == found

@@ -2,6 +2,7 @@
 
 import dataclasses
 from itertools import combinations
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,8 @@ from scipy.spatial.transform import Rotation
 
 import jaxbundle
 from jaxbundle.errors import InputError
+from jaxbundle.orientation import batched
+from jaxbundle.tiepoints import camera_starts, verification
 from jaxbundle.tiepoints.camera_starts import start_cameras
 from jaxbundle.tiepoints.closure import (
     ClosureMinimum,
@@ -147,6 +150,28 @@ def test_rotations_close_with_the_right_principal_distance_and_distortion():
     assert few.parameters["fx"] == pytest.approx(by_pairs["fx"], rel=1e-12)
 
 
+def test_a_lens_is_found_from_the_pairs_of_its_own_photographs(monkeypatch):
+    """A pair of two lenses determines neither of them alone."""
+    def estimate(camera, pairs, *_):
+        used.append([len(a) for a, _ in pairs])
+        return SimpleNamespace(camera=camera, pairs=[])
+
+    used = []
+    monkeypatch.setattr(camera_starts, "estimate_interior", estimate)
+    monkeypatch.setattr(camera_starts, "_choose_pairs", lambda pairs, *_: pairs)
+    start = {"fx": F, "fy": F, "cx": 599.5, "cy": 449.5, "k1": 0.0}
+    cameras = [jaxbundle.Camera(id, "opencv", start, image_size=SIZE) for id in "abc"]
+    features = [features_at(np.zeros((40, 2)))] * 5
+    numbers = {(0, 1): 10, (0, 2): 12, (1, 3): 14, (2, 3): 16, (3, 4): 18}
+    matches = [
+        FeatureMatches(pair, np.zeros((n, 2), int), np.full(n, 0.5), np.ones(n, bool))
+        for pair, n in numbers.items()
+    ]
+    # photographs 0, 1 and 2 are of the cameras a and b, which share a lens
+    start_cameras(cameras, [0, 0, 1, 2, 2], [0, 0, 1], [False] * 3, features, matches)
+    assert used == [[10, 12], [18]]
+
+
 def test_a_first_principal_distance_without_loops_is_passed_over(monkeypatch):
     """And one with few loops, which close by chance, is not taken for the best."""
     start = np.array([7.0, -0.1])
@@ -192,6 +217,8 @@ def test_numbers_of_matches_and_loops_follow_from_one_another():
     oriented = VerificationSettings().min_matches
     assert MarkSettings().min_moved == oriented
     assert CoplanaritySettings().min_matches * 2 / 3 == oriented
+    # two right matches of which half are right: one chance in 1e5 that no trial has them
+    assert 0.75 ** VerificationSettings().rotation_trials == pytest.approx(1e-5, rel=0.05)
     all_pairs = list(combinations(range(4), 2))
     assert ClosureSettings().min_loops == count_independent(all_pairs) == 2 + 1
 
@@ -205,7 +232,7 @@ def test_matches_need_rays_in_both_photographs():
     assert _with_ideal(ideal, matches).rows[:, 0].tolist() == [0, 3]
 
 
-def test_verification_keeps_true_matches_and_names_what_is_degenerate(cloud):
+def test_verification_keeps_true_matches_and_names_what_is_degenerate(cloud, monkeypatch):
     rng, X, views = cloud
     noise = lambda xy: xy + 3e-4 * rng.normal(size=xy.shape)
     a, b = (noise(seen(X, *views[k])) for k in (0, 3))
@@ -217,7 +244,19 @@ def test_verification_keeps_true_matches_and_names_what_is_degenerate(cloud):
     foreign = rng.uniform(-0.5, 0.5, (2, 60, 2))
     first = [a, noise(seen(X, X0, M)), noise(seen(flat, *views[0])), foreign[0]]
     second = [b, turned, noise(seen(flat, *views[2])), foreign[1]]
+    run, programs = batched.run_in_lanes, []
+
+    def run_in_lanes(program, lanes, *arrays):
+        programs.append((id(program), lanes, tuple(np.shape(a)[1:] for a in arrays)))
+        return run(program, lanes, *arrays)
+
+    monkeypatch.setattr(batched, "run_in_lanes", run_in_lanes)
     found = verify_pairs(first, second, np.full(4, 2e-3))
+    # the programs that are compiled ahead of the matches are those that these need
+    needed = {*programs}
+    programs.clear()
+    verification.prepare()
+    assert {*programs} <= needed and len(programs) == 2
     good, M, base, angle, kind, _ = found[0]
     assert good[~wrong].mean() > 0.97 and good[wrong].mean() < 0.2
     true = views[3][1] @ views[0][1].T
@@ -346,6 +385,17 @@ def test_features_lie_at_the_centres_of_blobs(monkeypatch):
     assert np.abs(np.median(e, axis=0)).max() < 0.05
 
 
+@pytest.mark.parametrize("number, searches", [(99, 2), (101, 1)])
+def test_fewer_than_a_third_of_the_features_are_searched_again(monkeypatch, number, searches):
+    """The time of such a photograph doubles; that of others does not."""
+    searched = []
+    search = lambda *given: searched.append(given[-1]) or ([None] * number, [])
+    monkeypatch.setattr("jaxbundle.tiepoints.features._search", search)
+    settings = FeatureSettings(number=300)
+    find_features(np.zeros((64, 64), np.uint8), settings)
+    assert searched == [settings.contrast, settings.faint_contrast][:searches]
+
+
 def test_faint_features_are_searched_where_there_are_few():
     """Blobs of six grey values: below the contrast of distinct features."""
     true = np.stack(np.meshgrid(np.arange(20, 300, 20), np.arange(20, 220, 20)), -1).reshape(-1, 2)
@@ -368,6 +418,8 @@ def test_the_memory_of_a_search_is_what_was_measured_and_hardly_more():
     assert memory_of_features(3600, 3600, FeatureSettings()) == pytest.approx(
         memory_of_features(1800, 1800, settings)
     )
+    # a small photograph is not enlarged
+    assert memory_of_features(600, 900, FeatureSettings()) == memory_of_features(600, 900, settings)
 
 
 def test_tracks_without_contradictions():
