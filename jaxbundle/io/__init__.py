@@ -31,6 +31,7 @@ _HOME = {
     "jaxbundle.io.results.gis": ("write_geojson", "write_geopackage"),
     "jaxbundle.io.results.ply": ("write_ply",),
     "jaxbundle.io.rasters.correction": ("map_of",),
+    "jaxbundle.io.scanner.csm_writing": ("StateFit", "write_csm_state"),
     "jaxbundle.io.rasters.maps": ("MapGrid", "MapSystem"),
     "jaxbundle.io.scanner.flight": ("FlightFile", "read_flight"),
     "jaxbundle.io.scanner.read": ("read_scanner",),

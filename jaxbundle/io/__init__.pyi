@@ -54,6 +54,8 @@ from jaxbundle.io.results.gis import write_geopackage as write_geopackage
 from jaxbundle.io.results.ply import write_ply as write_ply
 from jaxbundle.io.results.result_project import adjusted_network as adjusted_network
 from jaxbundle.io.results.result_project import readjustable_network as readjustable_network
+from jaxbundle.io.scanner.csm_writing import StateFit as StateFit
+from jaxbundle.io.scanner.csm_writing import write_csm_state as write_csm_state
 from jaxbundle.io.scanner.flight import FlightFile as FlightFile
 from jaxbundle.io.scanner.flight import read_flight as read_flight
 from jaxbundle.io.scanner.read import read_scanner as read_scanner
@@ -72,6 +74,7 @@ __all__ = [
     "MapSystem",
     "OutputFormat",
     "RefineFile",
+    "StateFit",
     "TARGETS",
     "adjusted_network",
     "convert",
@@ -100,6 +103,7 @@ __all__ = [
     "write_colmap_cameras",
     "write_coordinates",
     "write_corners",
+    "write_csm_state",
     "write_dxf",
     "write_geojson",
     "write_geopackage",

@@ -51,8 +51,9 @@ curvature between nodes, (16·10 m)²/8R = 0.5 mm for pixels of 10 m, grows with
 distance of nodes and of the size of pixels."""
 TOLERANCE = 0.02
 """Pixels of the image by which interpolated positions may be wrong where they are tested: a fifth
-of 0.1 pixel, to which images are measured at best. GDAL's default is 0.125. At 0.005 an image of
-10 000 × 10 000 pixels takes as long, at 0.001 half of its blocks are projected point by point."""
+of 0.1 pixel, to which images are measured at best. GDAL's default is 0.125. Of an image with RPC of
+4000 × 4000 pixels, 20° off the nadir, nodes 32 pixels apart serve down to 0.005, 16 apart to 0.001;
+every pixel by itself takes 1.7 times as long (3.05 s of processor instead of 1.75)."""
 HEIGHTS = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
 """Heights of a block at which positions are computed, t above."""
 

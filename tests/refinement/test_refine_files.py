@@ -27,7 +27,9 @@ from jaxbundle.io.scanner.refinement import read_refinement
 from jaxbundle.io.scanner.writing import write_scanner_image
 from jaxbundle.io.text.csv_tables import read_csv, write_csv
 from jaxbundle.pushbroom.image import pose_at
+from jaxbundle.pushbroom.image_to_ground import locate_lines
 from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable
+from jaxbundle.pushbroom.surfaces import Height
 from jaxbundle.refinement import Freedom, refine
 from jaxbundle.refinement.freedom import change_image, change_of, make_form
 from jaxbundle.refinement.refined_image import refined_image
@@ -226,3 +228,24 @@ def test_nothing_free_and_nothing_measured(folder):
     file = read_refinement(folder / "refine.toml")
     with pytest.raises(InputError, match="every unknown is held"):
         refine(*file[:4])
+
+
+@pytest.mark.further
+def test_refined_images_as_model_states(folder):
+    """Read back, a state sees the ground of the refined scanner file."""
+    (folder / "refine.toml").write_text(TEXT.replace("[images]", "csm_states = true\n[images]"))
+    run = CliRunner().invoke(app, [
+        "pushbroom", "refine", str(folder / "refine.toml"), "--out", str(folder / "out"),
+    ])  # fmt: skip
+    assert run.exit_code == 0, run.output
+    one, other = (read_scanner(folder / "out" / name).image for name in ("A.toml", "A.json"))
+    lines, pixels = np.arange(0.0, 600, 37), np.arange(0.0, 400, 31)
+    X = [np.asarray(locate_lines(i, Height(500.0), lines, pixels)) for i in (one, other)]
+    off = float(np.linalg.norm(X[0] - X[1], axis=0).max())
+    told = [line for line in run.output.splitlines() if "model state" in line]
+    # the lens of the scene has a distortion of degree 7, which a state cannot contain: it is told
+    stated = float(told[0].split("up to ")[1].split(" m")[0]) if told else 3e-3
+    assert off < 1.5 * stated + 1e-6
+    (folder / "refine.toml").write_text(TEXT.replace("[images]", "csm_states = 1\n[images]"))
+    with pytest.raises(InputError, match="csm_states is 1; true or false"):
+        read_refinement(folder / "refine.toml")

@@ -39,6 +39,7 @@ def refine(
     from jaxbundle.io.results.result_json import verdict_dict, without_nan
     from jaxbundle.io.scanner.refined_images import (
         describe_refits,
+        describe_states,
         names_of_images,
         write_images,
     )
@@ -75,7 +76,8 @@ def refine(
     page = partial(compose_refinement, result, origin)
     with write_result(json, as_json, out, "pushbroom refine", names, force, html, page) as new:
         if new is not None:
-            write_images(new, file, result)
+            for said in describe_states(write_images(new, file, result)):
+                warn(said)
             rows = point_rows(result)
             write_csv(new / "points.csv", list(rows[0]), [list(row.values()) for row in rows])
             photographs = adjusted_photographs(result)

@@ -1,18 +1,32 @@
-"""The scanner images of a refinement as files: scanner files of rigorous ones, compensated
-coefficients of those with RPC."""
+"""The scanner images of a refinement as files: scanner files of rigorous ones, also model states of
+the Community Sensor Model; compensated coefficients of those with RPC."""
 
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
+import equinox as eqx
+import jax
+import numpy as np
+
+from jaxbundle.geometry.ellipsoid import geodetic
+from jaxbundle.io.scanner.csm_writing import StateFit, write_csm_state
 from jaxbundle.io.scanner.refinement import RefineFile
 from jaxbundle.io.scanner.rpc import write_rpc
 from jaxbundle.io.scanner.writing import names_of, write_scanner_image
+from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.rpc.image import RpcImage
+from jaxbundle.pushbroom.trajectory import attitude_at
 from jaxbundle.refinement import Refinement, RpcScannerImage
+from jaxbundle.system.programs import compile_once
 
 # Pixels that compensated coefficients may be off their bias without a warning: half of what good
 # tie points are measured to. A bias of a pixel leaves some thousandths.
 LARGEST_REFIT = 0.05
+# Metres on the ground that a model state may differ without a warning: a hundredth of a pixel of
+# the finest satellites.
+LARGEST_STATE_ERROR = 3e-3
+STATE_ENDING = ".json"
 
 
 def names_of_images(file: RefineFile) -> list[str]:
@@ -21,19 +35,72 @@ def names_of_images(file: RefineFile) -> list[str]:
         name
         for one in file.images
         for name in (
-            [f"{one.id}{file.rpc_ending}"] if isinstance(one, RpcScannerImage) else names_of(one.id)
+            [f"{one.id}{file.rpc_ending}"]
+            if isinstance(one, RpcScannerImage)
+            else [*names_of(one.id), *([f"{one.id}{STATE_ENDING}"] if file.csm_states else [])]
         )
     ]
 
 
-def write_images(folder: Path, file: RefineFile, result: Refinement) -> None:
-    """Write the refined images into a folder."""
+def write_images(folder: Path, file: RefineFile, result: Refinement) -> dict[str, StateFit]:
+    """Write the refined images into a folder; returns how well model states fit, by image."""
+    fits = {}
+    heights = _mean_height(result)
     for one in file.images:
         image = result.image(one.id)
         if isinstance(image, RpcImage):
             write_rpc(folder / f"{one.id}{file.rpc_ending}", image.rpc)
         else:
             write_scanner_image(folder, one.id, image, one.earth)
+            if file.csm_states:
+                path = folder / f"{one.id}{STATE_ENDING}"
+                fits[one.id] = write_csm_state(
+                    path, _without_corners(image), one.earth, heights, one.id
+                )
+    return fits
+
+
+def describe_states(fits: dict[str, StateFit]) -> Iterator[str]:
+    """Model states that differ from their images, as warnings."""
+    for id, fit in fits.items():
+        if fit.ground > LARGEST_STATE_ERROR:
+            yield (
+                f"image {id!r}: its model state differs by up to {fit.ground:.2g} m on the ground "
+                f"(trajectory {fit.trajectory:.2g}, optics {fit.optics:.2g}, corrections "
+                f"{fit.corrections:.2g})"
+            )
+
+
+def _mean_height(result: Refinement) -> float:
+    """The mean height of the points, where the corrections of states hold."""
+    earth = next((one.earth for one in result.inputs.rigorous if one.earth is not None), None)
+    X = np.asarray(result.positions)
+    if earth is None or not len(X):
+        return 0.0
+    return float(np.mean(np.asarray(geodetic(earth, tuple(X.T))[2])))
+
+
+def _without_corners(image: PushbroomImage) -> PushbroomImage:
+    """The image with Lagrange's polynomials through the quaternions instead of slerp, where these
+    follow it to within twice the 1e-9 rad to which slerp follows the refined attitude: a state,
+    of polynomials as well, would have to follow the corners of slerp."""
+    attitude = image.trajectory.attitude
+    table = dataclasses.replace(attitude.table, method="lagrange", order=7)
+    smooth = dataclasses.replace(attitude, table=table, slerp=False)
+    times = np.asarray(table.times)
+    low, high = (float(image.times.time(line)) for line in (-0.5, image.lines - 0.5))
+    middle = (times[1:] + times[:-1]) / 2
+    middle = middle[(middle > low) & (middle < high)]
+    if len(times) < 8 or not len(middle):
+        return image
+    one, other = (np.asarray(_rotations(a, middle)) for a in (attitude, smooth))
+    turn = np.linalg.norm(one - other, axis=(1, 2)) / np.sqrt(2)  # of small rotations
+    if not turn.max() < 2e-9:
+        return image
+    return eqx.tree_at(lambda i: i.trajectory.attitude, image, smooth)
+
+
+_rotations = compile_once(jax.vmap(attitude_at, (None, 0)))
 
 
 def describe_refits(result: Refinement) -> Iterator[str]:

@@ -11,6 +11,7 @@ dem = "terrain.tif"                 # a terrain model, whose heights are observa
 dem_sigma = 5.0                     # of these, metres
 geoid = "egm96.gtx"                 # as of the commands: for heights above the geoid
 rpc_format = "text"                 # text | rpb, of the compensated coefficients in --out
+csm_states = true                   # also write rigorous images as model states of usgscsm
 sigma = 0.5                         # of line and pixel, where the table has none; default 1, a unit
 angle_unit = "deg"                  # rad | deg | gon, of this file and of longitude, latitude
 snooping = "pope"                   # none | baarda | pope
@@ -77,6 +78,7 @@ SECTIONS = {
         "dem_sigma",
         "geoid",
         "rpc_format",
+        "csm_states",
         "sigma",
         "angle_unit",
         "snooping",
@@ -94,7 +96,8 @@ RPC_ENDINGS = {"text": "_RPC.TXT", "rpb": ".RPB"}
 
 class RefineFile(NamedTuple):
     """The arguments of `jaxbundle.refinement.refine`; `rpc_ending`: of the names of files with
-    compensated coefficients."""
+    compensated coefficients; `csm_states`: whether rigorous images are written as model states,
+    too."""
 
     images: list[AnyScannerImage]
     points: GroundPoints
@@ -105,6 +108,7 @@ class RefineFile(NamedTuple):
     warnings: tuple[str, ...] = ()
     terrain: HeightModel | None = None
     rpc_ending: str = RPC_ENDINGS["text"]
+    csm_states: bool = False
 
 
 def read_refinement(path: str | Path) -> RefineFile:
@@ -152,7 +156,22 @@ def read_refinement(path: str | Path) -> RefineFile:
         tuple(warnings),
         _read_terrain(section, images),
         RPC_ENDINGS[rpc_format],
+        _wants_states(section, images),
     )
+
+
+def _wants_states(section: TomlSection, images: Sequence[AnyScannerImage]) -> bool:
+    """Whether rigorous images are written as model states."""
+    wanted = section.values.get("csm_states", False)
+    if not isinstance(wanted, bool):
+        raise InputError(f"{section.where}csm_states is {wanted!r}; true or false is expected")
+    local = [one.id for one in images if isinstance(one, ScannerImage) and one.earth is None]
+    if wanted and local:
+        raise InputError(
+            f"{section.where}csm_states: image {local[0]!r} is in a local frame, which model "
+            "states do not have; omit it"
+        )
+    return wanted
 
 
 def _read_terrain(section: TomlSection, images: Sequence[AnyScannerImage]) -> HeightModel | None:
