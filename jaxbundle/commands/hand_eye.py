@@ -20,11 +20,9 @@ from jaxbundle.io.results.result_project import readjustable_network
 from jaxbundle.io.text.csv_tables import read_csv
 from jaxbundle.measure.boards import Board
 from jaxbundle.network.build import add_further
-from jaxbundle.network.kinds.robot_poses import IN_HAND, TABLES, RobotPoses
+from jaxbundle.network.kinds.robot_poses import IN_HAND, PARTS, TABLES, RobotPoses
 from jaxbundle.network.tables import Network
 from jaxbundle.results import TableMethods
-
-PARTS = {"robot positions": 0, "robot rotations": 3}
 
 
 @print_in_one_screen
@@ -76,7 +74,7 @@ class HandEye(TableMethods):
         """σ of a position of the hand (object unit) and of its attitude (unit of angles), estimated
         from the residuals; of those given the median."""
         adjustment, found = self.adjustment, {}
-        for name, first in PARTS.items():
+        for name, first in zip(PARTS, (0, 3)):
             if name in adjustment.sigma_factors:
                 given = float(np.median(self.poses.sigma[:, first : first + 3]))
                 unit = adjustment.angle_scale if first else 1.0

@@ -106,6 +106,8 @@ def _ply(content: bytes) -> Mesh:
     at, vertices, faces = 0, np.zeros((0, 3)), []
     texts = iter(body.split()) if form == "ascii" else None
     for name, number, properties in elements:
+        if not 0 <= number <= len(body) or not properties:
+            raise ValueError(f"{number} elements {name!r} are not in a file of this length")
         types = [order + PLY_TYPES[p[0]] for p in properties if p[0] != "list"]
         plain = len(types) == len(properties)
         if texts is not None:

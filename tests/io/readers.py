@@ -39,6 +39,7 @@ from jaxbundle.io.results.json_lines import JsonLines
 from jaxbundle.io.scanner.asp_points import read_gcp, read_match
 from jaxbundle.io.writing.folders import check_folder, read_marker, replace_folder
 from jaxbundle.measure.boards import Board
+from jaxbundle.network.surface_models import read_mesh
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 ROOM = 1 << 20
@@ -94,6 +95,30 @@ def _(folder):
     from test_boards_of_others import RESULTS
 
     (folder / "results-cam.txt").write_text(RESULTS)
+
+
+CORNERS = ((0.0, 0.0, 1.5), (1.0, 0.0, 0.5), (0.0, 1.0, 0.25), (1.0, 1.0, 0.125))
+
+
+@reader("mesh obj", lambda f: read_mesh(f / "mesh.obj"))
+def _(folder):
+    lines = [f"v {x} {y} {z}" for x, y, z in CORNERS]
+    (folder / "mesh.obj").write_text("\n".join([*lines, "f 1/1 2/2 3/3", "f 2 4 -2", ""]))
+
+
+for form in ("ascii", "binary_little_endian"):
+    @reader(f"mesh ply {form}", lambda f: read_mesh(f / "mesh.ply"))
+    def _(folder, form=form):
+        head = (f"ply\nformat {form} 1.0\nelement vertex 4\nproperty float x\nproperty float y\n"
+                "property float z\nelement face 2\nproperty list uchar int vertex_indices\n"
+                "end_header\n")  # fmt: skip
+        if form == "ascii":
+            rows = [" ".join(map(str, v)) for v in CORNERS]
+            body = "\n".join([*rows, "3 0 1 2", "3 1 3 2", ""]).encode()
+        else:
+            body = b"".join(struct.pack("<fff", *v) for v in CORNERS)
+            body += struct.pack("<BiiiBiii", 3, 0, 1, 2, 3, 1, 3, 2)
+        (folder / "mesh.ply").write_bytes(head.encode() + body)
 
 
 @reader("control", lambda f: read_control(f / "control.csv"))

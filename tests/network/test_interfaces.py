@@ -294,3 +294,13 @@ def test_predicted_precision_is_through_the_interface(above):
     found = jaxbundle.precision(problem, data)
     sigma = np.stack([result.points[f"s{a}"] for a in "XYZ"], 1) / result.sigma0
     np.testing.assert_allclose(found.points, sigma, rtol=2e-3)
+
+
+def test_an_interface_in_the_project_file(dived, tmp_path):
+    """As an entry, and its σ from there."""
+    path = jaxbundle.write_project(refracted(dived, FLAT).replace(further=()), tmp_path / "port")
+    entry = "\n".join(f"{k} = {v!r}" for k, v in (FLAT | {"sZ": "free", "sindex": 0.002}).items())
+    path.write_text(path.read_text() + f"\n[[interface]]\n{entry}\n")
+    (one,) = jaxbundle.read_network(str(path)).further
+    assert one.camera == ("cam",) and one.sigma[0, 2] == np.inf and one.sigma[0, 7] == 0.002
+    assert np.isnan(one.sigma[0, 3:7]).all() and one.value[0, 6] == GLASS

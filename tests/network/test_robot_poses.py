@@ -14,7 +14,7 @@ from jaxbundle.geometry import (
     matrix_from_quaternion,
     omega_phi_kappa_from_matrix,
 )
-from jaxbundle.io.results.result_project import adjusted_network
+from jaxbundle.io.results.result_project import adjusted_network, readjustable_network
 from jaxbundle.leastsquares.problem import with_data
 from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.network.kinds.fit_hand_eye import Rigid, motions, solve
@@ -229,6 +229,10 @@ def test_repeatability_is_a_variance_component(seen):
     assert result.sigma_factors["robot positions"] == pytest.approx(3, rel=0.4)
     assert result.sigma_factors["robot rotations"] == pytest.approx(3, rel=0.4)
     assert "robot positions" in result.report()
+    again = readjustable_network(result).further[0].sigma
+    for name, k in (("robot positions", 0), ("robot rotations", 3)):
+        expected = result.sigma_factors[name] * (SIGMA_R if k else SIGMA_P)
+        np.testing.assert_allclose(again[:, k : k + 3], expected)
 
 
 def test_jacobians(seen):

@@ -8,7 +8,13 @@ from jaxtyping import Float
 
 from jaxbundle.cameras import get_model
 from jaxbundle.network.camera_tables import with_start
-from jaxbundle.network.kinds import CameraParameters, ExteriorPriors, Further, Interfaces
+from jaxbundle.network.kinds import (
+    CameraParameters,
+    ExteriorPriors,
+    Further,
+    Interfaces,
+    RobotPoses,
+)
 from jaxbundle.network.kinds.base import among
 from jaxbundle.network.tables import ESTIMATED, Camera, Images, Network, Points
 from jaxbundle.network.undetermined import keep_points, without_distances
@@ -234,6 +240,8 @@ def _further(adjustment: "Adjustment") -> list[Further]:
             continue
         first, *_ = [problem.observations_of(next(names)) for _ in range(number)]
         factor = adjustment.sigma_factors.get(first.kind.name, 1.0)
+        if isinstance(table, RobotPoses) and number > 1:
+            table, factor = table.rescale(adjustment.sigma_factors), 1.0
         for name, power in (("sigma", 1), ("covariance", 2)):
             if factor != 1 and hasattr(table, name):
                 changed: dict = {name: getattr(table, name) * factor**power}

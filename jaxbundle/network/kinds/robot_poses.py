@@ -69,6 +69,7 @@ PLACE, SIGMAS = ("X", "Y", "Z"), ("sX", "sY", "sZ", "srx", "sry", "srz")
 QUATERNION = ("qw", "qx", "qy", "qz")
 ATTITUDES = (QUATERNION, ("rx", "ry", "rz"), ("roll", "pitch", "yaw"), ("omega", "phi", "kappa"))
 COVARIANCE = tuple(f"c{i + 1}{j + 1}" for i in range(6) for j in range(i, 6))
+PARTS = ("robot positions", "robot rotations")
 FEWEST = 3
 # Of half of a rotation of 180°, whose axis is undetermined: no division by 0 there.
 SMALLEST_COSINE = 1e-12
@@ -178,6 +179,12 @@ class RobotPoses(Further):
     def number_of_equations(self) -> int:
         return 6
 
+    def rescale(self, factors: Mapping[str, float]) -> "RobotPoses":
+        """With σ multiplied by the factors of positions and rotations, by the names of their
+        kinds."""
+        each = np.repeat([factors.get(name, 1.0) for name in PARTS], 3)
+        return dataclasses.replace(self, sigma=self.sigma * each)
+
     @property
     def type(self) -> str:
         """Where the camera is."""
@@ -240,9 +247,10 @@ class RobotPoses(Further):
             axes = (*PLACE, "rx", "ry", "rz")
             kind = Kind("robot poses", HandPose(self.type), of, axes, POSE_UNITS)
             return [kind(rows, measured, covariance=self.covariance)]
-        parts = (("robot positions", 0, PLACE, "length"), ("robot rotations", 3, None, "angle"))
+        axes, units = (PLACE, ("rx", "ry", "rz")), ("length", "angle")
+        parts = zip(PARTS, (0, 3), axes, units)
         return [
-            Kind(name, HandPart(self.type, first), of, axes or ("rx", "ry", "rz"), units)(
+            Kind(name, HandPart(self.type, first), of, axes, units)(
                 rows, measured, sigma=self.sigma[:, first : first + 3]
             )
             for name, first, axes, units in parts
