@@ -41,7 +41,7 @@ class Mesh(NamedTuple):
     triangles: Int[np.ndarray, "m 3"]
 
 
-class HeightGrid(NamedTuple):
+class TerrainGrid(NamedTuple):
     """Heights [rows, columns], NaN for voids; the place of the first node, and the steps along X of
     columns and along Y of rows."""
 
@@ -154,7 +154,7 @@ def _binary_rows(
     return rows, at
 
 
-def read_grid(path: str | Path) -> HeightGrid:
+def read_grid(path: str | Path) -> TerrainGrid:
     """The heights of a raster in the coordinates of its map, north up.
 
     **Raises:** `InputError`, also without the package rasterio."""
@@ -165,7 +165,7 @@ def read_grid(path: str | Path) -> HeightGrid:
 
 
 @lru_cache(maxsize=4)
-def _read_grid(path: str, _: int) -> HeightGrid:
+def _read_grid(path: str, _: int) -> TerrainGrid:
     try:
         import rasterio
     except ImportError:
@@ -177,7 +177,7 @@ def _read_grid(path: str, _: int) -> HeightGrid:
         raise InputError(f"{path}: the grid is rotated; expected rows along X, columns along Y")
     # heights are of the centres of pixels
     origin = (place.c + 0.5 * place.a, place.f + 0.5 * place.e)
-    return HeightGrid(heights, origin, (place.a, place.e))
+    return TerrainGrid(heights, origin, (place.a, place.e))
 
 
 def triangles_near(
@@ -214,7 +214,7 @@ def distances_to_triangles(
 
 
 def heights_near(
-    grid: HeightGrid, X: Float[np.ndarray, "points 3"]
+    grid: TerrainGrid, X: Float[np.ndarray, "points 3"]
 ) -> tuple[Float[np.ndarray, "points nodes nodes"], Float[np.ndarray, "points 2"]]:
     """A part of a grid around every point, and the place of its first node; NaN beyond edges."""
     padded = np.pad(grid.heights, REACH, constant_values=np.nan)

@@ -220,9 +220,21 @@ def find_change(
         numbers = [int(k) for k in np.unique(labels[known]) if k]
         regions = tuple(volume(k, known & (labels == k)) for k in numbers)
     return SurfaceChange(
-        d, sigma, sign, before.x, before.y, before.size, before.system, level, limit, together,
-        float(robust_sigma(rest[quiet])), len(L), volume(0, known), regions,
-    )  # fmt: skip
+        d,
+        sigma,
+        sign,
+        before.x,
+        before.y,
+        before.size,
+        before.system,
+        level,
+        limit,
+        together,
+        float(robust_sigma(rest[quiet])),
+        len(L),
+        volume(0, known),
+        regions,
+    )
 
 
 def _shared_errors(
@@ -285,9 +297,13 @@ def _volume(
     shared = L.sum((1, 2))
     number, a = int(inside.sum()), size**2
     return Region(
-        label, number, number * a, float(d.sum() / number), float(a * d.sum()),
+        label,
+        number,
+        number * a,
+        float(d.sum() / number),
+        float(a * d.sum()),
         float(a * np.sqrt(max(variance, 0.0) + shared @ shared)),
-    )  # fmt: skip
+    )
 
 
 def _significant_regions(

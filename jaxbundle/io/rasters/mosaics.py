@@ -69,10 +69,12 @@ def _virtual(tiles: list[Path]) -> str:
     lefts, tops, rights, bottoms = zip(*bounds)
     left, top = min(lefts), min(tops)
     placed = "".join(
-        part.format(f"<DstRect xOff='{b[0] - left}' yOff='{b[1] - top}' xSize='{b[2] - b[0]}' "
-                    f"ySize='{b[3] - b[1]}'/>")
+        part.format(
+            f"<DstRect xOff='{b[0] - left}' yOff='{b[1] - top}' xSize='{b[2] - b[0]}' "
+            f"ySize='{b[3] - b[1]}'/>"
+        )
         for part, b in zip(parts, bounds)
-    )  # fmt: skip
+    )
     system = "" if crs is None else f"<SRS>{escape(crs.to_wkt())}</SRS>"
     corner = origin[0] + left * step[0], origin[1] + top * step[1]
     return (

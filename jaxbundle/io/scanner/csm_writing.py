@@ -170,10 +170,12 @@ def _between(
 
 def _weights(nodes: Float[np.ndarray, " n"], at: float) -> Float[np.ndarray, " n"]:
     """Lagrange's weights of nodes at a place."""
-    return np.array([
-        np.prod([(at - other) / (node - other) for other in nodes if other != node])
-        for node in nodes
-    ])  # fmt: skip
+    return np.array(
+        [
+            np.prod([(at - other) / (node - other) for other in nodes if other != node])
+            for node in nodes
+        ]
+    )
 
 
 def _lagrange(
@@ -394,9 +396,9 @@ def _description(
     times = [float(image.times.time(line)) for line in (0.0, image.lines - 1.0)]
     surface = Height(level=height, earth=earth)
     pose = pose_at(image, image.middle_time)
-    at = lambda u: np.stack([
-        *ground_point(pose, image.optics.slopes(u), surface, image.corrections)
-    ])  # fmt: skip
+    at = lambda u: np.stack(
+        [*ground_point(pose, image.optics.slopes(u), surface, image.corrections)]
+    )
     ends = at(0.0), at(image.pixels - 1.0)
     swath = float(np.linalg.norm(ends[1] - ends[0]))
     return {

@@ -30,7 +30,7 @@ from jaxbundle.network.columns import Columns, did_you_mean
 from jaxbundle.network.kinds.base import Contribution, Further, check_settings, numbers, rows_of
 from jaxbundle.network.kinds.figures import EXACT_SIGMA, across_rays, sigma_or_exact
 from jaxbundle.network.surface_models import (
-    HeightGrid,
+    TerrainGrid,
     Mesh,
     heights_near,
     read_grid,
@@ -173,7 +173,7 @@ class SurfacePoints(Further):
             mesh = read_mesh(mesh) if isinstance(mesh, str) else Mesh(*map(np.asarray, mesh))
             return ON_MESH, (triangles_near(mesh, X) - origin,)
         grid = given["dem"]
-        grid = read_grid(grid) if isinstance(grid, str) else HeightGrid(*grid)
+        grid = read_grid(grid) if isinstance(grid, str) else TerrainGrid(*grid)
         heights, first = heights_near(grid, X)
         middle = heights.shape[1] // 2
         void = ~np.isfinite(heights[:, middle - 1 : middle + 1, middle - 1 : middle + 1])
