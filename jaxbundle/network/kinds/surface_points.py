@@ -30,8 +30,8 @@ from jaxbundle.network.columns import Columns, did_you_mean
 from jaxbundle.network.kinds.base import Contribution, Further, check_settings, numbers, rows_of
 from jaxbundle.network.kinds.figures import EXACT_SIGMA, across_rays, sigma_or_exact
 from jaxbundle.network.surface_models import (
-    TerrainGrid,
     Mesh,
+    TerrainGrid,
     heights_near,
     read_grid,
     read_mesh,
