@@ -14,13 +14,13 @@ import numpy as np
 
 import jaxbundle
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
-from jaxbundle.measure.ring_targets import codes_in_order
-from jaxbundle.orientation.rays import ideal_points
+from jaxbundle.measure import ring_codes
 from jaxbundle.planning import stations_looking_at
 
 SIZE, FINE = (1024, 768), 4
-PARAMETERS = {"fx": 1100.0, "fy": 1100.0, "cx": 515.2, "cy": 380.9, "k1": -0.08, "k2": 0.02}
-CAMERA = jaxbundle.Camera("cam", "opencv", PARAMETERS, image_size=SIZE)
+K = np.array([[1100.0, 0, 515.2], [0, 1100.0, 380.9], [0, 0, 1]])
+DISTORTION = np.array([-0.08, 0.02, 0.0, 0.0])
+EXACT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
 RADIUS, SIDE, NOISE, BLUR = 9.0, 600.0, 1.5, 0.7
 ENDS, SIGMA = ("4", "15"), 0.01
 CENTRES = 600 * np.array([
@@ -52,7 +52,7 @@ def light(ab, number):
     if not number:
         return disc
     # clockwise as seen from before it
-    code = codes_in_order(14)[int(number) - 1]
+    code = ring_codes(14)[int(number) - 1]
     sector = (np.mod(-t, 2 * np.pi) / (2 * np.pi) * 14).astype(int) % 14
     return disc | ((r > 2) & (r < 3) & (code >> (13 - sector) & 1 == 1))
 
@@ -69,11 +69,13 @@ def photograph(X0, M, rng):
         seen = M @ (centre - X0)
         # without distortion, which moves it by up to ten pixels
         x, y = -seen[:2] / seen[2]
-        at = round(PARAMETERS["cx"] + 1100 * x), round(PARAMETERS["cy"] - 1100 * y)
+        at = round(K[0, 2] + K[0, 0] * x), round(K[1, 2] - K[1, 1] * y)
         u, v = (k + np.arange(-half, half + 1) for k in at)
-        fine = np.stack(np.meshgrid(np.add.outer(u, part).ravel(), np.add.outer(v, part).ravel()), -1)
-        xy = np.asarray(ideal_points(CAMERA, fine.reshape(-1, 2)))
-        rays = np.concatenate([xy, -np.ones((len(xy), 1))], 1) @ M
+        parts = [np.add.outer(k, part).ravel() for k in (u, v)]
+        fine = np.stack(np.meshgrid(*parts), -1)
+        xy = cv2.undistortPoints(fine.reshape(-1, 1, 2), K, DISTORTION, criteria=EXACT)
+        # y upwards, the object before the camera at negative z
+        rays = np.insert(xy.reshape(-1, 2) * [1, -1], 2, -1.0, axis=1) @ M
         s = ((centre - X0) @ normal) / (rays @ normal)
         offset = X0 + s[:, None] * rays - centre
         lit = light(np.stack([offset @ e, offset @ f]) / RADIUS, number)

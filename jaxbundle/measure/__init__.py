@@ -6,6 +6,7 @@ Pixel (0, 0) is the centre of the upper-left pixel, u to the right, v down; a ph
 
 from jaxbundle.measure.board_points import BoardPoints
 from jaxbundle.measure.boards import Board, BoardSet
+from jaxbundle.measure.coded_targets import NamedPoints, find_coded_targets
 from jaxbundle.measure.corners import find_board, find_board_points
 from jaxbundle.measure.cube_filter import filter_cloud
 from jaxbundle.measure.ellipses import Ellipse, circle_centre_shift, fit_ellipse, rim_centre_shift
@@ -17,6 +18,7 @@ from jaxbundle.measure.least_squares_matching import (
     match_least_squares,
 )
 from jaxbundle.measure.matching import Match, correlation, find_match
+from jaxbundle.measure.ring_targets import RingSettings, ring_codes
 from jaxbundle.measure.targets import Target, centre_by_ellipse, centre_by_grey_values
 from jaxbundle.measure.transfer import (
     View,
@@ -38,6 +40,8 @@ __all__ = [
     "LeastSquaresMatch",
     "Match",
     "MatchingStatus",
+    "NamedPoints",
+    "RingSettings",
     "Target",
     "Transformation",
     "View",
@@ -48,6 +52,7 @@ __all__ = [
     "filter_cloud",
     "find_board",
     "find_board_points",
+    "find_coded_targets",
     "find_match",
     "fit_ellipse",
     "fit_fiducials",
@@ -62,4 +67,5 @@ __all__ = [
     "pixel_from_image",
     "read_photograph",
     "rim_centre_shift",
+    "ring_codes",
 ]

@@ -48,7 +48,7 @@ class RingSettings:
 
 
 @functools.cache
-def codes_in_order(bits: int) -> tuple[int, ...]:
+def ring_codes(bits: int) -> tuple[int, ...]:
     """The codes of the printed numbers 1, 2, …: in ascending order."""
     full = 1 << bits
     code = np.arange(1, full - 1)
@@ -70,7 +70,7 @@ def find_ring_targets(
 
     **Arguments:** `numbered`: named by the printed number, without codes that have none; otherwise
     by the code."""
-    number = {c: k for k, c in enumerate(codes_in_order(bits), 1)} if numbered else None
+    number = {c: k for k, c in enumerate(ring_codes(bits), 1)} if numbered else None
     found: list[tuple[float, str, Target]] = []
     for target in find_discs(grey, settings):
         read = _read_code(grey, target, bits, settings)

@@ -8,9 +8,9 @@ from jaxbundle.errors import InputError
 from jaxbundle.measure.coded_targets import find_coded_targets
 from jaxbundle.measure.ring_targets import (
     RingSettings,
-    codes_in_order,
     find_plain_discs,
     find_ring_targets,
+    ring_codes,
 )
 
 SIDE, FINE = 110, 6
@@ -42,10 +42,10 @@ def test_ring_codes_do_not_depend_on_how_the_target_is_turned(bits, code):
 
 def test_printed_numbers():
     """The numbers printed on targets of a surveyed panel; how many targets makers offer."""
-    codes = codes_in_order(14)
+    codes = ring_codes(14)
     for number, code in {2: 135, 22: 215, 37: 291, 62: 437, 74: 489}.items():
         assert codes[number - 1] == code
-    assert len(codes) == 516 and len(codes_in_order(12)) == 147
+    assert len(codes) == 516 and len(ring_codes(12)) == 147
     # turned by any number of sectors no two targets are alike
     turns = {(c << k | c >> (14 - k)) & (2**14 - 1) for c in codes for k in range(14)}
     assert len(turns) == sum(14 // (2 if c >> 7 == c & 127 else 1) for c in codes)
@@ -53,7 +53,7 @@ def test_printed_numbers():
 
 def test_a_target_is_named_by_its_number_and_others_are_not_targets():
     number = 22
-    code = codes_in_order(14)[number - 1]
+    code = ring_codes(14)[number - 1]
     middle = np.array([52.0, 50.0])
     assert find_coded_targets(ring(code, 14, middle, 0.3), "ring14").names == ("22",)
     # an odd number of sectors: one was read wrongly
@@ -61,7 +61,7 @@ def test_a_target_is_named_by_its_number_and_others_are_not_targets():
 
 
 def test_the_ground_of_a_target_may_be_cut_by_the_edge_of_the_photograph():
-    grey = ring(codes_in_order(14)[21], 14, np.array([55.0, 55.0]), 0.3)
+    grey = ring(ring_codes(14)[21], 14, np.array([55.0, 55.0]), 0.3)
     # the ring ends at 24 pixels from the centre; its ground is looked at 27 from it
     assert find_coded_targets(grey[30:], "ring14").names == ("22",)
     assert len(find_coded_targets(grey[40:], "ring14")) == 0
@@ -69,7 +69,7 @@ def test_the_ground_of_a_target_may_be_cut_by_the_edge_of_the_photograph():
 
 def test_plain_discs():
     """Discs beside a coded target, without the sectors of its ring."""
-    grey = ring(codes_in_order(14)[73], 14, np.array([40.0, 40.0]), 0.3)
+    grey = ring(ring_codes(14)[73], 14, np.array([40.0, 40.0]), 0.3)
     cv2.circle(grey, (92, 90), 6, 210, -1, cv2.LINE_AA)
     coded = [target for _, target in find_ring_targets(grey, 14, RingSettings())]
     (disc,) = find_plain_discs(grey, coded, RingSettings())
