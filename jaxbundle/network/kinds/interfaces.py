@@ -42,7 +42,6 @@ from jaxbundle.leastsquares.declarations import Kind, ObservationSet, Table
 from jaxbundle.leastsquares.spaces import Change, Frame, Posed, PoseValue, Triple, Vector
 from jaxbundle.network.columns import Columns, did_you_mean, is_missing
 from jaxbundle.network.kinds.base import Contribution, Further, computed_minus_given
-from jaxbundle.network.kinds.mountings import turn_of
 from jaxbundle.network.rules import check_unique
 from jaxbundle.network.tables import Network
 
@@ -86,12 +85,12 @@ class Refraction:
 
 
 def given_plane(frame: Posed, given: tuple[Array, Array]) -> Float[Array, "3"]:
-    """The shift of a plane along its given normal, and its tilts, against the given point and
-    rotation."""
+    """The shift of a plane along its normal, and its tilts, against the given point and rotation.
+    Of the plane alone, not of where its frame is on it, which has no derivative."""
     X0, M = given
-    shift = M[2] @ (jnp.stack(frame.centre) - X0)
-    turn = turn_of(frame.rotation.matrix() @ M.T)
-    return jnp.stack([shift, turn[0], turn[1]])
+    z = jnp.stack(frame.rotation.apply_inverse((0.0, 0.0, 1.0)))
+    x, y, _ = M @ z
+    return jnp.stack([z @ (jnp.stack(frame.centre) - X0), y, -x])
 
 
 PLANE_PRIOR = ("length", "angle", "angle")
