@@ -52,7 +52,8 @@ def rows(images):
         "tilt": {"free": ["view"], "sigma": {"view": 0.01}},
         "azimuth": {"free": ["declination"], "sigma": {"declination": 0.01}},
         "surface_points": {"surface": ["floor"] * 9, "point": plane, "sigma": [0.01] * 9},
-        "surfaces": {"floor": {"mesh": ([[-3, -3, -1], [3, -3, -1], [0, 4, -1]], [[0, 1, 2]])}},
+        # a plane: the choice of a triangle has no derivative
+        "surfaces": {"floor": {"plane": [0.0, 0.0, -1.0], "normal": [0.0, 0.0, 1.0]}},
         "attitudes": {"image": images}
         | {a: [0.0] * 8 for a in angles} | {f"s{a}": [1e-3] * 8 for a in angles},
         "attitude": {"free": ["boresight"], "sigma": {"boresight": 0.01}},
