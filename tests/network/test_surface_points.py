@@ -13,7 +13,7 @@ import jaxbundle
 from jaxbundle.errors import InputError
 from jaxbundle.network.kinds.surface_points import above_grid, on_mesh
 from jaxbundle.network.surface_models import (
-    HeightGrid,
+    TerrainGrid,
     distances_to_triangles,
     heights_near,
     read_grid,
@@ -156,7 +156,7 @@ def test_heights_are_bilinear():
     heights, origin, step = grid()
     random = np.random.default_rng(4)
     X = np.c_[random.uniform(-2.9, 2.9, (50, 2)), np.zeros(50)]
-    parts, first = heights_near(HeightGrid(heights, origin, step), X)
+    parts, first = heights_near(TerrainGrid(heights, origin, step), X)
     for P, part, at in zip(X, parts, first):
         i, j = (P[0] - origin[0]) / step[0], (P[1] - origin[1]) / step[1]
         c, r = int(i), int(j)
