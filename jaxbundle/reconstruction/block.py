@@ -9,13 +9,11 @@ from jaxtyping import Float
 
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.network.kinds import Antennas
-from jaxbundle.network.tables import Camera
-from jaxbundle.network.units import from_image_unit
 from jaxbundle.orientation import batched
-from jaxbundle.orientation.rays import ideal_points
 from jaxbundle.photographs.exif import Exif
 from jaxbundle.report.layout import significant
 from jaxbundle.system.clock import in_words, now
+from jaxbundle.tiepoints.verified_pairs import central_distance
 
 
 @dataclasses.dataclass(frozen=True)
@@ -176,7 +174,8 @@ def describe_block(result: Adjustment, exif: Mapping[str, Exif], system: str) ->
     of_image = np.array(
         [np.median(depth[image == k]) if (image == k).any() else np.nan for k in range(len(X0))]
     )
-    pixel = np.array([_pixel_angle(camera) for camera in network.cameras])[network.images.camera]
+    c = np.array([central_distance(camera) for camera in network.cameras])
+    pixel = 1 / c[network.images.camera]
     # within 45 degrees of the vertical: in an oblique block the middle of a photograph is not below
     # the camera, and footprints reach to the horizon
     down = bool(system) and float(np.median(M[:, 2, 2])) > 0.7
@@ -216,14 +215,6 @@ def describe_block(result: Adjustment, exif: Mapping[str, Exif], system: str) ->
         places,
         camera_positions(result),
     )
-
-
-def _pixel_angle(camera: Camera) -> float:
-    """The angle of a pixel in the middle of the image."""
-    columns, rows = camera.image_size or (1, 1)
-    middle = np.array([[columns - 1, rows - 1]]) / 2 + [[0.0, 0.0], [1.0, 0.0]]
-    xy, _ = from_image_unit((camera,), np.zeros(2, int), middle, np.ones((2, 2)), "px")
-    return float(np.linalg.norm(np.diff(ideal_points(camera, xy), axis=0)))
 
 
 def _inner(xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:

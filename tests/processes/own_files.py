@@ -101,6 +101,36 @@ def write_calibration(photographs: slice) -> Callable[[Path], None]:
                             SQUARE, "--free", "fx,fy,cx,cy,k1", "--json", path)  # fmt: skip
 
 
+def write_poses(path: Path, result: jaxbundle.Adjustment, in_hand: bool) -> None:
+    """The poses of a robot: its hand 0.1 before the camera, or with the object before it."""
+    from jaxbundle.geometry import matrix_from_omega_phi_kappa, omega_phi_kappa_from_matrix
+
+    rng = np.random.default_rng(6)
+    degree = np.pi / 180
+    rows = ["image,X,Y,Z,omega,phi,kappa"]
+    for id, values in zip(result.network.images.id, result.image_values):
+        X0, angles = values[:3], values[3:]
+        M = np.asarray(matrix_from_omega_phi_kappa(angles))
+        place = X0 - 0.1 * M[2] if in_hand else -M @ X0
+        of_hand = angles if in_hand else np.asarray(omega_phi_kappa_from_matrix(M.T))
+        measured = [*(place + rng.normal(0, 2e-4, 3)), *(of_hand / degree + rng.normal(0, 0.02, 3))]
+        rows.append(f"{id},{','.join(f'{x:.6f}' for x in measured)}")
+    path.write_text("\n".join(rows) + "\n", encoding="utf-8")
+
+
+def write_robot(path: Path) -> None:
+    """With the camera that took `views`."""
+    board = jaxbundle.Board(*BOARD, SQUARE)
+    seen = jaxbundle.calibrate(PHOTOGRAPHS[:6], board)
+    write_poses(path, seen.adjustment, True)
+
+
+def write_arm(path: Path) -> None:
+    """Before the camera of the project."""
+    project = EXAMPLES / "convergent4" / "project.toml"
+    write_poses(path, jaxbundle.adjust(jaxbundle.read_network(project)), False)
+
+
 def copy_photographs(folder: Path, photographs: Iterable[Path]) -> None:
     folder.mkdir(parents=True)
     for path in photographs:
@@ -266,6 +296,8 @@ OWN: dict[str, Callable[[Path], None]] = {
     "made.csv": write_made,
     "views": lambda path: copy_photographs(path, PHOTOGRAPHS[:6]),
     "base.toml": write_camera,
+    "robot.csv": write_robot,
+    "arm.csv": write_arm,
     "photos": write_photos,
     "gcp_list.txt": write_control_of_photos,
     "scanner.toml": write_scanner,

@@ -39,7 +39,6 @@ NOT_RUN = {
     "make test": "the tests themselves",
     "pip install": "installs: `make test-oldest` and `make test-newest` do",
     "srun": "needs SLURM",
-    "--poses robot.csv": "needs the poses of a robot",
     "--join host": "needs two machines",
     "--join machine0": "needs 16 machines",
 }
