@@ -12,6 +12,7 @@ from jaxtyping import Float
 from jaxbundle.adjustment.adjust import adjust
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.calibration import calibrate
+from jaxbundle.choices import HAND_EYE
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.quaternions import matrix_from_quaternion
@@ -22,6 +23,7 @@ from jaxbundle.measure.boards import Board
 from jaxbundle.network.build import add_further
 from jaxbundle.network.kinds.robot_poses import IN_HAND, PARTS, TABLES, RobotPoses
 from jaxbundle.network.tables import Network
+from jaxbundle.reconstruction.adjusting import WRONG_MISFIT
 from jaxbundle.results import TableMethods
 
 
@@ -115,6 +117,7 @@ class HandEye(TableMethods):
             "frame": self.frame.tolist(),
             "covariance": {name: self.covariance(name).tolist() for name in names},
             "repeatability": self.repeatability,
+            "doubts": self.doubts,
             "unknowns": {
                 table: self.adjustment.further_unknowns[table] for table in TABLES[self.poses.type]
             },
@@ -135,7 +138,22 @@ class HandEye(TableMethods):
         for name, value in self.repeatability.items():
             unit = network.object_unit if name == "robot positions" else network.angle_unit
             lines.append(f"repeatability, {name}: σ {value:.3g} {unit}")
-        return "\n".join(lines)
+        return "\n".join([*lines, *(f"warning: {said}" for said in self.doubts)])
+
+    @property
+    def doubts(self) -> list[str]:
+        """Why the result is probably wrong: poses that fit much worse than their σ."""
+        factors = self.adjustment.sigma_factors
+        worse = {name: factors[name] for name in PARTS if factors.get(name, 1) > WRONG_MISFIT}
+        if not worse:
+            return []
+        said = " and ".join(f"{name} {factor:.0f} times" for name, factor in worse.items())
+        other = HAND_EYE[HAND_EYE.index(self.poses.type) - 1]
+        return [
+            f"{said} worse than their σ: is the camera mounted as said ({self.poses.type}, not "
+            f"{other}), do poses and photographs belong together, and are the units and the order "
+            "of the rotations those of the robot?"
+        ]
 
 
 def _matrix(R: Float[np.ndarray, "3 3"], t: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:

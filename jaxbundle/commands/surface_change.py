@@ -15,7 +15,7 @@ from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.io.rasters.reading import check_georeference, open_raster, read_values
 from jaxbundle.io.results.result_json import without_nan
-from jaxbundle.network.columns import did_you_mean, list_some
+from jaxbundle.network.columns import count, did_you_mean, list_some
 from jaxbundle.results import TableMethods
 from jaxbundle.surfaces.change import (
     HeightGrid,
@@ -33,6 +33,11 @@ from jaxbundle.surfaces.views import is_inside
 
 # Errors by name, such as {"vertical": 0.2}.
 Errors = Mapping[str, float]
+
+NOTHING_SHARED = (
+    ": those of the orientations are missing (--before-orientation, --before-error), and σ of "
+    "volumes and of slow changes are too small"
+)
 
 
 @print_in_one_screen
@@ -64,15 +69,17 @@ class ChangeResult(TableMethods):
             f"{found['cells']} cells of both surfaces; at the level {100 * found['level']:g} % "
             f"(|w| > {found['limit']:.3g}) {100 * found['risen']:.3g} % have risen, "
             f"{100 * found['fallen']:.3g} % fallen",
-            f"mean σ of a difference {found['mean_sigma']:.4g}; {found['shared_errors']} errors "
-            f"shared by cells; {found['cells_that_count_as_one']:.3g} cells count as one; σ of "
-            f"cells are {found['sigma_ratio']:.3g} of their scatter's (1 is right)",
+            f"mean σ of a difference {found['mean_sigma']:.4g}; scatter of the cells over their "
+            f"own σ {found['sigma_ratio']:.3g} (1 is right)",
+            f"errors of neighbours are correlated over {found['cells_that_count_as_one']:.3g} "
+            f"cells; {count(found['shared_errors'], 'error')} common to cells"
+            + ("" if found["shared_errors"] else NOTHING_SHARED),
         ]
         for region in (self.change.total, *self.change.regions[:20]):
             name = "all cells" if region.label == 0 else f"region {region.label}"
             lines.append(
                 f"{name}: {region.cells} cells, mean {region.mean:.4g}, volume "
-                f"{region.volume:.6g} ± {region.sigma:.3g}"
+                f"{region.volume:.6g}, σ {region.sigma:.3g}"
             )
         return "\n".join(lines)
 

@@ -371,8 +371,14 @@ def test_the_command_and_the_function(seen, tmp_path, command, capsys):
     told = command("hand-eye", path, "--poses", table, "--sigma-position", SIGMA_P,
                    "--sigma-angle", SIGMA_R, "--json", tmp_path / "out.json")  # fmt: skip
     assert told.status == 0 and "repeatability, robot positions" in told.out
+    assert not found.doubts and "warning" not in str(found)
     with pytest.raises(InputError, match="repeatability"):
         jaxbundle.hand_eye(path, table)
+    # the camera is said to stand before the robot: no pose agrees
+    wrong = jaxbundle.hand_eye(
+        path, table, type="eye-to-hand", sigma_position=SIGMA_P, sigma_angle=SIGMA_R
+    )
+    assert "eye-to-hand, not eye-in-hand" in wrong.doubts[0] and wrong.doubts[0] in str(wrong)
 
 
 @pytest.mark.further
