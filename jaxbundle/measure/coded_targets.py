@@ -69,9 +69,16 @@ def find_coded_targets(
     **Arguments:** `kind`: see the module; `rings`: other than the defaults of `RingSettings`;
     `uncoded`: look for discs without a code, too.
 
-    **Raises:** `InputError` for an unknown kind.
+    **Raises:** `InputError` for an unknown kind, or other values than 8-bit grey ones.
     """
     check_kind(kind)
+    if np.ndim(grey) != 2 or np.asarray(grey).dtype != np.uint8:
+        raise InputError(
+            "grey: expected 8-bit grey values [rows, columns], got "
+            f"{np.asarray(grey).dtype} {list(np.shape(grey))}; `read_photograph` gives them"
+        )
+    # what is masked shows nothing
+    grey = np.ascontiguousarray(np.ma.filled(grey, 0))
     name, _, option = kind.partition(":")
     if name.startswith("ring"):
         return _rings(grey, int(name[4:]), option != "codes", rings or RingSettings(), uncoded)

@@ -98,6 +98,17 @@ def test_corners_of_markers(kind, dictionary):
     assert len(find_coded_targets(twice, kind)) == 0
 
 
+def test_grey_values_of_other_kinds():
+    grey = ring(ring_codes(14)[21], 14, np.array([55.0, 55.0]), 0.3)
+    hidden = np.ma.masked_array(grey, np.arange(SIDE)[:, None] < 60 + 0 * grey)
+    assert len(find_coded_targets(hidden, "ring14")) == 0
+    nothing = np.ma.masked_array(grey, np.zeros(grey.shape, bool))
+    assert find_coded_targets(nothing, "ring14").names == ("22",)
+    for other in (grey / 255.0, np.stack([grey] * 3, -1)):
+        with pytest.raises(InputError, match="expected 8-bit grey values"):
+            find_coded_targets(other, "ring14")
+
+
 def test_unknown_kinds_are_refused():
     grey = np.zeros((50, 50), np.uint8)
     for kind, said in (("ring13", "ring12"), ("aruco:DICT_9", "DICT_9"), ("charuco:8", "8x6")):
