@@ -1,5 +1,6 @@
 """`jaxbundle reconstruct`: photographs to an adjusted network."""
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -106,8 +107,11 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
     )
     found, _ = find_photographs(photos)
     check_writable(json, out, COMMAND, FILES, [*files, *(p.path for p in found)], force, html)
-    with keep_matches(out, force) as store, staging(quiet or json == "-") as tell:
-        advise(f"run the same command again to resume; matches are kept in {store}")
+    # targets are found again in seconds
+    kept = nullcontext() if features == "none" else keep_matches(out, force)
+    with kept as store, staging(quiet or json == "-") as tell:
+        if store is not None:
+            advise(f"run the same command again to resume; matches are kept in {store}")
         result = jaxbundle.reconstruct(
             photos,
             camera=given,

@@ -78,7 +78,9 @@ class ReconstructionSettings:
         one_of("pairs", self.pairs, MATCHED_PAIRS)
         integer("points", self.points)
         if not self.natural_points and self.targets is None:
-            raise InputError("features none: the targets that take their place are missing")
+            raise InputError(
+                "features none: coded targets alone connect the photographs; give targets, such as ring14"
+            )
         if self.uncoded and not (self.targets or "").startswith("ring"):
             raise InputError("uncoded: ring-coded targets are expected, such as ring14")
         if not self.aspect_sigma > 0:
