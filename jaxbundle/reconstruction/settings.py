@@ -79,7 +79,8 @@ class ReconstructionSettings:
         integer("points", self.points)
         if not self.natural_points and self.targets is None:
             raise InputError(
-                "features none: coded targets alone connect the photographs; give targets, such as ring14"
+                "features none: coded targets alone connect the photographs; give targets, such as "
+                "ring14"
             )
         if self.uncoded and not (self.targets or "").startswith("ring"):
             raise InputError("uncoded: ring-coded targets are expected, such as ring14")
