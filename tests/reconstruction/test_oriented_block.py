@@ -1,6 +1,5 @@
 """Rays of named points in an adjusted block, compared with exact projections."""
 
-import dataclasses
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -10,9 +9,9 @@ import pytest
 from jaxbundle import Camera
 from jaxbundle.cameras import get_model, project
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
-from jaxbundle.reconstruction.block import _pixel_angle
 from jaxbundle.reconstruction.named import NamedMeasurements
 from jaxbundle.reconstruction.oriented_block import FrameData, OrientedBlock
+from jaxbundle.tiepoints.verified_pairs import central_distance
 
 F, SIZE = 1000.0, (1600, 1200)
 PIXELS = {"fx": F, "fy": F, "cx": 799.5, "cy": 599.5}
@@ -87,8 +86,6 @@ def test_a_measurement_outside_the_range_of_its_camera_has_no_ray():
 
 
 @pytest.mark.parametrize("camera", [PERSPECTIVE, DISTORTED])
-def test_the_angle_of_a_pixel_is_that_in_the_middle_of_the_image(camera):
-    """1/f, where there is no distortion; without a size of the image, of the first pixel."""
-    assert _pixel_angle(camera) == pytest.approx(1 / F, rel=1e-5)
-    nowhere = dataclasses.replace(PERSPECTIVE, image_size=None)
-    assert _pixel_angle(nowhere) == pytest.approx(1 / F, rel=1e-5)
+def test_the_principal_distance_in_the_middle_of_the_image(camera):
+    """F, where there is no distortion."""
+    assert central_distance(camera) == pytest.approx(F, rel=1e-5)
