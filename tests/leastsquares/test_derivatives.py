@@ -23,7 +23,7 @@ from jaxbundle.leastsquares.datum.conditions import (
     zeros_of_tables,
 )
 from jaxbundle.leastsquares.declarations import Kind, Motions, Table
-from jaxbundle.leastsquares.equations.hessian import exact_equations
+from jaxbundle.leastsquares.equations.hessian import equations_and_terms
 from jaxbundle.leastsquares.equations.normal import Normal, zero_tangent
 from jaxbundle.leastsquares.indexing.rows import _look_up_in_copies, lay_out_data, look_up
 from jaxbundle.leastsquares.iterations.retraction import retract
@@ -35,6 +35,7 @@ from jaxbundle.leastsquares.problem import (
     without_filling,
 )
 from jaxbundle.leastsquares.quality.derivatives import attach_derivatives, solve
+from jaxbundle.leastsquares.quality.hessian_products import multiply
 from jaxbundle.leastsquares.quality.precision import precision
 from jaxbundle.leastsquares.spaces import Pose, PoseValue
 
@@ -179,20 +180,29 @@ def test_hessian_is_that_of_the_dense_cost(name):
     moved, zero, free = after(problem, problem.data.start)
     cost = lambda x: 0.5 * jnp.sum(residuals(problem, moved(x), problem.data) ** 2)
 
+    declared, plan = problem.declared, problem.plan
+    change = np.random.default_rng(5).normal(size=zero.shape)
+    unravel = ravel_pytree({name: g.free for name, g in plan.groups.items()})[1]
+
     @jax.jit
     def both():
-        equations = exact_equations(
-            problem.declared, problem.plan, data.start, lay_out_data(problem.plan, data)
-        )
-        H = Normal(problem.plan, equations[2]).as_matrix()
-        return (*equations[:2], H), (cost(zero), jax.grad(cost)(zero), jax.hessian(cost)(zero))
+        laid = lay_out_data(plan, data)
+        equations, terms = equations_and_terms(declared, plan, data.start, laid)
+        H = Normal(plan, equations[2]).as_matrix()
+        product = multiply(declared, plan, data.start, terms, unravel(jnp.asarray(change)))
+        ours = (*equations[:2], H, ravel_pytree(product)[0])
+        return ours, (cost(zero), jax.grad(cost)(zero), jax.hessian(cost)(zero))
 
-    (value, gradient, H), dense = both()
+    (value, gradient, H, product), dense = both()
     assert float(value) == pytest.approx(float(dense[0]), rel=1e-12)
     gradient = ravel_pytree(gradient)[0]
     np.testing.assert_allclose(gradient, dense[1], atol=1e-12 * np.abs(dense[1]).max())
     size = np.sqrt(np.diag(np.where(free, dense[2], np.eye(len(free)))).clip(1e-6))
     np.testing.assert_allclose(H / size / size[:, None], dense[2] / size / size[:, None], atol=1e-9)
+    # Held unknowns neither change nor are changed.
+    expected = np.where(free, dense[2] @ np.where(free, change, 0), 0)
+    largest = np.abs(expected / size).max()
+    np.testing.assert_allclose(product / size, expected / size, atol=1e-9 * largest)
     if name == "photographs":  # Some points are eliminated, some kept.
         assert problem.plan.groups["point (kept)"].free.sum() == 9
 

@@ -8,6 +8,7 @@ the function of one observation, forward over reverse, and are summed like those
 
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -32,34 +33,52 @@ from jaxbundle.leastsquares.spaces import Block
 from jaxbundle.types import Scalar, present
 
 
-def exact_equations(
+class SecondOrder(eqx.Module):
+    """The derivatives of the observations of a part by all directions of its slots: J = ∂v, and the
+    curvature Σ v·∂²v, with a column (and a row) of zeros at the end. H = JᵀJ + curvature."""
+
+    jacobian: Float[Array, "chunks length r n"]
+    curvature: Float[Array, "chunks length n n"]
+
+
+def equations_and_terms(
     declared: Declared, plan: Plan, values: Values, laid: ChunkedData
-) -> tuple[Float[Array, ""], Tangent, NormalBlocks]:
-    """½·vᵀPv, its gradient and its Hessian, like `normal.normal_equations`."""
+) -> tuple[tuple[Float[Array, ""], Tangent, NormalBlocks], tuple[SecondOrder, ...]]:
+    """½·vᵀPv, its gradient and its Hessian, like `normal.normal_equations`, and the derivatives of
+    every part, of which they are sums."""
     plan, laid = fill_places(plan, laid)
-    prepared, sums = prepare(declared, values), Sums(plan)
+    prepared, sums, terms = prepare(declared, values), Sums(plan), []
     for number, part in enumerate(plan.parts):
-        cost, gradient, hessian = _derivatives(declared, plan, number, prepared, laid)
+        v, found = _derivatives(declared, plan, number, prepared, laid)
+        J = found.jacobian
+        gradient = jnp.einsum("clri,clr->cli", J, v)
+        hessian = jnp.einsum("clri,clrj->clij", J, J) + found.curvature
         more = _blocks(declared, plan, part, gradient, hessian)
-        sums.add_part(part, cost.sum(), *more)
-    return sums.total(declared, values)
+        sums.add_part(part, 0.5 * jnp.vdot(v, v), *more)
+        terms.append(found)
+    return sums.total(declared, values), tuple(terms)
+
+
+def count_terms(declared: Declared, plan: Plan) -> int:
+    """The numbers of the curvature of all observations."""
+    directions = (sum(widths_of(declared, part)) for part in plan.parts)
+    return sum(part.source.size * n**2 for part, n in zip(plan.parts, directions))
 
 
 def _derivatives(
     declared: Declared, plan: Plan, number: int, prepared: Prepared, laid: ChunkedData
-) -> tuple[Array, Array, Array]:
-    """½|v|² of every observation of a part, its gradient and Hessian with respect to all directions
-    of its slots, with a row and a column of zeros at the end."""
+) -> tuple[Float[Array, "chunks length r"], SecondOrder]:
+    """The residuals of every observation of a part and their derivatives."""
     part = plan.parts[number]
     kind, widths = declared.kinds[part.set_name], widths_of(declared, part)
-    one = _HalfSquare(residual_of(declared, part), widths)
-    return map_observations(part, kind, prepared, laid, number, one)
+    one = _SecondOrderOfOne(residual_of(declared, part), widths)
+    v, J, curvature = map_observations(part, kind, prepared, laid, number, one)
+    return v, SecondOrder(J, curvature)
 
 
 @dataclasses.dataclass(frozen=True)
-class _HalfSquare:
-    """½|v|² of one observation, its gradient and Hessian with respect to the changes of its
-    slots."""
+class _SecondOrderOfOne:
+    """The residuals v of one observation, J = ∂v and Σ v·∂²v by the changes of its slots."""
 
     residual: Residual
     widths: tuple[int, ...]
@@ -67,23 +86,22 @@ class _HalfSquare:
     def __call__(
         self, blocks: tuple[Block, ...], measured: PyTree[Scalar], weight: Weight
     ) -> tuple[Array, Array, Array]:
-        # One vector of all directions of all slots: H has the mixed second derivatives of slots,
-        # too.
+        # One vector of all directions of all slots: the curvature has the mixed second derivatives
+        # of slots, too.
         ends = [sum(self.widths[:s]) for s in range(len(self.widths) + 1)]
+        still = jnp.zeros(ends[-1])
 
-        def half_square(x: Float[Array, " n"]) -> Scalar:
+        def residuals(x: Float[Array, " n"]) -> tuple[Array, Array]:
             changes = tuple(tuple(x[a:b]) for a, b in zip(ends, ends[1:]))
-            return 0.5 * sum(r * r for r in self.residual(blocks, measured, weight, changes))
+            v = jnp.stack(self.residual(blocks, measured, weight, changes))
+            return v, v
 
-        def gradient(x: Float[Array, " n"]) -> tuple[Array, tuple[Scalar, Array]]:
-            cost, g = jax.value_and_grad(half_square)(x)
-            return g, (cost, g)
-
+        J, v = jax.jacfwd(residuals, has_aux=True)(still)
         # Forward over reverse: as many forward passes as directions over one reverse pass, instead
         # of reverse over reverse, which would keep every intermediate value twice.
-        hessian, (cost, g) = jax.jacfwd(gradient, has_aux=True)(jnp.zeros(ends[-1]))
+        curvature = jax.jacfwd(jax.grad(lambda x: jnp.vdot(v, residuals(x)[0])))(still)
         # The zero at the end is column −1, for directions that a touch lacks.
-        return cost, jnp.pad(g, (0, 1)), jnp.pad(hessian, (0, 1))
+        return v, jnp.pad(J, ((0, 0), (0, 1))), jnp.pad(curvature, (0, 1))
 
 
 def _blocks(

@@ -33,7 +33,7 @@ from jaxbundle.arguments import integer, one_of, positive
 from jaxbundle.implicit import derivative_along, differentiable_once, implicit_root
 from jaxbundle.leastsquares.datum import conditions as datum
 from jaxbundle.leastsquares.equations import elimination
-from jaxbundle.leastsquares.equations.hessian import exact_equations
+from jaxbundle.leastsquares.equations.hessian import SecondOrder, count_terms, equations_and_terms
 from jaxbundle.leastsquares.equations.normal import Normal, Tangent, normal_equations, zero_tangent
 from jaxbundle.leastsquares.indexing.plan import Plan
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
@@ -49,9 +49,15 @@ from jaxbundle.leastsquares.iterations.retraction import representatives, retrac
 from jaxbundle.leastsquares.iterations.solver import find, half_square
 from jaxbundle.leastsquares.iterations.stopping import converged
 from jaxbundle.leastsquares.problem import Problem, complete_data, make_solver, without_filling
+from jaxbundle.leastsquares.quality.hessian_products import multiply
 from jaxbundle.system.programs import compile_once
+from jaxbundle.types import present
 
 Sensitivity = Literal["exact", "gauss-newton"]
+
+# Numbers of the derivatives of single observations that are kept for products with the Hessian:
+# 32 MB. Larger problems form each product from the residuals: their memory counts, not the program.
+MAX_TERMS = 4_000_000
 
 FIRST_ORDER_ONLY = (
     'sensitivity = "gauss-newton" has first derivatives only: '
@@ -107,7 +113,8 @@ def solve(
 class LinearisedSolution(eqx.Module):
     """The problem at a solution, as a constant for the derivative rules. `pins`: of the penalty
     ½·Σ pins·δ² on changes of the kept unknowns: the diagonal elements of N where one is pinned,
-    else 0, as in `factor` (empty if nothing is open)."""
+    else 0, as in `factor` (empty if nothing is open). `terms`: of the exact Hessian, of small
+    problems (`MAX_TERMS`)."""
 
     declared: Declared = eqx.field(static=True)
     plan: Plan
@@ -115,6 +122,7 @@ class LinearisedSolution(eqx.Module):
     data: Data
     factor: elimination.NormalFactor
     pins: Tangent
+    terms: tuple[SecondOrder, ...] | None = None
 
     def hold_given(self, data: Data) -> Values:
         """The solution with held values taken from the start values."""
@@ -131,6 +139,12 @@ class LinearisedSolution(eqx.Module):
         change = {name: x * plan.groups[name].free for name, x in change.items()}
         return residuals(self.declared, plan, self.move(change, data), laid)
 
+    def times(self, change: Tangent) -> Tangent:
+        """H·δ of ½vᵀPv and of the penalty on the pins, from `terms`."""
+        product = multiply(self.declared, self.plan, self.values, present(self.terms), change)
+        penalty = {g: pins**2 * change[g] for g, pins in self.pins.items()}
+        return {g: x + penalty[g] if g in penalty else x for g, x in product.items()}
+
     def move(self, change: Tangent, data: Data) -> Values:
         return retract(self.declared, self.plan, self.hold_given(data), change)
 
@@ -142,16 +156,16 @@ def attach_derivatives(
     """The solution `values` for `data`, in its datum, differentiable with respect to every field of
     `data`.
 
-    One more Newton step makes it exact, since the iterations end before the last digits
+    One or two more Newton steps make it exact, since the iterations end before the last digits
     converge."""
     values, fixed = jax.lax.stop_gradient((values, data))
     # The factor is that of the solution itself, where its derivatives are taken.
     values, _ = datum.move_to_datum(declared, plan, values, fixed.start)
-    at = linearise(declared, plan, values, fixed, sensitivity == "exact")
-    # Along open motions the gradient is only rounding: that part is removed.
-    gradient = gradient_after(zero_tangent(plan), at, fixed)
-    gradient = datum.s_transform_transposed(declared, plan, values, gradient)
-    step = jax.tree.map(jnp.negative, elimination.solve(at.factor, gradient))
+    exact = sensitivity == "exact"
+    if exact and count_terms(declared, plan) <= MAX_TERMS:
+        at, step = _step_twice(declared, plan, values, fixed)
+    else:
+        at, step = _newton_step(declared, plan, values, fixed, exact)
     if sensitivity == "gauss-newton":
         change = datum.s_transform(declared, plan, values, step)
         return representatives(declared, at.move(_propagate(change, at, data), data), data.start)
@@ -160,18 +174,44 @@ def attach_derivatives(
     return representatives(declared, moved, data.start)
 
 
-def linearise(
-    declared: Declared, plan: Plan, values: Values, data: Data, exact: bool
-) -> LinearisedSolution:
-    """With the factor of the exact Hessian, or of JᵀPJ."""
-    equations = exact_equations if exact else normal_equations
-    laid = lay_out_data(plan, data)
-    normal = Normal(plan, equations(declared, plan, values, laid)[-1])
+def _newton_step(
+    declared: Declared, plan: Plan, values: Values, data: Data, exact: bool, keep: bool = False
+) -> tuple[LinearisedSolution, Tangent]:
+    """The problem at the values, with the factor of the exact Hessian (and its terms, to `keep`) or
+    of JᵀPJ; and the step from there."""
+    laid, terms = lay_out_data(plan, data), None
+    if exact:
+        equations, terms = equations_and_terms(declared, plan, values, laid)
+    else:
+        equations = normal_equations(declared, plan, values, laid)
+    _, gradient, blocks = equations
+    normal = Normal(plan, blocks)
     # Conjugate gradients tolerate open motions.
     pinned = plan.datum if plan.reduction in FACTORS else None
     pins, own = {} if pinned is None else pinned.pins, normal.diagonal()
     pins = {g: p * jnp.where(own[g] > 0, own[g], 1.0) for g, p in pins.items()}
-    return LinearisedSolution(declared, plan, values, data, elimination.factorise(normal), pins)
+    factor = elimination.factorise(normal)
+    # Along open motions the gradient is only rounding: that part is removed.
+    gradient = datum.s_transform_transposed(declared, plan, values, gradient)
+    step = jax.tree.map(jnp.negative, elimination.solve(factor, gradient))
+    terms = terms if keep else None
+    return LinearisedSolution(declared, plan, values, data, factor, pins, terms), step
+
+
+def _step_twice(
+    declared: Declared, plan: Plan, values: Values, data: Data
+) -> tuple[LinearisedSolution, Tangent]:
+    """`_newton_step` after another: the terms are those of the solution itself. In a loop, so that
+    the program contains it once."""
+
+    def one(values: Values, _: None) -> tuple[Values, tuple]:
+        at, step = _newton_step(declared, plan, values, data, True, keep=True)
+        return at.move(step, data), (values, at.factor, at.pins, at.terms, step)
+
+    _, both = jax.lax.scan(one, values, length=2)
+    *at, step = jax.tree.map(lambda x: x[-1], both)
+    values, factor, pins, terms = at
+    return LinearisedSolution(declared, plan, values, data, factor, pins, terms), step
 
 
 def gradient_after(change: Tangent, at: LinearisedSolution, data: Data) -> Tangent:
@@ -198,11 +238,13 @@ def _solve_structured(times: Callable, at: LinearisedSolution, b: Tangent) -> Ta
     flat = lambda tree: ravel_pytree(tree)[0]
     factor = lambda b: flat(elimination.solve(at.factor, unravel(b)))
 
-    def improved(times: Callable, b: Float[Array, " n"]) -> Float[Array, " n"]:
-        x = factor(b)
-        return x + factor(b - times(x)) if at.plan.reduction in FACTORS else x
-
     product = lambda x: flat(times(unravel(x)))
+    quick = product if at.terms is None else lambda x: flat(at.times(unravel(x)))
+
+    def improved(_: Callable, b: Float[Array, " n"]) -> Float[Array, " n"]:
+        x = factor(b)
+        return x + factor(b - quick(x)) if at.plan.reduction in FACTORS else x
+
     return unravel(jax.lax.custom_linear_solve(product, right, improved, symmetric=True))
 
 
