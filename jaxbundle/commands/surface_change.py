@@ -13,7 +13,6 @@ from jaxtyping import Float
 from jaxbundle.choices import CLOUD_FILES, SURFACE_ERRORS
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
-from jaxbundle.io.rasters.reading import check_georeference, open_raster, read_values
 from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.network.columns import count, did_you_mean, list_some
 from jaxbundle.results import TableMethods
@@ -30,6 +29,7 @@ from jaxbundle.surfaces.inputs import read_orientations
 from jaxbundle.surfaces.orientation import orientation_modes
 from jaxbundle.surfaces.point_files import read_cloud
 from jaxbundle.surfaces.views import is_inside
+from jaxbundle.system.rasters import read_heights
 
 # Errors by name, such as {"vertical": 0.2}.
 Errors = Mapping[str, float]
@@ -182,23 +182,20 @@ def _open(
 
 def _read_grid(path: Path) -> HeightGrid:
     """The first band of a raster, north up; σ unknown."""
-    with open_raster(path) as source:
-        check_georeference(path, source)
-        place = source.transform
-        if place.b or place.d or place.a <= 0 or abs(place.a + place.e) > 1e-6 * place.a:
-            raise InputError(
-                f"{path}: square cells, north up, are expected; it has {place.a:g} × {place.e:g}: "
-                "make them with gdalwarp -tr"
-            )
-        values = source.scales[0] * read_values(path, source, 1) + source.offsets[0]
-        if source.crs is not None and source.crs.is_geographic:
-            raise InputError(
-                f"{path}: cells in degrees have no volume; give a model in a projected system "
-                "(gdalwarp -t_srs)"
-            )
-        system = None if source.crs is None else source.crs.to_wkt()
-    unknown = np.full(values.shape, np.nan)
-    return HeightGrid(values, unknown, place.c, place.f, place.a, system)
+    found = read_heights(path)
+    (x, y), (east, north) = found.origin, found.step
+    if east <= 0 or abs(east + north) > 1e-6 * east:
+        raise InputError(
+            f"{path}: square cells, north up, are expected; it has {east:g} × {north:g}: "
+            "make them with gdalwarp -tr"
+        )
+    if found.geographic:
+        raise InputError(
+            f"{path}: cells in degrees have no volume; give a model in a projected system "
+            "(gdalwarp -t_srs)"
+        )
+    unknown, half = np.full(found.heights.shape, np.nan), 0.5 * east
+    return HeightGrid(found.heights, unknown, x - half, y + half, east, found.system)
 
 
 def _open_mask(path: str | Path) -> HeightGrid:

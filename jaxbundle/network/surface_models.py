@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from jaxbundle.errors import InputError
 from jaxbundle.system.file_content import check_plain
 from jaxbundle.system.foreign_parsers import foreign_parser
+from jaxbundle.system.rasters import read_heights
 
 # Triangles near the start value of a point, of which the nearest counts: one and the 12 that share
 # a corner with it in a regular mesh, rounded up.
@@ -166,18 +167,8 @@ def read_grid(path: str | Path) -> TerrainGrid:
 
 @lru_cache(maxsize=4)
 def _read_grid(path: str, _: int) -> TerrainGrid:
-    try:
-        import rasterio
-    except ImportError:
-        raise InputError("rasters need rasterio: pip install 'jaxbundle[geo]'") from None
-    with foreign_parser(path, "a raster of heights"), rasterio.open(path) as source:
-        heights = source.read(1, masked=True).astype(float).filled(np.nan)
-        place = source.transform
-    if place.b or place.d:
-        raise InputError(f"{path}: the grid is rotated; expected rows along X, columns along Y")
-    # heights are of the centres of pixels
-    origin = (place.c + 0.5 * place.a, place.f + 0.5 * place.e)
-    return TerrainGrid(heights, origin, (place.a, place.e))
+    found = read_heights(path)
+    return TerrainGrid(found.heights, found.origin, found.step)
 
 
 def triangles_near(

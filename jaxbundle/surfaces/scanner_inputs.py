@@ -16,7 +16,6 @@ from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, geodetic
-from jaxbundle.io.rasters.reading import check_pixels, check_raw, open_raster, read_pixels
 from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.io.scanner.rpc import read_rpc
 from jaxbundle.io.scanner.rpc_images import (
@@ -40,6 +39,7 @@ from jaxbundle.surfaces.scanner_views import (
 )
 from jaxbundle.surfaces.views import Grey
 from jaxbundle.system.file_content import missing
+from jaxbundle.system.rasters import check_pixels, check_raw, open_raster, read_pixels
 
 if TYPE_CHECKING:
     import pyproj

@@ -226,6 +226,12 @@ def test_rasters_are_read(tmp_path):
     np.testing.assert_allclose(found.origin, origin)
     np.testing.assert_allclose(found.step, (dx, dy))
     assert np.isnan(found.heights[0, 5]) and np.isnan(found.heights).sum() == 1
+    # whole decimetres below 500 m, as terrain models are often stored
+    with rasterio.open(path, "w", driver="GTiff", width=11, height=11, count=1, dtype="int16",
+                       transform=place) as out:  # fmt: skip
+        out.scales, out.offsets = (0.1,), (500.0,)
+        out.write(np.round((heights - 500) / 0.1).astype(np.int16), 1)
+    np.testing.assert_allclose(read_grid(path).heights, heights, atol=0.05 + 1e-9)
 
 
 def test_in_a_project(made, tmp_path):

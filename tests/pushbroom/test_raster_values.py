@@ -10,10 +10,10 @@ from jaxbundle.commands.scanner_inputs import surface_of
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.io.rasters.maps import describe_distance
-from jaxbundle.io.rasters.reading import check_raw
 from jaxbundle.io.rasters.scenes import read_scene
 from jaxbundle.io.rasters.terrain_models import read_terrain
 from jaxbundle.surfaces.scanner_inputs import read_grey
+from jaxbundle.system.rasters import check_raw
 
 STORED = np.arange(30, dtype=np.int16).reshape(5, 6) * 10
 NORTH_UP = rasterio.transform.Affine(0.01, 0, 13, 0, -0.01, 41)

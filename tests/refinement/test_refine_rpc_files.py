@@ -15,12 +15,12 @@ from jaxbundle.cli.app import app
 from jaxbundle.cli.pushbroom import refine as _refine  # noqa: F401
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, geodetic
-from jaxbundle.io.rasters.reading import open_plain
 from jaxbundle.io.scanner.refinement import read_refinement
 from jaxbundle.io.scanner.rpc import StatedErrors, read_rpc, read_stated_errors, write_rpc
 from jaxbundle.io.text.csv_tables import read_csv, write_csv
 from jaxbundle.pushbroom.rpc.polynomials import project_points
 from jaxbundle.refinement import HELD, Freedom
+from jaxbundle.system.rasters import open_plain
 
 TEXT = """
 [refine]

@@ -18,15 +18,6 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.rasters.checkpoints import Checkpoint
 from jaxbundle.io.rasters.map_blocks import PLAIN, MapBands, MapFormat, write_map
 from jaxbundle.io.rasters.maps import MapGrid, MapSystem, contiguous, grid_around
-from jaxbundle.io.rasters.reading import (
-    Window,
-    as_type,
-    check_raw,
-    open_raster,
-    rasterio,
-    read_plain,
-    read_values,
-)
 from jaxbundle.pushbroom.ground_to_image import Search
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.image_to_ground import locate_lines
@@ -42,6 +33,15 @@ from jaxbundle.pushbroom.rpc.image import RpcImage, locate_rpc_lines
 from jaxbundle.pushbroom.surfaces import GroundSurface
 from jaxbundle.pushbroom.terrain import Terrain
 from jaxbundle.system.programs import compile_once
+from jaxbundle.system.rasters import (
+    Window,
+    as_type,
+    check_raw,
+    open_raster,
+    rasterio,
+    read_plain,
+    read_values,
+)
 from jaxbundle.types import AnyArray, Progress, Scalar
 
 if TYPE_CHECKING:

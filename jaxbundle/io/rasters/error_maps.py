@@ -8,7 +8,6 @@ from jaxtyping import Float
 
 from jaxbundle.io.rasters.map_blocks import MapBands, write_map
 from jaxbundle.io.rasters.maps import MapGrid, MapSystem
-from jaxbundle.io.rasters.reading import rasterio
 from jaxbundle.io.rasters.writing import write_raster
 from jaxbundle.pushbroom.ground_to_image import Search
 from jaxbundle.pushbroom.image import PushbroomImage
@@ -21,6 +20,7 @@ from jaxbundle.pushbroom.rectification import (
 )
 from jaxbundle.pushbroom.rpc.image import RpcImage
 from jaxbundle.pushbroom.surfaces import GroundSurface
+from jaxbundle.system.rasters import rasterio
 from jaxbundle.types import Progress
 
 SIGMAS = "sigma east [m]", "sigma north [m]", "planimetric sigma [m]"

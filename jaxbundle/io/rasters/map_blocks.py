@@ -12,10 +12,10 @@ import numpy as np
 from jaxbundle.choices import Compression
 from jaxbundle.io.rasters.checkpoints import Checkpoint
 from jaxbundle.io.rasters.maps import MapGrid, MapSystem
-from jaxbundle.io.rasters.reading import as_type, rasterio
 from jaxbundle.io.rasters.writing import add_overviews, make_cog, write_raster
 from jaxbundle.pushbroom.rectification import BLOCK_SIZE, NODE_STEP, MapNodes
 from jaxbundle.pushbroom.surfaces import GroundSurface
+from jaxbundle.system.rasters import as_type, rasterio
 from jaxbundle.types import Progress
 
 # While two blocks are computed, as many wait for their turn to be written: a slow one does not stop

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from xml.sax.saxutils import escape
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.rasters.reading import check_georeference, open_raster
+from jaxbundle.system.rasters import check_georeference, open_raster
 from jaxbundle.system.temporaries import temporary
 
 if TYPE_CHECKING:

@@ -11,12 +11,12 @@ from jaxbundle.choices import Resampling
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.io.rasters.maps import MapSystem
-from jaxbundle.io.rasters.reading import as_type, check_georeference, open_raster, read_values
 from jaxbundle.io.rasters.writing import write_raster
 from jaxbundle.pushbroom.flight import take_image
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.surfaces import GroundSurface
 from jaxbundle.system.file_content import naming_file
+from jaxbundle.system.rasters import as_type, check_georeference, open_raster, read_values
 from jaxbundle.types import Progress
 
 

@@ -10,7 +10,11 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.io.rasters.extent import Extent
 from jaxbundle.io.rasters.mosaics import as_one_raster
-from jaxbundle.io.rasters.reading import (
+from jaxbundle.io.rasters.vertical import KNOWN_SYSTEM, HeightScale, with_vertical_unit
+from jaxbundle.pushbroom.terrain import Terrain, make_terrain
+from jaxbundle.system.file_content import naming_file
+from jaxbundle.system.foreign_parsers import foreign_parser
+from jaxbundle.system.rasters import (
     GEOGRAPHIC,
     check_georeference,
     open_raster,
@@ -18,10 +22,6 @@ from jaxbundle.io.rasters.reading import (
     rasterio,
     read_values,
 )
-from jaxbundle.io.rasters.vertical import KNOWN_SYSTEM, HeightScale, with_vertical_unit
-from jaxbundle.pushbroom.terrain import Terrain, make_terrain
-from jaxbundle.system.file_content import naming_file
-from jaxbundle.system.foreign_parsers import foreign_parser
 
 if TYPE_CHECKING:
     from rasterio.io import DatasetReader

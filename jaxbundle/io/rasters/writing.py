@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.rasters.reading import open_plain, rasterio
 from jaxbundle.io.writing.replacing import disk_of, replace_file
+from jaxbundle.system.rasters import open_plain, rasterio
 from jaxbundle.system.temporaries import temporary
 
 if TYPE_CHECKING:

@@ -21,7 +21,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.rasters.reading import open_plain, open_raster, rasterio
 from jaxbundle.io.scanner.rpc_vendor_files import from_geom, from_xml
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.xml_fields import number_in
@@ -29,6 +28,7 @@ from jaxbundle.io.writing.replacing import disk_of, replace_file
 from jaxbundle.network.columns import show
 from jaxbundle.pushbroom.rpc.polynomials import TERMS, Rpc
 from jaxbundle.system.foreign_parsers import foreign_parser
+from jaxbundle.system.rasters import open_plain, open_raster, rasterio
 
 # Names in text and in RPB.
 OFFSETS = {

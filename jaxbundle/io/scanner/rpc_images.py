@@ -13,12 +13,12 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid
-from jaxbundle.io.rasters.reading import check_raw, open_raster
 from jaxbundle.io.scanner.rpc import RASTERS, read_rpc
 from jaxbundle.io.text.xml_fields import read_xml
 from jaxbundle.pushbroom.rpc.image import RpcImage
 from jaxbundle.pushbroom.rpc.polynomials import Rpc
 from jaxbundle.system.file_content import missing
+from jaxbundle.system.rasters import check_raw, open_raster
 
 IMAGES = (*RASTERS, ".jp2", ".png", ".jpg")
 COEFFICIENTS = (".txt", ".rpb", ".geom")

@@ -1,4 +1,4 @@
-"""Rasters through rasterio: functions common to readers and writers."""
+"""Rasters through rasterio: what all who read and write them share."""
 
 import os
 import warnings
@@ -6,9 +6,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.system.file_content import check_plain, naming_file
@@ -102,6 +103,41 @@ def read_values(
     """As `read_pixels`, in double precision, NaN where there is no data."""
     values: Any = read_pixels(path, source, bands, window)
     return values.astype(float).filled(np.nan)
+
+
+class HeightRaster(NamedTuple):
+    """Heights [rows, columns], NaN for voids; the centre of the first cell and the steps along X of
+    columns and along Y of rows, in the coordinates of its map; its coordinate system (WKT)."""
+
+    heights: Float[np.ndarray, "rows columns"]
+    origin: tuple[float, float]
+    step: tuple[float, float]
+    system: str | None
+    geographic: bool
+
+
+def read_heights(path: str | Path) -> HeightRaster:
+    """The heights of the first band of a raster as it is, along its own axes, with the scale and
+    offset of the band.
+
+    **Raises:** `InputError` if it cannot be read, has no georeference, or is rotated."""
+    with open_raster(path) as source:
+        check_georeference(path, source)
+        place = source.transform
+        if place.b or place.d:
+            raise InputError(
+                f"{path}: the raster is rotated; expected rows along X, columns along Y (gdalwarp)"
+            )
+        values = source.scales[0] * read_values(path, source, 1) + source.offsets[0]
+        crs = source.crs
+        return HeightRaster(
+            values,
+            # heights are of the centres of cells
+            (place.c + 0.5 * place.a, place.f + 0.5 * place.e),
+            (place.a, place.e),
+            None if crs is None else crs.to_wkt(),
+            crs is not None and crs.is_geographic,
+        )
 
 
 def read_plain(path: str | Path, source: "DatasetReader", window: Window) -> np.ndarray:
