@@ -38,7 +38,7 @@ NETWORK_FILES = {
     "column-map": "a .toml file with [table.…] sections",
     "colmap": "a folder with cameras.bin or cameras.txt",
     "bingo": "a folder with image.dat and geoin.dat",
-    "metashape": "an .xml file of Metashape's cameras",
+    "metashape": "an .xml file of Metashape's cameras, or a project, .psx",
     "photomodeler": 'a .txt file that begins with "Bundle Soln"',
     "bundler": 'a file that begins with "# Bundle file"',
     "openmvg": "openMVG's sfm_data.json",

@@ -263,7 +263,7 @@ HOLDS: dict[str, set[str]] = {
     "photomodeler": {"image sizes of cameras", "pixel sizes of cameras", "roles of points",
                      "σ of control points", "σ of image points"},
     "metashape": {"image sizes of cameras", "pixel sizes of cameras", "roles of points",
-                  "σ of control points"},
+                  "σ of control points", "colours of points"},
     "bingo": {"prior σ of camera parameters", "roles of points", "image sizes of cameras",
               "pixel sizes of cameras"},
     "csm-frame": {"image sizes of cameras", "pixel sizes of cameras"},
