@@ -59,6 +59,7 @@ NETWORK_FILES = {
     "csm-frame": "an ISD (.json) of a frame camera, USGS_ASTRO_FRAME_SENSOR_MODEL",
     "nvm": "an .nvm file of VisualSFM",
     "alicevision": "an .sfm or .json of AliceVision",
+    "opf": "an .opf project of the Open Photogrammetry Format (PIX4Dmatic)",
 }
 # Kinds of inputs that are cameras alone.
 CAMERA_INPUTS = {

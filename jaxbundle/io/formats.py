@@ -64,6 +64,7 @@ from jaxbundle.io.networks.opensfm import (
     write_opensfm_cameras,
 )
 from jaxbundle.io.networks.opensfm_control import CONTROL
+from jaxbundle.io.networks.opf import is_opf, read_opf
 from jaxbundle.io.networks.orb_slam import is_orb_slam_pair, read_orb_slam_pair
 from jaxbundle.io.networks.photo_list import read_photo_list
 from jaxbundle.io.networks.photomodeler import is_photomodeler, read_photomodeler
@@ -264,6 +265,7 @@ FORMATS: dict[str, Format] = {
         read_alicevision,
         NETWORK_FILES["alicevision"],
     ),
+    "opf": Format(is_opf, read_opf, NETWORK_FILES["opf"]),
 }
 
 

@@ -81,7 +81,9 @@ def read_archive(path: Path) -> ChunkArchive:
     told = []
     if len(chunks) > 1:
         others = [id or "?" for id in chunks if id != chosen]
-        told.append(f"chunk {chosen}, the active one, is read; not read: {list_some(others, as_text=str)}")
+        told.append(
+            f"chunk {chosen}, the active one, is read; not read: {list_some(others, as_text=str)}"
+        )
     archive = project.parent / str(chunks[chosen])
     chunk = copy.deepcopy(document_of(archive, _members(archive, path), PROJECT))
     if chunk.tag != "chunk":
