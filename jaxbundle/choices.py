@@ -59,6 +59,7 @@ NETWORK_FILES = {
     "csm-frame": "an ISD (.json) of a frame camera, USGS_ASTRO_FRAME_SENSOR_MODEL",
     "nvm": "an .nvm file of VisualSFM",
     "alicevision": "an .sfm or .json of AliceVision",
+    "realityscan": "a folder with .xmp of RealityScan, or its .csv of camera parameters",
     "opf": "an .opf project of the Open Photogrammetry Format (PIX4Dmatic)",
 }
 # Kinds of inputs that are cameras alone.
@@ -77,7 +78,7 @@ FORMATS = tuple(NETWORK_FILES)
 TARGETS = (
     "ply", "dxf", "csv", "bundler", "bal", "colmap", "colmap-text", "openmvg", "opensfm",
     "transforms", "kalibr", "micmac", "jaicov", "mrcal", "opencv-stereo", "ros-stereo",
-    "anipose", "project",
+    "anipose", "realityscan", "realityscan-csv", "project",
 )  # fmt: skip
 # Kinds of outputs: networks, and cameras alone.
 CAMERA_FILES = (

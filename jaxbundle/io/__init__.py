@@ -25,6 +25,7 @@ _HOME = {
     "jaxbundle.io.networks.photo_list": ("read_photo_list",),
     "jaxbundle.io.networks.project": ("read_project", "write_project"),
     "jaxbundle.io.networks.pycolmap_objects": ("from_pycolmap", "to_pycolmap"),
+    "jaxbundle.io.networks.realityscan": ("write_realityscan_csv", "write_realityscan_xmp"),
     "jaxbundle.io.networks.transforms": ("write_transforms",),
     "jaxbundle.io.results.coordinates": ("write_coordinates",),
     "jaxbundle.io.results.dxf": ("write_dxf",),

@@ -43,6 +43,8 @@ from jaxbundle.io.networks.project import read_project as read_project
 from jaxbundle.io.networks.project import write_project as write_project
 from jaxbundle.io.networks.pycolmap_objects import from_pycolmap as from_pycolmap
 from jaxbundle.io.networks.pycolmap_objects import to_pycolmap as to_pycolmap
+from jaxbundle.io.networks.realityscan import write_realityscan_csv as write_realityscan_csv
+from jaxbundle.io.networks.realityscan import write_realityscan_xmp as write_realityscan_xmp
 from jaxbundle.io.networks.transforms import write_transforms as write_transforms
 from jaxbundle.io.rasters.correction import map_of as map_of
 from jaxbundle.io.rasters.maps import MapGrid as MapGrid
@@ -116,6 +118,8 @@ __all__ = [
     "write_opensfm",
     "write_ply",
     "write_project",
+    "write_realityscan_csv",
+    "write_realityscan_xmp",
     "write_ros",
     "write_rpc",
     "write_target",

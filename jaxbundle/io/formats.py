@@ -70,6 +70,14 @@ from jaxbundle.io.networks.photo_list import read_photo_list
 from jaxbundle.io.networks.photomodeler import is_photomodeler, read_photomodeler
 from jaxbundle.io.networks.project import FILE_NAME, fill_project, project_file, read_project
 from jaxbundle.io.networks.project import FILES as PROJECT_FILES
+from jaxbundle.io.networks.realityscan import FILES as REALITYSCAN_FILES
+from jaxbundle.io.networks.realityscan import (
+    REALITYSCAN_LOSSES,
+    fill_realityscan,
+    is_realityscan,
+    read_realityscan,
+    write_realityscan_csv,
+)
 from jaxbundle.io.networks.rig_result import (
     file_of_line,
     is_rig_line,
@@ -265,6 +273,12 @@ FORMATS: dict[str, Format] = {
         read_alicevision,
         NETWORK_FILES["alicevision"],
     ),
+    "realityscan": Format(
+        is_realityscan,
+        read_realityscan,
+        NETWORK_FILES["realityscan"],
+        takes_image_size=True,
+    ),
     "opf": Format(is_opf, read_opf, NETWORK_FILES["opf"]),
 }
 
@@ -311,6 +325,13 @@ TARGETS: dict[str, OutputFormat] = {
         write_dxf,
         "NAME.dxf",
         losses=DXF_LOSSES,
+    ),
+    "realityscan-csv": OutputFormat(
+        _file_of("realityscan", ".csv"),
+        write_realityscan_csv,
+        "NAME.csv with realityscan in its name",
+        ("opencv",),
+        losses=REALITYSCAN_LOSSES,
     ),
     "csv": OutputFormat(
         _ends(".csv"),
@@ -427,6 +448,14 @@ TARGETS: dict[str, OutputFormat] = {
         PIXEL_MODELS,
         alone=True,
         losses=ANIPOSE_LOSSES,
+    ),
+    "realityscan": OutputFormat(
+        _folder_of("realityscan"),
+        fill_realityscan,
+        "a folder with realityscan in its name",
+        ("opencv",),
+        REALITYSCAN_FILES,
+        losses=REALITYSCAN_LOSSES,
     ),
     "project": OutputFormat(
         lambda path: not path.suffix or path.is_dir() or path.name == FILE_NAME,
