@@ -133,9 +133,9 @@ def batch(  # noqa: PLR0913 - the options of the command
     from jaxbundle.batches.processes import add_parts, run_joined
     from jaxbundle.batches.run_on_files import run_batch
     from jaxbundle.batches.stacks import is_camera_stack
+    from jaxbundle.cli.acceptance import accept_result, check_accept, end_unmet
     from jaxbundle.cli.batch_outputs import addition_of, check_outputs, write_outputs
     from jaxbundle.cli.board_options import board_given
-    from jaxbundle.cli.judging import accept_result, check_accept, end_unmet
     from jaxbundle.cli.outputs import check_page, trace_files
     from jaxbundle.cli.processes import join_for_one_task
     from jaxbundle.cli.progress import counting

@@ -65,7 +65,7 @@ def change(  # noqa: PLR0913 - the options of the command
 ) -> None:
     """Compare two surfaces: differences, their σ and significance, volumes with σ."""
     import jaxbundle
-    from jaxbundle.cli.judging import check_accept
+    from jaxbundle.cli.acceptance import check_accept
     from jaxbundle.cli.outputs import check_writable, print_result
     from jaxbundle.io.results.result_json import json_text
     from jaxbundle.io.text.csv_tables import write_text

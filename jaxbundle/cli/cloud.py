@@ -42,7 +42,7 @@ def cloud(  # noqa: PLR0913 - the options of the command
 ) -> None:
     """Filter, thin, convert and compare point clouds; accuracy and DSM."""
     import jaxbundle
-    from jaxbundle.cli.judging import check_accept
+    from jaxbundle.cli.acceptance import check_accept
     from jaxbundle.cli.outputs import check_writable, print_result
     from jaxbundle.surfaces.dsm import write_dsm
     from jaxbundle.surfaces.point_files import write_cloud

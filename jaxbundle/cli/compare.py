@@ -38,8 +38,8 @@ def compare(  # noqa: PLR0913 - the options of the command
     """Compare two calibrations: parameters, and image differences. Of two saved adjustments, all
     common unknowns, with a test of each difference."""
     import jaxbundle
+    from jaxbundle.cli.acceptance import check_accept
     from jaxbundle.cli.camera_inputs import calibration_given, pair, write_png
-    from jaxbundle.cli.judging import check_accept
     from jaxbundle.cli.outputs import check_json_target, print_result
     from jaxbundle.commands.comparison import CalibrationComparison, is_saved_adjustment
     from jaxbundle.io.text.csv_tables import table_rows, write_csv

@@ -43,8 +43,8 @@ def hand_eye_command(  # noqa: PLR0913 - the options of the command
 ) -> None:
     """Find the pose of a camera on a robot, with σ, from photographs and the robot's poses."""
     import jaxbundle
+    from jaxbundle.cli.acceptance import check_accept
     from jaxbundle.cli.board_options import board_given
-    from jaxbundle.cli.judging import check_accept
     from jaxbundle.cli.outputs import check_json_target, print_result
 
     check_accept(accept, "hand-eye")

@@ -24,8 +24,8 @@ from jaxbundle.certificates.lengths import (
     require_points,
 )
 from jaxbundle.certificates.page import acceptance_section, lengths_section
+from jaxbundle.cli.acceptance import end_unmet
 from jaxbundle.cli.certificate_options import ACCEPTANCE_FILE, LENGTHS_FILE, CertificateOptions
-from jaxbundle.cli.judging import end_unmet
 from jaxbundle.cli.outputs import HTML, check_content, check_file
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import table_rows, write_csv, write_text

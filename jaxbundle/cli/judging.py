@@ -1,17 +1,10 @@
 """The judge of a command's result, imported only where an option asks for one."""
 
-import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import typer
-
-from jaxbundle.cli.app import NOT_ACCEPTED
 from jaxbundle.cli.certificate_options import CertificateOptions
-
-if TYPE_CHECKING:
-    from jaxbundle.certificates.acceptance import Acceptance
 
 
 class NoJudge:
@@ -45,33 +38,3 @@ def judge_of(
     from jaxbundle.cli.judgement import make_judge
 
     return make_judge(command, options, outputs, out, inputs, **known)
-
-
-def check_accept(criteria: Sequence[str] | None, command: str) -> None:
-    """Refuse criteria that cannot be decided of a command's result, before the work.
-
-    **Raises:** `InputError`."""
-    if criteria:
-        from jaxbundle.certificates.acceptance import check_criteria
-
-        check_criteria(criteria, command)
-
-
-def accept_result(result: Any, criteria: Sequence[str] | None) -> "Acceptance | None":
-    """The criteria and what was found; a criterion about what the result does not have is not met,
-    so that a mistake in its name loses no result."""
-    if not criteria:
-        return None
-    from jaxbundle.certificates.acceptance import accept_known
-
-    return accept_known(result, criteria)
-
-
-def end_unmet(accepted: "Acceptance | None") -> None:
-    """End the command with a line for each criterion that is not met.
-
-    **Raises:** `typer.Exit` with status 4 if there are any."""
-    if accepted is not None and not accepted.met:
-        for line in accepted.unmet:
-            print(f"jaxbundle: {line}", file=sys.stderr)
-        raise typer.Exit(NOT_ACCEPTED)

@@ -18,8 +18,8 @@ from jaxbundle import report
 from jaxbundle.adjustment.error_budget import Budget
 from jaxbundle.adjustment.orientation_covariance import orientation_covariance
 from jaxbundle.adjustment.result import Adjustment
+from jaxbundle.cli.acceptance import accept_result, end_unmet
 from jaxbundle.cli.certificate_options import JUDGEMENT_FILES
-from jaxbundle.cli.judging import accept_result, end_unmet
 from jaxbundle.commands.origins import network_files as network_files
 from jaxbundle.commands.origins import trace_files as trace_files
 from jaxbundle.commands.origins import trace_origin as trace_origin

@@ -46,7 +46,7 @@ def plan(  # noqa: PLR0913 - the options of the command
 ) -> None:
     """Plan a block of vertical photographs: strips, photographs, expected precision."""
     import jaxbundle
-    from jaxbundle.cli.judging import check_accept
+    from jaxbundle.cli.acceptance import check_accept
     from jaxbundle.cli.outputs import check_writable, print_result
     from jaxbundle.io import write_project
     from jaxbundle.io.networks.project import FILES

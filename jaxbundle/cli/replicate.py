@@ -35,7 +35,7 @@ def replicate(  # noqa: PLR0913 - the options of the command
     share. Of several inputs, jobs of one camera, the interior orientations are compared each with
     each.
     """
-    from jaxbundle.cli.judging import check_accept
+    from jaxbundle.cli.acceptance import check_accept
     from jaxbundle.cli.outputs import check_writable, print_result
     from jaxbundle.cli.progress import staging
 

@@ -21,8 +21,8 @@ def stability(
 ) -> None:
     """Test whether calibrations of one camera differ significantly."""
     import jaxbundle
+    from jaxbundle.cli.acceptance import check_accept
     from jaxbundle.cli.camera_inputs import calibration_given
-    from jaxbundle.cli.judging import check_accept
     from jaxbundle.cli.outputs import check_json_target, print_result
 
     check_accept(accept, "stability")

@@ -81,7 +81,7 @@ def surface(  # noqa: PLR0913 - the options of the command
 ) -> None:
     """Match oriented images to a cloud with the σ of every point, and report its accuracy."""
     import jaxbundle
-    from jaxbundle.cli.judging import accept_result, check_accept, end_unmet
+    from jaxbundle.cli.acceptance import accept_result, check_accept, end_unmet
     from jaxbundle.cli.outputs import check_json, put_json
     from jaxbundle.cli.progress import staging
     from jaxbundle.io.results.result_json import json_text

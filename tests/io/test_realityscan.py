@@ -185,5 +185,9 @@ def test_what_is_wrong_in_a_table_is_named(tmp_path):
 def test_two_focal_lengths_are_refused(tmp_path):
     net = read_network(folder(tmp_path), image_size=SIZE)
     camera = net.cameras[0].__class__("c", "opencv", {"fx": 900.0, "fy": 905.0}, image_size=SIZE)
-    with pytest.raises(InputError, match="one focal length"):
+    near = dataclasses.replace(camera, parameters={"fx": 900.0, "fy": 900.5})
+    said = write_realityscan_csv(net.replace(cameras=(near,)), tmp_path / "realityscan.csv")
+    # f = √(900·900.5) changes 640 px by 0.18 px
+    assert "the difference of fx and fy (largest change in an image 0.18 px)" in said
+    with pytest.raises(InputError, match=r"one focal length.* 1.8 px at the edge"):
         write_realityscan_csv(net.replace(cameras=(camera,)), tmp_path / "realityscan.csv")

@@ -53,7 +53,7 @@ def accuracy(  # noqa: PLR0913 - the options of the command
     Of about a thousand irregular positions, so that none of them falls in step with the records.
     """
     from jaxbundle import pushbroom as line_scanners
-    from jaxbundle.cli.judging import accept_result, check_accept, end_unmet
+    from jaxbundle.cli.acceptance import accept_result, check_accept, end_unmet
     from jaxbundle.cli.pushbroom.accuracy_table import table_of, write_table
     from jaxbundle.cli.pushbroom.places import grid_of
     from jaxbundle.cli.pushbroom.shared import keep_inputs, warn, write_rows

@@ -28,7 +28,7 @@ def refine(
 ) -> None:
     """Refine scanner images, rigorous or with RPC, with control and tie points."""
     from jaxbundle import pushbroom as line_scanners
-    from jaxbundle.cli.judging import accept_result, check_accept, end_unmet
+    from jaxbundle.cli.acceptance import accept_result, check_accept, end_unmet
     from jaxbundle.cli.outputs import (
         PAGE,
         REPORT,

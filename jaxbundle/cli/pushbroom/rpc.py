@@ -41,7 +41,7 @@ def fit(
 ) -> None:
     """Fit coefficients to a scanner or a table; print the residuals in pixels."""
     from jaxbundle import pushbroom as line_scanners
-    from jaxbundle.cli.judging import accept_result, check_accept, end_unmet
+    from jaxbundle.cli.acceptance import accept_result, check_accept, end_unmet
     from jaxbundle.cli.pushbroom.shared import keep_inputs, warn, write_rows
 
     check_accept(accept, "pushbroom rpc fit")
@@ -96,7 +96,7 @@ def compensate(
 ) -> None:
     """Remove the bias found by control points; print residuals, redundancy numbers and w."""
     from jaxbundle import pushbroom as line_scanners
-    from jaxbundle.cli.judging import accept_result, check_accept, end_unmet
+    from jaxbundle.cli.acceptance import accept_result, check_accept, end_unmet
     from jaxbundle.cli.pushbroom.shared import keep_inputs, write_rows
     from jaxbundle.io.scanner.rpc import RASTERS
 

@@ -42,6 +42,7 @@ from jaxbundle.geometry.pose_conventions import flip_rows
 from jaxbundle.io.cameras.nearest_camera import Foreign, fit_camera, fit_messages
 from jaxbundle.io.networks.assemble import (
     PIXEL_CENTRE,
+    all_parameters,
     assemble,
     entry_of,
     foreign_document,
@@ -54,7 +55,6 @@ from jaxbundle.io.networks.losses import (
     describe_losses,
     losing,
     need_values,
-    one_focal_length,
     size_of,
 )
 from jaxbundle.io.networks.poses import check_rotations, matrices_of
@@ -73,6 +73,8 @@ NAMESPACE = "http://www.capturingreality.com/ns/xcr/1.1#"
 # The property of XMP for the name of the file that is described.
 MEDIA, OWN_NAME = "http://ns.adobe.com/xap/1.0/mm/", "PreservedFileName"
 FILES = ("*.xmp",)
+# Pixels that one focal length instead of two may change: rounding to whole pixels does as much.
+LARGEST_DIFFERENCE = 0.5
 # Millimetres of the larger side of an image, in which focal lengths are.
 FILM_SIDE = 36.0
 RADIAL, TANGENTIAL = ("k1", "k2", "k3", "k4"), ("t1", "t2")
@@ -318,7 +320,15 @@ def _heading_of(R: Float[np.ndarray, "3 3"]) -> tuple[float, float, float]:
 def _written(camera: Camera) -> dict[str, float]:
     """The interior orientation in the units of the program."""
     p = check_others_zero(camera, "RealityScan", ("k1", "k2", "k3", "p1", "p2"))
-    (w, h), f = size_of(camera, "RealityScan"), one_focal_length(camera, "RealityScan")
+    w, h = size_of(camera, "RealityScan")
+    # an adjusted camera has two focal lengths that differ by their σ
+    f, off = math.sqrt(p["fx"] * p["fy"]), _focal_difference(camera)
+    if off > LARGEST_DIFFERENCE:
+        raise InputError(
+            f"camera {camera.id!r}: RealityScan has one focal length, but fx is {p['fx']:.9g} and "
+            f"fy {p['fy']:.9g}, {off:.2g} px at the edge of the image; adjust the camera with "
+            'tie = [["fx", "fy"]]'
+        )
     side = max(w, h)
     found = {"f": f / side * FILM_SIDE}
     found |= {"px": (p["cx"] + PIXEL_CENTRE - w / 2) / side}
@@ -326,6 +336,19 @@ def _written(camera: Camera) -> dict[str, float]:
     return found | {"k1": p["k1"], "k2": p["k2"], "k3": p["k3"], "k4": 0.0} | {
         "t1": p["p1"], "t2": p["p2"]
     }  # fmt: skip
+
+
+def _focal_difference(camera: Camera) -> float:
+    """What one focal length instead of two changes at the edge of the image, pixels."""
+    p, (w, h) = all_parameters(camera), size_of(camera, "RealityScan")
+    f = math.sqrt(p["fx"] * p["fy"])
+    return max(w / 2 * abs(f / p["fx"] - 1), h / 2 * abs(f / p["fy"] - 1))
+
+
+def _losses(network: Network) -> tuple[str, ...]:
+    off = max((_focal_difference(camera) for camera in network.cameras), default=0.0)
+    one = f"the difference of fx and fy (largest change in an image {off:.2g} px)"
+    return (*describe_losses(network, REALITYSCAN_LOSSES), *([one] if off else []))
 
 
 def write_realityscan_csv(network: Network, path: str | Path) -> tuple[str, ...]:
@@ -347,7 +370,7 @@ def write_realityscan_csv(network: Network, path: str | Path) -> tuple[str, ...]
     # a comma in the name of a photograph is quoted
     csv.writer(text, lineterminator="\n").writerows(rows)
     write_text(Path(path), f"#{','.join(HEADER)}\n{text.getvalue()}")
-    return describe_losses(network, REALITYSCAN_LOSSES)
+    return _losses(network)
 
 
 def write_realityscan_xmp(
@@ -385,7 +408,7 @@ def fill_realityscan(network: Network, folder: Path) -> tuple[str, ...]:
     folder.mkdir(exist_ok=True)
     for name, text in zip(names, texts):
         write_text(folder / f"{name}.xmp", text)
-    return describe_losses(network, REALITYSCAN_LOSSES)
+    return _losses(network)
 
 
 def _xmp(id: str, p: Mapping[str, float], R: np.ndarray, X0: np.ndarray, group: int) -> str:
