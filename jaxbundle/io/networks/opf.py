@@ -195,6 +195,7 @@ def _resources(path: Path) -> Resources:
 
 def _place(path: Path, uri: str) -> Path:
     """The file of a resource, relative to the project."""
+    # a project from the network would be read from anywhere
     parts = urlparse(uri)
     if parts.scheme not in ("", "file"):
         raise InputError(f"{path}: {uri!r}: a file beside the project is expected")
@@ -203,6 +204,7 @@ def _place(path: Path, uri: str) -> Path:
 
 def _id(row: JsonFields, key: str) -> str:
     """A whole number of 64 bits, as text."""
+    # not `integer`, which a float beyond 2⁵³ would not reach: identifiers have 64 bits
     value = row.get(key)
     if isinstance(value, bool) or not isinstance(value, int):
         said = "missing" if value is None else f"{value!r}; a whole number is expected"
@@ -264,6 +266,7 @@ def _camera(
         )
     if size is None:
         raise InputError(f"{internals.path}: a fisheye without image_size_px in input-cameras")
+    # p0 and even powers have no place in the models here
     A = internals.array("affine", (4,))
     polynomial = internals.array("polynomial", (None,))
     parameters = {"A": A, "p": polynomial, "cx": cx, "cy": cy}
@@ -277,6 +280,7 @@ def _camera(
 def _project_fisheye(p: Mapping[str, Any], X: Scalar, Y: Scalar, Z: Scalar) -> Float[Array, "2"]:
     """The formula of the specification, from the centre of the first pixel."""
     off = root(X * X + Y * Y)
+    # the angle to the axis, 1 at 90°
     theta = 2 / np.pi * jnp.arctan2(off, Z)
     rho = sum(p["p"][i] * theta**i for i in range(len(p["p"])))
     x, y = (jnp.where(off > 0, rho * a / jnp.where(off > 0, off, 1.0), 0.0) for a in (X, Y))
@@ -291,6 +295,7 @@ def _shift(frame: JsonFields | None, told: list[str]) -> Float[np.ndarray, "3"]:
     """What positions have on top of the canonical coordinates."""
     if frame is None:
         return np.zeros(3)
+    # canonical = base·scale, exchanged where it is left-handed; positions have the shift on top
     base = frame.child("base_to_canonical")
     scale = base.array("scale", (3,))
     if (scale != 1).any() or base.get("swap_xy"):
@@ -310,6 +315,7 @@ def _control(
 ) -> tuple[dict[str, Any], dict[str, Any], Points | None]:
     """Columns of the points with marks, and of their image points; control and check points."""
     given, projected = resources.document(INPUT_POINTS), resources.document(PROJECTED_POINTS)
+    # manual tie points have marks as control points have, but no coordinates
     rows = [] if given is None else [*given.rows("gcps"), *given.rows("mtps")]
     ids, checks, marks = [], {}, []
     for row in rows:
@@ -362,6 +368,7 @@ def _tracks(
     for node in file.rows("nodes"):
         if node.get("mesh") is None:
             continue
+        # the specification has one primitive a mesh
         primitive = _of(file, "meshes", node.integer("mesh")).rows("primitives")[0]
         if primitive.get("extensions") is None or MATCHES not in primitive.get("extensions"):
             continue
@@ -380,6 +387,7 @@ def _tracks(
         xy = _accessor(file, matches.child("imagePoints").integer("pixelCoordinates"), "VEC2")
         if len(xy) != len(camera) or (camera >= len(uids)).any():
             raise InputError(f"{path}: cameras and image points of its matches do not agree")
+        # the rows of the matches of the first point, the second, …: ranges may be in any order
         point = np.repeat(np.arange(len(X)), number)
         at = np.repeat(begin - np.cumsum(number) + number, number) + np.arange(number.sum())
         if len(at) and at.max() >= len(camera):
@@ -420,6 +428,7 @@ def _ranges(file: JsonFields, matches: JsonFields, n: int) -> tuple[np.ndarray, 
     pair = _accessor(file, matches.integer("pointIndexRanges"), "VEC2").astype(np.uint64)
     if len(pair) != n:
         raise InputError(f"{file.path}: {len(pair)} ranges of matches of {n} points")
+    # little-endian: the first of the two numbers of 32 bits is the low one
     packed = pair[:, 0] | (pair[:, 1] << np.uint64(32))
     first = packed & np.uint64(2**40 - 1)
     return first.astype(np.int64), (packed >> np.uint64(40)).astype(np.int64)
@@ -449,6 +458,7 @@ def _accessor(file: JsonFields, index: int, kind: str | None) -> np.ndarray:
     check_plain(place)
     begin = view.integer("byteOffset", 0) + accessor.integer("byteOffset", 0)
     try:
+        # before anything is allocated for a count in a damaged header
         there = place.stat().st_size
         if begin + number * dtype.itemsize > there:
             raise InputError(

@@ -73,8 +73,6 @@ NAMESPACE = "http://www.capturingreality.com/ns/xcr/1.1#"
 # The property of XMP for the name of the file that is described.
 MEDIA, OWN_NAME = "http://ns.adobe.com/xap/1.0/mm/", "PreservedFileName"
 FILES = ("*.xmp",)
-# Pixels that one focal length instead of two may change: rounding to whole pixels does as much.
-LARGEST_DIFFERENCE = 0.5
 # Millimetres of the larger side of an image, in which focal lengths are.
 FILM_SIDE = 36.0
 RADIAL, TANGENTIAL = ("k1", "k2", "k3", "k4"), ("t1", "t2")
@@ -118,6 +116,7 @@ def is_realityscan(path: Path) -> bool:
         return first is not None and NAMESPACE.encode() in beginning(first, 10_000)
     if path.suffix.lower() != ".csv":
         return False
+    # the table may begin with the number of cameras, and its columns may be chosen by the user
     for line in beginning(path, 10_000).decode("utf-8", errors="replace").splitlines():
         if not line.strip() or line.startswith("#cameras"):
             continue
@@ -144,6 +143,7 @@ def read_realityscan(
     rows = list(read(path, unknown, image_size))
     if not rows:
         raise InputError(f"{path}: there are no cameras")
+    # each photograph states its own numbers: equal ones are of one camera
     cameras: dict[tuple, Camera] = {}
     used = []
     for row in rows:
@@ -186,6 +186,7 @@ def _size(
     folder: Path, name: str, given: Sequence[float] | None, where: str
 ) -> tuple[tuple[int, int], str]:
     """The size of a photograph, and its name with suffix if it is beside."""
+    # XMP files have the stem of their photograph only
     for file in (folder / name, *(folder / f"{name}{suffix}" for suffix in PHOTOGRAPHS)):
         if file.suffix.lower() in PHOTOGRAPHS and file.is_file():
             return photograph_size(file), file.name
@@ -250,6 +251,7 @@ def _interior(path: Path, fields: Mapping[str, str]) -> dict[str, float]:
     number = lambda key, default: number_in(fields.get(key, default), f"{path}: {key}")
     if number("Skew", "0") != 0 or number("AspectRatio", "1") != 1:
         raise InputError(f"{path}: Skew and AspectRatio are not read; 0 and 1 are expected")
+    # the six coefficients are there for every model, those it does not have as 0
     k = np.zeros(6)
     if model != "perspective" and "DistortionCoeficients" in fields:
         k = _numbers(path, fields, "DistortionCoeficients", 6)
@@ -259,6 +261,7 @@ def _interior(path: Path, fields: Mapping[str, str]) -> dict[str, float]:
 
 
 def _pose(path: Path, fields: Mapping[str, str]) -> tuple[np.ndarray, np.ndarray]:
+    # a calibration alone has no pose: unknown, never the identity
     if "Rotation" not in fields or "Position" not in fields:
         return np.full((3, 3), np.nan), np.full(3, np.nan)
     R = _numbers(path, fields, "Rotation", 9).reshape(3, 3)
@@ -307,6 +310,7 @@ def _heading_of(R: Float[np.ndarray, "3 3"]) -> tuple[float, float, float]:
     """Heading, pitch and roll of a rotation camera → object, degrees; of a camera whose image rows
     are vertical (pitch ±90°) roll is 0."""
     pitch = math.asin(min(1.0, max(-1.0, R[2, 1])))
+    # 1e-12: rounding of a product of three rotations, beyond which two angles become one
     if abs(R[2, 1]) > 1 - 1e-12:
         heading, roll = -math.atan2(R[1, 0], R[0, 0]), 0.0
     else:
@@ -317,13 +321,14 @@ def _heading_of(R: Float[np.ndarray, "3 3"]) -> tuple[float, float, float]:
 # --- writing --------------------------------------------------------------------------------
 
 
-def _written(camera: Camera) -> dict[str, float]:
-    """The interior orientation in the units of the program."""
+def _written(camera: Camera, largest_difference: float = 0.5) -> dict[str, float]:
+    """The interior orientation in the units of the program; `largest_difference`: what one focal
+    length instead of two may change, pixels: rounding to whole ones does as much."""
     p = check_others_zero(camera, "RealityScan", ("k1", "k2", "k3", "p1", "p2"))
     w, h = size_of(camera, "RealityScan")
     # an adjusted camera has two focal lengths that differ by their σ
     f, off = math.sqrt(p["fx"] * p["fy"]), _focal_difference(camera)
-    if off > LARGEST_DIFFERENCE:
+    if off > largest_difference:
         raise InputError(
             f"camera {camera.id!r}: RealityScan has one focal length, but fx is {p['fx']:.9g} and "
             f"fy {p['fy']:.9g}, {off:.2g} px at the edge of the image; adjust the camera with "
@@ -414,6 +419,7 @@ def fill_realityscan(network: Network, folder: Path) -> tuple[str, ...]:
 def _xmp(id: str, p: Mapping[str, float], R: np.ndarray, X0: np.ndarray, group: int) -> str:
     numbers = lambda values: " ".join(repr(float(v)) for v in values)
     coefficients = [p[name] for name in (*RADIAL, *TANGENTIAL)]
+    # a model without tangential terms would drop them
     model = "brown3t2" if any(coefficients[4:]) else "brown3"
     model = model if any(coefficients) else "perspective"
     rdf = "http://www.w3.org/1999/02/22-rdf-syntax-ns#"
