@@ -169,3 +169,21 @@ def test_a_refinement_is_judged_by_its_check_points():
     assert [row.met for row in found.rows] == [True, True, True, False, True, False, True, True,
                                                False]  # fmt: skip
     assert not accept(Refinement(None, None, ()), "check.rms < 1 m").met
+
+
+def test_any_command_ends_with_status_4_and_writes_everything(command, tmp_path):
+    cameras = ROOT / "examples" / "video_cameras" / "cameras.toml"
+    pair = (f"{cameras}#1-indoor", f"{cameras}#1-outdoor", "--json", tmp_path / "c.json")
+    told = command("compare", *pair, "--csv", tmp_path / "c.csv", "--accept", "rings.rms < 1e-9",
+                   "--accept", "no.such < 1")  # fmt: skip
+    document = json.loads((tmp_path / "c.json").read_text("utf-8"))
+    assert told.status == 4 and told.err.count("not met") == 2 and (tmp_path / "c.csv").is_file()
+    assert "unknown quantity 'no.such'" in told.err
+    assert [row["met"] for row in document["acceptance"]["criteria"]] == [False, False]
+    plan = ("plan", "--c", "100", "--image", "68,104", "--area", "300,300", "--sigma-image",
+            "0.003", "--height", "1000", "--no-network")  # fmt: skip
+    # m = 1000/0.1, which the plan states as such
+    assert command(*plan, "--accept", "scale_number <= 10000").status == 0
+    assert command(*plan, "--accept", "scale_number < 10000").status == 4
+    told = command(*plan, "--accept", "scale_number")
+    assert told.status == 2 and "is expected" in told.err
