@@ -77,8 +77,8 @@ FORMATS = tuple(NETWORK_FILES)
 """Kinds of inputs that are networks."""
 TARGETS = (
     "ply", "dxf", "csv", "bundler", "bal", "colmap", "colmap-text", "openmvg", "opensfm",
-    "transforms", "kalibr", "micmac", "jaicov", "mrcal", "opencv-stereo", "ros-stereo",
-    "anipose", "realityscan", "realityscan-csv", "project",
+    "alicevision", "transforms", "kalibr", "micmac", "jaicov", "mrcal", "opencv-stereo",
+    "ros-stereo", "anipose", "realityscan", "realityscan-csv", "project",
 )  # fmt: skip
 # Kinds of outputs: networks, and cameras alone.
 CAMERA_FILES = (

@@ -12,6 +12,7 @@ _HOME = {
     "jaxbundle.io.cameras.opencv_writing": ("write_opencv", "write_ros"),
     "jaxbundle.io.exchange": ("Converted", "convert"),
     "jaxbundle.io.formats": ("FORMATS", "TARGETS", "Format", "OutputFormat", "read_network"),
+    "jaxbundle.io.networks.alicevision_writing": ("write_alicevision",),
     "jaxbundle.io.networks.bal": ("write_bal",),
     "jaxbundle.io.networks.bundler": ("write_bundler",),
     "jaxbundle.io.networks.colmap": ("write_colmap", "write_colmap_cameras"),

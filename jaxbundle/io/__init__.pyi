@@ -26,6 +26,7 @@ from jaxbundle.io.formats import Format as Format
 from jaxbundle.io.formats import OutputFormat as OutputFormat
 from jaxbundle.io.formats import TARGETS as TARGETS
 from jaxbundle.io.formats import read_network as read_network
+from jaxbundle.io.networks.alicevision_writing import write_alicevision as write_alicevision
 from jaxbundle.io.networks.bal import write_bal as write_bal
 from jaxbundle.io.networks.bundler import write_bundler as write_bundler
 from jaxbundle.io.networks.colmap import write_colmap as write_colmap
@@ -96,6 +97,7 @@ __all__ = [
     "read_target",
     "readjustable_network",
     "to_pycolmap",
+    "write_alicevision",
     "write_autocal",
     "write_bal",
     "write_bundler",

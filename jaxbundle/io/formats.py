@@ -17,6 +17,7 @@ from jaxbundle.io.cameras.opencv_file import FILE_STORAGE, YAML
 from jaxbundle.io.cameras.opencv_file import SUFFIXES as OPENCV_SUFFIXES
 from jaxbundle.io.cameras.opencv_writing import write_opencv, write_ros
 from jaxbundle.io.networks.alicevision import is_alicevision, read_alicevision
+from jaxbundle.io.networks.alicevision_writing import ALICEVISION_LOSSES, write_alicevision
 from jaxbundle.io.networks.anipose import (
     ANIPOSE_LOSSES,
     is_anipose,
@@ -383,6 +384,13 @@ TARGETS: dict[str, OutputFormat] = {
         PIXEL_MODELS,
         OPENSFM_FILES,
         losses=OPENSFM_LOSSES,
+    ),
+    "alicevision": OutputFormat(
+        _ends(".sfm"),
+        write_alicevision,
+        "NAME.sfm",
+        PIXEL_MODELS,
+        losses=ALICEVISION_LOSSES,
     ),
     "transforms": OutputFormat(
         _file_of("transforms", ".json"),

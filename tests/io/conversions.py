@@ -27,7 +27,8 @@ NAMES = {
     "bundler": "bundle.out", "bal": "problem.txt", "openmvg": "sfm_data.json",
     "transforms": "transforms.json", "kalibr": "camchain.yaml", "micmac": "Ori-A",
     "anipose": "calibration.toml", "jaicov": "project.phc", "opencv-stereo": "stereo.yaml",
-    "realityscan-csv": "realityscan.csv", "ply": "n.ply", "dxf": "n.dxf", "csv": "n.csv",
+    "realityscan-csv": "realityscan.csv", "alicevision": "scene.sfm",
+    "ply": "n.ply", "dxf": "n.dxf", "csv": "n.csv",
 }  # fmt: skip
 DRAWINGS = ("ply", "dxf", "csv")
 """Outputs that are not read as networks."""
@@ -269,7 +270,6 @@ HOLDS: dict[str, set[str]] = {
               "pixel sizes of cameras"},
     "csm-frame": {"image sizes of cameras", "pixel sizes of cameras"},
     "nvm": {"pixel sizes of cameras", "σ of image points", "colours of points"},
-    "alicevision": {"image sizes of cameras", "pixel sizes of cameras", "colours of points"},
     "opf": {"image sizes of cameras", "roles of points", "σ of control points",
             "colours of points"},
     "orb-slam": {"image sizes of cameras", "rigs"},
