@@ -38,7 +38,7 @@ NETWORK_FILES = {
     "column-map": "a .toml file with [table.…] sections",
     "colmap": "a folder with cameras.bin or cameras.txt",
     "bingo": "a folder with image.dat and geoin.dat",
-    "metashape": "an .xml file of Metashape's cameras",
+    "metashape": "an .xml file of Metashape's cameras, or a project, .psx",
     "photomodeler": 'a .txt file that begins with "Bundle Soln"',
     "bundler": 'a file that begins with "# Bundle file"',
     "openmvg": "openMVG's sfm_data.json",
@@ -59,6 +59,8 @@ NETWORK_FILES = {
     "csm-frame": "an ISD (.json) of a frame camera, USGS_ASTRO_FRAME_SENSOR_MODEL",
     "nvm": "an .nvm file of VisualSFM",
     "alicevision": "an .sfm or .json of AliceVision",
+    "realityscan": "a folder with .xmp of RealityScan, or its .csv of camera parameters",
+    "opf": "an .opf project of the Open Photogrammetry Format (PIX4Dmatic)",
 }
 # Kinds of inputs that are cameras alone.
 CAMERA_INPUTS = {
@@ -75,8 +77,8 @@ FORMATS = tuple(NETWORK_FILES)
 """Kinds of inputs that are networks."""
 TARGETS = (
     "ply", "dxf", "csv", "bundler", "bal", "colmap", "colmap-text", "openmvg", "opensfm",
-    "transforms", "kalibr", "micmac", "jaicov", "mrcal", "opencv-stereo", "ros-stereo",
-    "anipose", "project",
+    "alicevision", "transforms", "kalibr", "micmac", "jaicov", "mrcal", "opencv-stereo",
+    "ros-stereo", "anipose", "realityscan", "realityscan-csv", "project",
 )  # fmt: skip
 # Kinds of outputs: networks, and cameras alone.
 CAMERA_FILES = (

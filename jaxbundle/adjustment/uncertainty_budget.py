@@ -203,13 +203,15 @@ class UncertaintyBudget(TableMethods):
         ):
             value, said = estimate(one.value, float(U), 2)
             shown = "∞" if nu > MANY_DEGREES else f"{nu:.0f}"
+            # u in the form of U: both with an exponent, or none
+            combined = f"{u:.2e}" if "e" in said else significant(float(u))
             rows.append(
                 (
                     one.words,
                     value,
                     said,
                     one.unit,
-                    significant(float(u)),
+                    combined,
                     f"{k:.2f}",
                     shown,
                 )

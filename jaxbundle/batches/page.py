@@ -11,6 +11,7 @@ from jaxbundle.network.columns import count
 from jaxbundle.report.layout import WITHOUT_SIGMA, digits_of, estimate, fixed, significant
 from jaxbundle.report.page import (
     UNKNOWN,
+    Addition,
     Finding,
     Listing,
     Origin,
@@ -19,6 +20,7 @@ from jaxbundle.report.page import (
     give_verdict,
     write,
 )
+from jaxbundle.report.page.adjustment import NO_ADDITION
 from jaxbundle.report.page.charts import draw_histogram
 from jaxbundle.report.page.columns import Column, estimates
 from jaxbundle.report.page.document import NOTHING
@@ -30,15 +32,20 @@ def compose_batch(
     rows: Iterable[Mapping] | Population,
     origin: Origin = UNKNOWN,
     against: Mapping[str, np.ndarray] = NOTHING,
+    also: Addition = NO_ADDITION,
 ) -> Iterator[str]:
     """The page of the results of `run_batch`, as their lines are read (`result_rows`): HTML, in
-    pieces. `against`: columns to correlate with (`Population.correlations`)."""
+    pieces. `against`: columns to correlate with (`Population.correlations`); `also`: findings and
+    sections of a command."""
     found = rows if isinstance(rows, Population) else Population(rows)
-    return write(_describe(found, origin, against))
+    return write(_describe(found, origin, against, also))
 
 
-def _describe(found: Population, origin: Origin, against: Mapping[str, np.ndarray]) -> Page:
+def _describe(
+    found: Population, origin: Origin, against: Mapping[str, np.ndarray], also: Addition
+) -> Page:
     sections = [
+        *also.sections,
         *_rms(found),
         *_parameters(found),
         *_correlations(found, against),
@@ -47,7 +54,7 @@ def _describe(found: Population, origin: Origin, against: Mapping[str, np.ndarra
     counts = Counter(found.status.tolist()).most_common()
     states = [(name, n, fixed(100 * n / len(found), 1)) for name, n in counts]
     shown = "<h3>Status</h3>\n", grid(("status", "number", "%"), states)
-    first = give_verdict(_judge(found), (), *shown)
+    first = give_verdict([*also.findings, *_judge(found)], (), *shown)
     title = f"{count(len(found), 'input')}: batch"
     listed = Listing("Results", _columns(found, against), "", "One row a camera or network.")
     return Page(title, [first, *sections], origin, tables={"results": listed})

@@ -67,8 +67,8 @@ class Correlation:
 
 class Population:
     """Columns over all rows of a batch (`batch.run.result_rows`): `keys`, `status`, `remark`,
-    `numbers` by name; the parameters of cameras, `values`, with their `sigma`, and their deviations
-    `apart` from the median, in robust standard deviations; `rms_apart`, signed."""
+    `numbers` by name; the `models` of cameras; their parameters, `values`, with their `sigma`, and
+    their deviations `apart` from the median, in robust standard deviations; `rms_apart`, signed."""
 
     def __init__(self, rows: Iterable[Mapping], settings: PopulationSettings | None = None):
         self.settings = settings or PopulationSettings()
@@ -76,6 +76,7 @@ class Population:
         words = lambda name: np.array([str(row.get(name, "")) for row in kept], dtype=object)
         self.keys, self.status, self.remark = (words(n) for n in ("key", "status", "remark"))
         self.numbers = {name: numbers(row.get(name) for row in kept) for name in NUMBERS}
+        self.models = {model for row in kept for model in row["models"]}
         names = dict.fromkeys(name for row in kept for name in row["parameters"])
         column = lambda name, what: numbers(
             row["parameters"].get(name, {}).get(what) for row in kept
@@ -243,6 +244,8 @@ def _row(row: Mapping) -> dict:
     removed = row.get("removed")
     found["removed"] = len(removed) if isinstance(removed, list) else removed
     found["remark"] = row.get("remark") or row.get("error", "")
+    cameras = (row.get("cameras") or {}).values()
+    found["models"] = {row.get("model"), *(c.get("model") for c in cameras)} - {None}
     return found | {"parameters": row["parameters"] if "parameters" in row else _of_network(row)}
 
 

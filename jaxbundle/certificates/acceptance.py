@@ -2,22 +2,20 @@
 
 import dataclasses
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 
+from jaxbundle.batches.population import Population
 from jaxbundle.cameras import get_model
-from jaxbundle.certificates.criteria import Criterion, read_criteria
+from jaxbundle.certificates.criteria import Criterion, read_criteria, read_criterion
 from jaxbundle.certificates.lengths import LengthTest, length_errors, read_lengths
-from jaxbundle.certificates.quantities import (
-    AXES,
-    QuantityValues,
-    find_quantity,
-    offered,
-    require_parameter,
-    unknown_quantity,
-)
+from jaxbundle.certificates.quantities import find_quantity, offered
+from jaxbundle.certificates.quantities_of_batches import SOLVED
+from jaxbundle.certificates.quantities_of_others import unknown_quantity
+from jaxbundle.certificates.quantity import AXES, QuantityValues, require_parameter
 from jaxbundle.certificates.units import convert, kind_of
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError, NotSolvedError
@@ -34,7 +32,8 @@ OF_UNKNOWNS = ("sigma", "sigma.rms", "value", "t", "correlation")
 class AcceptanceRow:
     """One criterion: the `value` that decides, in the unit of the limit (the largest of several
     for an upper limit, the smallest for a lower one); what it is `of`; the `number` of values;
-    whether all of them meet it; `why` there is no value."""
+    whether all of them meet it; `why` there is no value; `failed`: of what the values are that do
+    not meet it, of a batch the inputs."""
 
     criterion: Criterion
     value: float
@@ -42,6 +41,7 @@ class AcceptanceRow:
     number: int = 1
     met: bool = False
     why: str = ""
+    failed: tuple[str, ...] = ()
 
     @property
     def line(self) -> str:
@@ -52,6 +52,7 @@ class AcceptanceRow:
         where += f", {'largest' if self.criterion.upper else 'smallest'} of {self.number}" * (
             bool(self.of) and self.number > 1
         )
+        where += f"; {len(self.failed)} do not meet it" * (len(self.failed) > 1)
         where += ")" * bool(self.of)
         return f"{self.criterion.text}: {self.said}{where}"
 
@@ -97,6 +98,12 @@ class Acceptance(TableMethods):
         """A line for each criterion that is not met."""
         return [f"not met: {row.line}" for row in self.rows if not row.met]
 
+    def meets_all(self, inputs: Sequence[str]) -> Bool[np.ndarray, " inputs"]:
+        """Which inputs of a batch meet every criterion; none if one cannot be decided of any."""
+        failed = {one for row in self.rows for one in row.failed}
+        undecided = any(row.why and not row.failed for row in self.rows)
+        return np.array([not undecided and one not in failed for one in inputs], bool)
+
     @property
     def sentence(self) -> str:
         """The result in words."""
@@ -136,10 +143,10 @@ class Acceptance(TableMethods):
     def to_dict(self) -> dict[str, Any]:
         """The rows as plain dicts and numbers, as in JSON."""
         columns = {name: column.tolist() for name, column in self.table().items()}
-        return {
-            "met": self.met,
-            "criteria": [dict(zip(columns, r)) for r in zip(*columns.values())],
-        }
+        rows = [dict(zip(columns, r)) for r in zip(*columns.values())]
+        for found, row in zip(self.rows, rows):
+            row["failed"] = len(found.failed)
+        return {"met": self.met, "criteria": rows}
 
     def __str__(self) -> str:
         return "\n".join([f"Acceptance: {self.sentence}", *table(HEADER, self.text_rows(), "lrll")])
@@ -158,8 +165,10 @@ def accept(
 
     **Arguments:**
 
-    - `result`: of `adjust`, `calibrate`, `calibrate_rig`, `reconstruct`; of any other function the
-      quantities are the numbers of `to_dict()` by their path, such as `"counts.images > 3"`.
+    - `result`: of `adjust`, `calibrate`, `calibrate_rig`, `reconstruct`, `hand_eye`, `batch` (of
+      every input; one without a result is not accepted unless a criterion says which share `solved`
+      must be), `pushbroom.refine`; of any other function the quantities are the numbers of
+      `to_dict()` by their path, such as `"counts.images > 3"`, of a list of every row.
     - `criteria`: texts QUANTITY COMPARISON NUMBER UNIT; quantities and units are listed in
       docs/certificate.md. A quantity of several parameters, points or parts must meet the criterion
       with each.
@@ -171,13 +180,38 @@ def accept(
     **Raises:** `InputError` for an unknown quantity, argument or unit; `NotSolvedError` for a
     result without a solution.
     """
+    return _accept(result, criteria, lengths, _judge)
+
+
+def accept_known(result: Any, criteria: Iterable[str]) -> Acceptance:
+    """`accept`, in which a criterion that is refused is not met, with the reason."""
+
+    def judge(subject: Any, test: LengthTest | None, one: Criterion) -> AcceptanceRow:
+        try:
+            return _judge(subject, test, one)
+        except InputError as error:
+            why = str(error).removeprefix(f"criterion {one.text!r}: ")
+            return AcceptanceRow(one, math.nan, why=why)
+
+    return _accept(result, criteria, None, judge)
+
+
+def _accept(
+    result: Any, criteria: Iterable[str] | str, lengths: Any, judge: Callable[..., AcceptanceRow]
+) -> Acceptance:
     found = read_criteria(criteria)
-    if not np.all(result.converged):
+    population = getattr(result, "population", result)
+    if isinstance(population, Population):
+        if all(one.name != SOLVED for one in found):
+            # an input without a result has no numbers that could fail
+            found.append(read_criterion(f"{SOLVED} >= 100 %"))
+        return Acceptance(tuple(judge(population, None, one) for one in found))
+    if not np.all(getattr(result, "converged", True)):
         raise NotSolvedError("the result has no solution: there is nothing to accept")
     test = lengths
     if lengths is not None and not isinstance(lengths, LengthTest):
         test = length_test_of(result, lengths)
-    return Acceptance(tuple(_judge(result, test, one) for one in found))
+    return Acceptance(tuple(judge(result, test, one) for one in found))
 
 
 def length_test_of(result: Any, lengths: Any, **options: Any) -> LengthTest:
@@ -203,18 +237,22 @@ def _judge(result: Any, test: LengthTest | None, one: Criterion) -> AcceptanceRo
     except InputError as error:
         raise InputError(f"criterion {one.text!r}: {error}") from None
     except (LookupError, NotSolvedError) as error:
-        return AcceptanceRow(one, math.nan, why=str(error.args[0] if error.args else error))
+        why = str(error.args[0] if error.args else error)
+        return AcceptanceRow(one, math.nan, why=why, failed=getattr(error, "inputs", ()))
     # NaN decides: what cannot be compared is not accepted
     worst = max if one.upper else min
     unknown = [name for name, value in values.items() if math.isnan(value)]
     of = unknown[0] if unknown else worst(values, key=lambda name: values[name])
+    failed = [name for name, value in values.items() if not one.holds(value)]
+    owners = [found.owners.get(name, name) for name in failed]
     return AcceptanceRow(
         one,
         values[of],
         of,
         len(values),
-        all(one.holds(value) for value in values.values()),
+        not failed,
         "it is not a number" if unknown else "",
+        tuple(dict.fromkeys(k for o in owners for k in ([o] if isinstance(o, str) else o))),
     )
 
 
@@ -236,16 +274,17 @@ def check_criteria(
 
     **Raises:** `InputError` naming the criterion, and what is known."""
     criteria, known = read_criteria(texts or ()), offered(command)
+    if not known:
+        return criteria
     for one in criteria:
         try:
             if one.name not in known:
                 forms = [quantity.form for quantity in known.values()]
                 raise InputError(unknown_quantity(one.name, forms))
             cameras = network.cameras if network is not None else _of_models(models)
-            if one.name in OF_UNKNOWNS:
+            if one.name in OF_UNKNOWNS and command != "pushbroom refine":
                 _check_unknown(one, cameras, network, command)
-            elif one.argument and not known[one.name].arguments:
-                raise InputError(f"it has no argument, but ({one.argument}) is given")
+            known[one.name].check_argument(one.argument)
             _check_unit(one, known[one.name].unit, network)
         except InputError as error:
             raise InputError(f"--accept {one.text!r}: {error}") from None
@@ -293,6 +332,8 @@ def _check_unit(one: Criterion, words: str, network: Network | None) -> None:
         else:
             _check_unit_of_parameter(one, name, network)
             return
+    if words == "length, angle":
+        words = "angle" if one.argument == "rotation" else "length"
     kind = kind_of(one.unit)
     if words == "length":
         unit = "m" if network is None else network.object_unit

@@ -299,7 +299,8 @@ def _budgets(certificate: "Certificate") -> Iterator[Section]:
                 f"<h3>{text(one.words + where)}</h3>\n",
                 grid(BUDGET_HEADER, part.budget.rows(m), "budget"),
                 paragraph(
-                    f"u = {row[4]}, ν_eff = {row[6]}, k = {row[5]}, U = {row[2]} {one.unit}; σ of "
+                    f"u = {row[4]}, ν_eff = {row[6]}, k = {row[5]}, "
+                    f"U = {f'{row[2]} {one.unit}'.strip()}; σ of "
                     f"the adjustment {significant(float(part.budget.sigma[m]))}."
                 ),
             ]

@@ -13,69 +13,49 @@ import numpy as np
 
 from jaxbundle.adjustment.budget_inputs import unit_of_parameter
 from jaxbundle.adjustment.result import Adjustment
+from jaxbundle.batches.population import Population
 from jaxbundle.calibration.result import Calibration
 from jaxbundle.calibration.rig.result import RigCalibration
 from jaxbundle.calibration.several import Calibrations
-from jaxbundle.cameras import get_model
 from jaxbundle.certificates.lengths import LengthTest
+from jaxbundle.certificates.quantities_of_batches import OF_BATCH
+from jaxbundle.certificates.quantities_of_others import (
+    OF_HAND_EYE,
+    OF_REFINEMENT,
+    find_by_path,
+    unknown_quantity,
+)
+from jaxbundle.certificates.quantity import (
+    AXES,
+    Quantity,
+    QuantityValues,
+    Subject,
+    one_value,
+    refuse_argument,
+    require_parameter,
+)
 from jaxbundle.certificates.units import NO_PITCH, PixelPitch
 from jaxbundle.errors import InputError
-from jaxbundle.network.columns import did_you_mean, list_some
+from jaxbundle.network.columns import did_you_mean
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.reconstruction.result import Reconstruction
+from jaxbundle.refinement import Refinement
 from jaxbundle.report.correlated import stated_sigma, stated_sigma_of
 from jaxbundle.types import present
 
-AXES = ("X", "Y", "Z")
-
-
-@dataclasses.dataclass(frozen=True)
-class Subject:
-    """What criteria are about: a result, and the test of calibrated lengths, if there is one."""
-
-    result: Any
-    lengths: LengthTest | None = None
-
-
-@dataclasses.dataclass(frozen=True)
-class QuantityValues:
-    """Values of a quantity by what they are of ("" for the whole), in `unit`."""
-
-    values: Mapping[str, float]
-    unit: str = ""
-    pitch: PixelPitch = NO_PITCH
-
-
-@dataclasses.dataclass(frozen=True)
-class Quantity:
-    """A quantity: its `form` for lists ("sigma(NAME)", in brackets what may be omitted), its `unit`
-    in words, what it is; `find` its values in a subject, by the argument."""
-
-    form: str
-    unit: str
-    words: str
-    find: Callable[[Subject, str], QuantityValues]
-
-    @property
-    def name(self) -> str:
-        return self.form.partition("(")[0].rstrip("[")
-
-    @property
-    def arguments(self) -> tuple[str, ...]:
-        """The arguments it may have; names of them in capitals."""
-        inside = self.form.partition("(")[2].rstrip(")]")
-        return tuple(inside.split("|")) if inside else ()
-
 
 def offered(kind: str) -> dict[str, Quantity]:
-    """The quantities of a command's result, by name: "adjust", "calibrate", "calibrate-rig",
-    "reconstruct"."""
+    """The quantities of a command's result, by name; none of a command whose quantities are the
+    numbers of its JSON."""
     every = {
         "adjust": (OF_ADJUSTMENT,),
         "calibrate": (OF_CALIBRATION, OF_ADJUSTMENT),
         "calibrate-rig": (OF_RIG,),
         "reconstruct": (OF_RECONSTRUCTION, OF_ADJUSTMENT),
-    }[kind]
+        "batch": (OF_BATCH,),
+        "hand-eye": (OF_HAND_EYE, OF_ADJUSTMENT),
+        "pushbroom refine": (OF_REFINEMENT,),
+    }.get(kind, ())
     found: dict[str, Quantity] = {}
     for quantities in every:
         for one in quantities:
@@ -100,16 +80,9 @@ def find_quantity(
             }
             return _join(parts)
     if not groups:
-        return _by_path(result, name, argument)
+        return find_by_path(result, name, argument)
     known = {one.form for quantities, _ in groups for one in quantities}
     raise InputError(unknown_quantity(name, sorted(known)))
-
-
-def unknown_quantity(name: str, forms: list[str]) -> str:
-    """The message for an unknown quantity, with the list."""
-    names = [form.partition("(")[0].rstrip("[") for form in forms]
-    mean = did_you_mean(name, names, listing=False)
-    return f"unknown quantity {name!r}{mean}; known: {list_some(forms, len(forms), str)}"
 
 
 def _parts_of(result: Any) -> list[tuple[tuple[Quantity, ...], dict[str, Any]]]:
@@ -131,6 +104,13 @@ def _parts_of(result: Any) -> list[tuple[tuple[Quantity, ...], dict[str, Any]]]:
         one = len(result.parts) == 1
         parts = {"" if one else part.name: part.adjustment for part in result.parts}
         return [(OF_RECONSTRUCTION, {"": result}), (OF_ADJUSTMENT, parts)]
+    if isinstance(result, Population):
+        return [(OF_BATCH, {"": result})]
+    if isinstance(result, Refinement):
+        return [(OF_REFINEMENT, {"": result})]
+    if isinstance(adjustment := getattr(result, "adjustment", None), Adjustment):
+        # of a camera on a robot, which is above this room
+        return [(OF_HAND_EYE, {"": result}), (OF_ADJUSTMENT, {"": adjustment})]
     return []
 
 
@@ -145,24 +125,9 @@ def _join(parts: Mapping[str, QuantityValues]) -> QuantityValues:
         for label, found in parts.items()
         for name, value in found.values.items()
     }
-    return QuantityValues(values, units.pop(), pitches.pop() if len(pitches) == 1 else NO_PITCH)
-
-
-def _by_path(result: Any, name: str, argument: str) -> QuantityValues:
-    """A number of `to_dict` by its path, such as `rms` or `counts.images`, of any other result."""
-    to_dict = getattr(result, "to_dict", None)
-    if to_dict is None:
-        raise InputError(f"a result of jaxbundle is expected, not {type(result).__name__}")
-    found = to_dict()
-    for part in name.split("."):
-        if not isinstance(found, Mapping) or part not in found:
-            keys = list(found) if isinstance(found, Mapping) else []
-            numbers = [k for k in keys if isinstance(found[k], int | float | Mapping)]
-            raise InputError(unknown_quantity(name, numbers))
-        found = found[part]
-    if isinstance(found, bool) or not isinstance(found, int | float) or argument:
-        raise InputError(f"{name}: is not one number of the result")
-    return QuantityValues({"": float(found)})
+    owners = {name: owner for found in parts.values() for name, owner in found.owners.items()}
+    pitch = pitches.pop() if len(pitches) == 1 else NO_PITCH
+    return QuantityValues(values, units.pop(), pitch, owners)
 
 
 # --- adjustment -----------------------------------------------------------------------------
@@ -176,21 +141,12 @@ def _pitch(cameras: Any) -> PixelPitch:
     return NO_PITCH
 
 
-def _one(value: float, unit: str = "") -> QuantityValues:
-    return QuantityValues({"": float(value)}, unit)
-
-
 def _number(function: Callable[[Adjustment], float]) -> Callable[[Subject, str], QuantityValues]:
     def find(subject: Subject, argument: str) -> QuantityValues:
-        _refuse_argument(argument)
-        return _one(function(subject.result))
+        refuse_argument(argument)
+        return one_value(function(subject.result))
 
     return find
-
-
-def _refuse_argument(argument: str) -> None:
-    if argument:
-        raise InputError(f"it has no argument, but ({argument}) is given")
 
 
 def _split(argument: str) -> tuple[str, str, str]:
@@ -273,18 +229,6 @@ def _of_cameras(
     return QuantityValues(values, units.pop(), _pitch(cameras))
 
 
-def require_parameter(cameras: Any, name: str) -> None:
-    """Refuse a name that is no parameter of any of these cameras.
-
-    **Raises:** `InputError`."""
-    known = dict.fromkeys(p for c in cameras for p in get_model(c.model).parameters)
-    if name not in known:
-        raise InputError(
-            f"there is no parameter {name!r}{did_you_mean(name, known, listing=False)}; known: "
-            f"{', '.join([*known, *EXTERIOR, *AXES])}"
-        )
-
-
 def _sigma(subject: Subject, argument: str) -> QuantityValues:
     return _parameters(subject, argument, stated_sigma_of, stated_sigma)
 
@@ -311,7 +255,7 @@ def _rms_sigma(subject: Subject, argument: str) -> QuantityValues:
 
 
 def _image_rms(subject: Subject, argument: str) -> QuantityValues:
-    _refuse_argument(argument)
+    refuse_argument(argument)
     adjustment: Adjustment = subject.result
     rows = adjustment.residuals
     image = rows["kind"] == "image"
@@ -344,7 +288,7 @@ def _check_rms(subject: Subject, argument: str) -> QuantityValues:
     parts = {"": AXES, "3D": AXES, "H": AXES[:2], "V": AXES[2:], **{a: (a,) for a in AXES}}
     if argument not in parts:
         raise InputError(f"({argument}): one of X, Y, Z, H, V, 3D is expected")
-    return _one(math.sqrt(sum(rms[axis] ** 2 for axis in parts[argument])), unit)
+    return one_value(math.sqrt(sum(rms[axis] ** 2 for axis in parts[argument])), unit)
 
 
 def _check_max(subject: Subject, argument: str) -> QuantityValues:
@@ -381,7 +325,7 @@ def _control_rms(subject: Subject, argument: str) -> QuantityValues:
     if not own.any():
         raise LookupError("the result has no control points with σ")
     rms = [_rms(rows["v"][own & (rows["axis"] == a)]) for a in AXES if argument in ("", a)]
-    return _one(math.sqrt(sum(x * x for x in rms)), adjustment.network.object_unit)
+    return one_value(math.sqrt(sum(x * x for x in rms)), adjustment.network.object_unit)
 
 
 def _lengths(subject: Subject) -> LengthTest:
@@ -391,20 +335,20 @@ def _lengths(subject: Subject) -> LengthTest:
 
 
 def _lme(subject: Subject, argument: str) -> QuantityValues:
-    _refuse_argument(argument)
+    refuse_argument(argument)
     test = _lengths(subject)
     errors = zip(test.lengths.ends, np.abs(test.error).tolist())
     return QuantityValues({f"length {a} – {b}": error for (a, b), error in errors}, test.unit)
 
 
 def _lme_rms(subject: Subject, argument: str) -> QuantityValues:
-    _refuse_argument(argument)
-    return _one(_lengths(subject).rms, _lengths(subject).unit)
+    refuse_argument(argument)
+    return one_value(_lengths(subject).rms, _lengths(subject).unit)
 
 
 def _lme_number(subject: Subject, argument: str) -> QuantityValues:
-    _refuse_argument(argument)
-    return _one(len(_lengths(subject).lengths))
+    refuse_argument(argument)
+    return one_value(len(_lengths(subject).lengths))
 
 
 def _chi_squared(adjustment: Adjustment) -> float:
@@ -461,7 +405,7 @@ def _calibrated(
     function: Callable[[Calibration], float], unit: str = ""
 ) -> Callable[[Subject, str], QuantityValues]:
     def find(subject: Subject, argument: str) -> QuantityValues:
-        _refuse_argument(argument)
+        refuse_argument(argument)
         camera = present(subject.result).camera
         return QuantityValues({"": float(function(subject.result))}, unit, _pitch([camera]))
 
@@ -505,8 +449,8 @@ def _rig_number(
     function: Callable[[RigCalibration], float],
 ) -> Callable[[Subject, str], QuantityValues]:
     def find(subject: Subject, argument: str) -> QuantityValues:
-        _refuse_argument(argument)
-        return _one(function(subject.result))
+        refuse_argument(argument)
+        return one_value(function(subject.result))
 
     return find
 
@@ -571,8 +515,8 @@ def _reconstructed(
     function: Callable[[Reconstruction], float],
 ) -> Callable[[Subject, str], QuantityValues]:
     def find(subject: Subject, argument: str) -> QuantityValues:
-        _refuse_argument(argument)
-        return _one(function(subject.result))
+        refuse_argument(argument)
+        return one_value(function(subject.result))
 
     return find
 

@@ -13,6 +13,7 @@ import typer
 import jaxbundle
 from jaxbundle.choices import BOARDS, DICTIONARIES
 from jaxbundle.cli.app import Html, Quiet, app, choice, model_choice
+from jaxbundle.cli.certificate_options import Accept
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.system.interrupts import advise
 
@@ -98,6 +99,7 @@ def batch(  # noqa: PLR0913 - the options of the command
         typer.Option(help="CSV of id and quantities to correlate with: serial number, date"),
     ] = None,
     html: Html = "",
+    accept: Accept = None,
     force: Annotated[
         bool,
         typer.Option(
@@ -131,7 +133,8 @@ def batch(  # noqa: PLR0913 - the options of the command
     from jaxbundle.batches.processes import add_parts, run_joined
     from jaxbundle.batches.run_on_files import run_batch
     from jaxbundle.batches.stacks import is_camera_stack
-    from jaxbundle.cli.batch_outputs import check_outputs, write_outputs
+    from jaxbundle.cli.acceptance import accept_result, check_accept, end_unmet
+    from jaxbundle.cli.batch_outputs import addition_of, check_outputs, write_outputs
     from jaxbundle.cli.board_options import board_given
     from jaxbundle.cli.outputs import check_page, trace_files
     from jaxbundle.cli.processes import join_for_one_task
@@ -145,10 +148,13 @@ def batch(  # noqa: PLR0913 - the options of the command
     known = (
         board_given(board, square, kind, None, marker, dictionary, first_marker) if board else None
     )
+    check_accept(accept, "batch")
     check_page(html, None, [*inputs, json_lines], force)
     given = [*inputs, json_lines, *filter(None, (html, against and str(against)))]
     check_outputs(table, summary, given, force)
-    asked = _made_of_lines({"--html": html, "--table": table, "--summary": summary}, json_lines)
+    asked = _made_of_lines(
+        {"--html": html, "--table": table, "--summary": summary, "--accept": accept}, json_lines
+    )
     columns = None if against is None else _read_against(against, bool(asked))
     if not all(is_camera_stack(one) or known and is_photograph_folder(one) for one in inputs):
         # Cameras already use the cores by threads; devices gain nothing.
@@ -182,7 +188,7 @@ def batch(  # noqa: PLR0913 - the options of the command
         )
         if not first:
             # only the first process writes, though all compute
-            html, table, summary, asked, quiet = "", None, None, [], True
+            html, table, summary, accept, asked, quiet = "", None, None, None, [], True
     elif not part:
         add_parts(json_lines)  # left by joined processes that were ended
     advise("run the same command again to resume")
@@ -208,11 +214,13 @@ def batch(  # noqa: PLR0913 - the options of the command
             progress=lambda _, done, total: bar.update(task, completed=done, total=total),
         )
     done = BatchRun(tuple(inputs), json_lines, counts)
+    accepted = None
     if asked:
         found = done.population
         # read again, for the keys that now have results
         beside = {} if columns is None else read_against(columns, found.keys, str(against))
-        write_outputs(found, beside, table, summary)
+        accepted = accept_result(found, accept)
+        write_outputs(found, beside, table, summary, accepted)
     if html:
         origin = trace_files(
             inputs,
@@ -231,13 +239,16 @@ def batch(  # noqa: PLR0913 - the options of the command
                 "--set": ", ".join(set or ()),
                 "--part": part,
                 "--against": "" if against is None else str(against),
+                "--accept": "; ".join(accept or ()),
             },
         )
-        write_text(Path(html), compose_batch(found, origin, beside))
+        write_text(Path(html), compose_batch(found, origin, beside, addition_of(accepted)))
     total, solved = done.statuses.total(), done.solved
     said = ", ".join(f"{n} {status}" for status, n in done.statuses.most_common() if n)
     if not quiet:
         print(done.report())
+        if accepted is not None:
+            print(f"\n{accepted}")
         if any(counts[status] for status in STATUSES_WITH_REASON):
             _print_reasons(inputs, json_lines)
     if first and known:
@@ -250,6 +261,7 @@ def batch(  # noqa: PLR0913 - the options of the command
             f"result: {said}",
             file=sys.stderr,
         )
+    end_unmet(accepted)
 
 
 def _made_of_lines(outputs: Mapping[str, object], json_lines: str) -> list[str]:

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +13,12 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.results.parquet import is_parquet, need_pyarrow, write_parquet
 from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.io.text.csv_tables import table_rows, write_csv, write_text
+from jaxbundle.report.page import Addition, Finding
+from jaxbundle.report.page.adjustment import NO_ADDITION
+from jaxbundle.report.verdict import BAD, GOOD
+
+if TYPE_CHECKING:
+    from jaxbundle.certificates.acceptance import Acceptance
 
 
 def check_outputs(
@@ -38,18 +45,39 @@ def check_outputs(
 
 
 def write_outputs(
-    found: Population, against: Mapping[str, np.ndarray], table: Path | None, summary: Path | None
+    found: Population,
+    against: Mapping[str, np.ndarray],
+    table: Path | None,
+    summary: Path | None,
+    accepted: "Acceptance | None" = None,
 ) -> None:
-    """Write the requested files."""
+    """Write the requested files; with criteria, whether each input meets them."""
     if table is not None:
         columns = found.table(against)
+        if accepted is not None:
+            columns["accepted"] = accepted.meets_all(found.keys.tolist())
         if is_parquet(table):
             write_parquet(table, columns)
         else:
             write_csv(table, list(columns), map(_plain, table_rows(columns)))
     if summary is not None:
-        text = json.dumps(without_nan(found.summary(against)), ensure_ascii=False, indent=1)
+        document = found.summary(against)
+        if accepted is not None:
+            good = accepted.meets_all(found.keys.tolist())
+            document["acceptance"] = accepted.to_dict()
+            document["not_accepted"] = found.keys[~good].tolist()
+        text = json.dumps(without_nan(document), ensure_ascii=False, indent=1)
         write_text(summary, text + "\n")
+
+
+def addition_of(accepted: "Acceptance | None") -> Addition:
+    """What criteria add to the page."""
+    if accepted is None:
+        return NO_ADDITION
+    from jaxbundle.certificates.page import acceptance_section
+
+    finding = Finding("Acceptance", GOOD if accepted.met else BAD, accepted.sentence)
+    return NO_ADDITION._replace(findings=(finding,), sections=(acceptance_section(accepted),))
 
 
 def _plain(row: tuple) -> tuple:

@@ -7,6 +7,7 @@ import typer
 
 from jaxbundle.choices import SURFACE_ERRORS
 from jaxbundle.cli.app import Force, Json, Quiet, app
+from jaxbundle.cli.certificate_options import Accept
 from jaxbundle.errors import InputError
 
 COMMAND = "change"
@@ -57,12 +58,14 @@ def change(  # noqa: PLR0913 - the options of the command
     ] = None,
     level: Annotated[float, typer.Option(help="of significance of a cell")] = 0.05,
     size: Annotated[float | None, typer.Option(help="cells, of clouds")] = None,
+    accept: Accept = None,
     json: Json = "",
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
     """Compare two surfaces: differences, their σ and significance, volumes with σ."""
     import jaxbundle
+    from jaxbundle.cli.acceptance import check_accept
     from jaxbundle.cli.outputs import check_writable, print_result
     from jaxbundle.io.results.result_json import json_text
     from jaxbundle.io.text.csv_tables import write_text
@@ -74,6 +77,7 @@ def change(  # noqa: PLR0913 - the options of the command
         for path in (before, after, before_sigma, after_sigma, stable, regions)
         if path is not None
     ]
+    check_accept(accept, "change")
     check_writable(json, out, COMMAND, FILES, inputs, force)
     found = jaxbundle.change(
         before,
@@ -96,7 +100,7 @@ def change(  # noqa: PLR0913 - the options of the command
         write_change(found.change, folder / FILES[0], folder / FILES[1])
         write_text(folder / FILES[2], json_text(found.to_dict()))
         write_text(folder / FILES[3], found.report() + "\n")
-    print_result(found, json, quiet)
+    print_result(found, json, quiet, accept)
 
 
 def _errors(option: str, given: list[str] | None) -> dict[str, float]:

@@ -9,6 +9,7 @@ import typer
 
 from jaxbundle.choices import CLOUD_FILES, CUBE_POINTS
 from jaxbundle.cli.app import Json, app, choice
+from jaxbundle.cli.certificate_options import Accept
 from jaxbundle.errors import InputError
 
 
@@ -33,6 +34,7 @@ def cloud(  # noqa: PLR0913 - the options of the command
         Path | None, typer.Option(help="points X,Y,Z (.csv) whose heights are compared")
     ] = None,
     plane: Annotated[bool, typer.Option("--plane", help="RMS to the best plane")] = False,
+    accept: Accept = None,
     json: Json = "",
     force: Annotated[
         bool, typer.Option("--force", help="replace files that are not clouds")
@@ -40,12 +42,14 @@ def cloud(  # noqa: PLR0913 - the options of the command
 ) -> None:
     """Filter, thin, convert and compare point clouds; accuracy and DSM."""
     import jaxbundle
+    from jaxbundle.cli.acceptance import check_accept
     from jaxbundle.cli.outputs import check_writable, print_result
     from jaxbundle.surfaces.dsm import write_dsm
     from jaxbundle.surfaces.point_files import write_cloud
 
     if (dsm is None) != (size is None):
         raise InputError("--dsm and --size: give both")
+    check_accept(accept, "cloud")
     inputs = [given for given in (file, against, check) if given is not None]
     check_writable(json, None, "cloud", (), inputs, force)
     _check_targets(inputs, out, dsm, force)
@@ -66,7 +70,7 @@ def cloud(  # noqa: PLR0913 - the options of the command
         write_dsm(found.dsm, dsm, dsm.with_name(f"{dsm.stem}_sigma{dsm.suffix}"))
     if out is not None:
         write_cloud(found.cloud, out)
-    print_result(found, json)
+    print_result(found, json, accept=accept)
 
 
 # The beginning of a cloud, by its suffix.

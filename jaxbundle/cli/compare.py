@@ -7,13 +7,14 @@ from typing import Annotated
 import typer
 
 from jaxbundle.cli.app import Json, app
+from jaxbundle.cli.certificate_options import Accept
 from jaxbundle.errors import InputError
 
 PAIR = "examples/video_cameras/cameras.toml#1-indoor examples/video_cameras/cameras.toml#1-outdoor"
 
 
 @app.command(example=PAIR)
-def compare(
+def compare(  # noqa: PLR0913 - the options of the command
     a: Annotated[
         str,
         typer.Argument(
@@ -31,16 +32,19 @@ def compare(
     pixel_size: Annotated[str, typer.Option(help="W,H in mm, if missing in A")] = "",
     csv: Annotated[Path | None, typer.Option(help="file for the table of rings")] = None,
     plot: Annotated[Path | None, typer.Option(help="PNG file for the map")] = None,
+    accept: Accept = None,
     json: Json = "",
 ) -> None:
     """Compare two calibrations: parameters, and image differences. Of two saved adjustments, all
     common unknowns, with a test of each difference."""
     import jaxbundle
+    from jaxbundle.cli.acceptance import check_accept
     from jaxbundle.cli.camera_inputs import calibration_given, pair, write_png
     from jaxbundle.cli.outputs import check_json_target, print_result
     from jaxbundle.commands.comparison import CalibrationComparison, is_saved_adjustment
     from jaxbundle.io.text.csv_tables import table_rows, write_csv
 
+    check_accept(accept, "compare")
     check_json_target(json, (one.partition("#")[0] for one in (a, b)))
     if is_saved_adjustment(a) or is_saved_adjustment(b):
         if plot is not None:
@@ -58,7 +62,6 @@ def compare(
             image_size=pair("--image-size", image_size),
             pixel_size=pair("--pixel-size", pixel_size),
         )
-    print_result(found, json)
     if csv is not None:
         table = found.table()
         write_csv(csv, list(table), table_rows(table))
@@ -67,3 +70,4 @@ def compare(
 
         size = (7.5, 6) if found.covariance is None else (14, 6)
         write_png(plot, size, partial(difference_maps, found.images, found.covariance))
+    print_result(found, json, accept=accept)

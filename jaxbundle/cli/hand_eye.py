@@ -8,6 +8,7 @@ import typer
 from jaxbundle.choices import HAND_EYE
 from jaxbundle.cli import calibration_options as options
 from jaxbundle.cli.app import Json, app, choice
+from jaxbundle.cli.certificate_options import Accept
 
 
 @app.command("hand-eye", example="photos --poses robot.csv --board 9x6 --square 0.03")
@@ -37,13 +38,16 @@ def hand_eye_command(  # noqa: PLR0913 - the options of the command
     marker: options.Marker = None,
     dictionary: options.Dictionary = "DICT_4X4_50",
     model: options.Model = "opencv",
+    accept: Accept = None,
     json: Json = "",
 ) -> None:
     """Find the pose of a camera on a robot, with σ, from photographs and the robot's poses."""
     import jaxbundle
+    from jaxbundle.cli.acceptance import check_accept
     from jaxbundle.cli.board_options import board_given
     from jaxbundle.cli.outputs import check_json_target, print_result
 
+    check_accept(accept, "hand-eye")
     check_json_target(json, [*input, str(poses)])
     settings = {
         "type": type,
@@ -57,4 +61,4 @@ def hand_eye_command(  # noqa: PLR0913 - the options of the command
     else:
         network = input[0] if len(input) == 1 else input
         found = jaxbundle.hand_eye(network, poses, **settings)
-    print_result(found, json)
+    print_result(found, json, accept=accept)

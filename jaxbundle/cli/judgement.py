@@ -2,13 +2,11 @@
 judged after it."""
 
 import dataclasses
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import typer
 
 from jaxbundle.certificates.acceptance import (
     Acceptance,
@@ -26,7 +24,7 @@ from jaxbundle.certificates.lengths import (
     require_points,
 )
 from jaxbundle.certificates.page import acceptance_section, lengths_section
-from jaxbundle.cli.app import NOT_ACCEPTED
+from jaxbundle.cli.acceptance import end_unmet
 from jaxbundle.cli.certificate_options import ACCEPTANCE_FILE, LENGTHS_FILE, CertificateOptions
 from jaxbundle.cli.outputs import HTML, check_content, check_file
 from jaxbundle.errors import InputError
@@ -119,10 +117,7 @@ class Judge:
         """End the command with a line for each criterion that is not met.
 
         **Raises:** `typer.Exit` with status 4 if there are any."""
-        if judgement.acceptance is not None and not judgement.acceptance.met:
-            for line in judgement.acceptance.unmet:
-                print(f"jaxbundle: {line}", file=sys.stderr)
-            raise typer.Exit(NOT_ACCEPTED)
+        end_unmet(judgement.acceptance)
 
 
 def make_judge(

@@ -8,7 +8,7 @@ import dataclasses
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
@@ -18,6 +18,7 @@ from jaxbundle import report
 from jaxbundle.adjustment.error_budget import Budget
 from jaxbundle.adjustment.orientation_covariance import orientation_covariance
 from jaxbundle.adjustment.result import Adjustment
+from jaxbundle.cli.acceptance import accept_result, end_unmet
 from jaxbundle.cli.certificate_options import JUDGEMENT_FILES
 from jaxbundle.commands.origins import network_files as network_files
 from jaxbundle.commands.origins import trace_files as trace_files
@@ -183,13 +184,22 @@ def check_json_target(json: str, inputs: Iterable[str | Path]) -> None:
     check_json(json)
 
 
-def print_result(result: ReportedResult, json: str, quiet: bool = False) -> None:
+def print_result(
+    result: ReportedResult, json: str, quiet: bool = False, accept: Sequence[str] | None = None
+) -> None:
     """Print the report of a result, or write its JSON (`-`: instead of the report). `quiet`: no
-    report beside a file."""
+    report beside a file; `accept`: criteria, whose verdict follows.
+
+    **Raises:** `typer.Exit` with status 4 if a criterion is not met."""
+    accepted = accept_result(result, accept)
     if json:
-        put_json(json, result.to_dict())
+        more = NOTHING if accepted is None else {"acceptance": accepted.to_dict()}
+        put_json(json, {**result.to_dict(), **more})
     if json != "-" and not (quiet and json):
         print(result.report())
+        if accepted is not None:
+            print(f"\n{accepted}")
+    end_unmet(accepted)
 
 
 def put_json(json: str, document: Mapping) -> None:

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from jaxbundle.cli.app import Force, Json, app
+from jaxbundle.cli.certificate_options import Accept
 from jaxbundle.errors import InputError
 
 
@@ -39,15 +40,18 @@ def plan(  # noqa: PLR0913 - the options of the command
         bool, typer.Option(help="σ from the covariance of a simulated block")
     ] = True,
     out: Annotated[Path | None, typer.Option(help="folder for the block as a project")] = None,
+    accept: Accept = None,
     json: Json = "",
     force: Force = False,
 ) -> None:
     """Plan a block of vertical photographs: strips, photographs, expected precision."""
     import jaxbundle
+    from jaxbundle.cli.acceptance import check_accept
     from jaxbundle.cli.outputs import check_writable, print_result
     from jaxbundle.io import write_project
     from jaxbundle.io.networks.project import FILES
 
+    check_accept(accept, "plan")
     check_writable(json, out, "plan", FILES, (), force)
     if sum(value is not None for value in (height, scale, ground_pixel)) != 1:
         raise InputError("give one of --height, --scale, --ground-pixel (with --pixel)")
@@ -67,12 +71,11 @@ def plan(  # noqa: PLR0913 - the options of the command
         network=network,
         errors=_sizes(errors or ()),
     )
-    written = None
     if out is not None:
         written = write_project(found.network, out, force=force, by="plan")
-    print_result(found, json)
-    if written is not None and json != "-":
-        print(f"{'written':22}{written}")
+        if json != "-":
+            print(f"{'written':22}{written}")
+    print_result(found, json, accept=accept)
 
 
 def _sizes(given: Sequence[str]) -> dict[str, float]:

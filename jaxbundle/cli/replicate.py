@@ -7,6 +7,7 @@ import typer
 import jaxbundle
 from jaxbundle.choices import REPLICATION, TESTS
 from jaxbundle.cli.app import Control, Force, Format, Input, Json, Quiet, Settings, app, choice
+from jaxbundle.cli.certificate_options import Accept
 
 
 @app.command(example="out/board/network --by views --repeat 4", once=True)
@@ -18,6 +19,7 @@ def replicate(  # noqa: PLR0913 - the options of the command
     by: Annotated[str, choice(REPLICATION, "what the halves do not share")] = "photographs",
     repeat: Annotated[int, typer.Option(min=1, help="random halves; runs have one")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="of the random halves")] = 0,
+    accept: Accept = None,
     json: Json = "",
     force: Force = False,
     set: Settings = None,
@@ -33,9 +35,11 @@ def replicate(  # noqa: PLR0913 - the options of the command
     share. Of several inputs, jobs of one camera, the interior orientations are compared each with
     each.
     """
+    from jaxbundle.cli.acceptance import check_accept
     from jaxbundle.cli.outputs import check_writable, print_result
     from jaxbundle.cli.progress import staging
 
+    check_accept(accept, "replicate")
     jaxbundle.use_cores()
     check_writable(json, None, "replicate", (), [input, *(more or ())], force)
     with staging(quiet or json == "-") as show:
@@ -50,4 +54,4 @@ def replicate(  # noqa: PLR0913 - the options of the command
             snooping=snooping,
             progress=show,
         )
-    print_result(found, json, quiet)
+    print_result(found, json, quiet, accept)

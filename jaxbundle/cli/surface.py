@@ -7,6 +7,7 @@ import typer
 
 from jaxbundle.choices import SURFACE_POINTS
 from jaxbundle.cli.app import Force, Quiet, app, choice
+from jaxbundle.cli.certificate_options import Accept
 
 FILES = (
     "cloud.csv",
@@ -73,12 +74,14 @@ def surface(  # noqa: PLR0913 - the options of the command
             help="write cloud.csv, too; cloud.ply has its columns in a fraction of the size"
         ),
     ] = True,
+    accept: Accept = None,
     json: Annotated[str, typer.Option(help="counts and accuracy as JSON; - prints only JSON")] = "",
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
     """Match oriented images to a cloud with the σ of every point, and report its accuracy."""
     import jaxbundle
+    from jaxbundle.cli.acceptance import accept_result, check_accept, end_unmet
     from jaxbundle.cli.outputs import check_json, put_json
     from jaxbundle.cli.progress import staging
     from jaxbundle.io.results.result_json import json_text
@@ -92,6 +95,7 @@ def surface(  # noqa: PLR0913 - the options of the command
     from jaxbundle.surfaces.point_files import write_cloud
     from jaxbundle.system.clock import in_words, now
 
+    check_accept(accept, "surface")
     check_json(json)
     check_folder(out, "surface", FILES, input, force)
     with staging(quiet or json == "-") as show:
@@ -114,6 +118,10 @@ def surface(  # noqa: PLR0913 - the options of the command
         )
     files = [str(file) for one in input for file in input_files(one)]
     told = f"{', '.join(stamp(files, in_words(now())))}\n{found.report()}"
+    accepted, document = accept_result(found, accept), found.to_dict()
+    if accepted is not None:
+        told += f"\n\n{accepted}"
+        document = {**document, "acceptance": accepted.to_dict()}
     with replace_folder(out, "surface", FILES, force) as folder:
         if csv:
             write_cloud_csv(found.cloud, folder / "cloud.csv")
@@ -122,9 +130,10 @@ def surface(  # noqa: PLR0913 - the options of the command
             write_dsm(found.dsm, folder / "dsm.tif", folder / "dsm_sigma.tif")
             if found.orthophoto is not None:
                 write_orthophoto(found.orthophoto, found.dsm, folder / "orthophoto.tif")
-        write_text(folder / "surface.json", json_text(found.to_dict()))
+        write_text(folder / "surface.json", json_text(document))
         write_text(folder / "report.txt", told + "\n")
     if json:
-        put_json(json, found.to_dict())
+        put_json(json, document)
     if not quiet and json != "-":
         print(told)
+    end_unmet(accepted)

@@ -26,6 +26,7 @@ from jaxbundle.io.formats import Format as Format
 from jaxbundle.io.formats import OutputFormat as OutputFormat
 from jaxbundle.io.formats import TARGETS as TARGETS
 from jaxbundle.io.formats import read_network as read_network
+from jaxbundle.io.networks.alicevision_writing import write_alicevision as write_alicevision
 from jaxbundle.io.networks.bal import write_bal as write_bal
 from jaxbundle.io.networks.bundler import write_bundler as write_bundler
 from jaxbundle.io.networks.colmap import write_colmap as write_colmap
@@ -43,6 +44,8 @@ from jaxbundle.io.networks.project import read_project as read_project
 from jaxbundle.io.networks.project import write_project as write_project
 from jaxbundle.io.networks.pycolmap_objects import from_pycolmap as from_pycolmap
 from jaxbundle.io.networks.pycolmap_objects import to_pycolmap as to_pycolmap
+from jaxbundle.io.networks.realityscan import write_realityscan_csv as write_realityscan_csv
+from jaxbundle.io.networks.realityscan import write_realityscan_xmp as write_realityscan_xmp
 from jaxbundle.io.networks.transforms import write_transforms as write_transforms
 from jaxbundle.io.rasters.correction import map_of as map_of
 from jaxbundle.io.rasters.maps import MapGrid as MapGrid
@@ -94,6 +97,7 @@ __all__ = [
     "read_target",
     "readjustable_network",
     "to_pycolmap",
+    "write_alicevision",
     "write_autocal",
     "write_bal",
     "write_bundler",
@@ -116,6 +120,8 @@ __all__ = [
     "write_opensfm",
     "write_ply",
     "write_project",
+    "write_realityscan_csv",
+    "write_realityscan_xmp",
     "write_ros",
     "write_rpc",
     "write_target",

@@ -17,6 +17,7 @@ from jaxbundle.io.cameras.opencv_file import FILE_STORAGE, YAML
 from jaxbundle.io.cameras.opencv_file import SUFFIXES as OPENCV_SUFFIXES
 from jaxbundle.io.cameras.opencv_writing import write_opencv, write_ros
 from jaxbundle.io.networks.alicevision import is_alicevision, read_alicevision
+from jaxbundle.io.networks.alicevision_writing import ALICEVISION_LOSSES, write_alicevision
 from jaxbundle.io.networks.anipose import (
     ANIPOSE_LOSSES,
     is_anipose,
@@ -64,11 +65,20 @@ from jaxbundle.io.networks.opensfm import (
     write_opensfm_cameras,
 )
 from jaxbundle.io.networks.opensfm_control import CONTROL
+from jaxbundle.io.networks.opf import is_opf, read_opf
 from jaxbundle.io.networks.orb_slam import is_orb_slam_pair, read_orb_slam_pair
 from jaxbundle.io.networks.photo_list import read_photo_list
 from jaxbundle.io.networks.photomodeler import is_photomodeler, read_photomodeler
 from jaxbundle.io.networks.project import FILE_NAME, fill_project, project_file, read_project
 from jaxbundle.io.networks.project import FILES as PROJECT_FILES
+from jaxbundle.io.networks.realityscan import FILES as REALITYSCAN_FILES
+from jaxbundle.io.networks.realityscan import (
+    REALITYSCAN_LOSSES,
+    fill_realityscan,
+    is_realityscan,
+    read_realityscan,
+    write_realityscan_csv,
+)
 from jaxbundle.io.networks.rig_result import (
     file_of_line,
     is_rig_line,
@@ -264,6 +274,13 @@ FORMATS: dict[str, Format] = {
         read_alicevision,
         NETWORK_FILES["alicevision"],
     ),
+    "realityscan": Format(
+        is_realityscan,
+        read_realityscan,
+        NETWORK_FILES["realityscan"],
+        takes_image_size=True,
+    ),
+    "opf": Format(is_opf, read_opf, NETWORK_FILES["opf"]),
 }
 
 
@@ -309,6 +326,13 @@ TARGETS: dict[str, OutputFormat] = {
         write_dxf,
         "NAME.dxf",
         losses=DXF_LOSSES,
+    ),
+    "realityscan-csv": OutputFormat(
+        _file_of("realityscan", ".csv"),
+        write_realityscan_csv,
+        "NAME.csv with realityscan in its name",
+        ("opencv",),
+        losses=REALITYSCAN_LOSSES,
     ),
     "csv": OutputFormat(
         _ends(".csv"),
@@ -360,6 +384,13 @@ TARGETS: dict[str, OutputFormat] = {
         PIXEL_MODELS,
         OPENSFM_FILES,
         losses=OPENSFM_LOSSES,
+    ),
+    "alicevision": OutputFormat(
+        _ends(".sfm"),
+        write_alicevision,
+        "NAME.sfm",
+        PIXEL_MODELS,
+        losses=ALICEVISION_LOSSES,
     ),
     "transforms": OutputFormat(
         _file_of("transforms", ".json"),
@@ -425,6 +456,14 @@ TARGETS: dict[str, OutputFormat] = {
         PIXEL_MODELS,
         alone=True,
         losses=ANIPOSE_LOSSES,
+    ),
+    "realityscan": OutputFormat(
+        _folder_of("realityscan"),
+        fill_realityscan,
+        "a folder with realityscan in its name",
+        ("opencv",),
+        REALITYSCAN_FILES,
+        losses=REALITYSCAN_LOSSES,
     ),
     "project": OutputFormat(
         lambda path: not path.suffix or path.is_dir() or path.name == FILE_NAME,

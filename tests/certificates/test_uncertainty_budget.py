@@ -222,3 +222,11 @@ def test_it_prints_and_is_a_table(convergent4):
         np.testing.assert_allclose(columns["share"][own].sum(), 1)
         value, U = (float(x) for x in budget.result_rows()[m][1:3])
         assert abs(value - one.value) <= U and U == pytest.approx(budget.expanded[m], rel=0.06)
+
+
+def test_u_and_U_have_one_form(convergent4):
+    budget = jaxbundle.uncertainty_budget(convergent4, of=("camera:cam:c", "camera:cam:K3"))
+    for one, row in zip(budget.measurands, budget.result_rows()):
+        assert ("e" in row[2]) == ("e" in row[4]), one.words
+        # U = k·u, within the digits that are shown
+        assert float(row[2]) == pytest.approx(float(row[5]) * float(row[4]), rel=0.06)

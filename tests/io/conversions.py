@@ -27,6 +27,7 @@ NAMES = {
     "bundler": "bundle.out", "bal": "problem.txt", "openmvg": "sfm_data.json",
     "transforms": "transforms.json", "kalibr": "camchain.yaml", "micmac": "Ori-A",
     "anipose": "calibration.toml", "jaicov": "project.phc", "opencv-stereo": "stereo.yaml",
+    "realityscan-csv": "realityscan.csv", "alicevision": "scene.sfm",
     "ply": "n.ply", "dxf": "n.dxf", "csv": "n.csv",
 }  # fmt: skip
 DRAWINGS = ("ply", "dxf", "csv")
@@ -234,7 +235,8 @@ def round_trip(kind: str, network: Network) -> tuple[Comparison, tuple[str, ...]
     """A network written and read back, and what was said to be lost."""
     with tempfile.TemporaryDirectory() as name:
         path, said = write(kind, network, Path(name))
-        back = read_network(path, format=None if kind == "colmap-text" else kind)
+        size = (1280, 720) if kind.startswith("realityscan") else None
+        back = read_network(path, format=None if kind not in FORMATS else kind, image_size=size)
     return Comparison(network, back), said
 
 
@@ -263,12 +265,13 @@ HOLDS: dict[str, set[str]] = {
     "photomodeler": {"image sizes of cameras", "pixel sizes of cameras", "roles of points",
                      "σ of control points", "σ of image points"},
     "metashape": {"image sizes of cameras", "pixel sizes of cameras", "roles of points",
-                  "σ of control points"},
+                  "σ of control points", "colours of points"},
     "bingo": {"prior σ of camera parameters", "roles of points", "image sizes of cameras",
               "pixel sizes of cameras"},
     "csm-frame": {"image sizes of cameras", "pixel sizes of cameras"},
     "nvm": {"pixel sizes of cameras", "σ of image points", "colours of points"},
-    "alicevision": {"image sizes of cameras", "pixel sizes of cameras", "colours of points"},
+    "opf": {"image sizes of cameras", "roles of points", "σ of control points",
+            "colours of points"},
     "orb-slam": {"image sizes of cameras", "rigs"},
     "vins": {"image sizes of cameras", "rigs"},
     "euroc": {"image sizes of cameras", "rigs"},
@@ -282,7 +285,7 @@ HOLDS: dict[str, set[str]] = {
 """What the inputs may have, beside `ALWAYS` and what an output of the same name keeps."""
 MOUNTED = {"anipose", "orb-slam", "vins", "euroc", "rig", "rig-line", "kalibr", "opencv-stereo",
            "ros-stereo"}  # fmt: skip
-WITHOUT_POINTS = MOUNTED | {"transforms", "micmac", "mrcal", "csm-frame"}
+WITHOUT_POINTS = MOUNTED | {"transforms", "micmac", "mrcal", "csm-frame", "realityscan"}
 
 
 def holds(kind: str) -> set[str]:
@@ -316,8 +319,9 @@ def cell(given: str, kind: str) -> str:
 
 def table() -> str:
     """The table of conversions."""
-    kinds = [kind for kind in TARGETS if kind not in ("colmap-text", "ros-stereo")]
-    titles = {"colmap": "colmap, colmap-text", "opencv-stereo": "opencv-stereo, ros-stereo"}
+    kinds = [k for k in TARGETS if k not in ("colmap-text", "ros-stereo", "realityscan-csv")]
+    titles = {"colmap": "colmap, colmap-text", "opencv-stereo": "opencv-stereo, ros-stereo",
+              "realityscan": "realityscan, realityscan-csv"}  # fmt: skip
     lines = [f"| from, to | {' | '.join(titles.get(kind, kind) for kind in kinds)} | not read |",
              "|---" * (len(kinds) + 2) + "|"]  # fmt: skip
     for given, form in FORMATS.items():

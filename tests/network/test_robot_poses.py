@@ -371,6 +371,11 @@ def test_the_command_and_the_function(seen, tmp_path, command, capsys):
     told = command("hand-eye", path, "--poses", table, "--sigma-position", SIGMA_P,
                    "--sigma-angle", SIGMA_R, "--json", tmp_path / "out.json")  # fmt: skip
     assert told.status == 0 and "repeatability, robot positions" in told.out
+    criteria = [f"robot.repeatability(position) < {3e3 * SIGMA_P} mm", "sigma0 < 2",
+                "robot.sigma(position) < 1 m"]  # fmt: skip
+    judged = jaxbundle.accept(found, criteria)
+    assert judged.met and judged.rows[2].number == 6
+    assert judged.rows[2].value >= sigma[:3].max() * (1 - 1e-9)
     assert not found.doubts and "warning" not in str(found)
     with pytest.raises(InputError, match="repeatability"):
         jaxbundle.hand_eye(path, table)

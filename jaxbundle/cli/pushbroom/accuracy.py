@@ -7,6 +7,7 @@ import typer
 
 from jaxbundle.choices import ATTITUDE_ERRORS, AttitudeError
 from jaxbundle.cli.app import choice
+from jaxbundle.cli.certificate_options import Accept
 from jaxbundle.cli.pushbroom.app import Csv, Dem, Geoid, Json, Level, ScannerFile, pushbroom
 from jaxbundle.errors import InputError
 
@@ -43,6 +44,7 @@ def accuracy(  # noqa: PLR0913 - the options of the command
     height: Level = None,
     dem: Dem = None,
     geoid: Geoid = None,
+    accept: Accept = None,
     csv: Csv = None,
     json: Json = "",
 ) -> None:
@@ -51,14 +53,18 @@ def accuracy(  # noqa: PLR0913 - the options of the command
     Of about a thousand irregular positions, so that none of them falls in step with the records.
     """
     from jaxbundle import pushbroom as line_scanners
+    from jaxbundle.cli.acceptance import accept_result, check_accept, end_unmet
     from jaxbundle.cli.pushbroom.accuracy_table import table_of, write_table
     from jaxbundle.cli.pushbroom.places import grid_of
     from jaxbundle.cli.pushbroom.shared import keep_inputs, warn, write_rows
 
+    check_accept(accept, "pushbroom accuracy")
     keep_inputs([scanner, truth, dem], csv=csv, json=json, map=map_)
     if map_ is not None:
         _check_map(map_, table)
     if table:
+        if accept:
+            raise InputError("--accept: not available with --table; omit one of them")
         if dem is not None:
             raise InputError("--dem: use --height with --table; terrain has no reverse mode")
         kind = cast(AttitudeError, table)
@@ -84,9 +90,11 @@ def accuracy(  # noqa: PLR0913 - the options of the command
     figures = {name: value for name, value in found.figures.items() if name != "scanner"}
     if map_ is not None:
         _write_map(map_, found.table(), figures)
-    write_rows(found.columns, csv, json, found.figures)
+    accepted = accept_result(found, accept)
+    write_rows(found.columns, csv, json, found.figures, accepted)
     if json != "-":
         typer.echo("; ".join(f"{k} {v:.6g}" for k, v in figures.items()), err=True)
+    end_unmet(accepted)
 
 
 def _check_map(path: Path, table: str | None) -> None:

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from jaxbundle.cli.app import Force, Html, Json
+from jaxbundle.cli.certificate_options import Accept
 from jaxbundle.cli.pushbroom.app import pushbroom
 
 PHOTOGRAPHS = "photographs"
@@ -22,10 +23,12 @@ def refine(
     ] = None,
     html: Html = "",
     force: Force = False,
+    accept: Accept = None,
     json: Json = "",
 ) -> None:
     """Refine scanner images, rigorous or with RPC, with control and tie points."""
     from jaxbundle import pushbroom as line_scanners
+    from jaxbundle.cli.acceptance import accept_result, check_accept, end_unmet
     from jaxbundle.cli.outputs import (
         PAGE,
         REPORT,
@@ -51,6 +54,7 @@ def refine(
     from jaxbundle.report.page.refinement import compose_refinement
     from jaxbundle.report.refinement_verdict import conclude_refinement
 
+    check_accept(accept, "pushbroom refine")
     file = read_refinement(input)
     names = [REPORT, PAGE, RESULT, "points.csv", *(f"{PHOTOGRAPHS}/{name}" for name in FILES)]
     names += names_of_images(file)
@@ -71,7 +75,11 @@ def refine(
         result = dataclasses.replace(result, warnings=(*result.warnings, *refits))
     verdict = conclude_refinement(result)
     text = head_line(origin) + report(result, verdict.words)
+    accepted = accept_result(result, accept)
     document = without_nan({"verdict": verdict_dict(verdict), **to_json(result)})
+    if accepted is not None:
+        text += f"\n{accepted}\n"
+        document["acceptance"] = without_nan(accepted.to_dict())
     as_json = json_.dumps(document, ensure_ascii=False) + "\n"
     page = partial(compose_refinement, result, origin)
     with write_result(json, as_json, out, "pushbroom refine", names, force, html, page) as new:
@@ -90,3 +98,4 @@ def refine(
     else:
         for warning in result.warnings:
             warn(warning)
+    end_unmet(accepted)

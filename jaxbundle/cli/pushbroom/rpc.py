@@ -7,6 +7,7 @@ import typer
 
 from jaxbundle.choices import RPC_BIASES
 from jaxbundle.cli.app import Application, choice
+from jaxbundle.cli.certificate_options import Accept
 from jaxbundle.cli.pushbroom.app import Csv, Dem, Geoid, Json, Level, pushbroom
 from jaxbundle.errors import InputError
 
@@ -35,19 +36,24 @@ def fit(
     ridge: Annotated[
         float | None, typer.Option(min=0, help="ridge parameter; default: automatic")
     ] = None,
+    accept: Accept = None,
     json: Figures = "",
 ) -> None:
     """Fit coefficients to a scanner or a table; print the residuals in pixels."""
     from jaxbundle import pushbroom as line_scanners
+    from jaxbundle.cli.acceptance import accept_result, check_accept, end_unmet
     from jaxbundle.cli.pushbroom.shared import keep_inputs, warn, write_rows
 
+    check_accept(accept, "pushbroom rpc fit")
     keep_inputs([source], out=out, json=json)
     found = line_scanners.rpc.fit(source, heights=_heights(heights), ridge=ridge, tell=warn)
     found.write(out)
+    accepted = accept_result(found, accept)
     if json:
-        write_rows(found.columns, None, json, found.figures)
+        write_rows(found.columns, None, json, found.figures, accepted)
     else:
-        print(found)
+        print(found if accepted is None else f"{found}\n\n{accepted}")
+    end_unmet(accepted)
 
 
 @rpc.command(example="out/image_RPC.TXT --points points.csv")
@@ -85,21 +91,26 @@ def compensate(
     model: Annotated[str, choice(RPC_BIASES, "in the image")] = "shift",
     sigma: Annotated[float, typer.Option(help="σ of measured lines and samples, pixels")] = 1.0,
     csv: Csv = None,
+    accept: Accept = None,
     json: Figures = "",
 ) -> None:
     """Remove the bias found by control points; print residuals, redundancy numbers and w."""
     from jaxbundle import pushbroom as line_scanners
+    from jaxbundle.cli.acceptance import accept_result, check_accept, end_unmet
     from jaxbundle.cli.pushbroom.shared import keep_inputs, write_rows
     from jaxbundle.io.scanner.rpc import RASTERS
 
+    check_accept(accept, "pushbroom rpc compensate")
     # the tags of a raster may be replaced in place
     keep_inputs([control], out=out, csv=csv, json=json)
     keep_inputs([coefficients], csv=csv, json=json, out=None if out.suffix in RASTERS else out)
     found = line_scanners.rpc.compensate(coefficients, control, model=model, sigma=sigma)
     found.write(out)
-    write_rows(found.columns, csv, json, found.figures)
+    accepted = accept_result(found, accept)
+    write_rows(found.columns, csv, json, found.figures, accepted)
     if json != "-":
         typer.echo("; ".join(f"{k} {v:.6g}" for k, v in found.figures.items()), err=True)
+    end_unmet(accepted)
 
 
 def _heights(text: str) -> tuple[float, float]:

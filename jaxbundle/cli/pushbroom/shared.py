@@ -4,6 +4,7 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import typer
@@ -20,6 +21,9 @@ from jaxbundle.io.text.csv_tables import write_csv, write_text
 from jaxbundle.io.writing.fingerprints import files_read
 from jaxbundle.system.terminals import write_json
 from jaxbundle.types import Column
+
+if TYPE_CHECKING:
+    from jaxbundle.certificates.acceptance import Acceptance
 
 
 def open_scanner(path: Path) -> ScannerInput:
@@ -40,9 +44,15 @@ def keep_inputs(inputs: Sequence[str | Path | None], **outputs: str | Path | Non
 
 
 def write_rows(
-    columns: Mapping[str, Column], csv: Path | None, json_: str, head: Mapping | None = None
+    columns: Mapping[str, Column],
+    csv: Path | None,
+    json_: str,
+    head: Mapping | None = None,
+    accepted: "Acceptance | None" = None,
 ) -> None:
-    """A table as CSV or JSON, in a file or on standard output."""
+    """A table as CSV or JSON, in a file or on standard output; with what was found of criteria."""
+    if accepted is not None:
+        head = {**(head or {}), "acceptance": accepted.to_dict()}
     columns = {
         name: values.tolist() if isinstance(values, np.ndarray) else list(values)
         for name, values in columns.items()

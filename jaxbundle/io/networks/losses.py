@@ -154,6 +154,12 @@ def changed(names: Sequence[str], written: Sequence[object]) -> int:
     return sum(name != str(new) for name, new in zip(names, written, strict=True))
 
 
+def written_numbers(ids: Sequence[str]) -> list[int]:
+    """The ids if all are numbers, else 0, 1, 2, …"""
+    plain = all(id.isascii() and id.isdigit() and len(id) < 10 and str(int(id)) == id for id in ids)
+    return [int(id) for id in ids] if plain else list(range(len(ids)))
+
+
 def are_numbered_from_0(ids: Sequence[str]) -> bool:
     """Whether the names are 0, 1, 2, …, as a format counts them."""
     return changed(ids, range(len(ids))) == 0

@@ -1,4 +1,4 @@
-"""Cameras of Agisoft Metashape: the XML of "Export Cameras".
+"""Cameras of Agisoft Metashape: the XML of "Export Cameras", and projects (`.psx`).
 
     document/chunk
       sensors/sensor id label type            calibration class="adjusted": f cx cy k1… p1 p2 b1 b2
@@ -18,7 +18,7 @@ georeferenced), otherwise chunk coordinates.
 
 Markers are points. If their references are in a local coordinate system, three of them or more
 are control points, and disabled ones check points; otherwise they are tie points
-without coordinates. The tie points of Metashape are not in this file.
+without coordinates. The tie points of Metashape are in projects only (`metashape_archive.py`).
 
 Source: Agisoft Metashape user manual, sections on formats; exported files.
 """
@@ -37,11 +37,18 @@ from jaxbundle.io.cameras.nearest_camera import NoPlaceError
 from jaxbundle.io.networks.assemble import (
     PIXEL_CENTRE,
     assemble,
+    colour_columns,
     foreign_document,
     image_columns,
     unique_labels,
 )
 from jaxbundle.io.networks.control import with_control
+from jaxbundle.io.networks.metashape_archive import (
+    ChunkArchive,
+    TieTable,
+    is_metashape_archive,
+    read_archive,
+)
 from jaxbundle.io.networks.metashape_camera import (
     check_sensor,
     label_of,
@@ -102,13 +109,16 @@ MARKER_KEYS = Keys(
 
 
 def is_metashape(path: Path) -> bool:
-    """Whether an XML file begins with a `document` that has a `chunk`."""
+    """Whether an XML file begins with a `document` that has a `chunk`, or a file is a project."""
+    if is_metashape_archive(path):
+        return True
     head = beginning(path, 4000) if path.suffix.lower() == ".xml" else b""
     return b"<document" in head and b"<chunk" in head
 
 
 def read_metashape(path: str | Path, overrides: Sequence[str] = ()) -> Network:
-    """The cameras and images of an export, and the image points of markers if there are any.
+    """The cameras and images of an export or a project, the image points of markers if there are
+    any, and the tie points of a project.
 
     Cameras and images are named by their labels; nothing is free, σ is 1 px, the datum inner.
 
@@ -116,7 +126,7 @@ def read_metashape(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     """
     path = Path(path)
     unknown = UnknownKeys()
-    chunk = _chunk(path, unknown)
+    chunk, ties, said = _chunk(path, unknown)
     sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
     cameras = [camera for camera in chunk.iterfind("cameras//camera")]
     for camera in cameras:
@@ -138,6 +148,7 @@ def read_metashape(path: str | Path, overrides: Sequence[str] = ()) -> Network:
             where = f"{path}, sensor {label_of(sensors[id])!r}"
             check_sensor(unknown, sensors[id], where)
     entries, told = _entries(path, sensors, used)
+    told = [*said, *told]
     used = [camera for camera in used if camera.get("sensor_id") in entries]
     labels = unique_labels([label_of(c) for c in used], [c.get("id", "") for c in used])
     poses = [
@@ -157,6 +168,8 @@ def read_metashape(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     )
     by_id = {c.get("id"): label for c, label in zip(used, labels)}
     points, rays, control = _markers(path, chunk, by_id)
+    if ties is not None:
+        points, rays = _with_ties(path, chunk, ties, by_id, points, rays)
     document = foreign_document(path.stem, entries.values(), object_unit="m")
     if left:
         why = "not aligned" if aligned else "without a measured marker"
@@ -197,18 +210,23 @@ def _entries(
     return entries, told
 
 
-def _chunk(path: Path, unknown: UnknownKeys) -> ET.Element:
-    root = read_xml(path)
-    chunks = root.findall("chunk")
-    if root.tag != "document" or len(chunks) != 1:
-        raise InputError(
-            f"{path}: one <chunk> in a <document> is expected; there are {len(chunks)}"
-        )
-    unknown.check_element(root, DOCUMENT_KEYS, path)
-    unknown.check_element(chunks[0], CHUNK_KEYS, path)
-    for marker in chunks[0].iterfind("markers//marker"):
+def _chunk(path: Path, unknown: UnknownKeys) -> ChunkArchive:
+    """The chunk; of a project with its tie points, and messages."""
+    if is_metashape_archive(path):
+        found = read_archive(path)
+    else:
+        root = read_xml(path)
+        chunks = root.findall("chunk")
+        if root.tag != "document" or len(chunks) != 1:
+            raise InputError(
+                f"{path}: one <chunk> in a <document> is expected; there are {len(chunks)}"
+            )
+        unknown.check_element(root, DOCUMENT_KEYS, path)
+        found = ChunkArchive(chunks[0])
+    unknown.check_element(found.chunk, CHUNK_KEYS, path)
+    for marker in found.chunk.iterfind("markers//marker"):
         unknown.check_element(marker, MARKER_KEYS, f"{path}, marker {label_of(marker)!r}")
-    return chunks[0]
+    return found
 
 
 def _pose(
@@ -217,7 +235,17 @@ def _pose(
     """M and X0, in the chunk's frame or, if it has a transform, in that of the world."""
     T = numbers_of(f"{where}, transform", camera.findtext("transform"), 16).reshape(4, 4)
     to_chunk, centre = T[:3, :3], T[:3, 3]
-    component = camera.get("component_id")
+    R, t, scale = _to_world(where, chunk, camera.get("component_id"))
+    to_chunk, centre = R @ to_chunk, scale * (R @ centre) + t
+    check_rotations(to_chunk, f"{where}: the transform")
+    return flip_rows(to_chunk.T), centre
+
+
+def _to_world(
+    where: str, chunk: ET.Element, component: str | None
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"], float]:
+    """R, t and s of X = s·R·x + t, from the frame of a chunk or of a component of it; the identity
+    where there is no transform."""
     holder = next(
         (c for c in chunk.iterfind("components/component") if c.get("id") == component), None
     )
@@ -225,14 +253,56 @@ def _pose(
     transform = chunk.find("transform") if transform is None else transform
     if transform is not None and (transform.text or "").strip():
         raise InputError(f"{where}: the transform of the chunk has no <rotation>, as old versions")
-    if transform is not None and transform.find("rotation") is not None:
-        place = f"{where}, transform of the chunk"
-        R = numbers_of(f"{place}, rotation", transform.findtext("rotation"), 9).reshape(3, 3)
-        t = numbers_of(f"{place}, translation", transform.findtext("translation"), 3)
-        scale = number_in(transform.findtext("scale", ""), f"{place}, scale")
-        to_chunk, centre = R @ to_chunk, scale * (R @ centre) + t
-    check_rotations(to_chunk, f"{where}: the transform")
-    return flip_rows(to_chunk.T), centre
+    if transform is None or transform.find("rotation") is None:
+        return np.eye(3), np.zeros(3), 1.0
+    place = f"{where}, transform of the chunk"
+    R = numbers_of(f"{place}, rotation", transform.findtext("rotation"), 9).reshape(3, 3)
+    t = numbers_of(f"{place}, translation", transform.findtext("translation"), 3)
+    return R, t, number_in(transform.findtext("scale", ""), f"{place}, scale")
+
+
+def _with_ties(
+    path: Path,
+    chunk: ET.Element,
+    ties: TieTable,
+    images: Mapping[str | None, str],
+    points: Columns | None,
+    rays: Columns | None,
+) -> tuple[Columns, Columns]:
+    """The tables of points and image points of the markers, followed by those of tie points (`t`
+    and the number of the track); image points of tracks without a point are left out."""
+    X = np.empty_like(ties.position)
+    for component in dict.fromkeys(ties.component.tolist()):
+        rows = np.array([one == component for one in ties.component.tolist()])
+        R, t, scale = _to_world(f"{path}, tie points", chunk, component)
+        X[rows] = scale * ties.position[rows] @ R.T + t
+    known = np.array([camera in images for camera in ties.camera.tolist()], bool)
+    known &= np.isin(ties.track, ties.id)
+    xy = ties.xy[known] - PIXEL_CENTRE
+    names = [f"t{id}" for id in ties.id.tolist()]
+    made = {"id": names, "role": ["tie"] * len(names), **dict(zip("XYZ", X.T))}
+    made |= colour_columns(ties.colour)
+    seen = {
+        "image": [images[camera] for camera in ties.camera[known].tolist()],
+        "point": [f"t{id}" for id in ties.track[known].tolist()],
+        "x": xy[:, 0],
+        "y": xy[:, 1],
+    }
+    return _joined(points, made, path), _joined(rays, seen, path)
+
+
+def _joined(first: Columns | None, more: Mapping[str, Any], path: Path) -> Columns:
+    """The rows of a table, followed by others; columns that the first does not have are empty
+    there."""
+    if first is None:
+        return Columns(dict(more), Source(str(path), None, "tie point"))
+    return Columns(
+        {
+            name: [*first.values.get(name, [None] * len(first)), *column]
+            for name, column in more.items()
+        },
+        Source(str(path), None, "point"),
+    )
 
 
 def _markers(

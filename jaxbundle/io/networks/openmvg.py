@@ -55,6 +55,7 @@ from jaxbundle.io.networks.losses import (
     need_values,
     one_focal_length,
     size_of,
+    written_numbers,
 )
 from jaxbundle.io.networks.poses import check_rotations, matrices_of
 from jaxbundle.io.networks.settings import choose_datum
@@ -370,7 +371,7 @@ def write_openmvg(network: Network, path: str | Path) -> tuple[str, ...]:
         seen[p].append(_entry(i, {"id_feat": int(features[i]), "x": xy}))
         features[i] += 1
     held = points.has_role("control", "fixed")
-    numbers = _numbers(points.id)
+    numbers = written_numbers(points.id)
     tables = [
         [
             _entry(numbers[p], {"X": points.position[p].tolist(), "observations": seen[p]})
@@ -398,7 +399,7 @@ OPENMVG_LOSSES = losing(
     partly={
         "names of cameras": lambda n: changed([c.id for c in n.cameras], range(len(n.cameras))),
         "roles of points": lambda n: int(n.points.has_role("fixed", "check").sum()),
-        "names of points": lambda n: changed(n.points.id, _numbers(n.points.id)),
+        "names of points": lambda n: changed(n.points.id, written_numbers(n.points.id)),
     },
 )
 
@@ -417,12 +418,6 @@ def _view_entries(network: Network) -> list[dict[str, Any]]:
 
 def _entry(key: int, value: dict[str, Any]) -> dict[str, Any]:
     return {"key": key, "value": value}
-
-
-def _numbers(ids: Sequence[str]) -> list[int]:
-    """The ids if all are numbers, else 0, 1, 2, …"""
-    plain = all(id.isascii() and id.isdigit() and len(id) < 10 and str(int(id)) == id for id in ids)
-    return [int(id) for id in ids] if plain else list(range(len(ids)))
 
 
 def _intrinsics(cameras: Sequence[Camera], first: int) -> list[dict[str, Any]]:

@@ -48,10 +48,15 @@ def read_csv(path: Path) -> Columns:
 
     Blank lines and lines that begin with `#` are skipped.
     """
+    return parse_csv(path, read_text(path))
+
+
+def parse_csv(path: Path, text: str) -> Columns:
+    """The columns of the text of a CSV file, as `read_csv`; `path` names it in messages."""
     lines = [
         (number, line)
-        for number, line in enumerate(re.split(r"\r\n?|\n", read_text(path)), 1)
-        if (text := line.lstrip()) and text[0] != "#"
+        for number, line in enumerate(re.split(r"\r\n?|\n", text), 1)
+        if (there := line.lstrip()) and there[0] != "#"
     ]
     try:
         rows = list(csv.reader((line for _, line in lines), skipinitialspace=True, strict=True))

@@ -99,10 +99,14 @@ def read_xml(path: str | Path) -> ET.Element:
     **Raises:** `InputError` if it cannot be read, is not XML, or defines entities, which unpack to
     gigabytes or name other files.
     """
+    return parse_xml(path, read_text(Path(path), fallback="latin-1"))
+
+
+def parse_xml(path: str | Path, text: str) -> ET.Element:
+    """The root of the document in a text; `path` names it in messages. Raises as `read_xml`."""
     from defusedxml.common import DefusedXmlException
     from defusedxml.ElementTree import ParseError, fromstring
 
-    text = read_text(Path(path), fallback="latin-1")
     try:
         root = fromstring(text)
         for element in root.iter():

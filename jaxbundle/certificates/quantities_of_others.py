@@ -1,0 +1,193 @@
+"""Quantities of robots' cameras and of refined scanner images; of any other result the numbers of
+its JSON."""
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from jaxbundle.certificates.quantity import (
+    AXES,
+    Quantity,
+    QuantityValues,
+    Subject,
+    one_value,
+    refuse_argument,
+)
+from jaxbundle.errors import InputError
+from jaxbundle.network.columns import did_you_mean, list_some
+from jaxbundle.network.kinds.robot_poses import PARTS
+from jaxbundle.network.tables import EXTERIOR
+from jaxbundle.refinement import Refinement
+
+METRES = "m"
+
+
+def unknown_quantity(name: str, forms: Sequence[str]) -> str:
+    """The message for an unknown quantity, with the list."""
+    names = [form.partition("(")[0].rstrip("[") for form in forms]
+    mean = did_you_mean(name, names, listing=False)
+    return f"unknown quantity {name!r}{mean}; known: {list_some(forms, len(forms), str)}"
+
+
+# --- any other result -----------------------------------------------------------------------
+
+
+def find_by_path(result: Any, name: str, argument: str) -> QuantityValues:
+    """The numbers of `to_dict` by their path, such as `rms`, `counts.images`, or, of every row of a
+    list, `splits.d2`.
+
+    **Raises:** `InputError` for an unknown path, and for one that leads to no number."""
+    to_dict = getattr(result, "to_dict", None)
+    if to_dict is None:
+        raise InputError(f"a result of jaxbundle is expected, not {type(result).__name__}")
+    refuse_argument(argument)
+    found = dict(_walk(to_dict(), name.split("."), name, ""))
+    if not found:
+        raise LookupError(f"{name}: the result has none")
+    return QuantityValues(found)
+
+
+def _walk(document: Any, path: Sequence[str], name: str, of: str) -> Iterator[tuple[str, float]]:
+    """The numbers below a part of a document, each with the rows of the lists that lead to it."""
+    if isinstance(document, list | tuple):
+        for number, row in enumerate(document, 1):
+            own = str(row.get("id", number)) if isinstance(row, Mapping) else str(number)
+            yield from _walk(row, path, name, f"{of} {own}".strip())
+    elif path:
+        if not isinstance(document, Mapping) or path[0] not in document:
+            entries = document.items() if isinstance(document, Mapping) else ()
+            kinds = int | float | Mapping | list | tuple
+            raise InputError(
+                unknown_quantity(name, [k for k, v in entries if isinstance(v, kinds)])
+            )
+        yield from _walk(document[path[0]], path[1:], name, of)
+    elif document is None:
+        # A number that is not finite is null in JSON; it is not accepted.
+        yield of, math.nan
+    elif isinstance(document, bool) or not isinstance(document, int | float):
+        raise InputError(f"{name}: is not a number of the result")
+    else:
+        yield of, float(document)
+
+
+# --- a camera on a robot --------------------------------------------------------------------
+
+
+def _mounting(subject: Subject, argument: str) -> QuantityValues:
+    """σ of the two poses that are estimated."""
+    adjustment = subject.result.adjustment
+    network = adjustment.problem.network
+    if argument not in ("position", "rotation"):
+        raise InputError(f"({argument}): position or rotation is expected")
+    table = subject.result.table()
+    values = {
+        f"{name} of {of}": float(sigma)
+        for of, name, sigma in zip(table["of"], table["unknown"], table["sigma"])
+        if (name in (*EXTERIOR[:3], *AXES)) == (argument == "position")
+    }
+    unit = network.angle_unit if argument == "rotation" else network.object_unit
+    return QuantityValues(values, unit)
+
+
+def _repeatability(subject: Subject, argument: str) -> QuantityValues:
+    network = subject.result.adjustment.problem.network
+    if argument not in ("position", "rotation"):
+        raise InputError(f"({argument}): position or rotation is expected")
+    part = PARTS[argument == "rotation"]
+    if part not in subject.result.repeatability:
+        raise LookupError(f"the repeatability of {part} is not estimated")
+    unit = network.angle_unit if argument == "rotation" else network.object_unit
+    return one_value(subject.result.repeatability[part], unit)
+
+
+OF_HAND_EYE: tuple[Quantity, ...] = (
+    Quantity("robot.sigma(position|rotation)", "length, angle", "σ of the two poses", _mounting),
+    Quantity(
+        "robot.repeatability(position|rotation)",
+        "length, angle",
+        "σ of the robot's poses, from their residuals",
+        _repeatability,
+    ),
+)
+
+
+# --- scanner images -------------------------------------------------------------------------
+
+
+def _refined(function: Callable[[Refinement], float]) -> Callable[[Subject, str], QuantityValues]:
+    def find(subject: Subject, argument: str) -> QuantityValues:
+        refuse_argument(argument)
+        return one_value(function(subject.result))
+
+    return find
+
+
+def _differences(result: Refinement) -> np.ndarray:
+    if result.check is None:
+        raise LookupError("the result has no check points")
+    return result.check.difference
+
+
+def _check_rms(subject: Subject, argument: str) -> QuantityValues:
+    """RMS of an axis; H of the first two; without an argument of all that are known."""
+    chosen = {"": [0, 1, 2], "H": [0, 1], "V": [2], **{a: [i] for i, a in enumerate(AXES)}}
+    if argument not in chosen:
+        raise InputError(f"({argument}): one of X, Y, Z, H, V is expected")
+    square = _differences(subject.result)[:, chosen[argument]] ** 2
+    known = np.isfinite(square)
+    if not known.any():
+        raise LookupError("no check point has this difference")
+    # one scanner image gives no height: what is not known does not count as 0 of it
+    axes = known.any(0)
+    mean = np.where(known, square, 0.0).sum(0)[axes] / known.sum(0)[axes]
+    return one_value(math.sqrt(mean.sum()), METRES)
+
+
+def _check_max(subject: Subject, argument: str) -> QuantityValues:
+    if argument not in ("", *AXES):
+        raise InputError(f"({argument}): one of X, Y, Z is expected")
+    difference = _differences(subject.result)
+    values = {
+        f"{axis} of check point {id}": abs(float(d))
+        for i, axis in enumerate(AXES)
+        if argument in ("", axis)
+        for id, d in zip(subject.result.check.id, difference[:, i])
+        if math.isfinite(d)
+    }
+    if not values:
+        raise LookupError("no check point has this difference")
+    return QuantityValues(values, METRES)
+
+
+def _point_sigma(subject: Subject, argument: str) -> QuantityValues:
+    result: Refinement = subject.result
+    if argument not in AXES:
+        raise InputError(f"({argument}): one of X, Y, Z is expected")
+    sigma = np.asarray(result.inspection.point_sigma)[:, AXES.index(argument)]
+    chosen = {f"{argument} of point {k}": float(s) for k, s in zip(result.point_ids, sigma) if s}
+    if not chosen:
+        raise LookupError(f"no {argument} of a point is estimated")
+    return QuantityValues(chosen, METRES)
+
+
+def _check_number(result: Refinement) -> int:
+    return 0 if result.check is None else len(result.check.id)
+
+
+OF_REFINEMENT: tuple[Quantity, ...] = (
+    Quantity("sigma0", "", "σ0 of the adjustment", _refined(lambda r: r.sigma0)),
+    Quantity("redundancy", "", "its redundancy", _refined(lambda r: r.redundancy)),
+    Quantity("removed", "", "observations removed as blunders", _refined(lambda r: len(r.removed))),
+    Quantity("warnings", "", "number of warnings", _refined(lambda r: len(r.warnings))),
+    Quantity("sigma(X|Y|Z)", "length", "σ of the points, the largest", _point_sigma),
+    Quantity(
+        "check.rms[(X|Y|Z|H|V)]",
+        "length",
+        "RMS difference at check points, of all axes",
+        _check_rms,
+    ),
+    Quantity("check.max[(X|Y|Z)]", "length", "largest difference at check points", _check_max),
+    Quantity("check.number", "", "number of check points", _refined(_check_number)),
+)

@@ -1,0 +1,88 @@
+"""What a quantity is that acceptance criteria may name."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from jaxbundle.cameras import get_model
+from jaxbundle.certificates.lengths import LengthTest
+from jaxbundle.certificates.units import NO_PITCH, PixelPitch
+from jaxbundle.errors import InputError
+from jaxbundle.network.columns import did_you_mean
+from jaxbundle.network.tables import EXTERIOR
+
+AXES = ("X", "Y", "Z")
+
+
+@dataclasses.dataclass(frozen=True)
+class Subject:
+    """What criteria are about: a result, and the test of calibrated lengths, if there is one."""
+
+    result: Any
+    lengths: LengthTest | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class QuantityValues:
+    """Values of a quantity by what they are of ("" for the whole), in `unit`; `owners`: the inputs
+    of a batch that a value concerns, by the same names."""
+
+    values: Mapping[str, float]
+    unit: str = ""
+    pitch: PixelPitch = NO_PITCH
+    owners: Mapping[str, str | list[str]] = dataclasses.field(default_factory=dict)
+
+
+@dataclasses.dataclass(frozen=True)
+class Quantity:
+    """A quantity: its `form` for lists ("sigma(NAME)", in brackets what may be omitted), its `unit`
+    in words, what it is; `find` its values in a subject, by the argument."""
+
+    form: str
+    unit: str
+    words: str
+    find: Callable[[Subject, str], QuantityValues]
+
+    @property
+    def name(self) -> str:
+        return self.form.partition("(")[0].rstrip("[")
+
+    @property
+    def arguments(self) -> tuple[str, ...]:
+        """The arguments it may have; names of them in capitals."""
+        inside = self.form.partition("(")[2].rstrip(")]")
+        return tuple(inside.split("|")) if inside else ()
+
+    def check_argument(self, argument: str) -> None:
+        """Refuse an argument that is none of those, where they are not names of a result.
+
+        **Raises:** `InputError`."""
+        expected = self.arguments
+        if not expected:
+            refuse_argument(argument)
+        open_ones = any("NAME" in one or one == "CAMERA" for one in expected)
+        may_be_omitted = not expected or "[" in self.form
+        if open_ones or argument in expected or (not argument and may_be_omitted):
+            return
+        raise InputError(f"({argument}): one of {', '.join(expected)} is expected")
+
+
+def one_value(value: float, unit: str = "") -> QuantityValues:
+    return QuantityValues({"": float(value)}, unit)
+
+
+def refuse_argument(argument: str) -> None:
+    if argument:
+        raise InputError(f"it has no argument, but ({argument}) is given")
+
+
+def require_parameter(cameras: Any, name: str) -> None:
+    """Refuse a name that is no parameter of any of these cameras.
+
+    **Raises:** `InputError`."""
+    known = dict.fromkeys(p for c in cameras for p in get_model(c.model).parameters)
+    if name not in known:
+        raise InputError(
+            f"there is no parameter {name!r}{did_you_mean(name, known, listing=False)}; known: "
+            f"{', '.join([*known, *EXTERIOR, *AXES])}"
+        )
