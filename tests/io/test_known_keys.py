@@ -2,12 +2,13 @@
 change the geometry is refused."""
 
 import pytest
-from foreign_samples import SAMPLES, places, write_sample
+from foreign_samples import SAMPLES, SCANNERS, places, write_sample
 
 from jaxbundle.errors import InputError
 from jaxbundle.io import read_cameras, read_network
 from jaxbundle.io.cameras.camera_files import is_camera_file
 from jaxbundle.io.cameras.nearest_camera import fit_messages
+from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.io.text.known_keys import Keys, UnknownKeys, may_change_geometry
 
 GEOMETRY = (
@@ -17,8 +18,10 @@ GEOMETRY = (
 HARMLESS = ("vendor_remark", "android", "design", "grayscale", "original_name", "community")
 
 
-def messages(path) -> tuple[str, ...]:
+def messages(path, scanner=False) -> tuple[str, ...]:
     """What reading a file tells."""
+    if scanner:
+        return read_scanner(path).warnings
     if is_camera_file(path):
         return fit_messages(read_cameras(path))
     return read_network(path).warnings
@@ -26,15 +29,14 @@ def messages(path) -> tuple[str, ...]:
 
 @pytest.mark.parametrize("name", SAMPLES)
 def test_a_harmless_key_is_named_and_a_geometric_one_refused(tmp_path, name):
-    plain = messages(write_sample(tmp_path, name))
-    assert not any("unknown key" in told for told in plain)
+    told = lambda *key: messages(write_sample(tmp_path, name, *key), name in SCANNERS)
+    file = SAMPLES[name][0]
+    assert not any("unknown key" in message for message in told())
     for place in range(places(name)):
-        path = write_sample(tmp_path, name, "vendor_remark", place)
-        told = [told for told in messages(path) if "unknown key 'vendor_remark'" in told]
-        assert told and all(path.name in message for message in told)
-        path = write_sample(tmp_path, name, "lens_offset", place)
-        with pytest.raises(InputError, match=rf"{path.name}.*unknown key 'lens_offset'.*geometry"):
-            messages(path)
+        found = [t for t in told("vendor_remark", place) if "unknown key 'vendor_remark'" in t]
+        assert found and all(file in message for message in found)
+        with pytest.raises(InputError, match=rf"{file}.*unknown key 'lens_offset'.*geometry"):
+            told("lens_offset", place)
 
 
 def test_the_words_of_geometry():
