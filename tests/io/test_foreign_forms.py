@@ -580,3 +580,54 @@ def test_a_refusal_names_the_kind_and_what_is_missing(tmp_path, command, name, t
     for words in (("convert", path, tmp_path / "n.csv"), ("camera", path), ("adjust", path)):
         told = command(*words)
         assert told.status == 2 and kind in told.err and name in told.err
+
+
+@pytest.mark.parametrize("old, new, message", [
+    ('"sensorWidth": "8"', '"sensorWidth": "0"', "sensorWidth is 0, pixelRatio 1.01"),
+    ('"pixelRatio": "1.01"', '"pixelRatio": "-1"', "sensorWidth is 8, pixelRatio -1"),
+])  # fmt: skip
+def test_sensors_of_alicevision_without_size(tmp_path, old, new, message):
+    path = write_sample(tmp_path, "alicevision")
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+    with pytest.raises(InputError, match=message):
+        read_network(path)
+
+
+def test_a_setting_of_vins_without_cameras(tmp_path):
+    path = write_sample(tmp_path, "vins")
+    path.write_text(path.read_text().replace("num_of_cam: 2", "num_of_cam: 0"))
+    with pytest.raises(InputError, match="num_of_cam is 0; a whole number from 1"):
+        read_network(path)
+
+
+def test_an_angle_of_the_height(tmp_path):
+    """camera_angle_y alone: f = h/2 / tan(y/2), square pixels, and the middle of the image."""
+    path = write_sample(tmp_path, "transforms")
+    path.write_text(path.read_text().replace("camera_angle_x", "camera_angle_y"))
+    (camera,) = read_network(path).cameras
+    f = 600 / 2 / np.tan(0.7 / 2)
+    assert camera.parameters["fx"] == camera.parameters["fy"] == pytest.approx(f, rel=1e-15)
+    assert (camera.parameters["cx"], camera.parameters["cy"]) == (399.5, 299.5)
+    assert camera.tie == (("fx", "fy"),)
+    text = path.read_text()
+    path.write_text(text.replace('"camera_angle_y": 0.7, "w": 800, "h": 600', '"fl_x": 500'))
+    with pytest.raises(InputError, match="cx is missing, and w and h"):
+        read_network(path)
+    path.write_text(text.replace('"camera_angle_y": 0.7, ', ""))
+    with pytest.raises(InputError, match="fl_x and camera_angle_x are missing"):
+        read_network(path)
+
+
+@pytest.mark.parametrize("model", ["plumb_bob", '""', "none"])
+def test_a_camera_of_ros_without_distortion(tmp_path, model):
+    """1 × 0 coefficients, as simulated and uncalibrated cameras have."""
+    path = write_sample(tmp_path, "ros")
+    text = path.read_text().replace("plumb_bob", model)
+    old = "{rows: 1, cols: 5, data: [-0.3, 0.1, 0.001, -0.0005, 0]}"
+    assert old in text
+    path.write_text(text.replace(old, "{rows: 1, cols: 0, data: []}"))
+    (camera,) = read_cameras(path)
+    assert (camera.model, camera.parameters["fx"]) == ("opencv", 500)
+    assert not any(camera.parameters[name] for name in ("k1", "k2", "p1", "p2"))

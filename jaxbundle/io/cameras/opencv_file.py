@@ -467,6 +467,9 @@ def matrix_of(
     if isinstance(value, Mapping):
         stated = tuple(_whole(value.get(key)) for key in ("rows", "cols"))
         data = value.get("data")
+        # ROS writes a camera without distortion as 1 × 0 numbers, or none at all
+        if data in (None, []) and 0 in (value.get("rows"), value.get("cols")):
+            data, stated = [], (1, 0)
         whole = [n for n in stated if n is not None]
         if len(whole) < 2 or not isinstance(data, list) or len(data) != whole[0] * whole[1]:
             size = len(data) if isinstance(data, list) else "no"

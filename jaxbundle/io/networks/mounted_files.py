@@ -58,7 +58,7 @@ def read_vins(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     cameras, poses = [], []
     keys = sorted(filter(CALIB.fullmatch, fields.document))
     # a monocular setting may still name the second camera, without its place
-    for key in keys[: fields.integer("num_of_cam", len(keys))]:
+    for key in keys[: fields.integer("num_of_cam", len(keys), 1)]:
         file = path.parent / fields.text(key)
         if not file.is_file():
             raise InputError(f"{path}: {key}: no such file {file}; expected it beside this one")

@@ -211,9 +211,7 @@ DIMAP1: dict[str, Keys] = {
     "Satellite_Attitudes": Keys(
         ("Corrected_Attitudes",), {"Raw_Attitudes": "from which the corrected ones are made"}
     ),
-    "Corrected_Attitudes": Keys(
-        ("Corrected_Attitude",), {"STAR_TRACKER_USED": STATE}
-    ),
+    "Corrected_Attitudes": Keys(("Corrected_Attitude",), {"STAR_TRACKER_USED": STATE}),
     "Corrected_Attitude": Keys(("Angles",)),
     "Angles": Keys(("TIME", "YAW", "PITCH", "ROLL"), {"OUT_OF_RANGE": STATE}),
     "Sensor_Configuration": Keys(
