@@ -104,7 +104,9 @@ def test_there_and_back(tmp_path):
 BROKEN = {
     "no frames": (lambda d: d["frames"].clear(), "transforms.json: there are no frames"),
     "model": (lambda d: d.update(camera_model="EQUIRECTANGULAR"), "EQUIRECTANGULAR are not off"),
-    "focal": (lambda d: [d.pop(n) for n in ("fl_x", "fl_y")], "transforms.json: fl_x and camera_angle_x are missing"),
+    "focal": (
+        lambda d: [d.pop(name) for name in ("fl_x", "fl_y")], "fl_x and camera_angle_x are missing"
+    ),
     "width": (lambda d: d.update(w=12.5), "w is 12.5; a whole number"),
     "matrix": (lambda d: d["frames"][1].update(transform_matrix=[[1, 2]]), r"s\[1\]: transform"),
     "mirror": (

@@ -137,7 +137,8 @@ def test_other_bands_and_shifts_are_reported(tmp_path):
     shift = "<DEREGISTRATION_VALUE>0.25</DEREGISTRATION_VALUE>"
 
     def change(text):
-        text = text.replace("</Instrument_Look_Angles_List>", f"{band}</Instrument_Look_Angles_List>")
+        end = "</Instrument_Look_Angles_List>"
+        text = text.replace(end, f"{band}{end}")
         return text.replace("<Time_Stamp>", f"{shift}<Time_Stamp>")
 
     _, bands, shifts = read_scanner(write_dimap(tmp_path, change)).warnings

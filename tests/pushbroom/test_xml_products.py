@@ -316,7 +316,8 @@ def test_early_products_of_pleiades(tmp_path):
 
 def test_a_stated_unit_is_used(tmp_path):
     """PerúSat states seconds, which no profile is known to have."""
-    text = dimap(unit=1.0).replace("PHR_", "PER1_").replace("<LINE_PERIOD>", '<LINE_PERIOD unit="S">')
+    text = dimap(unit=1.0).replace("PHR_", "PER1_")
+    text = text.replace("<LINE_PERIOD>", '<LINE_PERIOD unit="S">')
     (tmp_path / "DIM.XML").write_text(text, encoding="latin-1")
     assert float(read_scanner(tmp_path / "DIM.XML").image.times.period) == pytest.approx(PERIOD)
     (tmp_path / "DIM.XML").write_text(text.replace('"S"', '"h"'), encoding="latin-1")

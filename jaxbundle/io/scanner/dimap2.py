@@ -176,8 +176,9 @@ def _period(file: XmlFields, names: Names, lines: int, epoch: np.datetime64) -> 
     # where START and END contradict it: the unit documented for the product
     if known and period > 0:
         return known[0] * period
+    name = names.period.rpartition("/")[2]
     raise InputError(
-        f"{file.path}: {names.period.rpartition('/')[2]} is {period:g} and START to END {span:g} s for {lines} lines; a "
+        f"{file.path}: {name} is {period:g} and START to END {span:g} s for {lines} lines; a "
         "period in seconds, milliseconds or microseconds that fits is expected"
     )
 
