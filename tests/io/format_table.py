@@ -1,7 +1,8 @@
-"""What the readers of keyed files know, and what a round trip changes: tables from the declarations
-and the formats themselves.
+"""What the readers of keyed files know, and what a round trip changes: tables from the
+declarations and the formats themselves.
 
-    python tests/io/format_table.py [--write]
+    PYTHONPATH=.:tests/io:tests/pushbroom:tests/photographs:tests/surfaces:tests/measure \
+        python tests/io/format_table.py [--write]
 
 `used`: keys that a reader uses; `left`: those that it may leave, with a reason in its module;
 `warned`: those that it does not read and says so. Every other key is a warning, or refused if its
@@ -18,13 +19,6 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-
-TESTS = Path(__file__).parents[1]
-if __name__ == "__main__":
-    sys.path += [str(TESTS.parent), *(str(TESTS / name) for name in
-                 ("io", "pushbroom", "photographs", "surfaces", "measure", "adjustment",
-                  "reconstruction"))]  # fmt: skip
-
 from exchange_cases import matrix, network
 from foreign_samples import SAMPLES
 from readers import READERS
@@ -38,6 +32,7 @@ from jaxbundle.io.formats import CAMERA_KINDS, FORMATS, TARGETS
 from jaxbundle.io.text.known_keys import Keys
 from jaxbundle.network.tables import Network
 
+TESTS = Path(__file__).parents[1]
 PAGE = TESTS.parent / "docs" / "exchange.md"
 BEGIN, END = "<!-- by tests/io/format_table.py --write -->\n", "<!-- end of the tables -->"
 # Where a format is recognised by its name, and the model of a camera that it holds exactly.
@@ -52,7 +47,8 @@ OF_MODULE = {
     "slam_yaml": ("camodocal", "camodocal-lens"), "ros_ini": ("ros-ini",),
     "metashape_camera": ("metashape",), "metashape_lens": ("metashape-lens",),
     "micmac_camera": ("autocal",), "mounted_files": ("vins",), "orb_slam": ("orb-slam",
-    "orb-slam-pair"), "opencv_rigs": ("opencv-stereo", "opencv-nested"), "csm_frame": ("csm-frame",),
+    "orb-slam-pair"), "opencv_rigs": ("opencv-stereo", "opencv-nested"),
+    "csm_frame": ("csm-frame",),
     "kalibr": ("kalibr", "kalibr-camera"), "opensfm": ("opensfm", "opensfm-cameras"),
     "dimap_keys": ("dimap", "dimap2", "dimap2-table", "dimap2-early"),
 }  # fmt: skip
@@ -84,9 +80,9 @@ def keys_table() -> str:
         [
             *lines, "",
             f"{len(FORMATS)} inputs of networks, {len(TARGETS)} outputs of networks, "
-            f"{len(CAMERA_KINDS)} of cameras; {len(SAMPLES)} keyed samples, each of which the tests "
-            f"read with a further key in every place; {len(READERS)} inputs that `make mutations` "
-            "damages.",
+            f"{len(CAMERA_KINDS)} of cameras; {len(SAMPLES)} keyed samples, each read by the tests "
+            f"with a further key in every place; {len(READERS)} inputs that "
+            "`make mutations` damages.",
         ]
     )  # fmt: skip
 

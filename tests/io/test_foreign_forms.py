@@ -573,6 +573,11 @@ def test_image_points_of_an_nvm_from_a_corner(tmp_path, centres):
     ("default.xml", '<?xml version="1.0"?>\n<opencv_storage><Settings><BoardSize_Width>9'
      "</BoardSize_Width></Settings></opencv_storage>\n", "a FileStorage of OpenCV without camera_"),
     ("ground_control_points.json", '{"points": []}', "ground control of OpenSfM; give its folder"),
+    ("cameras.xml", "version https://git-lfs.github.com/spec/v1\noid sha256:6a\nsize 361\n",
+     "a pointer of Git LFS"),
+    ("sensor.yaml", "sensor_type: imu\ncomment: VI-Sensor IMU\n", "another sensor than a camera"),
+    ("DIM.XML", '<?xml version="1.0"?>\n<Dimap_Document>\n</Dimap_Document>\n', "DIMAP, a product"),
+    ("image.XML", "<isd><IMD/></isd>\n", "support data of DigitalGlobe, a product of a line"),
 ])  # fmt: skip
 def test_a_refusal_names_the_kind_and_what_is_missing(tmp_path, command, name, text, kind):
     path = tmp_path / name

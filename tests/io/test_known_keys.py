@@ -76,7 +76,9 @@ def folders(tmp_path_factory):
     return made
 
 
-@pytest.mark.parametrize("kind, k", [(kind, k) for kind, f in FOLDERS.items() for k in range(len(f))])
+@pytest.mark.parametrize(
+    "kind, k", [(kind, k) for kind, files in FOLDERS.items() for k in range(len(files))]
+)
 def test_keys_of_the_files_of_a_folder(tmp_path, folders, kind, k):
     name, behind, form = FOLDERS[kind][k]
     folder = shutil.copytree(folders[kind], tmp_path / folders[kind].name)

@@ -45,7 +45,7 @@ LEVELS = ("basic1b", "stereo1b")
 # all three, to 0.7 m without refraction.
 CORRECTIONS = Corrections(light_time=True, aberration=True, refraction=True)
 
-HEAD = dict.fromkeys(
+HEAD: dict[str, str] = dict.fromkeys(
     (
         *("SATID", "REVNUMBER", "STRIPID", "TYPE", "VERSION", "GENERATIONTIME", "NUMPOINTS"),
         *("EFFECTIVETIME", "MODELGENERATIONTIME", "GEOMODELLEVEL", "CATID", "NUMTLC"),
