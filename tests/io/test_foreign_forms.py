@@ -607,6 +607,26 @@ def test_a_setting_of_vins_without_cameras(tmp_path):
         read_network(path)
 
 
+def test_a_transposed_camera_matrix(tmp_path):
+    """Open3D writes it column by column; MATLAB's counts from 1; and the lens model of calibdb."""
+    path = tmp_path / "camera.json"
+    rows = [[525, 0, 0], [0, 526, 0], [319.5, 239.5, 1]]
+    named = {"width": 640, "height": 480, "intrinsic_matrix": [x for row in rows for x in row]}
+    path.write_text(json.dumps(named))
+    (camera,) = read_cameras(path)
+    core = [camera.parameters[name] for name in ("fx", "fy", "cx", "cy")]
+    assert core == [525, 526, 319.5, 239.5]
+    path.write_text(json.dumps({**named, "intrinsic_matrix": rows}))
+    with pytest.raises(InputError, match="transposed, as MATLAB has it, whose pixels count from 1"):
+        read_cameras(path)
+    rows = {"camera_matrix": [[600, 0, 320], [0, 601, 240], [0, 0, 1]], "img_size": [640, 480],
+            "distortion_coefficients": [[0.1, 0.2, 0.001, 0.002, 0.0]],
+            "distortion_model": "rectilinear"}  # fmt: skip
+    path.write_text(json.dumps(rows))
+    (camera,) = read_cameras(path)
+    assert camera.model == "opencv" and camera.parameters["k1"] == 0.1
+
+
 def test_an_angle_of_the_height(tmp_path):
     """camera_angle_y alone: f = h/2 / tan(y/2), square pixels, and the middle of the image."""
     path = write_sample(tmp_path, "transforms")
