@@ -605,6 +605,24 @@ def test_a_setting_of_vins_without_cameras(tmp_path):
     path.write_text(path.read_text().replace("num_of_cam: 2", "num_of_cam: 0"))
     with pytest.raises(InputError, match="num_of_cam is 0; a whole number from 1"):
         read_network(path)
+    path.write_text('a:\n  cam0_calib: "left.yaml"\n')
+    with pytest.raises(InputError, match="cam0_calib is missing at the first level"):
+        read_network(path, format="vins")
+
+
+def test_other_names_of_focal_lengths(tmp_path):
+    """fx, fy of every frame, and a scale of depths, as dense_depth_priors_nerf writes them."""
+    frame = {"file_path": "a.png", "fx": 700.5, "fy": 701.5, "cx": 320, "cy": 240,
+             "transform_matrix": np.eye(4).tolist(), "depth_file_path": "d.png"}  # fmt: skip
+    path = tmp_path / "transforms_train.json"
+    head = {"near": 0.1, "far": 8.0, "depth_scaling_factor": 1000.0}
+    path.write_text(json.dumps({**head, "frames": [frame]}))
+    (camera,) = read_network(path).cameras
+    core = [camera.parameters[name] for name in ("fx", "fy", "cx", "cy")]
+    assert core == [700.5, 701.5, 319.5, 239.5]
+    path.write_text(json.dumps({**head, "frames": [{**frame, "fl_x": 700}]}))
+    with pytest.raises(InputError, match="fl_x and fx differ"):
+        read_network(path)
 
 
 def test_a_transposed_camera_matrix(tmp_path):

@@ -61,16 +61,18 @@ INTRINSICS = (
     *("camera_model", "is_fisheye", "camera_angle_x", "camera_angle_y", "fl_x", "fl_y"),
     *("cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2"),
 )
+# As dense_depth_priors_nerf has them.
+OTHER_NAMES = {"fl_x": "fx", "fl_y": "fy"}
 # By what the focal length of an axis is given.
 FOCAL = ("fl", "camera_angle")
 TRAINING = "how a field is trained and displayed"
 KEYS = Keys(
-    ("frames", *INTRINSICS),
+    ("frames", *INTRINSICS, *OTHER_NAMES.values()),
     {
         **dict.fromkeys(
             ("aabb_scale", "aabb", "render_aabb*", "up", "n_frames", "sharpness*", "white_*",
              "black_*", "bg_color*", "envmap", "from_na", "from_mitsuba", "enable_depth_loading",
-             "integer_depth_scale", "depth_unit_scale_factor", "near", "far", "*_filenames",
+             "integer_depth_scale", "depth_scal*", "depth_unit_scale_factor", "near", "far", "*_filenames",
              "centroid", "avglen", "totw", "hdr", "sun_*", "time*", "fps", "num_frames", "wave*",
              "background*", "bounding_box*", "scene_box", "comment*", "version", "crop_box*"),
             TRAINING,
@@ -88,7 +90,7 @@ KEYS = Keys(
 )  # fmt: skip
 # `rotation` is the step of Blender's turntable, in `transforms_train.json`.
 FRAME_KEYS = Keys(
-    ("file_path", "transform_matrix", *INTRINSICS),
+    ("file_path", "transform_matrix", *INTRINSICS, *OTHER_NAMES.values()),
     dict.fromkeys(
         ("sharpness", "mask_path", "depth_file_path", "*_path", "colmap_im_id", "colmap_id",
          "rotation", "time*", "timestamp*", "bg_color", "split", "light*", "exposure*", "*_id",
@@ -164,13 +166,15 @@ def read_transforms(
 
 def _intrinsics(file: JsonFields, frame: JsonFields) -> JsonFields:
     """The camera fields of a frame, missing ones from the file."""
-    own = any(name in frame.document for name in INTRINSICS)
-    values = {
-        name: value
-        for source in (file, frame)  # the frame's own replace those of the file
-        for name in INTRINSICS
-        if (value := source.get(name)) is not None
-    }
+    own = any(name in frame.document for name in (*INTRINSICS, *OTHER_NAMES.values()))
+    values = {}
+    for source in (file, frame):  # the frame's own replace those of the file
+        for name in INTRINSICS:
+            given = [k for k in (name, OTHER_NAMES.get(name, name)) if source.get(k) is not None]
+            if len({str(source.get(k)) for k in given}) > 1:
+                raise InputError(f"{source.path}: {' and '.join(given)} differ; expected one")
+            if given:
+                values[name] = source.get(given[0])
     return JsonFields(frame.path if own else file.path, values)
 
 
