@@ -110,7 +110,7 @@ BROKEN = {
     "width": (lambda d: d.update(w=12.5), "w is 12.5; a whole number"),
     "matrix": (lambda d: d["frames"][1].update(transform_matrix=[[1, 2]]), r"s\[1\]: transform"),
     "mirror": (
-        lambda d: d["frames"][1].update(transform_matrix=(-np.eye(4)).tolist()), "not a rotation"
+        lambda d: d["frames"][1].update(transform_matrix=(-np.eye(4)).tolist()), "that mirrors"
     ),
     "NaN": (lambda d: d.update(k1=float("nan")), "k1 is nan"),
     "name": (lambda d: d["frames"][1].pop("file_path"), r"frames\[1\]: file_path is missing"),

@@ -72,8 +72,8 @@ KEYS = Keys(
         **dict.fromkeys(
             ("aabb_scale", "aabb", "render_aabb*", "up", "n_frames", "sharpness*", "white_*",
              "black_*", "bg_color*", "envmap", "from_na", "from_mitsuba", "enable_depth_loading",
-             "integer_depth_scale", "depth_scal*", "depth_unit_scale_factor", "near", "far", "*_filenames",
-             "centroid", "avglen", "totw", "hdr", "sun_*", "time*", "fps", "num_frames", "wave*",
+             "integer_depth_scale", "depth_scal*", "depth_unit_scale_factor", "near", "far",
+             "*_filenames", "centroid", "avglen", "totw", "hdr", "sun_*", "time*", "fps", "num_frames", "wave*",
              "background*", "bounding_box*", "scene_box", "comment*", "version", "crop_box*"),
             TRAINING,
         ),
