@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import re
 from collections.abc import Callable, Sequence
 from fnmatch import fnmatchcase
 from functools import partial
@@ -615,6 +616,17 @@ def read_network(
     return _with_adjusted_control(network) if FORMATS[format].adjusted else network
 
 
+# What files are that no reader of networks and cameras reads, by something in their beginning.
+SCANNER_PRODUCT = "a product of a line scanner; `jaxbundle pushbroom` reads it"
+OTHER_KINDS = {
+    rb"^version https://git-lfs": "a pointer of Git LFS, not the file; fetch it by `git lfs pull`",
+    rb"(?m)^sensor_type:\s*(?!camera)\w+": "of EuRoC, but of another sensor than a camera",
+    rb"(?i)<(?:PHR_)?Dimap_Document": f"DIMAP, {SCANNER_PRODUCT}",
+    rb"<isd>": f"support data of DigitalGlobe, {SCANNER_PRODUCT}",
+    rb"USGS_ASTRO_LINE_SCANNER": f"support data (ISD), {SCANNER_PRODUCT}",
+}
+
+
 def describe_incomplete(path: Path) -> str:
     """What a file is that has a known form and not what is read from it; empty for others."""
     if path.name == CONTROL:
@@ -624,7 +636,8 @@ def describe_incomplete(path: Path) -> str:
             "a FileStorage of OpenCV without camera_matrix; expected the result of a calibration, "
             "such as out_camera_data.xml, not its settings or images"
         )
-    return ""
+    head = beginning(path, 1000)
+    return next((said for mark, said in OTHER_KINDS.items() if re.search(mark, head)), "")
 
 
 def expected_inputs(path: Path) -> str:

@@ -387,14 +387,20 @@ def _make_observations(
     table: Columns, images: Images, points: Points, sigma_image: float | None, origin: str | None
 ) -> Observations:
     table.check_names(OBSERVATION_COLUMNS, OBSERVATION_SIGMAS)
-    sigma = _matrix(table, OBSERVATION_SIGMAS)
+    if table.values.keys().isdisjoint(OBSERVATION_SIGMAS):
+        # millions of rows of other programs have none
+        sigma, missing = np.full((len(table), 2), sigma_image or 1.0), len(table) > 0
+    else:
+        stated = _matrix(table, OBSERVATION_SIGMAS)
+        sigma = np.where(np.isnan(stated), sigma_image or 1.0, stated)
+        missing = bool(np.isnan(stated).any())
     return Observations(
         image=_rows_in(images, table, "image"),
         point=_rows_in(points, table, "point"),
         xy=_matrix(table, ("x", "y"), required=True),
-        sigma=np.where(np.isnan(sigma), sigma_image or 1.0, sigma),
+        sigma=sigma,
         source=table.source,
-        sigma_origin=origin or (UNIT if sigma_image is None and np.isnan(sigma).any() else STATED),
+        sigma_origin=origin or (UNIT if sigma_image is None and missing else STATED),
     )
 
 

@@ -302,6 +302,61 @@ error = 0.4
 """
 
 
+def _groups(text: str, *names: str) -> str:
+    """Places for keys in elements of XML, in the first of each name."""
+    for name in names:
+        assert f"<{name}>" in text, name
+        text = text.replace(f"<{name}>", f"<{name}>@", 1)
+    return text
+
+
+def _worldview() -> str:
+    from test_xml_products import worldview
+
+    return _groups(worldview(), "isd", "IMD", "IMAGE", "TLCLISTList", "EPH", "ATT", "ATTLISTList",
+                   "GEO", "PRINCIPAL_DISTANCE", "OPTICAL_DISTORTION", "PERSPECTIVE_CENTER",
+                   "CAMERA_ATTITUDE", "DETECTOR_MOUNTING", "BAND_P", "DETECTOR_ARRAY")  # fmt: skip
+
+
+def _dimap2(kind: str) -> str:
+    from test_xml_products import dimap, early
+
+    if kind == "early":
+        return _groups(early(), "PHR_Dimap_Document", "Product_Characteristics",
+                       "Raster_Dimensions", "Sensor_Model_Characteristics", "Point",
+                       "UTC_Sensor_Model_Range", "Sensor_Attitudes", "Polynomial_Models", "Q0",
+                       "Position_In_Retina", "Viewing_Directions", "PsiX_Model")  # fmt: skip
+    text = _groups(dimap(kind == "polynomial"), "Dimap_Document", "Metadata_Identification",
+                   "Dataset_Identification", "Raster_Data", "Raster_Dimensions", "Geometric_Data",
+                   "Refined_Model", "Time", "Time_Range", "Time_Stamp", "Ephemeris", "Point_List",
+                   "Point", "Attitudes", "Instrument_Calibration")  # fmt: skip
+    more = ("Polynomial_Quaternions", "Q2", "Swath_Range") if kind == "polynomial" else (
+        "Quaternion_List", "Quaternion", "Band_Calibration")  # fmt: skip
+    return _groups(text, *more, "Polynomial_Look_Angles")
+
+
+def _dimap1() -> str:
+    import tempfile
+
+    from test_dimap import write_dimap
+
+    with tempfile.TemporaryDirectory() as folder:
+        text = write_dimap(Path(folder)).read_text()
+    return _groups(text, "Dimap_Document", "Dataset_Id", "Raster_Dimensions", "Data_Strip",
+                   "Ephemeris", "Point", "Location", "Satellite_Attitudes", "Corrected_Attitude",
+                   "Angles", "Sensor_Configuration", "Time_Stamp", "Instrument_Look_Angles",
+                   "Look_Angles")  # fmt: skip
+
+
+def _csm() -> str:
+    from test_csm import support_data
+
+    return json.dumps({"@": 0, **support_data()})
+
+
+SCANNERS = ("csm", "worldview", "dimap", "dimap2", "dimap2-table", "dimap2-early")
+"""Those that `read_scanner` reads."""
+
 SAMPLES: dict[str, tuple[str, str, object]] = {
     "opencv": ("camera.yaml", YAML, OPENCV),
     "opencv-xml": ("camera.xml", XML, STORAGE),
@@ -333,6 +388,12 @@ SAMPLES: dict[str, tuple[str, str, object]] = {
     "opensfm-cameras": ("camera_models.json", JSON, lambda: _opensfm("cameras")),
     "openmvg": ("sfm_data.json", JSON, _openmvg),
     "mrcal": ("left.cameramodel", "'{key}': 7, ", _mrcal),
+    "csm": ("isd.json", JSON, _csm),
+    "worldview": ("image.xml", XML, _worldview),
+    "dimap": ("METADATA.DIM", XML, _dimap1),
+    "dimap2": ("DIM.XML", XML, lambda: _dimap2("polynomial")),
+    "dimap2-table": ("DIM.XML", XML, lambda: _dimap2("table")),
+    "dimap2-early": ("DIM.XML", XML, lambda: _dimap2("early")),
 }  # fmt: skip
 """File name, form of a key, text or the function that makes it, by format."""
 

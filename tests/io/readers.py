@@ -461,7 +461,7 @@ def _rpc_product(case):
     return make
 
 
-for case in ("Pleiades", "Pleiades Neo", "WorldView", "OSSIM"):
+for case in ("Pleiades", "Pleiades, first products", "Pleiades Neo", "WorldView", "OSSIM"):
     READERS[f"rpc {case}"] = Reader(
         _rpc_product(case), lambda f: scanners.read_rpc(next(f.iterdir()))
     )

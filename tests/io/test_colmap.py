@@ -2,6 +2,7 @@
 
 import dataclasses
 import struct
+import sys
 
 import numpy as np
 import pytest
@@ -21,7 +22,9 @@ from jaxbundle.io.networks.colmap import (
 )
 from jaxbundle.io.networks.colmap_model import find_rows
 from jaxbundle.io.networks.colmap_models import MODELS, from_colmap, to_colmap
+from jaxbundle.io.text import rows
 from jaxbundle.network import Camera
+from jaxbundle.network.tables import Observations
 
 FILES = {
     "cameras.txt": "# Camera list\n1 SIMPLE_RADIAL 640 480 500 320 240 -0.1\n"
@@ -401,3 +404,44 @@ def test_rows_of_numbers(ids):
     wanted = np.array([2, 9, -5, 10**15, 7, 10**12, 0])
     expected = [ids.index(k) if k in ids else -1 for k in wanted.tolist()]
     assert find_rows(np.array(ids, np.int64), wanted).tolist() == expected
+
+
+@pytest.mark.parametrize("arrow", [True, False])
+def test_numbers_of_a_long_text(monkeypatch, arrow):
+    """pyarrow, where it is installed, and NumPy read the same bits, and refuse the same."""
+    if arrow:
+        pytest.importorskip("pyarrow")
+    else:
+        monkeypatch.setitem(sys.modules, "pyarrow", None)
+    monkeypatch.setattr(rows, "LONG_TEXT", 0)
+    values = np.random.default_rng(3).normal(size=500) * 10.0 ** np.arange(-250, 250)
+    words = [*map(repr, values.tolist()), "5.", ".5", "-1E+3", "+7", "5e-324"]
+    text = "".join(word + blank for word, blank in zip(words, [" ", "\n", "\t", "  \n\n "] * 200))
+    assert (rows.parse_numbers(text) == [float(word) for word in words]).all()
+    lines = [" ".join(words[:7]), "", words[9]]
+    parsed = rows.parse_lines(lines)
+    assert [len(row) for row in parsed] == [7, 0, 1] and parsed[2][0] == values[9]
+    for wrong in ("1_0", "3x", "1,5", "0x10", "1-2", "1.5.2", "1d3", "--1", "1e5e", "ä"):
+        with pytest.raises(ValueError):
+            rows.parse_numbers(f"1 {wrong} 2")
+        assert rows.parse_lines(["1", f"2 {wrong}"]) is None
+    for unlike in ("nan", "inf"):
+        assert rows.parse_lines(["1", f"2 {unlike}"]) is None
+
+
+@pytest.mark.parametrize("gaps", [False, True])
+def test_points_without_image_points(tmp_path, gaps):
+    """Where a point of points3D.bin begins follows from the images, or from the points before."""
+    before = network("opencv")
+    if gaps:
+        ids = tuple(str(100 + 7 * k) for k in range(len(before.points)))
+        before = before.replace(points=dataclasses.replace(before.points, id=ids))
+    rays = before.observations
+    seen = ~np.isin(rays.point, [2, len(before.points) - 1])
+    fewer = {name: getattr(rays, name)[seen] for name in ("image", "point", "xy", "sigma")}
+    before = before.replace(observations=Observations(**fewer))
+    write_colmap(before, tmp_path)
+    after = read_colmap(tmp_path)
+    assert after.points.id == before.points.id and len(after.observations) == seen.sum()
+    np.testing.assert_array_equal(after.points.position, before.points.position)
+    np.testing.assert_array_equal(after.observations.point, fewer["point"])

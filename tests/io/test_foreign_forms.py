@@ -573,6 +573,11 @@ def test_image_points_of_an_nvm_from_a_corner(tmp_path, centres):
     ("default.xml", '<?xml version="1.0"?>\n<opencv_storage><Settings><BoardSize_Width>9'
      "</BoardSize_Width></Settings></opencv_storage>\n", "a FileStorage of OpenCV without camera_"),
     ("ground_control_points.json", '{"points": []}', "ground control of OpenSfM; give its folder"),
+    ("cameras.xml", "version https://git-lfs.github.com/spec/v1\noid sha256:6a\nsize 361\n",
+     "a pointer of Git LFS"),
+    ("sensor.yaml", "sensor_type: imu\ncomment: VI-Sensor IMU\n", "another sensor than a camera"),
+    ("DIM.XML", '<?xml version="1.0"?>\n<Dimap_Document>\n</Dimap_Document>\n', "DIMAP, a product"),
+    ("image.XML", "<isd><IMD/></isd>\n", "support data of DigitalGlobe, a product of a line"),
 ])  # fmt: skip
 def test_a_refusal_names_the_kind_and_what_is_missing(tmp_path, command, name, text, kind):
     path = tmp_path / name
@@ -580,3 +585,92 @@ def test_a_refusal_names_the_kind_and_what_is_missing(tmp_path, command, name, t
     for words in (("convert", path, tmp_path / "n.csv"), ("camera", path), ("adjust", path)):
         told = command(*words)
         assert told.status == 2 and kind in told.err and name in told.err
+
+
+@pytest.mark.parametrize("old, new, message", [
+    ('"sensorWidth": "8"', '"sensorWidth": "0"', "sensorWidth is 0, pixelRatio 1.01"),
+    ('"pixelRatio": "1.01"', '"pixelRatio": "-1"', "sensorWidth is 8, pixelRatio -1"),
+])  # fmt: skip
+def test_sensors_of_alicevision_without_size(tmp_path, old, new, message):
+    path = write_sample(tmp_path, "alicevision")
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+    with pytest.raises(InputError, match=message):
+        read_network(path)
+
+
+def test_a_setting_of_vins_without_cameras(tmp_path):
+    path = write_sample(tmp_path, "vins")
+    path.write_text(path.read_text().replace("num_of_cam: 2", "num_of_cam: 0"))
+    with pytest.raises(InputError, match="num_of_cam is 0; a whole number from 1"):
+        read_network(path)
+    path.write_text('a:\n  cam0_calib: "left.yaml"\n')
+    with pytest.raises(InputError, match="cam0_calib is missing at the first level"):
+        read_network(path, format="vins")
+
+
+def test_other_names_of_focal_lengths(tmp_path):
+    """fx, fy of every frame, and a scale of depths, as dense_depth_priors_nerf writes them."""
+    frame = {"file_path": "a.png", "fx": 700.5, "fy": 701.5, "cx": 320, "cy": 240,
+             "transform_matrix": np.eye(4).tolist(), "depth_file_path": "d.png"}  # fmt: skip
+    path = tmp_path / "transforms_train.json"
+    head = {"near": 0.1, "far": 8.0, "depth_scaling_factor": 1000.0}
+    path.write_text(json.dumps({**head, "frames": [frame]}))
+    (camera,) = read_network(path).cameras
+    core = [camera.parameters[name] for name in ("fx", "fy", "cx", "cy")]
+    assert core == [700.5, 701.5, 319.5, 239.5]
+    path.write_text(json.dumps({**head, "frames": [{**frame, "fl_x": 700}]}))
+    with pytest.raises(InputError, match="fl_x and fx differ"):
+        read_network(path)
+
+
+def test_a_transposed_camera_matrix(tmp_path):
+    """Open3D writes it column by column; MATLAB's counts from 1; and the lens model of calibdb."""
+    path = tmp_path / "camera.json"
+    rows = [[525, 0, 0], [0, 526, 0], [319.5, 239.5, 1]]
+    named = {"width": 640, "height": 480, "intrinsic_matrix": [x for row in rows for x in row]}
+    path.write_text(json.dumps(named))
+    (camera,) = read_cameras(path)
+    core = [camera.parameters[name] for name in ("fx", "fy", "cx", "cy")]
+    assert core == [525, 526, 319.5, 239.5]
+    path.write_text(json.dumps({**named, "intrinsic_matrix": rows}))
+    with pytest.raises(InputError, match="transposed, as MATLAB has it, whose pixels count from 1"):
+        read_cameras(path)
+    rows = {"camera_matrix": [[600, 0, 320], [0, 601, 240], [0, 0, 1]], "img_size": [640, 480],
+            "distortion_coefficients": [[0.1, 0.2, 0.001, 0.002, 0.0]],
+            "distortion_model": "rectilinear"}  # fmt: skip
+    path.write_text(json.dumps(rows))
+    (camera,) = read_cameras(path)
+    assert camera.model == "opencv" and camera.parameters["k1"] == 0.1
+
+
+def test_an_angle_of_the_height(tmp_path):
+    """camera_angle_y alone: f = h/2 / tan(y/2), square pixels, and the middle of the image."""
+    path = write_sample(tmp_path, "transforms")
+    path.write_text(path.read_text().replace("camera_angle_x", "camera_angle_y"))
+    (camera,) = read_network(path).cameras
+    f = 600 / 2 / np.tan(0.7 / 2)
+    assert camera.parameters["fx"] == camera.parameters["fy"] == pytest.approx(f, rel=1e-15)
+    assert (camera.parameters["cx"], camera.parameters["cy"]) == (399.5, 299.5)
+    assert camera.tie == (("fx", "fy"),)
+    text = path.read_text()
+    path.write_text(text.replace('"camera_angle_y": 0.7, "w": 800, "h": 600', '"fl_x": 500'))
+    with pytest.raises(InputError, match="cx is missing, and w and h"):
+        read_network(path)
+    path.write_text(text.replace('"camera_angle_y": 0.7, ', ""))
+    with pytest.raises(InputError, match="fl_x and camera_angle_x are missing"):
+        read_network(path)
+
+
+@pytest.mark.parametrize("model", ["plumb_bob", '""', "none"])
+def test_a_camera_of_ros_without_distortion(tmp_path, model):
+    """1 × 0 coefficients, as simulated and uncalibrated cameras have."""
+    path = write_sample(tmp_path, "ros")
+    text = path.read_text().replace("plumb_bob", model)
+    old = "{rows: 1, cols: 5, data: [-0.3, 0.1, 0.001, -0.0005, 0]}"
+    assert old in text
+    path.write_text(text.replace(old, "{rows: 1, cols: 0, data: []}"))
+    (camera,) = read_cameras(path)
+    assert (camera.model, camera.parameters["fx"]) == ("opencv", 500)
+    assert not any(camera.parameters[name] for name in ("k1", "k2", "p1", "p2"))

@@ -104,11 +104,13 @@ def test_there_and_back(tmp_path):
 BROKEN = {
     "no frames": (lambda d: d["frames"].clear(), "transforms.json: there are no frames"),
     "model": (lambda d: d.update(camera_model="EQUIRECTANGULAR"), "EQUIRECTANGULAR are not off"),
-    "focal": (lambda d: d.pop("fl_x"), "transforms.json: fl_x is missing"),
+    "focal": (
+        lambda d: [d.pop(name) for name in ("fl_x", "fl_y")], "fl_x and camera_angle_x are missing"
+    ),
     "width": (lambda d: d.update(w=12.5), "w is 12.5; a whole number"),
     "matrix": (lambda d: d["frames"][1].update(transform_matrix=[[1, 2]]), r"s\[1\]: transform"),
     "mirror": (
-        lambda d: d["frames"][1].update(transform_matrix=(-np.eye(4)).tolist()), "not a rotation"
+        lambda d: d["frames"][1].update(transform_matrix=(-np.eye(4)).tolist()), "that mirrors"
     ),
     "NaN": (lambda d: d.update(k1=float("nan")), "k1 is nan"),
     "name": (lambda d: d["frames"][1].pop("file_path"), r"frames\[1\]: file_path is missing"),

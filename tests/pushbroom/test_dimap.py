@@ -109,6 +109,10 @@ REFUSED = {
     "time": ("<TIME>2008-03-04T12:29", "<TIME>yesterday", ["Point 1, TIME", "yesterday"]),
     "order": ("<TIME>2008-03-04T12:29:03", "<TIME>2008-03-04T12:39:03", ["point 2", "sort"]),
     "no xml": ("</Dimap_Document>", "", ["not valid XML"]),
+    "resampled": (
+        "<Data_Strip>", "<Data_Processing><PROCESSING_LEVEL>1B</PROCESSING_LEVEL>"
+        "</Data_Processing><Data_Strip>", ["PROCESSING_LEVEL is '1B'", "1A"],
+    ),
     "late": ("<NROWS>600", "<NROWS>700", ["Corrected_Attitude: image line 646", "0.25 s are"]),
 }
 
@@ -125,3 +129,18 @@ def test_what_is_refused(tmp_path, case):
         read_scanner(write_dimap(tmp_path, change))
     for word in words:
         assert word in str(refused.value), refused.value
+
+
+def test_other_bands_and_shifts_are_reported(tmp_path):
+    """The look angles of a second band, and a shift between arrays."""
+    band = "<Instrument_Look_Angles><BAND_INDEX>2</BAND_INDEX></Instrument_Look_Angles>"
+    shift = "<DEREGISTRATION_VALUE>0.25</DEREGISTRATION_VALUE>"
+
+    def change(text):
+        end = "</Instrument_Look_Angles_List>"
+        text = text.replace(end, f"{band}{end}")
+        return text.replace("<Time_Stamp>", f"{shift}<Time_Stamp>")
+
+    _, bands, shifts = read_scanner(write_dimap(tmp_path, change)).warnings
+    assert "2 bands have look angles of their own" in bands
+    assert "DEREGISTRATION_VALUE 0.25" in shifts and "not applied" in shifts

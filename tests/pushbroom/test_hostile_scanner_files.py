@@ -10,7 +10,7 @@ from rpc_scenes import made_up
 from scanner_files import write_scanner
 from test_csm import support_data
 from test_dimap import write_dimap
-from test_xml_products import dimap, worldview
+from test_xml_products import dimap, early, worldview
 
 from jaxbundle.io.scanner.csm import read_csm
 from jaxbundle.io.scanner.flight import read_flight
@@ -52,6 +52,8 @@ def made(kind: str, folder: Path) -> Path:
             (folder / "image.xml").write_text(worldview())
         case "dimap2":
             (folder / "DIM.XML").write_text(dimap())
+        case "dimap of first products":
+            (folder / "DIM.XML").write_text(early())
         case "dimap":
             write_dimap(folder)
         case "rpc":
@@ -66,6 +68,7 @@ READ = {
     "csm": lambda folder: read_csm(folder / "isd.json"),
     "worldview": lambda folder: read_scanner(folder / "image.xml"),
     "dimap2": lambda folder: read_scanner(folder / "DIM.XML"),
+    "dimap of first products": lambda folder: read_scanner(folder / "DIM.XML"),
     "dimap": lambda folder: read_scanner(folder / "METADATA.DIM"),
     "rpc": lambda folder: read_rpc(folder / "image_RPC.TXT"),
 }

@@ -72,7 +72,28 @@ def geom(rpc):
     return "\n".join(lines) + "\n"
 
 
+EARLY = (("line", "Row"), ("sample", "Col"), ("longitude", "Lon"), ("latitude", "Lat"),
+         ("height", "Alt"))  # fmt: skip
+
+
+def early(rpc):
+    """As in the first products of Pléiades: A the scale, B the offset, pixels counted from 1."""
+    scales = "".join(
+        f"<{name}><A>{float(getattr(rpc, f'{axis}_scale'))!r}</A>"
+        f"<B>{float(getattr(rpc, f'{axis}_offset')) + (axis in ('line', 'sample'))!r}</B></{name}>"
+        for axis, name in EARLY
+    )
+    lists = ""
+    for axis, name in (("line", "F_ROW"), ("sample", "F_COL")):
+        both = (*getattr(rpc, f"{axis}_numerator"), *getattr(rpc, f"{axis}_denominator"))
+        lists += f"<{name}>{' '.join(repr(float(c)) for c in both)}</{name}>"
+    return f"""<PHR_Dimap_Document><Geoposition><Rational_Sensor_Model><Global_RFM>
+<Inverse_Model>{lists}</Inverse_Model><RFM_Validity>{scales}</RFM_Validity></Global_RFM>
+</Rational_Sensor_Model></Geoposition></PHR_Dimap_Document>"""
+
+
 PRODUCTS = {
+    "Pleiades, first products": ("PHRDIMAP.XML", early(RPC)),
     "Pleiades": ("RPC_PHR.XML", dimap(RPC)),
     "Pleiades, domain beyond the image": ("RPC_PHR.XML", dimap(RPC, domain=(-27, -791))),
     "SPOT 6": ("RPC_SPOT6.XML", dimap(RPC, "S6_SENSOR", 0.0, (0, 0))),

@@ -270,22 +270,66 @@ def test_dimap2(tmp_path, polynomial):
     check_image(scanner, by_dimap(polynomial))
 
 
-@pytest.mark.parametrize("root", ["PHR_DIMAP_Document", "PHR_Dimap_Document"])
-def test_early_products_of_pleiades(tmp_path, root):
-    """The same document under another root is the same image; without the model it is refused as
-    what it is."""
+def early():
+    """The same model in the form of the first products of Pléiades."""
+    root = ET.fromstring(dimap().partition("?>")[2])
+    take = lambda path: "".join(ET.tostring(e, "unicode") for e in root.find(f".//{path}"))
+    points = take("Point_List")
+    for new, old in (("LOCATION_VALUES", "LOCATION_XYZ"), ("VELOCITY_VALUES", "VELOCITY_XYZ"),
+                     ("UTC_TIME", "TIME")):  # fmt: skip
+        points = points.replace(f"<{old}>", f"<{new}>").replace(f"</{old}>", f"</{new}>")
+    turns = [take(f"Polynomial_Quaternions/Q{k}") for k in range(4)]
+    turns = "".join(f"<Q{k}>{turn}</Q{k}>" for k, turn in enumerate(turns))
+    number = lambda name: root.findtext(f".//{name}")
+    (x, y) = (" ".join(map(repr, row)) for row in LOS)
+    return f"""<?xml version="1.0" encoding="UTF-8"?>
+<PHR_Dimap_Document><Metadata_Identification>
+<METADATA_PROFILE version="1.4">PHR_SYSTEM_RECTIFIED_PRODUCT</METADATA_PROFILE>
+</Metadata_Identification><Dataset_Identification><DATASET_NAME>a</DATASET_NAME>
+</Dataset_Identification><Product_Characteristics><PROCESSING_LEVEL>SENSOR</PROCESSING_LEVEL>
+</Product_Characteristics><Raster_Dimensions><NROWS>{LINES}</NROWS><NCOLS>{PIXELS}</NCOLS>
+</Raster_Dimensions><Geometric_Data><Sensor_Model_Characteristics>
+<UTC_Sensor_Model_Range><START>{stamp(0)}</START><END>{number("END")}</END>
+</UTC_Sensor_Model_Range><Sensor_Ephemeris><Point_List>{points}</Point_List></Sensor_Ephemeris>
+<Sensor_Attitudes><Polynomial_Models>{turns}</Polynomial_Models><OFFSET>{number("OFFSET")}</OFFSET>
+<SCALE>{number("SCALE")}</SCALE></Sensor_Attitudes>
+<SENSOR_LINE_PERIOD>{number("LINE_PERIOD")}</SENSOR_LINE_PERIOD><Sensor_Viewing_Model>
+<Position_In_Retina><FIRST_COL>5</FIRST_COL></Position_In_Retina><Viewing_Directions>
+<PsiX_Model><COEFFICIENTS>{x}</COEFFICIENTS></PsiX_Model>
+<PsiY_Model><COEFFICIENTS>{y}</COEFFICIENTS></PsiY_Model></Viewing_Directions>
+</Sensor_Viewing_Model></Sensor_Model_Characteristics></Geometric_Data></PHR_Dimap_Document>"""
+
+
+def test_early_products_of_pleiades(tmp_path):
+    """Their own names, or those of DIMAP 2 under another root, are the same image."""
+    texts = [dimap(), early()]
+    texts.append(dimap(change=lambda t: t.replace("Dimap_Document", "PHR_DIMAP_Document")))
     images = []
-    for tag in ("Dimap_Document", root):
-        (tmp_path / "DIM.XML").write_text(
-            dimap(change=lambda t, tag=tag: t.replace("Dimap_Document", tag)), encoding="latin-1"
-        )
-        images.append(read_scanner(tmp_path / "DIM.XML").image)
-    for a, b in zip(*map(jax.tree.leaves, images), strict=True):
-        np.testing.assert_array_equal(a, b)
-    text = f"<{root}><METADATA_PROFILE>PHR_SYSTEM_RECTIFIED_PRODUCT</METADATA_PROFILE></{root}>"
-    (tmp_path / "DIM.XML").write_text(text)
-    with pytest.raises(InputError, match="Pléiades .PHR_SYSTEM_RECTIFIED_PRODUCT. without"):
+    for text in texts:
+        (tmp_path / "DIM.XML").write_text(text, encoding="latin-1")
+        images.append(read_scanner(tmp_path / "DIM.XML"))
+        assert not images[-1].warnings
+    for other in images[1:]:
+        for a, b in zip(*(jax.tree.leaves(i.image) for i in (images[0], other)), strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_a_stated_unit_is_used(tmp_path):
+    """PerúSat states seconds, which no profile is known to have."""
+    text = dimap(unit=1.0).replace("PHR_", "PER1_")
+    text = text.replace("<LINE_PERIOD>", '<LINE_PERIOD unit="S">')
+    (tmp_path / "DIM.XML").write_text(text, encoding="latin-1")
+    assert float(read_scanner(tmp_path / "DIM.XML").image.times.period) == pytest.approx(PERIOD)
+    (tmp_path / "DIM.XML").write_text(text.replace('"S"', '"h"'), encoding="latin-1")
+    with pytest.raises(InputError, match="LINE_PERIOD is in 'h'; expected one of s, ms"):
         read_scanner(tmp_path / "DIM.XML")
+
+
+def test_biases_are_reported(tmp_path):
+    bias = "<Instrument_Biases><YAW>0</YAW><PITCH>1e-5</PITCH></Instrument_Biases>"
+    text = dimap(change=lambda t: t.replace("<Swath_Range>", f"{bias}<Swath_Range>"))
+    (tmp_path / "DIM.XML").write_text(text, encoding="latin-1")
+    assert "0, 1e-05, 0) are not applied" in read_scanner(tmp_path / "DIM.XML").warnings[0]
 
 
 def test_the_unit_of_the_period_of_few_lines_is_that_of_the_product(tmp_path):
@@ -316,8 +360,21 @@ REFUSED = {
                  ["Point 1, LOCATION_XYZ has 4 numbers"]),
     "no quaternion": (lambda change: dimap(change=change), "<COEFFICIENTS>", "<COEFFICIENTS>9 ",
                       ["Attitudes, quaternion 1", "length"]),
-    "rpc": (lambda change: change("<Dimap_Document><Rational_Function_Model/></Dimap_Document>"),
+    "rpc": (lambda change: change("<Dimap_Document><Rational_Function_Model><Global_RFM/>"
+                                  "</Rational_Function_Model></Dimap_Document>"),
             "", "", ["RPC alone", "pushbroom rpc"]),
+    "projected": (lambda change: dimap(change=change), "<Raster_Data>", "<Geoposition><Raster_CRS>"
+                  "<RASTER_GEOMETRY>GROUND</RASTER_GEOMETRY></Raster_CRS></Geoposition>"
+                  "<Raster_Data>", ["RASTER_GEOMETRY is 'GROUND'", "projected", "RPC"]),
+    "ortho": (lambda change: change("<Dimap_Document><METADATA_PROFILE>S6_ORTHO</METADATA_PROFILE>"
+                                    "<Raster_Data/></Dimap_Document>"),
+              "", "", ["DIMAP (S6_ORTHO) without a model of the camera"]),
+    "early": (lambda change: change("<PHR_Dimap_Document><METADATA_PROFILE>PHR_X</METADATA_PROFILE>"
+                                    "</PHR_Dimap_Document>"), "", "", ["DIMAP (PHR_X) without"]),
+    "distortion without a list": (
+        worldview, "<ALISTList><ALIST>0 0</ALIST></ALISTList>", "<ALIST>0 1e-7</ALIST>",
+        ["OPTICAL_DISTORTION (ALIST)"],
+    ),
     "other": (lambda change: change("<gpx/>"), "", "", ["another kind", "<gpx>", "DigitalGlobe"]),
 }  # fmt: skip
 

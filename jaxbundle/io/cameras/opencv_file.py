@@ -233,6 +233,15 @@ def _core(path: str | Path, found: Found) -> tuple[dict[str, float], float]:
         four = matrix_of(path, name, value, None).tolist()
         return dict(zip(CORE, four)), extra
     K = matrix_of(path, name, value, (3, 3))
+    # its last column can be no principal point
+    if not K[:2, 2].any() and K[2, :2].all():
+        # Open3D writes nine numbers column by column
+        if not isinstance(value, list) or isinstance(value[0], list):
+            raise InputError(
+                f"{path}: {name} is transposed, as MATLAB has it, whose pixels count from 1; "
+                "expected rows (fx, s, cx), (0, fy, cy), (0, 0, 1), with 1 less in cx and cy"
+            )
+        K = K.T
     for row, column, wanted in ((1, 0, 0), (2, 0, 0), (2, 1, 0), (2, 2, 1)):
         if K[row, column] != wanted:
             raise InputError(
@@ -467,6 +476,9 @@ def matrix_of(
     if isinstance(value, Mapping):
         stated = tuple(_whole(value.get(key)) for key in ("rows", "cols"))
         data = value.get("data")
+        # ROS writes a camera without distortion as 1 × 0 numbers, or none at all
+        if data in (None, []) and 0 in (value.get("rows"), value.get("cols")):
+            data, stated = [], (1, 0)
         whole = [n for n in stated if n is not None]
         if len(whole) < 2 or not isinstance(data, list) or len(data) != whole[0] * whole[1]:
             size = len(data) if isinstance(data, list) else "no"

@@ -229,8 +229,13 @@ def _camera(row: JsonFields, id: str, version: tuple[int, ...]) -> dict[str, Any
             else (np.array([_number(row, "pxFocalLength")] * 2))
         )
     else:
-        ratio = _number(row, "pixelRatio", 1.0)
-        fx = _number(row, "focalLength") / _number(row, "sensorWidth") * w
+        ratio, width = _number(row, "pixelRatio", 1.0), _number(row, "sensorWidth")
+        if ratio <= 0 or width <= 0:
+            raise InputError(
+                f"{row.path}: sensorWidth is {width:g}, pixelRatio {ratio:g}; positive numbers are "
+                "expected"
+            )
+        fx = _number(row, "focalLength") / width * w
         f = np.array([fx, fx * ratio if version >= (1, 2, 5) else fx / ratio])
     if len(f) != 2 or not (f > 0).all():
         raise InputError(f"{row.path}: the focal length is {f}; positive numbers are expected")

@@ -16,7 +16,6 @@ Source: Agarwal, Snavely, Seitz and Szeliski (2010), Bundle Adjustment in the La
 
 import bz2
 import gzip
-import warnings
 import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -39,6 +38,7 @@ from jaxbundle.io.networks.poses import (
 from jaxbundle.io.networks.settings import apply_overrides, check_project_settings
 from jaxbundle.io.text.archives import largest_unpacked_size
 from jaxbundle.io.text.csv_tables import write_bytes
+from jaxbundle.io.text.rows import parse_numbers
 from jaxbundle.network.build import make_cameras, make_network
 from jaxbundle.network.columns import Columns, show
 from jaxbundle.network.tables import EXTERIOR, Network, Source
@@ -210,11 +210,9 @@ def _numbers(path: Path) -> tuple[tuple[int, ...], Float[np.ndarray, " n"]]:
             f"line 1 announces, in a file of {size} bytes"
         )
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")  # about text that is not a number
-            # without a list of words, which would take several times the memory of the numbers
-            numbers = np.fromstring(text, sep=" ")
-    except (ValueError, DeprecationWarning):
+        # without a list of words, which would take several times the memory of the numbers
+        numbers = parse_numbers(text.decode("ascii"))
+    except ValueError:
         raise _not_a_number(path, text) from None
     if len(numbers) != expected:
         raise InputError(

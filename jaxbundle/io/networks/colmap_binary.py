@@ -11,7 +11,7 @@ Source: COLMAP documentation, "Output Format", and src/colmap/scene/reconstructi
 """
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -194,9 +194,7 @@ def _track_lengths(
     from the images are those of the file if every point has the length expected there.
     """
     first, size, length = file.position, POINT.itemsize, len(file.data)
-    if number and images:
-        seen = np.concatenate([image.point for image in images])
-        expected = np.unique(seen[seen != NO_POINT], return_counts=True)[1]
+    for expected in _expected_lengths(number, images):
         ends = first + np.cumsum(size + 8 * expected)
         if len(expected) == number and ends[-1] == length:
             place = ends - 8 * expected - 8
@@ -216,6 +214,25 @@ def _track_lengths(
     file.position = begin
     file.end()
     return np.array(lengths, np.int64)
+
+
+def _expected_lengths(
+    number: int, images: Sequence[ColmapImage]
+) -> Iterator[Int[np.ndarray, " points"]]:
+    """The numbers of image points of every object point: of those that have any, and of all, if
+    they are numbered from 1."""
+    if not number or not images:
+        return
+    seen = np.concatenate([image.point for image in images])
+    seen = seen[seen != NO_POINT]
+    # numbers with few gaps, as usual, are counted in a table
+    if len(seen) and seen.max() < 8 * (len(seen) + number):
+        counts = np.bincount(seen)
+        yield counts[counts > 0]
+        if not counts[0] and len(counts) <= number + 1:
+            yield np.concatenate([counts[1:], np.zeros(number + 1 - len(counts), counts.dtype)])
+    else:
+        yield np.unique(seen, return_counts=True)[1]
 
 
 def binary_files(model: ColmapModel) -> dict[str, bytes]:

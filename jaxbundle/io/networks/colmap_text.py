@@ -27,7 +27,14 @@ from jaxbundle.io.networks.colmap_models import (
     to_colmap,
 )
 from jaxbundle.io.networks.losses import size_of
-from jaxbundle.io.text.rows import TextRow, TextRows, join_numbers, parse_numbers
+from jaxbundle.io.text.rows import (
+    END_OF_LINE,
+    TextRow,
+    TextRows,
+    join_numbers,
+    parse_lines,
+    parse_numbers,
+)
 from jaxbundle.network.tables import Camera, Source
 
 QT = ("QW", "QX", "QY", "QZ", "TX", "TY", "TZ")
@@ -59,7 +66,7 @@ def read_text_cameras(path: Path) -> dict[int, Camera]:
 def _images(path: Path) -> list[ColmapImage]:
     # comments are skipped only before heads: the line of image points may be empty
     rows = TextRows(path, "#", blank=True)
-    images = []
+    heads, points = [], []
     while rows.more():
         head = rows.take("an image")
         if not head.words:
@@ -69,17 +76,23 @@ def _images(path: Path) -> list[ColmapImage]:
                 f"{len(head)} values where an image is expected: IMAGE_ID, "
                 f"{', '.join(QT)}, CAMERA_ID, NAME"
             )
-        pose = head.numbers(QT, 1, more=True)
-        points = rows.take("the image points of an image") if rows.more() else TextRow(path, 0, "")
-        numbers = points.all_numbers("an image point")
+        heads.append((head, head.numbers(QT, 1, more=True)))
+        points.append(
+            rows.take("the image points of an image") if rows.more() else TextRow(path, 0, "")
+        )
+    # all lines at once; one by one if there is a fault in any
+    parsed = parse_lines(row.text for row in points)
+    images = []
+    for k, ((head, pose), row) in enumerate(zip(heads, points)):
+        numbers = row.all_numbers("an image point") if parsed is None else parsed[k]
         if len(numbers) % 3:
-            raise points.error(
+            raise row.error(
                 f"{len(numbers)} numbers; X, Y, POINT3D_ID are expected for each image point"
             )
         numbers = numbers.reshape(-1, 3)
         # beyond 2⁵² floats are all whole: a number there has lost digits
         if (numbers[:, 2] != np.floor(numbers[:, 2])).any() or (abs(numbers) > 2**52).any():
-            raise points.error("a POINT3D_ID is not a whole number")
+            raise row.error("a POINT3D_ID is not a whole number")
         images.append(
             ColmapImage(
                 head.integer(0, "IMAGE_ID"),
@@ -121,23 +134,22 @@ def _plain_points(
     path: Path, lines: Sequence[tuple[int, str]], images: set[int]
 ) -> ColmapPoints | None:
     """The same at once; None if something is unusual, and read line by line."""
-    text = "\n".join(line for _, line in lines)
     try:
-        content = np.frombuffer(f"\n{text}\n".encode("ascii"), np.uint8)
-        numbers = parse_numbers(text)
+        numbers = parse_numbers(END_OF_LINE.join([*(line for _, line in lines), ""]))
     except ValueError:
         return None
-    blank = content <= ord(" ")
-    # where words and lines begin, in characters; words of every line
-    words = np.flatnonzero(blank[:-1] & ~blank[1:])
-    first = np.searchsorted(words, np.flatnonzero(content == ord("\n")))
-    number, first = np.diff(first), first[:-1]
+    ends = np.flatnonzero(np.isnan(numbers))
+    number = np.diff(ends, prepend=-1) - 1  # of every line
     # beyond 2⁵² floats are all whole: a number there has lost digits
-    plain = len(numbers) == len(words) and (number >= 8).all() and (number % 2 == 0).all()
-    if not plain or not (np.abs(numbers) < 2**52).all():
+    plain = len(ends) == len(lines) and (number >= 8).all() and (number % 2 == 0).all()
+    if not plain or not (np.abs(numbers) < 2**52).sum() == len(numbers) - len(ends):
         return None
-    in_line = np.arange(len(words)) - np.repeat(first, number)
-    track, ids = numbers[(in_line >= 8) & (in_line % 2 == 0)], numbers[first]
+    first = ends - number
+    is_track = np.ones(len(numbers), bool)
+    is_track[ends] = False
+    is_track[first[:, None] + np.arange(8)] = False
+    # pairs of an image and the index of its image point
+    track, ids = numbers[is_track][::2], numbers[first]
     image = track.astype(np.int64)  # whole numbers are looked up in a table, others sorted
     if (image != track).any() or not np.isin(image, [*images]).all():
         return None

@@ -67,8 +67,14 @@ def check_rotations(R: Float[np.ndarray, "*images 3 3"], where: str) -> None:
     """Refuse invalid rotation matrices.
 
     **Raises:** `InputError` beginning with `where`."""
-    if not are_rotations(R).all():
-        raise InputError(f"{where} is not a rotation matrix")
+    good = are_rotations(R)
+    if not good.all():
+        (first, *_) = np.reshape(R, (-1, 3, 3))[~np.ravel(good)]
+        # minus a reflection is a rotation
+        mirror = are_rotations(-first).all()
+        raise InputError(
+            f"{where} is not a rotation matrix{', but one that mirrors' if mirror else ''}"
+        )
 
 
 @partial(compile_once, static=0)

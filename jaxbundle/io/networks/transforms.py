@@ -1,8 +1,8 @@
 """Cameras of nerfstudio and instant-ngp: `transforms.json`.
 
     camera_model      OPENCV, PINHOLE, SIMPLE_PINHOLE, OPENCV_FISHEYE; OPENCV without it
-    fl_x fl_y cx cy w h k1 k2 k3 k4 p1 p2       of all frames, or of each; or camera_angle_x, the
-                                                angle of view, in radians, for fl_x
+    fl_x fl_y cx cy w h k1 k2 k3 k4 p1 p2       of all frames, or of each; or camera_angle_x,
+                                                camera_angle_y, angles of view in radians
     frames            file_path, transform_matrix
 
 The transform is camera → world, 4 × 4, x right, y up, the camera looks along −z, as here: M = Rᵀ,
@@ -61,15 +61,20 @@ INTRINSICS = (
     *("camera_model", "is_fisheye", "camera_angle_x", "camera_angle_y", "fl_x", "fl_y"),
     *("cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2"),
 )
+# As dense_depth_priors_nerf has them.
+OTHER_NAMES = {"fl_x": "fx", "fl_y": "fy"}
+# By what the focal length of an axis is given.
+FOCAL = ("fl", "camera_angle")
 TRAINING = "how a field is trained and displayed"
 KEYS = Keys(
-    ("frames", *INTRINSICS),
+    ("frames", *INTRINSICS, *OTHER_NAMES.values()),
     {
         **dict.fromkeys(
             ("aabb_scale", "aabb", "render_aabb*", "up", "n_frames", "sharpness*", "white_*",
              "black_*", "bg_color*", "envmap", "from_na", "from_mitsuba", "enable_depth_loading",
-             "integer_depth_scale", "depth_unit_scale_factor", "near", "far", "*_filenames",
-             "centroid", "avglen", "totw", "hdr", "sun_*", "time*", "fps", "num_frames", "wave*",
+             "integer_depth_scale", "depth_scal*", "depth_unit_scale_factor", "near", "far",
+             "*_filenames", "centroid", "avglen", "totw", "hdr", "sun_*", "time*", "fps",
+             "num_frames", "wave*",
              "background*", "bounding_box*", "scene_box", "comment*", "version", "crop_box*"),
             TRAINING,
         ),
@@ -86,7 +91,7 @@ KEYS = Keys(
 )  # fmt: skip
 # `rotation` is the step of Blender's turntable, in `transforms_train.json`.
 FRAME_KEYS = Keys(
-    ("file_path", "transform_matrix", *INTRINSICS),
+    ("file_path", "transform_matrix", *INTRINSICS, *OTHER_NAMES.values()),
     dict.fromkeys(
         ("sharpness", "mask_path", "depth_file_path", "*_path", "colmap_im_id", "colmap_id",
          "rotation", "time*", "timestamp*", "bg_color", "split", "light*", "exposure*", "*_id",
@@ -162,13 +167,15 @@ def read_transforms(
 
 def _intrinsics(file: JsonFields, frame: JsonFields) -> JsonFields:
     """The camera fields of a frame, missing ones from the file."""
-    own = any(name in frame.document for name in INTRINSICS)
-    values = {
-        name: value
-        for source in (file, frame)  # the frame's own replace those of the file
-        for name in INTRINSICS
-        if (value := source.get(name)) is not None
-    }
+    own = any(name in frame.document for name in (*INTRINSICS, *OTHER_NAMES.values()))
+    values = {}
+    for source in (file, frame):  # the frame's own replace those of the file
+        for name in INTRINSICS:
+            given = [k for k in (name, OTHER_NAMES.get(name, name)) if source.get(k) is not None]
+            if len({str(source.get(k)) for k in given}) > 1:
+                raise InputError(f"{source.path}: {' and '.join(given)} differ; expected one")
+            if given:
+                values[name] = source.get(given[0])
     return JsonFields(frame.path if own else file.path, values)
 
 
@@ -184,15 +191,18 @@ def _camera(id: str, fields: JsonFields) -> Camera:
     size = None
     if fields.get("w") is not None or fields.get("h") is not None:
         size = fields.integer("w", least=1), fields.integer("h", least=1)
-    fx = _focal_length(fields, "x", size and size[0], None)
-    fy = _focal_length(fields, "y", size and size[1], fx)
-    middle = (size[0] / 2, size[1] / 2) if size else (None, None)
-    c = [fields.number(f"c{axis}", n) - PIXEL_CENTRE for axis, n in zip("xy", middle)]
+    # either axis may be the one that is given
+    first, other = "xy" if any(fields.get(f"{n}_x") is not None for n in FOCAL) else "yx"
+    side = dict(zip("xy", size or (None, None)))
+    f = {first: _focal_length(fields, first, side[first], None)}
+    f[other] = _focal_length(fields, other, side[other], f[first])
+    fx, fy = f["x"], f["y"]
+    c = [_principal_point(fields, axis, side[axis]) - PIXEL_CENTRE for axis in "xy"]
     core: dict[str, float] = dict(zip(("fx", "fy", "cx", "cy"), (fx, fy, *c)))
     coefficients = {name: fields.number(name, 0.0) for name in names}
     k4 = fields.number("k4", 0.0) if kind == "OPENCV" else 0.0
     if k4 == 0:
-        tie = (("fx", "fy"),) if fields.get("fl_y") is None and fx == fy else ()
+        tie = (("fx", "fy"),) if fields.get(f"fl_{other}") is None and fx == fy else ()
         return Camera(id, model, core | coefficients, image_size=size, tie=tie)
     if size is None:
         raise InputError(f"{fields.path}: w is missing; k4 is not 0: a fit needs the image size")
@@ -210,7 +220,22 @@ def _focal_length(fields: JsonFields, axis: str, size: int | None, other: float 
                 "them in the file, or --image-size W,H (convert, camera)"
             )
         return size / 2 / np.tan(fields.number(f"camera_angle_{axis}") / 2)
+    if other is None and fields.get(f"fl_{axis}") is None:
+        raise InputError(
+            f"{fields.path}: fl_x and camera_angle_x are missing; expected one of them, or fl_y, "
+            "camera_angle_y"
+        )
     return fields.number(f"fl_{axis}", other)
+
+
+def _principal_point(fields: JsonFields, axis: str, size: int | None) -> float:
+    """A coordinate of the principal point: given, or the middle of the image."""
+    if fields.get(f"c{axis}") is None and size is None:
+        raise InputError(
+            f"{fields.path}: c{axis} is missing, and w and h, whose half it is otherwise; expected "
+            "them in the file, or --image-size W,H (convert, camera)"
+        )
+    return fields.number(f"c{axis}", None if size is None else size / 2)
 
 
 def polynomial(p: Mapping[str, Scalar], X: Scalar, Y: Scalar, Z: Scalar) -> Float[Array, "2"]:

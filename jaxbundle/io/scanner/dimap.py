@@ -22,8 +22,11 @@ from scipy.spatial.transform import Rotation
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.io.scanner.csm_trajectory import LAGRANGE_ORDER
+from jaxbundle.io.scanner.dimap_keys import DIMAP1, DIMAP1_DOCUMENT
 from jaxbundle.io.scanner.scanner import ScannerInput
+from jaxbundle.io.text.known_keys import UnknownKeys
 from jaxbundle.io.text.xml_fields import XmlFields
+from jaxbundle.network.columns import show
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.ancillary import (
     attitude_table,
@@ -42,9 +45,18 @@ def read_dimap(file: XmlFields) -> ScannerInput:
     """The pushbroom image of a SPOT 5 scene, `METADATA.DIM`.
 
     **Raises:** `InputError` naming file, element and its number: a missing one, an invalid number
-    or time, a different number of look angles and pixels, times that do not increase.
+    or time, a different number of look angles and pixels, times that do not increase, another
+    level than 1A.
     """
     path = file.path
+    level = file.text("Data_Processing/PROCESSING_LEVEL", "1A")
+    if level.upper() != "1A":
+        raise InputError(
+            f"{path}: PROCESSING_LEVEL is {show(level)}: an image that was resampled; expected one "
+            "of level 1A, which has the pixels of the camera"
+        )
+    unknown = UnknownKeys()
+    unknown.check_tree(file.root, {file.root.tag: DIMAP1_DOCUMENT, **DIMAP1}, path)
     lines, pixels = (file.number(f"Raster_Dimensions/{n}") for n in ("NROWS", "NCOLS"))
     check_size(lines, pixels, f"{path}: Raster_Dimensions")
     lines, pixels = int(lines), int(pixels)
@@ -89,7 +101,27 @@ def read_dimap(file: XmlFields) -> ScannerInput:
         Trajectory(position, attitude), times, optics, lines, pixels, sources=(points, source)
     )
     name = file.text("Dataset_Id/DATASET_NAME", path.stem)
-    return ScannerInput(name, image, WGS84, warnings)
+    told = (*warnings, *_not_applied(file), *unknown.messages())
+    return ScannerInput(name, image, WGS84, told)
+
+
+def _not_applied(file: XmlFields) -> list[str]:
+    """Warnings about what the file has of other bands, and shifts between them."""
+    told = []
+    bands = file.root.findall(".//Instrument_Look_Angles_List/Instrument_Look_Angles")
+    if len(bands) > 1:
+        told.append(
+            f"{file.path}: {len(bands)} bands have look angles of their own; those of the first, "
+            f"{bands[0].findtext('BAND_INDEX', '').strip() or 'without a number'}, are used"
+        )
+    for name in ("DEREGISTRATION_VALUE", "COUPLED_DEREGISTRATION_VALUE"):
+        value = file.number(name, 0.0)
+        if value:
+            told.append(
+                f"{file.path}: {name} {value:g}, a shift between arrays of detectors, is not "
+                "applied: the look angles are those of the array itself"
+            )
+    return told
 
 
 def _extrapolate(

@@ -9,13 +9,18 @@
 - positions LOCATION_XYZ in metres, Earth-fixed; q = (Q0, Q1, Q2, Q3) scalar first, camera → Earth;
 - of Pléiades q is a polynomial of (t − OFFSET)/SCALE, t in seconds of the day of START; of the
   others a table;
-- LINE_PERIOD in milliseconds (Pléiades) or microseconds (the others): the unit that leads from
-  START to END, if one does.
+- LINE_PERIOD in the unit that it states, else in milliseconds (Pléiades) or microseconds (the
+  others): the unit that leads from START to END, if one does.
+
+The first products of Pléiades (`PHR_DIMAP_Document`, 2012 to 2019) have the same model in
+`Geometric_Data/Sensor_Model_Characteristics`, under other names (`EARLY`). Images that were
+projected have the model of the camera, too, but other pixels: they are refused by their level.
 
 The attitude contains aberration and light time: no correction is set.
 """
 
 import xml.etree.ElementTree as ET
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -24,46 +29,92 @@ from scipy.spatial.transform import Rotation
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84
+from jaxbundle.io.scanner.dimap_keys import DIMAP2, DIMAP2_DOCUMENT
 from jaxbundle.io.scanner.product_tables import Tables, trajectory_of
 from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.scanner.sight_frames import polynomial_optics, sight_frame
+from jaxbundle.io.text.known_keys import UnknownKeys
 from jaxbundle.io.text.xml_fields import XmlFields, number_in, seconds
+from jaxbundle.network.columns import show
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.ancillary import check_times, normalise_quaternions
 from jaxbundle.pushbroom.image import check_size, make_image
 from jaxbundle.pushbroom.scanner import LineTimes
 
 MODEL = "Geometric_Data/Refined_Model"
+EARLY_MODEL = "Geometric_Data/Sensor_Model_Characteristics"
 # Units of LINE_PERIOD by METADATA_PROFILE, if START and END do not determine them.
 PROFILES = {"PHR": 1e-3, "PNEO": 1e-6, "S6": 1e-6, "S7": 1e-6}
+TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "microseconds": 1e-6}
+# Levels whose pixels are those of the camera.
+LEVELS = ("SENSOR", "PRIMARY")
+
+
+class Names(NamedTuple):
+    """Where a form of the document has the parts of the model."""
+
+    range: str
+    period: str
+    points: str
+    location: str
+    time: str
+    polynomials: str
+    coefficients: str
+    first_column: str
+
+
+NAMES = Names(
+    f"{MODEL}/Time/Time_Range",
+    f"{MODEL}/Time/Time_Stamp/LINE_PERIOD",
+    f"{MODEL}/Ephemeris/Point_List/Point",
+    "LOCATION_XYZ",
+    "TIME",
+    f"{MODEL}/Attitudes/Polynomial_Quaternions",
+    f"{MODEL}/Attitudes/Polynomial_Quaternions/Q{{}}/COEFFICIENTS",
+    f"{MODEL}/Geometric_Calibration/Instrument_Calibration/Swath_Range/FIRST_COL",
+)
+EARLY = Names(
+    f"{EARLY_MODEL}/UTC_Sensor_Model_Range",
+    f"{EARLY_MODEL}/SENSOR_LINE_PERIOD",
+    f"{EARLY_MODEL}/Sensor_Ephemeris/Point_List/Point",
+    "LOCATION_VALUES",
+    "UTC_TIME",
+    f"{EARLY_MODEL}/Sensor_Attitudes",
+    f"{EARLY_MODEL}/Sensor_Attitudes/Polynomial_Models/Q{{}}/COEFFICIENTS",
+    f"{EARLY_MODEL}/Sensor_Viewing_Model/Position_In_Retina/FIRST_COL",
+)
 
 
 def read_dimap2(file: XmlFields) -> ScannerInput:
     """The pushbroom image of a DIMAP 2 file of sensor level.
 
     **Raises:** `InputError` naming file and element: a missing one, an invalid number or time,
-    tables that end too long before the image.
+    an image that was projected, tables that end too long before the image.
     """
     path = file.path
+    _check_level(file)
+    names = NAMES if file.find(MODEL) is not None else EARLY
+    unknown = UnknownKeys()
+    unknown.check_tree(file.root, {file.root.tag: DIMAP2_DOCUMENT, **DIMAP2}, path)
     lines, pixels = (file.number(f"Raster_Dimensions/{n}") for n in ("NROWS", "NCOLS"))
     check_size(lines, pixels, f"{path}: Raster_Dimensions")
     lines, pixels = int(lines), int(pixels)
-    epoch = file.time(f"{MODEL}/Time/Time_Range/START")
-    period = _period(file, lines, epoch)
+    epoch = file.time(f"{names.range}/START")
+    period = _period(file, names, lines, epoch)
     times = LineTimes(jnp.zeros(()), jnp.asarray(period))
-    points = f"{MODEL}/Ephemeris/Point_List/Point"
-    t = file.times(points, epoch)
-    P = np.array([_read_location(file, e, k) for k, e in enumerate(file.elements(points), 1)])
+    t = file.times(names.points, epoch, names.time)
+    points = enumerate(file.elements(names.points), 1)
+    P = np.array([_read_location(file, names.location, e, k) for k, e in points])
     positions = Source(f"{path}, Point_List", None, "point")
     attitude = Source(f"{path}, Attitudes", None, "quaternion")
     last = period * (lines - 1)
-    rows, R, lengths = _attitudes(file, epoch, last, attitude)
+    rows, R, lengths = _attitudes(file, names, epoch, last, attitude)
     for times_of, source in ((t, positions), (rows, attitude)):
         if len(times_of) < 2:
             raise InputError(f"{source.name}: {len(times_of)} row; 2 at least")
         check_times(times_of, source)
     tables = Tables(t, P, rows, R, positions, attitude)
-    x, y, warnings = _look_angles(file)
+    x, y, warnings = _look_angles(file, names)
     u = np.arange(pixels)
     # the optics are polynomials about a mean direction in the middle of the image
     frame = sight_frame(
@@ -79,13 +130,39 @@ def read_dimap2(file: XmlFields) -> ScannerInput:
         sources=(positions, attitude),
     )
     name = file.text("Dataset_Identification/DATASET_NAME", path.stem)
-    return ScannerInput(name, image, WGS84, (*lengths, *warnings, *told))
+    return ScannerInput(name, image, WGS84, (*lengths, *warnings, *told, *unknown.messages()))
 
 
-def _period(file: XmlFields, lines: int, epoch: np.datetime64) -> float:
+def _check_level(file: XmlFields) -> None:
+    """Refuse an image that was projected, whose pixels are no longer those of the camera."""
+    for key in ("Raster_CRS/RASTER_GEOMETRY", "PROCESSING_LEVEL"):
+        level = file.text(key, "")
+        if level and level.upper() not in LEVELS:
+            raise InputError(
+                f"{file.path}: {key} is {show(level)}: an image that was projected; expected one "
+                "of sensor (primary) level. For this one use RPC, or the map as it is"
+            )
+
+
+def _unit(file: XmlFields, element: ET.Element | None, units: dict[str, float]) -> float | None:
+    """The unit that an element states; None if it states none."""
+    said = None if element is None else element.get("unit")
+    if element is None or said is None:
+        return None
+    if said.strip().lower() not in units:
+        raise InputError(
+            f"{file.path}: {element.tag} is in {show(said)}; expected one of {', '.join(units)}"
+        )
+    return units[said.strip().lower()]
+
+
+def _period(file: XmlFields, names: Names, lines: int, epoch: np.datetime64) -> float:
     """The period of the lines in seconds."""
-    period = file.number(f"{MODEL}/Time/Time_Stamp/LINE_PERIOD")
-    span = seconds(file.time(f"{MODEL}/Time/Time_Range/END"), epoch)
+    period = file.number(names.period)
+    stated = _unit(file, file.find(names.period), TIME_UNITS)
+    if stated is not None and period > 0:
+        return stated * period
+    span = seconds(file.time(f"{names.range}/END"), epoch)
     # 5 % and a line: not critical, since the units are a factor of 1000 apart
     fits = lambda unit: (
         period > 0 and abs(unit * period * (lines - 0.5) - span) <= 0.05 * span + unit * period
@@ -99,16 +176,18 @@ def _period(file: XmlFields, lines: int, epoch: np.datetime64) -> float:
     # where START and END contradict it: the unit documented for the product
     if known and period > 0:
         return known[0] * period
+    name = names.period.rpartition("/")[2]
     raise InputError(
-        f"{file.path}: LINE_PERIOD is {period:g} and START to END {span:g} s for {lines} lines; a "
+        f"{file.path}: {name} is {period:g} and START to END {span:g} s for {lines} lines; a "
         "period in seconds, milliseconds or microseconds that fits is expected"
     )
 
 
-def _read_location(file: XmlFields, element: ET.Element, k: int) -> list[float]:
+def _read_location(file: XmlFields, name: str, element: ET.Element, k: int) -> list[float]:
     """The position of the k-th point, metres."""
-    where = f"{file.path}: Point {k}, LOCATION_XYZ"
-    words = element.findtext("LOCATION_XYZ", "").replace(",", " ").split()
+    where = f"{file.path}: Point {k}, {name}"
+    _unit(file, element.find(name), {"m": 1.0})
+    words = element.findtext(name, "").replace(",", " ").split()
     if len(words) != 3:
         raise InputError(f"{where} has {len(words)} numbers; 3 are expected")
     return [number_in(word, where) for word in words]
@@ -118,28 +197,32 @@ def _read_location(file: XmlFields, element: ET.Element, k: int) -> list[float]:
 Attitudes = tuple[Float[np.ndarray, " n"], Rotation, tuple[str, ...]]
 
 
-def _attitudes(file: XmlFields, epoch: np.datetime64, last: float, source: Source) -> Attitudes:
-    if file.find(f"{MODEL}/Attitudes/Polynomial_Quaternions") is not None:
-        return _polynomial(file, epoch, last, source)
+def _attitudes(
+    file: XmlFields, names: Names, epoch: np.datetime64, last: float, source: Source
+) -> Attitudes:
+    if names is EARLY or file.find(names.polynomials) is not None:
+        return _polynomial(file, names, epoch, last, source)
     key = f"{MODEL}/Attitudes/Quaternion_List/Quaternion"
     values = file.columns(key, ("Q0", "Q1", "Q2", "Q3"))
     return file.times(key, epoch), *_rotations(values, source)
 
 
-def _polynomial(file: XmlFields, epoch: np.datetime64, last: float, source: Source) -> Attitudes:
+def _polynomial(
+    file: XmlFields, names: Names, epoch: np.datetime64, last: float, source: Source
+) -> Attitudes:
     """The attitudes of a polynomial, as a table from a second before the image to one after."""
-    key = f"{MODEL}/Attitudes/Polynomial_Quaternions"
+    key = names.polynomials
     start = seconds(epoch, epoch.astype("datetime64[D]"))
     offset = file.number(f"{key}/OFFSET") - start
     day = 86400.0
     offset -= day * np.round(offset / day)  # a strip over midnight
     scale = file.number(f"{key}/SCALE")
     if scale == 0:
-        raise InputError(f"{file.path}: SCALE of Polynomial_Quaternions is 0")
+        raise InputError(f"{file.path}: SCALE of {key.rpartition('/')[2]} is 0")
     # Through eight rows Lagrange's polynomial of degree 7 is exact for those of low degree;
     # the division by their length is no polynomial, and the reason for more rows.
     rows = np.linspace(-1.0, last + 1.0, 65)
-    parts = [file.numbers(f"{key}/Q{k}/COEFFICIENTS") for k in range(4)]
+    parts = [file.numbers(names.coefficients.format(k)) for k in range(4)]
     values = np.stack([np.polyval(c[::-1], (rows - offset) / scale) for c in parts], 1)
     return rows, *_rotations(values, source)
 
@@ -152,27 +235,44 @@ def _rotations(
 
 
 def _look_angles(
-    file: XmlFields,
+    file: XmlFields, names: Names
 ) -> tuple[Float[np.ndarray, "4"], Float[np.ndarray, "4"], tuple[str, ...]]:
     """ψ_x and ψ_y as polynomials of the pixel, and a warning if there are several bands."""
     key = f"{MODEL}/Geometric_Calibration/Instrument_Calibration"
     bands = file.root.findall(f".//{key}/Band_Calibration_List/Band_Calibration")
-    shift = file.number(f"{key}/Swath_Range/FIRST_COL", 1.0) - 1 if not bands else 0.0
-    names = [[n for n in (f"{axis}LOS_{k}" for k in range(4))] for axis in "XY"]
+    shift = file.number(names.first_column, 1.0) - 1 if not bands else 0.0
     angles = f"{key}/{'Band_Calibration_List/Band_Calibration/' if bands else ''}"
     angles += "Polynomial_Look_Angles"
     polynomials = []
-    for row in names:
-        values = [file.number(f"{angles}/{n}", None if k == 0 else 0.0) for k, n in enumerate(row)]
+    for axis in "XY":
+        if names is EARLY:
+            values = _early_angles(file, axis)
+        else:
+            rows = [f"{angles}/{axis}LOS_{k}" for k in range(4)]
+            values = [file.number(row, None if k == 0 else 0.0) for k, row in enumerate(rows)]
         # ψ(u + u₀) as a polynomial of u
         moved = np.polynomial.Polynomial(values)(np.polynomial.Polynomial([shift, 1.0])).coef
-        polynomials.append(np.r_[moved, np.zeros(len(row) - len(moved))])
-    warnings = (
-        ()
-        if len(bands) < 2
-        else (
+        polynomials.append(np.r_[moved, np.zeros(4 - len(moved))])
+    warnings = []
+    if len(bands) > 1:
+        warnings.append(
             f"{file.path}: {len(bands)} bands have different look angles; those of the first, "
-            f"{bands[0].findtext('BAND_ID', '').strip() or 'without a name'}, are used",
+            f"{bands[0].findtext('BAND_ID', '').strip() or 'without a name'}, are used"
         )
-    )
-    return *polynomials, warnings
+    biases = [file.number(f"Instrument_Biases/{n}", 0.0) for n in ("YAW", "PITCH", "ROLL")]
+    if any(biases):
+        warnings.append(
+            f"{file.path}: Instrument_Biases (yaw, pitch, roll {biases[0]:g}, {biases[1]:g}, "
+            f"{biases[2]:g}) are not applied: no document says whether the attitudes contain them; "
+            "compare with the RPC of the product"
+        )
+    return *polynomials, tuple(warnings)
+
+
+def _early_angles(file: XmlFields, axis: str) -> list[float]:
+    """ψ_x or ψ_y as a polynomial of the column of the focal plane, of degree 3 at most."""
+    key = f"{EARLY_MODEL}/Sensor_Viewing_Model/Viewing_Directions/Psi{axis}_Model/COEFFICIENTS"
+    values = file.numbers(key).tolist()
+    if not 1 <= len(values) <= 4:
+        raise InputError(f"{file.path}: {key} has {len(values)} numbers; expected 1 to 4")
+    return values

@@ -6,7 +6,7 @@ from pathlib import Path
 from jaxbundle.errors import InputError
 from jaxbundle.io.scanner.csm import read_csm
 from jaxbundle.io.scanner.dimap import read_dimap
-from jaxbundle.io.scanner.dimap2 import MODEL, read_dimap2
+from jaxbundle.io.scanner.dimap2 import EARLY_MODEL, MODEL, read_dimap2
 from jaxbundle.io.scanner.pvl import read_support_data
 from jaxbundle.io.scanner.rpc_check import check_against_rpc
 from jaxbundle.io.scanner.scanner import ScannerInput
@@ -113,17 +113,22 @@ def _read_xml(path: Path) -> ScannerInput:
     has = lambda key: root.find(f".//{key}") is not None
     # early products of Pléiades have PHR_DIMAP_Document or PHR_Dimap_Document
     if root.tag.lower().endswith("dimap_document"):
-        if has(MODEL):
+        if has(MODEL) or has(EARLY_MODEL):
             return read_dimap2(XmlFields(path, root, "DIMAP 2 of sensor level"))
-        if has("Rational_Function_Model"):
+        if has("Rational_Function_Model/Global_RFM"):
             raise InputError(
                 f"{path}: DIMAP of RPC alone; give it to `pushbroom rpc`, or the DIM_….XML here"
             )
-        if root.tag != "Dimap_Document":
-            profile = root.findtext(".//METADATA_PROFILE", "without a profile")[:60]
+        if not has("Sensor_Configuration") and not has("Satellite_Attitudes"):
+            kind = ", ".join(
+                f"{text[:60]}"
+                for name in ("METADATA_PROFILE", "PROCESSING_LEVEL", "PRODUCT_TYPE")
+                if (text := root.findtext(f".//{name}", "").strip())
+            )
             raise InputError(
-                f"{path}: DIMAP of Pléiades ({profile}) without {MODEL}: the sensor level is "
-                "expected; of other levels give the RPC (RPC_….XML) to `pushbroom rpc`"
+                f"{path}: DIMAP ({kind or 'without a profile'}) without a model of the camera, "
+                f"{MODEL} or Data_Strip/Sensor_Configuration: expected a product of sensor level. "
+                "Of other levels give the RPC (RPC_….XML), if it has any, to `pushbroom rpc`"
             )
         return read_dimap(XmlFields(path, root, "DIMAP of SPOT 5"))
     if has("GEO") and has("EPH") and has("ATT"):

@@ -5,6 +5,7 @@
 | DigitalGlobe XML | `RPB` in the same file |
 | DigitalGlobe `NAME.IMD` | `NAME.RPB` beside it |
 | DIMAP 2 and 3, `DIM_NAME.XML` | `RPC_NAME.XML` beside it |
+| DIMAP of the first products of Pléiades | in the same file |
 
 Which corrections the attitudes leave to the reader differs between products of one vendor (a later
 processing may contain them). So those usual for the product are used if they agree with the RPC
@@ -87,9 +88,12 @@ def _find_rpc_file(path: Path) -> Path | None:
         )
     if stem.upper().startswith("DIM_"):
         file = path.with_name(f"RPC_{path.name[4:]}")
-        return file if file.is_file() else None
-    if suffix == ".xml" and "<RPB>" in read_text(path, fallback="latin-1"):
-        return path
+        if file.is_file():
+            return file
+    if suffix == ".xml":
+        text = read_text(path, fallback="latin-1")
+        if "<RPB>" in text or "<Rational_Sensor_Model>" in text:
+            return path
     return None
 
 

@@ -2,6 +2,7 @@
 
 | file | coefficients | centre of the first pixel |
 |---|---|---|
+| DIMAP of the first products of Pléiades, `.XML` | `Inverse_Model/F_ROW`, `F_COL` | (1, 1) |
 | DIMAP 2 and 3, `.XML` | `Inverse_Model`, `GroundtoImage_Values` | by product: `DIMAP_ORIGIN` |
 | DigitalGlobe, `.XML` | `RPB/IMAGE`, of RPC00B | (0, 0) |
 | OSSIM keyword list, `….geom` | `line_num_coeff_00`, …, of `polynomial_format` B | (0, 0) |
@@ -40,6 +41,15 @@ DIMAP_ORIGIN = {"PHR": 1.0, "PNEO": 0.0, "S6": 0.0, "S7": 0.0}
 # Row and column of the centre of the first pixel for other profiles, by the name that DIMAP 2 and
 # DIMAP 3 give the coefficients.
 DIMAP_OTHER = {"Inverse_Model": 1.0, "GroundtoImage_Values": 0.0}
+# The RPC of the first products of Pléiades, and the names of their axes.
+EARLY = "Rational_Sensor_Model/Global_RFM"
+EARLY_AXES = {
+    "line": "Row",
+    "sample": "Col",
+    "longitude": "Lon",
+    "latitude": "Lat",
+    "height": "Alt",
+}
 DIMAP, DIGITALGLOBE = "an RPC file of DIMAP", "an RPC file of DigitalGlobe"
 
 
@@ -49,6 +59,8 @@ def from_xml(path: Path) -> dict[str, Any]:
     **Raises:** `InputError` for XML of another kind, naming the kind.
     """
     root = read_xml(path)
+    if root.find(f".//{EARLY}") is not None:
+        return _from_early_dimap(XmlFields(path, root, DIMAP))
     has_rpc = root.find(".//Rational_Function_Model") is not None
     if root.tag.lower().endswith("dimap_document") or has_rpc:
         if root.find(".//RFM_Validity") is not None:
@@ -128,6 +140,20 @@ def _from_dimap(file: XmlFields) -> dict[str, Any]:
     for field, (axis, part) in FIELDS.items():
         names = [f"{axis}_{part}_coeff_{k}".upper() for k in range(1, TERMS + 1)]
         values[field] = [file.number(f"{inverse}/{name}") for name in names]
+    return values
+
+
+def _from_early_dimap(file: XmlFields) -> dict[str, Any]:
+    """Scales A and offsets B; of every polynomial numerator and denominator in one list."""
+    values = {}
+    for axis, name in EARLY_AXES.items():
+        values[f"{axis}_scale"] = file.number(f"{EARLY}/RFM_Validity/{name}/A")
+        values[f"{axis}_offset"] = file.number(f"{EARLY}/RFM_Validity/{name}/B")
+    for axis, name in (("line", "ROW"), ("sample", "COL")):
+        values[f"{axis}_offset"] -= 1.0
+        both = file.numbers(f"{EARLY}/Inverse_Model/F_{name}", 2 * TERMS).tolist()
+        values[f"{axis}_numerator"] = both[:TERMS]
+        values[f"{axis}_denominator"] = both[TERMS:]
     return values
 
 

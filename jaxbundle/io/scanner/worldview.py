@@ -31,6 +31,7 @@ from jaxbundle.io.scanner.csm_trajectory import slerp
 from jaxbundle.io.scanner.product_tables import Tables, trajectory_of
 from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.scanner.sight_frames import polynomial_optics, sight_frame
+from jaxbundle.io.text.known_keys import Keys, UnknownKeys
 from jaxbundle.io.text.xml_fields import XmlFields, number_in, seconds
 from jaxbundle.network.columns import show
 from jaxbundle.network.tables import Source
@@ -43,6 +44,87 @@ LEVELS = ("basic1b", "stereo1b")
 # Of products whose RPC say nothing else: a file of WorldView-1 agrees with its RPC to 0.05 m with
 # all three, to 0.7 m without refraction.
 CORRECTIONS = Corrections(light_time=True, aberration=True, refraction=True)
+
+HEAD: dict[str, str] = dict.fromkeys(
+    (
+        *("SATID", "REVNUMBER", "STRIPID", "TYPE", "VERSION", "GENERATIONTIME", "NUMPOINTS"),
+        *("EFFECTIVETIME", "MODELGENERATIONTIME", "GEOMODELLEVEL", "CATID", "NUMTLC"),
+    ),
+    "of the delivery, or the length of a list that follows",
+)
+GREY_VALUES = "grey values, no geometry"
+SUMMARY = "summaries of angles and sizes, which follow from the model"
+KEYS: dict[str, Keys] = {
+    "isd": Keys(
+        ("IMD", "EPH", "ATT", "GEO"),
+        {
+            "TIL": "files that together are the image",
+            "STE": SUMMARY,
+            "RPB": "RPC, with which the model is compared",
+            "README": "of the delivery, or the length of a list that follows",
+        },
+    ),
+    "IMD": Keys(
+        ("IMAGEDESCRIPTOR", "NUMROWS", "NUMCOLUMNS", "PRODUCTORDERID", "IMAGE"),
+        {
+            **HEAD,
+            **dict.fromkeys(("PRODUCT*", "CHILDCATALOGID", "OUTPUTFORMAT"), "of the delivery"),
+            **dict.fromkeys(
+                (
+                    *("BANDID", "RADIOMETRICLEVEL", "RADIOMETRICENHANCEMENT", "BITSPERPIXEL"),
+                    *("COMPRESSIONTYPE", "JPEGPROFILENAME", "PANSHARPENALGORITHM"),
+                    *("NUMBEROFLOOKS", "NUMLOOKS", "CLOUDCOVER"),
+                ),
+                GREY_VALUES,
+            ),
+            "BAND_*": "corners of the image and calibration of the grey values",
+        },
+    ),
+    "IMAGE": Keys(
+        ("TLCTIME", "TLCLISTList", "AVGLINERATE", "SCANDIRECTION"),
+        {
+            **HEAD,
+            **dict.fromkeys(("MIN*", "MAX*", "MEAN*", "ROWUNCERTAINTY", "COLUNCERTAINTY"), SUMMARY),
+            "MODE": "of the order",
+            "FIRSTLINETIME": "the time of the first line, which TLCLIST has, too",
+            **dict.fromkeys(
+                (
+                    *("EXPOSUREDURATION", "TDILEVEL", "PNIIRS", "CLOUDCOVER", "RESAMPLINGKERNEL"),
+                    "CCDBIAS",
+                ),
+                GREY_VALUES,
+            ),
+            "POSITIONKNOWLEDGESRC": "of the delivery",
+            "ATTITUDEKNOWLEDGESRC": "of the delivery",
+        },
+    ),
+    "TLCLISTList": Keys(("TLCLIST",)),
+    "EPH": Keys(("STARTTIME", "TIMEINTERVAL", "EPHEMLISTList"), HEAD),
+    "EPHEMLISTList": Keys(("EPHEMLIST",)),
+    "ATT": Keys(("STARTTIME", "TIMEINTERVAL", "ATTLISTList"), HEAD),
+    "ATTLISTList": Keys(("ATTLIST",)),
+    "GEO": Keys(
+        (
+            *("PRINCIPAL_DISTANCE", "OPTICAL_DISTORTION", "PERSPECTIVE_CENTER"),
+            *("CAMERA_ATTITUDE", "DETECTOR_MOUNTING"),
+        ),
+        HEAD,
+    ),
+    "PRINCIPAL_DISTANCE": Keys(("PD",), HEAD),
+    "OPTICAL_DISTORTION": Keys(
+        ("ALISTList", "BLISTList", "ALIST", "BLIST"),
+        {**HEAD, "POLYORDER": "the length of a list that follows"},
+    ),
+    "ALISTList": Keys(("ALIST",)),
+    "BLISTList": Keys(("BLIST",)),
+    "PERSPECTIVE_CENTER": Keys(("CX", "CY", "CZ"), HEAD),
+    "CAMERA_ATTITUDE": Keys(("QCS1", "QCS2", "QCS3", "QCS4"), HEAD),
+    "DETECTOR_MOUNTING": Keys(("BAND_*",), HEAD),
+    "BAND_*": Keys(("DETECTOR_ARRAY",), {"BANDID": "the name of the band", **HEAD}),
+    "DETECTOR_ARRAY": Keys(
+        ("DETORIGINX", "DETORIGINY", "DETROTANGLE", "DETPITCH"), {"DETARRID": "a number", **HEAD}
+    ),
+}
 
 
 def read_worldview(file: XmlFields) -> ScannerInput:
@@ -58,6 +140,8 @@ def read_worldview(file: XmlFields) -> ScannerInput:
             f"{path}: IMAGEDESCRIPTOR is {show(level)}; only Basic1B and Stereo1B have the "
             "geometry of the camera, use the RPC of others"
         )
+    unknown = UnknownKeys()
+    unknown.check_tree(file.root, {file.root.tag: KEYS["isd"], **KEYS}, path)
     lines, pixels = file.number("IMD/NUMROWS"), file.number("IMD/NUMCOLUMNS")
     check_size(lines, pixels, f"{path}: NUMROWS, NUMCOLUMNS")
     lines, pixels = int(lines), int(pixels)
@@ -92,7 +176,7 @@ def read_worldview(file: XmlFields) -> ScannerInput:
         sources=(tables.positions, tables.attitude),
     )
     name = file.text("IMD/PRODUCTORDERID", path.stem) or path.stem
-    return ScannerInput(name, image, WGS84, (*lengths, *odd, *warnings, *told))
+    return ScannerInput(name, image, WGS84, (*lengths, *odd, *warnings, *told, *unknown.messages()))
 
 
 def _line_times(file: XmlFields, lines: int) -> LineTimes:
@@ -151,8 +235,9 @@ def _detectors(
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"], tuple[str, ...]]:
     """x/c and y/c as polynomials of the pixel, and a warning if bands differ."""
     for name in ("ALIST", "BLIST"):
-        found = file.find(f"GEO/OPTICAL_DISTORTION/{name}List")
-        text = "" if found is None else " ".join(found.itertext()).replace(",", " ")
+        # early files have the coefficients without a list around them
+        found = file.root.findall(f".//GEO/OPTICAL_DISTORTION//{name}")
+        text = " ".join(word for e in found for word in e.itertext()).replace(",", " ")
         if any(number_in(word, f"{file.path}: {name}") != 0 for word in text.split()):
             raise InputError(f"{file.path}: OPTICAL_DISTORTION ({name}) is not supported; use RPC")
     mounting = file.find("GEO/DETECTOR_MOUNTING")

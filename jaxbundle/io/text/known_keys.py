@@ -81,11 +81,19 @@ class Keys:
         """The names that are not known."""
         return [name for name in names if not self._has(name)]
 
+    def uses(self, name: str) -> bool:
+        """Whether a name is one of those used."""
+        return name in self.used or any(fnmatchcase(name, part) for part in self.used)
+
     def _has(self, name: str) -> bool:
         return name in self.known or any(fnmatchcase(name, part) for part in self.patterns)
 
     def __or__(self, other: "Keys") -> "Keys":
         return Keys((*self.used, *other.used), self.left | other.left, self.warned | other.warned)
+
+
+LEAF = Keys((), {"version": "of the dictionary of the value"})
+"""Of an element of XML that has text alone."""
 
 
 class UnknownKeys:
@@ -118,9 +126,30 @@ class UnknownKeys:
             self._places.setdefault((name, ""), []).append(str(where))
 
     def check_element(self, element: ET.Element, keys: Keys, where: object) -> None:
-        """The same for the children and attributes of an element of XML."""
+        """The same for the children and attributes of an element of XML; attributes with a
+        namespace (the schema) are of XML itself."""
         children = (child.tag for child in element if isinstance(child.tag, str))
-        self.check((*dict.fromkeys(children), *element.attrib), keys, where)
+        attributes = (name for name in element.attrib if not name.startswith("{"))
+        self.check((*dict.fromkeys(children), *attributes), keys, where)
+
+    def check_tree(self, root: ET.Element, keys: Mapping[str, Keys], where: object) -> None:
+        """The same for an element of XML and all that is used of it.
+
+        `keys`: those of the elements by their names, or patterns with *; an element without an
+        entry has text alone. What may be left is left whole, with all that is in it.
+        """
+        patterns = [name for name in keys if "*" in name]
+        places = [(root, f"{where}: {root.tag[:60]}")]
+        while places:
+            element, place = places.pop()
+            tag = element.tag
+            if tag not in keys:
+                tag = next((name for name in patterns if fnmatchcase(tag, name)), tag)
+            own = keys.get(tag, LEAF)
+            self.check_element(element, own, place)
+            used = [c for c in element if isinstance(c.tag, str) and own.uses(c.tag)]
+            # from the end of the list: the first of the document is the first to be refused
+            places += [(child, f"{place}/{child.tag[:60]}") for child in reversed(used)]
 
     def messages(self) -> tuple[str, ...]:
         """Warnings about the unknown keys."""

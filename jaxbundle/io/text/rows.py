@@ -16,6 +16,11 @@ from jaxbundle.network.columns import show
 # Characters, of some hundred numbers: longer rows are read without a text for each number, four
 # times faster; in shorter ones the guard around it costs more than it gains.
 LONG_ROW = 1000
+# Characters from which it pays to import pyarrow, a tenth of a second.
+LONG_TEXT = 1_000_000
+BLANK_TO_LINE = bytes.maketrans(b" \t", b"\n\n")
+# A number that no line has, since they are finite: where the next line begins.
+END_OF_LINE = " nan\n"
 BLANKS = "; blanks separate columns, so that no name may have one"
 
 
@@ -28,12 +33,52 @@ def parse_numbers(text: str) -> Float[np.ndarray, " n"]:
     """The numbers of a text that blanks and line feeds separate, without a text for each.
 
     **Raises:** `ValueError` for anything else."""
+    if len(text) > LONG_TEXT and (found := _parse_by_arrow(text)) is not None:
+        return found
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # about text that is not a number
         try:
             return np.fromstring(text, sep=" ")
         except DeprecationWarning as error:
             raise ValueError(f"{error}") from None
+
+
+def _parse_by_arrow(text: str) -> Float[np.ndarray, " n"] | None:
+    """The same numbers by pyarrow, where it is installed; None if it refuses the text, too.
+
+    Both round as IEEE 754 has it, and refuse what is no number; 2.6 times faster.
+    """
+    try:
+        import pyarrow as pa
+        from pyarrow import csv
+    except ImportError:
+        return None
+    try:
+        # one column: a number a line
+        content = text.encode("ascii").translate(BLANK_TO_LINE)
+        table = csv.read_csv(
+            pa.BufferReader(content),
+            csv.ReadOptions(use_threads=False, column_names=["x"]),
+            csv.ParseOptions(quote_char=False),
+            csv.ConvertOptions(column_types={"x": pa.float64()}, null_values=[]),
+        )
+    except (pa.ArrowException, UnicodeEncodeError):
+        return None
+    return table["x"].to_numpy()
+
+
+def parse_lines(lines: Iterable[str]) -> list[Float[np.ndarray, " n"]] | None:
+    """The numbers of every line, all lines at once; None if something is not a finite number."""
+    lines = list(lines)
+    try:
+        numbers = parse_numbers(END_OF_LINE.join([*lines, ""]))
+    except ValueError:
+        return None
+    ends = np.flatnonzero(np.isnan(numbers))
+    if len(ends) != len(lines) or np.isinf(numbers).any():
+        return None
+    # views of one array
+    return [numbers[a:b] for a, b in zip([0, *(ends[:-1] + 1).tolist()], ends.tolist())]
 
 
 class TextRow:
