@@ -17,6 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import test_hostile_files as networks
 import test_hostile_scanner_files as scanners
+import test_metashape_projects
+import test_opf
+import test_realityscan
 from exchange_cases import CAMERAS, network
 from PIL import Image
 
@@ -88,6 +91,26 @@ def _(folder):
 @reader("cameras toml", lambda f: read_cameras(f / "cameras.toml"))
 def _(folder):
     write_cameras([CAMERAS["opencv"], CAMERAS["snavely"]], folder / "cameras.toml")
+
+
+@reader("opf", lambda f: read_network(f / "project.opf"))
+def _(folder):
+    test_opf.write(folder)
+
+
+@reader("metashape project", lambda f: read_network(f / "block.psx"))
+def _(folder):
+    test_metashape_projects.write(folder)
+
+
+@reader("realityscan xmp", lambda f: read_network(f, format="realityscan", image_size=(1280, 720)))
+def _(folder):
+    test_realityscan.folder(folder)
+
+
+@reader("realityscan csv", lambda f: read_network(f / "cameras.csv", image_size=(1280, 720)))
+def _(folder):
+    test_realityscan.table(folder)
 
 
 @reader("kalibr results", lambda f: read_kalibr_results(f / "results-cam.txt"))
