@@ -45,6 +45,8 @@ REMARKS = {
     "edge of the image: a moving shutter, or film that is not flat",
     "along tracks": "errors of {} along the tracks of points, alike from stations near to each "
     "other: measured against one image",
+    "given points": "points held, as those of a board, are not where they are given, by {} in "
+    "images: use a flat board, or estimate its points (--board-free)",
 }
 # σ under correlated errors over classical ones from which the difference is a finding: five in a
 # hundred exceed 1.96 classical σ where the model is right, thirteen at this ratio.

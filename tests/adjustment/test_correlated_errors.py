@@ -248,8 +248,13 @@ def test_everything_that_states_a_sigma_asks_the_error_model(shaken):
     sizes = {size.name: size.size for size in shaken.error_model.sizes}
     start = dataclasses.replace(shaken.problem.data, start=shaken.values)
     design = jaxbundle.precision(shaken.problem, start, names=(names[0],), errors=sizes)
-    np.testing.assert_allclose(np.sqrt(design.covariance[0, 0]), C[0], rtol=0.05)
-    np.testing.assert_allclose(design.cameras[0, 0], f["sigma_correlated"], rtol=0.05)
+    # a design knows its sizes, which the adjustment has estimated
+    known = shaken.error_model.as_estimated
+    of_image = np.sqrt(known.covariance("image")[2][0, 0])
+    np.testing.assert_allclose(np.sqrt(design.covariance[0, 0]), of_image, rtol=0.05)
+    of_camera = np.sqrt(known.covariance("camera")[0][0, 0])
+    np.testing.assert_allclose(design.cameras[0, 0], of_camera, rtol=0.05)
+    assert of_image < C[0] and of_camera < f["sigma_correlated"]
     with pytest.raises(jaxbundle.InputError, match="no component principal"):
         jaxbundle.precision(shaken.problem, start, errors={"principal": 0.1})
 

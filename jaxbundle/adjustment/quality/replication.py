@@ -320,7 +320,7 @@ def expected_band(
                 squared_difference(D @ e, np.tensordot(t, C, 1)) / len(D)
                 for D, C in zip(effects, parts)
             ]
-            for e, t in zip(errors, theta)
+            for e, t in zip(errors, model.widening * theta)
         ]
         ratios += np.mean(of_splits, 1).tolist()
     low, high = np.quantile(ratios, [0.025, 0.975])
