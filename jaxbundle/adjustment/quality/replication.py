@@ -47,10 +47,10 @@ from jaxbundle.results import TableMethods, rows_of
 MIN_RAYS_OF_IMAGE = 8
 # Photographs of a camera in a half: two hardly determine an interior orientation.
 MIN_IMAGES = 3
-# Factor of the weights 1/σ of image points of the other half: its square, 1e-8, is far below the
-# share of a half in the information on a camera, and far above the rounding of the normal
-# equations, 1e-16.
-FAINT = 1e-4
+# Factor of the weights 1/σ of image points of the other half: its square, 1e-6, is far below the
+# share of a half in the information on a camera. The images of the other half keep pivots of this
+# size, times those of the conditions of a rig, 1e-6, above `PIVOT`, 1e-13.
+FAINT = 1e-3
 # Simulations at once: 80 MB of errors for 100 000 rows.
 PORTION = 100
 
