@@ -221,7 +221,8 @@ def fill_calibrations(
             write_text(folder / f"rig_{file_name(name)}.toml", text)
         fill_rig(found.rig.network(), folder / RIG)
         views = network_of_views(found.rig)
-        if views is not None:
+        # a camera may have the name of this folder
+        if views is not None and ADJUSTED not in map(file_name, found.cameras):
             fill_project(views, folder / ADJUSTED)
         if plots:
             save_rig_plots(found.rig, folder, progress)
