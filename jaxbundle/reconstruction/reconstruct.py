@@ -594,8 +594,8 @@ class _ReconstructionRun:
         placed, note = with_attitudes(oriented.network, self.names, self.further.attitudes)
         kinds, names = _kinds_of_measurements(placed, measured, self.names)
         significance, weighting = self.settings.significance, self.settings.weighting
-        placed, kinds = leave_out_features(placed, kinds, weighting.feature_share)
-        weighted = adjust_weighted(placed, kinds, names, significance, self._begin, weighting)
+        placed, kept = leave_out_features(placed, kinds == -1, weighting)
+        weighted = adjust_weighted(placed, kinds[kept], names, significance, self._begin, weighting)
         return weighted, note
 
 

@@ -284,14 +284,11 @@ def test_positions_of_features_beside_matches_are_not_used():
     camera = Camera("cam", "brown", {"c": 24.0}, free=("c",))
     network = simulate(ring_of_stations(5, 2.5, 6.0), grid_of_targets(4, 4, 0.5), camera, noise=0.0)
     rays = network.observations
-    kinds = np.where((rays.point == 3) & (rays.image < 2), adjusting.FEATURE, 0)
-    kinds[(rays.point == 5) & (rays.image < 3)] = adjusting.FEATURE  # two matched rays are left
-    kinds[(rays.image == 1) & (rays.point > 3)] = adjusting.FEATURE
-    sigma = np.where(kinds == adjusting.FEATURE, 40.0, 1.0)[:, None] * rays.sigma
-    sigma[rays.image == 1] = 40.0 * rays.sigma[rays.image == 1]
+    is_feature = (rays.point == 3) & (rays.image < 2)
+    is_feature |= (rays.point == 5) & (rays.image < 3)  # two matched rays are left
+    is_feature |= (rays.image == 1) & (rays.point > 3)
+    sigma = np.where(is_feature | (rays.image == 1), 40.0, 1.0)[:, None] * rays.sigma
     given = network.replace(observations=dataclasses.replace(rays, sigma=sigma))
-    left, of_left = adjusting.leave_out_features(given, kinds, 0.01)
-    gone = len(rays) - len(left.observations)
-    assert gone == 1 and len(of_left) == len(left.observations)
-    kept = set(zip(left.observations.image.tolist(), left.observations.point.tolist()))
-    assert (0, 3) not in kept and {(1, 3), (0, 5)} <= kept
+    left, keep = adjusting.leave_out_features(given, is_feature)
+    gone = set(zip(rays.image[~keep].tolist(), rays.point[~keep].tolist()))
+    assert gone == {(0, 3)} and len(left.observations) == keep.sum()

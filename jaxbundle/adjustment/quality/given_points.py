@@ -61,7 +61,7 @@ def given_points_component(
 
 def _held(found: Solution) -> Bool[np.ndarray, " points"]:
     """Which points have no free coordinate."""
-    return ~np.asarray(found.problem.table("point").free, bool).any(1)
+    return np.logical_not(np.asarray(found.problem.table("point").free, bool).any(axis=1))
 
 
 def _correlation(X: Float[np.ndarray, "n 3"], octaves: int) -> Float[np.ndarray, "n n"]:

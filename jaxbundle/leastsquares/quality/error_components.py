@@ -76,10 +76,6 @@ IMAGE = "image"
 OTHERS = "other observations"
 # That of the independent part, in units of the a priori σ.
 INDEPENDENT = "independent errors"
-# The coverage that intervals of 1.96 σ promise.
-COVERAGE = 0.95
-# Student's distribution has a variance from three degrees of freedom on.
-MIN_DEGREES = 3.0
 
 
 class ErrorSize(NamedTuple):
@@ -249,10 +245,15 @@ class ErrorModel:
         return some, inverse @ forms[np.ix_(some, some)] @ inverse
 
     def _excesses(
-        self, some: Int[np.ndarray, " m"], spread: Float[np.ndarray, "m m"]
+        self,
+        some: Int[np.ndarray, " m"],
+        spread: Float[np.ndarray, "m m"],
+        coverage: float = 0.95,
+        min_degrees: float = 3.0,
     ) -> Iterator[float]:
-        """λ of every table that is not eliminated."""
-        upper = 1 - (1 - COVERAGE) / 2
+        """λ of every table that is not eliminated, for intervals of a `coverage`; `min_degrees` of
+        freedom, from which Student's distribution has a variance."""
+        upper = 1 - (1 - coverage) / 2
         for table in self.own[0]:
             if table == self.found.problem.plan.eliminated:
                 continue
@@ -264,7 +265,7 @@ class ErrorModel:
                 continue
             of_variance = np.einsum("knw,kl,lnw->nw", c, spread, c)
             degrees = np.median(2 * variance[free] ** 2 / of_variance[free])
-            t = t_quantile(upper, max(float(degrees), MIN_DEGREES))
+            t = t_quantile(upper, max(float(degrees), min_degrees))
             together = np.einsum("k,knw->nw", np.sqrt(np.diag(spread)), c)
             share = np.median(variance[free] / together[free])
             yield ((t / normal_quantile(upper)) ** 2 - 1) * float(share)
