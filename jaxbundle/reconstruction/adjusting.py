@@ -71,8 +71,8 @@ class WeightingSettings:
     1.5 to 3."""
     feature_share: float = 0.01
     """Share of the information of a photograph, Σ 1/σ², below which its positions of features are
-    not used where `min_matched_rays` of their point are matched. Without them σ are larger by at most 0.5 %
-    (√(1 − 0.01)); smaller: photographs of few matches keep errors that tracks share."""
+    not used where `min_matched_rays` of their point are matched. Without them σ are larger by at
+    most 0.5 % (√(1 − 0.01)); smaller: photographs of few matches keep errors that tracks share."""
     min_matched_rays: int = 3
     """Matched rays that determine a point and check each other."""
     agreeing_ray: float = 0.001
