@@ -226,9 +226,9 @@ def shared_errors(
 ) -> list[BudgetLine]:
     """A line for each component of errors that image points share; none where these do not make
     the standard uncertainties larger, as a rule of all measurands."""
-    model = adjustment.error_model
-    if model is None:
+    if adjustment.error_model is None:
         return []
+    model = adjustment.error_model.as_estimated
     modelled = np.diagonal(model.propagate_rows(slopes))
     if not np.mean(modelled / np.maximum((model.found.sigma0 * sigma) ** 2, 1e-300)) > 1:
         return []

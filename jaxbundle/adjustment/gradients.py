@@ -19,11 +19,6 @@ from jaxbundle.leastsquares.indexing.rows import Data
 from jaxbundle.leastsquares.problem import Problem
 from jaxbundle.system.programs import compile_once, quick_jit
 
-# Numbers of the arguments up to which the program is compiled with little optimisation: for 160 it
-# is compiled in 6 s of processor instead of 11; of 1000, a hundred evaluations take about as much
-# longer as compiling saves.
-QUICK_UP_TO = 1000
-
 
 @dataclasses.dataclass(frozen=True)
 class GradientCheck:
@@ -95,8 +90,9 @@ def check_gradients(
         y, forward = jax.linearize(f, x)
         return y, forward(d), jax.linear_transpose(forward, x)(c)[0]
 
-    # Of few numbers compiling takes longer than all evaluations.
-    compiled = quick_jit if x.size <= QUICK_UP_TO else compile_once
+    # Little optimisation for few numbers: for 160 it is compiled in 6 s of processor instead of 11;
+    # for 1000, a hundred evaluations take about as much longer as compiling saves.
+    compiled = quick_jit if x.size <= 1000 else compile_once
     derivatives = compiled(differentiate, ())
     outputs = jax.eval_shape(f, x).shape
     random = np.random.default_rng(integer("seed", seed, 0))

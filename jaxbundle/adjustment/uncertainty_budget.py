@@ -355,7 +355,7 @@ def uncertainty_budget(
     of_held = held_lines(adjustment, of, held, factor) if held else []
     sigma = factor * adjustment.sigma0 * results.sigma
     if shared and adjustment.error_model is not None:
-        C = np.diagonal(adjustment.error_model.propagate_rows(slopes))
+        C = np.diagonal(adjustment.error_model.as_estimated.propagate_rows(slopes))
         sigma = factor * np.sqrt(np.clip(C, 0, None))
     single = [group.inputs() for group in groups_of_inputs]
     inputs = {

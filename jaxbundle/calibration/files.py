@@ -5,7 +5,8 @@
 | report.txt, report.html, result.json | the full report; the same as a page; its numbers |
 | CAMERA.toml | the camera for a project; σ as comments |
 | CAMERA.yaml, colmap/ | the camera for OpenCV; camera, poses and board for COLMAP |
-| network/ | the adjusted network, for `jaxbundle adjust FOLDER/network` |
+| network/ | the adjusted network, for `jaxbundle adjust FOLDER/network`; of a rig also that of all
+its cameras, on mountings |
 | coverage, uncertainty, uncertainty_far, uncertainty_distance, halves .png | accuracy |
 | models.txt, models.json, difference_MODEL.png | comparison of `--models` |
 | plan, perspective, histogram, residuals_…, distortion_…, correlations_… .png | as in `adjust` |
@@ -24,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxbundle.calibration.page import compose_calibration, compose_calibrations
+from jaxbundle.calibration.rig.network import network_of_views
 from jaxbundle.calibration.several_report import calibrations_dict as calibrations_dict
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
@@ -118,6 +120,7 @@ def files_of(names: Sequence[str]) -> list[str]:
                 *(f"{name}/{file}" for name, files in RIG_FILES.values() for file in files),
             )
         ]
+        found += [f"{ADJUSTED}/{file}" for file in NETWORK_FILES]
     return found
 
 
@@ -217,6 +220,10 @@ def fill_calibrations(
             text = camera_text(found.rig.camera(name), found.rig.sigma[name])
             write_text(folder / f"rig_{file_name(name)}.toml", text)
         fill_rig(found.rig.network(), folder / RIG)
+        views = network_of_views(found.rig)
+        # a camera may have the name of this folder
+        if views is not None and ADJUSTED not in map(file_name, found.cameras):
+            fill_project(views, folder / ADJUSTED)
         if plots:
             save_rig_plots(found.rig, folder, progress)
 

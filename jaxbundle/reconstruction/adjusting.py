@@ -69,6 +69,12 @@ class WeightingSettings:
     """Largest factor of σ (`WeightedAdjustment.worst`) above which a result with `some_errors` is
     doubtful: around the fountain of the set `loop` it is 1.3, on facades, which repeat themselves,
     1.5 to 3."""
+    feature_share: float = 0.01
+    """Share of the information of a photograph, Σ 1/σ², below which its positions of features are
+    not used where `min_matched_rays` of their point are matched. Without them σ are larger by at
+    most 0.5 % (√(1 − 0.01)); smaller: photographs of few matches keep errors that tracks share."""
+    min_matched_rays: int = 3
+    """Matched rays that determine a point and check each other."""
     agreeing_ray: float = 0.001
     """Maximum misclosure of a ray that agrees with a result, relative to the image extent, the
     angle to the axis that 95 % of the rays do not exceed (`orientation.rays.sights`): 1.4 pixels of
@@ -98,6 +104,33 @@ class WeightedAdjustment:
             factors = {f"image points {name}": f for name, f in self.factors.items()}
             changed = self.adjustment.with_changes(sigma_factors=factors)
             object.__setattr__(self, "adjustment", changed)
+
+
+def leave_out_features(
+    network: Network,
+    is_feature: Bool[np.ndarray, " rays"],
+    settings: WeightingSettings = WeightingSettings(),
+) -> tuple[Network, Bool[np.ndarray, " rays"]]:
+    """The network without positions of features that hardly contribute; which rays it has.
+
+    A position that was not matched is predicted from the feature of the window of its track, whose
+    error all predictions of the track have in common. With σ forty times those of matches they
+    determine nothing, but these common errors are most of those along tracks that an error model
+    finds: in ten rendered photographs, with true orientations, 0.41 of the variance with and 0.16
+    without them, the projection centres 0.052 mm off either way.
+
+    **Arguments:** `is_feature`: which rays are no matches.
+    """
+    rays = network.observations
+    matched = np.bincount(rays.point[~is_feature], minlength=len(network.points))
+    superfluous = is_feature & (matched[rays.point] >= settings.min_matched_rays)
+    information = (1 / rays.sigma**2).sum(1)
+    of_image = lambda some: np.bincount(
+        rays.image, information * some, minlength=len(network.images)
+    )
+    few = of_image(superfluous) < settings.feature_share * of_image(np.ones(len(rays)))
+    keep = ~(superfluous & few[rays.image])
+    return network.replace(observations=rays.take(keep)), keep
 
 
 def adjust_weighted(

@@ -23,7 +23,12 @@ from jaxbundle.orientation.network import Oriented
 from jaxbundle.photographs.concurrent import photographs_at_once
 from jaxbundle.photographs.reading import read_photograph
 from jaxbundle.reconstruction import square_pixels
-from jaxbundle.reconstruction.adjusting import DOUBTFUL_MISFIT, WeightedAdjustment, adjust_weighted
+from jaxbundle.reconstruction.adjusting import (
+    DOUBTFUL_MISFIT,
+    WeightedAdjustment,
+    adjust_weighted,
+    leave_out_features,
+)
 from jaxbundle.reconstruction.attitudes import map_attitudes, with_attitudes
 from jaxbundle.reconstruction.block import describe_block
 from jaxbundle.reconstruction.control import Control
@@ -589,7 +594,8 @@ class _ReconstructionRun:
         placed, note = with_attitudes(oriented.network, self.names, self.further.attitudes)
         kinds, names = _kinds_of_measurements(placed, measured, self.names)
         significance, weighting = self.settings.significance, self.settings.weighting
-        weighted = adjust_weighted(placed, kinds, names, significance, self._begin, weighting)
+        placed, kept = leave_out_features(placed, kinds == -1, weighting)
+        weighted = adjust_weighted(placed, kinds[kept], names, significance, self._begin, weighting)
         return weighted, note
 
 

@@ -17,6 +17,7 @@ from jaxbundle.types import present
 if TYPE_CHECKING:
     from jaxbundle.adjustment.quality.replication import HalvesDifference
     from jaxbundle.adjustment.result import Adjustment
+    from jaxbundle.leastsquares.quality.error_components import ErrorModel
 
 TITLE = "Correlated errors"
 LEGEND = (
@@ -45,6 +46,8 @@ REMARKS = {
     "edge of the image: a moving shutter, or film that is not flat",
     "along tracks": "errors of {} along the tracks of points, alike from stations near to each "
     "other: measured against one image",
+    "given points": "points held, as those of a board, are not where they are given, by {} in "
+    "images: use a flat board, or estimate its points (--board-free)",
 }
 # σ under correlated errors over classical ones from which the difference is a finding: five in a
 # hundred exceed 1.96 classical σ where the model is right, thirteen at this ratio.
@@ -167,9 +170,9 @@ def difference_rows(split: "HalvesDifference") -> list[tuple[str, ...]]:
     ]
 
 
-def not_looked_for(adjustment: "Adjustment") -> str:
+def not_looked_for(model: "ErrorModel") -> str:
     """Which components a model lacks, in a sentence; empty if none."""
-    found = " ".join(size.name for size in present(adjustment.error_model).sizes)
+    found = " ".join(size.name for size in model.sizes)
     if "by photograph" not in found:
         return (
             "Errors of photographs and a field on the sensor were not looked for: they need eight "
@@ -192,7 +195,7 @@ def correlated_lines(adjustment: "Adjustment") -> list[str]:
     lines = [*heading(TITLE), *table(COMPONENT_HEADER, component_rows(adjustment), "lrrlr"), ""]
     lines += [line for said in remarks(adjustment) for line in paragraph(f"- {said}", 0, 2)]
     lines += ["", *paragraph(LEGEND)]
-    if words := not_looked_for(adjustment):
+    if words := not_looked_for(present(adjustment.error_model)):
         lines += paragraph(words)
     lines += ["", *table(SIGMA_HEADER, sigma_rows(adjustment), "lrrr")]
     return [*lines, *_replication_lines(adjustment)]

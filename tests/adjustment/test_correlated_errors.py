@@ -9,9 +9,12 @@ import pytest
 
 import jaxbundle
 from jaxbundle.adjustment.problem import make_problem
-from jaxbundle.adjustment.quality.correlated_errors import splines, wendland
+from jaxbundle.adjustment.quality.correlated_errors import splines
+from jaxbundle.adjustment.quality.given_points import given_points_component, wendland
 from jaxbundle.adjustment.quality.replication import compared_parameters
 from jaxbundle.leastsquares.quality import error_components
+from jaxbundle.leastsquares.quality.error_effects import stack_rows
+from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.network.undetermined import keep_images
 from jaxbundle.planning import grid_of_targets, ring_of_stations
 from jaxbundle.report import correlated
@@ -248,10 +251,42 @@ def test_everything_that_states_a_sigma_asks_the_error_model(shaken):
     sizes = {size.name: size.size for size in shaken.error_model.sizes}
     start = dataclasses.replace(shaken.problem.data, start=shaken.values)
     design = jaxbundle.precision(shaken.problem, start, names=(names[0],), errors=sizes)
-    np.testing.assert_allclose(np.sqrt(design.covariance[0, 0]), C[0], rtol=0.05)
-    np.testing.assert_allclose(design.cameras[0, 0], f["sigma_correlated"], rtol=0.05)
+    # a design knows its sizes, which the adjustment has estimated
+    known = shaken.error_model.as_estimated
+    of_image = np.sqrt(known.covariance("image")[2][0, 0])
+    np.testing.assert_allclose(np.sqrt(design.covariance[0, 0]), of_image, rtol=0.05)
+    of_camera = np.sqrt(known.covariance("camera")[0][0, 0])
+    np.testing.assert_allclose(design.cameras[0, 0], of_camera, rtol=0.05)
+    assert of_image < C[0] and of_camera < f["sigma_correlated"]
     with pytest.raises(jaxbundle.InputError, match="no component principal"):
         jaxbundle.precision(shaken.problem, start, errors={"principal": 0.1})
+
+
+def test_errors_of_given_points_are_found(clean):
+    """Columns are the changes of residuals if held points move; with displaced points the component
+    is found in its size, and the principal distance is off by more than classical σ."""
+    points = dataclasses.replace(clean.points, role=("fixed",) * len(clean.points))
+    given = clean.replace(points=points, datum="control")
+    found = jaxbundle.adjust(given, correlated=True)
+    solution, rays = found.cofactors.solution, found.problem
+    row = 2 * np.arange(len(clean.observations))
+    sigma = clean.observations.sigma
+    columns = given_points_component(solution, row, rays.point, sigma, 0, 8).root.toarray()
+    X, step = np.asarray(solution.values["point"]), np.zeros((len(points), 3))
+    step[7, 2] = 1e-5
+    moved = Solution(solution.problem, solution.values | {"point": X + step})
+    change = stack_rows(moved, moved.residuals) - stack_rows(solution, solution.residuals)
+    column = columns[:, 2 * len(points) + 7]
+    scale = column @ change / (column @ column)
+    np.testing.assert_allclose(change, scale * column, atol=1e-4 * np.abs(change).max())
+    none = given_points_component(solution, row, rays.point, sigma, 0, len(points) + 1)
+    assert none is None and found.error_model.sizes[-1].size < 0.1
+    rng = np.random.default_rng(2)
+    off = points.position + 0.003 * rng.normal(size=X.shape)
+    wrong = given.replace(points=dataclasses.replace(points, position=off))
+    size = jaxbundle.adjust(wrong, correlated=True).error_model.sizes[-1]
+    # 3 mm at 6 m are 0.75 pixels across the line of sight, 0.61 in the mean of all directions
+    assert size.name == "given points" and 0.5 < size.size < 0.75 and size.score > 20
 
 
 def test_check_points_share_the_errors_of_the_network():

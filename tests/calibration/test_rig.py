@@ -2,6 +2,7 @@
 
 import dataclasses
 from functools import partial
+from types import SimpleNamespace
 
 import board_photographs as taken
 import cv2
@@ -12,11 +13,13 @@ import pytest
 import render
 from test_calibrate import VIEWS
 
+import jaxbundle
 from jaxbundle.batches.epochs import epoch_keys
 from jaxbundle.calibration import BoardViews, calibrate_cameras, calibrate_rig
 from jaxbundle.calibration.files import calibrations_dict, fill_rig, json_text, save_rig_plots
 from jaxbundle.calibration.rig.calibrate import require_solved
 from jaxbundle.calibration.rig.declare import Rig, adjust_rig, declare_rig, leave_out
+from jaxbundle.calibration.rig.network import network_of_views
 from jaxbundle.calibration.rig.report import rig_dict, rig_text
 from jaxbundle.cameras import get_model, image_ray, project
 from jaxbundle.errors import InputError, NotSolvedError
@@ -122,6 +125,21 @@ def test_a_rig_leaves_the_program(both, rig, tmp_path):
         assert np.abs((base - BASE) / mounting.sigma[:3]).max() < 3
     stereo = cv2.FileStorage(str(tmp_path / "stereo.yaml"), cv2.FILE_STORAGE_READ)
     np.testing.assert_allclose(stereo.getNode("R").mat(), flip @ mounting.rotation @ flip)
+
+
+def test_the_views_of_a_rig_are_a_network_with_the_same_minimum(rig):
+    """Exact mountings are conditions with a thousandth of the σ of a ray there."""
+    result = jaxbundle.adjust(network_of_views(rig))
+    np.testing.assert_allclose(result.sigma0, rig.sigma0, rtol=1e-3)
+    for name in rig.names:
+        found, sigma = result.camera_parameters(name), rig.sigma[name]
+        away = [(found[p] - rig.parameters[name][p]) / s for p, s in sigma.items()]
+        assert np.abs(away).max() < 0.01
+    halves = jaxbundle.replicate(result, by="points", repeat=2)
+    assert not halves.failed and halves.dof == sum(map(len, rig.sigma.values()))
+    known = rig.rig.known._replace(bases=[SimpleNamespace()])
+    other = SimpleNamespace(rig=dataclasses.replace(rig.rig, known=known))
+    assert network_of_views(other) is None
 
 
 def test_mounting_and_cameras_are_the_truth(rig):

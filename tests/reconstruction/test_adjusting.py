@@ -276,3 +276,19 @@ def test_points_without_rays_are_no_points_of_three(monkeypatch):
     kinds = np.zeros(len(network.observations), int)
     adjusting.adjust_weighted(network, kinds, {0: "all"}, 0.001, print)
     assert given == [network.points.id, network.points.id[1:14]]
+
+
+def test_positions_of_features_beside_matches_are_not_used():
+    """Where three rays of the point are matched, and only in photographs whose matches have nearly
+    all of the information."""
+    camera = Camera("cam", "brown", {"c": 24.0}, free=("c",))
+    network = simulate(ring_of_stations(5, 2.5, 6.0), grid_of_targets(4, 4, 0.5), camera, noise=0.0)
+    rays = network.observations
+    is_feature = (rays.point == 3) & (rays.image < 2)
+    is_feature |= (rays.point == 5) & (rays.image < 3)  # two matched rays are left
+    is_feature |= (rays.image == 1) & (rays.point > 3)
+    sigma = np.where(is_feature | (rays.image == 1), 40.0, 1.0)[:, None] * rays.sigma
+    given = network.replace(observations=dataclasses.replace(rays, sigma=sigma))
+    left, keep = adjusting.leave_out_features(given, is_feature)
+    gone = set(zip(rays.image[~keep].tolist(), rays.point[~keep].tolist()))
+    assert gone == {(0, 3)} and len(left.observations) == keep.sum()

@@ -9,6 +9,7 @@ Components of real photographs (`leastsquares.quality.error_components` estimate
 | principal distance | the same, at the edge of the image | image unit |
 | affine | shear and ratio of scales, the same | image unit |
 | along tracks | of images of one point, alike from stations near to each other | a priori σ |
+| given points | held points, as those of a board, not where they are given | image unit |
 
 Fields are sums of cubic B-splines on the sensor, in octaves of the same variance. Along a track the
 errors of two images are correlated by Wendland's function (1995) of the distance of their stations.
@@ -22,6 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbundle.adjustment.problem import NetworkProblem
+from jaxbundle.adjustment.quality.given_points import given_points_component, wendland
 from jaxbundle.arguments import number as require_number
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.quality.error_components import (
@@ -53,6 +55,8 @@ class CorrelationSettings:
       with the finest splines alone the variance found is spread evenly over all of them, and
       unknowns of the camera, which take up the coarse part, get too little of it.
     - `min_points_of_knot`: image points for each, so that residuals show the field.
+    - `min_given_points`: held points, seen in two images or more, from which their errors are
+      estimated; a size from eight is right to a quarter, as of photographs.
     - `reach`: distance of stations at which errors along a track are independent, in units of the
       median distance to the points. Half and double have scores of the same size in five real sets.
     """
@@ -61,6 +65,7 @@ class CorrelationSettings:
     knots: tuple[int, int] = (11, 9)
     octaves: int = 4
     min_points_of_knot: int = 4
+    min_given_points: int = 8
     reach: float = 0.6
     estimation: ErrorSettings = ErrorSettings()
 
@@ -157,14 +162,22 @@ def error_components(
     """The components that the image points of a network can show."""
     rays = image_rows(found, problem)
     components = components_of(rays, _scene(found), problem.network.cameras, settings)
-    return with_others(components, rays, found)
+    return with_given_points_and_others(components, rays, found, settings)
 
 
-def with_others(
-    components: list[ErrorComponent], rays: ImageRows, found: Solution
+def with_given_points_and_others(
+    components: list[ErrorComponent],
+    rays: ImageRows,
+    found: Solution,
+    settings: CorrelationSettings,
 ) -> list[ErrorComponent]:
-    """Components of image points, and that of all other observations where there are any."""
+    """Components of image points, that of given points, and that of all other observations, where
+    there are any."""
     import scipy.sparse as sp
+
+    chosen = settings.octaves, settings.min_given_points
+    given = given_points_component(found, rays.row, rays.point, rays.sigma, *chosen)
+    components = [*components, *([] if given is None else [given])]
 
     others = np.setdiff1d(np.arange(rays.number), np.concatenate([rays.row, rays.row + 1]))
     others = others[_have_weight(found)[others]]
@@ -354,11 +367,6 @@ def _sparse_splines(
     step = 50_000  # 40 MB of a dense matrix
     parts = [splines(at[k : k + step], half, knots) for k in range(0, len(at), step)]
     return sp.vstack([sp.csr_matrix(part) for part in parts]).tocsr()
-
-
-def wendland(distance: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """Wendland's C² function of compact support, positive definite in space: 1 at 0, 0 from 1."""
-    return np.clip(1 - distance, 0, None) ** 4 * (4 * distance + 1)
 
 
 def _along_tracks(rays: ImageRows, scene: StationsAndPoints, reach: float) -> ErrorComponent | None:

@@ -26,7 +26,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.display import print_in_one_screen
@@ -38,8 +38,14 @@ from jaxbundle.leastsquares.quality.error_components import ErrorModel
 from jaxbundle.leastsquares.quality.error_effects import effects, stack_rows
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.network.columns import count
+from jaxbundle.network.kinds import Rigs
 from jaxbundle.network.tables import Network
-from jaxbundle.report.correlated import DIFFERENCE_HEADER, REPLICATION_LEGEND, difference_rows
+from jaxbundle.report.correlated import (
+    DIFFERENCE_HEADER,
+    REPLICATION_LEGEND,
+    difference_rows,
+    not_looked_for,
+)
 from jaxbundle.report.layout import heading, paragraph, table
 from jaxbundle.results import TableMethods, rows_of
 
@@ -47,10 +53,10 @@ from jaxbundle.results import TableMethods, rows_of
 MIN_RAYS_OF_IMAGE = 8
 # Photographs of a camera in a half: two hardly determine an interior orientation.
 MIN_IMAGES = 3
-# Factor of the weights 1/σ of image points of the other half: its square, 1e-8, is far below the
-# share of a half in the information on a camera, and far above the rounding of the normal
-# equations, 1e-16.
-FAINT = 1e-4
+# Factor of the weights 1/σ of image points of the other half: its square, 1e-6, is far below the
+# share of a half in the information on a camera. The images of the other half keep pivots of this
+# size, times those of the conditions of a rig, 1e-6, above `PIVOT`, 1e-13.
+FAINT = 1e-3
 # Simulations at once: 80 MB of errors for 100 000 rows.
 PORTION = 100
 
@@ -204,6 +210,8 @@ class Replication(TableMethods):
             lines.append(f"d²/n with σ of correlated errors   {self.ratio_correlated:.2f}")
         if self.band is not None:
             lines.append(f"expected of these, with 95 %       {self.expected}")
+        if self.model is not None and (lacking := not_looked_for(self.model)):
+            lines.append(lacking)
         return "\n".join([*lines, *(f"not adjusted: {why}" for why in self.failed)])
 
     def report(self) -> str:
@@ -228,21 +236,35 @@ def _mean(values: Iterator[float]) -> float:
 def random_halves(
     network: Network, by: str, repeat: int, seed: int
 ) -> Iterator[Bool[np.ndarray, " rays"]]:
-    """Which image points belong to the second half, for every split."""
+    """Which image points belong to the second half, for every split. Simultaneous photographs of a
+    rig stay together: only they determine its mountings."""
     rng, rays = np.random.default_rng(seed), network.observations
+    exposure = _exposures(network)
     if by == "runs":
         # of each camera by itself: photographs of several may follow each other
         camera, later = network.images.camera, np.zeros(len(network.images), bool)
         for c in np.unique(camera):
             own = np.flatnonzero(camera == c)
-            later[own[len(own) // 2 :]] = True
+            times = exposure[own]
+            later[own] = times >= np.sort(times)[len(own) // 2]
         yield later[rays.image]
         return
-    number, of = (
-        (len(network.points), rays.point) if by == "points" else (len(network.images), rays.image)
-    )
+    number, of = len(network.points), rays.point
+    if by != "points":
+        number, of = int(exposure.max(initial=-1)) + 1, exposure[rays.image]
     for _ in range(repeat):
         yield (rng.permutation(number) % 2 == 1)[of]
+
+
+def _exposures(network: Network) -> Int[np.ndarray, " images"]:
+    """The number of the exposure of every image, in their order: one of simultaneous images."""
+    epoch_of: dict[str, tuple[str, str]] = {}
+    for rigs in network.further:
+        if isinstance(rigs, Rigs):
+            epoch_of |= dict(zip(rigs.image, zip(rigs.rig, rigs.epoch)))
+    number: dict[Any, int] = {}
+    keys = [epoch_of.get(id, (id,)) for id in network.images.id]
+    return np.array([number.setdefault(key, len(number)) for key in keys], int)
 
 
 def compare_halves(
@@ -320,7 +342,7 @@ def expected_band(
                 squared_difference(D @ e, np.tensordot(t, C, 1)) / len(D)
                 for D, C in zip(effects, parts)
             ]
-            for e, t in zip(errors, theta)
+            for e, t in zip(errors, model.widening * theta)
         ]
         ratios += np.mean(of_splits, 1).tolist()
     low, high = np.quantile(ratios, [0.025, 0.975])

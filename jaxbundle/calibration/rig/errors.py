@@ -10,7 +10,7 @@ from jaxbundle.adjustment.quality.correlated_errors import (
     ImageRows,
     StationsAndPoints,
     components_of,
-    with_others,
+    with_given_points_and_others,
 )
 from jaxbundle.calibration.rig.declare import Rig, used_rays
 from jaxbundle.geometry import matrix_from_quaternion
@@ -41,7 +41,8 @@ def rig_errors(rig: Rig, found: Solution, settings: CorrelationSettings) -> Erro
         rig.sigma[used],
         len(stack_rows(found, found.residuals)),
     )
-    components = with_others(components_of(rays, _scene(found), rig.cameras, settings), rays, found)
+    components = components_of(rays, _scene(found), rig.cameras, settings)
+    components = with_given_points_and_others(components, rays, found, settings)
     return fit_error_model(found, components, settings.estimation) if components else None
 
 

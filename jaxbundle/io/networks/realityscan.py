@@ -37,6 +37,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.cameras.field_of_view import SMALL_FORMAT
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import flip_rows
 from jaxbundle.io.cameras.nearest_camera import Foreign, fit_camera, fit_messages
@@ -73,8 +74,6 @@ NAMESPACE = "http://www.capturingreality.com/ns/xcr/1.1#"
 # The property of XMP for the name of the file that is described.
 MEDIA, OWN_NAME = "http://ns.adobe.com/xap/1.0/mm/", "PreservedFileName"
 FILES = ("*.xmp",)
-# Millimetres of the larger side of an image, in which focal lengths are.
-FILM_SIDE = 36.0
 RADIAL, TANGENTIAL = ("k1", "k2", "k3", "k4"), ("t1", "t2")
 MODELS = ("perspective", "brown3", "brown4", "brown3t2", "brown4t2")
 POSE = ("x", "y", "alt", "heading", "pitch", "roll")
@@ -169,7 +168,7 @@ def read_realityscan(
 def _camera(id: str, row: Row) -> Camera:
     p, (w, h) = row.parameters, row.size
     side = max(w, h)
-    f = p["f"] * side / FILM_SIDE
+    f = p["f"] * side / SMALL_FORMAT[0]
     if not f > 0:
         raise InputError(f"{row.where}: the focal length is {p['f']:g}; above 0 is expected")
     core = {"fx": f, "fy": f}
@@ -335,7 +334,7 @@ def _written(camera: Camera, largest_difference: float = 0.5) -> dict[str, float
             'tie = [["fx", "fy"]]'
         )
     side = max(w, h)
-    found = {"f": f / side * FILM_SIDE}
+    found = {"f": f / side * SMALL_FORMAT[0]}
     found |= {"px": (p["cx"] + PIXEL_CENTRE - w / 2) / side}
     found |= {"py": (p["cy"] + PIXEL_CENTRE - h / 2) / side}
     return found | {"k1": p["k1"], "k2": p["k2"], "k3": p["k3"], "k4": 0.0} | {

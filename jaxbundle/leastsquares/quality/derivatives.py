@@ -55,10 +55,6 @@ from jaxbundle.types import present
 
 Sensitivity = Literal["exact", "gauss-newton"]
 
-# Numbers of the derivatives of single observations that are kept for products with the Hessian:
-# 32 MB. Larger problems form each product from the residuals: their memory counts, not the program.
-MAX_TERMS = 4_000_000
-
 FIRST_ORDER_ONLY = (
     'sensitivity = "gauss-newton" has first derivatives only: '
     'take second ones with sensitivity = "exact"'
@@ -114,7 +110,7 @@ class LinearisedSolution(eqx.Module):
     """The problem at a solution, as a constant for the derivative rules. `pins`: of the penalty
     ½·Σ pins·δ² on changes of the kept unknowns: the diagonal elements of N where one is pinned,
     else 0, as in `factor` (empty if nothing is open). `terms`: of the exact Hessian, of small
-    problems (`MAX_TERMS`)."""
+    problems."""
 
     declared: Declared = eqx.field(static=True)
     plan: Plan
@@ -162,7 +158,9 @@ def attach_derivatives(
     # The factor is that of the solution itself, where its derivatives are taken.
     values, _ = datum.move_to_datum(declared, plan, values, fixed.start)
     exact = sensitivity == "exact"
-    if exact and count_terms(declared, plan) <= MAX_TERMS:
+    # 32 MB of derivatives of single observations. Larger problems form each product with the
+    # Hessian from the residuals: there memory counts, not the time to compile.
+    if exact and count_terms(declared, plan) <= 4_000_000:
         at, step = _step_twice(declared, plan, values, fixed)
     else:
         at, step = _newton_step(declared, plan, values, fixed, exact)

@@ -21,6 +21,17 @@ side of a trace (Hutchinson 1990). V_k that fit the residuals no better than the
 get the size zero. Observations that are said to have their own σ (`OTHERS`: control, priors beside
 image points) are independent errors of the size σ0, whatever that of the others is.
 
+Sizes are estimates: intervals of √C times the normal quantile z hold less often than z promises.
+With the covariance of the θ, a variance c = Σ θ_k·c_k has ν = 2·c²/var(c) degrees of freedom
+(Satterthwaite 1946; of mixed models Kackar and Harville 1984, Kenward and Roger 1997). Covariances
+are those of
+
+    θ_k + λ·σ(θ_k),    λ = ((t_ν/z)² − 1)·c/Σ c_k·σ(θ_k)
+
+with the medians of the unknowns of a table, and the table of the largest λ: intervals of 1.96 σ
+hold 95 %, and sizes that are well determined stay as they are. One factor for all components would
+make σ of points larger for the uncertain size of a field that they do not depend on.
+
 Alternatives that did not help: effects as unknowns with priors give honest σ too, but estimates in
 two halves of a real network agree no better; neither do they with whitening. Covariances clustered
 by image or point (White 1980; Bell and McCaffrey 2002) miss the errors: unknowns of an image absorb
@@ -28,6 +39,7 @@ what its residuals should show.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -37,7 +49,11 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxbundle.leastsquares.indexing.rows import (
     Values,
 )
-from jaxbundle.leastsquares.quality.distributions import level_of_one, normal_quantile
+from jaxbundle.leastsquares.quality.distributions import (
+    level_of_one,
+    normal_quantile,
+    t_quantile,
+)
 from jaxbundle.leastsquares.quality.error_effects import AT_ONCE, effects, remove_fit, stack_rows
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.types import present
@@ -182,7 +198,8 @@ class ErrorModel:
     """The covariance of the observations of a solved problem. `theta` [k]: of the independent part
     and of the `components`, with their covariance; `own`: by table the blocks [rows, width, width]
     of the covariance of the unknowns that a component of θ = 1 gives, in the order of `components`;
-    `equations` of the θ, None where they are stated."""
+    `equations` of the θ, None where they are stated; `widened`: by `widening`, as all covariances
+    that are stated, or as estimated."""
 
     found: Solution
     components: tuple[ErrorComponent, ...]
@@ -191,11 +208,67 @@ class ErrorModel:
     score: Float[np.ndarray, " k"]
     own: tuple[dict[str, Float[np.ndarray, "rows width width"]], ...]
     equations: SizeEquations | None = None
+    widened: bool = True
 
     @property
     def theta_sigma(self) -> Float[np.ndarray, " k"]:
         """σ of the θ."""
         return np.sqrt(np.diag(self.theta_covariance))
+
+    @functools.cached_property
+    def widening(self) -> Float[np.ndarray, " k"]:
+        """What the θ are multiplied by in covariances, because they are estimates."""
+        factor = np.ones(len(self.theta))
+        if self.widened and (found := self._sizes_that_vary()) is not None:
+            some, spread = found
+            sigma = np.sqrt(np.diag(spread))
+            largest = max(self._excesses(some, spread), default=0.0)
+            factor[some] += largest * sigma / self.theta[some]
+        return factor
+
+    @property
+    def as_estimated(self) -> "ErrorModel":
+        """The model without `widening`, for budgets, which state degrees of freedom themselves."""
+        return dataclasses.replace(self, widened=False)
+
+    def _sizes_that_vary(self) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, "m m"]] | None:
+        """The θ that are not zero, and their covariance in the system of these alone; None if sizes
+        are stated or errors independent."""
+        if self.equations is None:
+            return None
+        T = self.equations.reduced[0]
+        some = np.flatnonzero(self.theta[: len(T)] > 0)
+        if not (some > 0).any():
+            return None
+        forms = T @ self.theta_covariance[: len(T), : len(T)] @ T  # the covariance of q
+        inverse = np.linalg.pinv(T[np.ix_(some, some)], 1e-10, hermitian=True)
+        return some, inverse @ forms[np.ix_(some, some)] @ inverse
+
+    def _excesses(
+        self,
+        some: Int[np.ndarray, " m"],
+        spread: Float[np.ndarray, "m m"],
+        coverage: float = 0.95,
+        min_degrees: float = 3.0,
+    ) -> Iterator[float]:
+        """λ of every table that is not eliminated, for intervals of a `coverage`; `min_degrees` of
+        freedom, from which Student's distribution has a variance."""
+        upper = 1 - (1 - coverage) / 2
+        for table in self.own[0]:
+            if table == self.found.problem.plan.eliminated:
+                continue
+            blocks = [self.found.cofactor(table), *(own.get(table) for own in self.own)]
+            c = np.stack([np.diagonal(np.asarray(blocks[k]), axis1=1, axis2=2) for k in some])
+            variance = np.einsum("k,knw->nw", self.theta[some], c)
+            free = variance > 0
+            if not free.any():
+                continue
+            of_variance = np.einsum("knw,kl,lnw->nw", c, spread, c)
+            degrees = np.median(2 * variance[free] ** 2 / of_variance[free])
+            t = t_quantile(upper, max(float(degrees), min_degrees))
+            together = np.einsum("k,knw->nw", np.sqrt(np.diag(spread)), c)
+            share = np.median(variance[free] / together[free])
+            yield ((t / normal_quantile(upper)) ** 2 - 1) * float(share)
 
     @property
     def sizes(self) -> tuple[ErrorSize, ...]:
@@ -214,8 +287,9 @@ class ErrorModel:
 
     def covariance(self, table: str) -> Float[np.ndarray, "rows width width"]:
         """The covariance blocks of all rows of a table."""
-        blocks = self.theta[0] * np.asarray(self.found.cofactor(table))
-        return blocks + sum(t * own[table] for t, own in zip(self.theta[1:], self.own) if t != 0)
+        theta = self.widening * self.theta
+        blocks = theta[0] * np.asarray(self.found.cofactor(table))
+        return blocks + sum(t * own[table] for t, own in zip(theta[1:], self.own) if t != 0)
 
     def propagate_rows(
         self, rows: Mapping[str, Float[np.ndarray, "n rows width"]]
@@ -271,8 +345,9 @@ class ErrorModel:
 
     def of_effects(self, D: Float[np.ndarray, "n rows"]) -> Float[np.ndarray, "n n"]:
         """The covariance D·Σ·Dᵀ of linear functions D of the errors, in units of their σ."""
-        C = self.theta[0] * D @ D.T
-        for t, component in zip(self.theta[1:], self.components):
+        theta = self.widening * self.theta
+        C = theta[0] * D @ D.T
+        for t, component in zip(theta[1:], self.components):
             if t != 0:
                 C = C + t * _of_component(component, D)
         return C

@@ -32,6 +32,7 @@ from jaxbundle.leastsquares.indexing.rows import (
     Values,
     lay_out_data,
     prepare,
+    residuals,
     restore_order,
 )
 from jaxbundle.leastsquares.solution import Solution
@@ -73,6 +74,30 @@ def effects(
     size = sum(np.asarray(found.residuals[o.name]).size for o in found.problem.observations)
     # without errors the residuals are −A·N⁻¹Rᵀ
     return -_solve_columns(found, number, np.zeros((0, size)), rows)[0]
+
+
+def residual_change(
+    found: Solution, table: str, direction: Float[np.ndarray, "n width"]
+) -> Float[np.ndarray, " rows"]:
+    """The derivative of all residuals, in units of their σ, along a direction of the values of a
+    table of vectors, also of those that are held."""
+    size = found.problem.sizes["table", table]
+    along = _derivative_along(*found.arguments, table, _fill(direction, size))
+    return _stack(found, jax.tree.map(lambda x: np.asarray(x)[None], along))[0]
+
+
+@compile_once
+def _derivative_along(
+    declared: Declared,
+    plan: Plan,
+    values: Values,
+    data: Data,
+    table: str,
+    direction: Float[Array, "n width"],
+) -> dict[str, Float[Array, "n r"]]:
+    laid = lay_out_data(plan, data)
+    of = lambda x: restore_order(plan, residuals(declared, plan, {**values, table: x}, laid))
+    return jax.jvp(of, (values[table],), (direction,))[1]
 
 
 def _solve_columns(

@@ -199,7 +199,7 @@ def correlated_errors(adjustment: "Adjustment") -> Iterator[Section]:
             *(paragraph(said) for said in correlated.remarks(adjustment)),
             paragraph(correlated.LEGEND),
         ]
-        if words := correlated.not_looked_for(adjustment):
+        if words := correlated.not_looked_for(adjustment.error_model):
             parts.append(paragraph(words))
         parts += [
             "<h3>Standard deviations</h3>\n",

@@ -1,0 +1,79 @@
+"""The adjusted views of a rig as a network: to adjust it again, and to compare halves of it
+(`jaxbundle.replicate`).
+
+A photograph of camera k at the epoch e has the orientation
+
+    M = R_k·M_e,        X0 = X0_e + M_eᵀ·b_k
+"""
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaxbundle.geometry import matrix_from_quaternion
+from jaxbundle.geometry.rotations import omega_phi_kappa_from_matrix
+from jaxbundle.network.build import make_network
+from jaxbundle.network.tables import EXTERIOR, UNIT, Camera, Network
+from jaxbundle.types import present
+
+if TYPE_CHECKING:
+    from jaxbundle.calibration.rig.result import RigCalibration
+
+
+def network_of_views(found: "RigCalibration") -> Network | None:
+    """The photographs of all cameras, tied by mountings (table `rigs`), with the image points that
+    were used; None where a network has no words for the rig: several boards, or something known of
+    the mountings."""
+    rig = found.rig
+    if len(rig.boards) > 1 or rig.known.mountings or rig.known.bases:
+        return None
+    used = found.used
+    views, image = np.unique(
+        np.stack([rig.camera, rig.epoch], 1)[used], axis=0, return_inverse=True
+    )
+    mounting, pose = found.values("mounting"), found.values("epoch")
+    R, M = (
+        np.array([np.asarray(matrix_from_quaternion(q)) for q in rows.rotation])
+        for rows in (mounting, pose)
+    )
+    # the rig has its points relative to the centroid of the board
+    away = present(rig.centroids)[0]
+    position = [away + pose.position[e] + M[e].T @ mounting.position[k] for k, e in views]
+    angles = [np.asarray(omega_phi_kappa_from_matrix(R[k] @ M[e])) for k, e in views]
+    ids = [f"{found.names[k]} {rig.epochs[e]}" for k, e in views]
+    seen, point = np.unique(rig.point[used], return_inverse=True)
+    role = "tie" if rig.points_free else "fixed" if rig.point_sigma is None else "control"
+    points = {"id": [rig.ids[p] for p in seen], "role": [role] * len(seen)}
+    points |= dict(zip("XYZ", found.board[seen].T))
+    if rig.point_sigma is not None:
+        given = rig.points[seen] + away
+        points |= dict(zip("XYZ", given.T)) | {
+            f"s{a}": [rig.point_sigma] * len(seen) for a in "XYZ"
+        }
+    names = [found.names[k] for k, _ in views]
+    epochs = [rig.epochs[e] for _, e in views]
+    return make_network(
+        [_camera(found, name) for name in found.names],
+        {"id": ids, "camera": names, **dict(zip(EXTERIOR, np.hstack([position, angles]).T))},
+        points,
+        {
+            "image": [ids[i] for i in image.ravel()],
+            "point": [rig.ids[p] for p in seen[point]],
+            **dict(zip(("x", "y", "sx", "sy"), np.hstack([rig.xy, rig.sigma])[used].T)),
+        },
+        datum="inner",
+        residuals="measured",
+        image_unit=found.image_unit,
+        object_unit=found.object_unit,
+        sigma_origin=UNIT,
+        name="rig",
+        rigs={"rig": ["rig"] * len(ids), "epoch": epochs, "image": ids},
+        rig={"reference": found.names[0]},
+    )
+
+
+def _camera(found: "RigCalibration", name: str) -> Camera:
+    """A camera with its adjusted values and the free parameters of the rig."""
+    free = found.rig.cameras[found.names.index(name)].free
+    return dataclasses.replace(found.camera(name), id=name, free=free)
