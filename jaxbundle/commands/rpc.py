@@ -20,6 +20,7 @@ from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.io.scanner.rpc import read_rpc, write_rpc
 from jaxbundle.io.text.csv_tables import read_csv
+from jaxbundle.io.text.known_keys import UnknownKeys
 from jaxbundle.network.columns import Columns
 from jaxbundle.pushbroom.rpc.bias import apply_bias, fit_bias
 from jaxbundle.pushbroom.rpc.fitting import RpcCheck, RpcTable, fit_image, fit_rpc
@@ -125,7 +126,10 @@ def apply(
 
     **Raises:** `InputError`, also if no point has a solution.
     """
-    given, table = read_rpc(Path(coefficients)), read_csv(Path(points))
+    unknown = UnknownKeys()
+    given, table = read_rpc(Path(coefficients), unknown), read_csv(Path(points))
+    for message in unknown.messages():
+        tell(message)
     if "line" in table.values:
         table.check_names(("line", "sample"), ("id",))
         place = [table.numbers(name, required=True) for name in ("line", "sample")]

@@ -73,7 +73,7 @@ BROKEN = {
     "RPC00A": (".RPB", "RPC00B", "RPC00A", ["line 3", "RPC00A", "order"]),
     "coefficients": (".RPB", "lineNumCoef = (", "lineNumCoef = (1.0,", ["21 coef", "20"]),
     "bracket": (".RPB", "lineDenCoef = (\n\t\t\t1.0", "lineDenCoef = (\n\t\t\tone", ["'one'"]),
-    "gone": (".RPB", "sampOffset", "sumpOffset", ["sampOffset is missing"]),
+    "gone": (".RPB", "sampOffset", "sumpOffset", ["'sumpOffset'", "mean 'sampOffset'"]),
 }
 
 

@@ -11,6 +11,7 @@ from test_rpc_files import RPC, assert_same, write_raster
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.io.scanner.rpc import read_rpc, write_rpc
+from jaxbundle.io.text.known_keys import UnknownKeys
 from jaxbundle.pushbroom.rpc.polynomials import locate_points_on, project_points
 from jaxbundle.pushbroom.surfaces import Height
 
@@ -197,3 +198,25 @@ def test_negative_scales_lead_to_the_same_ground():
     found = locate_points_on(turned_over(rpc), surface, line, sample)
     for a, b in zip(found, expected):
         np.testing.assert_allclose(a, b, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["own_RPC.TXT", "own.RPB", "own.XML", "dimap.XML"])
+def test_unknown_keys_are_told_or_refused(tmp_path, name):
+    path = tmp_path / name
+    if name.endswith("XML"):
+        path.write_text(dimap(RPC) if name == "dimap.XML" else digitalglobe(RPC))
+        add = "</RFM_Validity>" if name == "dimap.XML" else "</IMAGE>"
+        line = lambda key: f"<{key}>1</{key}>{add}"
+    else:
+        write_rpc(path, RPC)
+        add = "\n"
+        line = lambda key: f"\n{key} = 1;\n" if name == "own.RPB" else f"\n{key}: 1\n"
+    text, unknown = path.read_text(), UnknownKeys()
+    path.write_text(text.replace(add, line("operator"), 1))
+    assert read_rpc(path, unknown).line_offset == read_rpc(path).line_offset
+    (message,) = unknown.messages()
+    assert path.name in message and "operator" in message.lower()
+    path.write_text(text.replace(add, line("lineShift"), 1))
+    with pytest.raises(InputError, match="(?i)lineshift.*geometry") as refused:
+        read_rpc(path)
+    assert path.name in str(refused.value)

@@ -9,7 +9,9 @@ products (`rpc_vendor_files`).
 
 In all of them line 0, sample 0 is the centre of the first pixel, degrees and metres, as in `Rpc`.
 Scales may be negative, as from some providers. Errors in a file (ERR_BIAS, ERR_RAND) are read by
-`read_stated_errors`, limits (MIN_LONG, …) are ignored, and none of them are written.
+`read_stated_errors`, limits (MIN_LONG, …) are left, and none of them are written. Keys that are
+not known are told, or refused (`io.text.known_keys`); not in keyword lists of OSSIM, which hold the
+state of the whole program.
 """
 
 import re
@@ -23,6 +25,7 @@ import numpy as np
 from jaxbundle.errors import InputError
 from jaxbundle.io.scanner.rpc_vendor_files import from_geom, from_xml
 from jaxbundle.io.text.csv_tables import read_text, write_text
+from jaxbundle.io.text.known_keys import Keys, UnknownKeys
 from jaxbundle.io.text.xml_fields import number_in
 from jaxbundle.io.writing.replacing import disk_of, replace_file
 from jaxbundle.network.columns import show
@@ -57,6 +60,32 @@ FIELDS = {
     "sample_numerator": ("SAMP_NUM_COEFF", "sampNumCoef"),
     "sample_denominator": ("SAMP_DEN_COEFF", "sampDenCoef"),
 }
+STATED_ERROR = "read as a stated error where it is asked for"
+TEXT_KEYS = Keys(
+    (
+        *(f"{name}_{part}" for name, _ in OFFSETS.values() for part in ("OFF", "SCALE")),
+        *(f"{name}_{k}" for name, _ in FIELDS.values() for k in range(1, TERMS + 1)),
+    ),
+    {
+        "ERR_*": STATED_ERROR,
+        "MIN_*": "limits of the coefficients: beyond them positions are told to be outside anyway",
+        "MAX_*": "the same",
+    },
+)
+RPB_KEYS = Keys(
+    (
+        "SpecId",
+        *(f"{key}{part}" for _, key in OFFSETS.values() for part in ("Offset", "Scale")),
+        *(key for _, key in FIELDS.values()),
+    ),
+    {
+        "err*": STATED_ERROR,
+        "satId": "the name of the satellite",
+        "bandId": "all bands of an image have the same coefficients",
+        "BEGIN_GROUP": "the group of the coefficients",
+        "END_GROUP": "the same",
+    },
+)
 RPB = re.compile(r"\s*(\w+)\s*=\s*(.*?)\s*;?\s*$")
 # The errors of RPC00B in XML, RPB, text and keyword lists of OSSIM.
 ERRORS = {
@@ -76,23 +105,26 @@ class StatedErrors(NamedTuple):
     random: float = 0.0
 
 
-def read_rpc(path: str | Path) -> Rpc:
+def read_rpc(path: str | Path, unknown: UnknownKeys | None = None) -> Rpc:
     """The coefficients of a text file, an RPB file, a raster with RPC tags, or of a product.
 
+    **Arguments:** `unknown`: notices keys that are not understood (`UnknownKeys.messages`).
+
     **Raises:** `InputError` naming file and line: missing or repeated entries, invalid numbers,
-    another unit, not RPC00B.
+    another unit, not RPC00B, an unknown key that may change the geometry.
     """
-    path = Path(path)
+    path, unknown = Path(path), unknown or UnknownKeys()
     if path.suffix.lower() in RASTERS:
         values = _from_raster(path)
     else:
         text = read_text(path, fallback="latin-1")
         if text.lstrip().startswith("<"):
-            values = from_xml(path)
+            values = from_xml(path, unknown)
         elif "line_num_coeff_00" in text or path.suffix.lower() == ".geom":
             values = from_geom(path, text)
         else:
-            values = _from_rpb(path, text) if "lineOffset" in text else _from_text(path, text)
+            read = _from_rpb if "lineOffset" in text else _from_text
+            values = read(path, text, unknown)
     for axis in OFFSETS:
         if values[f"{axis}_scale"] == 0:
             raise InputError(f"{path}: the scale of {axis} is 0; another number is expected")
@@ -136,7 +168,7 @@ def write_rpc(path: str | Path, rpc: Rpc) -> None:
             write_text(path, _plain_text(rpc))
 
 
-def _from_text(path: Path, text: str) -> dict[str, Any]:
+def _from_text(path: Path, text: str, unknown: UnknownKeys) -> dict[str, Any]:
     entries = {}
     for number, line in enumerate(text.splitlines(), 1):
         if not line.strip():
@@ -147,10 +179,13 @@ def _from_text(path: Path, text: str) -> dict[str, Any]:
                 f"{path}, line {number}: {show(line.strip())}; NAME: value is expected, such as "
                 "LINE_OFF: 3000.5"
             )
-        name = name.strip().upper()
+        written, name = name.strip(), name.strip().upper()
         if name in entries:
             raise InputError(f"{path}, line {number}: {name} occurs twice")
         entries[name] = value.split(), number
+        # as it is written: capitals show where the words of an unknown name begin
+        if TEXT_KEYS.unknown((name,)):
+            unknown.check((written,), TEXT_KEYS, f"{path}, line {number}")
 
     def number_of(name: str, unit: str | None = None) -> float:
         if name not in entries:
@@ -170,7 +205,7 @@ def _from_text(path: Path, text: str) -> dict[str, Any]:
     return values
 
 
-def _from_rpb(path: Path, text: str) -> dict[str, Any]:
+def _from_rpb(path: Path, text: str, unknown: UnknownKeys) -> dict[str, Any]:
     entries, name = {}, None
     for number, line in enumerate(text.splitlines(), 1):
         if name is None:
@@ -191,6 +226,8 @@ def _from_rpb(path: Path, text: str) -> dict[str, Any]:
             f"{path}, line {kind[1]}: SpecId is {kind[0]}; only RPC00B is read, whose terms are "
             "in another order"
         )
+    for key, (_, line) in entries.items():
+        unknown.check((key,), RPB_KEYS, f"{path}, line {line}")
 
     def value_of(key: str) -> tuple[str, str]:
         if key not in entries:

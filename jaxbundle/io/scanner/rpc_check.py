@@ -23,6 +23,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.scanner.rpc import read_rpc, read_stated_errors
 from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.text.csv_tables import read_text
+from jaxbundle.io.text.known_keys import UnknownKeys
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.rpc.agreement import (
@@ -41,10 +42,13 @@ def check_against_rpc(scanner: ScannerInput, path: Path, choose: bool = True) ->
     if file is None:
         return scanner
     try:
-        rpc = read_rpc(file)
+        unknown = UnknownKeys()
+        rpc = read_rpc(file, unknown)
         random_error = read_stated_errors(file).random
     except InputError as error:
         return _warn(scanner, f"not compared with its RPC: {error}")
+    for message in unknown.messages():
+        scanner = _warn(scanner, message)
     image = scanner.image
     usual = _compare(image, rpc, (image.corrections,))[0]
     scanner = dataclasses.replace(scanner, agreement=usual)

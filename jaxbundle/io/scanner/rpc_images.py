@@ -14,6 +14,7 @@ import numpy as np
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid
 from jaxbundle.io.scanner.rpc import RASTERS, read_rpc
+from jaxbundle.io.text.known_keys import UnknownKeys
 from jaxbundle.io.text.xml_fields import read_xml
 from jaxbundle.pushbroom.rpc.image import RpcImage
 from jaxbundle.pushbroom.rpc.polynomials import Rpc
@@ -55,10 +56,12 @@ def read_rpc_image(path: Path, raster: Path | None = None) -> RpcInput:
     **Raises:** `InputError`, also for a raster that is a map.
     """
     source, beside = find_coefficients(path), raster or find_raster(path)
-    rpc = read_rpc(source)
+    unknown = UnknownKeys()
+    rpc = read_rpc(source, unknown)
     if beside is None:
         lines, pixels = _domain_size(rpc)
-        return RpcInput(path.stem, RpcImage(rpc, lines, pixels, sized=False))
+        image = RpcImage(rpc, lines, pixels, sized=False)
+        return RpcInput(path.stem, image, warnings=unknown.messages())
     with open_raster(beside) as bands:
         # Tags belong to the pixels of their raster, also of a map or of a part; a file of
         # coefficients to the whole image.
@@ -66,7 +69,7 @@ def read_rpc_image(path: Path, raster: Path | None = None) -> RpcInput:
             check_raw(beside, bands)
         size = bands.height, bands.width
     said = () if source == beside else _other_size(source, beside, rpc, size)
-    return RpcInput(path.stem, RpcImage(rpc, *size), warnings=said)
+    return RpcInput(path.stem, RpcImage(rpc, *size), warnings=(*unknown.messages(), *said))
 
 
 def find_coefficients(path: Path) -> Path:

@@ -11,13 +11,16 @@ The validity domain of a DIMAP file (FIRST_ROW, FIRST_COL) says where the coeffi
 begin outside the image, at negative rows and columns, and does not number the pixels.
 """
 
+import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
 
 from jaxbundle.errors import InputError
+from jaxbundle.io.text.known_keys import Keys, UnknownKeys
 from jaxbundle.io.text.xml_fields import XmlFields, number_in, read_xml
 from jaxbundle.network.columns import show
 from jaxbundle.pushbroom.rpc.polynomials import TERMS
+from jaxbundle.types import present
 
 AXES = {
     "line": "line",
@@ -50,11 +53,44 @@ EARLY_AXES = {
     "latitude": "Lat",
     "height": "Alt",
 }
+LIMITS = "limits of the coefficients: beyond them positions are told to be outside anyway"
+DIMAP_KEYS = Keys(
+    (
+        *(f"{name}_{part}".upper() for name in AXES.values() for part in ("off", "scale")),
+        *(
+            f"{axis}_{part}_coeff_{k}".upper()
+            for axis, part in FIELDS.values()
+            for k in range(1, TERMS + 1)
+        ),
+    ),
+    {
+        "*_Validity_Domain": LIMITS,
+        **{f"{end}_{axis}": LIMITS for end in ("FIRST", "LAST") for axis in ("ROW", "COL")},
+        **{f"{end}_{axis}": LIMITS for end in ("FIRST", "LAST") for axis in ("LON", "LAT")},
+        "ERR_BIAS*": "a stated error",
+        "ERR_RAND*": "a stated error",
+    },
+)
+DIGITALGLOBE_KEYS = {
+    "RPB": Keys(("SPECID", "IMAGE"), {"SATID": "the satellite", "BANDID": "the band"}),
+    "IMAGE": Keys(
+        (
+            *(f"{name}{part}".upper() for name in AXES.values() for part in ("offset", "scale")),
+            *(f"{axis}{part}coef".upper() + "List" for axis, part in FIELDS.values()),
+        ),
+        {"ERR*": "a stated error"},
+    ),
+    **{
+        name + "List": Keys((name,))
+        for name in (f"{axis}{part}coef".upper() for axis, part in FIELDS.values())
+    },
+}
 DIMAP, DIGITALGLOBE = "an RPC file of DIMAP", "an RPC file of DigitalGlobe"
 
 
-def from_xml(path: Path) -> dict[str, Any]:
-    """The fields of `Rpc` in an XML file of DIMAP or DigitalGlobe.
+def from_xml(path: Path, unknown: UnknownKeys) -> dict[str, Any]:
+    """The fields of `Rpc` in an XML file of DIMAP or DigitalGlobe; `unknown` notices keys of the
+    coefficients that are not understood.
 
     **Raises:** `InputError` for XML of another kind, naming the kind.
     """
@@ -64,12 +100,13 @@ def from_xml(path: Path) -> dict[str, Any]:
     has_rpc = root.find(".//Rational_Function_Model") is not None
     if root.tag.lower().endswith("dimap_document") or has_rpc:
         if root.find(".//RFM_Validity") is not None:
-            return _from_dimap(XmlFields(path, root, DIMAP))
+            return _from_dimap(XmlFields(path, root, DIMAP), root, unknown)
         raise InputError(
             f"{path}: DIMAP without RPC (RFM_Validity); its RPC are in a separate file, "
             "RPC_….XML. `pushbroom` commands read the rigorous model from this file"
         )
     if root.find(".//RPB") is not None:
+        unknown.check_tree(present(root.find(".//RPB")), DIGITALGLOBE_KEYS, path)
         return _from_digitalglobe(XmlFields(path, root, DIGITALGLOBE))
     raise InputError(
         f"{path}: XML of another kind, <{root.tag[:60]}>: no RPC of DIMAP (RFM_Validity) and none "
@@ -125,10 +162,12 @@ def number_of(path: Path, found: dict[str, tuple[str, int]], name: str) -> float
     return number_in(value, f"{path}, line {line}: {name}")
 
 
-def _from_dimap(file: XmlFields) -> dict[str, Any]:
+def _from_dimap(file: XmlFields, root: ET.Element, unknown: UnknownKeys) -> dict[str, Any]:
     inverse = next((n for n in DIMAP_OTHER if file.find(n) is not None), None)
     if inverse is None:
         raise file.missing("Inverse_Model")
+    for name in ("RFM_Validity", inverse):
+        unknown.check_element(present(root.find(f".//{name}")), DIMAP_KEYS, f"{file.path}: {name}")
     values = {}
     for axis, name in AXES.items():
         for part, short in (("offset", "OFF"), ("scale", "SCALE")):
