@@ -387,11 +387,12 @@ def _tracks(
         xy = _accessor(file, matches.child("imagePoints").integer("pixelCoordinates"), "VEC2")
         if len(xy) != len(camera) or (camera >= len(uids)).any():
             raise InputError(f"{path}: cameras and image points of its matches do not agree")
+        # before room is made for them: of damaged ranges 2²⁴ matches for every point
+        if (begin + number > len(camera)).any() or number.sum() > len(camera):
+            raise InputError(f"{path}: ranges of matches beyond the last match")
         # the rows of the matches of the first point, the second, …: ranges may be in any order
         point = np.repeat(np.arange(len(X)), number)
         at = np.repeat(begin - np.cumsum(number) + number, number) + np.arange(number.sum())
-        if len(at) and at.max() >= len(camera):
-            raise InputError(f"{path}: ranges of matches beyond the last match")
         seen_in = [images.get(uid) for uid in uids]
         kept = np.array([seen_in[c] is not None for c in camera[at]], bool)
         at, point = at[kept], point[kept]
