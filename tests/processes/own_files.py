@@ -19,7 +19,7 @@ import numpy as np
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
 ROOMS = ("", "measure", "reconstruction", "surfaces", "io", "refinement", "cli")
-sys.path[:0] = [str(ROOT / "tests" / room) for room in ROOMS]
+sys.path[:0] = [*(str(ROOT / "tests" / room) for room in ROOMS), str(ROOT / "benchmarks")]
 
 import jaxbundle  # noqa: E402
 
@@ -272,6 +272,17 @@ def write_strips(path: Path) -> None:
     write_strips(path.parent, ("ahead", "back"))
 
 
+def write_sparse_model(path: Path) -> None:
+    """A disturbed model of COLMAP with wrong image points."""
+    from splat_poses import draw
+
+    from jaxbundle.io import write_colmap
+
+    folder = path / "sparse" / "0"
+    folder.parent.mkdir(parents=True)
+    write_colmap(draw(0)[0], folder)
+
+
 OWN: dict[str, Callable[[Path], None]] = {
     "PROJECT": write_project,
     "my": write_project,
@@ -304,6 +315,7 @@ OWN: dict[str, Callable[[Path], None]] = {
     "refine.toml": write_refinement,
     "a.tif": write_rpc_images,
     "ahead.toml": write_strips,
+    "scene": write_sparse_model,
 }  # fmt: skip
 MADE_BY = {
     "docs/calibrate.md": ["cameras.npz"], "docs/reconstruct.md": ["surveyed"],
