@@ -206,3 +206,22 @@ def test_what_is_wrong_is_named(tmp_path, file, old, new, why):
     (tmp_path / file).write_text(text.replace(old, new, 1))
     with pytest.raises(InputError, match=why):
         read_network(path)
+
+
+def test_control_that_is_not_used_is_told(tmp_path):
+    net = read_network(write(tmp_path, control=2))
+    assert any("2 control points with marks; they are not used" in told for told in net.warnings)
+
+
+@pytest.mark.parametrize("part, value", [("primitives", []), ("cameraUids", 5)])
+def test_a_gltf_without_its_parts_is_refused(tmp_path, part, value):
+    path = write(tmp_path)
+    document = json.loads((tmp_path / "tracks.gltf").read_text())
+    mesh = document["meshes"][0]
+    if part == "primitives":
+        mesh[part] = value
+    else:
+        mesh["primitives"][0]["extensions"]["OPF_mesh_primitive_matches"][part] = value
+    (tmp_path / "tracks.gltf").write_text(json.dumps(document))
+    with pytest.raises(InputError, match=f"tracks.gltf.*{part}"):
+        read_network(path)

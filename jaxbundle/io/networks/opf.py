@@ -155,7 +155,7 @@ def read_opf(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         np.array([np.asarray(matrix_from_omega_phi_kappa(a)) for a in angles]),
         X0,
     )
-    marked, seen, control = _control(resources, names, unknown, shift)
+    marked, seen, control = _control(resources, names, unknown, shift, told)
     tie, rays = _tracks(resources.tracks, names, shift)
     network = assemble(
         path,
@@ -312,6 +312,7 @@ def _control(
     images: Mapping[str, str],
     unknown: UnknownKeys,
     shift: Float[np.ndarray, "3"],
+    told: list[str],
 ) -> tuple[dict[str, Any], dict[str, Any], Points | None]:
     """Columns of the points with marks, and of their image points; control and check points."""
     given, projected = resources.document(INPUT_POINTS), resources.document(PROJECTED_POINTS)
@@ -339,6 +340,11 @@ def _control(
     for row in known:
         unknown.check(row.document, PROJECTED_KEYS, row.path)
     if not known:
+        if given is not None and given.rows("gcps"):
+            told.append(
+                f"{given.path}: its control points have no projected coordinates; their marks are "
+                "read as those of tie points"
+            )
         return points, seen, None
     names = [row.text("id") for row in known]
     control = Points(
@@ -349,7 +355,13 @@ def _control(
         Source(str(resources.path)),
     )
     # fewer than three points do not determine the seven parameters of a datum
-    return points, seen, control if control.role.count("control") >= 3 else None
+    if control.role.count("control") < 3:
+        told.append(
+            f"{resources.path}: {control.role.count('control')} control points with marks; they "
+            "are not used, since three are needed for a datum"
+        )
+        return points, seen, None
+    return points, seen, control
 
 
 # --- tie points -----------------------------------------------------------------------------
@@ -369,7 +381,7 @@ def _tracks(
         if node.get("mesh") is None:
             continue
         # the specification has one primitive a mesh
-        primitive = _of(file, "meshes", node.integer("mesh")).rows("primitives")[0]
+        primitive = _of(_of(file, "meshes", node.integer("mesh")), "primitives", 0)
         if primitive.get("extensions") is None or MATCHES not in primitive.get("extensions"):
             continue
         matches = primitive.child("extensions").child(MATCHES)
@@ -382,7 +394,10 @@ def _tracks(
             points[axis] += column
         colours.append(_colours(file, primitive, len(X)))
         begin, number = _ranges(file, matches, len(X))
-        uids = [str(uid) for uid in matches.get("cameraUids") or ()]
+        uids = matches.get("cameraUids") or ()
+        if not isinstance(uids, list | tuple):
+            raise InputError(f"{path}: cameraUids of its matches is no list of cameras")
+        uids = [str(uid) for uid in uids]
         camera = _accessor(file, matches.integer("cameraIds"), "SCALAR")[:, 0]
         xy = _accessor(file, matches.child("imagePoints").integer("pixelCoordinates"), "VEC2")
         if len(xy) != len(camera) or (camera >= len(uids)).any():
