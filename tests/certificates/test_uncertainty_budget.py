@@ -201,7 +201,11 @@ def test_errors_that_image_points_share_are_lines_of_their_own(convergent4):
     )
     result = jaxbundle.adjust(network.replace(observations=moved), correlated=True)
     budget = uncertainty_budget(result)
+    stated = result.correlated_camera_covariance("cam")
+    # a budget states degrees of freedom; a covariance is wider instead
+    result.keep(result.error_model.as_estimated, None)
     C = result.correlated_camera_covariance("cam")
+    assert (np.diag(stated) > np.diag(C)).all()
     shared = [line for line in budget.lines if "shared" in line.words]
     assert shared and all(1 <= line.degrees < 1000 for line in shared)
     np.testing.assert_allclose(budget.sigma, np.sqrt(np.diag(C)), rtol=1e-6)
