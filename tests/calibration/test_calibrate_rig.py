@@ -209,6 +209,7 @@ def test_photographs_to_a_rig(calibrate_rig, folders, tmp_path):
     assert [camera.id for camera in network.cameras] == ["left", "right"]
 
 
+@pytest.mark.further
 def test_folders_that_cannot_be_a_rig(calibrate_rig, folders, tmp_path):
     """Status 2 and one line: what is wrong, where, and what to do; nothing is written."""
     for name in ("empty", "grey", "mixed", "left", "right"):

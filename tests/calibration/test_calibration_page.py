@@ -32,6 +32,7 @@ def test_what_has_no_logarithm_is_not_drawn(calibration, monkeypatch, middle, co
         assert (f"</svg>{name}</span>" in text) == (name in drawn)
 
 
+@pytest.mark.further
 def test_views_are_compared_in_halves_without_being_asked(calibration):
     """Twelve views of a rendered board: its first lines have the factor, its σ are the larger."""
     halves = calibration.adjustment.replication

@@ -127,6 +127,7 @@ def test_a_rig_leaves_the_program(both, rig, tmp_path):
     np.testing.assert_allclose(stereo.getNode("R").mat(), flip @ mounting.rotation @ flip)
 
 
+@pytest.mark.further
 def test_the_views_of_a_rig_are_a_network_with_the_same_minimum(rig):
     """Exact mountings are conditions with a thousandth of the σ of a ray there."""
     result = jaxbundle.adjust(network_of_views(rig))
@@ -422,6 +423,7 @@ def test_a_rig_is_judged_and_certified(rig):
     assert 'id="mountings"' in page and page.count("Uncertainty budget") >= 1
 
 
+@pytest.mark.further
 def test_a_rig_has_the_errors_that_its_photographs_share(both):
     """An affine distortion of each photograph, far above the noise: σ of mountings and cameras
     under it beside the classical ones; without such errors they are the classical ones."""

@@ -108,8 +108,10 @@ def test_simulated_image_points_see_their_points_by_snells_law(request, case, ro
 
 @pytest.mark.parametrize("case, row, spread", [
     ("dived", FLAT, {"sZ": 0.01, "somega": "free", "sphi": "free", "sindex": "free"}),
-    ("dived", DOME, {"sX": "free", "sY": "free", "sZ": "free", "sindex": 0.01}),
-    ("above", SURFACE, {"sZ": "free", "somega": "free", "sphi": "free", "sindex": "free"}),
+    pytest.param("dived", DOME, {"sX": "free", "sY": "free", "sZ": "free", "sindex": 0.01},
+                 marks=pytest.mark.further),
+    pytest.param("above", SURFACE, {"sZ": "free", "somega": "free", "sphi": "free",
+                                    "sindex": "free"}, marks=pytest.mark.further),
 ])  # fmt: skip
 def test_what_is_free_is_found(request, case, row, spread):
     """From start values that are off, the truth within 4 σ; what is weighted stays near."""
@@ -270,6 +272,7 @@ def test_in_a_project_and_back(dived, tmp_path, row):
     assert (again.interface, again.type, again.camera) == (one.interface, one.type, one.camera)
 
 
+@pytest.mark.further
 def test_the_adjusted_network_has_the_adjusted_interface(above):
     spread = {"sZ": 0.1, "somega": "free", "sphi": "free", "sindex": 0.01}
     result = jaxbundle.adjust(refracted(above, SURFACE, SURFACE | {"Z": 1.02} | spread))
