@@ -288,6 +288,7 @@ def test_the_adjusted_network_has_the_adjusted_interface(above):
     assert whole.sigma0 == pytest.approx(result.sigma0, rel=1e-6)
 
 
+@pytest.mark.further
 def test_predicted_precision_is_through_the_interface(above):
     """σ of a design, which predicts its image points, is that of the adjusted network."""
     network = refracted(above, SURFACE, SURFACE | {"sZ": "free", "sindex": 0.01})

@@ -91,7 +91,9 @@ def test_the_closed_form_is_exact_on_clean_data(seen, type):
     assert solve(A, Rigid(B.R, 0.25 * B.t))[2] == pytest.approx(4, abs=1e-11)
 
 
-@pytest.mark.parametrize("type", ["eye-in-hand", "eye-to-hand"])
+@pytest.mark.parametrize(
+    "type", ["eye-in-hand", pytest.param("eye-to-hand", marks=pytest.mark.further)]
+)
 def test_clean_data_give_the_truth(seen, type):
     network = robot(seen.truth, hands(seen, type), type=type)
     result = jaxbundle.adjust(network)
@@ -237,8 +239,10 @@ def test_repeatability_is_a_variance_component(seen):
 
 def test_jacobians(seen):
     for type in ("eye-in-hand", "eye-to-hand"):
-        result = jaxbundle.adjust(robot(seen.network, hands(seen, type, noise=1.0), type=type))
-        check_jacobians(result.problem, result.values)
+        problem = jaxbundle.make_problem(
+            robot(seen.network, hands(seen, type, noise=1.0), type=type)
+        )
+        check_jacobians(problem, problem.data.start)
 
 
 def motion(angle, axis, shift):
