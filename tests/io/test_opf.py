@@ -13,6 +13,17 @@ from jaxbundle.errors import InputError
 from jaxbundle.io import read_network
 from jaxbundle.io.formats import recognise_format
 from jaxbundle.io.networks.assemble import all_parameters
+from jaxbundle.io.networks.opf_keys import (
+    CALIBRATED,
+    CAMERA_LIST,
+    FRAME,
+    INPUT_CAMERAS,
+    INPUT_POINTS,
+    KEYS,
+    PROJECT,
+    PROJECTED_POINTS,
+    TRACKS,
+)
 from jaxbundle.network.reprojection import point_errors
 
 F, C = 1000.0, (641.5, 359.0)
@@ -225,3 +236,59 @@ def test_a_gltf_without_its_parts_is_refused(tmp_path, part, value):
     (tmp_path / "tracks.gltf").write_text(json.dumps(document))
     with pytest.raises(InputError, match=f"tracks.gltf.*{part}"):
         read_network(path)
+
+
+FILES = {
+    PROJECT: "project.opf", CAMERA_LIST: "list.json", INPUT_CAMERAS: "input.json",
+    CALIBRATED: "calibrated.json", FRAME: "frame.json", INPUT_POINTS: "points.json",
+    PROJECTED_POINTS: "projected.json", TRACKS: "tracks.gltf",
+}  # fmt: skip
+
+
+def objects(value, path):
+    """The objects at a path of a document."""
+    rows = value if isinstance(value, list) else [value]
+    name, _, more = path.partition(".")
+    return rows if not path else [x for r in rows if name in r for x in objects(r[name], more)]
+
+
+@pytest.mark.parametrize("kind", KEYS)
+def test_a_further_key_anywhere_is_named_and_a_geometric_one_refused(tmp_path, kind):
+    path = write(tmp_path)
+    file = tmp_path / FILES[kind]
+    text = file.read_text()
+    assert not any("unknown key" in told for told in read_network(path).warnings)
+    met = 0
+    for place, keys in KEYS[kind].items():
+        for added in ("vendor_remark", "lens_offset"):
+            document = json.loads(text)
+            if not (found := objects(document, place)) or not keys.unknown([added]):
+                continue  # no manual tie points; extensions are a program's own
+            found[-1][added] = 7
+            file.write_text(json.dumps(document))
+            if added == "lens_offset":
+                with pytest.raises(InputError, match=rf"{file.name}.*unknown key 'lens_offset'"):
+                    read_network(path)
+            else:
+                (told,) = [t for t in read_network(path).warnings if "'vendor_remark'" in t]
+                assert file.name in told
+                met += 1
+    assert met == len(KEYS[kind]) - {INPUT_POINTS: 2, TRACKS: 1}.get(kind, 0)
+
+
+def test_numbers_that_are_not_one_after_the_other_are_refused(tmp_path):
+    path, file = write(tmp_path), tmp_path / "tracks.gltf"
+    text = file.read_text()
+    for key, place, value in (
+        ("byteStride", "bufferViews", 24), ("sparse", "accessors", {"count": 1}),
+        ("children", "nodes", [1]),
+    ):  # fmt: skip
+        document = json.loads(text)
+        document[place][0][key] = value
+        file.write_text(json.dumps(document))
+        with pytest.raises(InputError, match=r"tracks.gltf, (accessors|nodes)\[0\]: .*expected"):
+            read_network(path)
+    document = json.loads(text)
+    document["bufferViews"][0]["byteStride"] = 12  # as they are
+    file.write_text(json.dumps(document))
+    assert len(read_network(path).points) == 4 + len(POINTS)

@@ -49,47 +49,31 @@ from jaxbundle.io.networks.assemble import (
     unique_labels,
 )
 from jaxbundle.io.networks.control import with_control
+from jaxbundle.io.networks.opf_keys import (
+    CALIBRATED,
+    CAMERA_LIST,
+    FRAME,
+    INPUT_CAMERAS,
+    INPUT_POINTS,
+    KEYS,
+    MATCHES,
+    PROJECT,
+    PROJECTED_POINTS,
+    TRACKS,
+)
 from jaxbundle.io.networks.settings import choose_datum
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.io.text.json_fields import JsonFields, read_object
-from jaxbundle.io.text.known_keys import Keys, UnknownKeys
+from jaxbundle.io.text.known_keys import UnknownKeys
 from jaxbundle.network.columns import Columns, list_some
 from jaxbundle.network.tables import Network, Points, Source
 from jaxbundle.system.file_content import beginning, check_plain
 
 SUFFIX = ".opf"
-FORMAT = "application/opf-"
-CALIBRATED, CAMERA_LIST = f"{FORMAT}calibrated-cameras+json", f"{FORMAT}camera-list+json"
-INPUT_CAMERAS, FRAME = f"{FORMAT}input-cameras+json", f"{FORMAT}scene-reference-frame+json"
-INPUT_POINTS = f"{FORMAT}input-control-points+json"
-PROJECTED_POINTS = f"{FORMAT}projected-control-points+json"
-TRACKS = "model/gltf+json"
-MATCHES = "OPF_mesh_primitive_matches"
 
 # glTF: component types and the numbers of an element.
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 LENGTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-
-HEAD = ("format", "version")
-VENDOR = {"extensions": "objects of a vendor", "ext*": "objects of a vendor"}
-SENSOR_KEYS = Keys(("id", "internals"), {"rig_relatives": "every camera has its pose", **VENDOR})
-CAMERA_KEYS = Keys(
-    ("id", "sensor_id", "position", "orientation_deg"),
-    VENDOR,
-    {"rolling_shutter": "one pose a photograph is read"},
-)
-INTERNAL_KEYS = Keys(
-    (
-        *("type", "principal_point_px", "focal_length_px", "radial_distortion"),
-        *("tangential_distortion", "affine", "polynomial"),
-    ),
-    {"is_symmetric_affine": "what is held", "is_p0_zero": "what is held", **VENDOR},
-)
-POINT_KEYS = Keys(
-    ("id", "marks", "is_checkpoint"), {"geolocation": "given coordinates, projected", **VENDOR}
-)
-MARK_KEYS = Keys(("camera_id", "position_px"), {"accuracy": "of a click, without a unit", **VENDOR})
-PROJECTED_KEYS = Keys(("id", "coordinates", "sigmas"), VENDOR)
 
 
 class Resources(NamedTuple):
@@ -98,6 +82,7 @@ class Resources(NamedTuple):
     path: Path
     files: Mapping[str, list[Path]]
     tracks: Path | None
+    unknown: UnknownKeys
 
     def document(self, kind: str) -> JsonFields | None:
         """The only file of a format; None if there is none."""
@@ -107,7 +92,7 @@ class Resources(NamedTuple):
                 f"{self.path}: {len(found)} resources of format {kind}, "
                 f"{list_some(found, as_text=str)}; expected a project with one calibration"
             )
-        return _read(found[0]) if found else None
+        return _read(found[0], kind, self.unknown) if found else None
 
 
 def is_opf(path: Path) -> bool:
@@ -124,18 +109,16 @@ def read_opf(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     **Raises:** `InputError` naming file and field.
     """
     path, unknown = Path(path), UnknownKeys()
-    resources = _resources(path)
+    resources = _resources(path, unknown)
     calibrated = resources.document(CALIBRATED)
     if calibrated is None:
         raise InputError(
             f"{path}: a project without calibrated cameras; expected one after its calibration"
         )
     told: list[str] = []
-    cameras = _sensors(calibrated, resources.document(INPUT_CAMERAS), unknown, told)
+    cameras = _sensors(calibrated, resources.document(INPUT_CAMERAS), told)
     shift = _shift(resources.document(FRAME), told)
     rows = calibrated.rows("cameras")
-    for row in rows:
-        unknown.check(row.document, CAMERA_KEYS, row.path)
     if not rows:
         raise InputError(f"{calibrated.path}: there are no cameras")
     ids = [_id(row, "id") for row in rows]
@@ -155,8 +138,8 @@ def read_opf(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         np.array([np.asarray(matrix_from_omega_phi_kappa(a)) for a in angles]),
         X0,
     )
-    marked, seen, control = _control(resources, names, unknown, shift, told)
-    tie, rays = _tracks(resources.tracks, names, shift)
+    marked, seen, control = _control(resources, names, shift, told)
+    tie, rays = _tracks(resources, names, shift)
     network = assemble(
         path,
         foreign_document(path.stem, cameras.values(), object_unit="m"),
@@ -174,12 +157,14 @@ def read_opf(path: str | Path, overrides: Sequence[str] = ()) -> Network:
 # --- files ----------------------------------------------------------------------------------
 
 
-def _read(path: Path) -> JsonFields:
-    return JsonFields(path, read_object(path, read_text(path), "OPF"))
+def _read(path: Path, kind: str, unknown: UnknownKeys) -> JsonFields:
+    document = read_object(path, read_text(path), "OPF")
+    unknown.check_objects(document, KEYS[kind], path)
+    return JsonFields(path, document)
 
 
-def _resources(path: Path) -> Resources:
-    file = _read(path)
+def _resources(path: Path, unknown: UnknownKeys) -> Resources:
+    file = _read(path, PROJECT, unknown)
     files: dict[str, list[Path]] = {}
     tracks: list[Path] = []
     for item in file.rows("items"):
@@ -190,7 +175,7 @@ def _resources(path: Path) -> Resources:
                 files[kind].append(place)
             if item.text("type") == "calibration" and kind == TRACKS:
                 tracks.append(place)
-    return Resources(path, files, tracks[0] if tracks else None)
+    return Resources(path, files, tracks[0] if tracks else None, unknown)
 
 
 def _place(path: Path, uri: str) -> Path:
@@ -226,7 +211,7 @@ def _files(camera_list: JsonFields | None) -> dict[str, str]:
 
 
 def _sensors(
-    calibrated: JsonFields, given: JsonFields | None, unknown: UnknownKeys, told: list[str]
+    calibrated: JsonFields, given: JsonFields | None, told: list[str]
 ) -> dict[str, dict[str, Any]]:
     """The entries of the sensors by id."""
     described = {_id(row, "id"): row for row in ([] if given is None else given.rows("sensors"))}
@@ -234,9 +219,7 @@ def _sensors(
     labels = [str(described[id].get("name") or id) if id in described else id for id in rows]
     found = {}
     for (id, row), label in zip(rows.items(), unique_labels(labels, list(rows))):
-        unknown.check(row.document, SENSOR_KEYS, row.path)
         internals = row.child("internals")
-        unknown.check(internals.document, INTERNAL_KEYS, internals.path)
         size = described[id].array("image_size_px", (2,)) if id in described else None
         entry, fit = _camera(internals, size)
         told += [f"sensor {label!r}: {fit}"] if fit else []
@@ -310,7 +293,6 @@ def _shift(frame: JsonFields | None, told: list[str]) -> Float[np.ndarray, "3"]:
 def _control(
     resources: Resources,
     images: Mapping[str, str],
-    unknown: UnknownKeys,
     shift: Float[np.ndarray, "3"],
     told: list[str],
 ) -> tuple[dict[str, Any], dict[str, Any], Points | None]:
@@ -320,11 +302,9 @@ def _control(
     rows = [] if given is None else [*given.rows("gcps"), *given.rows("mtps")]
     ids, checks, marks = [], {}, []
     for row in rows:
-        unknown.check(row.document, POINT_KEYS, row.path)
         id = row.text("id")
         here = []
         for mark in row.rows("marks"):
-            unknown.check(mark.document, MARK_KEYS, mark.path)
             if (image := images.get(_id(mark, "camera_id"))) is not None:
                 here.append((image, id, *(mark.array("position_px", (2,)) - PIXEL_CENTRE)))
         if here:
@@ -337,8 +317,6 @@ def _control(
     seen = {"image": image, "point": point, "x": x, "y": y}
     known = [] if projected is None else projected.rows("projected_gcps")
     known = [row for row in known if row.text("id") in checks]
-    for row in known:
-        unknown.check(row.document, PROJECTED_KEYS, row.path)
     if not known:
         if given is not None and given.rows("gcps"):
             told.append(
@@ -368,16 +346,18 @@ def _control(
 
 
 def _tracks(
-    path: Path | None, images: Mapping[str, str], shift: Float[np.ndarray, "3"]
+    resources: Resources, images: Mapping[str, str], shift: Float[np.ndarray, "3"]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Columns of the tie points of a glTF with matches, and of their image points."""
     points: dict[str, Any] = {"id": [], "role": [], "X": [], "Y": [], "Z": []}
     rays: dict[str, Any] = {"image": [], "point": [], "x": [], "y": []}
-    if path is None:
+    if (path := resources.tracks) is None:
         return points, rays
-    file = _read(path)
+    file = _read(path, TRACKS, resources.unknown)
     colours = []
     for node in file.rows("nodes"):
+        if node.get("children") and node.get("matrix") is not None:
+            raise InputError(f"{node.path}: a matrix for its children; expected one for its mesh")
         if node.get("mesh") is None:
             continue
         # the specification has one primitive a mesh
@@ -469,6 +449,12 @@ def _accessor(file: JsonFields, index: int, kind: str | None) -> np.ndarray:
     view = _of(file, "bufferViews", accessor.integer("bufferView"))
     buffer = _of(file, "buffers", view.integer("buffer"))
     dtype = np.dtype(COMPONENTS[component])
+    width = dtype.itemsize * LENGTHS[form]
+    if accessor.get("sparse") is not None or view.integer("byteStride", width) != width:
+        raise InputError(
+            f"{accessor.path}: numbers that are interleaved with others, or sparse; expected those "
+            "of an accessor one after the other"
+        )
     number = accessor.integer("count") * LENGTHS[form]
     place = _place(Path(file.path), buffer.text("uri"))
     check_plain(place)

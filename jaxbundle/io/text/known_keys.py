@@ -11,6 +11,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
 from fnmatch import fnmatchcase
 from functools import cached_property
+from typing import Any
 
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import closest_name, show
@@ -150,6 +151,31 @@ class UnknownKeys:
             used = [c for c in element if isinstance(c.tag, str) and own.uses(c.tag)]
             # from the end of the list: the first of the document is the first to be refused
             places += [(child, f"{place}/{child.tag[:60]}") for child in reversed(used)]
+
+    def check_objects(
+        self, document: Mapping[str, Any], keys: Mapping[str, Keys], where: object
+    ) -> None:
+        """The same for an object of JSON and those in it that have an entry.
+
+        `keys`: of the objects by their path, `""` for the document, `"items.resources"`; of a list,
+        of all objects in it.
+        """
+        places = [("", document, str(where))]
+        while places:
+            path, value, place = places.pop()
+            self.check(value, keys[path], place)
+            below = []
+            for name, inner in value.items():
+                if (inside := f"{path}.{name}".lstrip(".")) not in keys:
+                    continue
+                rows = enumerate(inner) if isinstance(inner, list) else [(None, inner)]
+                for k, row in rows:
+                    # what is no object is for its reader to refuse
+                    if isinstance(row, Mapping):
+                        number = "" if k is None else f"[{k}]"
+                        below.append((inside, row, f"{place}, {name}{number}"))
+            # from the end of the list: the first of the document is the first to be refused
+            places += reversed(below)
 
     def messages(self) -> tuple[str, ...]:
         """Warnings about the unknown keys."""
