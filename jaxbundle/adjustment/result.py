@@ -538,6 +538,13 @@ class Adjustment:
         model, why = self._modelled
         return why if model is None else ""
 
+    @property
+    def assumes_independence(self) -> bool:
+        """Whether σ take the errors of image points as independent, though there are photographs
+        enough to look for others."""
+        enough = len(self.problem.network.images) >= CORRELATIONS.min_images
+        return self.correlations is None and enough
+
     @functools.cached_property
     def replication(self) -> Replication | None:
         """One split of the network into halves, adjusted and compared; None if not requested."""

@@ -49,7 +49,11 @@ def cameras(adjustment: "Adjustment") -> dict[str, dict]:
                     "value": value,
                     "sigma": float(sigma[name]) if name in sigma else None,
                     "free": name in sigma,
-                    "t": _significance(value - default.get(name, 0.0), sigma[name])
+                    # by the σ that is shown first: under correlated errors it may be the larger
+                    "t": _significance(
+                        value - default.get(name, 0.0),
+                        max(sigma[name], correlated.get(name, 0.0)),
+                    )
                     if name in sigma
                     else None,
                     "total_correlation": float(total[name]) if name in sigma else None,

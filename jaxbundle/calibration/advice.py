@@ -1,10 +1,11 @@
 """Weaknesses of a calibration in words, and advice on further photographs."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxbundle.calibration.quality import Coverage, CrossValidation
 from jaxbundle.cameras import CameraModel
@@ -25,6 +26,13 @@ class AdviceSettings:
       number of photographs that have it: the change of scale across the board, which separates
       the principal distance from the distance, grows with the sine of the angle.
     - `min_distance_ratio`: of farthest to nearest distance of the board.
+    - `min_move`: a photograph whose station has moved by less than this part of the distance of the
+      board, and that is turned by less than as many radians, repeats another one: its points are
+      moved by about as much of the principal distance, and see the same places of the lens.
+      `max_alike`: the largest part of such photographs. Half or double of either name the same
+      sets of photographs in the examples.
+    - `min_removed`: photographs in which snooping has removed the same point of the board: gross
+      errors of detection strike a point twice by chance.
     - `min_reach`, `min_part`: of the half diagonal to the farthest point; of the cells of the image
       with points. Beyond the farthest point the distortion is extrapolated by its highest power.
     - `max_rms`: a larger RMS, in pixels, is not caused by corner detection, which has a tenth.
@@ -38,6 +46,9 @@ class AdviceSettings:
     min_tilt: float = 15.0
     min_tilted: int = 3
     min_distance_ratio: float = 1.3
+    min_move: float = 0.02
+    max_alike: float = 0.2
+    min_removed: int = 4
     min_reach: float = 0.85
     min_part: float = 0.6
     max_rms: float = 1.0
@@ -101,6 +112,19 @@ def suggest(
     ]
 
 
+def often_removed(
+    points: Iterable[str], views: int, settings: AdviceSettings = ADVICE
+) -> list[str]:
+    """Points of the board that were removed in many of the `views`, in words; `points`: of every
+    image point that was removed."""
+    often = [(n, name) for name, n in Counter(points).items() if n >= settings.min_removed]
+    return [
+        f"point {name} of the board was removed in {n} of {views} photographs: it is not where it "
+        "is given; look at the print there"
+        for n, name in sorted(often, reverse=True)
+    ]
+
+
 def turns(rotation: Float[np.ndarray, "views 3 3"]) -> Float[np.ndarray, " views"]:
     """The roll of every photograph about its line of sight, degrees: of the image's x axis in the
     plane of the board."""
@@ -110,6 +134,24 @@ def turns(rotation: Float[np.ndarray, "views 3 3"]) -> Float[np.ndarray, " views
 def tilts(rotation: Float[np.ndarray, "views 3 3"]) -> Float[np.ndarray, " views"]:
     """The angle between every line of sight and the normal of the board, degrees."""
     return np.degrees(np.arccos(np.clip(np.abs(rotation[:, 2, 2]), 0, 1)))
+
+
+def repeated(
+    position: Float[np.ndarray, "views 3"],
+    rotation: Float[np.ndarray, "views 3 3"],
+    away: Float[np.ndarray, " views"],
+    min_move: float,
+) -> Bool[np.ndarray, " views"]:
+    """Which photographs have nearly the pose of an earlier one that has not."""
+    found = np.zeros(len(position), bool)
+    for k in range(len(position)):
+        first = np.flatnonzero(~found[:k])
+        move = np.linalg.norm(position[first] - position[k], axis=1) / away[k]
+        # of a small rotation by a, trace(R) = 1 + 2·cos(a)
+        cosine = (np.einsum("nij,ij->n", rotation[first], rotation[k]) - 1) / 2
+        turn = np.arccos(np.clip(cosine, -1, 1))
+        found[k] = (np.maximum(move, turn) < min_move).any()
+    return found
 
 
 def _geometry(
@@ -145,6 +187,12 @@ def _geometry(
         yield (
             f"all photographs are from nearly one distance ({away.min():.3g} to {away.max():.3g} "
             f"{unit}): take some nearer and some farther away"
+        )
+    alike = repeated(position, rotation, away, settings.min_move).sum()
+    if alike > settings.max_alike * number:
+        yield (
+            f"{alike} of {number} photographs repeat the pose of another: they are no further "
+            "geometry, and halves of the photographs agree too well; take them from other places"
         )
 
 

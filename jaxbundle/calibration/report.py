@@ -13,6 +13,7 @@ from jaxbundle.calibration.verdict import (
 from jaxbundle.io.results.result_json import result_dict, verdict_dict
 from jaxbundle.measure.boards import Board, BoardSet
 from jaxbundle.measure.views import BoardViews
+from jaxbundle.network.columns import count
 from jaxbundle.report.layout import (
     WITHOUT_SIGMA,
     clean,
@@ -81,7 +82,10 @@ def _camera(calibration: "Calibration") -> list[str]:
         elif value != 0:
             rows.append((name, significant(value, WITHOUT_SIGMA), "held"))
     lines += table(("parameter", "value", "σ"), rows, "lrr")
-    lines += ["", f"RMS of an image point {calibration.rms:.4f} px"]
+    rms = calibration.rms
+    removed = len(calibration.adjustment.removed)
+    lines += ["", f"RMS of an image point {rms:.4f} px, of a coordinate {rms / np.sqrt(2):.4f} px"]
+    lines += [f"Removed as gross errors: {count(removed, 'image point')}"] if removed else []
     return lines
 
 

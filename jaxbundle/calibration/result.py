@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from jaxbundle import plotting
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.calibration import quality
-from jaxbundle.calibration.advice import advice, suggest
+from jaxbundle.calibration.advice import advice, often_removed, suggest
 from jaxbundle.calibration.affinity import find_missing_affinity
 from jaxbundle.calibration.bias import CalibrationBias, find_bias
 from jaxbundle.calibration.mapping_error import MappingError, mapping_error
@@ -174,6 +174,12 @@ class Calibration(TableMethods):
         missed = find_missing_affinity(self.adjustment)
         if missed is not None and missed.missed:
             found = [*found, str(missed)]
+        problem = self.adjustment.problem
+        removed = [
+            row for one in self.adjustment.removed if one.kind == "image" for row in one.rows
+        ]
+        points = [problem.network.points.id[problem.point[row]] for row in removed]
+        found += often_removed(points, len(problem.network.images))
         if self.bias is not None and self.bias.found:
             found = [*found, self.bias.sentence]
         return found

@@ -4,7 +4,16 @@ from typing import TYPE_CHECKING
 
 from jaxbundle.calibration.advice import ADVICE
 from jaxbundle.calibration.rig.advice import undetermined_mountings
-from jaxbundle.report.verdict import BAD, DOUBTFUL, GOOD, Finding, Verdict, conclude, in_words
+from jaxbundle.report.verdict import (
+    BAD,
+    DOUBTFUL,
+    GOOD,
+    NOTED,
+    Finding,
+    Verdict,
+    conclude,
+    in_words,
+)
 
 if TYPE_CHECKING:
     from jaxbundle.calibration.quality import Coverage
@@ -57,6 +66,11 @@ def find(calibration: "Calibration") -> list[Finding]:
         state = DOUBTFUL if checked.test > ADVICE.max_test else GOOD
         words = " ".join(cross_validation_in_words(calibration))
         found.append(Finding("Cross-validation", state, words, "halves that contradict each other"))
+    if (bias := calibration.bias) is not None:
+        # half of the variance: as large as all errors of measurement together
+        state = GOOD if not bias.found else DOUBTFUL if bias.ratio > 0.5 else NOTED
+        brief = f"{100 * bias.ratio:.0f} % of the residual variance are a bias"
+        found.append(Finding("Bias", state, bias.sentence, brief))
     return found
 
 
@@ -75,7 +89,8 @@ def cross_validation_in_words(calibration: "Calibration") -> list[str]:
         return ["too few photographs for two halves" if calibration.validated else "not made"]
     largest = max(checked.difference, key=lambda n: abs(checked.difference[n]))
     sentences = [
-        f"the camera of either half leaves an RMS of {checked.rms_other:.4f} px in the other half, "
+        "of the two halves made of every other photograph, "
+        f"the camera of either leaves an RMS of {checked.rms_other:.4f} px in the other half, "
         f"where its own leaves {checked.rms_own:.4f} px. The two differ by "
         f"{abs(checked.difference[largest]):.1f} σ in {largest}, the most; test of all parameters "
         f"together {checked.test:.2f} (1 expected)."

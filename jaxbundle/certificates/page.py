@@ -23,6 +23,7 @@ from jaxbundle.certificates.positional import SUMMARY_HEADER
 from jaxbundle.certificates.units import LENGTHS, convert
 from jaxbundle.network.columns import count
 from jaxbundle.report import head, observations
+from jaxbundle.report.correlated import INDEPENDENCE
 from jaxbundle.report.layout import clean, column_decimals, fixed, significant
 from jaxbundle.report.page.charts import ChartLayout, Curve, draw_curves, draw_field, draw_plan
 from jaxbundle.report.page.document import Page, Section, write
@@ -247,6 +248,9 @@ def _results(certificate: "Certificate") -> Iterator[Section]:
                 f"coverage probability of {coverage:.4g} % (JCGM 100:2008, Annex G)."
             )
         )
+        budgeted = (part.adjustment for part in certificate.parts if part.budget is not None)
+        if any(adjustment.assumes_independence for adjustment in budgeted):
+            parts.append(paragraph(f"Standard uncertainties are {INDEPENDENCE}."))
         parts.append(_correlations(certificate))
     yield Section("results", "Results with expanded uncertainty", "".join(parts), "Results")
 

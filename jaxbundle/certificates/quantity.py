@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from jaxbundle.cameras import get_model
+from jaxbundle.cameras.model import PRINCIPAL_DISTANCES
 from jaxbundle.certificates.lengths import LengthTest
 from jaxbundle.certificates.units import NO_PITCH, PixelPitch
 from jaxbundle.errors import InputError
@@ -80,9 +81,13 @@ def require_parameter(cameras: Any, name: str) -> None:
     """Refuse a name that is no parameter of any of these cameras.
 
     **Raises:** `InputError`."""
-    known = dict.fromkeys(p for c in cameras for p in get_model(c.model).parameters)
+    models = [get_model(c.model) for c in cameras]
+    known = dict.fromkeys(p for model in models for p in model.parameters)
     if name not in known:
+        hint = did_you_mean(name, known, listing=False)
+        if any(name in names for names in PRINCIPAL_DISTANCES):  # that of other models
+            distances = dict.fromkeys(p for model in models for p in model.principal_distance)
+            hint = f"; the principal distance of this model is {' and '.join(distances)}"
         raise InputError(
-            f"there is no parameter {name!r}{did_you_mean(name, known, listing=False)}; known: "
-            f"{', '.join([*known, *EXTERIOR, *AXES])}"
+            f"there is no parameter {name!r}{hint}; known: {', '.join([*known, *EXTERIOR, *AXES])}"
         )

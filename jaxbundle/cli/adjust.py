@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 import jaxbundle
-from jaxbundle.choices import ESTIMATORS, METHODS, REDUCTIONS, TESTS
+from jaxbundle.choices import ESTIMATED, ESTIMATORS, METHODS, REDUCTIONS, TESTS
 from jaxbundle.cli.app import (
     Check,
     Control,
@@ -70,9 +70,12 @@ def adjust(  # noqa: PLR0913 - the options of the command
         bool, typer.Option("--components", help="estimate variance components")
     ] = False,
     correlated: Annotated[
-        bool,
-        typer.Option("--correlated", help="look for errors that image points share; σ under them"),
-    ] = False,
+        bool | None,
+        typer.Option(
+            help="look for errors that image points share, and σ under them; by itself where the σ "
+            "of image points were estimated, as in networks of reconstruct"
+        ),
+    ] = None,
     second_minimum: Annotated[
         bool,
         typer.Option(help="look for second minima: plane objects turned over, depth reversed"),
@@ -167,6 +170,8 @@ def adjust(  # noqa: PLR0913 - the options of the command
     if check:
         network = network.replace(points=select_checks(network.points, check))
     check_test(snooping, significance, "--")
+    if correlated is None:
+        correlated = network.observations.sigma_origin == ESTIMATED
     held = held_of(budget, network)
     # before an adjustment that may take hours
     check_targets(input, network, json, out, control, force, html, save)

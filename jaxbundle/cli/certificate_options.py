@@ -9,8 +9,8 @@ Accept = Annotated[
     list[str] | None,
     typer.Option(
         metavar="CRITERION",
-        help="criterion such as 'sigma(c) < 2 um' or 'check.rms < 5 mm'; status 4 if not met; "
-        "repeatable",
+        help="criterion such as 'sigma(c) < 2 um', 'sigma(fx) < 1 px' or 'check.rms < 5 mm'; "
+        "status 4 if not met; repeatable",
     ),
 ]
 CertificateFile = Annotated[

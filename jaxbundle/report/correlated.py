@@ -52,6 +52,11 @@ REMARKS = {
 # σ under correlated errors over classical ones from which the difference is a finding: five in a
 # hundred exceed 1.96 classical σ where the model is right, thirteen at this ratio.
 NOTABLE_RATIO = 1.3
+# Of a network with photographs enough, where nobody has looked for correlated errors.
+INDEPENDENCE = (
+    "classical: the errors of image points are taken as independent; --correlated "
+    "(correlated=True) looks for errors that they share, which make σ larger"
+)
 COMPONENT_HEADER = ("component", "size", "σ", "unit", "score")
 SIGMA_HEADER = ("unknown", "σ classical", "σ correlated", "ratio")
 
@@ -86,6 +91,8 @@ def first_facts(adjustment: "Adjustment") -> list[tuple[str, str]]:
                 "classical ones (median of the orientations); the larger of both is shown",
             )
         )
+    elif adjustment.assumes_independence:
+        rows.append(("σ shown", INDEPENDENCE))
     return rows
 
 

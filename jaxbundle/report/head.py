@@ -100,7 +100,8 @@ def first_facts(
     if adjustment.converged:
         _, words, findings = verdict or adjustment.verdict
         rows = [("Verdict", words), *((f.about, f.words) for f in findings if f.lowers)]
-        rows += correlated.first_facts(adjustment)
+        said = {about for about, _ in rows}
+        rows += [row for row in correlated.first_facts(adjustment) if row[0] not in said]
     rows += [("Attention", clean(text)) for text in adjustment.findings]
     if words := left_out_in_words(adjustment):
         rows.append(("Left out", f"{words}: see Notes, and left_out in the JSON"))

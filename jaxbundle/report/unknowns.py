@@ -83,7 +83,8 @@ def _one_camera(entry: Mapping[str, Any], model: CameraModel) -> list[str]:
         )
     free = entry["free"]
     if len(free) > 1:
-        lines += ["", "Correlations in %", *_triangle(free, entry["correlations"])]
+        C = entry.get("correlations_correlated", entry["correlations"])
+        lines += ["", "Correlations in %", *_triangle(free, C)]
     return lines
 
 

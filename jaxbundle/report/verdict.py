@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbundle.leastsquares.quality.distributions import level_of_one
+from jaxbundle.leastsquares.quality.distributions import chi2_quantile, level_of_one
 from jaxbundle.leastsquares.quality.global_test import contradicts
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import ESTIMATED
@@ -162,12 +162,14 @@ def _correlated(adjustment: "Adjustment") -> list[Finding]:
         brief = "no look at correlated errors"
         found.append(Finding("Correlated errors", NOTED, f"not looked for: {why}", brief))
     if (halves := adjustment.replication) is not None:
+        words, brief = halves.sentence, f"halves by {halves.by} contradict each other"
         if not halves.splits:
             state, brief = NOTED, "halves not compared"
         else:
             state = DOUBTFUL if halves.probability < LEVEL else GOOD
-            brief = f"halves by {halves.by} contradict each other"
-        found.append(Finding("Replication", state, halves.sentence, brief))
+            limit = chi2_quantile(1 - LEVEL, halves.dof) / halves.dof
+            words += f"; in one of 1000 cases they differ by more than {limit:.2f} by chance"
+        found.append(Finding("Replication", state, words, brief))
     return found
 
 

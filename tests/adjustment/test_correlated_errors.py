@@ -236,6 +236,8 @@ def test_everything_that_states_a_sigma_asks_the_error_model(shaken):
     np.testing.assert_allclose(
         [f["sigma_correlated"], f["sigma"]], [np.sqrt(C[0, 0]) for C in blocks]
     )
+    # what is significant is so by the σ that is shown
+    assert f["t"] == pytest.approx(f["value"] / max(f["sigma"], f["sigma_correlated"]))
     names = [("image", shaken.network.images.id[2], name) for name in ("X0", "Y0", "kappa")]
     C = shaken.covariance(*names, classical=True)
     np.testing.assert_allclose(

@@ -19,7 +19,7 @@ from jaxbundle.adjustment.quality.projection_uncertainty import images_through_s
 from jaxbundle.batches.calibrate import calibrate_batch
 from jaxbundle.batches.calibrate_rigs import calibrate_rigs
 from jaxbundle.calibration import calibrate
-from jaxbundle.calibration.advice import advice, suggest
+from jaxbundle.calibration.advice import advice, often_removed, suggest
 from jaxbundle.calibration.files import json_text, write_calibration
 from jaxbundle.calibration.quality import coverage, grid_of, uncertainty_map
 from jaxbundle.calibration.simulate import simulate_views
@@ -294,6 +294,12 @@ def test_what_is_missing_is_said():
     said = poses_in_words(good, covered=left, rms=2.0, t={"fx": 900.0, "k3": 0.4})
     assert "no point in the lower right corner" in said[0] and "cover 3 %" in said[1]
     assert "RMS 2.00 px" in said[2] and len(said) == 3
+    again = [*good, *(render.pose(a + 0.5, b, c, middle, d * 1.01) for a, b, c, d in (
+        (30, 0, 0, 0.4), (-30, 0, 0, 0.6), (25, 20, 0, 0.5)))]  # fmt: skip
+    (said,) = poses_in_words(again)
+    assert said.startswith("3 of 11 photographs repeat the pose of another")
+    (said,) = often_removed(["2-1", "1-3", "1-3", "1-3", "1-3", "2-1"], 9)
+    assert said.startswith("point 1-3 of the board was removed in 4 of 9 photographs")
     (suggestion,) = suggest({"fx": 900.0, "k3": 0.4}, get_model("opencv"))
     assert suggestion.startswith("not significant: k3 (t 0.4)")
 

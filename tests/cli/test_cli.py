@@ -94,6 +94,16 @@ def test_json_alone_on_stdout(convergent4):
     assert found == pytest.approx(table["correlations"][c, x0], abs=1e-6)
 
 
+def test_of_estimated_sigma_correlated_errors_are_looked_for(command):
+    """As `reconstruct` does with the network that it writes."""
+    project, estimated = EXAMPLE / "project.toml", "sigma_origin=estimated"
+    done = command("adjust", project, "--set", estimated)
+    assert done.status == 0 and "Correlated errors" in done.out, done.err
+    assert "not looked for" in " ".join(done.out.split())  # four photographs
+    done = command("adjust", project, "--set", estimated, "--no-correlated")
+    assert done.status == 0 and "Correlated errors" not in done.out, done.err
+
+
 BROKEN = {
     "missing table": ("images.csv", None, None, ["images.csv"]),
     "missing column": ("points.csv", "id,role,X,Y,Z", "id,role,X,Y,H", ["points.csv", "H"]),

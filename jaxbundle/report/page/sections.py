@@ -77,7 +77,9 @@ def cameras(adjustment: "Adjustment", max_cameras: int = 20) -> Iterator[Section
         if len(entry["free"]) > 1:
             parts += [
                 "<h3>Correlations in %</h3>\n",
-                show_correlations(entry["free"], entry["correlations"]),
+                show_correlations(
+                    entry["free"], entry.get("correlations_correlated", entry["correlations"])
+                ),
             ]
         others = len(adjustment.cameras) - len(chosen)
         if others and number == len(chosen) - 1:
