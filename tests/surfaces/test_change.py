@@ -10,13 +10,8 @@ from scipy.ndimage import gaussian_filter
 
 import jaxbundle
 from jaxbundle.errors import InputError
-from jaxbundle.surfaces.change import (
-    HeightGrid,
-    align,
-    correlation_of,
-    find_change,
-    stated_modes,
-)
+from jaxbundle.surfaces.change import ChangeSettings, correlation_of, find_change
+from jaxbundle.surfaces.height_cells import HeightGrid, UncertainCells, align, stated_modes
 from jaxbundle.surfaces.orientation import orientation_covariance, orientation_modes
 from jaxbundle.surfaces.views import FrameView
 
@@ -103,6 +98,8 @@ def test_variances_are_those_of_dense_algebra():
             quiet = np.abs(own / s) < 3 * 1.4826 * np.median(np.abs(own / s - np.median(own / s)))
             rho = correlation_of((own / s * quiet).reshape(shape), quiet.reshape(shape))
             assert found.correlation == pytest.approx(rho.sum(), rel=0.05)
+            assert found.sigma_ratio > 1
+            s = s * found.sigma_ratio
             P = np.eye(L.shape[1])
             if known is not None:
                 A = (L / s[:, None])[stable.ravel()]
