@@ -190,9 +190,9 @@ def _match_ground_images(
     say: Callable[[str], object],
 ) -> _Matched:
     """Scanner or RPC images: the surface is in the coordinates of a map."""
-    if len(inputs) < 2:
-        raise InputError(f"{inputs[0]}: one image; a surface needs at least two")
     views, around = read_ground_views(inputs, photos)
+    if len(views) < 2:
+        raise InputError(f"{inputs[0]}: one image; a surface needs at least two")
     bounds, messages = ground_bounds(views, heights)
     messages = (*messages, *align_all(views, bounds))
     if around is not None and crs is not None:

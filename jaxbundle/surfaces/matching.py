@@ -192,7 +192,7 @@ def _match_windows(
         pair = base, other
         place, uncertain = correct_bending(pair, nodes, uv, q, match, half, settings.bending)
         uncertain = uncertain + settings.added_sigma**2 * np.eye(2)
-        good = window.usable & _is_confirmed(match, begin, settings)
+        good = window.usable & is_confirmed(match, begin, settings)
         good &= _agrees(other, guides[k], X, settings.max_guide_distance)
         good &= has_texture(base.grey, uv, match.sigma0, half, settings.windows.min_texture)
         back = np.linalg.inv(np.where(good[:, None, None], match.A, np.eye(2)))
@@ -204,7 +204,7 @@ def _match_windows(
     return out
 
 
-def _is_confirmed(
+def is_confirmed(
     match: SubpixelMatches, start: Places, settings: MatchingSettings
 ) -> Bool[np.ndarray, " n"]:
     """Whether least squares matching has converged near its start, to a similar window."""

@@ -82,17 +82,36 @@ def read_ground_views(
                 check_raw(raster, source)
         grey = read_grey(raster)
         if not isinstance(orientation, Rpc):
-            image = orientation[0]
-            if (image.pixels, image.lines) != (grey.shape[1], grey.shape[0]):
-                raise InputError(
-                    f"{raster}: {grey.shape[1]} × {grey.shape[0]} pixels, the scanner file has "
-                    f"{image.pixels} × {image.lines}"
-                )
+            _check_size(raster, grey, orientation[0])
         view = _view(name, grey, orientation, around)
         if one is not None and block is not None:
             _add_covariance(view, orientation, one, block)
         views.append(view)
     return tuple(views), around
+
+
+def views_of_images(
+    ids: Sequence[str], orientations: Sequence[Orientation], rasters: Sequence[Path]
+) -> tuple[GroundView, ...]:
+    """Images with known orientations and their pixels, by their ids.
+
+    **Raises:** `InputError` if a raster cannot be read, or has another size."""
+    around = _common_neighbourhood([Path(id) for id in ids], orientations)
+    views = []
+    for id, orientation, raster in zip(ids, orientations, rasters):
+        grey = read_grey(raster)
+        if not isinstance(orientation, Rpc):
+            _check_size(raster, grey, orientation[0])
+        views.append(_view(id, grey, orientation, around))
+    return tuple(views)
+
+
+def _check_size(raster: Path, grey: Grey, image: PushbroomImage) -> None:
+    if (image.pixels, image.lines) != (grey.shape[1], grey.shape[0]):
+        raise InputError(
+            f"{raster}: {grey.shape[1]} × {grey.shape[0]} pixels, the scanner file has "
+            f"{image.pixels} × {image.lines}"
+        )
 
 
 def read_refined_views(

@@ -6,6 +6,8 @@ points = "points.csv"               # id,role,X,Y,Z[,sX,sY,sZ], or
                                     # id,role,longitude,latitude,height[,sE,sN,sh]
 observations = "observations.csv"   # image,point,line,pixel[,sline,spixel]; or a list of such
                                     # files, and .match and .gcp of Ames Stereo Pipeline
+tie_points = "ties.csv"             # the same columns, of tie points only, which need no row in
+                                    # points (`pushbroom tie` writes it); or a list
 frames = "photographs"              # a project of photographs that share points
 dem = "terrain.tif"                 # a terrain model, whose heights are observations of tie points
 dem_sigma = 5.0                     # of these, metres
@@ -74,6 +76,7 @@ SECTIONS = {
     "refine": (
         "points",
         "observations",
+        "tie_points",
         "frames",
         "dem",
         "dem_sigma",
