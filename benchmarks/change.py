@@ -1,5 +1,5 @@
-"""False alarms and volumes of `change`, from images to significance: pairs of satellite images of one
-place in two years are refined with control, matched, and compared, many times.
+"""False alarms and volumes of `change`, from images to significance: pairs of satellite images of
+one place in two years are refined with control, matched, and compared, many times.
 
     OPENBLAS_NUM_THREADS=1 python benchmarks/change.py [--draws 100] [--pixels 200] [--json FILE]
 
@@ -82,7 +82,7 @@ def refined_views(year, name, ground, rng, half):
     from jaxbundle.geometry.ellipsoid import WGS84, earth_fixed
     from jaxbundle.io.scanner.refined_orientations import joint_covariance
     from jaxbundle.network.tables import Observations
-    from jaxbundle.pushbroom.rpc.bias import RpcBias, apply_bias
+    from jaxbundle.pushbroom.rpc.bias import RpcBias, apply_bias, domain_of_bias
     from jaxbundle.pushbroom.rpc.image import RpcImage
     from jaxbundle.pushbroom.rpc.polynomials import project_points
     from jaxbundle.refinement import RpcScannerImage, local_points, refine
@@ -114,7 +114,7 @@ def refined_views(year, name, ground, rng, half):
         noisy = year.greys[k] + NOISE * rng.normal(size=year.greys[k].shape)
         grey = (9 * np.clip(noisy, 0, 255) + 200).astype(np.uint16)
         view = RpcView(one.id, grey, found.image(one.id).rpc, year.around)
-        view.orientation = rpc_orientation(joint, one.id)
+        view.orientation = rpc_orientation(joint, one.id, domain_of_bias(one.image.rpc))
         views.append(view)
     return views
 
@@ -216,7 +216,8 @@ def main():
     for k in range(given.draws):
         rows.append(draw(pairs, grounds, rng, half))
         if (k + 1) % 10 == 0:
-            print(f"{k + 1} of {given.draws} draws, {time.perf_counter() - begin:.0f} s", flush=True)
+            seconds = time.perf_counter() - begin
+            print(f"{k + 1} of {given.draws} draws, {seconds:.0f} s", flush=True)
             for row in zip(*rows):
                 print("   ", {n: float(f"{v:.4g}") for n, v in conclude(row).items()}, flush=True)
     figures = dict(zip(("no_stable_ground", "stable_ground"), map(conclude, zip(*rows))))

@@ -7,15 +7,16 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.scanner.refinement import SECTIONS
 from jaxbundle.io.scanner.refinement_images import read_images
 from jaxbundle.io.scanner.rpc_images import find_raster
-from jaxbundle.io.text.sections import TomlFile
 from jaxbundle.io.text.csv_tables import read_toml
-from jaxbundle.io.text.sections import refuse_unknown
+from jaxbundle.io.text.sections import TomlFile, refuse_unknown
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.refinement import ScannerImage
 from jaxbundle.surfaces.reconstruct import ground_bounds
 from jaxbundle.surfaces.scanner_inputs import views_of_images
 from jaxbundle.surfaces.tie_points import TiePoints, TiePointSettings, match_tie_points
 from jaxbundle.types import Progress
+
+DEFAULT = TiePointSettings()
 
 
 def tie(
@@ -24,7 +25,7 @@ def tie(
     spacing: int = 200,
     zmin: float | None = None,
     zmax: float | None = None,
-    settings: TiePointSettings = TiePointSettings(),
+    settings: TiePointSettings = DEFAULT,
     progress: Progress | None = None,
     tell: Callable[[str], object] | None = None,
 ) -> TiePoints:
@@ -67,8 +68,7 @@ def tie(
             raise InputError(f"{source}: no raster {source.stem}.tif beside it")
         rasters.append(raster)
     orientations = [
-        (one.image, one.earth) if isinstance(one, ScannerImage) else one.image.rpc
-        for one in images
+        (one.image, one.earth) if isinstance(one, ScannerImage) else one.image.rpc for one in images
     ]
     views = views_of_images([one.id for one in images], orientations, rasters)
     heights = None if zmin is None or zmax is None else (zmin, zmax)

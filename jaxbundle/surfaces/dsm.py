@@ -4,10 +4,10 @@ A cell has the weighted mean of the heights of its points, p = 1/σ_Z², without
 from their median by more than three times its spread. Errors of neighbours are highly correlated,
 since the windows of their matching overlap: points of a base image that are within a × b pixels of
 it count as m = (1 + a/w)·(1 + b/w) independent ones, w the side of the windows, at most as the n
-that they are. With the scatter of the points, σ² = max(n/m, χ²/(n − 1))/Σp. Small gaps are filled with the mean of the
-heights around, weighted by the inverse squares of their distances, with σ from the cells around and
-the distance to them; beside a wall from the lower surface, since hidden parts are low
-(Hirschmüller 2008).
+that they are. With the scatter of the points, σ² = max(n/m, χ²/(n − 1))/Σp. Small gaps are filled
+with the mean of the heights around, weighted by the inverse squares of their distances, with σ from
+the cells around and the distance to them; beside a wall from the lower surface, since hidden parts
+are low (Hirschmüller 2008).
 
 The errors of the orientations are common to the points of a cell, and no mean reduces them: weights
 are by the σ without them, and their mean variance is added to that of the cell.
@@ -147,9 +147,7 @@ def make_dsm(
     return found if cloud.shared is None else _add_shared(found, cell, cloud.shared)
 
 
-def _add_shared(
-    dsm: Dsm, cell: Int[np.ndarray, " n"], shared: Float[np.ndarray, " n"]
-) -> Dsm:
+def _add_shared(dsm: Dsm, cell: Int[np.ndarray, " n"], shared: Float[np.ndarray, " n"]) -> Dsm:
     """The model with the errors of the orientations in its σ; filled cells have those of the
     nearest cell with points."""
     shape = dsm.height.shape

@@ -7,7 +7,8 @@ its bias,
 
 of a rigorous image by the derivative of v = S·g (`refinement.kinds`) at the projected point, since
 v is the first Newton step towards it. The refined image is taken for the one that the unknowns
-belong to: it differs by their estimates, of which the product with an error is of second order.
+belong to: it differs by their estimates, of which the product with an error is of second order. But
+(l̂, ŝ) are those of the given coefficients: compensated ones have offsets and scales of their own.
 """
 
 import dataclasses
@@ -21,37 +22,43 @@ from jaxtyping import Array, Float
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.io.networks.orientation_covariance import OrientationCovariance, Unknown
 from jaxbundle.pushbroom.image import PushbroomImage
-from jaxbundle.pushbroom.rpc.bias import bias_terms
+from jaxbundle.pushbroom.rpc.bias import BiasDomain, bias_terms
 from jaxbundle.pushbroom.rpc.polynomials import Rpc, project
 from jaxbundle.refinement.freedom import Form, Freedom, make_form, names
 from jaxbundle.refinement.kinds import ScannerPoint, lines_of
 from jaxbundle.refinement.rpc_points import TERM_NAMES, names_of_terms
 from jaxbundle.system.programs import compile_once
+from jaxbundle.types import Scalar
 
 
 @dataclasses.dataclass(frozen=True)
 class GroundOrientation:
     """The unknowns of an image that are not held, their places among all that it may have, and the
-    joint covariance of the images of its refinement; `form`: of a rigorous image."""
+    joint covariance of the images of its refinement; `form`: of a rigorous image; `domain`: of an
+    image with RPC."""
 
     joint: OrientationCovariance
     unknowns: tuple[Unknown, ...]
     columns: tuple[int, ...]
     form: Form | None = None
+    domain: BiasDomain | None = None
 
 
 def _orientation(
-    joint: OrientationCovariance, every: tuple[Unknown, ...], form: Form | None = None
+    joint: OrientationCovariance,
+    every: tuple[Unknown, ...],
+    form: Form | None = None,
+    domain: BiasDomain | None = None,
 ) -> GroundOrientation:
     held = joint.index(every) < 0
     columns = tuple(np.flatnonzero(~held).tolist())
-    return GroundOrientation(joint, tuple(every[k] for k in columns), columns, form)
+    return GroundOrientation(joint, tuple(every[k] for k in columns), columns, form, domain)
 
 
-def rpc_orientation(joint: OrientationCovariance, id: str) -> GroundOrientation:
-    """Of an image with RPC."""
-    terms = names_of_terms(len(TERM_NAMES))
-    return _orientation(joint, tuple(("image", id, name) for name in terms))
+def rpc_orientation(joint: OrientationCovariance, id: str, domain: BiasDomain) -> GroundOrientation:
+    """Of an image with RPC; `domain` of the coefficients that were refined."""
+    every = tuple(("image", id, name) for name in names_of_terms(len(TERM_NAMES)))
+    return _orientation(joint, every, domain=domain)
 
 
 def scanner_orientation(
@@ -112,8 +119,10 @@ def _by_unknowns(
     return jax.vmap(jax.jacfwd(residual), (None, 0, 0))(jnp.zeros(number), X, lines)
 
 
-def bias_derivative(rpc: Rpc, longitude: Array, latitude: Array, h: Array) -> Float[Array, "2 12"]:
+def bias_derivative(
+    rpc: Rpc, domain: BiasDomain, longitude: Scalar, latitude: Scalar, h: Scalar
+) -> Float[Array, "2 12"]:
     """∂(sample, line) of one point by all terms of a bias, of lines before those of samples."""
-    terms = jnp.stack(bias_terms(rpc, *project(rpc, longitude, latitude, h)))
+    terms = jnp.stack(bias_terms(domain, *project(rpc, longitude, latitude, h)))
     none = jnp.zeros_like(terms)
     return jnp.stack([jnp.concatenate([none, terms]), jnp.concatenate([terms, none])])

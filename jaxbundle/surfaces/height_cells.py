@@ -70,12 +70,19 @@ class HeightGrid:
 
 
 class CellSource(Protocol):
-    """Cells that are read window by window."""
+    """Cells that are read window by window; attributes as of `HeightGrid`."""
 
-    x: float
-    y: float
-    size: float
-    system: str | None
+    @property
+    def x(self) -> float: ...
+
+    @property
+    def y(self) -> float: ...
+
+    @property
+    def size(self) -> float: ...
+
+    @property
+    def system(self) -> str | None: ...
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -96,14 +96,12 @@ class OrientedErrors:
         """Points, and the directions along which their errors count, in the images' coordinates."""
         if self.around is None or self.system is None:
             return X, direction
-        X = from_map(*X.T, self.around, self.system)
+        X = from_map(X[:, 0], X[:, 1], X[:, 2], self.around, self.system)
         J = map_derivative(X, self.around, self.system)
         return X, np.einsum("ni,nij->nj", direction, J)
 
 
-def oriented_errors(
-    chosen: ChosenImages, others: Set[str], system: str | None
-) -> OrientedErrors:
+def oriented_errors(chosen: ChosenImages, others: Set[str], system: str | None) -> OrientedErrors:
     """The errors of the chosen images; `others`: images whose errors belong to the same ones, of
     another surface of the same adjustment.
 

@@ -82,9 +82,7 @@ class RasterCells:
         inside &= row + self.shape[0] <= found.shape[0] and column + self.shape[1] <= found.shape[1]
         if not inside:
             raise InputError(f"{path}: does not have the cells of {self.path}")
-        cut = found.part(
-            slice(row, row + self.shape[0]), slice(column, column + self.shape[1])
-        )
+        cut = found.part(slice(row, row + self.shape[0]), slice(column, column + self.shape[1]))
         return dataclasses.replace(self, sigma=cut)
 
 

@@ -35,6 +35,7 @@ from jaxbundle.io.scanner.rpc_images import (
 from jaxbundle.photographs.places import utm_system
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.image_to_ground import locate_point
+from jaxbundle.pushbroom.rpc.bias import domain_of_bias
 from jaxbundle.pushbroom.rpc.polynomials import Rpc
 from jaxbundle.pushbroom.surfaces import Ground
 from jaxbundle.surfaces.cloud import Cloud
@@ -192,7 +193,8 @@ def _add_covariance(
     if joint is None:
         return
     if isinstance(orientation, Rpc):
-        view.orientation = rpc_orientation(joint, one.id)
+        domain = one.domain if one.domain is not None else domain_of_bias(orientation)
+        view.orientation = rpc_orientation(joint, one.id, domain)
     else:
         spacing = one.knot_spacing
         view.orientation = scanner_orientation(joint, one.id, one.sensor, *orientation, spacing)

@@ -23,6 +23,7 @@ from jaxbundle.io.networks.orientation_covariance import OrientationCovariance, 
 from jaxbundle.pushbroom.ground_to_image import make_search, project_near, project_points
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.image_to_ground import locate_point
+from jaxbundle.pushbroom.rpc.bias import BiasDomain
 from jaxbundle.pushbroom.rpc.polynomials import Rpc, locate, project
 from jaxbundle.pushbroom.surfaces import Height, Plane
 from jaxbundle.surfaces.ground_orientation import (
@@ -119,8 +120,10 @@ class RpcView(_GroundView):
 
     def derivative_by_orientation(self, X: Points) -> Float[np.ndarray, "n 2 k"]:
         """∂(u, v) by the unknowns."""
-        columns = [] if self.orientation is None else list(self.orientation.columns)
-        return run_in_lanes(_rpc_by_bias, self._frame, X)[:, :, columns]
+        if self.orientation is None or self.orientation.domain is None:
+            return np.zeros((len(X), 2, 0))
+        frame = (*self._frame, BiasDomain(*map(jnp.asarray, self.orientation.domain)))
+        return run_in_lanes(_rpc_by_bias, frame, X)[:, :, list(self.orientation.columns)]
 
     def range(self) -> tuple[float, float]:
         """The range of heights of the polynomials."""
@@ -158,7 +161,6 @@ class ScannerView(_GroundView):
     def derivative(self, X: Points) -> Float[np.ndarray, "n 2 3"]:
         places = np.nan_to_num(self.project(X) - np.array(self.shift))
         return run_in_lanes(_scanner_derivative, self._frame, X, places)
-
 
     def derivative_by_orientation(self, X: Points) -> Float[np.ndarray, "n 2 k"]:
         """∂(u, v) by the unknowns."""
@@ -220,10 +222,10 @@ def _rpc_derivative(
 
 @compile_once
 def _rpc_by_bias(
-    frame: tuple[Rpc, Neighbourhood], X: Float[Array, "n 3"]
+    frame: tuple[Rpc, Neighbourhood, BiasDomain], X: Float[Array, "n 3"]
 ) -> Float[Array, "n 2 terms"]:
-    rpc, around = frame
-    return jax.vmap(lambda X: bias_derivative(rpc, *around.geographic(X)))(X)
+    rpc, around, domain = frame
+    return jax.vmap(lambda X: bias_derivative(rpc, domain, *around.geographic(X)))(X)
 
 
 @compile_once

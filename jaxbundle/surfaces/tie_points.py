@@ -270,9 +270,7 @@ def _refine_pair(
     C = C * robust_sigma(rest[good] / predicted) ** 2
     back = np.linalg.inv(np.where(good[:, None, None], match.A, np.eye(2)))
     in_base = back @ C @ np.swapaxes(back, 1, 2)
-    out = _PairMatches(
-        np.zeros((n, 2)), np.zeros(n, bool), np.zeros((n, 2)), np.zeros((n, 2))
-    )
+    out = _PairMatches(np.zeros((n, 2)), np.zeros(n, bool), np.zeros((n, 2)), np.zeros((n, 2)))
     out.place[rows], out.good[rows] = match.uv, good
     for target, values in ((out.sigma, C), (out.in_base, in_base)):
         target[rows] = np.sqrt(np.einsum("nii->ni", values) / 2)

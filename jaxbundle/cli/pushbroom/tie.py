@@ -12,7 +12,7 @@ from jaxbundle.cli.pushbroom.app import pushbroom
 @pushbroom.command(example="refine.toml --out ties.csv")
 def tie(
     input: Annotated[
-        Path, typer.Argument(help="refine file, .toml (docs/pushbroom.md): its [images] are matched")
+        Path, typer.Argument(help="refine file, .toml (docs/pushbroom.md), for its [images]")
     ],
     out: Annotated[Path, typer.Option(help="CSV table for tie_points of the refine file")],
     spacing: Annotated[int, typer.Option(min=1, help="pixels between tie points")] = 200,

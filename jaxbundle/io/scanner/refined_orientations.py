@@ -8,6 +8,7 @@ folder.
 | `id`, `file` | the image; its refined scanner file, or its compensated coefficients |
 | `raster` | its pixels, beside the table or relative to it; empty if none was found |
 | `sensor`, `knot_spacing` | of a rigorous image: whose sensor it shares; of its jitter, seconds |
+| `line_offset` … `sample_scale` | of an image with RPC: of the coefficients given to `refine` |
 
 `precision.csv`: the covariance, in the form of that of photographs (`networks`), with the kinds
 `image` and `sensor` and the parameters of the report; radians, metres, pixels. σ are a posteriori.
@@ -33,18 +34,19 @@ from jaxbundle.io.scanner.refinement import RefineFile
 from jaxbundle.io.scanner.rpc_images import find_raster
 from jaxbundle.io.text.csv_tables import read_csv, write_csv
 from jaxbundle.network.columns import list_some
+from jaxbundle.pushbroom.rpc.bias import BiasDomain, domain_of_bias
 from jaxbundle.refinement import Refinement, RpcScannerImage
 from jaxbundle.refinement.freedom import UnknownName
 
 TABLE = "refined.csv"
-HEAD = ("id", "file", "raster", "sensor", "knot_spacing")
+HEAD = ("id", "file", "raster", "sensor", "knot_spacing", *BiasDomain._fields)
 KINDS = ("image", "sensor")
 
 
 @dataclasses.dataclass(frozen=True)
 class RefinedFile:
     """An image of a refinement: its file, its raster if it is where it was, the name of that, its
-    sensor, and the spacing of the knots of its jitter (s)."""
+    sensor, and the spacing of the knots of its jitter (s); `domain` of its bias, with RPC."""
 
     id: str
     file: Path
@@ -52,6 +54,7 @@ class RefinedFile:
     raster_name: str
     sensor: str
     knot_spacing: float
+    domain: BiasDomain | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,10 +97,11 @@ def write_refined_orientations(
         raster = find_raster(file.sources[one.id])
         known = "" if raster is None else os.path.relpath(raster, place)
         if isinstance(one, RpcScannerImage):
-            rows.append((one.id, f"{one.id}{file.rpc_ending}", known, "", ""))
+            domain = domain_of_bias(one.image.rpc)
+            rows.append((one.id, f"{one.id}{file.rpc_ending}", known, "", "", *domain))
         else:
             more = one.sensor or one.id, one.freedom.knot_spacing
-            rows.append((one.id, f"{one.id}.toml", known, *more))
+            rows.append((one.id, f"{one.id}.toml", known, *more, "", "", "", ""))
     write_csv(folder / TABLE, HEAD, rows)
     covariance = joint_covariance(result)
     if covariance is not None:
@@ -115,6 +119,7 @@ def read_refined_orientations(folder: Path) -> RefinedBlock | None:
     table = read_csv(path)
     table.check_names(HEAD)
     spacing, images = table.numbers("knot_spacing"), []
+    domains = np.stack([table.numbers(name) for name in BiasDomain._fields], 1)
     for k, (id, file, raster, sensor) in enumerate(zip(*(table.values[n] for n in HEAD[:4]))):
         refined = folder / file
         if not file or not refined.is_file():
@@ -123,7 +128,11 @@ def read_refined_orientations(folder: Path) -> RefinedBlock | None:
         knots = float(spacing[k]) if spacing[k] == spacing[k] else 1.0
         if not knots > 0:
             raise InputError(f"{table.source(k)}: knot_spacing is {knots:g}; seconds above 0")
-        images.append(RefinedFile(id, refined, pixels, Path(raster).name, sensor or id, knots))
+        domain = BiasDomain(*domains[k].tolist()) if np.isfinite(domains[k]).all() else None
+        if domain is not None and 0.0 in domain[1::2]:
+            raise InputError(f"{table.source(k)}: a scale is 0; those of the coefficients are not")
+        name = Path(raster).name
+        images.append(RefinedFile(id, refined, pixels, name, sensor or id, knots, domain))
     if not images:
         raise InputError(f"{path}: no image")
     covariance = None
@@ -133,9 +142,7 @@ def read_refined_orientations(folder: Path) -> RefinedBlock | None:
     return RefinedBlock(tuple(images), covariance)
 
 
-def _check_owners(
-    path: Path, images: list[RefinedFile], covariance: OrientationCovariance
-) -> None:
+def _check_owners(path: Path, images: list[RefinedFile], covariance: OrientationCovariance) -> None:
     """Refuse unknowns of images that are not there: the σ would be too small."""
     owners = {("image", one.id) for one in images} | {("sensor", one.sensor) for one in images}
     strange = sorted({f"{kind} {id}" for kind, id, _ in covariance.unknowns if
