@@ -197,7 +197,7 @@ def _points_that_count_as_one(
     both = group * len(cloud.images) + cloud.image
     order = np.argsort(both, kind="stable")
     keys, first, count = np.unique(both[order], return_index=True, return_counts=True)
-    uv = np.where(known[:, None], cloud.uv, np.inf)[order]
+    uv = np.where(np.expand_dims(known, 1), cloud.uv, np.inf)[order]
     with np.errstate(invalid="ignore"):
         reach = np.maximum.reduceat(uv, first) - np.minimum.reduceat(uv, first)
     independent = np.prod(1 + reach / window, axis=1)

@@ -13,7 +13,6 @@ belong to: it differs by their estimates, of which the product with an error is 
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,10 +24,10 @@ from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.rpc.bias import BiasDomain, bias_terms
 from jaxbundle.pushbroom.rpc.polynomials import Rpc, project
 from jaxbundle.refinement.freedom import Form, Freedom, make_form, names
-from jaxbundle.refinement.kinds import ScannerPoint, lines_of
+from jaxbundle.refinement.kinds import MeasuredLine, ScannerPoint, lines_of
 from jaxbundle.refinement.rpc_points import TERM_NAMES, names_of_terms
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import Scalar
+from jaxbundle.types import AnyArray, Scalar
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,9 +110,11 @@ def scanner_derivative(
 
 @compile_once
 def _by_unknowns(
-    kind: ScannerPoint, number: int, own: int, X: Float[Array, "n 3"], lines: eqx.Module
+    kind: ScannerPoint, number: int, own: int, X: Float[Array, "n 3"], lines: MeasuredLine
 ) -> Float[Array, "n 2 k"]:
-    def residual(p: Float[Array, " k"], X: Float[Array, "3"], line: eqx.Module) -> Array:
+    def residual(
+        p: Float[Array, " k"], X: Float[Array, "3"], line: MeasuredLine
+    ) -> Float[AnyArray, "2"]:
         return kind(p[:own], p[own:], X, line)
 
     return jax.vmap(jax.jacfwd(residual), (None, 0, 0))(jnp.zeros(number), X, lines)
