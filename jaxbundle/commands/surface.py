@@ -108,7 +108,8 @@ def surface(  # noqa: PLR0913 (public: the options of the command, all but one b
     **Arguments:**
 
     - `input`: a project or COLMAP folder of oriented photographs, whose files are in the folder
-      `photos`; or two or more scanner or RPC images.
+      `photos`; or two or more scanner or RPC images; or the folder of `pushbroom refine --out`,
+      whose covariance is then in the σ.
     - `pairs`: BASE,OTHER[,OTHER…], names; default: selected by geometry.
     - `zmin`, `zmax`: lowest and highest height searched; default: from the tie points, or from the
       range of the coefficients.

@@ -20,7 +20,7 @@ from jaxbundle.surfaces.dsm import make_dsm
 from jaxbundle.surfaces.height_cells import (
     CellSource,
     HeightGrid,
-    StatedErrors,
+    StatedSurfaceErrors,
     UncertainCells,
     align,
     middle_of,
@@ -68,7 +68,8 @@ class ChangeResult(TableMethods):
             f"(|w| > {found['limit']:.3g}) {100 * found['risen']:.3g} % have risen, "
             f"{100 * found['fallen']:.3g} % fallen",
             f"mean σ of a difference {found['mean_sigma']:.4g}; scatter of the cells over their "
-            f"own σ {found['sigma_ratio']:.3g} (1 is right)",
+            f"own σ {found['sigma_ratio']:.3g} (1 is right)"
+            + (", which are multiplied by it" if found["sigma_ratio"] > 1 else ""),
             f"errors of neighbours are correlated over {found['cells_that_count_as_one']:.3g} "
             f"cells; {count(found['shared_errors'], 'error')} common to cells"
             + ("" if found["shared_errors"] else NOTHING_SHARED),
@@ -225,7 +226,7 @@ def _with_errors(
 ) -> UncertainCells:
     """A surface with its shared errors: those of its orientations first."""
     given = {key: value for key, value in errors.items() if key != "cell"}
-    stated = StatedErrors(middle_of(cells), **given)
+    stated = StatedSurfaceErrors(middle_of(cells), **given)
     return UncertainCells(cells, (*(() if orientation is None else (orientation,)), stated))
 
 

@@ -117,7 +117,7 @@ class SharedErrors(Protocol):
 
 
 @dataclasses.dataclass(frozen=True)
-class StatedErrors:
+class StatedSurfaceErrors:
     """Stated errors of a surface: of a vertical shift, of a horizontal one (σ for each axis), of a
     tilt (radians, about each axis through the `middle`)."""
 
@@ -155,7 +155,7 @@ def stated_modes(
     grid: HeightGrid, vertical: float = 0.0, horizontal: float = 0.0, tilt: float = 0.0
 ) -> Modes:
     """The columns of L of stated errors of a whole surface."""
-    return StatedErrors(middle_of(grid), vertical, horizontal, tilt)(grid)
+    return StatedSurfaceErrors(middle_of(grid), vertical, horizontal, tilt)(grid)
 
 
 @dataclasses.dataclass(frozen=True)
