@@ -150,12 +150,11 @@ def check_away_from_poles(
         return
     latitude = y * 360.0 / system.turn
     if np.nanmax(np.abs(latitude)) > farthest:
-        north = np.nanmean(latitude) > 0
-        pole, ups = ("North", "EPSG:32661") if north else ("South", "EPSG:32761")
+        middle = float(np.nanmean(latitude))
         raise InputError(
-            f"the image is at the {pole} Pole, latitude to {np.nanmax(np.abs(latitude)):.4g}°, where "
-            f"a map in longitude and latitude falls apart; give --crs {ups} (Universal Polar "
-            "Stereographic)"
+            f"the image is at the {'North' if middle > 0 else 'South'} Pole, latitude to "
+            f"{np.nanmax(np.abs(latitude)):.4g}°, where a map in longitude and latitude falls "
+            f"apart; give --crs {utm_system(middle, 0.0)} (Universal Polar Stereographic)"
         )
 
 
