@@ -64,7 +64,7 @@ def town(side):
     return Scene(tuple(shapes), tuple(textures))
 
 
-def passes(pixels):
+def passes(pixels, pitches=PITCHES):
     """Scanner images that look at one place ahead and back."""
     optics = FocalLine(jnp.array([10_000.0, *np.zeros(10)]), jnp.float64(10_000 * GSD / ORBIT),
                        jnp.float64((pixels - 1) / 2), jnp.float64(0.0))  # fmt: skip
@@ -82,7 +82,7 @@ def passes(pixels):
 
     start = 0.7, 1.9
     target = middle(0.0, *start)
-    for pitch in PITCHES:
+    for pitch in pitches:
         place = np.array(start)
         for _ in range(4):
             off = middle(pitch, *place) - target

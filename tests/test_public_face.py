@@ -54,7 +54,7 @@ def test_a_function_takes_the_options_of_its_command(command):
 
 
 @pytest.mark.parametrize(
-    "command", ["info", "locate", "project", "correct", "simulate", "accuracy", "refine"]
+    "command", ["info", "locate", "project", "correct", "simulate", "accuracy", "refine", "tie"]
 )
 def test_every_command_of_line_scanners_is_a_function(command):
     function = getattr(jaxbundle.pushbroom, command)

@@ -25,10 +25,13 @@ SigmaFile = Annotated[
 ]
 Orientation = Annotated[
     Path | None,
-    typer.Option(help="project of its photographs, with the covariance of their orientations"),
+    typer.Option(
+        help="project of its photographs, or folder of pushbroom refine --out, with the covariance "
+        "of the orientations"
+    ),
 ]
 Images = Annotated[
-    str, typer.Option(metavar="PATTERNS", help="its photographs in that project: ids, with * and ,")
+    str, typer.Option(metavar="PATTERNS", help="its images in that project: ids, with * and ,")
 ]
 
 

@@ -32,7 +32,8 @@ def surface(  # noqa: PLR0913 - the options of the command
         list[Path],
         typer.Argument(
             help="project or COLMAP folder of oriented photographs; or at least two scanner or RPC "
-            "images (GeoTIFF with RPC tags or companion file, scanner files)"
+            "images (GeoTIFF with RPC tags or companion file, scanner files), or the folder of "
+            "pushbroom refine --out"
         ),
     ],
     out: Annotated[Path, typer.Option(help="folder for cloud, report, DSM")],

@@ -29,6 +29,7 @@ from jaxbundle.io.scanner.rpc import read_stated_errors
 from jaxbundle.io.scanner.rpc_images import IMAGES, RpcInput, find_coefficients
 from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.writing.fingerprints import files_read, of_words
+from jaxbundle.io.writing.replacing import remove_left_behind
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.pushbroom.ground_to_image import make_search
 from jaxbundle.pushbroom.image import PushbroomImage
@@ -157,6 +158,9 @@ def correct(  # noqa: PLR0913 (public: the options of the command, all but three
         None if checkpoint is None else Path(checkpoint),
         of_words([made, repr(correction), repr(height)]),
     ) as kept:
+        if kept is not None:
+            # no other process makes this map: the checkpoint is locked
+            remove_left_behind(out)
         write_corrected(
             picture,
             out,

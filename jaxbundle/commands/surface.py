@@ -108,7 +108,8 @@ def surface(  # noqa: PLR0913 (public: the options of the command, all but one b
     **Arguments:**
 
     - `input`: a project or COLMAP folder of oriented photographs, whose files are in the folder
-      `photos`; or two or more scanner or RPC images.
+      `photos`; or two or more scanner or RPC images; or the folder of `pushbroom refine --out`,
+      whose covariance is then in the σ.
     - `pairs`: BASE,OTHER[,OTHER…], names; default: selected by geometry.
     - `zmin`, `zmax`: lowest and highest height searched; default: from the tie points, or from the
       range of the coefficients.
@@ -190,9 +191,9 @@ def _match_ground_images(
     say: Callable[[str], object],
 ) -> _Matched:
     """Scanner or RPC images: the surface is in the coordinates of a map."""
-    if len(inputs) < 2:
-        raise InputError(f"{inputs[0]}: one image; a surface needs at least two")
     views, around = read_ground_views(inputs, photos)
+    if len(views) < 2:
+        raise InputError(f"{inputs[0]}: one image; a surface needs at least two")
     bounds, messages = ground_bounds(views, heights)
     messages = (*messages, *align_all(views, bounds))
     if around is not None and crs is not None:

@@ -39,7 +39,10 @@ class MapPositions(NamedTuple):
 
 
 def utm_system(latitude: float, longitude: float) -> str:
-    """The EPSG code of the zone of UTM of a place."""
+    """The EPSG code of the zone of UTM of a place; beyond 84° N and 80° S, where these end, of the
+    Universal Polar Stereographic system (NGA.STND.0037)."""
+    if not -80 <= latitude <= 84:
+        return "EPSG:32661" if latitude > 0 else "EPSG:32761"
     zone = int((longitude + 180) // 6) % 60 + 1
     # 326zz north, 327zz south of the equator (EPSG registry, WGS 84 / UTM)
     return f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}"

@@ -30,6 +30,7 @@ _HOME = {
         "ScannerInfo",
         "info",
     ),
+    "jaxbundle.commands.scanner_ties": ("tie",),
     "jaxbundle.commands.scanner_tables": (
         "ScannerTable",
         "accuracy",

@@ -10,6 +10,7 @@ from jaxbundle.commands.scanner_tables import ScannerTable as ScannerTable
 from jaxbundle.commands.scanner_tables import accuracy as accuracy
 from jaxbundle.commands.scanner_tables import locate as locate
 from jaxbundle.commands.scanner_tables import project as project
+from jaxbundle.commands.scanner_ties import tie as tie
 from jaxbundle.pushbroom import rpc as rpc
 from jaxbundle.pushbroom.ancillary import attitude_table as attitude_table
 from jaxbundle.pushbroom.ancillary import position_table as position_table
@@ -150,6 +151,7 @@ __all__ = [
     "spread_positions",
     "state_orbit",
     "take_image",
+    "tie",
     "to_earth",
     "true_image",
     "turn_positions",

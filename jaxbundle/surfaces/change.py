@@ -20,11 +20,18 @@ cells, by the distance of these (windows of matching overlap, filters smooth):
 
     V = a·Σ d'ᵢ,     σ_V² = a²·(ΣΣ ρᵢⱼ·σᵢ·σⱼ + |Σ (L·P^½)ᵢ|²).
 
-ρ is estimated from d'/σ of unchanged cells. With ρ a cell counts as 1/Σρ of one for t̂.
+ρ is estimated from d'/σ of unchanged cells. With ρ a cell counts as 1/Σρ of one for t̂. The scatter
+of d'/σ, by the median, multiplies the σ of cells if it is above 1: σ that are too small would call
+more than α·n unchanged cells changed.
+
+Cells are read and computed tile by tile, since the columns of L of a large surface would not be in
+memory: once for the sums of t̂, once for d', σ and w, and again for the tiles of regions; ρ and the
+scatter of the cells are those of some tiles.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -35,68 +42,10 @@ from scipy.stats import norm
 
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
+from jaxbundle.surfaces.height_cells import CellSource, Grid, Modes
 from jaxbundle.surfaces.scatter import robust_sigma
 
-Grid = Float[np.ndarray, "rows columns"]
-
-
-@print_in_one_screen
-@dataclasses.dataclass(frozen=True)
-class HeightGrid:
-    """Heights of square cells, NaN: none, with the σ of their own and the columns of L, `shared`
-    [k, rows, columns], in units of the heights; `x`, `y`: outer corner of the first cell."""
-
-    height: Grid
-    sigma: Grid
-    x: float
-    y: float
-    size: float
-    system: str | None = None
-    shared: Float[np.ndarray, "k rows columns"] | None = None
-
-    @property
-    def modes(self) -> Float[np.ndarray, "k rows columns"]:
-        """The columns of L, none without shared errors."""
-        return np.zeros((0, *self.height.shape)) if self.shared is None else self.shared
-
-    def window(self, rows: slice, columns: slice) -> "HeightGrid":
-        """A part of it."""
-        return dataclasses.replace(
-            self,
-            height=self.height[rows, columns],
-            sigma=self.sigma[rows, columns],
-            x=self.x + columns.start * self.size,
-            y=self.y - rows.start * self.size,
-            shared=self.modes[:, rows, columns],
-        )
-
-    def slopes(self) -> Float[np.ndarray, "2 rows columns"]:
-        """∂z/∂x and ∂z/∂y, 0 beside gaps."""
-        down, right = (
-            np.gradient(self.height, self.size, axis=axis)
-            if self.height.shape[axis] > 1
-            else np.zeros_like(self.height)
-            for axis in (0, 1)
-        )
-        return np.nan_to_num(np.stack([right, -down]))
-
-
-def stated_modes(
-    grid: HeightGrid, vertical: float = 0.0, horizontal: float = 0.0, tilt: float = 0.0
-) -> Float[np.ndarray, "k rows columns"]:
-    """The columns of L of stated errors: of a vertical shift, of a horizontal one (σ for each
-    axis), of a tilt (radians, about each axis through the middle)."""
-    rows, columns = grid.height.shape
-    modes = []
-    if vertical:
-        modes.append(np.full((rows, columns), vertical))
-    if horizontal:
-        modes += [-horizontal * slope for slope in grid.slopes()]
-    if tilt:
-        east = (np.arange(columns) - (columns - 1) / 2) * grid.size
-        north = ((rows - 1) / 2 - np.arange(rows)) * grid.size
-        modes += [tilt * np.broadcast_to(v, (rows, columns)) for v in (east, north[:, None])]
-    return np.stack(modes) if modes else np.zeros((0, rows, columns))
+Cells = Bool[np.ndarray, "rows columns"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,7 +67,8 @@ class SurfaceChange:
     the shared errors that stable ground shows), its `sigma`; `sign` of significant cells, −1, 0, 1.
 
     `limit`: of |w| = |difference|/σ at the `level`; `correlation`: cells that count as one, Σρ;
-    `sigma_ratio`: scatter of the cells without shared errors, over their σ, 1 if these are right;
+    `sigma_ratio`: scatter of the cells without shared errors, over their given σ, 1 if these are
+    right; σ are multiplied by it if it is larger;
     `modes`: shared errors; `total` and `regions`: volumes."""
 
     difference: Grid
@@ -137,7 +87,7 @@ class SurfaceChange:
     regions: tuple[Region, ...] = ()
 
     @property
-    def known(self) -> Bool[np.ndarray, "rows columns"]:
+    def known(self) -> Cells:
         """Which cells have both heights."""
         return np.isfinite(self.difference)
 
@@ -161,18 +111,110 @@ class ChangeSettings:
     """Cells of the smallest region of significant ones that is listed: 3 × 3."""
     most_regions: int = 50
     """Regions that are listed, the largest volumes first."""
+    enlarge_sigma: bool = True
+    """Whether the given σ of cells are multiplied by their scatter, if that is above 1."""
+    tile_numbers: int = 1 << 25
+    """Numbers of a tile in memory, 8 bytes each: 256 MB. A cell has about sixteen, and four for
+    each error that cells share. Smaller tiles read more cells twice, at their edges."""
+    sampled_tiles: int = 16
+    """Tiles of which ρ and the scatter of the cells are estimated, evenly spread: of a million
+    cells each, of which some ten thousand are independent even with the longest ρ."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Tile:
+    """Cells of both surfaces: differences, their own σ, L, which are known; `rows`, `columns`:
+    their place, `core`: the place in them of those that no other tile has."""
+
+    d: Grid
+    own: Grid
+    L: Modes
+    known: Cells
+    rows: slice
+    columns: slice
+    core: tuple[slice, slice]
+
+    @property
+    def place(self) -> tuple[slice, slice]:
+        """Where the core is in the whole."""
+        return tuple(
+            slice(part.start + core.start, part.start + core.stop)
+            for part, core in zip((self.rows, self.columns), self.core)
+        )  # type: ignore[return-value] of two
+
+
+@dataclasses.dataclass(frozen=True)
+class _Tiles:
+    """Both surfaces in tiles of `side` cells."""
+
+    before: CellSource
+    after: CellSource
+    same_errors: bool
+    side: int
+    margin: int
+
+    @property
+    def corners(self) -> list[tuple[int, int]]:
+        """The first cell of every tile."""
+        rows, columns = (range(0, n, self.side) for n in self.before.shape)
+        return [(r, c) for r in rows for c in columns]
+
+    def parts(self, corner: tuple[int, int], margin: int) -> tuple[slice, slice]:
+        """The cells of a tile with some around."""
+        rows, columns = (
+            slice(max(first - margin, 0), min(first + self.side + margin, n))
+            for first, n in zip(corner, self.before.shape)
+        )
+        return rows, columns
+
+    def read(self, corner: tuple[int, int]) -> _Tile:
+        """A tile, with cells around it."""
+        rows, columns = self.parts(corner, self.margin)
+        inner = self.parts(corner, 0)
+        core = tuple(
+            slice(i.start - o.start, i.stop - o.start) for i, o in zip(inner, (rows, columns))
+        )
+        before, after = self.before.window(rows, columns), self.after.window(rows, columns)
+        d, own = after.height - before.height, np.hypot(before.sigma, after.sigma)
+        with np.errstate(invalid="ignore"):
+            known = np.isfinite(d) & (own > 0)
+        d, own = np.where(known, d, np.nan), np.where(known, own, np.nan)
+        one, two = before.modes, after.modes
+        L = two - one if self.same_errors else np.concatenate([one, two])
+        return _Tile(d, own, np.where(known, L, 0.0), known, rows, columns, core)  # type: ignore[arg-type] of two
+
+
+@dataclasses.dataclass
+class _NormalEquations:
+    """LᵀΣ⁻¹L and LᵀΣ⁻¹d of some cells, and their number."""
+
+    matrix: Float[np.ndarray, "k k"]
+    right: Float[np.ndarray, " k"]
+    cells: int = 0
+
+    def add(self, tile: _Tile, cells: Cells) -> None:
+        A = (tile.L[:, cells] / tile.own[cells]).T
+        self.matrix += A.T @ A
+        self.right += A.T @ (tile.d[cells] / tile.own[cells])
+        self.cells += int(cells.sum())
+
+    def solve(self, together: float) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
+        """t̂ and P; `together` of the cells count as one."""
+        P = np.linalg.inv(np.eye(len(self.right)) + self.matrix / together)
+        return P @ self.right / together, P
 
 
 def find_change(
-    before: HeightGrid,
-    after: HeightGrid,
+    before: CellSource,
+    after: CellSource,
     level: float = 0.05,
-    stable: Bool[np.ndarray, "rows columns"] | None = None,
+    stable: Cells | None = None,
     labels: Int[np.ndarray, "rows columns"] | None = None,
     same_errors: bool = False,
     settings: ChangeSettings = ChangeSettings(),
 ) -> SurfaceChange:
-    """The change between two grids of the same cells (`align`).
+    """The change between two surfaces of the same cells (`height_cells.align`), in memory
+    (`HeightGrid`) or in files.
 
     **Arguments:** `level` of significance; `stable`: cells known to be unchanged; `labels`: regions
     whose volumes are computed, 0 for none; by default those of significant cells of one sign;
@@ -182,43 +224,39 @@ def find_change(
     """
     if not 0 < level < 1:
         raise InputError(f"--level {level:g}: between 0 and 1 is expected, such as 0.05")
-    d = after.height - before.height
-    known = np.isfinite(d)
-    if not known.any():
-        raise InputError("the two surfaces have no cell in common with heights of both")
-    own = np.hypot(before.sigma, after.sigma)
-    known &= own > 0
-    if not known.any():
-        raise InputError("no common cell has a σ above 0 of both surfaces; give them")
-    d, own = np.where(known, d, np.nan), np.where(known, own, np.nan)
-    if same_errors and len(before.modes) != len(after.modes):
+    if same_errors and before.shared_errors != after.shared_errors:
         raise InputError("the shared errors of both surfaces are not those of one adjustment")
-    L = after.modes - before.modes if same_errors else np.concatenate([before.modes, after.modes])
-    L = np.where(known, L, 0.0)
-    # first what correlates errors of cells: what shared errors explain is none of it
-    t, _ = _shared_errors(d, own, L, known, 1.0)
-    rest = (d - np.tensordot(t, L, 1)) / own
-    quiet = known & (np.abs(rest) < 3 * max(robust_sigma(rest[known]), 1e-300))
-    rho = correlation_of(np.where(quiet, rest, 0.0), quiet, settings)
-    together = float(rho.sum())
-    P = np.eye(len(L))
+    k = max(before.shared_errors, after.shared_errors)
+    k = k if same_errors else before.shared_errors + after.shared_errors
+    side = int(np.sqrt(settings.tile_numbers / (16 + 4 * k)))
+    # a tile of which the cells around are most would be slow
+    tiles = _Tiles(before, after, same_errors, max(side, 8 * settings.reach), settings.reach)
+    read = lru_cache(1)(tiles.read)
+    every, quiet = (_NormalEquations(np.zeros((k, k)), np.zeros(k)) for _ in range(2))
+    usable = _sum_up(tiles, read, every, quiet, stable)
+    rho, ratio = _scatter_of(usable, read, every.solve(1.0)[0], settings)
+    together, scale = float(rho.sum()), max(ratio, 1.0) if settings.enlarge_sigma else 1.0
+    t, P = np.zeros(k), np.eye(k)
     if stable is not None:
-        if not (known & stable).any():
-            raise InputError("--stable: no stable cell has heights of both surfaces")
-        t, P = _shared_errors(d, own, L, known & stable, together)
-        d = d - np.tensordot(t, L, 1)
-    LP = np.tensordot(_root(P).T, L, 1)
-    sigma = np.sqrt(own**2 + np.sum(LP**2, axis=0))
+        t, P = quiet.solve(together * scale**2)
+    reduction = _Reduction(t, _root(P).T, scale)
     limit = float(norm.ppf(1 - level / 2))
-    with np.errstate(invalid="ignore"):
-        sign = np.where(np.abs(d) > limit * sigma, np.sign(d), 0).astype(np.int8)
-    sign[~known] = 0
-    volume = lambda label, cells: _volume(label, cells, (d, own, LP), rho, before.size)
+    # of several tiles in single precision: half the memory, and 1e-7 of a difference
+    dtype = np.float64 if len(tiles.corners) == 1 else np.float32
+    d, sigma = (np.full(before.shape, np.nan, dtype) for _ in range(2))
+    sign, total = np.zeros(before.shape, np.int8), _VolumeSums(0, k)
+    for corner in usable:
+        tile = read(corner)
+        found, own, LP = reduction(tile)
+        s = np.sqrt(own**2 + np.sum(LP**2, axis=0))
+        with np.errstate(invalid="ignore"):
+            sure = np.where(np.abs(found) > limit * s, np.sign(found), 0)
+        d[tile.place], sigma[tile.place] = found[tile.core], s[tile.core]
+        sign[tile.place] = np.where(tile.known, sure, 0)[tile.core]
+        total.add(tile.core, (found, own, LP), tile.known, rho)
     if labels is None:
-        regions = _significant_regions(sign, d, settings, volume)
-    else:
-        numbers = [int(k) for k in np.unique(labels[known]) if k]
-        regions = tuple(volume(k, known & (labels == k)) for k in numbers)
+        labels = _significant_labels(sign, d, settings)
+    regions = _volumes(labels, usable, tiles, read, reduction, rho)
     return SurfaceChange(
         d,
         sigma,
@@ -230,42 +268,122 @@ def find_change(
         level,
         limit,
         together,
-        float(robust_sigma(rest[quiet])),
-        len(L),
-        volume(0, known),
+        ratio,
+        k,
+        total.region(before.size),
         regions,
     )
 
 
-def _shared_errors(
-    d: Grid,
-    own: Grid,
-    L: Float[np.ndarray, "k rows columns"],
-    cells: Bool[np.ndarray, "rows columns"],
-    together: float,
-) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
-    """t̂ and P from the differences of some cells; `together` of them count as one."""
-    A = (L[:, cells] / own[cells]).T
-    P = np.linalg.inv(np.eye(len(L)) + A.T @ A / together)
-    return P @ A.T @ (d[cells] / own[cells]) / together, P
+@dataclasses.dataclass(frozen=True)
+class _Reduction:
+    """The shared errors that are known, t̂, and P^½; by what the σ of cells are multiplied."""
+
+    t: Float[np.ndarray, " k"]
+    root: Float[np.ndarray, "k k"]
+    scale: float
+
+    def __call__(self, tile: _Tile) -> tuple[Grid, Grid, Modes]:
+        """d', the σ of cells, and L·P^½ of a tile."""
+        d = tile.d - np.tensordot(self.t, tile.L, 1)
+        return d, self.scale * tile.own, np.tensordot(self.root, tile.L, 1)
+
+
+def _volumes(
+    labels: Int[np.ndarray, "rows columns"],
+    usable: list[tuple[int, int]],
+    tiles: _Tiles,
+    read: Callable[[tuple[int, int]], _Tile],
+    reduction: _Reduction,
+    rho: Float[np.ndarray, "m m"],
+) -> tuple[Region, ...]:
+    """The volumes of regions, in the order of their labels."""
+    sums = {}
+    for corner in usable:
+        if not labels[tiles.parts(corner, 0)].any():
+            continue
+        tile = read(corner)
+        reduced = reduction(tile)
+        mine = np.where(tile.known, labels[tile.rows, tile.columns], 0)
+        for label in np.unique(mine[tile.core]).tolist():
+            if label:
+                one = sums.setdefault(label, _VolumeSums(label, len(reduction.t)))
+                one.add(tile.core, reduced, mine == label, rho)
+    return tuple(sums[label].region(tiles.before.size) for label in sorted(sums))
+
+
+def _sum_up(
+    tiles: _Tiles,
+    read: Callable[[tuple[int, int]], _Tile],
+    every: _NormalEquations,
+    quiet: _NormalEquations,
+    stable: Cells | None,
+) -> list[tuple[int, int]]:
+    """The normal equations of t̂ of all cells and of stable ones; the tiles with known cells."""
+    usable, heights = [], False
+    for corner in tiles.corners:
+        tile = read(corner)
+        core = np.zeros_like(tile.known)
+        core[tile.core] = tile.known[tile.core]
+        heights = heights or bool(core.any())
+        if not core.any():
+            continue
+        usable.append(corner)
+        every.add(tile, core)
+        if stable is not None:
+            quiet.add(tile, core & stable[tile.rows, tile.columns])
+    if not usable:
+        raise InputError(
+            "the two surfaces have no cell in common with heights of both and a σ above 0"
+        )
+    if stable is not None and not quiet.cells:
+        raise InputError("--stable: no stable cell has heights of both surfaces")
+    return usable
+
+
+def _scatter_of(
+    usable: list[tuple[int, int]],
+    read: Callable[[tuple[int, int]], _Tile],
+    t: Float[np.ndarray, " k"],
+    settings: ChangeSettings,
+) -> tuple[Float[np.ndarray, "2*reach+1 2*reach+1"], float]:
+    """ρ of cells by their distance, and the scatter of cells over their σ, from some tiles: without
+    what shared errors explain, which is no correlation of cells."""
+    number = min(len(usable), settings.sampled_tiles)
+    chosen = [usable[k] for k in np.unique(np.linspace(0, len(usable) - 1, number).astype(int))]
+    fields = []
+    for corner in chosen:
+        tile = read(corner)
+        rest = ((tile.d - np.tensordot(t, tile.L, 1)) / tile.own)[tile.core]
+        fields.append(rest if len(chosen) == 1 else rest.astype(np.float32))
+    of_cells = np.concatenate([f[np.isfinite(f)] for f in fields])
+    most = 3 * max(robust_sigma(of_cells), 1e-300)
+    with np.errstate(invalid="ignore"):
+        quiet = [np.abs(f) < most for f in fields]
+    rho = correlation_of([np.where(q, f, 0.0) for f, q in zip(fields, quiet)], quiet, settings)
+    return rho, float(robust_sigma(np.concatenate([f[q] for f, q in zip(fields, quiet)])))
 
 
 def correlation_of(
-    w: Grid, known: Bool[np.ndarray, "rows columns"], settings: ChangeSettings = ChangeSettings()
+    w: Grid | list[Grid],
+    known: Cells | list[Cells],
+    settings: ChangeSettings = ChangeSettings(),
 ) -> Float[np.ndarray, "2*reach+1 2*reach+1"]:
-    """ρ of errors by the distance of cells, 1 in the middle, from normalised residuals.
+    """ρ of errors by the distance of cells, 1 in the middle, from normalised residuals of a grid,
+    or of several parts.
 
     Products are averaged over all pairs of known cells at a distance. Beyond the first distance
     where their mean around the middle is below the least correlation they are 0.
     """
-    reach = min(settings.reach, *(n - 1 for n in w.shape))
-    w = np.where(known, w, 0.0)
-    pairs = lambda a: fftconvolve(a, a[::-1, ::-1], "full")[
-        w.shape[0] - 1 - reach : w.shape[0] + reach, w.shape[1] - 1 - reach : w.shape[1] + reach
-    ]
-    number = np.round(pairs(known.astype(float)))
+    parts = list(zip(w, known)) if isinstance(w, list) else [(w, known)]
+    shape = np.max([np.shape(a) for a, _ in parts], axis=0)
+    reach = min(settings.reach, *(n - 1 for n in shape))
+    total, number = np.zeros((2, 2 * reach + 1, 2 * reach + 1))
+    for a, inside in parts:
+        total += _pairs(np.where(inside, a, 0.0), reach)
+        number += np.round(_pairs(np.asarray(inside, float), reach))
     with np.errstate(invalid="ignore", divide="ignore"):
-        rho = np.where(number > 0, pairs(w) / number, 0.0)
+        rho = np.where(number > 0, total / number, 0.0)
     middle = rho[reach, reach]
     rho = rho / middle if middle > 0 else np.zeros_like(rho)
     k = np.arange(-reach, reach + 1)
@@ -278,50 +396,92 @@ def correlation_of(
     return np.maximum(rho, 0.0)
 
 
-def _volume(
-    label: int,
-    cells: Bool[np.ndarray, "rows columns"],
-    given: tuple[Grid, Grid, Float[np.ndarray, "k rows columns"]],
-    rho: Float[np.ndarray, "m m"],
-    size: float,
-) -> Region:
-    """The volume of some cells."""
-    rows, columns = (np.flatnonzero(cells.any(axis)) for axis in (1, 0))
-    part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-    inside = cells[part]
-    d, own, L = (np.where(inside, a[..., *part], 0.0) for a in given)
-    # ΣΣ ρᵢⱼ·σᵢ·σⱼ by one convolution
-    variance = float(np.sum(own * fftconvolve(own, rho, "same"))) if min(own.shape) > 0 else 0.0
-    if min(own.shape) < len(rho):
-        variance = float(np.sum(own * ndimage.convolve(own, rho, mode="constant")))
-    shared = L.sum((1, 2))
-    number, a = int(inside.sum()), size**2
-    return Region(
-        label,
-        number,
-        number * a,
-        float(d.sum() / number),
-        float(a * d.sum()),
-        float(a * np.sqrt(max(variance, 0.0) + shared @ shared)),
-    )
+def _pairs(a: Grid, reach: int) -> Float[np.ndarray, "m m"]:
+    """Sums of the products of all pairs of cells by their distance."""
+    a = np.pad(a, [(0, max(reach + 1 - n, 0)) for n in a.shape])
+    around = tuple(slice(n - 1 - reach, n + reach) for n in a.shape)
+    return fftconvolve(a, a[::-1, ::-1], "full")[around]
 
 
-def _significant_regions(
-    sign: Int[np.ndarray, "rows columns"], d: Grid, settings: ChangeSettings, volume: Any
-) -> tuple[Region, ...]:
-    """The volumes of connected significant cells of one sign, the largest first."""
-    found = []
+class _VolumeSums:
+    """The sums over the cells of a region: their number, d, L·P^½, and ΣΣ ρᵢⱼ·σᵢ·σⱼ."""
+
+    def __init__(self, label: int, k: int) -> None:
+        self.label, self.cells, self.sum, self.variance = label, 0, 0.0, 0.0
+        self.shared = np.zeros(k)
+
+    def add(
+        self,
+        inner: tuple[slice, slice],
+        reduced: tuple[Grid, Grid, Modes],
+        cells: Cells,
+        rho: Float[np.ndarray, "m m"],
+    ) -> None:
+        """Add those `cells` of a reduced tile that are in its `inner` part, and their pairs with
+        all cells."""
+        d, sigma, LP = reduced
+        core = np.zeros_like(cells)
+        core[inner] = cells[inner]
+        if not core.any():
+            return
+        reach = len(rho) // 2
+        part = tuple(
+            slice(max(at[0] - reach, 0), at[-1] + reach + 1)
+            for at in (np.flatnonzero(core.any(axis)) for axis in (1, 0))
+        )
+        core, cells = core[part], cells[part]
+        own = np.where(cells, sigma[part], 0.0)
+        self.cells += int(core.sum())
+        self.sum += float(np.sum(d[part], where=core))
+        self.shared += np.sum(LP[:, *part], axis=(1, 2), where=core)
+        # ΣΣ ρᵢⱼ·σᵢ·σⱼ by one convolution
+        if min(own.shape) < len(rho):
+            beside = ndimage.convolve(own, rho, mode="constant")
+        else:
+            beside = fftconvolve(own, rho, "same")
+        self.variance += float(np.sum(own * beside, where=core))
+
+    def region(self, size: float) -> Region:
+        """The volume."""
+        a = size**2
+        variance = max(self.variance, 0.0) + self.shared @ self.shared
+        mean, volume = self.sum / self.cells, a * self.sum
+        sigma = float(a * np.sqrt(variance))
+        return Region(self.label, self.cells, self.cells * a, mean, volume, sigma)
+
+
+def _significant_labels(
+    sign: Int[np.ndarray, "rows columns"], d: Grid, settings: ChangeSettings
+) -> Int[np.ndarray, "rows columns"]:
+    """Connected significant cells of one sign, numbered from the largest sum of differences on."""
+    kept, found = np.zeros(sign.shape, np.int32), []
     for wanted in (1, -1):
         labels, number = ndimage.label(sign == wanted, np.ones((3, 3)))
-        cells = np.bincount(labels.ravel(), minlength=number + 1)
-        sums = ndimage.sum_labels(np.nan_to_num(d), labels, np.arange(number + 1))
-        found += [
-            (abs(sums[k]), labels == k)
-            for k in np.argsort(-np.abs(sums))[: settings.most_regions + 1]
-            if k and cells[k] >= settings.least_cells
-        ]
+        cells, sums = np.zeros(number + 1, int), np.zeros(number + 1)
+        for rows in _bands(len(sign)):
+            flat = labels[rows].ravel()
+            cells += np.bincount(flat, minlength=number + 1)
+            sums += np.bincount(flat, np.nan_to_num(d[rows]).ravel(), minlength=number + 1)
+        sums[0] = 0.0
+        large = [k for k in np.argsort(-np.abs(sums)) if k and cells[k] >= settings.least_cells]
+        mine = np.zeros(number + 1, np.int32)
+        for k in large[: settings.most_regions]:
+            found.append((abs(sums[k]), len(found) + 1))
+            mine[k] = len(found)
+        for rows in _bands(len(sign)):
+            kept[rows] += mine[labels[rows]]
     found.sort(key=lambda pair: -pair[0])
-    return tuple(volume(k, cells) for k, (_, cells) in enumerate(found[: settings.most_regions], 1))
+    order = np.zeros(len(found) + 1, np.int32)
+    for place, (_, number) in enumerate(found[: settings.most_regions], 1):
+        order[number] = place
+    for rows in _bands(len(sign)):
+        kept[rows] = order[kept[rows]]
+    return kept
+
+
+def _bands(rows: int, together: int = 512) -> Iterator[slice]:
+    """Some rows at a time: of 10 000 cells each, 40 MB."""
+    return (slice(k, min(k + together, rows)) for k in range(0, rows, together))
 
 
 def _root(P: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
@@ -330,51 +490,21 @@ def _root(P: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
     return vectors * np.sqrt(np.maximum(values, 0.0))
 
 
-def align(
-    before: HeightGrid, after: HeightGrid, more: Sequence[HeightGrid] = ()
-) -> tuple[HeightGrid, ...]:
-    """The common cells of grids, of the first two and `more`.
-
-    **Raises:** `InputError` if they are not on one lattice, or do not overlap.
-    """
-    grids = before, after, *more
-    places = []
-    for grid in grids:
-        at = (before.y - grid.y) / before.size, (grid.x - before.x) / before.size
-        # a hundredth of a cell over the whole grid
-        longer = abs(grid.size / before.size - 1) * max(grid.height.shape)
-        if longer > 0.01 or max(abs(v - round(v)) for v in at) > 0.01:
-            raise InputError(
-                f"the cells of {grid.size:g} from ({grid.x:.10g}, {grid.y:.10g}) are not those of "
-                f"{before.size:g} from ({before.x:.10g}, {before.y:.10g}); make both with the same "
-                "--dsm, whose edges are multiples of it, or resample one (gdalwarp -tap -tr)"
-            )
-        places.append((round(at[0]), round(at[1])))
-    first = [max(p[k] for p in places) for k in (0, 1)]
-    last = [min(p[k] + g.height.shape[k] for p, g in zip(places, grids)) for k in (0, 1)]
-    if min(last[k] - first[k] for k in (0, 1)) < 1:
-        raise InputError("the two surfaces do not overlap: check their coordinate systems")
-    return tuple(
-        grid.window(*(slice(first[k] - p[k], last[k] - p[k]) for k in (0, 1)))
-        for grid, p in zip(grids, places)
-    )
-
-
 def summary(change: SurfaceChange) -> Mapping[str, Any]:
     """Figures of a change, for JSON."""
-    number = int(change.known.sum())
-    signs = change.sign[change.known]
+    number = change.total.cells
+    risen, fallen = (int(np.count_nonzero(change.sign == sign)) for sign in (1, -1))
     return {
         "cells": number,
         "level": change.level,
         "limit": change.limit,
-        "significant": float(np.mean(signs != 0)),
-        "risen": float(np.mean(signs > 0)),
-        "fallen": float(np.mean(signs < 0)),
+        "significant": (risen + fallen) / number,
+        "risen": risen / number,
+        "fallen": fallen / number,
         "shared_errors": change.modes,
         "cells_that_count_as_one": change.correlation,
         "sigma_ratio": change.sigma_ratio,
-        "mean_sigma": float(np.nanmean(change.sigma)),
+        "mean_sigma": float(np.nanmean(change.sigma, dtype=float)),
         "total": dataclasses.asdict(change.total),
         "regions": [dataclasses.asdict(region) for region in change.regions],
     }

@@ -17,7 +17,8 @@ from jaxbundle.results import data_frame
 class Cloud:
     """Points X [n, 3] with covariance, object unit; `rays`; `image`, index into `images`, and `uv`,
     the pixel of that base image; `colour` red, green, blue. `system`: coordinate system, if it
-    is a map system."""
+    is a map system. `shared`: the part of the variance of Z that is of the orientations of the
+    images, which points share; None: none, or not known."""
 
     X: Float[np.ndarray, "n 3"]
     covariance: Float[np.ndarray, "n 3 3"]
@@ -27,6 +28,7 @@ class Cloud:
     images: tuple[str, ...]
     colour: UInt8[np.ndarray, "n 3"] | None = None
     system: str | None = None
+    shared: Float[np.ndarray, " n"] | None = None
 
     def __post_init__(self) -> None:
         n = len(self.X)
@@ -61,8 +63,11 @@ class Cloud:
         """Some of the points."""
         fields = ("X", "covariance", "rays", "image", "uv")
         some = {name: getattr(self, name)[rows] for name in fields}
-        colour = None if self.colour is None else self.colour[rows]
-        return dataclasses.replace(self, **some, colour=colour)
+        more = {
+            name: None if (given := getattr(self, name)) is None else given[rows]
+            for name in ("colour", "shared")
+        }
+        return dataclasses.replace(self, **some, **more)
 
 
 def empty_cloud(image: str) -> Cloud:
@@ -89,4 +94,5 @@ def merge(clouds: Sequence[Cloud]) -> Cloud:
         names,
         None if any(c is None for c in colours) else join("colour"),
         clouds[0].system,
+        None if any(c.shared is None for c in clouds) else join("shared"),
     )

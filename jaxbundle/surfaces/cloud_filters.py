@@ -48,6 +48,9 @@ def thin(cloud: Cloud, size: float, least: int = 1, place: str = "mean") -> Clou
         # not 1/total: the errors of neighbours are not independent (see above)
         harmonic = count / total
         C = found.covariance * (harmonic / filled[best])[:, None, None]
+        if found.shared is not None:
+            scaled = found.shared * harmonic / filled[best]
+            found = dataclasses.replace(found, shared=scaled)
         found = dataclasses.replace(found, X=X, covariance=C if known else found.covariance)
     return found.take(count >= least)
 

@@ -66,8 +66,9 @@ def dense_cloud(
         _points(base, found, uv, slice(k, k + PIXELS_AT_ONCE), settings)
         for k in range(0, len(uv), PIXELS_AT_ONCE)
     ]
-    X, covariance, rays, places = (np.concatenate(p) for p in zip(*parts))
-    cloud = Cloud(X, covariance, rays, np.zeros(len(X), np.int16), places, (base.name,))
+    X, covariance, rays, places, shared = (np.concatenate(p) for p in zip(*parts))
+    image = np.zeros(len(X), np.int16)
+    cloud = Cloud(X, covariance, rays, image, places, (base.name,), shared=shared)
     return cloud, used, left_out
 
 
@@ -123,8 +124,9 @@ def _look_up(
 
 def _points(
     base: FrameView, found: Sequence[_PairDepths], uv: Places, rows: slice, settings: DenseSettings
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Points of some pixels, their covariance, numbers of rays, and their pixels."""
+) -> tuple[np.ndarray, ...]:
+    """Points of some pixels, their covariance, numbers of rays, their pixels, and of the variance
+    of Z that of the orientations."""
     q, s = (np.stack([getattr(pair, name)[rows] for pair in found]) for name in ("q", "sigma"))
     across = np.stack([pair.axis for pair in found])
     across = across - (across @ base.M[2])[:, None] * base.M[2]
@@ -142,8 +144,10 @@ def _points(
     X = base.X0 + length[:, None] * d
     used = np.concatenate([np.ones((1, len(X)), bool), np.isfinite(s[:, good])]).T
     views = [base, *(pair.other for pair in found)]
-    covariance += orientation_covariance(views, X, used)
-    return X, covariance.astype(np.float32), (number + 1).astype(np.int16), uv.astype(np.float32)
+    of_orientation = orientation_covariance(views, X, used)
+    covariance = (covariance + of_orientation).astype(np.float32)
+    shared = of_orientation[:, 2, 2].astype(np.float32)
+    return X, covariance, (number + 1).astype(np.int16), uv.astype(np.float32), shared
 
 
 def _inverse_distance(

@@ -19,6 +19,7 @@ from jaxbundle.surfaces.dense_cloud import consistent
 from jaxbundle.surfaces.generic_rectification import straighten
 from jaxbundle.surfaces.guide import Guide
 from jaxbundle.surfaces.intersection import IntersectedPoints, intersect
+from jaxbundle.surfaces.orientation import orientation_covariance
 from jaxbundle.surfaces.segments import windows
 from jaxbundle.surfaces.views import OrientedImage, Places, line_of_sight
 
@@ -173,13 +174,16 @@ def _intersect(
         known = consistent(q, spread, max_difference)
     cloud = intersect_rays(known)
     good = np.isfinite(cloud.covariance).all((1, 2)) & np.isfinite(cloud.X).all(1) & known.any(0)
+    used = np.concatenate([np.expand_dims(known.any(0), 0), known]).T[good]
+    of_orientation = orientation_covariance(views, cloud.X[good], used)
     return Cloud(
         cloud.X[good],
-        cloud.covariance[good].astype(np.float32),
+        (cloud.covariance[good] + of_orientation).astype(np.float32),
         cloud.rays[good].astype(np.int16),
         np.zeros(int(good.sum()), np.int16),
         uv[good].astype(np.float32),
         (base.name,),
+        shared=of_orientation[:, 2, 2].astype(np.float32),
     )
 
 

@@ -1,11 +1,16 @@
 """A digital surface model of a cloud: heights on a grid with the σ of every cell.
 
 A cell has the weighted mean of the heights of its points, p = 1/σ_Z², without those that differ
-from their median by more than three times its spread. Its σ is that of the mean, enlarged by the
-scatter of the points: σ² = max(1, χ²/(n − 1))/Σp. Small gaps are filled with the mean of the
-heights around, weighted by the inverse squares of their distances, with σ from the cells around and
-the distance to them; beside a wall from the lower surface, since hidden parts are low
-(Hirschmüller 2008).
+from their median by more than three times its spread. Errors of neighbours are highly correlated,
+since the windows of their matching overlap: points of a base image that are within a × b pixels of
+it count as m = (1 + a/w)·(1 + b/w) independent ones, w the side of the windows, at most as the n
+that they are. With the scatter of the points, σ² = max(n/m, χ²/(n − 1))/Σp. Small gaps are filled
+with the mean of the heights around, weighted by the inverse squares of their distances, with σ from
+the cells around and the distance to them; beside a wall from the lower surface, since hidden parts
+are low (Hirschmüller 2008).
+
+The errors of the orientations are common to the points of a cell, and no mean reduces them: weights
+are by the σ without them, and their mean variance is added to that of the cell.
 """
 
 import dataclasses
@@ -26,6 +31,8 @@ from jaxbundle.surfaces.scatter import NORMAL_SIGMA_BY_MAD
 if TYPE_CHECKING:
     import xarray
 
+# The description of the band of the σ without the errors of the orientations.
+OWN_SIGMA = "sigma of height without orientation"
 # The value of cells without height in files: the one most programs for height models expect.
 NO_DATA = -9999.0
 
@@ -47,6 +54,9 @@ class DsmSettings:
     """Standard deviation of the heights around a gap, in cell sizes, above which they are of two
     surfaces: that of a wall is half its height. Larger: higher walls are filled with means;
     smaller: steep slopes are filled from below."""
+    window: float = 5.0
+    """Side of the windows of matching, pixels: of dense matching the smallest, which pixels of good
+    texture take."""
     max_cells: float = 2e9
     """A larger grid is refused: the three grids of so many cells take 48 GB."""
 
@@ -55,7 +65,8 @@ class DsmSettings:
 @dataclasses.dataclass(frozen=True)
 class Dsm:
     """Heights and σ [rows, columns], north up, NaN: none; `x`, `y`: outer corner of the first cell;
-    numbers of points; coordinate system, or None."""
+    numbers of points; coordinate system, or None; `own_sigma`: without the errors of orientations,
+    where they are known."""
 
     height: Float[np.ndarray, "rows columns"]
     sigma: Float[np.ndarray, "rows columns"]
@@ -64,6 +75,7 @@ class Dsm:
     y: float
     size: float
     system: str | None = None
+    own_sigma: Float[np.ndarray, "rows columns"] | None = None
 
     def place(self, X: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray]:
         """Row and column, whole numbers at the centres of cells, of points."""
@@ -116,7 +128,10 @@ def make_dsm(
         )
     cell = ((row - top) * columns + (column - left)).astype(np.int64)
     Z, sigma_Z, number = cloud.X[:, 2], cloud.sigma[:, 2], rows * columns
-    height, sigma, count = _average_cells(cell, Z, sigma_Z, size, number, settings)
+    if cloud.shared is not None:
+        sigma_Z = np.sqrt(np.maximum(sigma_Z**2 - cloud.shared, 0.0))
+    alike = _points_that_count_as_one(cloud, cell, settings.window)
+    height, sigma, count = _average_cells(cell, Z, sigma_Z, size, number, alike, settings)
     shape = rows, columns
     found = Dsm(
         height.reshape(shape),
@@ -127,11 +142,29 @@ def make_dsm(
         size,
         cloud.system,
     )
-    return _fill(found, fill, settings) if fill else found
+    if fill:
+        found = _fill(found, fill, settings)
+    return found if cloud.shared is None else _add_shared(found, cell, cloud.shared)
+
+
+def _add_shared(dsm: Dsm, cell: Int[np.ndarray, " n"], shared: Float[np.ndarray, " n"]) -> Dsm:
+    """The model with the errors of the orientations in its σ; filled cells have those of the
+    nearest cell with points."""
+    shape = dsm.height.shape
+    number = np.bincount(cell, minlength=dsm.height.size).reshape(shape)
+    with np.errstate(invalid="ignore"):
+        mean = np.bincount(cell, shared, dsm.height.size).reshape(shape) / number
+    filled = np.isfinite(dsm.height) & (number == 0)
+    if filled.any():
+        nearest = {"return_distances": False, "return_indices": True}
+        at = np.asarray(ndimage.distance_transform_edt(number == 0, **nearest))
+        mean[filled] = mean[tuple(at[:, filled])]
+    return dataclasses.replace(dsm, sigma=np.sqrt(dsm.sigma**2 + mean), own_sigma=dsm.sigma)
 
 
 def write_dsm(dsm: Dsm, path: str | Path, sigma_path: str | Path | None = None) -> None:
-    """GeoTIFFs of heights and of their σ, float32, no-data `NO_DATA`."""
+    """GeoTIFFs of heights and of their σ, float32, no-data `NO_DATA`. Where the σ without the
+    errors of the orientations is known, it is the second band of the file of σ."""
     from rasterio.transform import Affine
 
     profile = {
@@ -141,12 +174,37 @@ def write_dsm(dsm: Dsm, path: str | Path, sigma_path: str | Path | None = None) 
         "compress": "deflate",
     }
     rows, columns = dsm.height.shape
-    given = ((path, dsm.height, "height"), (sigma_path, dsm.sigma, "sigma of height"))
-    for target, values, name in given:
+    sigmas = {"sigma of height": dsm.sigma}
+    if dsm.own_sigma is not None:
+        sigmas[OWN_SIGMA] = dsm.own_sigma
+    for target, bands in ((path, {"height": dsm.height}), (sigma_path, sigmas)):
         if target is not None:
-            with write_raster(target, columns, rows, 1, "float32", **profile) as raster:
-                raster.write(np.nan_to_num(values, nan=NO_DATA).astype(np.float32)[None])
-                raster.describe([name])
+            count = len(bands)
+            with write_raster(target, columns, rows, count, "float32", **profile) as raster:
+                values = np.stack([*bands.values()])
+                raster.write(np.nan_to_num(values, nan=NO_DATA).astype(np.float32))
+                raster.describe([*bands])
+
+
+def _points_that_count_as_one(
+    cloud: Cloud, cell: Int[np.ndarray, " n"], window: float
+) -> Float[np.ndarray, " cells"]:
+    """n/m of every cell with points, in ascending order; 1 without pixels of base images."""
+    cells, group = np.unique(cell, return_inverse=True)
+    known = np.isfinite(cloud.uv).all(1)
+    if not known.any():
+        return np.ones(len(cells))
+    both = group * len(cloud.images) + cloud.image
+    order = np.argsort(both, kind="stable")
+    keys, first, count = np.unique(both[order], return_index=True, return_counts=True)
+    uv = np.where(np.expand_dims(known, 1), cloud.uv, np.inf)[order]
+    with np.errstate(invalid="ignore"):
+        reach = np.maximum.reduceat(uv, first) - np.minimum.reduceat(uv, first)
+    independent = np.prod(1 + reach / window, axis=1)
+    # without a pixel a point stands for itself
+    independent = np.minimum(np.where(np.isfinite(independent), independent, count), count)
+    of_cell = keys // len(cloud.images)
+    return np.bincount(of_cell, count) / np.bincount(of_cell, independent)
 
 
 def _average_cells(
@@ -155,9 +213,11 @@ def _average_cells(
     sigma: Float[np.ndarray, " n"],
     size: float,
     number: int,
+    alike: Float[np.ndarray, " cells"],
     settings: DsmSettings,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Weighted means by cell, their σ and numbers of points."""
+    """Weighted means by cell, their σ and numbers of points; `alike`: of the points of each cell
+    with points so many count as one."""
     order = np.lexsort((Z, cell))
     cell, Z, sigma = cell[order], Z[order], sigma[order]
     cells, first, count = np.unique(cell, return_index=True, return_counts=True)
@@ -177,7 +237,7 @@ def _average_cells(
     mean = np.bincount(group, weight * Z) / total
     n = np.bincount(group, keep)
     square = np.bincount(group, weight * (Z - mean[group]) ** 2)
-    ratio = np.maximum(1.0, square / np.maximum(n - 1, 1))
+    ratio = np.maximum(alike, square / np.maximum(n - 1, 1))
     out = np.full((2, number), np.nan)
     out[0, cells], out[1, cells] = mean, np.sqrt(ratio / total) if known.any() else np.nan
     numbers = np.zeros(number, int)

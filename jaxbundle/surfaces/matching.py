@@ -99,7 +99,8 @@ class MatchingSettings:
 class SurfaceMatches:
     """Points of a base image: pixels in it, object points with covariance, numbers of rays.
 
-    `factor`: the variance factor of the covariances; `rejected`: numbers of points by reason.
+    `factor`: the variance factor of the covariances; `rejected`: numbers of points by reason;
+    `shared`: of the variance of Z that of the orientations.
     """
 
     uv: Float[np.ndarray, "n 2"]
@@ -108,6 +109,7 @@ class SurfaceMatches:
     rays: Int[np.ndarray, " n"]
     factor: float
     rejected: dict[str, int]
+    shared: Float[np.ndarray, " n"] | None = None
 
 
 def match_points(
@@ -190,7 +192,7 @@ def _match_windows(
         pair = base, other
         place, uncertain = correct_bending(pair, nodes, uv, q, match, half, settings.bending)
         uncertain = uncertain + settings.added_sigma**2 * np.eye(2)
-        good = window.usable & _is_confirmed(match, begin, settings)
+        good = window.usable & is_confirmed(match, begin, settings)
         good &= _agrees(other, guides[k], X, settings.max_guide_distance)
         good &= has_texture(base.grey, uv, match.sigma0, half, settings.windows.min_texture)
         back = np.linalg.inv(np.where(good[:, None, None], match.A, np.eye(2)))
@@ -202,7 +204,7 @@ def _match_windows(
     return out
 
 
-def _is_confirmed(
+def is_confirmed(
     match: SubpixelMatches, start: Places, settings: MatchingSettings
 ) -> Bool[np.ndarray, " n"]:
     """Whether least squares matching has converged near its start, to a similar window."""
@@ -253,7 +255,8 @@ def _accept(
     lost["rays do not meet"] += int((bad & ~narrow & ~undetermined).sum())
     good = ~(bad | narrow | undetermined)
     covariance = factor * found.covariance[good] + shape[good]
-    covariance += orientation_covariance(table.views, found.X[good], table.is_used[good])
+    of_orientation = orientation_covariance(table.views, found.X[good], table.is_used[good])
+    covariance += of_orientation
     return SurfaceMatches(
         table.uv[good, 0],
         found.X[good],
@@ -261,6 +264,7 @@ def _accept(
         found.rays[good],
         factor,
         {reason: number for reason, number in lost.items() if number},
+        of_orientation[:, 2, 2],
     )
 
 

@@ -237,6 +237,7 @@ def _match_interest_points(
         found.uv,
         (base.name,),
         _colour(base, found.uv),
+        shared=found.shared,
     )
     return cloud, {
         "points": len(uv),

@@ -17,19 +17,29 @@ from jaxtyping import Float
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, geodetic
 from jaxbundle.io.scanner.read import read_scanner
+from jaxbundle.io.scanner.refined_orientations import (
+    TABLE,
+    RefinedBlock,
+    RefinedFile,
+    read_refined_orientations,
+)
 from jaxbundle.io.scanner.rpc import read_rpc
 from jaxbundle.io.scanner.rpc_images import (
     COMPANION_ENDINGS,
     IMAGES,
     find_coefficients,
     find_raster,
+    has_rpc_only,
+    read_rpc_image,
 )
 from jaxbundle.photographs.places import utm_system
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.image_to_ground import locate_point
+from jaxbundle.pushbroom.rpc.bias import domain_of_bias
 from jaxbundle.pushbroom.rpc.polynomials import Rpc
 from jaxbundle.pushbroom.surfaces import Ground
 from jaxbundle.surfaces.cloud import Cloud
+from jaxbundle.surfaces.ground_orientation import rpc_orientation, scanner_orientation
 from jaxbundle.surfaces.scanner_views import (
     GroundView,
     Neighbourhood,
@@ -51,44 +61,150 @@ Orientation = Rpc | tuple[PushbroomImage, Ellipsoid | None]
 def read_ground_views(
     files: Sequence[Path], folder: Path | None
 ) -> tuple[tuple[GroundView, ...], Neighbourhood | None]:
-    """The oriented images and the origin of their coordinates, None in a local frame.
+    """The oriented images and the origin of their coordinates, None in a local frame. Refined files
+    have the covariance of their refinement.
 
     **Raises:** `InputError` for another kind of file, a missing raster, or another size.
     """
-    found = [_orientation(path, folder) for path in files]
-    earths = [None if isinstance(o, Rpc) else o[1] for o, _ in found]
-    local = [not isinstance(o, Rpc) and o[1] is None for o, _ in found]
-    if any(local) and not all(local):
-        raise InputError(
-            f"{files[local.index(True)]}: is in a local frame, the other images are on the Earth"
-        )
-    around = None if all(local) else _central_neighbourhood(found[0][0])
+    files, blocks = _with_blocks(files)
+    refined = [None if b is None else b.image_of(path) for b, path in zip(blocks, files)]
+    found = [
+        _orientation(path, folder, None if one is None else _pixels_of(one, folder))
+        for path, one in zip(files, refined)
+    ]
+    around = _common_neighbourhood(files, [orientation for orientation, _ in found])
     names = [raster.name for _, raster in found]
     if len({*names}) < len(names):
         names = [str(raster) for _, raster in found]
     views = []
-    for name, (orientation, raster), earth in zip(names, found, earths):
+    for name, (orientation, raster), one, block in zip(names, found, refined, blocks):
         if not isinstance(orientation, Rpc):
             with open_raster(raster) as source:
                 check_raw(raster, source)
         grey = read_grey(raster)
-        if isinstance(orientation, Rpc):
-            assert around is not None, "an RPC is not in a local frame"
-            views.append(RpcView(name, grey, orientation, around))
-            continue
-        image = orientation[0]
-        if (image.pixels, image.lines) != (grey.shape[1], grey.shape[0]):
-            raise InputError(
-                f"{raster}: {grey.shape[1]} × {grey.shape[0]} pixels, the scanner file has "
-                f"{image.pixels} × {image.lines}"
-            )
-        views.append(ScannerView(name, grey, image, earth, around))
+        if not isinstance(orientation, Rpc):
+            _check_size(raster, grey, orientation[0])
+        view = _view(name, grey, orientation, around)
+        if one is not None and block is not None:
+            _add_covariance(view, orientation, one, block)
+        views.append(view)
     return tuple(views), around
+
+
+def views_of_images(
+    ids: Sequence[str], orientations: Sequence[Orientation], rasters: Sequence[Path]
+) -> tuple[GroundView, ...]:
+    """Images with known orientations and their pixels, by their ids.
+
+    **Raises:** `InputError` if a raster cannot be read, or has another size."""
+    around = _common_neighbourhood([Path(id) for id in ids], orientations)
+    views = []
+    for id, orientation, raster in zip(ids, orientations, rasters):
+        grey = read_grey(raster)
+        if not isinstance(orientation, Rpc):
+            _check_size(raster, grey, orientation[0])
+        views.append(_view(id, grey, orientation, around))
+    return tuple(views)
+
+
+def _check_size(raster: Path, grey: Grey, image: PushbroomImage) -> None:
+    if (image.pixels, image.lines) != (grey.shape[1], grey.shape[0]):
+        raise InputError(
+            f"{raster}: {grey.shape[1]} × {grey.shape[0]} pixels, the scanner file has "
+            f"{image.pixels} × {image.lines}"
+        )
+
+
+def read_refined_views(
+    folder: Path,
+) -> tuple[tuple[GroundView, ...], Neighbourhood | None] | None:
+    """The images of a refinement without their pixels, named by their ids; None for another folder.
+
+    **Raises:** `InputError` as `read_ground_views`."""
+    block = read_refined_orientations(folder)
+    if block is None:
+        return None
+    found = [
+        read_rpc(one.file) if has_rpc_only(one.file) else _scanner_of(one.file)
+        for one in block.images
+    ]
+    around = _common_neighbourhood([one.file for one in block.images], found)
+    views = []
+    for one, orientation in zip(block.images, found):
+        image = (
+            read_rpc_image(one.file, one.raster).image
+            if isinstance(orientation, Rpc)
+            else orientation[0]
+        )
+        nothing = np.broadcast_to(np.uint8(0), (image.lines, image.pixels))
+        view = _view(one.id, nothing, orientation, around)
+        _add_covariance(view, orientation, one, block)
+        views.append(view)
+    return tuple(views), around
+
+
+def _with_blocks(files: Sequence[Path]) -> tuple[list[Path], list[RefinedBlock | None]]:
+    """Files, for the folder of a refinement all of its images, and the refinements they are of."""
+    every: list[Path] = []
+    known: dict[Path, RefinedBlock | None] = {}
+    for path in files:
+        place = path if path.is_dir() else path.parent
+        if place not in known:
+            known[place] = read_refined_orientations(place)
+        block = known[place]
+        every += [one.file for one in block.images] if path.is_dir() and block else [path]
+    return every, [known[path.parent] for path in every]
+
+
+def _pixels_of(one: RefinedFile, folder: Path | None) -> Path | None:
+    """The raster of a refined image: where it was, or of its name in a folder."""
+    if one.raster is not None or folder is None:
+        return one.raster
+    named = folder / one.raster_name
+    return named if one.raster_name and named.is_file() else None
+
+
+def _common_neighbourhood(
+    files: Sequence[Path], found: Sequence[Orientation]
+) -> Neighbourhood | None:
+    """The place of images that are all on the Earth; None if all are in a local frame."""
+    local = [not isinstance(o, Rpc) and o[1] is None for o in found]
+    if any(local) and not all(local):
+        raise InputError(
+            f"{files[local.index(True)]}: is in a local frame, the other images are on the Earth"
+        )
+    return None if all(local) else _central_neighbourhood(found[0])
+
+
+def _view(
+    name: str, grey: Grey, orientation: Orientation, around: Neighbourhood | None
+) -> GroundView:
+    if isinstance(orientation, Rpc):
+        assert around is not None, "coefficients are never in a local frame"
+        return RpcView(name, grey, orientation, around)
+    return ScannerView(name, grey, *orientation, around)
+
+
+def _add_covariance(
+    view: GroundView, orientation: Orientation, one: RefinedFile, block: RefinedBlock
+) -> None:
+    """What the refinement of an image says of its errors."""
+    joint = block.covariance
+    if joint is None:
+        return
+    if isinstance(orientation, Rpc):
+        domain = one.domain if one.domain is not None else domain_of_bias(orientation)
+        view.orientation = rpc_orientation(joint, one.id, domain)
+    else:
+        spacing = one.knot_spacing
+        view.orientation = scanner_orientation(joint, one.id, one.sensor, *orientation, spacing)
 
 
 def is_ground_image(path: Path) -> bool:
     """Whether a file may be a scanner image or one with rational polynomials."""
     name = path.name
+    if (path / TABLE).is_file():
+        return True
     if path.suffix.lower() in IMAGES or any(name.endswith(end) for end in COMPANION_ENDINGS):
         return True
     if path.suffix.lower() in (".json", ".dim", ".imd"):
@@ -141,23 +257,23 @@ def to_map(cloud: Cloud, around: Neighbourhood, crs: str) -> Cloud:
     together = 1 << 18
     for first in range(0, len(cloud), together):
         part = slice(first, first + together)
-        X[part], J = _with_derivative(cloud.X[part], around, crs)
+        X[part] = np.stack([*map_coordinates(cloud.X[part], around, crs), cloud.X[part, 2]], 1)
+        J = map_derivative(cloud.X[part], around, crs)
         covariance[part] = J @ cloud.covariance[part] @ np.swapaxes(J, 1, 2)
     return dataclasses.replace(cloud, X=X, covariance=covariance, system=crs)
 
 
-def _with_derivative(
+def map_derivative(
     X: Float[np.ndarray, "n 3"], around: Neighbourhood, crs: str
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
-    """Points in a map system, and their derivatives by the coordinates of the neighbourhood."""
+) -> Float[np.ndarray, "n 3 3"]:
+    """The derivatives of coordinates in a map system by those of the neighbourhood."""
     # differences over one metre: a map's curvature within it is 1e-7
     x, y = map_coordinates(X, around, crs)
     columns = []
     for axis in range(2):
         dx, dy = map_coordinates(X + np.eye(3)[axis], around, crs)
         columns.append(np.stack([dx - x, dy - y, np.zeros_like(x)], 1))
-    J = np.stack([*columns, np.broadcast_to([0.0, 0, 1], X.shape)], 2)
-    return np.stack([x, y, X[:, 2]], 1), J
+    return np.stack([*columns, np.broadcast_to([0.0, 0, 1], X.shape)], 2)
 
 
 def map_coordinates(
@@ -194,8 +310,10 @@ def _transformer(crs: str) -> "pyproj.Transformer":
         raise InputError(f"--crs {crs!r}: {' '.join(str(error).split())}") from None
 
 
-def _orientation(path: Path, folder: Path | None) -> tuple[Orientation, Path]:
-    """The polynomials, or the scanner's image and Earth; and the raster."""
+def _orientation(
+    path: Path, folder: Path | None, raster: Path | None = None
+) -> tuple[Orientation, Path]:
+    """The polynomials, or the scanner's image and Earth; and the raster, if it is not known."""
     if not path.is_file():
         raise missing(path, "a raster with RPC, or a scanner file")
     if path.suffix.lower() in IMAGES:
@@ -203,13 +321,16 @@ def _orientation(path: Path, folder: Path | None) -> tuple[Orientation, Path]:
     scanner = path.suffix.lower() in (".json", ".dim", ".imd") or (path.suffix == ".toml")
     if path.suffix.lower() == ".xml":
         try:
-            return read_rpc(path), _raster_of(path, folder)
+            return read_rpc(path), raster or _raster_of(path, folder)
         except InputError:
             scanner = True
-    if scanner:
-        file = read_scanner(path)
-        return (file.image, file.earth), _raster_of(path, folder)
-    return read_rpc(path), _raster_of(path, folder)
+    orientation = _scanner_of(path) if scanner else read_rpc(path)
+    return orientation, raster or _raster_of(path, folder)
+
+
+def _scanner_of(path: Path) -> Orientation:
+    file = read_scanner(path)
+    return file.image, file.earth
 
 
 def _raster_of(path: Path, folder: Path | None) -> Path:

@@ -19,11 +19,18 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, earth_fixed, geodetic
+from jaxbundle.io.networks.orientation_covariance import OrientationCovariance, Unknown
 from jaxbundle.pushbroom.ground_to_image import make_search, project_near, project_points
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.image_to_ground import locate_point
+from jaxbundle.pushbroom.rpc.bias import BiasDomain
 from jaxbundle.pushbroom.rpc.polynomials import Rpc, locate, project
 from jaxbundle.pushbroom.surfaces import Height, Plane
+from jaxbundle.surfaces.ground_orientation import (
+    GroundOrientation,
+    bias_derivative,
+    scanner_derivative,
+)
 from jaxbundle.surfaces.views import Grey, Places, Points, run_in_lanes
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, Scalar
@@ -69,6 +76,8 @@ class _GroundView:
     shift = (0.0, 0.0)
     """Added to projected positions (u, v): the estimated error of the orientation."""
     _point: ClassVar[Callable]
+    orientation: GroundOrientation | None = None
+    """What a refinement says of the errors of its orientation."""
 
     def __init__(self, name: str, grey: Grey, frame: PyTree) -> None:
         self.name, self.grey, self._frame = name, grey, frame
@@ -82,6 +91,16 @@ class _GroundView:
 
     def bounds(self, uv: Places, low: float, high: float) -> Float[np.ndarray, "n 2"]:
         return np.broadcast_to(np.array([low, high], float), (len(uv), 2)).copy()
+
+    @property
+    def joint(self) -> OrientationCovariance | None:
+        """The covariance of the orientations of its refinement."""
+        return None if self.orientation is None else self.orientation.joint
+
+    @property
+    def unknowns(self) -> tuple[Unknown, ...]:
+        """Of its orientation, that are not held."""
+        return () if self.orientation is None else self.orientation.unknowns
 
 
 class RpcView(_GroundView):
@@ -98,6 +117,13 @@ class RpcView(_GroundView):
 
     def derivative(self, X: Points) -> Float[np.ndarray, "n 2 3"]:
         return run_in_lanes(_rpc_derivative, self._frame, X)
+
+    def derivative_by_orientation(self, X: Points) -> Float[np.ndarray, "n 2 k"]:
+        """∂(u, v) by the unknowns."""
+        if self.orientation is None or self.orientation.domain is None:
+            return np.zeros((len(X), 2, 0))
+        frame = (*self._frame, BiasDomain(*map(jnp.asarray, self.orientation.domain)))
+        return run_in_lanes(_rpc_by_bias, frame, X)[:, :, list(self.orientation.columns)]
 
     def range(self) -> tuple[float, float]:
         """The range of heights of the polynomials."""
@@ -135,6 +161,15 @@ class ScannerView(_GroundView):
     def derivative(self, X: Points) -> Float[np.ndarray, "n 2 3"]:
         places = np.nan_to_num(self.project(X) - np.array(self.shift))
         return run_in_lanes(_scanner_derivative, self._frame, X, places)
+
+    def derivative_by_orientation(self, X: Points) -> Float[np.ndarray, "n 2 k"]:
+        """∂(u, v) by the unknowns."""
+        if self.orientation is None:
+            return np.zeros((len(X), 2, 0))
+        # without the shift, and of points outside the image those of its corner, finite
+        places = np.nan_to_num(self.project(X) - np.array(self.shift))
+        Xt = run_in_lanes(lambda frame, X: _trajectory_points(frame, X).T, self._frame, X)
+        return scanner_derivative(self.orientation, self.image, self._frame.earth, Xt, places)
 
 
 GroundView = RpcView | ScannerView
@@ -183,6 +218,14 @@ def _rpc_derivative(
     frame: tuple[Rpc, Neighbourhood], X: Float[Array, "n 3"]
 ) -> Float[Array, "n 2 3"]:
     return jax.vmap(jax.jacfwd(partial(_rpc_pixel, frame)))(X)
+
+
+@compile_once
+def _rpc_by_bias(
+    frame: tuple[Rpc, Neighbourhood, BiasDomain], X: Float[Array, "n 3"]
+) -> Float[Array, "n 2 terms"]:
+    rpc, around, domain = frame
+    return jax.vmap(lambda X: bias_derivative(rpc, domain, *around.geographic(X)))(X)
 
 
 @compile_once

@@ -30,8 +30,12 @@ from jaxtyping import Array, Bool, Float, PyTree, Shaped, UInt8
 from jaxbundle.cameras import CameraModel, default_parameters, get_model, image_ray, project
 from jaxbundle.cameras.pixel_frame import pixel_frame
 from jaxbundle.errors import InputError
-from jaxbundle.geometry import matrix_from_omega_phi_kappa
-from jaxbundle.io.networks.orientation_covariance import OrientationCovariance
+from jaxbundle.geometry import matrix_from_omega_phi_kappa, omega_phi_kappa_from_matrix
+from jaxbundle.io.networks.orientation_covariance import (
+    OrientationCovariance,
+    Unknown,
+    unknowns_of_photograph,
+)
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.system.programs import compile_once
 
@@ -113,6 +117,16 @@ class FrameView:
         # it, so that rays farther from the axis than those of the image are excluded. 2 %: the
         # farthest ray of the image may be between the sampled ones.
         self._farthest = 1.02 * float(np.nanmax(np.arccos(np.clip(-axis @ self.M[2], -1, 1))))
+
+    @property
+    def unknowns(self) -> tuple[Unknown, ...]:
+        """Of its orientation and camera, also held ones."""
+        return unknowns_of_photograph(self.name, self.camera.id, self.frame.model.parameters)
+
+    def derivative_by_orientation(self, X: Points) -> Float[np.ndarray, "n 2 k"]:
+        """∂(u, v)/∂(X0, Y0, Z0, ω, φ, κ, parameters), pixels per object unit, radian, unit of the
+        parameter."""
+        return run_in_lanes(_by_orientation, self.frame, X)
 
     def edge(self) -> Places:
         """Positions along and across the whole image, including its edges."""
@@ -248,3 +262,16 @@ def _project(frame: PhotographFrame, X: Float[Array, "n 3"]) -> Float[Array, "n 
 @compile_once
 def _derivative(frame: PhotographFrame, X: Float[Array, "n 3"]) -> Float[Array, "n 2 3"]:
     return jax.vmap(jax.jacfwd(partial(pixel_of, frame)))(X)
+
+
+@compile_once
+def _by_orientation(frame: PhotographFrame, X: Float[Array, "n 3"]) -> Float[Array, "n 2 k"]:
+    angles = omega_phi_kappa_from_matrix(frame.M)
+
+    def pixel(theta: Float[Array, " k"], X: Float[Array, "3"]) -> Float[Array, "2"]:
+        M = matrix_from_omega_phi_kappa(theta[3:6])
+        moved = eqx.tree_at(lambda f: (f.X0, f.M, f.p), frame, (theta[:3], M, theta[6:]))
+        return pixel_of(moved, X)
+
+    theta = jnp.concatenate([frame.X0, angles, frame.p])
+    return jax.vmap(jax.jacfwd(pixel), (None, 0))(theta, X)

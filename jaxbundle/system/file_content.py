@@ -23,6 +23,8 @@ DEEPEST_NESTING = 64
 # The largest power of two that is a float of double precision (IEEE 754).
 LARGEST_INTEGER = 2**1023
 TOO_LARGE = "too large a number; finite numbers are expected"
+# Said of a file that ends where more is expected.
+ENDS_EARLY = "; the file ends there: is it cut off, or not completely copied?"
 QUOTED = re.compile(r'"(?:\\.|[^"\\])*"|\'[^\']*\'')
 DIGITS = re.compile(r"(?<![\w.])[-+]?\d[\d_]{307,}(?![\w.])")
 DOTTED = re.compile(rf"(?:[\w-]+\s*\.\s*){{{DEEPEST_NESTING - 1}}}")
@@ -137,6 +139,8 @@ def _parse(path: str | Path, text: str, parse: Callable[[str], Any], kind: str) 
         wrong = "nested too deeply"
     except ValueError as error:
         wrong = f"{error}"
+        if isinstance(error, json.JSONDecodeError) and error.pos >= len(text.rstrip()):
+            wrong += ENDS_EARLY
         if "digits" not in wrong:  # Python reads no whole number of more than 4300
             raise InputError(f"{path}: not valid {kind}: {wrong}") from None
         wrong = TOO_LARGE

@@ -40,6 +40,7 @@ from jaxbundle.io.networks.orientation_covariance import (
 )
 from jaxbundle.io.results.json_lines import JsonLines
 from jaxbundle.io.scanner.asp_points import read_gcp, read_match
+from jaxbundle.io.scanner.refined_orientations import read_refined_orientations
 from jaxbundle.io.writing.folders import check_folder, read_marker, replace_folder
 from jaxbundle.measure.boards import Board
 from jaxbundle.network.surface_models import read_mesh
@@ -203,6 +204,19 @@ def _(folder):
     A = np.random.default_rng(0).normal(size=(4, 4))
     given = OrientationCovariance(tuple(names), A @ A.T + np.eye(4))
     write_orientation_covariance(given, folder / "precision.csv", 0.0174)
+
+
+@reader("refined", lambda f: read_refined_orientations(f))
+def _(folder):
+    names = [("image", "A", n) for n in ("line shift", "sample shift")] + [("sensor", "S", "x")]
+    given = OrientationCovariance(tuple(names), np.eye(3) + 0.2)
+    write_orientation_covariance(given, folder / "precision.csv", 1.0)
+    for name in ("A_RPC.TXT", "B.toml"):
+        (folder / name).write_text("x\n")
+    (folder / "refined.csv").write_text(
+        "id,file,raster,sensor,knot_spacing,line_offset,line_scale,sample_offset,sample_scale\n"
+        "A,A_RPC.TXT,a.tif,,,100,90,80,70\nB,B.toml,,S,0.25,,,,\n"
+    )
 
 
 @reader("corners", lambda f: read_corners(f / "corners.vnl", Board(4, 3, 1.0), (640, 480)))

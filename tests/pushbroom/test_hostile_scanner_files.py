@@ -82,3 +82,18 @@ def valid(tmp_path_factory):
 @pytest.mark.parametrize("kind", READ)
 def test_a_valid_input_is_read(kind, valid):
     assert READ[kind](valid(kind)) is not None
+
+
+def test_files_that_are_cut_off_are_said_to_be(tmp_path):
+    """XML and model states that end early: the usual damage of large files."""
+    from jaxbundle.errors import InputError
+    from jaxbundle.io.scanner.csm_state import MODEL
+
+    state = MODEL + "\n" + json.dumps({"m_nLines": 100, "m_quaternions": [0.25] * 40}, indent=1)
+    for name, text in (("a.xml", '<isd><EPH a="1"><LIST>1 2 3</LIST></EPH></isd>'),
+                       ("b.json", state), ("c.json", state.partition("\n")[2])):  # fmt: skip
+        for share in (0.5, 0.8):
+            (tmp_path / name).write_text(text[: int(share * len(text))])
+            with pytest.raises(InputError, match="ends there: is it cut off") as told:
+                read_scanner(tmp_path / name)
+            assert name in str(told.value) and "\n" not in str(told.value)

@@ -49,3 +49,17 @@ def test_a_map_that_is_too_large():
     for size, most in ((1e-10, np.inf), (1e-3, 1e6)):
         with pytest.raises(InputError, match="--spacing .* larger"):
             grid_around(x, y, size, most)
+
+
+@pytest.mark.parametrize("latitude, system", [(89.98, "EPSG:32661"), (-89.5, "EPSG:32761")])
+def test_a_map_of_a_pole_needs_its_system(latitude, system):
+    """In longitude and latitude it was a map without a pixel of the image."""
+    from jaxbundle.io.rasters.maps import check_away_from_poles
+    from jaxbundle.photographs.places import utm_system
+
+    y = np.array([[latitude, latitude - np.sign(latitude) * 0.1]])
+    with pytest.raises(InputError, match=f"at the .* Pole.*give --crs {system}"):
+        check_away_from_poles(MapSystem(WGS84, None), y)
+    check_away_from_poles(MapSystem(WGS84, None), 0.9 * y)
+    check_away_from_poles(MapSystem(WGS84, system), 1e5 * y)
+    assert utm_system(latitude, 20.0) == system and utm_system(83.0, 20.0) == "EPSG:32634"

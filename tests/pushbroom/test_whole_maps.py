@@ -341,3 +341,24 @@ def test_bands_of_several_types_are_refused(folder, tmp_path):
     with pytest.raises(InputError, match="bands of uint16, float32"):
         pushbroom.correct(folder / "scanner.toml", tmp_path / "several.vrt", tmp_path / "map.tif",
                           height=0.0)  # fmt: skip
+
+
+def test_what_a_killed_process_left_of_a_map_is_removed(tmp_path):
+    """Of a process that does not run; not of one that does, and not of other files."""
+    import os
+    import subprocess
+    import sys
+
+    from jaxbundle.io.writing.replacing import remove_left_behind
+
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    gone, kept = tmp_path / f".map.{ended.pid}.tif", [
+        tmp_path / f".map.{os.getpid()}.tif", tmp_path / f".other.{ended.pid}.tif",
+        tmp_path / f".map.{ended.pid}.tif.aux", tmp_path / "map.tif",
+    ]  # fmt: skip
+    for path in (gone, *kept):
+        path.write_bytes(b"x")
+    remove_left_behind(tmp_path / "map.tif")
+    assert not gone.exists() and all(path.exists() for path in kept)
+    remove_left_behind(tmp_path / "none" / "map.tif")

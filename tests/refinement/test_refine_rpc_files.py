@@ -221,3 +221,29 @@ def test_frames_of_images_must_be_one(folder, scene, tmp_path):
     assert file.images[3].freedom == dataclasses.replace(
         Freedom(), attitude=(np.inf,) * 3, position=HELD
     )
+
+
+def test_tie_points_of_a_table_of_their_own_need_no_row_in_points(folder):
+    """The same refinement as with all in one table."""
+    whole = read_refinement(folder / "refine.toml")
+    role = dict(zip(whole.points.id, whole.points.role))
+    for name, ties in (("points.csv", False), ("observations.csv", False), ("ties.csv", True)):
+        source = folder / ("observations.csv" if ties else name)
+        head, *lines = (folder / "all.csv" if ties else source).read_text().splitlines()
+        if name == "observations.csv":
+            (folder / "all.csv").write_text("\n".join([head, *lines]))
+        place = 0 if name == "points.csv" else 1
+        kept = [line for line in lines if (role[line.split(",")[place]] == "tie") == ties]
+        (folder / name).write_text("\n".join([head, *kept]) + "\n")
+    change(folder, "[refine]", "[refine]\ntie_points = \"ties.csv\"")
+    found = read_refinement(folder / "refine.toml")
+    assert sorted(zip(found.points.id, found.points.role)) == sorted(role.items())
+    rows = lambda file: sorted(
+        (file.images[i].id, file.points.id[p], *xy)
+        for i, p, xy in zip(file.observations.image, file.observations.point,
+                            file.observations.xy.tolist())
+    )  # fmt: skip
+    assert rows(found) == rows(whole)
+    (folder / "ties.csv").write_text("image,point,line\nA,P1,5\n")
+    with pytest.raises(InputError, match="ties.csv: column 'pixel' is missing"):
+        read_refinement(folder / "refine.toml")

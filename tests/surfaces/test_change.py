@@ -10,13 +10,8 @@ from scipy.ndimage import gaussian_filter
 
 import jaxbundle
 from jaxbundle.errors import InputError
-from jaxbundle.surfaces.change import (
-    HeightGrid,
-    align,
-    correlation_of,
-    find_change,
-    stated_modes,
-)
+from jaxbundle.surfaces.change import ChangeSettings, correlation_of, find_change
+from jaxbundle.surfaces.height_cells import HeightGrid, UncertainCells, align, stated_modes
 from jaxbundle.surfaces.orientation import orientation_covariance, orientation_modes
 from jaxbundle.surfaces.views import FrameView
 
@@ -103,6 +98,8 @@ def test_variances_are_those_of_dense_algebra():
             quiet = np.abs(own / s) < 3 * 1.4826 * np.median(np.abs(own / s - np.median(own / s)))
             rho = correlation_of((own / s * quiet).reshape(shape), quiet.reshape(shape))
             assert found.correlation == pytest.approx(rho.sum(), rel=0.05)
+            assert found.sigma_ratio > 1
+            s = s * found.sigma_ratio
             P = np.eye(L.shape[1])
             if known is not None:
                 A = (L / s[:, None])[stable.ravel()]
@@ -123,6 +120,59 @@ def test_variances_are_those_of_dense_algebra():
                 SIZE**2 * np.sqrt(inside @ total @ inside), rel=0.02
             )
             assert (region.label, region.cells) == (5, 28)
+
+
+@dataclasses.dataclass(frozen=True)
+class Slanted:
+    """Errors with a column of L that depends on slopes, so that windows need cells around."""
+
+    number: int = 1
+
+    def __call__(self, grid):
+        return 0.3 * grid.slopes()[:1]
+
+
+@pytest.mark.parametrize("with_stable", [False, True])
+def test_tiles_give_what_the_whole_gives(with_stable):
+    """Of regions across their edges, of slopes at these; ρ loses the pairs across them."""
+    rng, truth = np.random.default_rng(4), hills()
+    labels = np.zeros((ROWS, COLUMNS), int)
+    labels[20:55, 25:70] = 3
+    labels[60:, :8] = 7
+    pair = [measured(rng, truth + 2.0 * k * (labels == 3), **SHARED) for k in (0, 1)]
+    pair[1].height[10:14, 5:30] = np.nan
+    pair = [UncertainCells(one, (Slanted(),)) for one in pair]
+    stable = (labels == 0) & (np.arange(COLUMNS) > 60) if with_stable else None
+    # as many cells of a tile as 32 numbers each leave, at least eight times the reach a side
+    small = ChangeSettings(reach=4, tile_numbers=1, sampled_tiles=99)
+    whole = ChangeSettings(reach=4)
+    for given in (labels, None):
+        one, other = (find_change(*pair, 0.05, stable, given, settings=s) for s in (whole, small))
+        assert one.difference.dtype == np.float64 and other.difference.dtype == np.float32
+        assert one.modes == other.modes == 12
+        assert other.correlation == pytest.approx(one.correlation, rel=0.05)
+        np.testing.assert_allclose(other.difference, one.difference, atol=0.01)
+        np.testing.assert_allclose(other.sigma, one.sigma, rtol=0.02)
+        assert (other.sign == one.sign).mean() > 0.99
+        assert other.total.cells == one.total.cells == ROWS * COLUMNS - 100
+        for a, b in zip((one.total, *one.regions[:1]), (other.total, *other.regions[:1])):
+            assert (a.label, a.cells) == (b.label, pytest.approx(b.cells, rel=0.02))
+            assert b.volume == pytest.approx(a.volume, rel=0.02, abs=20)
+            assert b.sigma == pytest.approx(a.sigma, rel=0.03)
+
+
+def test_sigma_that_are_too_small_are_enlarged_by_the_scatter():
+    rng, truth = np.random.default_rng(6), hills()
+    pair = [dataclasses.replace(grid(truth + noise(rng)), sigma=np.full((ROWS, COLUMNS), 0.1))
+            for _ in range(2)]  # fmt: skip
+    found = find_change(*pair)
+    assert found.sigma_ratio == pytest.approx(3.0, rel=0.1)
+    np.testing.assert_allclose(found.sigma, 0.1 * np.sqrt(2) * found.sigma_ratio)
+    assert np.mean(found.sign != 0) == pytest.approx(0.05, abs=0.02)
+    as_given = find_change(*pair, settings=ChangeSettings(enlarge_sigma=False))
+    assert np.mean(as_given.sign != 0) > 0.4
+    wide = [dataclasses.replace(one, sigma=np.full((ROWS, COLUMNS), 0.9)) for one in pair]
+    np.testing.assert_allclose(find_change(*wide).sigma, 0.9 * np.sqrt(2))
 
 
 @pytest.mark.further
@@ -236,6 +286,26 @@ def test_the_command_writes_maps_and_volumes(files, command):
     assert 550 < first.cells < 800 and first.mean == pytest.approx(3, abs=0.3)
     assert len(result.to_pandas()) == 1 + len(result.change.regions)
     assert "region 1" in str(result)
+
+
+def test_sigma_without_orientations_are_used_with_their_covariance(files):
+    """The second band of the file of σ, where it is described so."""
+    from jaxbundle.surfaces.raster_cells import OWN_SIGMA, open_cells
+
+    cells, path = open_cells(files / "before.tif"), files / "before_sigma.tif"
+    with rasterio.open(path) as source:
+        profile, values = source.profile, source.read(1)
+    with rasterio.open(path, "w", **{**profile, "count": 2}) as target:
+        target.write(np.stack([values, 0.5 * values]))
+        target.descriptions = ("sigma of height", OWN_SIGMA)
+    part = slice(10, 12), slice(20, 25)
+    for own, expected in ((False, 0.3), (True, 0.15)):
+        grid_ = cells.with_sigma(path, own).part(slice(5, 60), slice(0, 50)).window(*part)
+        np.testing.assert_allclose(grid_.sigma, expected, rtol=1e-6)
+        np.testing.assert_allclose(grid_.height, cells.values(slice(15, 17), slice(20, 25)))
+    write(files / "small.tif", np.full((9, 9), 0.3))
+    with pytest.raises(InputError, match="small.tif: does not have the cells of"):
+        cells.with_sigma(files / "small.tif", False)
 
 
 def test_grids_are_cut_to_their_common_cells():

@@ -60,6 +60,26 @@ def test_a_point_of_no_sigma_has_the_weight_of_the_worst():
     np.testing.assert_allclose(thin(cloud, 1.0).X, [(X[0] + X[1] + 4 * X[2]) / 6])
 
 
+def test_errors_of_orientations_are_not_averaged_in_a_cell():
+    """Nine independent points of σ 0.3 and one error of 0.4 common to them: 0.1² + 0.4²."""
+    rng = np.random.default_rng(1)
+    X = np.column_stack([rng.uniform(0, 1, (9, 2)), np.full(9, 5.0)])
+    C = np.broadcast_to(np.diag([0.1, 0.1, 0.25]), (9, 3, 3))
+    uv = 100.0 * np.arange(18).reshape(9, 2)
+    cloud = Cloud(X, C, np.full(9, 2), np.zeros(9, int), uv, ("a",), shared=np.full(9, 0.16))
+    dsm = make_dsm(cloud, 1.0)
+    np.testing.assert_allclose(dsm.own_sigma, 0.1)
+    np.testing.assert_allclose(dsm.sigma, np.hypot(0.1, 0.4))
+    # points whose windows overlap count as one: m = (1 + 2/5)·(1 + 2/5) of the nine
+    v, u = np.indices((3, 3)).reshape(2, -1)
+    near = dataclasses.replace(cloud, uv=np.stack([u, v], 1).astype(float), shared=None)
+    np.testing.assert_allclose(make_dsm(near, 1.0).sigma, 0.5 / 1.4)
+    assert make_dsm(near, 1.0).own_sigma is None
+    half = cloud.take(np.arange(9) < 4)
+    assert len(half.shared) == 4 and merge([half, half]).shared.shape == (8,)
+    assert merge([half, near]).shared is None
+
+
 def test_images_without_points_can_be_merged(plane):
     none = empty_cloud("c.jpg")
     assert merge([none, plane, none]).images == plane.images

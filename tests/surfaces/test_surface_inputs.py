@@ -25,7 +25,6 @@ from jaxbundle.surfaces.inputs import find_photographs, read_views
 from jaxbundle.surfaces.intersection import intersect
 from jaxbundle.surfaces.matching import _drop_worst_rays, _Rays
 from jaxbundle.surfaces.orientation import (
-    derivative_by_orientation,
     is_uncertain,
     orientation_covariance,
 )
@@ -155,7 +154,7 @@ def test_a_joint_covariance_of_orientations_and_camera_moves_points_as_it_says(t
 
 def test_the_derivative_by_the_orientation_is_that_of_the_projection():
     X = np.array([[0.3, 0.2, 0.1]])
-    B = derivative_by_orientation(views([SIGMA] * 3)[0], X)[0]
+    B = views([SIGMA] * 3)[0].derivative_by_orientation(X)[0]
     for j in range(6):
         both = []
         for sign in (1, -1):

@@ -8,3 +8,4 @@ from jaxbundle.cli.pushbroom import project as project
 from jaxbundle.cli.pushbroom import refine as refine
 from jaxbundle.cli.pushbroom import rpc as rpc
 from jaxbundle.cli.pushbroom import simulate as simulate
+from jaxbundle.cli.pushbroom import tie as tie

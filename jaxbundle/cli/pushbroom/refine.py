@@ -46,6 +46,8 @@ def refine(
         names_of_images,
         write_images,
     )
+    from jaxbundle.io.scanner.refined_orientations import FILE as PRECISION
+    from jaxbundle.io.scanner.refined_orientations import TABLE, write_refined_orientations
     from jaxbundle.io.scanner.refinement import read_refinement
     from jaxbundle.io.text.csv_tables import write_csv, write_text
     from jaxbundle.io.writing.fingerprints import files_read
@@ -53,11 +55,12 @@ def refine(
     from jaxbundle.report.page import UNKNOWN, head_line
     from jaxbundle.report.page.refinement import compose_refinement
     from jaxbundle.report.refinement_verdict import conclude_refinement
+    from jaxbundle.types import present
 
     check_accept(accept, "pushbroom refine")
     file = read_refinement(input)
     names = [REPORT, PAGE, RESULT, "points.csv", *(f"{PHOTOGRAPHS}/{name}" for name in FILES)]
-    names += names_of_images(file)
+    names += [TABLE, PRECISION, *names_of_images(file)]
     files = files_read(input)
     check_writable(json, out, "pushbroom refine", names, files, force, html)
     origin = UNKNOWN
@@ -86,6 +89,7 @@ def refine(
         if new is not None:
             for said in describe_states(write_images(new, file, result)):
                 warn(said)
+            write_refined_orientations(new, present(out), file, result)
             rows = point_rows(result)
             write_csv(new / "points.csv", list(rows[0]), [list(row.values()) for row in rows])
             photographs = adjusted_photographs(result)

@@ -35,12 +35,24 @@ class OrientationCovariance:
     unknowns: tuple[Unknown, ...]
     matrix: Float[np.ndarray, "n n"]
 
+    def index(self, unknowns: Sequence[Unknown]) -> Int[np.ndarray, " k"]:
+        """The rows of some unknowns; −1: held."""
+        at = {unknown: k for k, unknown in enumerate(self.unknowns)}
+        return np.array([at.get(unknown, -1) for unknown in unknowns], int)
+
     def rows(self, image: str, camera: str, parameters: Sequence[str]) -> Int[np.ndarray, " k"]:
         """The rows of X0 … kappa of an image and of parameters of its camera; −1: held."""
-        index = {unknown: k for k, unknown in enumerate(self.unknowns)}
-        wanted = [("image", image, name) for name in EXTERIOR]
-        wanted += [("camera", camera, name) for name in parameters]
-        return np.array([index.get(name, -1) for name in wanted])
+        return self.index(unknowns_of_photograph(image, camera, parameters))
+
+
+def unknowns_of_photograph(
+    image: str, camera: str, parameters: Sequence[str]
+) -> tuple[Unknown, ...]:
+    """X0 … kappa of an image and the parameters of its camera."""
+    return (
+        *(("image", image, name) for name in EXTERIOR),
+        *(("camera", camera, name) for name in parameters),
+    )
 
 
 def write_orientation_covariance(

@@ -17,7 +17,13 @@ from jaxbundle.choices import Resampling
 from jaxbundle.errors import InputError
 from jaxbundle.io.rasters.checkpoints import Checkpoint
 from jaxbundle.io.rasters.map_blocks import PLAIN, MapBands, MapFormat, write_map
-from jaxbundle.io.rasters.maps import MapGrid, MapSystem, contiguous, grid_around
+from jaxbundle.io.rasters.maps import (
+    MapGrid,
+    MapSystem,
+    check_away_from_poles,
+    contiguous,
+    grid_around,
+)
 from jaxbundle.pushbroom.ground_to_image import Search
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.image_to_ground import locate_lines
@@ -87,6 +93,7 @@ def map_of(
     x, y = system.from_ground(X)
     if not np.isfinite(x).any():
         raise InputError(f"coordinate system {system.crs}: it is not defined where the image is")
+    check_away_from_poles(system, y)
     x = contiguous(system, x)
     if size is None:
         rows = np.hypot(np.diff(x, axis=0), np.diff(y, axis=0)) / np.diff(inner)[:, None]

@@ -136,6 +136,28 @@ def describe_distance(
     )
 
 
+def check_away_from_poles(
+    system: MapSystem, y: Float[np.ndarray, "r c"], farthest: float = 89.0
+) -> None:
+    """Refuse a map in longitude and latitude of a place at a pole, which would be torn apart.
+
+    **Arguments:** `farthest`: degrees, beyond which a degree of longitude is less than a 57th of
+    one of latitude, so that square pixels show nothing.
+
+    **Raises:** `InputError` naming the system of the pole.
+    """
+    if system.turn is None:
+        return
+    latitude = y * 360.0 / system.turn
+    if np.nanmax(np.abs(latitude)) > farthest:
+        middle = float(np.nanmean(latitude))
+        raise InputError(
+            f"the image is at the {'North' if middle > 0 else 'South'} Pole, latitude to "
+            f"{np.nanmax(np.abs(latitude)):.4g}°, where a map in longitude and latitude falls "
+            f"apart; give --crs {utm_system(middle, 0.0)} (Universal Polar Stereographic)"
+        )
+
+
 def contiguous(system: MapSystem, x: Float[np.ndarray, "r c"]) -> Float[np.ndarray, "r c"]:
     """x of a lattice of points, longitudes made contiguous about its middle.
 

@@ -132,7 +132,7 @@ def _read_support_data(path: Path, unknown: UnknownKeys) -> tuple[JsonFields, in
     if name and brace and name.replace("_", "").isalnum():
         if name != MODEL:
             raise InputError(f"{path}: a model state of {show(name)}; {MODEL} is expected")
-        text = text[text.index("{") : text.rindex("}") + 1] if "}" in text else brace
+        text = text[text.index("{") : text.rfind("}") + 1 or len(text)]
     isd, order = (
         JsonFields(path, read_object(path, text, "an ISD or a model state")),
         LAGRANGE_ORDER,

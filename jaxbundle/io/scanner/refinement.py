@@ -6,6 +6,8 @@ points = "points.csv"               # id,role,X,Y,Z[,sX,sY,sZ], or
                                     # id,role,longitude,latitude,height[,sE,sN,sh]
 observations = "observations.csv"   # image,point,line,pixel[,sline,spixel]; or a list of such
                                     # files, and .match and .gcp of Ames Stereo Pipeline
+tie_points = "ties.csv"             # the same columns, of tie points only, which need no row in
+                                    # points (`pushbroom tie` writes it); or a list
 frames = "photographs"              # a project of photographs that share points
 dem = "terrain.tif"                 # a terrain model, whose heights are observations of tie points
 dem_sigma = 5.0                     # of these, metres
@@ -50,8 +52,9 @@ attitude_rate = "held"
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 from jaxbundle.errors import InputError
@@ -73,6 +76,7 @@ SECTIONS = {
     "refine": (
         "points",
         "observations",
+        "tie_points",
         "frames",
         "dem",
         "dem_sigma",
@@ -97,7 +101,7 @@ RPC_ENDINGS = {"text": "_RPC.TXT", "rpb": ".RPB"}
 class RefineFile(NamedTuple):
     """The arguments of `jaxbundle.refinement.refine`; `rpc_ending`: of the names of files with
     compensated coefficients; `csm_states`: whether rigorous images are written as model states,
-    too."""
+    too; `sources`: the given file of every image."""
 
     images: list[AnyScannerImage]
     points: GroundPoints
@@ -109,6 +113,7 @@ class RefineFile(NamedTuple):
     terrain: HeightModel | None = None
     rpc_ending: str = RPC_ENDINGS["text"]
     csm_states: bool = False
+    sources: Mapping[str, Path] = MappingProxyType({})
 
 
 def read_refinement(path: str | Path) -> RefineFile:
@@ -128,8 +133,8 @@ def read_refinement(path: str | Path) -> RefineFile:
     if "frames" in section:
         frames = read_network(section.path("frames", "a project of photographs", folder=True))
     # other programs name an image by its file, without folder and suffix
-    stem = lambda id: file.section("images").path(id, "an image").stem
-    names = {re.sub("(?i)_rpc$", "", stem(one.id)): one.id for one in images}
+    sources = {one.id: file.section("images").path(one.id, "an image") for one in images}
+    names = {re.sub("(?i)_rpc$", "", sources[one.id].stem): one.id for one in images}
     names |= {one.id: one.id for one in images}
     points, observations, said = read_points(section, names, images, frames, radians)
     warnings += said
@@ -157,6 +162,7 @@ def read_refinement(path: str | Path) -> RefineFile:
         _read_terrain(section, images),
         RPC_ENDINGS[rpc_format],
         _wants_states(section, images),
+        sources,
     )
 
 

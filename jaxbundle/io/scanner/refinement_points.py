@@ -37,13 +37,14 @@ def read_points(
 
     **Arguments:** `names`: ids of images by the names that other programs know them by.
     """
-    files = section.paths("observations", "a CSV table, .match or .gcp")
+    ties_alone = "tie_points" in section and "observations" not in section
+    files = [] if ties_alone else section.paths("observations", "a CSV table, .match or .gcp")
     by_suffix = {s: [f for f in files if f.suffix.lower() == s] for s in (GCP, MATCH)}
     tables = [read_csv(f) for f in files if f.suffix.lower() not in by_suffix]
     for table in tables:
         table.check_names(MEASURED[:4], MEASURED[4:])
     parts, warnings = [], []
-    if "points" in section or not (by_suffix[GCP] or by_suffix[MATCH]):
+    if "points" in section or not (by_suffix[GCP] or by_suffix[MATCH] or ties_alone):
         parts.append(_points_of(section.table("points"), images[0].earth, radians))
     for path in by_suffix[GCP]:
         control = read_gcp(path)
@@ -57,6 +58,15 @@ def read_points(
         tables.append(table)
         parts.append(ties)
         warnings += said
+    if "tie_points" in section:
+        given = {id for part in parts for id in part.id}
+        for path in section.paths("tie_points", "a CSV table of measurements of tie points"):
+            table = read_csv(path)
+            table.check_names(MEASURED[:4], MEASURED[4:])
+            tables.append(table)
+            new = [id for id in dict.fromkeys(table.values["point"]) if id not in given]
+            given |= set(new)
+            parts.append(_tie_points(new, Source(str(path))))
     points = _join_points(parts)
     # checked first: the ids of observations are looked up in it
     check_points_table(points)
@@ -128,11 +138,7 @@ def _matched(
         **dict(zip(("line", "pixel"), found.xy.T.tolist())),
     }
     source = Source("match files")
-    unknown = np.full((number, 3), np.nan)
-    axes = np.tile(np.eye(3), (number, 1, 1))
-    ties = GroundPoints(
-        tuple(labels), ("tie",) * number, unknown, np.zeros((number, 3)), axes, source=source
-    )
+    ties = _tie_points(labels, source)
     warnings = []
     if found.contradicting:
         warnings.append(
@@ -140,6 +146,13 @@ def _matched(
             "left out"
         )
     return Columns(values, source), ties, warnings
+
+
+def _tie_points(ids: Sequence[str], source: Source) -> GroundPoints:
+    """Tie points without coordinates."""
+    n = len(ids)
+    unknown, axes = np.full((n, 3), np.nan), np.tile(np.eye(3), (n, 1, 1))
+    return GroundPoints(tuple(ids), ("tie",) * n, unknown, np.zeros((n, 3)), axes, source=source)
 
 
 def _join_points(parts: Sequence[GroundPoints]) -> GroundPoints:

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.network.columns import show
+from jaxbundle.system.file_content import ENDS_EARLY
 
 # UTC; digits below a nanosecond are dropped.
 TIME = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d(?:\.\d{1,9})?)\d*Z?")
@@ -115,7 +116,9 @@ def parse_xml(path: str | Path, text: str) -> ET.Element:
     except DefusedXmlException:
         raise InputError(f"{path}: entities are not expected in this file") from None
     except (ParseError, ValueError) as error:
-        raise InputError(f"{path}: not valid XML: {error}") from None
+        # expat's errors 3 and 5, no element found and unclosed token, are of an end too early
+        early = ENDS_EARLY if text.strip() and getattr(error, "code", 0) in (3, 5) else ""
+        raise InputError(f"{path}: not valid XML: {error}{early}") from None
     except RecursionError:
         raise InputError(f"{path}: not valid XML: elements are nested too deeply") from None
     return root

@@ -2,9 +2,10 @@
 
 import errno
 import os
+import re
 import shutil
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from jaxbundle.errors import InputError
@@ -55,6 +56,31 @@ def replace_files(*paths: str | Path) -> Iterator[tuple[Path, ...]]:
             for name, path in zip(names, paths):
                 said = said.replace(str(name), str(path))
             raise InputError(said) from None
+
+
+def remove_left_behind(path: str | Path) -> None:
+    """Remove what killed processes have left of a file that they wrote: a large map takes the place
+    of the next one. Files of processes that still run are kept, and all where it is not known."""
+    target = Path(os.path.realpath(path))
+    if os.name != "posix" or not target.parent.is_dir():
+        return
+    pattern = re.compile(rf"\.{re.escape(target.stem[:60])}\.(\d+){re.escape(target.suffix)}")
+    for name in os.listdir(target.parent):
+        found = pattern.fullmatch(name)
+        if found is not None and not _is_running(int(found[1])):
+            with suppress(OSError):
+                os.unlink(target.with_name(name))
+
+
+def _is_running(process: int) -> bool:
+    """Whether there is a process with this number."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):
+        return True
+    return True
 
 
 def unwritable(path: str | Path, error: OSError) -> InputError:

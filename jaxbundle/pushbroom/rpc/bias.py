@@ -14,6 +14,7 @@ For correlated observations (Baarda, 1968), with Q the cofactors of the unknowns
 """
 
 from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -230,7 +231,21 @@ def _check_domain(rpc: Rpc, control: RpcTable, source: Source) -> None:
             )
 
 
-def bias_terms(rpc: Rpc, line: Scalar, sample: Scalar) -> tuple[Scalar, ...]:
+class BiasDomain(NamedTuple):
+    """The offsets and scales of the coefficients that a bias belongs to."""
+
+    line_offset: Scalar
+    line_scale: Scalar
+    sample_offset: Scalar
+    sample_scale: Scalar
+
+
+def domain_of_bias(rpc: Rpc) -> BiasDomain:
+    """The offsets and scales of coefficients."""
+    return BiasDomain(*(float(getattr(rpc, name)) for name in BiasDomain._fields))
+
+
+def bias_terms(rpc: Rpc | BiasDomain, line: Scalar, sample: Scalar) -> tuple[Scalar, ...]:
     """1, l̂, ŝ, l̂², l̂ŝ, ŝ²: what the coefficients of a bias are multiplied by."""
     l = (line - rpc.line_offset) / rpc.line_scale
     s = (sample - rpc.sample_offset) / rpc.sample_scale

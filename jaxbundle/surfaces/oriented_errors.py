@@ -1,0 +1,123 @@
+"""Errors that the cells of a surface share through the orientations of its images: photographs of a
+project, or scanner and RPC images of a refinement.
+
+A cell depends on all images that see it. Its height changes by n·dX, n = (−∂z/∂x, −∂z/∂y, 1) in the
+coordinates of the map; images of scanners have coordinates of their own, dX_map = (∂X_map/∂X)·dX.
+"""
+
+import dataclasses
+from collections.abc import Set
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.network.columns import list_some
+from jaxbundle.surfaces.height_cells import HeightGrid, Modes
+from jaxbundle.surfaces.inputs import read_orientations
+from jaxbundle.surfaces.orientation import (
+    OrientationErrors,
+    orientation_errors,
+    orientation_modes,
+)
+from jaxbundle.surfaces.scanner_inputs import from_map, map_derivative, read_refined_views
+from jaxbundle.surfaces.scanner_views import Neighbourhood
+from jaxbundle.surfaces.views import OrientedImage, is_inside
+
+
+@dataclasses.dataclass(frozen=True)
+class ChosenImages:
+    """The images of a project or of a refinement, and the names of those a surface was made of;
+    `around`: the place of scanner images, None in the coordinates of the object."""
+
+    path: Path
+    views: tuple[OrientedImage, ...]
+    around: Neighbourhood | None
+    names: Set[str]
+
+
+def choose_images(path: str | Path, patterns: str) -> ChosenImages:
+    """The images of a project, or of the folder of a refinement, whose ids have one of the
+    patterns, which commas separate.
+
+    **Raises:** `InputError` if they are fewer than two.
+    """
+    path = Path(path)
+    refined = read_refined_views(path) if path.is_dir() else None
+    views, around = refined if refined is not None else (read_orientations(path), None)
+    some = [pattern.strip() for pattern in patterns.split(",")]
+    names = {v.name for v in views if any(fnmatchcase(v.name, p) for p in some)}
+    if len(names) < 2:
+        known = list_some([view.name for view in views], 5, str)
+        raise InputError(f"{path}: {patterns} names {len(names)} of its images ({known})")
+    return ChosenImages(path, tuple(views), around, names)
+
+
+@dataclasses.dataclass(frozen=True)
+class OrientedErrors:
+    """The errors of a surface by the orientations of its images; `uses`: of those listed, which it
+    was made of; `system` of its coordinates."""
+
+    errors: OrientationErrors
+    uses: tuple[bool, ...]
+    around: Neighbourhood | None
+    system: str | None
+
+    @property
+    def number(self) -> int:
+        return self.errors.root.shape[1]
+
+    def __call__(self, grid: HeightGrid) -> Modes:
+        found = np.zeros((self.number, *grid.shape))
+        rows, columns = np.nonzero(np.isfinite(grid.height))
+        if not len(rows):
+            return found
+        height = grid.height[rows, columns]
+        x, y = grid.x + (columns + 0.5) * grid.size, grid.y - (rows + 0.5) * grid.size
+        slopes = grid.slopes()[:, rows, columns]
+        direction = np.stack([-slopes[0], -slopes[1], np.ones(len(x))], 1)
+        X, direction = self._to_images(np.stack([x, y, height], 1), direction)
+        used = np.zeros((len(X), len(self.uses)), bool)
+        for k, (view, mine) in enumerate(zip(self.errors.views, self.uses)):
+            if mine:
+                used[:, k] = is_inside(view, view.project(X))
+        # a cell of one image has no height from it
+        used &= used.sum(1, keepdims=True) > 1
+        seen = used.any(1)
+        M = orientation_modes(self.errors, X[seen], used[seen], direction[seen])
+        found[:, rows[seen], columns[seen]] = M.T
+        return found
+
+    def _to_images(
+        self, X: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "n 3"]
+    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+        """Points, and the directions along which their errors count, in the images' coordinates."""
+        if self.around is None or self.system is None:
+            return X, direction
+        X = from_map(X[:, 0], X[:, 1], X[:, 2], self.around, self.system)
+        J = map_derivative(X, self.around, self.system)
+        return X, np.einsum("ni,nij->nj", direction, J)
+
+
+def oriented_errors(chosen: ChosenImages, others: Set[str], system: str | None) -> OrientedErrors:
+    """The errors of the chosen images; `others`: images whose errors belong to the same ones, of
+    another surface of the same adjustment.
+
+    **Raises:** `InputError` without covariance, or of a surface without coordinate system.
+    """
+    if chosen.around is not None and system is None:
+        raise InputError(
+            f"{chosen.path}: its images are on the Earth, the surface has no coordinate system; "
+            "give it one (gdal_edit.py -a_srs)"
+        )
+    kept = [view for view in chosen.views if view.name in (chosen.names | others)]
+    errors = orientation_errors(kept)
+    if not errors.uncertain:
+        raise InputError(
+            f"{chosen.path}: no covariance of its orientations; adjust it with --out and give the "
+            "folder"
+        )
+    uses = tuple(view.name in chosen.names for view in kept)
+    return OrientedErrors(errors, uses, chosen.around, system)

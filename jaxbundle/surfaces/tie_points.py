@@ -1,0 +1,319 @@
+"""Tie points of scanner and RPC images by matching along epipolar curves.
+
+At corners of a base image the best correlation along the curve in each other image is searched,
+coarse to fine over the range of heights, then least squares matching gives the position; an error
+of the orientation across the curves, up to some ten pixels, is found first (`relative`). Matches
+are checked by uniqueness, convergence and ρ, and against their neighbours: the distance from the
+curve is a linear function of the position (what is left of the orientation), and the height does
+not leave that of the points around by far more than the others do. What remains are blunders that
+only redundancy finds: `refine` with snooping.
+
+**σ.** Half of the covariance of a match is that of each of its windows. Distances from the curves
+have no other reason than these errors: their scatter multiplies the covariances of a pair.
+"""
+
+import dataclasses
+from collections import Counter
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+
+from jaxbundle.errors import NotSolvedError
+from jaxbundle.results import TableMethods
+from jaxbundle.surfaces.bounds import Bounds
+from jaxbundle.surfaces.correlation import Pyramid, make_pyramid
+from jaxbundle.surfaces.guide import GuideSettings, search
+from jaxbundle.surfaces.interest import interest_points
+from jaxbundle.surfaces.matching import MatchingSettings, is_confirmed
+from jaxbundle.surfaces.pairs import score
+from jaxbundle.surfaces.relative import align
+from jaxbundle.surfaces.scanner_views import GroundView
+from jaxbundle.surfaces.scatter import robust_sigma
+from jaxbundle.surfaces.segments import positions, segments, visible_range, windows
+from jaxbundle.surfaces.subpixel_matching import has_texture, refine
+from jaxbundle.surfaces.views import Places, is_inside
+from jaxbundle.types import Progress
+
+
+@dataclasses.dataclass(frozen=True)
+class TiePointSettings:
+    """How tie points are chosen, matched and checked; pixels of the full images."""
+
+    levels: int = 3
+    """Levels of the pyramids: the search over all heights is in eighths of the image."""
+    max_deviation: float = 3.5
+    """Robust σ by which the distance from the epipolar curve may differ from a linear function of
+    the position: of normal errors 0.05 % are lost."""
+    max_height_deviation: float = 6.0
+    """Robust σ by which a height may differ from the median of those of its neighbours. Wider than
+    for errors: terrain and houses differ, too."""
+    neighbours: int = 8
+    """Points around for this median: the ring of a grid."""
+    least_matches: int = 12
+    """Fewest matches of a pair: fewer do not tell which of them are wrong."""
+    guide: GuideSettings = GuideSettings()
+    matching: MatchingSettings = MatchingSettings()
+
+
+@dataclasses.dataclass(frozen=True)
+class TiePoints(TableMethods):
+    """Measurements of tie points: names of images; of each measurement the image, the number of
+    the point, line and pixel, and their σ; `rejected`: numbers of matches by reason; messages."""
+
+    images: tuple[str, ...]
+    image: Int[np.ndarray, " n"]
+    point: Int[np.ndarray, " n"]
+    xy: Float[np.ndarray, "n 2"]
+    sigma: Float[np.ndarray, "n 2"]
+    rejected: dict[str, int]
+    messages: tuple[str, ...] = ()
+
+    def table(self) -> dict[str, np.ndarray]:
+        """Columns image, point, line, pixel, sline, spixel; one row a measurement."""
+        names = np.array(self.images, object)
+        points = np.array([f"T{k + 1}" for k in self.point], object)
+        columns = zip(("line", "pixel", "sline", "spixel"), (*self.xy.T, *self.sigma.T))
+        return {"image": names[self.image], "point": points, **dict(columns)}
+
+    def to_dict(self) -> dict:
+        """Counts as plain numbers."""
+        rays = np.bincount(np.bincount(self.point)) if len(self.point) else np.zeros(0, int)
+        return {
+            "points": int(self.point.max(initial=-1)) + 1,
+            "measurements": len(self.point),
+            "rays": {str(k): int(n) for k, n in enumerate(rays) if n},
+            "median_sigma": float(np.median(self.sigma)) if len(self.sigma) else None,
+            "rejected": dict(self.rejected),
+            "warnings": list(self.messages),
+        }
+
+    def __str__(self) -> str:
+        """Counts in lines."""
+        found = self.to_dict()
+        rays = ", ".join(f"{n} with {k}" for k, n in found["rays"].items())
+        lines = [f"{found['points']} tie points, by rays: {rays}; median σ "
+                 f"{found['median_sigma']:.3g} pixels"]  # fmt: skip
+        lines += [f"    {n:8} matches: {reason}" for reason, n in self.rejected.items()]
+        return "\n".join([*lines, *self.messages])
+
+
+class _PairMatches(NamedTuple):
+    """Places of points of a base in another image; which are good; σ there and in the base."""
+
+    place: Places
+    good: Bool[np.ndarray, " n"]
+    sigma: Float[np.ndarray, "n 2"]
+    in_base: Float[np.ndarray, "n 2"]
+
+
+def match_tie_points(
+    views: Sequence[GroundView],
+    bounds: Sequence[Bounds],
+    spacing: int,
+    settings: TiePointSettings = TiePointSettings(),
+    progress: Progress | None = None,
+) -> TiePoints:
+    """Tie points about `spacing` pixels apart, each in all images where it is found.
+
+    **Raises:** `NotSolvedError` if no pair has enough matches.
+    """
+    pyramids = [make_pyramid(view.grey, settings.levels) for view in views]
+    lost: Counter[str] = Counter()
+    messages: list[str] = []
+    rows: list[tuple[np.ndarray, np.ndarray, Places, np.ndarray]] = []
+    known: list[list[Places]] = [[] for _ in views]
+    number = 0
+    for i, base in enumerate(views):
+        uv = _new_corners(base, known[i], spacing, settings)
+        partners = [j for j in range(len(views)) if j != i and score(base, bounds[i], views[j])]
+        found = np.zeros((len(uv), len(views)), bool)
+        place = np.zeros((len(uv), len(views), 2))
+        sigma, in_base = np.zeros((2, len(uv), len(views), 2))
+        for j in partners:
+            pair = _match_pair(
+                (base, views[j]), (pyramids[i], pyramids[j]), uv, bounds[i], settings, lost
+            )
+            if pair is None:
+                # from the other side it is the same
+                if i < j:
+                    messages.append(f"{base.name} and {views[j].name}: too few matches")
+                continue
+            place[:, j], found[:, j], sigma[:, j], in_base[:, j] = pair
+        others = found.sum(1)
+        tied = np.flatnonzero(others)
+        found[tied, i], place[tied, i] = True, uv[tied]
+        mean = (in_base[tied] ** 2).sum(1) / others[tied, None]
+        sigma[tied, i] = np.sqrt(mean)
+        for j in range(len(views)):
+            mine = tied[found[tied, j]]
+            at = number + np.searchsorted(tied, mine)
+            rows.append((np.full(len(mine), j), at, place[mine, j], sigma[mine, j]))
+            known[j].append(place[mine, j])
+        number += len(tied)
+        if progress:
+            progress("tie points", i + 1, len(views))
+    if not number:
+        raise NotSolvedError(
+            "no tie points: the images have too little common texture, or their orientations or "
+            "the range of heights are wrong"
+        )
+    image, point, uv, s = (np.concatenate(columns) for columns in zip(*rows))
+    names = tuple(view.name for view in views)
+    return TiePoints(names, image, point, uv[:, ::-1], s[:, ::-1], dict(lost), tuple(messages))
+
+
+def _new_corners(
+    base: GroundView, known: Sequence[Places], spacing: int, settings: TiePointSettings
+) -> Places:
+    """Corners of an image that are not near those it has."""
+    uv = interest_points(base.grey, "corners", spacing)
+    uv = uv[is_inside(base, uv, settings.matching.edge_margin)]
+    every = np.concatenate([np.zeros((0, 2)), *known])
+    if not len(every) or not len(uv):
+        return uv
+    return uv[cKDTree(every).query(uv)[0] > spacing / 2]
+
+
+def _match_pair(
+    pair: tuple[GroundView, GroundView],
+    pyramids: tuple[Pyramid, Pyramid],
+    uv: Places,
+    bounds: Bounds,
+    settings: TiePointSettings,
+    lost: Counter[str],
+) -> _PairMatches | None:
+    """The matches of points of the first image in the second; None: too few."""
+    base, other = pair
+    before = other.shift
+    try:
+        if len(uv) < settings.least_matches or align(base, other, pyramids, bounds) is None:
+            return None
+        q, rho, second = _search_heights(pair, pyramids, uv, bounds, settings)
+        found, limits = np.isfinite(q), settings.matching
+        with np.errstate(invalid="ignore"):
+            low = found & ~(rho >= limits.min_correlation)
+            twice = found & ~low & (second > limits.max_second_ratio * rho)
+        lost["low correlation"] += int(low.sum())
+        lost["not unique"] += int(twice.sum())
+        q = np.where(found & ~low & ~twice, q, np.nan)
+        if np.isfinite(q).sum() < settings.least_matches:
+            return None
+        return _refine_pair(pair, uv, q, settings, lost)
+    finally:
+        # another base has another error
+        other.shift = before
+
+
+def _search_heights(
+    pair: tuple[GroundView, GroundView],
+    pyramids: tuple[Pyramid, Pyramid],
+    uv: Places,
+    bounds: Bounds,
+    settings: TiePointSettings,
+) -> Float[np.ndarray, "3 n"]:
+    """Heights of the best correlation, ρ, and ρ of the second best; NaN: none."""
+    base, other = pair
+    both = pyramids[0], [pyramids[1]]
+    wide = visible_range(base, other, uv, bounds(uv), settings.matching.edge_margin)
+    out = np.full((3, len(uv)), np.nan)
+    rows = np.flatnonzero(np.isfinite(wide).all(1) & (wide[:, 0] < wide[:, 1]))
+    wide = wide[rows]
+    pixels = np.maximum(segments(base, other, uv[rows], wide).length, 1.0)
+    rate, q = (wide[:, 1] - wide[:, 0]) / pixels, wide
+    for level in range(len(pyramids[0].levels) - 1, -1, -1):
+        found = search(base, [other], both, uv[rows], q, None, level, settings.guide)
+        middle = np.where(np.isfinite(found[0]), found[0], q.mean(1))
+        # what the search of this level may be off is searched in the next one
+        reach = settings.matching.search_margin * 2.0**level * rate
+        q = np.clip(middle[:, None] + reach[:, None] * [-1, 1], wide[:, :1], wide[:, 1:])
+        out[:2, rows] = found[:2]
+        if level == len(pyramids[0].levels) - 1:
+            # only the search of all heights tells whether there are two
+            out[2, rows] = found[2]
+    return out
+
+
+def _refine_pair(
+    pair: tuple[GroundView, GroundView],
+    uv: Places,
+    q: Float[np.ndarray, " n"],
+    settings: TiePointSettings,
+    lost: Counter[str],
+) -> _PairMatches | None:
+    """Least squares matching at heights (NaN: none), and the checks against neighbours."""
+    base, other = pair
+    n, rows, limits = len(uv), np.flatnonzero(np.isfinite(q)), settings.matching
+    uv, q = uv[rows], q[rows]
+    window = windows(base, other, base.points(uv, q))
+    start = positions(base, other, uv, q[:, None])[:, 0]
+    half = limits.half_fine_window
+    match = refine(base, other, uv, start, window.A, half, limits.windows)
+    good = window.usable & is_confirmed(match, start, limits)
+    good &= has_texture(base.grey, uv, match.sigma0, half, limits.windows.min_texture)
+    lost["not confirmed by least squares matching"] += int((~good).sum())
+    across = np.stack([-window.other_axis[:, 1], window.other_axis[:, 0]], 1)
+    across = across / np.linalg.norm(across, axis=1, keepdims=True)
+    off = np.einsum("ni,ni->n", match.uv - start, across)
+    good, rest = _near_the_curve(uv, off, good, settings)
+    lost["far from the epipolar curve"] += int(np.isfinite(rest).sum() - good.sum())
+    near = _as_high_as_neighbours(uv, q, good, settings)
+    lost["other height than its neighbours"] += int((good & ~near).sum())
+    good &= near
+    if good.sum() < settings.least_matches:
+        return None
+    C = match.covariance + limits.added_sigma**2 * np.eye(2)
+    C = np.where(good[:, None, None], C, 0.0)
+    predicted = np.sqrt(np.einsum("ni,nij,nj->n", across, C, across)[good])
+    C = C * robust_sigma(rest[good] / predicted) ** 2
+    back = np.linalg.inv(np.where(good[:, None, None], match.A, np.eye(2)))
+    in_base = back @ C @ np.swapaxes(back, 1, 2)
+    out = _PairMatches(np.zeros((n, 2)), np.zeros(n, bool), np.zeros((n, 2)), np.zeros((n, 2)))
+    out.place[rows], out.good[rows] = match.uv, good
+    for target, values in ((out.sigma, C), (out.in_base, in_base)):
+        target[rows] = np.sqrt(np.einsum("nii->ni", values) / 2)
+    return out
+
+
+def _near_the_curve(
+    uv: Places,
+    off: Float[np.ndarray, " n"],
+    good: Bool[np.ndarray, " n"],
+    settings: TiePointSettings,
+) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Which distances from the curve are those of a linear function of the position, and what is
+    left of all that were good; NaN for others."""
+    A = np.column_stack([np.ones(len(uv)), uv - uv.mean(0)])
+    A[:, 1:] /= np.maximum(np.abs(A[:, 1:]).max(0), 1.0)
+    kept, rest = good.copy(), np.full(len(uv), np.nan)
+    # the first fit has the blunders in it, the last ones have not
+    for _ in range(5):
+        if kept.sum() < settings.least_matches:
+            return np.zeros_like(good), rest
+        x = np.linalg.lstsq(A[kept], off[kept], rcond=None)[0]
+        rest = np.where(good, off - A @ x, np.nan)
+        rest -= np.median(rest[kept])
+        limit = settings.max_deviation * max(robust_sigma(rest[kept]), 1e-3)
+        with np.errstate(invalid="ignore"):
+            kept = good & (np.abs(rest) < limit)
+    return kept, rest
+
+
+def _as_high_as_neighbours(
+    uv: Places,
+    q: Float[np.ndarray, " n"],
+    good: Bool[np.ndarray, " n"],
+    settings: TiePointSettings,
+) -> Bool[np.ndarray, " n"]:
+    """Which heights do not leave the median of their neighbours' by far more than others do."""
+    rows, k = np.flatnonzero(good), settings.neighbours
+    if len(rows) <= k:
+        return good
+    _, near = cKDTree(uv[rows]).query(uv[rows], k + 1)
+    off = q[rows] - np.median(q[rows][near[:, 1:]], axis=1)
+    limit = settings.max_height_deviation * max(robust_sigma(off), 1e-9)
+    kept = good.copy()
+    kept[rows] = np.abs(off) < limit
+    return kept
