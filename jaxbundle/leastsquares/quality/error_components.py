@@ -210,6 +210,12 @@ class ErrorModel:
             for (name, unit), s, d, z in zip(names, root, sigma, self.score)
         )
 
+    @property
+    def widened_sizes(self) -> dict[str, float]:
+        """The sizes that covariances are of, by name, as a design takes them."""
+        factor = np.sqrt(self.widening)
+        return {one.name: float(k * one.size) for k, one in zip(factor, self.sizes)}
+
     def covariance(self, table: str) -> Float[np.ndarray, "rows width width"]:
         """The covariance blocks of all rows of a table."""
         theta = self.widening * self.theta
