@@ -693,3 +693,19 @@ def test_in_the_frame_of_a_widget_a_control_changes_the_numbers(tmp_path):
         browser.until(f"{inside}.getElementById('twice').innerText === '42 by Python'")
         assert browser.value("window.asked.given.x") == 3
         assert [line for line in browser.console if "can escape its sandboxing" not in line] == []
+
+
+def test_sigma_are_the_larger_under_correlated_errors():
+    """As the report has them, where images of a point share an error; also the drawn ellipsoids."""
+    network = jaxbundle.read_network("examples/convergent4/project.toml")
+    rays, rng = network.observations, np.random.default_rng(0)
+    shared = 3 * np.nanmedian(rays.sigma) * rng.normal(size=(len(network.points), 2))
+    rays = dataclasses.replace(rays, xy=rays.xy + shared[rays.point])
+    found = jaxbundle.adjust(network.replace(observations=rays), correlated=True)
+    assert found.sigma_ratio > 1.05
+    view = NetworkView(found)
+    C = found.image_covariance, found.classical_image_covariance
+    larger = np.max([np.sqrt(np.diagonal(one, axis1=1, axis2=2)) for one in C], axis=0)
+    # a design has predicted image coordinates, and of many columns other random combinations
+    assert_allclose(view.before.images, larger, rtol=0.1)
+    assert "the larger of the classical ones" in str(view._move_section({}, True))
