@@ -15,8 +15,8 @@
 | `parts` | hills and a facade that have nothing in common |
 | `scenes` | hills and the square of `depth`, which have nothing in common |
 | `foreign` | hills, and three photographs of other places |
-| `turntable` | a fountain that turns before a still camera, 18 degrees from one photograph to the next; the room behind it stands still |
-| `frames` | hills from a camera carried by hand: 40 frames of a video, 1 degree from one to the next |
+| `turntable` | a fountain that turns by 18 degrees before a still camera and a still room |
+| `frames` | hills, 40 frames of a video carried by hand, 1 degree from one to the next |
 
 Unless stated otherwise, the principal distance is unknown.
 """
@@ -243,7 +243,6 @@ def turntable(width: int) -> list[Shot]:
     scene = fountain_scene(texel)
     disc = HeightField(scene.shapes[0].height, (-2.6, -2.6, 2.6, 2.6))
     scene = Scene((disc, *scene.shapes[1:]), scene.textures)
-    rng = np.random.default_rng(14)
     X0 = arc(7.0, np.arange(n) * 2 * np.pi / n, 0.45)
     found = shots("t", scene, X0, np.tile([0.0, 0, 0.5], (n, 1)), width)
     far = facade(width)[4]
