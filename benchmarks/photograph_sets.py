@@ -15,6 +15,8 @@
 | `parts` | hills and a facade that have nothing in common |
 | `scenes` | hills and the square of `depth`, which have nothing in common |
 | `foreign` | hills, and three photographs of other places |
+| `turntable` | a fountain that turns by 18 degrees before a still camera and a still room |
+| `frames` | hills, 40 frames of a video carried by hand, 1 degree from one to the next |
 
 Unless stated otherwise, the principal distance is unknown.
 """
@@ -235,10 +237,38 @@ def convergent(width: int, number: int = 11) -> list[Shot]:
     return shots("photo_", scene, X0, 0.3 * rng.normal(size=(number, 3)), width, roll)
 
 
+def turntable(width: int) -> list[Shot]:
+    """The room is a picture of a facade, the same behind all."""
+    n, texel = 20, 0.5 * 7 / (FOCAL * width)
+    scene = fountain_scene(texel)
+    disc = HeightField(scene.shapes[0].height, (-2.6, -2.6, 2.6, 2.6))
+    scene = Scene((disc, *scene.shapes[1:]), scene.textures)
+    X0 = arc(7.0, np.arange(n) * 2 * np.pi / n, 0.45)
+    found = shots("t", scene, X0, np.tile([0.0, 0, 0.5], (n, 1)), width)
+    far = facade(width)[4]
+    room = render(far.scene, far.camera, far.X0, far.M, far.sensor).grey
+
+    def before_the_room(rendered: Rendered, shot: Shot) -> np.ndarray:
+        noise = np.random.default_rng(shot.sensor.seed).normal(0, 2, room.shape)
+        still = np.clip(room + noise, 0, 255).astype(np.uint8)
+        return np.where(rendered.surface >= 0, rendered.grey, still)
+
+    return [dataclasses.replace(shot, finish=before_the_room) for shot in found]
+
+
+def frames(width: int) -> list[Shot]:
+    rng = np.random.default_rng(15)
+    n, texel = 40, 0.5 * 6 / (FOCAL * width)
+    shake = lambda size: np.cumsum(size * rng.normal(size=(n, 3)), 0)
+    X0 = arc(6.0, np.radians(np.arange(n) - n / 2), 0.8) + shake(0.01)
+    return shots("v", hills_scene(texel), X0, shake(0.01), width, quality=80)
+
+
 SETS: dict[str, Callable[[int], list[Shot]]] = {
     f.__name__: f
     for f in (
         convergent, facade, chain, loop, wide, depth, portrait, cameras, parts, scenes, foreign,
+        turntable, frames,
     )  # fmt: skip
 }
 

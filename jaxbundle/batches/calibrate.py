@@ -31,10 +31,16 @@ from jaxbundle.batches.camera import (
     WEAK,
 )
 from jaxbundle.batches.compiled import ProgramKey, Rows, in_double, solve_portion, tests_of_points
-from jaxbundle.batches.correlated import ComponentSums, batch_errors, sums_of_portion
+from jaxbundle.batches.correlated import (
+    TRACED,
+    ComponentSums,
+    scatter_of_portion,
+    sums_of_portion,
+)
+from jaxbundle.batches.error_sizes import Scatter, batch_errors
 from jaxbundle.batches.input import Batch, Portion
 from jaxbundle.batches.misfit import far_outside, misfits, remarks
-from jaxbundle.batches.normal import CameraUnknowns
+from jaxbundle.batches.normal import CameraUnknowns, Sightings
 from jaxbundle.batches.result import BatchCalibration as BatchCalibration
 from jaxbundle.batches.snooping import MAX_ROUNDS, TESTS, Snooping
 from jaxbundle.batches.weakness import is_vague, vanishing, weak_geometry
@@ -53,7 +59,7 @@ OF_A_VIEW = (
     "sigma_position",
     "sigma_angles",
     "rotation",
-    "pose_parts",
+    "sums_pose",
     "sigma_position_correlated",
     "sigma_angles_correlated",
 )
@@ -147,27 +153,79 @@ def calibrate_batch(  # noqa: PLR0913 keyword arguments of a public function
     if correlated is not None:
         # one after the other: large products use all cores, and two programs that wait for the
         # same threads never end
-        parts = [rows | _sums(key, portion, rows) for portion, rows in zip(portions, parts)]
+        traced = _traced(portions, parts, correlated == "batch")
+        parts = [rows | _sums(key, portion, rows, traced) for portion, rows in zip(portions, parts)]
+    scatter = partial(_scatter, key, portions, parts, len(batch))
     shape = batch.xy.shape[1:3]
     parts = [_without_padding(portion, shape, rows) for portion, rows in zip(portions, parts)]
     order = np.argsort(np.concatenate([portion.cameras for portion in portions]))
     rows = {name: np.concatenate([p[name] for p in parts])[order] for name in parts[0]}
     if snooping is not None:
         rows["removed"] |= far
-    return _result(camera_model, batch, rows, correlated)
+    if correlated is not None:
+        rows |= _under_errors(batch, rows, scatter, correlated == "batch")
+    return _result(camera_model, batch, rows)
 
 
-def _sums(key: ProgramKey, portion: Portion, rows: Rows) -> Rows:
+def _traced(
+    portions: Sequence[Portion], parts: Sequence[Rows], together: bool
+) -> Bool[np.ndarray, " cameras"]:
+    """Whose traces are needed: of every solved camera, or for one set of sizes of some of them, as
+    far as there are with views enough for components by view."""
+    of = lambda rows, portion: np.stack([rows["status"] == CONVERGED, rows["views"].sum(1)])[
+        :, : len(portion.cameras)
+    ]
+    cameras = np.concatenate([portion.cameras for portion in portions])
+    solved, views = np.zeros((2, len(cameras)), int)
+    solved[cameras], views[cameras] = np.concatenate(list(map(of, parts, portions)), 1)
+    found = solved > 0
+    if together:
+        many = found & (views >= DEFAULTS.min_images)
+        chosen = np.flatnonzero(many if many.any() else found)
+        step = max(len(chosen) / TRACED, 1)
+        found = np.zeros(len(cameras), bool)
+        found[chosen[np.arange(0, len(chosen), step).astype(int)]] = True
+    return found
+
+
+def _sums(
+    key: ProgramKey, portion: Portion, rows: Rows, traced: Bool[np.ndarray, " cameras"]
+) -> Rows:
     """What the error components of the cameras of a portion are estimated from."""
+    wide = np.zeros(len(portion.axes), bool)
+    wide[: len(portion.cameras)] = traced[portion.cameras]
+    placed = portion.axes, portion.middle, wide
+    found = sums_of_portion(key, DEFAULTS, *_adjusted(portion, rows), *placed)
+    rows = {f"sums_{name}": np.array(x) for name, x in found._asdict().items()}
+    return rows | {"sums_pose": rows["sums_pose"].swapaxes(1, 2)}
+
+
+def _adjusted(portion: Portion, rows: Rows) -> tuple[Sightings, CameraUnknowns]:
+    """What was adjusted of a portion, with its weights, and the unknowns found."""
     weight = np.asarray(portion.seen.weight) * rows["views"][:, :, None]
     if "removed" in rows:
         weight = weight * ~rows["removed"]
     seen = in_double(dataclasses.replace(portion.seen, weight=weight))
-    at = CameraUnknowns(rows["interior"], rows["quaternion"], rows["shift"])
-    octaves, reach = tuple(DEFAULTS.octaves_of_knots), DEFAULTS.reach
-    found = sums_of_portion(key, octaves, reach, seen, at, portion.axes, portion.middle)
-    T, q, interior, pose = (np.array(x) for x in found)
-    return {"T": T, "q": q, "interior_parts": interior, "pose_parts": pose.swapaxes(1, 2)}
+    return seen, CameraUnknowns(rows["interior"], rows["quaternion"], rows["shift"])
+
+
+def _scatter(
+    key: ProgramKey,
+    portions: Sequence[Portion],
+    parts: Sequence[Rows],
+    cameras: int,
+    theta: Float[np.ndarray, "cameras k"],
+) -> Float[np.ndarray, "cameras k k"]:
+    """The covariances of the forms of all cameras under errors of these sizes."""
+    found = np.zeros((cameras, theta.shape[1], theta.shape[1]))
+    for portion, rows in zip(portions, parts):
+        own = theta[portion.cameras]
+        if own.any():
+            missing = len(portion.axes) - len(own)
+            wide = np.pad(own, [(0, missing), (0, 0)])
+            forms = scatter_of_portion(key, DEFAULTS, *_adjusted(portion, rows), wide)
+            found[portion.cameras] = np.asarray(forms)[: len(own)]
+    return found
 
 
 def _without_padding(portion: Portion, shape: tuple[int, int], solved: Rows) -> Rows:
@@ -187,9 +245,7 @@ def _without_padding(portion: Portion, shape: tuple[int, int], solved: Rows) -> 
     return rows
 
 
-def _result(
-    model: CameraModel, batch: Batch, rows: Rows, correlated: str | None
-) -> BatchCalibration:
+def _result(model: CameraModel, batch: Batch, rows: Rows) -> BatchCalibration:
     """Rows in the order of the cameras; NaN for no result."""
     ended = np.where(batch.finite, rows["status"], NOT_FINITE)
     solved = ended == CONVERGED
@@ -203,8 +259,6 @@ def _result(
     # the last RMS of those at the limit: the residuals may fit perfectly where nothing is
     # determined
     rms = np.where(ended == LIMIT, rows["rms"], np.nan)
-    if correlated is not None:
-        rows |= _under_errors(batch, rows, solved, correlated == "batch")
     for name in {*OF_A_VIEW} & {*rows}:
         rows[name][~rows["views"]] = np.nan
     for values in rows.values():
@@ -223,16 +277,15 @@ def _result(
     return BatchCalibration(model=key_of(model), parameters=free, **rows)
 
 
-def _under_errors(
-    batch: Batch, rows: Rows, solved: Bool[np.ndarray, " cameras"], together: bool
-) -> Rows:
+def _under_errors(batch: Batch, rows: Rows, scatter: Scatter, together: bool) -> Rows:
     """σ under errors that image points share; `together`: of the same size in all cameras."""
-    T, q, interior = (rows.pop(name) for name in ("T", "q", "interior_parts"))
-    q[~solved] = np.nan
-    sums = ComponentSums(T, q, interior, rows.pop("pose_parts").swapaxes(1, 2))
+    sums = ComponentSums(*(rows.pop(f"sums_{name}") for name in ComponentSums._fields))
+    solved = np.where(batch.finite, rows["status"], NOT_FINITE) == CONVERGED
+    sums.q[~solved] = np.nan
+    sums = sums._replace(pose=sums.pose.swapaxes(1, 2))
     views = rows["views"].sum(1)
     points = (rows["redundancy"] + len(batch.free) + 6 * views) // 2
-    found = batch_errors(sums, views, points, together)
+    found = batch_errors(sums, views, points, together, scatter)
     diagonal = np.diagonal(found.covariance, axis1=1, axis2=2)
     return {
         "covariance_correlated": found.covariance,

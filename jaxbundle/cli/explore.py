@@ -29,6 +29,10 @@ def explore(  # noqa: PLR0913 - the options of the command
     set: Settings = None,
     format: Format = None,
     control: Control = None,
+    correlated: Annotated[
+        bool,
+        typer.Option("--correlated", help="look for errors that image points share; σ under them"),
+    ] = False,
     port: Annotated[int, typer.Option(min=0, max=65535, help="0: any that is free")] = 0,
     browser: Annotated[bool, typer.Option(help="open the page in a browser")] = True,
     quiet: Quiet = False,
@@ -55,6 +59,7 @@ def explore(  # noqa: PLR0913 - the options of the command
             overrides=tuple(set or ()),
             format=format,
             control=control,
+            correlated=correlated,
             port=port,
             progress=progress,
             tell=tell,

@@ -52,6 +52,7 @@ def explore(  # noqa: PLR0913 (public: the options of the command, all but one b
     overrides: Sequence[str] = (),
     format: str | None = None,
     control: str | Path | None = None,
+    correlated: bool = False,
     port: int = 0,
     progress: Progress | None = None,
     tell: Callable[[str], object] = lambda _: None,
@@ -69,6 +70,7 @@ def explore(  # noqa: PLR0913 (public: the options of the command, all but one b
       flight.
     - `kind`: `"network"`, `"camera"` or `"scanner"`, where a file is not recognised (`--as`).
     - `overrides`, `format`, `control`: of the file of a network (`read_network`).
+    - `correlated`: of a network: σ under errors that image points share, as by `adjust`.
     - `photo`: a photograph to undistort; `image_size`, pixels, `pixel_size`, mm: where the camera
       has none.
     - `truth`: scanner file of the truth.
@@ -79,7 +81,12 @@ def explore(  # noqa: PLR0913 (public: the options of the command, all but one b
     """
     sizes = {"--image-size": image_size, "--pixel-size": pixel_size}
     options = {
-        NETWORK: {"--set": overrides, "--format": format, "--control": control},
+        NETWORK: {
+            "--set": overrides,
+            "--format": format,
+            "--control": control,
+            "--correlated": correlated,
+        },
         CAMERA: {"--photo": photo, **sizes},
         SCANNER: {"--truth": truth},
     }
@@ -93,7 +100,7 @@ def explore(  # noqa: PLR0913 (public: the options of the command, all but one b
                     + ("" if kind or path is None else "; change this with --as")
                 )
     if found == NETWORK:
-        view: ExplorerView = _view_network(input, overrides, format, control, progress)
+        view: ExplorerView = _view_network(input, overrides, format, control, correlated, progress)
     elif found == CAMERA:
         view = _view_camera(input, Path(photo) if photo else None, image_size, pixel_size)
     elif path is None:
@@ -156,6 +163,7 @@ def _view_network(
     overrides: Sequence[str],
     format: str | None,
     control: str | Path | None,
+    correlated: bool,
     progress: Progress | None,
 ) -> NetworkView:
     if isinstance(input, Adjustment):
@@ -164,12 +172,20 @@ def _view_network(
     if isinstance(input, str | Path):
         path, beside = Path(input), Path(control) if control else None
         network = read_network(path, format=format, overrides=overrides, control=beside)
-        origin = trace_origin(path, network, beside, {"--set": ", ".join(overrides)})
+        origin = trace_origin(
+            path,
+            network,
+            beside,
+            {
+                "--set": ", ".join(overrides),
+                "--correlated": correlated or None,
+            },
+        )
     elif isinstance(input, Network):
         network = input
     else:
         raise InputError(f"kind: {_named(input)} is no network")
-    return NetworkView(adjust(network, progress=progress), origin)
+    return NetworkView(adjust(network, correlated=correlated, progress=progress), origin)
 
 
 def _view_camera(

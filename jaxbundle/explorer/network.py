@@ -100,7 +100,12 @@ class NetworkView:
                 "the moved network does not determine all unknowns, or a camera has "
                 "no image of one of its points"
             )
-        return found
+        model = self.adjustment.error_model
+        if model is None:
+            return found
+        sigma0 = self.adjustment.sigma0
+        errors = precision(self.problem, data, sigma0=sigma0, errors=model.widened_sizes)
+        return _larger(found, jax.tree.map(np.asarray, errors))
 
     @cached_property
     def before(self) -> Precision:
@@ -362,13 +367,19 @@ class NetworkView:
         aim = draw_controls(
             [Switch("aim", "turned to its points", given.get("aim", True) is True)], live
         )
+        hint = (
+            "Where would a station be better? Same measurements, new geometry: σ to "
+            "first order, times σ0, with image points as they would be seen from there. "
+            "The error ellipsoids of the drawing are then the expected ones."
+        )
+        if self.adjustment.error_model is not None:
+            hint += (
+                " σ are the larger of the classical ones and of those under correlated errors of "
+                f"the sizes found, {significant(self.adjustment.sigma_ratio, 3)} times as large "
+                "as adjusted (median of the orientations)."
+            )
         parts = [
-            paragraph(
-                "Where would a station be better? Same measurements, new geometry: σ to "
-                "first order, times σ0, with image points as they would be seen from there. "
-                "The error ellipsoids of the drawing are then the expected ones.",
-                "hint",
-            ),
+            paragraph(hint, "hint"),
             '<div class="controls"><label><span>station</span><select id="move-station"></select>'
             "</label></div>\n",
             f'<div class="controls">\n{fields}</div>\n',
@@ -379,6 +390,20 @@ class NetworkView:
             place("moved"),
         ]
         return Section("move", "Move a station", "".join(parts), "Move a station")
+
+
+def _larger(one: Precision, other: Precision) -> Precision:
+    """The larger σ of every unknown, and of two covariances that of the larger trace."""
+    first = lambda a, b: np.trace(a, axis1=1, axis2=2) >= np.trace(b, axis1=1, axis2=2)
+    pick = lambda a, b: np.where(first(a, b)[:, None, None], a, b)
+    return Precision(
+        images=np.maximum(one.images, other.images),
+        cameras=np.maximum(one.cameras, other.cameras),
+        points=np.maximum(one.points, other.points),
+        covariance=one.covariance,
+        point_covariance=pick(one.point_covariance, other.point_covariance),
+        centre_covariance=pick(one.centre_covariance, other.centre_covariance),
+    )
 
 
 def _selection() -> Section:

@@ -7,6 +7,8 @@ import pytest
 
 import jaxbundle
 from jaxbundle.adjustment.quality.correlated_errors import DEFAULTS
+from jaxbundle.batches.error_sizes import batch_errors
+from jaxbundle.leastsquares.quality.size_traces import with_traces
 from jaxbundle.planning.stations import stations_looking_at
 
 VIEWS, NOISE = 9, 0.2
@@ -49,10 +51,7 @@ def of_batch(network, **options):
 
 
 def test_sizes_and_sigma_are_those_of_an_adjustment(network):
-    # a batch has no component of given points, and its sizes as they are estimated
-    settings = dataclasses.replace(DEFAULTS, min_given_points=len(network.points) + 1)
-    result = jaxbundle.adjust(network).with_changes(correlations=settings)
-    result.keep(result.error_model.as_estimated, None)
+    result = jaxbundle.adjust(network, correlated=True)
     found = of_batch(network, correlated="camera")
     assert found.converged.all()
     named = {size.name: size.size for size in result.error_model.sizes}
@@ -73,6 +72,30 @@ def test_sizes_and_sigma_are_those_of_an_adjustment(network):
     assert row["parameters"]["fx"]["sigma_correlated"] == found.sigma_correlated[0, 0]
     assert {c["name"] for c in row["error_components"]} >= {"affine by view"}
     assert len(found.table()["sigma_fx_correlated"]) == 1
+
+
+def test_traces_are_those_of_an_adjustment(network, monkeypatch):
+    """The engine has the columns of all components, also of given points and along tracks."""
+    result, seen = jaxbundle.adjust(network, correlated=True), []
+
+    def watched(sums, *arguments):
+        seen.append(sums)
+        return batch_errors(sums, *arguments)
+
+    monkeypatch.setattr(jaxbundle.batches.calibrate, "batch_errors", watched)
+    of_batch(network, correlated="camera")
+    T, equations = seen[0].T[0], result.error_model.equations
+    cubes = with_traces(seen[0].cubes[0], T)
+    # 16 random combinations of the columns of the last two; rest: exact to single precision
+    few = np.ix_(range(5), range(5))
+    np.testing.assert_allclose(T[few], equations.T[few], rtol=1e-3)
+    scale = np.sqrt(np.diag(T))
+    np.testing.assert_allclose(T / scale / scale[:, None], equations.T / scale / scale[:, None],
+                               atol=0.1)  # fmt: skip
+    few = np.ix_(range(5), range(5), range(5))
+    np.testing.assert_allclose(cubes[few], equations.cubes[few], rtol=3e-3)
+    for k in range(7):
+        assert cubes[k, k, k] == pytest.approx(equations.cubes[k, k, k], rel=0.5), k
 
 
 def test_sizes_of_a_batch_are_those_of_all_cameras_together(network):

@@ -43,6 +43,7 @@ from jaxbundle.explorer.widget import reply, show
 from jaxbundle.io.scanner.flight import read_flight
 from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.network.tables import Camera
+from jaxbundle.planning.stations import stations_looking_at
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.error_propagation import ground_errors
 from jaxbundle.pushbroom.flight import measured_image, true_image
@@ -693,3 +694,31 @@ def test_in_the_frame_of_a_widget_a_control_changes_the_numbers(tmp_path):
         browser.until(f"{inside}.getElementById('twice').innerText === '42 by Python'")
         assert browser.value("window.asked.given.x") == 3
         assert [line for line in browser.console if "can escape its sandboxing" not in line] == []
+
+
+def test_sigma_are_the_larger_under_correlated_errors():
+    """As the report has them, where photographs have an affine distortion each."""
+    rng, n = np.random.default_rng(3), 9
+    u, v = np.meshgrid(np.arange(10) - 4.5, np.arange(7) - 3.0)
+    board = 0.03 * np.stack([u.ravel(), v.ravel(), 0 * u.ravel()], 1)
+    azimuth = 2 * np.pi * np.arange(n) / n
+    X0 = 0.6 * np.stack([0.5 * np.cos(azimuth), 0.5 * np.sin(azimuth), np.full(n, 0.85)], 1)
+    placed = stations_looking_at(X0, np.zeros((n, 3)), roll=np.pi / 2 * (np.arange(n) % 4))
+    parameters = {"fx": 1500.0, "fy": 1500.0, "cx": 999.5, "cy": 749.5}
+    camera = Camera("cam", "opencv", parameters, free=("fx", "cx"), image_size=(2000, 1500))
+    network = jaxbundle.simulate(placed, board, camera, noise=0.2, seed=4)
+    rays, shear = network.observations, 0.6 * rng.normal(size=n)
+    x, y = ((rays.xy - rays.xy.mean(0)) / 900).T
+    xy = rays.xy + shear[rays.image, None] * np.stack([x, -y], 1)
+    points = dataclasses.replace(network.points, position=board, role=("fixed",) * len(board))
+    network = network.replace(
+        points=points, observations=dataclasses.replace(rays, xy=xy), datum="control"
+    )
+    found = jaxbundle.adjust(network, correlated=True)
+    assert found.sigma_ratio > 1.2
+    view = NetworkView(found)
+    C = found.image_covariance, found.classical_image_covariance
+    larger = np.max([np.sqrt(np.diagonal(one, axis1=1, axis2=2)) for one in C], axis=0)
+    # a design has predicted image coordinates, and of many columns other random combinations
+    assert_allclose(view.before.images, larger, rtol=0.1)
+    assert "the larger of the classical ones" in str(view._move_section({}, True))

@@ -1,17 +1,26 @@
 """Error components against dense algebra, and against errors drawn from them."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
 
 from jaxbundle import leastsquares as ls
 from jaxbundle.leastsquares.problem import make_problem
+from jaxbundle.leastsquares.quality.distributions import (
+    chi2_quantile,
+    normal_quantile,
+    skewed_quantile,
+)
 from jaxbundle.leastsquares.quality.error_components import (
     ErrorComponent,
     ErrorSettings,
     fit_error_model,
+    quadratic_forms,
 )
 from jaxbundle.leastsquares.quality.error_effects import effects, remove_fit, stack_rows
+from jaxbundle.leastsquares.quality.size_traces import Traces
 from jaxbundle.leastsquares.solution import Solution
 
 RANGE = ls.Kind(
@@ -120,10 +129,11 @@ def test_intervals_hold_although_sizes_are_estimated(network):
 def test_sizes_are_those_of_the_errors_in_the_mean(network):
     adjust, A, _, rows = network
     rng, parts, theta = np.random.default_rng(7), components(rows), []
+    settings = ErrorSettings(significance=1 - 1e-12)  # those that chance could explain, too
     for _ in range(60):
         e = rng.normal(size=len(A))
         e += sum(2 * part.root @ rng.normal(size=part.root.shape[1]) for part in parts)
-        theta.append(fit_error_model(adjust(e), parts).theta)
+        theta.append(fit_error_model(adjust(e), parts, settings).theta)
     mean, error = np.mean(theta, 0), np.std(theta, 0) / np.sqrt(60)
     # θ ≥ 0 leaves a bias of a part of σ where it is active
     assert (np.abs(mean - [1, 4, 4]) < 3.5 * error).all(), (mean, error)
@@ -181,3 +191,51 @@ def test_effects_on_rows_that_stay_in_the_reduced_system_are_those_of_dense_alge
     np.testing.assert_allclose(tables["point"].reshape(3, n), x[:, :n], atol=1e-10)
     np.testing.assert_allclose(tables["shift"].reshape(3, shifts)[:, 1:], x[:, n:], atol=1e-10)
     assert not tables["shift"].reshape(3, shifts)[:, 0].any()
+
+
+def test_traces_are_those_of_dense_algebra():
+    """Roots of few columns exactly, that of many from random combinations of them."""
+    rng = np.random.default_rng(0)
+    n, unknowns = 60, 9
+    A = rng.normal(size=(n, unknowns))
+    M = np.eye(n) - A @ np.linalg.pinv(A)
+    F = [sp.csr_matrix(s * rng.normal(size=(n, k))) for k, s in ((4, 1), (7, 0.5), (50, 0.1))]
+    traces = Traces(F, n - unknowns)
+    for k, root in enumerate(F[:2]):
+        traces.add(k, root.toarray().T, root.toarray().T @ M, True)
+    drawn = (F[2] @ rng.choice([-1.0, 1.0], (50, 4000))).T / np.sqrt(4000)
+    products = traces.add(2, drawn, drawn @ M, False)
+    traces.add_cubes(2, drawn @ M, (F[2] @ products).T @ M, 1.0)
+    T, cubes = traces.of_all()
+    V = [M] + [M @ (f @ f.T).toarray() @ M for f in F]
+    np.testing.assert_allclose(T, np.einsum("iab,jba->ij", V, V), rtol=0.02)
+    np.testing.assert_allclose(cubes, np.einsum("iab,jbc,kca->ijk", V, V, V), rtol=0.03)
+    few = np.ix_(range(3), range(3), range(3))
+    exact = np.einsum("iab,jbc,kca->ijk", V[:3], V[:3], V[:3])
+    np.testing.assert_allclose(cubes[few], exact, rtol=1e-9)
+
+
+def test_chance_makes_no_component(network):
+    """Independent errors show one in as many adjustments as the level says, though the form of four
+    columns is far from normal."""
+    adjust, A, _, rows = network
+    rng, parts = np.random.default_rng(8), components(rows)
+    system = fit_error_model(adjust(rng.normal(size=len(A))), parts).equations
+    M = np.eye(len(A)) - A @ np.linalg.pinv(A, 1e-9)
+    v = rng.normal(size=(4000, len(A))) @ M
+    q = quadratic_forms(parts, v)
+    found = {
+        name: np.mean([dataclasses.replace(system, **skewed).solve(one)[0][1:].any() for one in q])
+        for name, skewed in (("skewed", {}), ("normal", {"cubes": None}))
+    }
+    # 0.05 ± 0.0035
+    assert 0.03 < found["skewed"] < 0.06 < found["normal"], found
+
+
+@pytest.mark.parametrize("degrees", [1, 5, 80])
+def test_skewed_quantiles_are_those_of_chi2(degrees):
+    expected = (chi2_quantile(0.99, degrees) - degrees) / np.sqrt(2 * degrees)
+    g = np.sqrt(8 / degrees)
+    assert skewed_quantile(0.99, g) == pytest.approx(expected)
+    assert skewed_quantile(0.01, -g) == pytest.approx(-expected)
+    assert skewed_quantile(0.99, 1e-6) == pytest.approx(normal_quantile(0.99))

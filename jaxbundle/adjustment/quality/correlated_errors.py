@@ -39,6 +39,7 @@ from jaxbundle.leastsquares.quality.error_effects import first_rows
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Camera
+from jaxbundle.types import AnyArray
 
 
 @dataclasses.dataclass(frozen=True)
@@ -349,13 +350,16 @@ def splines(
     knots: tuple[int, int],
 ) -> Float[np.ndarray, "n columns*rows"]:
     """Products of cubic B-splines over −half … half of x and y."""
-    factors = []
-    for axis, number in enumerate(knots):
-        place = (at[:, axis] / half[axis] + 1) / 2 * (number - 3)
-        d = np.abs(place[:, None] - (np.arange(number) - 1.0))
-        inner, outer = 2 / 3 - d**2 + d**3 / 2, np.clip(2 - d, 0, None) ** 3 / 6
-        factors.append(np.where(d < 1, inner, outer))
-    return (factors[1][:, :, None] * factors[0][:, None, :]).reshape(len(at), -1)
+    x, y = (cubic_splines((at[:, k] / half[k] + 1) / 2, knots[k]) for k in (0, 1))
+    return np.asarray(y[:, :, None] * x[:, None, :]).reshape(len(at), -1)
+
+
+def cubic_splines(
+    place: Float[AnyArray, "*points"], number: int
+) -> Float[AnyArray, "*points number"]:
+    """Cubic B-splines of a number − 3 of equal intervals over 0 … 1."""
+    d = abs((place * (number - 3))[..., None] - (np.arange(number) - 1.0))
+    return ((2 - d).clip(0) ** 3 - 4 * (1 - d).clip(0) ** 3) / 6
 
 
 def _sparse_splines(

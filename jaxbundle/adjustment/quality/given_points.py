@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 from jaxbundle.leastsquares.quality.error_components import IMAGE, ErrorComponent
 from jaxbundle.leastsquares.quality.error_effects import residual_change
 from jaxbundle.leastsquares.solution import Solution
+from jaxbundle.types import AnyArray, Scalar
 
 GIVEN_POINTS = "given points"
 
@@ -42,7 +43,9 @@ def given_points_component(
     chosen = np.flatnonzero(given)
     if X.shape[1] != 3 or len(chosen) < min_points:
         return None
-    L = np.linalg.cholesky(_correlation(X[chosen], octaves))
+    apart = np.linalg.norm(X[chosen][:, None] - X[chosen], axis=2)
+    K = correlation_of_points(apart, apart.max(), np.eye(len(chosen)), octaves)
+    L = np.linalg.cholesky(K)
     own = given[point]
     column = np.searchsorted(chosen, point[own])
     rows = np.concatenate([rows[own], rows[own] + 1])
@@ -64,14 +67,15 @@ def _held(found: Solution) -> Bool[np.ndarray, " points"]:
     return np.logical_not(np.asarray(found.problem.table("point").free, bool).any(axis=1))
 
 
-def _correlation(X: Float[np.ndarray, "n 3"], octaves: int) -> Float[np.ndarray, "n n"]:
-    apart = np.linalg.norm(X[:, None] - X, axis=2)
-    K = np.eye(len(X))
+def correlation_of_points(
+    apart: Float[AnyArray, "n n"], extent: Scalar, own: Float[AnyArray, "n n"], octaves: int
+) -> Float[AnyArray, "n n"]:
+    """K from the distances of the points and the extent of the object; `own`: the identity."""
     for k in range(octaves):
-        K = K + wendland(apart / (apart.max() / 2**k))
-    return K / (1 + octaves)
+        own = own + wendland(apart / (extent / 2**k))
+    return own / (1 + octaves)
 
 
-def wendland(distance: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+def wendland(distance: Float[AnyArray, "..."]) -> Float[AnyArray, "..."]:
     """Wendland's C² function of compact support, positive definite in space: 1 at 0, 0 from 1."""
-    return np.clip(1 - distance, 0, None) ** 4 * (4 * distance + 1)
+    return (1 - distance).clip(0) ** 4 * (4 * distance + 1)

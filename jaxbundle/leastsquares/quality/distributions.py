@@ -17,6 +17,24 @@ def normal_quantile(probability: float) -> float:
     return float(_special().ndtri(probability))
 
 
+def normal_probability(x: float) -> float:
+    """Φ(x)."""
+    return float(_special().ndtr(x))
+
+
+def skewed_quantile(probability: float, skewness: float) -> float:
+    """The quantile of the χ² distribution, shifted and scaled to the mean 0 and the variance 1,
+    that has this skewness (of a negative one: mirrored): of sums of squares of normal numbers by
+    their first three moments (Pearson 1959; Imhof 1961)."""
+    if skewness < 0:
+        return -skewed_quantile(1 - probability, -skewness)
+    # χ² of ν has the skewness √(8/ν); of more degrees of freedom it is normal to 1e-6
+    if skewness < 1e-5:
+        return normal_quantile(probability)
+    half = 4 / skewness**2
+    return float((_special().gammaincinv(half, probability) - half) / math.sqrt(half))
+
+
 def chi2_quantile(probability: float, degrees: float) -> float:
     """x with P(χ² ≤ x) = probability."""
     return float(_special().chdtri(degrees, 1 - probability))

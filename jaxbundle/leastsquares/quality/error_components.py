@@ -14,23 +14,15 @@ expectations (MINQUE: Rao 1971; Koch 1999, section 3.6)
 
     q_k = vᵀV_k·v = Σ_j θ_j·T_kj,      T_kj = tr(M·V_k·M·V_j) = ‖F_kᵀ·M·F_j‖²
 
-with M² = M: T_00 is the redundancy.
+with M² = M: T_00 is the redundancy. How the θ ≥ 0 follow from them, and which are left out because
+chance could explain them: `estimated_sizes`.
 
 Roots of many columns are replaced by random combinations of them, F·Ξ/√R with E ΞΞᵀ = R·1, on one
-side of a trace (Hutchinson 1990). V_k that fit the residuals no better than the independent part
-get the size zero. Observations that are said to have their own σ (`OTHERS`: control, priors beside
-image points) are independent errors of the size σ0, whatever that of the others is.
+side of a trace (Hutchinson 1990). Observations that are said to have their own σ (`OTHERS`:
+control, priors beside image points) are independent errors of the size σ0, whatever that of the
+others is.
 
-Sizes are estimates: intervals of √C times the normal quantile z hold less often than z promises.
-With the covariance of the θ, a variance c = Σ θ_k·c_k has ν = 2·c²/var(c) degrees of freedom
-(Satterthwaite 1946; of mixed models Kackar and Harville 1984, Kenward and Roger 1997). Covariances
-are those of
-
-    θ_k + λ·σ(θ_k),    λ = ((t_ν/z)² − 1)·c/Σ c_k·σ(θ_k)
-
-with the medians of the unknowns of a table, and the table of the largest λ: intervals of 1.96 σ
-hold 95 %, and sizes that are well determined stay as they are. One factor for all components would
-make σ of points larger for the uncertain size of a field that they do not depend on.
+Sizes are estimates: what that does to covariances is `estimated_sizes`' (`ErrorModel.widening`).
 
 Alternatives that did not help: effects as unknowns with priors give honest σ too, but estimates in
 two halves of a real network agree no better; neither do they with whitening. Covariances clustered
@@ -49,12 +41,10 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxbundle.leastsquares.indexing.rows import (
     Values,
 )
-from jaxbundle.leastsquares.quality.distributions import (
-    level_of_one,
-    normal_quantile,
-    t_quantile,
-)
+from jaxbundle.leastsquares.quality.distributions import level_of_one, normal_quantile
 from jaxbundle.leastsquares.quality.error_effects import AT_ONCE, effects, remove_fit, stack_rows
+from jaxbundle.leastsquares.quality.estimated_sizes import SizeEquations, widening
+from jaxbundle.leastsquares.quality.size_traces import Traces
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.types import present
 
@@ -130,41 +120,6 @@ DEFAULTS = ErrorSettings()
 
 
 @dataclasses.dataclass(frozen=True)
-class SizeEquations:
-    """T·θ = q of an error model; `has_others`: the last component is `OTHERS`, whose θ follows
-    from σ0² = q_0/T_00; `critical`: components with a smaller θ over its σ are left out."""
-
-    T: Float[np.ndarray, "k k"]
-    has_others: bool
-    critical: float = 0.0
-
-    @property
-    def reduced(self) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "m k"]]:
-        """T of the estimated sizes, and the matrix that gives their q."""
-        part = np.eye(len(self.T))
-        if not self.has_others:
-            return self.T, part
-        # V_0 without the given rows, whose part of the forms is known
-        part[-1, 0] = -1
-        T = part.T @ self.T @ part
-        onto = part.T[:-1].copy()
-        onto[:, 0] -= T[:-1, -1] / self.T[0, 0]
-        return T[:-1, :-1], onto
-
-    def solve(
-        self, q: Float[np.ndarray, " k"]
-    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-        """θ ≥ 0 and the scores, of all components."""
-        T, onto = self.reduced
-        forms = onto @ q
-        theta, score = _significant(T, forms, self.critical), _scores(T, forms)
-        if self.has_others:
-            theta = np.append(theta, q[0] / self.T[0, 0] - theta[0])
-            score = np.append(score, 0.0)
-        return theta, score
-
-
-@dataclasses.dataclass(frozen=True)
 class IndependentErrors:
     """The classical covariance of a solved problem: independent observations with σ times one
     factor, of which `variance` is the square. It answers what an `ErrorModel` answers."""
@@ -217,58 +172,28 @@ class ErrorModel:
 
     @functools.cached_property
     def widening(self) -> Float[np.ndarray, " k"]:
-        """What the θ are multiplied by in covariances, because they are estimates."""
-        factor = np.ones(len(self.theta))
-        if self.widened and (found := self._sizes_that_vary()) is not None:
-            some, spread = found
-            sigma = np.sqrt(np.diag(spread))
-            largest = max(self._excesses(some, spread), default=0.0)
-            factor[some] += largest * sigma / self.theta[some]
-        return factor
+        """What the θ are multiplied by in covariances, because they are estimates; 1 if sizes are
+        stated."""
+        if not self.widened or self.equations is None:
+            return np.ones(len(self.theta))
+        T = self.equations.reduced[0]
+        forms = T @ self.theta_covariance[: len(T), : len(T)] @ T
+        return widening(self.theta, T, forms, self._parts_of_tables())
 
     @property
     def as_estimated(self) -> "ErrorModel":
         """The model without `widening`, for budgets, which state degrees of freedom themselves."""
         return dataclasses.replace(self, widened=False)
 
-    def _sizes_that_vary(self) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, "m m"]] | None:
-        """The θ that are not zero, and their covariance in the system of these alone; None if sizes
-        are stated or errors independent."""
-        if self.equations is None:
-            return None
-        T = self.equations.reduced[0]
-        some = np.flatnonzero(self.theta[: len(T)] > 0)
-        if not (some > 0).any():
-            return None
-        forms = T @ self.theta_covariance[: len(T), : len(T)] @ T  # the covariance of q
-        inverse = np.linalg.pinv(T[np.ix_(some, some)], 1e-10, hermitian=True)
-        return some, inverse @ forms[np.ix_(some, some)] @ inverse
-
-    def _excesses(
-        self,
-        some: Int[np.ndarray, " m"],
-        spread: Float[np.ndarray, "m m"],
-        coverage: float = 0.95,
-        min_degrees: float = 3.0,
-    ) -> Iterator[float]:
-        """λ of every table that is not eliminated, for intervals of a `coverage`; `min_degrees` of
-        freedom, from which Student's distribution has a variance."""
-        upper = 1 - (1 - coverage) / 2
+    def _parts_of_tables(self) -> Iterator[Float[np.ndarray, "k unknowns"]]:
+        """The variances that every θ = 1 gives the unknowns of the tables not eliminated."""
         for table in self.own[0]:
             if table == self.found.problem.plan.eliminated:
                 continue
             blocks = [self.found.cofactor(table), *(own.get(table) for own in self.own)]
-            c = np.stack([np.diagonal(np.asarray(blocks[k]), axis1=1, axis2=2) for k in some])
-            variance = np.einsum("k,knw->nw", self.theta[some], c)
-            free = variance > 0
-            if not free.any():
-                continue
-            of_variance = np.einsum("knw,kl,lnw->nw", c, spread, c)
-            degrees = np.median(2 * variance[free] ** 2 / of_variance[free])
-            t = t_quantile(upper, max(float(degrees), min_degrees))
-            together = np.einsum("k,knw->nw", np.sqrt(np.diag(spread)), c)
-            share = np.median(variance[free] / together[free])
-            yield ((t / normal_quantile(upper)) ** 2 - 1) * float(share)
+            none = np.zeros_like(np.asarray(blocks[0]))
+            parts = [none if block is None else np.asarray(block) for block in blocks]
+            yield np.stack([np.diagonal(part, axis1=1, axis2=2).ravel() for part in parts])
 
     @property
     def sizes(self) -> tuple[ErrorSize, ...]:
@@ -284,6 +209,12 @@ class ErrorModel:
             ErrorSize(name, unit, float(s), float(d), float(z))
             for (name, unit), s, d, z in zip(names, root, sigma, self.score)
         )
+
+    @property
+    def widened_sizes(self) -> dict[str, float]:
+        """The sizes that covariances are of, by name, as a design takes them."""
+        factor = np.sqrt(self.widening)
+        return {one.name: float(k * one.size) for k, one in zip(factor, self.sizes)}
 
     def covariance(self, table: str) -> Float[np.ndarray, "rows width width"]:
         """The covariance blocks of all rows of a table."""
@@ -376,23 +307,10 @@ def fit_error_model(
     rng = np.random.default_rng(settings.seed)
     F, number = [component.root.tocsr() for component in components], len(components) + 1
     v = stack_rows(found, found.residuals)
-    T = np.zeros((number, number))
-    T[0, 0] = found.problem.counts.redundancy
-    own: list[dict[str, np.ndarray]] = []
-    for k, root in enumerate(F, 1):
-        blocks: dict[str, np.ndarray] = {}
-        for columns in _columns(root, settings, rng):
-            remaining, changes = remove_fit(found, columns)
-            T[0, k] += np.sum(columns * remaining)
-            T[1:, k] += [np.sum((other.T @ remaining.T) ** 2) for other in F]
-            _add_squares(blocks, changes)
-        T[k, 0] = T[0, k]
-        own.append(blocks)
-    # random combinations, on one side of the traces, make it unsymmetric
-    T[1:, 1:] = (T[1:, 1:] + T[1:, 1:].T) / 2
+    T, cubes, own = _traces(found, F, settings, rng)
     has_others = _has_others(components)
-    critical = settings.critical(len(components) - has_others)
-    system = SizeEquations(T, has_others, critical)
+    critical = settings.critical(number - 1 - has_others)
+    system = SizeEquations(T, has_others, critical, cubes)
     theta, score = system.solve(quadratic_forms(components, v))
     given, independent = _independent_part(components, theta, len(v))
     F = F[: len(F) - system.has_others]
@@ -405,6 +323,27 @@ def fit_error_model(
         onto = np.concatenate([np.eye(len(covariance)), -np.eye(len(covariance))[:1]])
         covariance = onto @ covariance @ onto.T
     return ErrorModel(found, tuple(components), theta, covariance, score, tuple(own), system)
+
+
+def _traces(
+    found: Solution, F: Sequence[Any], settings: ErrorSettings, rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, "k k k"], list[dict[str, np.ndarray]]]:
+    """T of the independent part and of roots F; tr(M·V_i·M·V_j·M·V_l), which their skewness is
+    from; by root the covariance blocks that it gives. The cubes of two different roots of many
+    columns are left at zero: sums of so many squares are nearly normal."""
+    traces = Traces(F, found.problem.counts.redundancy)
+    own: list[dict[str, np.ndarray]] = [{} for _ in F]
+    exact = [root.shape[1] <= settings.max_columns for root in F]
+    # cubes of random combinations need the products of the others
+    for k in sorted(range(len(F)), key=lambda k: not exact[k]):
+        for n, columns in enumerate(_columns(F[k], settings, rng)):
+            remaining, changes = remove_fit(found, columns)
+            products = traces.add(k, columns, remaining, exact[k])
+            _add_squares(own[k], changes)
+            if not exact[k] and n == 0:
+                again, _ = remove_fit(found, np.asarray((F[k] @ products).T))
+                traces.add_cubes(k, remaining, again, settings.draws / len(columns))
+    return *traces.of_all(), own
 
 
 def stated_error_model(
@@ -469,54 +408,6 @@ def _columns(
         else:
             signs = rng.choice([-1.0, 1.0], (number, last - first))
             yield np.asarray(root @ signs).T / np.sqrt(total)
-
-
-def _nonnegative(
-    T: Float[np.ndarray, "k k"], q: Float[np.ndarray, " k"]
-) -> Float[np.ndarray, " k"]:
-    """θ ≥ 0 of T·θ = q, in the metric of T itself (the covariance of q is 2·T for white errors)."""
-    from scipy.optimize import nnls
-
-    scale = np.sqrt(np.where(np.diag(T) > 0, np.diag(T), 1.0))
-    A = T / scale[:, None] / scale
-    # T is symmetric and positive semidefinite: T = L·Lᵀ, and ‖Lᵀθ − L⁻¹q‖ is the least-squares form
-    w, E = np.linalg.eigh(A)
-    # components that are combinations of others leave eigenvalues of rounding
-    some = w > 1e-10 * w.max()
-    L = E[:, some] * np.sqrt(w[some])
-    right = (E[:, some].T @ (q / scale)) / np.sqrt(w[some])
-    return nnls(L.T, right)[0] / scale
-
-
-def _significant(
-    T: Float[np.ndarray, "k k"], q: Float[np.ndarray, " k"], critical: float
-) -> Float[np.ndarray, " k"]:
-    """θ ≥ 0 of the components whose θ is at least `critical` times the σ that it has in the system
-    of all that are left, if errors are independent; the least significant is left out first."""
-    # the mean square of all residuals: θ_0 may be zero, where others are in every observation
-    kept, white = np.arange(len(q)), max(q[0] / T[0, 0], 0.0)
-    while True:
-        part = T[np.ix_(kept, kept)]
-        theta = _nonnegative(part, q[kept])
-        # the covariance of q is 2·T·σ0⁴ for independent errors
-        sigma = white * np.sqrt(2 * np.diag(np.linalg.pinv(part, 1e-10, hermitian=True)))
-        short = theta[1:] < critical * sigma[1:]
-        if not short.any():
-            found = np.zeros(len(q))
-            found[kept] = theta
-            return found
-        kept = np.delete(kept, 1 + np.argmin(theta[1:] / np.maximum(sigma[1:], 1e-300)))
-
-
-def _scores(T: Float[np.ndarray, "k k"], q: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
-    """How far each quadratic form exceeds that of independent errors alone, in units of its σ."""
-    white = q[0] / T[0, 0]
-    variance = np.diag(T) - T[:, 0] ** 2 / T[0, 0]
-    away = q - T[:, 0] * white
-    # the form of the independent part determines its size: it exceeds nothing
-    # (a difference of two numbers of the size of T: smaller ones are rounding)
-    good = variance > 1e-9 * np.diag(T)
-    return np.where(good, away / np.sqrt(2 * np.where(good, variance, 1.0)) / white, 0.0)
 
 
 def _covariance_of_sizes(

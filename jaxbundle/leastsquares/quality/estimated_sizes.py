@@ -1,0 +1,186 @@
+"""Sizes of error components from quadratic forms of residuals, and what it means that they are
+estimates.
+
+The forms q of the residuals have the expectations T·θ (`error_components`). Of that the θ ≥ 0 are
+the solution, those left out that chance could explain. A θ = aᵀq of independent errors is a sum of
+squares of few of them: with the cumulants
+
+    κ₂ = 2·Σ a_i·a_j·T_ij,     κ₃ = 8·Σ a_i·a_j·a_l·tr(M·V_i·M·V_j·M·V_l)
+
+its quantiles are those of the χ² distribution, shifted and scaled, that has the same three moments
+(Pearson 1959; Imhof 1961). The normal quantile lets twice as many pass: a principal distance that
+changes from view to view hardly shows in residuals, and chance found changes of 5 σ.
+
+Sizes are estimates: intervals of √C times the normal quantile z hold less often than z promises.
+With the covariance of the θ, a variance c = Σ θ_k·c_k has ν = 2·c²/var(c) degrees of freedom
+(Satterthwaite 1946; of mixed models Kackar and Harville 1984, Kenward and Roger 1997). Covariances
+are those of
+
+    θ_k + λ·σ(θ_k),    λ = ((t_ν/z)² − 1)·c/Σ c_k·σ(θ_k)
+
+with the medians of the unknowns of a table, and the table of the largest λ: intervals of 1.96 σ
+hold 95 %, and sizes that are well determined stay as they are. One factor for all components would
+make σ of points larger for the uncertain size of a field that they do not depend on.
+"""
+
+import dataclasses
+from collections.abc import Iterable
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.leastsquares.quality.distributions import (
+    normal_probability,
+    normal_quantile,
+    skewed_quantile,
+    t_quantile,
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class SizeEquations:
+    """T·θ = q of an error model; `has_others`: the last component is `OTHERS`, whose θ follows
+    from σ0² = q_0/T_00; `critical`: the normal quantile of the level at which components are left
+    out that chance could explain; `cubes`: tr(M·V_i·M·V_j·M·V_l), of which the skewness of θ
+    follows."""
+
+    T: Float[np.ndarray, "k k"]
+    has_others: bool
+    critical: float = 0.0
+    cubes: Float[np.ndarray, "k k k"] | None = None
+
+    @property
+    def reduced(self) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "m k"]]:
+        """T of the estimated sizes, and the matrix that gives their q."""
+        part = np.eye(len(self.T))
+        if not self.has_others:
+            return self.T, part
+        # V_0 without the given rows, whose part of the forms is known
+        part[-1, 0] = -1
+        T = part.T @ self.T @ part
+        onto = part.T[:-1].copy()
+        onto[:, 0] -= T[:-1, -1] / self.T[0, 0]
+        return T[:-1, :-1], onto
+
+    def solve(
+        self, q: Float[np.ndarray, " k"]
+    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+        """θ ≥ 0 and the scores, of all components."""
+        T, onto = self.reduced
+        forms = onto @ q
+        cubes = self.cubes
+        if cubes is not None:
+            cubes = np.einsum("ia,jb,kc,abc->ijk", onto, onto, onto, cubes)
+        theta = _significant(T, forms, self.critical, cubes)
+        score = _scores(T, forms)
+        if self.has_others:
+            theta = np.append(theta, q[0] / self.T[0, 0] - theta[0])
+            score = np.append(score, 0.0)
+        return theta, score
+
+
+def widening(
+    theta: Float[np.ndarray, " k"],
+    T: Float[np.ndarray, "m m"],
+    forms: Float[np.ndarray, "m m"],
+    tables: Iterable[Float[np.ndarray, "k unknowns"]],
+) -> Float[np.ndarray, " k"]:
+    """What θ are multiplied by in covariances because they are estimates.
+
+    **Arguments:** `T` of the estimated sizes, the first m, and the covariance of their `forms` q;
+    of every table the variances that each component of θ = 1 gives its unknowns.
+    """
+    factor = np.ones(len(theta))
+    some = np.flatnonzero(theta[: len(T)] > 0)
+    if not (some > 0).any():
+        return factor  # independent errors alone
+    # of the θ that are not zero, in the system of these alone
+    inverse = np.linalg.pinv(T[np.ix_(some, some)], 1e-10, hermitian=True)
+    spread = inverse @ forms[np.ix_(some, some)] @ inverse
+    excesses = [_excess(theta[some], spread, parts[some]) for parts in tables]
+    sigma = np.sqrt(np.diag(spread))
+    factor[some] += max(excesses, default=0.0) * sigma / theta[some]
+    return factor
+
+
+def _excess(
+    theta: Float[np.ndarray, " s"],
+    spread: Float[np.ndarray, "s s"],
+    parts: Float[np.ndarray, "s unknowns"],
+    coverage: float = 0.95,
+    min_degrees: float = 3.0,
+) -> float:
+    """λ of a table, for intervals of a `coverage`; `min_degrees` of freedom, from which Student's
+    distribution has a variance."""
+    upper = 1 - (1 - coverage) / 2
+    variance = theta @ parts
+    free = variance > 0
+    if not free.any():
+        return 0.0
+    variance, parts = variance[free], parts[:, free]
+    of_variance = np.einsum("kn,kl,ln->n", parts, spread, parts)
+    degrees = float(np.median(2 * variance**2 / of_variance))
+    t = t_quantile(upper, max(degrees, min_degrees))
+    share = float(np.median(variance / (np.sqrt(np.diag(spread)) @ parts)))
+    return ((t / normal_quantile(upper)) ** 2 - 1) * share
+
+
+def _nonnegative(
+    T: Float[np.ndarray, "k k"], q: Float[np.ndarray, " k"]
+) -> Float[np.ndarray, " k"]:
+    """θ ≥ 0 of T·θ = q, in the metric of T itself (the covariance of q is 2·T for white errors)."""
+    from scipy.optimize import nnls
+
+    scale = np.sqrt(np.where(np.diag(T) > 0, np.diag(T), 1.0))
+    A = T / scale[:, None] / scale
+    # T is symmetric and positive semidefinite: T = L·Lᵀ, and ‖Lᵀθ − L⁻¹q‖ is the least-squares form
+    w, E = np.linalg.eigh(A)
+    # components that are combinations of others leave eigenvalues of rounding
+    some = w > 1e-10 * w.max()
+    L = E[:, some] * np.sqrt(w[some])
+    right = (E[:, some].T @ (q / scale)) / np.sqrt(w[some])
+    return nnls(L.T, right)[0] / scale
+
+
+def _significant(
+    T: Float[np.ndarray, "k k"],
+    q: Float[np.ndarray, " k"],
+    critical: float,
+    cubes: Float[np.ndarray, "k k k"] | None,
+) -> Float[np.ndarray, " k"]:
+    """θ ≥ 0 of the components whose θ is beyond the quantile that it has in the system of all that
+    are left, if errors are independent; the least significant is left out first."""
+    # the mean square of all residuals: θ_0 may be zero, where others are in every observation
+    kept, white = np.arange(len(q)), max(q[0] / T[0, 0], 0.0)
+    while True:
+        part = T[np.ix_(kept, kept)]
+        theta = _nonnegative(part, q[kept])
+        inverse = np.linalg.pinv(part, 1e-10, hermitian=True)
+        # the covariance of q is 2·T·σ0⁴ for independent errors
+        sigma = np.sqrt(2 * np.diag(inverse))
+        limit = np.full(len(kept), critical)
+        if cubes is not None:
+            third = 8 * np.einsum(
+                "na,nb,nc,abc->n", inverse, inverse, inverse, cubes[np.ix_(kept, kept, kept)]
+            )
+            level = normal_probability(critical)
+            skewness = third / np.where(sigma > 0, sigma, 1.0) ** 3
+            limit = np.array([skewed_quantile(level, float(g)) for g in skewness])
+        limit = limit * white * sigma
+        short = theta[1:] < limit[1:]
+        if not short.any():
+            found = np.zeros(len(q))
+            found[kept] = theta
+            return found
+        kept = np.delete(kept, 1 + np.argmin(theta[1:] / np.maximum(limit[1:], 1e-300)))
+
+
+def _scores(T: Float[np.ndarray, "k k"], q: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+    """How far each quadratic form exceeds that of independent errors alone, in units of its σ."""
+    white = q[0] / T[0, 0]
+    variance = np.diag(T) - T[:, 0] ** 2 / T[0, 0]
+    away = q - T[:, 0] * white
+    # the form of the independent part determines its size: it exceeds nothing
+    # (a difference of two numbers of the size of T: smaller ones are rounding)
+    good = variance > 1e-9 * np.diag(T)
+    return np.where(good, away / np.sqrt(2 * np.where(good, variance, 1.0)) / white, 0.0)
