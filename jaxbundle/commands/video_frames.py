@@ -45,6 +45,7 @@ class VideoFrames(TableMethods):
         return {
             "video": np.repeat(names, self.number.shape[1]),
             "frame": self.number.ravel(),
+            "image": np.array([file_of(n - f) for n, f in self._shown], dtype=object),
             "time": self.time.ravel(),
             "sharpness": self.sharpness.ravel(),
         }

@@ -49,6 +49,12 @@ def gibbs_vector(A: Rows, B: Rows) -> Triple:
     )
 
 
+def compose_gibbs(one: Triple, other: Triple) -> Triple:
+    """The Gibbs vector of C(one)·C(other)."""
+    over = 1 / (1 - sum(a * b for a, b in zip(one, other)))
+    return tuple((a + b + c) * over for a, b, c in zip(one, other, _cross(one, other)))
+
+
 def turn_by_gibbs(h: Triple, x: Triple) -> Triple:
     """C(h)·x = x + 2·(h × x + h × (h × x))/(1 + h·h)."""
     first = _cross(h, x)
@@ -67,15 +73,12 @@ def spline_position(positions: Sequence[Triple], u: Scalar) -> Triple:
     )
 
 
-def apply_inverse_spline_rotation(matrices: Sequence[Rows], u: Scalar, x: Triple) -> Triple:
-    """M(t)ᵀ·x of four control rotations, matrices by rows."""
-    weights = cumulative_basis(u)
-    for k in (2, 1, 0):
-        h = gibbs_vector(matrices[k + 1], matrices[k])
+def turn_back_by_steps(steps: Sequence[Triple], u: Scalar, x: Triple) -> Triple:
+    """M_i·M(t)ᵀ·x by the steps h_1, h_2, h_3 from a control rotation to the next."""
+    for weight, h in reversed(list(zip(cumulative_basis(u), steps))):
         # the inverse of C(h) is C(−h)
-        x = turn_by_gibbs(tuple(-weights[k] * c for c in h), x)
-    m = matrices[0]
-    return tuple(m[i] * x[0] + m[3 + i] * x[1] + m[6 + i] * x[2] for i in range(3))
+        x = turn_by_gibbs(tuple(-weight * c for c in h), x)
+    return x
 
 
 def _cross(a: Triple, b: Triple) -> Triple:

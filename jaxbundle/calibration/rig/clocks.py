@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.display import print_in_one_screen
-from jaxbundle.network.kinds.continuous_time import CLOCK_PARAMETERS
+from jaxbundle.network.kinds.continuous_time import CLOCK_PARAMETERS, OFFSET, RATE, READ_OUT
 
 
 @print_in_one_screen
@@ -36,6 +36,16 @@ class Clock:
         return dict(
             zip(CLOCK_PARAMETERS, zip((self.offset, self.rate, self.read_out), self.sigma.tolist()))
         )
+
+    def in_words(self) -> list[str]:
+        """Every unknown with its σ; of one that is not determined, why."""
+        scale = {OFFSET: (1e3, "ms"), RATE: (1e6, "ppm"), READ_OUT: (1e3, "ms")}
+        found = []
+        for name in self.estimated:
+            factor, unit = scale[name]
+            value, sigma = self.values[name]
+            found.append(f"{name} {factor * value:.4f} ± {factor * sigma:.2g} {unit}")
+        return [*found, *(f"{name} {why}" for name, why in self.held.items())]
 
     def to_dict(self) -> dict:
         """Values, σ and what is not determined as plain dicts and numbers."""

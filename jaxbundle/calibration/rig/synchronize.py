@@ -77,6 +77,9 @@ class SynchronizationSettings:
     offsets: OffsetSettings = OffsetSettings()
 
 
+SYNCHRONIZATION = SynchronizationSettings()
+
+
 def start_unsynchronized(
     calibrations: Mapping[str, Calibration],
     bodies: Mapping[str, Sequence[str]] | None,
@@ -84,7 +87,7 @@ def start_unsynchronized(
     known: KnownMountings,
     times: Times,
     estimated: Sequence[str],
-    settings: SynchronizationSettings,
+    settings: SynchronizationSettings = SYNCHRONIZATION,
 ) -> tuple[Rig, Connections]:
     """The rig with start values of all, also of clocks and motion.
 
@@ -135,6 +138,12 @@ def with_trajectory(rig: Rig, trajectory: Trajectory, pose: object, spacing: flo
     return dataclasses.replace(
         rig, trajectory=dataclasses.replace(trajectory, run=run, runs=runs, poses=poses)
     )
+
+
+def without_run(rig: Rig) -> list[tuple[str, str]]:
+    """The epochs that are in no run of photographs, and why they are not used."""
+    why = "too few photographs before and after it for a motion"
+    return [(rig.epochs[row], why) for row in np.flatnonzero(present(rig.trajectory).run < 0)]
 
 
 def _body_of_rows(rig: Rig) -> Int[np.ndarray, " rows"]:
@@ -248,7 +257,7 @@ def _aic(t: Float[np.ndarray, " n"], x: Float[np.ndarray, "n 9"], spacing: float
 
 
 def adjust_unsynchronized(
-    rig: Rig, settings: SynchronizationSettings, max_iterations: int = 50
+    rig: Rig, max_iterations: int = 50, settings: SynchronizationSettings = SYNCHRONIZATION
 ) -> tuple[Rig, Result, dict[str, dict[str, str]]]:
     """Adjust a rig with its clocks; by camera and unknown of its clock why it was held.
 

@@ -21,7 +21,12 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from jaxbundle import cameras
-from jaxbundle.geometry.pose_splines import apply_inverse_spline_rotation, spline_position
+from jaxbundle.geometry.pose_splines import (
+    compose_gibbs,
+    gibbs_vector,
+    spline_position,
+    turn_back_by_steps,
+)
 from jaxbundle.leastsquares.declarations import Kind
 from jaxbundle.leastsquares.spaces import Change, Posed, Triple, Turned
 from jaxbundle.types import Scalar
@@ -50,16 +55,20 @@ class Instant(NamedTuple):
 def place_on_spline(controls: Sequence[Posed], u: Scalar, X: Triple) -> Triple:
     """p + Mᵀ·X at a place u between the knots."""
     at = spline_position([one.centre for one in controls], u)
-    matrices = [_rows(one.rotation) for one in controls]
-    turned = apply_inverse_spline_rotation(matrices, u, X)
-    return tuple(a + b for a, b in zip(at, turned))
+    turns = [one.rotation for one in controls]
+    turned = turn_back_by_steps([_step(*pair) for pair in zip(turns, turns[1:])], u, X)
+    return tuple(a + b for a, b in zip(at, turns[0].apply_inverse(turned)))
 
 
-def _rows(rotation: Turned) -> tuple[Scalar, ...]:
-    """The matrix of a rotation by rows, as scalars."""
-    axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    columns = [rotation.apply(axis) for axis in axes]
-    return tuple(column[i] for i in range(3) for column in columns)
+def _step(one: Turned, other: Turned) -> Triple:
+    """The Gibbs vector of the rotation from one to the other; of the small rotations that both
+    have besides, θ/2 to second order."""
+    h = gibbs_vector(other.rows, one.rows)
+    if other.turn is not None:
+        h = compose_gibbs(tuple(t / 2 for t in other.turn), h)
+    if one.turn is not None:
+        h = compose_gibbs(h, tuple(-t / 2 for t in one.turn))
+    return h
 
 
 @dataclasses.dataclass(frozen=True)
