@@ -3,9 +3,9 @@
 
 Videos of `tests/calibration/video_scenes.py`: a board moved by hand before two cameras at 30 Hz,
 whose offset and rate are unknown; and the same with rolling shutters, whose read-out times are
-unknown, too. Every draw has new noise of the image points (0.05 px). For each unknown of the clocks,
-and the base: the RMS of errors, this over the median stated σ, the mean error over its own σ, and
-the largest |error|/σ.
+unknown, too. Every draw has new noise of the image points (0.05 px). For each unknown of the
+clocks, and the base: the RMS of errors, this over the median stated σ, the mean error over its own
+σ, and the largest |error|/σ.
 """
 
 import dataclasses
@@ -68,7 +68,8 @@ def main() -> None:
         found = draw_all(rig, exact_points(rig, frames, read_out), draws)
         took = (time.perf_counter() - begin) / draws
         spacing = rig.trajectory.runs[0].spacing
-        print(f"{unknowns}: {draws} draws, {frames} frames, knots {spacing:.3f} s, {took:.1f} s each")
+        said = f"{draws} draws, {frames} frames, knots {spacing:.3f} s, {took:.1f} s each"
+        print(f"{unknowns}: {said}")
         truth = [0, 0, read_out, *scenes.CLOCKS["b"], read_out, *(-T[:3, :3].T @ T[:3, 3])]
         for k, name in enumerate(names):
             error, sigma = found[:, k, 0] - truth[k], found[:, k, 1]

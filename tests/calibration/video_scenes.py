@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from jaxbundle.measure import Board, BoardViews
 
 BOARD = Board(8, 6, 0.03)
-FREE = ("fx", "fy", "cx", "cy", "k1", "k2")
+FREE = scenes.FREE
 MOUNTINGS = {
     "a": np.eye(4),
     "b": scenes.mounted((0.12, 0.01, -0.01), 2, 8, 1),

@@ -8,9 +8,9 @@ boards that move by themselves have a pose at every epoch, boards that are fixed
 one common pose and unknown relations. What ties the cameras, by boards seen simultaneously, by
 other cameras, or by the motion of the rig, is found by `connections`, which gives the start values.
 Cameras that are not synchronised have no epochs in common: their clocks are unknowns
-(`synchronize`). Epochs that contradict the mounting (the board moved in between) are excluded, or only listed
-without snooping. The boards are known, weighted or free, as in the calibration of one camera.
-Gross errors are removed camera by camera, then those that only the mounting reveals.
+(`synchronize`). Epochs that contradict the mounting (the board moved in between) are excluded, or
+only listed without snooping. The boards are known, weighted or free, as in the calibration of one
+camera. Gross errors are removed camera by camera, then those that only the mounting reveals.
 """
 
 import dataclasses

@@ -9,6 +9,7 @@ held at its start value, and that is said.
 import dataclasses
 from collections.abc import Mapping, Sequence
 
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -38,8 +39,15 @@ from jaxbundle.calibration.rig.trajectory import (
     plan_runs,
 )
 from jaxbundle.errors import InputError
-from jaxbundle.leastsquares import Result
-from jaxbundle.network.kinds.continuous_time import CLOCK, CLOCK_PARAMETERS, OFFSET, RATE
+from jaxbundle.leastsquares import PoseValue, Result
+from jaxbundle.leastsquares.solution import Solution
+from jaxbundle.network.kinds.continuous_time import (
+    CLOCK,
+    CLOCK_PARAMETERS,
+    OFFSET,
+    RATE,
+    TRAJECTORY,
+)
 from jaxbundle.network.kinds.mountings import MOUNTING
 from jaxbundle.types import present
 
@@ -114,13 +122,21 @@ def start_unsynchronized(
         _knots(views, [*centres.values()], time, float(np.median(frame))) / settings.undersmoothing,
         settings.least_frames * float(np.median(frame)),
     )
+    sigma0 = float(np.median([one.adjustment.sigma0 for one in calibrations.values()]))
     empty = Trajectory(
-        clocks, camera, row_time, np.full(len(camera), -1), (), rig.pose, float(np.median(frame))
+        clocks,
+        camera,
+        row_time,
+        np.full(len(camera), -1),
+        (),
+        rig.pose,
+        float(np.median(frame)),
+        sigma0,
     )
     return with_trajectory(rig, empty, rig.pose, spacing), connections
 
 
-def with_trajectory(rig: Rig, trajectory: Trajectory, pose: object, spacing: float) -> Rig:
+def with_trajectory(rig: Rig, trajectory: Trajectory, pose: PoseValue, spacing: float) -> Rig:
     """The rig with knots by the start values of clocks, and control poses by those of photographs.
 
     **Raises:** `InputError` if there is no run of photographs."""
@@ -261,23 +277,58 @@ def adjust_unsynchronized(
 ) -> tuple[Rig, Result, dict[str, dict[str, str]]]:
     """Adjust a rig with its clocks; by camera and unknown of its clock why it was held.
 
+    First with the clocks held: iterations would walk along a valley if the motion left them open.
     The rig is that with knots by its final clocks."""
-    rig, found = _adjust_until_assigned(rig, settings, max_iterations)
+    start = present(rig.trajectory).clocks
+    none = dataclasses.replace(start, free=np.zeros_like(start.free))
+    rig, found = _adjust_until_assigned(_with_clocks(rig, none), settings, max_iterations)
     if not found.converged:
         return rig, found, {}
-    held = _undetermined(rig, found, settings)
-    if not held:
-        return rig, found, held
-    trajectory = present(rig.trajectory)
-    free, names = trajectory.clocks.free.copy(), [camera.id for camera in rig.cameras]
-    value = trajectory.clocks.value.copy()
-    for name, of_camera in held.items():
-        for unknown in of_camera:
-            at = names.index(name), CLOCK_PARAMETERS.index(unknown)
-            free[at], value[at] = False, 0.0
-    clocks = dataclasses.replace(trajectory.clocks, free=free, value=value)
-    rig = _planned_again(rig, dataclasses.replace(trajectory, clocks=clocks), rig.pose)
-    return *_adjust_until_assigned(rig, settings, max_iterations), held
+    rig = _with_clocks(_started_at(rig, found), start)
+    probe = adjust_rig(rig, 1)
+    at = Solution(probe.problem, probe.problem.data.start)
+    held = _undetermined(rig, at, present(rig.trajectory).sigma0 ** 2, settings)
+    while True:
+        rig = _hold(rig, held, start)
+        rig, found = _adjust_until_assigned(rig, settings, max_iterations)
+        if not found.converged:
+            return rig, found, held
+        more = _undetermined(rig, found.solution, found.sigma0**2, settings)
+        if not more:
+            return rig, found, held
+        held = {name: held.get(name, {}) | more.get(name, {}) for name in held | more}
+
+
+def _with_clocks(rig: Rig, clocks: Clocks) -> Rig:
+    return dataclasses.replace(
+        rig, trajectory=dataclasses.replace(present(rig.trajectory), clocks=clocks)
+    )
+
+
+def _started_at(rig: Rig, found: Result) -> Rig:
+    """The rig with the poses and mountings of a solution as start values."""
+    values = found.minimum.values
+    trajectory = dataclasses.replace(
+        present(rig.trajectory), poses=jax.tree.map(np.asarray, values[TRAJECTORY])
+    )
+    return dataclasses.replace(
+        rig,
+        pose=rig.poses(values),
+        mounting=jax.tree.map(np.asarray, values[MOUNTING]),
+        trajectory=trajectory,
+    )
+
+
+def _hold(rig: Rig, held: Mapping[str, Mapping[str, str]], start: Clocks) -> Rig:
+    """The rig with these unknowns of clocks held at their start values."""
+    clocks = present(rig.trajectory).clocks
+    free, value = clocks.free.copy(), clocks.value.copy()
+    for k, camera in enumerate(rig.cameras):
+        for unknown in held.get(camera.id, {}):
+            j = CLOCK_PARAMETERS.index(unknown)
+            free[k, j], value[k, j] = False, start.value[k, j]
+    clocks = dataclasses.replace(clocks, free=free, value=value)
+    return _planned_again(rig, dataclasses.replace(present(rig.trajectory), clocks=clocks))
 
 
 def _adjust_until_assigned(
@@ -295,22 +346,23 @@ def _adjust_until_assigned(
             break
         if not np.isfinite(common[0]).all():
             break
-        rig = dataclasses.replace(rig, pose=rig.poses(values))
-        rig = _planned_again(rig, new, rig.pose)
+        rig = _planned_again(dataclasses.replace(rig, pose=rig.poses(values)), new)
     return rig, found
 
 
-def _planned_again(rig: Rig, trajectory: Trajectory, pose: object) -> Rig:
+def _planned_again(rig: Rig, trajectory: Trajectory) -> Rig:
+    """The rig with knots by other clocks."""
     spacing = max(run.spacing for run in present(rig.trajectory).runs)
-    return with_trajectory(rig, trajectory, pose, spacing)
+    return with_trajectory(rig, trajectory, rig.pose, spacing)
 
 
 def _undetermined(
-    rig: Rig, found: Result, settings: SynchronizationSettings
+    rig: Rig, at: Solution, variance: float, settings: SynchronizationSettings
 ) -> dict[str, dict[str, str]]:
-    """By camera and unknown of its clock, why the motion does not determine it."""
+    """By camera and unknown of its clock, why the motion does not determine it; `variance` of unit
+    weight."""
     trajectory, held = present(rig.trajectory), {}
-    clocks, variance = trajectory.clocks, found.sigma0**2
+    clocks = trajectory.clocks
     for k, camera in enumerate(rig.cameras):
         own = trajectory.camera == k
         if not own.any():
@@ -319,7 +371,7 @@ def _undetermined(
         frame = float(np.median(np.diff(np.unique(trajectory.time[own]))))
         # the effect of each unknown on the time of a photograph, at most
         effect = np.array([1.0, half, 0.5])
-        C = variance * _clock_and_mounting(found, k)
+        C = variance * _clock_and_mounting(at, k)
         sigma = np.sqrt(np.clip(np.diagonal(C)[:3], 0, None)) * effect
         for j, name in enumerate(CLOCK_PARAMETERS):
             if not clocks.free[k, j] or 3 * sigma[j] < settings.min_frames_known * frame:
@@ -337,11 +389,11 @@ def _undetermined(
     return held
 
 
-def _clock_and_mounting(found: Result, k: int) -> Float[np.ndarray, "9 9"]:
+def _clock_and_mounting(at: Solution, k: int) -> Float[np.ndarray, "9 9"]:
     """The joint cofactors of the clock and the mounting of a camera."""
-    rows = {t.name: np.zeros((9, t.rows, t.space.width)) for t in found.problem.tables}
+    rows = {t.name: np.zeros((9, t.rows, t.space.width)) for t in at.problem.tables}
     rows[CLOCK][:3, k], rows[MOUNTING][3:, k] = np.eye(3), np.eye(6)
-    return np.asarray(found.solution.propagate_rows(rows))
+    return np.asarray(at.propagate_rows(rows))
 
 
 def clocks_of(

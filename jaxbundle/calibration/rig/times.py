@@ -88,7 +88,8 @@ def _number(camera: str, photograph: str) -> int:
     found = re.findall(r"\d+", Path(photograph).stem)
     if not found:
         raise InputError(
-            f"times of camera {camera!r}: {photograph!r} has no number of a frame in its name; {HOW}"
+            f"times of camera {camera!r}: {photograph!r} has no number of a frame in its name; "
+            f"{HOW}"
         )
     return int(found[-1])
 

@@ -78,6 +78,7 @@ class Trajectory:
     - `runs`; `poses`: start values of their control poses: a body in the frame of the reference
       camera, rotations from that to the body.
     - `frame`: the median time from a photograph to the next, seconds.
+    - `sigma0` of the cameras by themselves, the median: what σ will be before the clocks are right.
     """
 
     clocks: Clocks
@@ -87,6 +88,7 @@ class Trajectory:
     runs: tuple[Run, ...]
     poses: PoseValue
     frame: float
+    sigma0: float = 1.0
 
     def intervals(
         self, row: Int[np.ndarray, " n"], line: Float[np.ndarray, " n"]

@@ -6,8 +6,8 @@
 
 t is the time of a photograph by the clock of its own camera, t_m the middle of all of that camera,
 so that offset and rate correlate little; `line` is the measured row relative to the middle one, in
-heights of the image: of a rolling shutter the read-out time is a third unknown of the clock. p and M
-are a spline (`jaxbundle.geometry.pose_splines`): its control poses are rows of the table
+heights of the image: of a rolling shutter the read-out time is a third unknown of the clock. p and
+M are a spline (`jaxbundle.geometry.pose_splines`): its control poses are rows of the table
 `trajectory`, of which an observation touches four, those of the interval of knots in which it was
 when the problem was made. If the clock moves it beyond a knot, the cubic of its interval goes on:
 at the knot it agrees with the next one to the second derivative.
