@@ -18,7 +18,7 @@ from jaxbundle.calibration.rig.start_offsets import (
 from jaxbundle.calibration.rig.times import times_of_photographs
 from jaxbundle.calibration.rig.trajectory import (
     Clocks,
-    Trajectory,
+    TargetMotion,
     control_poses,
     plan_runs,
 )
@@ -96,7 +96,7 @@ def trajectory_of(motion, frames=60, spacing=0.1):
         Rotation.from_matrix(R).as_quat(), 1, axis=-1))  # fmt: skip
     runs, run = plan_runs(np.zeros(len(own), int), common, spacing, spacing)
     poses = control_poses(runs, run, common, pose)
-    return Trajectory(clocks, own, time, run, runs, poses, 1 / 30), pose, M
+    return TargetMotion(clocks, own, time, run, runs, poses, 1 / 30), pose, M
 
 
 def test_control_poses_start_near_the_motion():
@@ -160,6 +160,23 @@ def test_times_in_every_form(tmp_path):
 def test_times_that_cannot_be(given, words):
     with pytest.raises(InputError, match=words):
         times_of_photographs(CAMERAS, given)
+
+
+def test_times_on_the_command_line(tmp_path):
+    """Frames per second, of each camera, a table; by default that which `frames` writes."""
+    from jaxbundle.cli.calibrate_rig import times_given
+
+    cameras = {name: str(tmp_path / name) for name in ("left", "right")}
+    assert times_given("30", cameras) == 30
+    assert times_given("left=30, right=25", cameras) == {"left": 30, "right": 25}
+    with pytest.raises(InputError, match=r"there is no .*frames.csv; give --times"):
+        times_given("", cameras)
+    table = tmp_path / "frames.csv"
+    table.write_text("video,image,time\n")
+    assert times_given("", cameras) == times_given(str(table), cameras) == table
+    for bad in ("fast", "left=30=2", "left=x"):
+        with pytest.raises(InputError, match="--times: expected frames per second"):
+            times_given(bad, cameras)
 
 
 @pytest.mark.parametrize(("options", "words"), [

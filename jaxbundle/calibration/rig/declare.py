@@ -28,7 +28,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxbundle.calibration.rig.known_mountings import NOTHING_KNOWN, KnownMountings
-from jaxbundle.calibration.rig.trajectory import CONTROLS, Trajectory
+from jaxbundle.calibration.rig.trajectory import CONTROLS, TargetMotion
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.pixel_frame import in_pixels
 from jaxbundle.leastsquares import Result, adjust
@@ -113,7 +113,7 @@ class Rig:
     place: PoseValue | None = None
     body: tuple[int, ...] = (0,)
     known: KnownMountings = NOTHING_KNOWN
-    trajectory: Trajectory | None = None
+    trajectory: TargetMotion | None = None
 
     @property
     def lines(self) -> Float[np.ndarray, " n"]:
@@ -228,7 +228,7 @@ def _image_points(rig: Rig) -> list[ObservationSet]:
     return observations
 
 
-def _timed_image_points(rig: Rig, trajectory: Trajectory) -> list[ObservationSet]:
+def _timed_image_points(rig: Rig, trajectory: TargetMotion) -> list[ObservationSet]:
     line, board = rig.lines, None if rig.place is None else "board"
     unused = trajectory.run[rig.epoch] < 0
     observations = []

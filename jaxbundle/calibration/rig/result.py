@@ -22,6 +22,7 @@ from jaxbundle.calibration.rig.connections import Connections
 from jaxbundle.calibration.rig.declare import Rig, used_rays
 from jaxbundle.calibration.rig.errors import rig_errors
 from jaxbundle.calibration.rig.mounting import POSE, Mounting, mounting_of, placement_of
+from jaxbundle.calibration.rig.next_view import NextView, next_view
 from jaxbundle.calibration.rig.quality import rig_coverage, rig_points, rig_uncertainty
 from jaxbundle.calibration.rig.synchronize import clocks_of
 from jaxbundle.cameras import get_model
@@ -78,6 +79,7 @@ class RigCalibration(TableMethods):
         self.left_out, self.contradicting = tuple(left_out), tuple(contradicting)
         self.ties = () if connections is None else connections.ties
         self.separate = () if connections is None else connections.separate
+        self._next_views: dict[str, NextView | None] = {}
         self._held_clocks = dict(held_clocks or {})
 
     @property
@@ -344,6 +346,13 @@ class RigCalibration(TableMethods):
     def advice(self) -> list[str]:
         """What would determine the mountings better, in words."""
         return advise_rig(self)
+
+    def next_view(self, name: str) -> NextView | None:
+        """The place of a board that would determine the mounting of a camera best, with the σ that
+        follows; None if there is none that it sees together with another camera."""
+        if name not in self._next_views:
+            self._next_views[name] = next_view(self, name)
+        return self._next_views[name]
 
     def camera(self, name: str) -> Camera:
         """A camera with the parameters of the common adjustment, held."""

@@ -130,7 +130,7 @@ def _offset_of_pair(
     step = frame / settings.steps
     first, last = int(np.floor(min(e[0] for e in ends) / step)), max(e[1] for e in ends)
     tried = step * np.arange(first, int(np.ceil(last / step)) + 1)
-    score = sum(_scores(a, b, tried, settings) for a, b in _pairs(one, other, common))
+    score = np.sum([_scores(*pair, tried, settings) for pair in _pairs(one, other, common)], axis=0)
     k = int(np.argmax(score))
     limit = chi2.isf(settings.significance / len(tried), len(common))
     if score[k] < limit:

@@ -34,7 +34,7 @@ from jaxbundle.calibration.rig.start_offsets import (
 from jaxbundle.calibration.rig.trajectory import (
     CONTROLS,
     Clocks,
-    Trajectory,
+    TargetMotion,
     control_poses,
     plan_runs,
 )
@@ -123,7 +123,7 @@ def start_unsynchronized(
         settings.least_frames * float(np.median(frame)),
     )
     sigma0 = float(np.median([one.adjustment.sigma0 for one in calibrations.values()]))
-    empty = Trajectory(
+    empty = TargetMotion(
         clocks,
         camera,
         row_time,
@@ -136,7 +136,7 @@ def start_unsynchronized(
     return with_trajectory(rig, empty, rig.pose, spacing), connections
 
 
-def with_trajectory(rig: Rig, trajectory: Trajectory, pose: PoseValue, spacing: float) -> Rig:
+def with_trajectory(rig: Rig, trajectory: TargetMotion, pose: PoseValue, spacing: float) -> Rig:
     """The rig with knots by the start values of clocks, and control poses by those of photographs.
 
     **Raises:** `InputError` if there is no run of photographs."""
@@ -350,7 +350,7 @@ def _adjust_until_assigned(
     return rig, found
 
 
-def _planned_again(rig: Rig, trajectory: Trajectory) -> Rig:
+def _planned_again(rig: Rig, trajectory: TargetMotion) -> Rig:
     """The rig with knots by other clocks."""
     spacing = max(run.spacing for run in present(rig.trajectory).runs)
     return with_trajectory(rig, trajectory, rig.pose, spacing)
@@ -406,8 +406,11 @@ def clocks_of(
     trajectory, found = present(rig.trajectory), {}
     for k, camera in enumerate(rig.cameras):
         step = np.diff(np.unique(trajectory.time[trajectory.camera == k]))
+        offset, rate, read_out = value[k].tolist()
         found[camera.id] = Clock(
-            *value[k].tolist(),
+            offset,
+            rate,
+            read_out,
             np.sqrt(np.clip(np.diagonal(covariance[k]), 0, None)),
             float(trajectory.clocks.middle[k]),
             float(np.median(step)),

@@ -21,7 +21,7 @@ from jaxbundle.geometry.quaternions import (
 from jaxbundle.leastsquares import Pose, PoseValue
 from jaxbundle.network.kinds.continuous_time import Instant, place_on_spline
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray
+from jaxbundle.types import AnyArray, Scalar
 
 # The control poses of an interval of a cubic spline.
 CONTROLS = 4
@@ -67,7 +67,7 @@ class Run:
 
 
 @dataclasses.dataclass(frozen=True)
-class Trajectory:
+class TargetMotion:
     """Poses of targets in time, and when they were photographed.
 
     **Fields:**
@@ -104,7 +104,7 @@ class Trajectory:
         instant = Instant(since, time - self.clocks.middle[camera], line, 1 / spacing)
         return (first + k).astype(int), instant
 
-    def with_clocks(self, value: Float[np.ndarray, "cameras 3"]) -> "Trajectory":
+    def with_clocks(self, value: Float[np.ndarray, "cameras 3"]) -> "TargetMotion":
         """The same with other start values of the clocks."""
         return dataclasses.replace(self, clocks=dataclasses.replace(self.clocks, value=value))
 
@@ -120,7 +120,7 @@ class Trajectory:
 
 @partial(compile_once, static=())
 def _view_poses(controls: PoseValue, u: Float[AnyArray, " n"]) -> PoseValue:
-    def one(four: PoseValue, u: Array) -> PoseValue:
+    def one(four: PoseValue, u: Scalar) -> PoseValue:
         posed = [Pose().prepare(jax.tree.map(lambda x, k=k: x[k], four)) for k in range(CONTROLS)]
         place = lambda X: jnp.stack(place_on_spline(posed, u, X))
         t = place((0.0, 0.0, 0.0))
