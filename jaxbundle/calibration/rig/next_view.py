@@ -92,7 +92,7 @@ def _images(
 
         zero = jnp.zeros(2 * space.width)
         J = jnp.concatenate(jax.jacfwd(image, (0, 1))(zero, jnp.asarray(p)), 1)
-        return image(zero, jnp.asarray(p)), J, mounted.ray(at.ray(tuple(X)))[2]
+        return image(zero, jnp.asarray(p)), J, jnp.asarray(mounted.ray(at.ray(tuple(X)))[2])
 
     return jax.vmap(lambda pose: jax.vmap(lambda X: one(pose, X))(points))(poses)
 
@@ -197,10 +197,11 @@ def _places(
     p = tuple(given.parameters.values())
     uv = random.uniform(0.15, 0.85, (n, 2)) * size
     xy = in_model_units(uv, model, given.image_size, given.pixel_size)
-    rays = np.array(jax.vmap(lambda xy: image_ray(model, p, xy[0], xy[1]))(xy))
-    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    rays = np.stack(jax.vmap(lambda xy: image_ray(model, p, xy[0], xy[1]))(xy), -1)
+    rays = rays / np.linalg.norm(rays, axis=1)[:, None]
     away = np.linalg.norm(rig.values("epoch").position, axis=1)
-    distance = random.uniform(*np.quantile(away, [0.05, 0.95]), n)
+    nearest, farthest = np.quantile(away, [0.05, 0.95]).tolist()
+    distance = random.uniform(nearest, farthest, n)
     tilt, roll = random.uniform(0, settings.max_tilt, n), random.uniform(0, 180, n)
     axis = random.uniform(0, 2 * np.pi, n)
     # the printed side is that which the cameras have seen: +z of the board towards them, or −z
