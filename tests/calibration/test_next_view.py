@@ -1,5 +1,7 @@
 """The next photograph of a rig: what it says is what follows when it is taken."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import rig_scenes as scenes
@@ -41,17 +43,17 @@ def test_the_photograph_that_is_advised_does_what_is_said():
     assert few.after > view.after * 0.999
 
     random, more = np.random.default_rng(9), {}
-    for name, one in pair.items():
-        (board, views), = one.items()
+    for name, views in pair.items():
         k = list(scenes.CHAIN).index(name)
-        middle = scenes.matrix(np.eye(3), -views.board.points.mean(0))
+        middle = scenes.matrix(np.eye(3), -scenes.BOARD.points.mean(0))
         pose = scenes.CHAIN[name] @ view.pose @ middle
-        xy = scenes.image(scenes.LENSES[k], pose, views.board, random, 0.05)
-        number = 900
-        more[name] = {board: jaxbundle.calibration.BoardViews(
-            views.board, (*views.names, f"{name}_{number}.png"), views.image_size,
-            np.concatenate([views.xy, xy[None]]),
-        )}  # fmt: skip
+        xy = scenes.image(scenes.LENSES[k], pose, scenes.BOARD, random, 0.05)
+        more[name] = dataclasses.replace(
+            views,
+            names=(*views.names, f"{name}_900.png"),
+            xy=np.concatenate([views.xy, xy[None]]),
+            photographs=(),
+        )
     again = jaxbundle.calibrate_rig(more, **OPTIONS)
     said = again.mountings["c1"].weakest[0] / again.sigma0 * rig.sigma0
     assert abs(said / view.after - 1) < 0.1
