@@ -52,9 +52,11 @@ from jaxbundle.calibration import Board as Board
 from jaxbundle.calibration import BoardViews as BoardViews
 from jaxbundle.calibration import Calibration as Calibration
 from jaxbundle.calibration import RigCalibration as RigCalibration
+from jaxbundle.calibration import WandCalibration as WandCalibration
 from jaxbundle.calibration import calibrate as calibrate
 from jaxbundle.calibration import calibrate_cameras as calibrate_cameras
 from jaxbundle.calibration import calibrate_rig as calibrate_rig
+from jaxbundle.calibration import calibrate_wand as calibrate_wand
 from jaxbundle.calibration.as_opencv import calibrate_opencv as calibrate_opencv
 from jaxbundle.calibration.stability import Stability as Stability
 from jaxbundle.cameras import CameraModel as CameraModel
@@ -166,6 +168,7 @@ __all__ = [
     "UncertaintyBudget",
     "Values",
     "VideoFrames",
+    "WandCalibration",
     "accept",
     "add_further",
     "adjust",
@@ -177,6 +180,7 @@ __all__ = [
     "calibrate_opencv",
     "calibrate_rig",
     "calibrate_rigs",
+    "calibrate_wand",
     "camera",
     "certificate",
     "change",

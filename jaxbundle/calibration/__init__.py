@@ -7,6 +7,7 @@ from jaxbundle.calibration.pixels import images_of_board
 from jaxbundle.calibration.result import Calibration
 from jaxbundle.calibration.rig.calibrate import calibrate_rig
 from jaxbundle.calibration.rig.result import RigCalibration
+from jaxbundle.calibration.rig.wand import WandCalibration, calibrate_wand
 from jaxbundle.calibration.several import Calibrations, calibrate_cameras
 from jaxbundle.calibration.simulate import simulate_views
 from jaxbundle.calibration.stability import Stability, stability
@@ -21,9 +22,11 @@ __all__ = [
     "ModelComparison",
     "RigCalibration",
     "Stability",
+    "WandCalibration",
     "calibrate",
     "calibrate_cameras",
     "calibrate_rig",
+    "calibrate_wand",
     "compare_models",
     "images_of_board",
     "simulate_views",

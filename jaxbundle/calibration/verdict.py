@@ -52,6 +52,9 @@ def _judge_rig(rig: "RigCalibration") -> Finding:
     if weak := undetermined_mountings(rig):
         names = ", ".join(weak)
         return Finding("Rig", BAD, f"{words}; positions not determined: {names}")
+    open_clocks = [name for name, clock in rig.clocks.items() if clock.held]
+    if open_clocks:
+        return Finding("Rig", BAD, f"{words}; clocks not determined: {', '.join(open_clocks)}")
     doubtful = rig.left_out or rig.contradicting or rig.separate or not rig.converged
     return Finding("Rig", DOUBTFUL if doubtful else GOOD, words)
 

@@ -25,6 +25,7 @@ COMMANDS = (
     "frames",
     "calibrate",
     "calibrate-rig",
+    "calibrate-wand",
     "hand-eye",
     "batch",
     "design",

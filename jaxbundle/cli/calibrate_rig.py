@@ -1,6 +1,6 @@
 """`jaxbundle calibrate-rig`: cameras on one mounting, from photographs of any boards."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -48,6 +48,22 @@ def calibrate_rig(  # noqa: PLR0913 - the options of the command
             help="FILE.toml with a section [rig], as of a project: what is known of the mountings"
         ),
     ] = "",
+    synchronize: Annotated[
+        str,
+        typer.Option(
+            metavar="offset,rate,read-out",
+            help="unknowns of the clocks of cameras that run by themselves, of these: from the "
+            "motion of the targets in videos",
+        ),
+    ] = "",
+    times: Annotated[
+        str,
+        typer.Option(
+            metavar="FPS or FILE.csv",
+            help="with --synchronize: frames per second, NAME=FPS,NAME=FPS, or a table camera,"
+            "image,time; default: frames.csv beside the folders",
+        ),
+    ] = "",
     model: options.Model = "opencv",
     free: options.Free = "",
     given: options.Given = None,
@@ -83,7 +99,8 @@ def calibrate_rig(  # noqa: PLR0913 - the options of the command
 
     Photographs of equal names, or equal last numbers in them, are simultaneous. Cameras are tied by
     boards that they see at the same time, through other cameras, or by the motion of the rig
-    between boards that are fixed to each other.
+    between boards that are fixed to each other. With --synchronize nothing is simultaneous: offsets
+    and rates of the clocks follow from frames of videos in which the targets move.
     """
     from jaxbundle.calibration import Calibrations
     from jaxbundle.calibration import calibrate_rig as calibrate_together
@@ -101,6 +118,7 @@ def calibrate_rig(  # noqa: PLR0913 - the options of the command
     else:
         known = board_given(board, square, kind, diameter, marker, dictionary, first_marker)
     cameras = name_cameras(folders)
+    when = times_given(times, cameras) if times or synchronize else None
     need_opencv()
     files = [path for folder in cameras.values() for path in photographs([folder])]
     settings = {
@@ -109,6 +127,8 @@ def calibrate_rig(  # noqa: PLR0913 - the options of the command
         "--kind": kind,
         "--fixed": fixed,
         "--mountings": mountings,
+        "--synchronize": synchronize,
+        "--times": times,
         "--model": model,
         "--free": free,
         "--given": ", ".join(given or ()),
@@ -127,6 +147,8 @@ def calibrate_rig(  # noqa: PLR0913 - the options of the command
             known,
             fixed=fixed,
             mountings=mountings or None,
+            synchronize=synchronize,
+            times=when,
             model=model,
             free=words(free) or None,
             given=values(given),
@@ -182,6 +204,30 @@ def name_cameras(folders: Sequence[str]) -> dict[str, str]:
             )
         found[own] = folder
     return found
+
+
+def times_given(times: str, cameras: Mapping[str, str]) -> float | dict[str, float] | Path:
+    """The times of photographs: frames per second, by camera if they differ, or a table."""
+    if not times:
+        tables = [Path(folder).parent / "frames.csv" for folder in cameras.values()]
+        found = next((table for table in tables if table.is_file()), None)
+        if found is None:
+            raise InputError(
+                f"--synchronize: there is no {tables[0]}; give --times: frames per second, or a "
+                "table with the columns camera, image, time"
+            )
+        return found
+    if Path(times).is_file():
+        return Path(times)
+    try:
+        if "=" not in times:
+            return float(times)
+        pairs = [word.split("=") for word in times.split(",")]
+        return {name.strip(): float(rate) for name, rate in pairs}
+    except ValueError:
+        raise InputError(
+            f"--times: expected frames per second, NAME=FPS,NAME=FPS or a file, got {times!r}"
+        ) from None
 
 
 def _check_alone(

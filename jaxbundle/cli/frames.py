@@ -15,6 +15,14 @@ def frames(
     videos: Annotated[list[Path], typer.Argument(help="videos; several: simultaneous ones")],
     out: Annotated[Path, typer.Option(help="folder for a folder of frames of each video")],
     number: Annotated[int, typer.Option(min=1, help="number of frames of each, at most")] = 60,
+    every: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="instead, every so many-th frame, for calibrate-rig --synchronize: the videos "
+            "need not be simultaneous",
+        ),
+    ] = None,
     first: Annotated[
         str, typer.Option(help="a,b: the frame of each video at which all begin; default: 0")
     ] = "",
@@ -37,6 +45,6 @@ def frames(
         raise InputError(f"--first: expected whole numbers a,b, got {first!r}") from None
     with staging(quiet or json == "-") as tell:
         result = jaxbundle.frames(
-            videos, out, number=number, first=begin, force=force, progress=tell
+            videos, out, number=number, every=every, first=begin, force=force, progress=tell
         )
     print_result(result, json, quiet)

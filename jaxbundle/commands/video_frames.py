@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxbundle.arguments import integer
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.io.writing.folders import replace_folder
@@ -16,6 +17,7 @@ from jaxbundle.photographs.video import (
     FrameSettings,
     VideoLook,
     choose_frames,
+    file_of_frame,
     look_at_video,
     write_frames,
 )
@@ -30,7 +32,8 @@ TABLE = "frames.csv"
 @dataclasses.dataclass(frozen=True)
 class VideoFrames(TableMethods):
     """Frames chosen from videos: their `number` in each [videos, n], the time in seconds, the
-    sharpness, and the `folders` into which they were written."""
+    sharpness, the `folders` into which they were written, and the names of the files there
+    (`image`)."""
 
     videos: tuple[Path, ...]
     folders: tuple[Path, ...]
@@ -38,6 +41,7 @@ class VideoFrames(TableMethods):
     number: Int[np.ndarray, "videos n"]
     time: Float[np.ndarray, "videos n"]
     sharpness: Float[np.ndarray, "videos n"]
+    image: tuple[str, ...]
 
     def table(self) -> dict[str, np.ndarray]:
         """A row for each frame of each video."""
@@ -45,6 +49,7 @@ class VideoFrames(TableMethods):
         return {
             "video": np.repeat(names, self.number.shape[1]),
             "frame": self.number.ravel(),
+            "image": np.tile(np.array(self.image, dtype=object), len(self.videos)),
             "time": self.time.ravel(),
             "sharpness": self.sharpness.ravel(),
         }
@@ -87,6 +92,7 @@ def frames(
     out: str | Path,
     *,
     number: int = 60,
+    every: int | None = None,
     first: Sequence[int] = (),
     force: bool = False,
     settings: FrameSettings | None = None,
@@ -102,6 +108,8 @@ def frames(
     - `videos`: files. Several: of cameras that run at one rate.
     - `out`: folder; in it a folder for each video, of its name, and a table `frames.csv`.
     - `number`: of frames at most, fewer if the pictures do not differ.
+    - `every`: instead, every so many-th frame, sharp or not, of videos that need not be
+      simultaneous or run at one rate: to find offsets of time (`calibrate_rig(…, synchronize=…)`).
     - `first`: for each video the frame at which all begin, if they were not started together.
     - `force`: replace a folder of other content.
     - `settings`: see `FrameSettings`; `number` replaces that of them.
@@ -119,8 +127,12 @@ def frames(
         )
     with replace_folder(out, BY, (*names, TABLE), force) as new:
         looks = [look_at_video(path, settings, progress) for path in paths]
-        _check_together(looks, begin)
-        chosen = choose_frames(looks, begin, settings)
+        if every is None:
+            _check_together(looks, begin)
+            chosen = choose_frames(looks, begin, settings)
+        else:
+            length = min(len(look) - skipped for look, skipped in zip(looks, begin))
+            chosen = np.arange(0, length, integer("every", every, least=1))
         for path, name, skipped in zip(paths, names, begin):
             # equal numbers in the names are one instant
             write_frames(path, chosen + skipped, skipped, new / name)
@@ -133,10 +145,11 @@ def frames(
             numbers,
             np.stack([n / look.rate for n, look in zip(numbers, looks)]),
             np.stack([look.sharpness[n] for n, look in zip(numbers, looks)]),
+            tuple(file_of_frame(k) for k in chosen.tolist()),
         )
         table = result.table()
         rows = zip(*(column.tolist() for column in table.values()))
-        text = "".join(f"{v},{f},{t:.6f},{s:.6g}\n" for v, f, t, s in rows)
+        text = "".join(f"{v},{f},{i},{t:.9f},{s:.6g}\n" for v, f, i, t, s in rows)
         (new / TABLE).write_text(f"{','.join(table)}\n{text}", encoding="utf-8")
     return result
 

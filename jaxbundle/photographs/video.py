@@ -121,6 +121,11 @@ def choose_frames(
     return np.sort(candidates[chosen])
 
 
+def file_of_frame(number: int) -> str:
+    """The name of the file of a frame."""
+    return f"frame_{number:06d}.png"
+
+
 def write_frames(path: Path, numbers: Int[np.ndarray, " n"], first: int, folder: Path) -> None:
     """Write frames as `frame_000123.png`, counted from the `first`, without loss.
 
@@ -135,7 +140,7 @@ def write_frames(path: Path, numbers: Int[np.ndarray, " n"], first: int, folder:
                 break
             if number in wanted:
                 there, frame = video.retrieve()
-                file = folder / f"frame_{number - first:06d}.png"
+                file = folder / file_of_frame(number - first)
                 if not there:
                     break
                 content = cv2.imencode(".png", frame)[1]

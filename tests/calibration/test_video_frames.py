@@ -66,6 +66,27 @@ def test_frames_of_several_videos_are_of_the_same_instants(tmp_path):
     assert names[0] == names[1]
 
 
+def test_every_frame_of_videos_that_are_not_synchronised(tmp_path):
+    """Of different rates; the table has camera, image and time as `calibrate-rig` takes them."""
+    from types import SimpleNamespace
+
+    from jaxbundle.calibration.rig.times import times_of_photographs
+
+    a, b = write(tmp_path / "a.avi"), write(tmp_path / "b.avi", rate=25, delay=5)
+    made = jaxbundle.frames([a, b], tmp_path / "out", every=7, first=[0, 5])
+    files = [sorted(f.name for f in folder.iterdir()) for folder in made.folders]
+    assert files[0] == files[1] == list(made.image)
+    assert made.number[0].tolist() == list(range(0, POSES * (REST + MOTION), 7))
+    found = times_of_photographs(
+        {n: SimpleNamespace(views=SimpleNamespace(photographs=made.image)) for n in "ab"},
+        tmp_path / "out" / "frames.csv",
+    )
+    for name, number, rate in zip("ab", made.number, (20, 25)):
+        assert np.allclose([found[name][image] for image in made.image], number / rate)
+    with pytest.raises(InputError, match="every"):
+        jaxbundle.frames(a, tmp_path / "none", every=0)
+
+
 def test_what_is_no_set_of_simultaneous_videos(tmp_path):
     a, b = write(tmp_path / "a.avi"), write(tmp_path / "b.avi", rate=25)
     text = tmp_path / "text.avi"

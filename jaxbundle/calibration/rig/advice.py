@@ -77,9 +77,19 @@ def _advise_weakest(rig: "RigCalibration") -> str:
     """The photograph that the weakest mounting needs."""
     name, mounting = max(rig.mountings.items(), key=lambda item: item[1].weakest[0])
     sigma, along = mounting.weakest
-    return (
+    weakest = (
         f"next: the position of {name!r} is the weakest, σ {sigma:.2g} {rig.object_unit} along "
-        f"{_direction(along)}: {_remedy(rig, name)}"
+        f"{_direction(along)}: "
+    )
+    view = rig.next_view(name)
+    if view is None or view.after >= view.before:
+        return weakest + _remedy(rig, name)
+    board = "the board" if len(rig.rig.boards) == 1 else f"board {view.board!r}"
+    return (
+        f"{weakest}hold {board} at {view.distance:.2g} {rig.object_unit} before {name!r}, its "
+        f"middle near pixel ({view.pixel[0]:.0f}, {view.pixel[1]:.0f}), tilted by "
+        f"{view.tilt:.0f}° and rolled by {view.roll:.0f}°, where {list_some(view.seen_by, 6)} see "
+        f"it: σ would be {view.after / view.before:.2f} times that"
     )
 
 

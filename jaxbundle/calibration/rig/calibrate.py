@@ -7,9 +7,10 @@ numbers in them (left_017.jpg, right_017.jpg). Each camera may see other boards 
 boards that move by themselves have a pose at every epoch, boards that are fixed to each other have
 one common pose and unknown relations. What ties the cameras, by boards seen simultaneously, by
 other cameras, or by the motion of the rig, is found by `connections`, which gives the start values.
-Epochs that contradict the mounting (the board moved in between) are excluded, or only listed
-without snooping. The boards are known, weighted or free, as in the calibration of one camera.
-Gross errors are removed camera by camera, then those that only the mounting reveals.
+Cameras that are not synchronised have no epochs in common: their clocks are unknowns
+(`synchronize`). Epochs that contradict the mounting (the board moved in between) are excluded, or
+only listed without snooping. The boards are known, weighted or free, as in the calibration of one
+camera. Gross errors are removed camera by camera, then those that only the mounting reveals.
 """
 
 import dataclasses
@@ -20,7 +21,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.arguments import show
+from jaxbundle.arguments import one_of, show
 from jaxbundle.batches.epochs import contradicting
 from jaxbundle.calibration.calibrate import calibrate
 from jaxbundle.calibration.each_camera import calibrate_each
@@ -32,6 +33,12 @@ from jaxbundle.calibration.rig.known_mountings import known_mountings
 from jaxbundle.calibration.rig.photographs import RigPhotographs, require_lists, views_of_camera
 from jaxbundle.calibration.rig.result import RigCalibration
 from jaxbundle.calibration.rig.start import start_rig
+from jaxbundle.calibration.rig.synchronize import (
+    adjust_unsynchronized,
+    start_unsynchronized,
+    without_run,
+)
+from jaxbundle.calibration.rig.times import HOW, times_of_photographs
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.leastsquares import Result
@@ -39,6 +46,7 @@ from jaxbundle.leastsquares.quality.snooping import check_test
 from jaxbundle.measure.boards import Board
 from jaxbundle.measure.views import BoardViews
 from jaxbundle.network.columns import list_some
+from jaxbundle.network.kinds.continuous_time import CLOCK_PARAMETERS
 from jaxbundle.types import Progress
 
 # Options of a camera that are those of its rig, too.
@@ -54,6 +62,8 @@ def calibrate_rig(
     seen_by: Mapping[str, Sequence[str]] | None = None,
     mountings: Mapping[str, Any] | str | Path | None = None,
     bases: Sequence[Mapping[str, Any]] = (),
+    synchronize: str | Sequence[str] = (),
+    times: Any = None,
     progress: Progress | None = None,
     **options: Any,
 ) -> RigCalibration:
@@ -77,6 +87,12 @@ def calibrate_rig(
     - `mountings`, `bases`: what is known of the mountings, held or with σ, as in the section
       `[rig]` of a project (degrees), such as `{"b": {"position": [0, 0, 0.1], "sigma_position":
       0.01}}`; or a file with that section.
+    - `synchronize`: unknowns of the clocks of cameras that run by themselves, of "offset", "rate"
+      and "read-out" (of a rolling shutter): nothing is simultaneous then, targets move along
+      splines in time, and `clocks` of the result has the unknowns. Photographs must follow each
+      other closely, as frames of a video; `times`: of them, frames per second (the last number in a
+      name is that of the frame), by camera if they differ; or seconds by camera and name; or the
+      path of a table with columns camera, image, time.
     - `board_sigma` (object unit), `board_free` (one board only), `snooping`, `significance`,
       `max_iterations` of cameras and rig, and further `options` of the cameras: as in `calibrate`.
       Without snooping, epochs that contradict the mounting are kept and listed in `contradicting`.
@@ -89,6 +105,7 @@ def calibrate_rig(
     check_test(options.get("snooping", "pope"), options.get("significance", 0.001))
     _check(photographs)
     known = known_mountings(mountings, bases, list(photographs))
+    unknowns = _unknowns_of_clocks(synchronize, times)
     if bodies is not None:
         bodies = require_lists("bodies", bodies, "{'room': ['front', 'rear']}")
     if fixed and bodies:
@@ -101,8 +118,29 @@ def calibrate_rig(
         # Points downweighted in a camera have full weight in the rig.
         given["snooping"] = "pope"
     bodies = declared if bodies is None else bodies
-    rig, connections = start_rig(calibrations, bodies, fixed, known)
+    if unknowns:
+        seconds = times_of_photographs(calibrations, times)
+        rig, connections = start_unsynchronized(
+            calibrations, bodies, fixed, known, seconds, unknowns
+        )
+    else:
+        rig, connections = start_rig(calibrations, bodies, fixed, known)
     return _adjust_together(calibrations, rig, connections, **given)
+
+
+def _unknowns_of_clocks(synchronize: str | Sequence[str], times: Any) -> tuple[str, ...]:
+    """The unknowns of clocks.
+
+    **Raises:** `InputError` for others, or without times."""
+    words = synchronize.split(",") if isinstance(synchronize, str) else synchronize
+    found = tuple(word.strip() for word in words if word.strip())
+    for word in found:
+        one_of("synchronize", word, CLOCK_PARAMETERS)
+    if found and times is None:
+        raise InputError(f"synchronize: the times of the photographs are missing (times); {HOW}")
+    if times is not None and not found:
+        raise InputError("times: are for cameras that are not synchronised; give synchronize, too")
+    return found
 
 
 def _calibrate_cameras(
@@ -152,17 +190,27 @@ def _adjust_together(
     rig = dataclasses.replace(rig, point_sigma=board_sigma, points_free=board_free)
     cameras = [one.camera for one in calibrations.values()]
     size = np.array([unit_size(get_model(one.model), one.pixel_size) for one in cameras])
-    left_out, found = [], require_solved(adjust_rig(rig, max_iterations), connections.ties)
+    left_out, held = [], {}
+    if rig.trajectory is None:
+        found = adjust_rig(rig, max_iterations)
+    else:
+        rig, found, held = adjust_unsynchronized(rig, max_iterations)
+        left_out = without_run(rig)
+    require_solved(found, connections.ties)
     # each time from the start values: a wrong epoch may have led the adjustment far away
     while (bad := _contradictions(rig, found, size)) and snooping:
-        why = "does not fit the mounting (RMS {:.1f} px): photographs not simultaneous?"
+        why = (
+            "does not fit the mounting (RMS {:.1f} px): photographs not simultaneous?"
+            if rig.trajectory is None
+            else "does not fit the motion and the mounting (RMS {:.1f} px): is its time right?"
+        )
         left_out += [(rig.epochs[e], why.format(rms)) for e, rms in bad.items()]
         found = require_solved(leave_out(rig, found, np.isin(rig.epoch, list(bad)), max_iterations))
     if snooping:
         found = snoop_rig(found, snooping, significance, max_iterations)
     why = "kept, but does not fit the mounting (RMS {:.1f} px)"
     tolerated = [(rig.epochs[e], why.format(rms)) for e, rms in bad.items()]
-    return RigCalibration(dict(calibrations), rig, found, left_out, tolerated, connections)
+    return RigCalibration(dict(calibrations), rig, found, left_out, tolerated, connections, held)
 
 
 def _check(photographs: Any) -> None:
@@ -209,6 +257,8 @@ def _contradictions(
     number = number.reshape(len(number), -1)
     rays = number.sum(1)
     rms = np.sqrt(np.bincount(rig.epoch, (v**2).sum(1), len(rays)) / np.maximum(rays, 1))
-    # only epochs of several views can contradict the mounting, or the relations of boards
-    bad = contradicting(rms, rays > 0, (number > 0).sum(1) > 1)
+    # only epochs of several views can contradict the mounting, or the relations of boards; or the
+    # motion before and after them
+    shared = rays > 0 if rig.trajectory is not None else (number > 0).sum(1) > 1
+    bad = contradicting(rms, rays > 0, shared)
     return {int(e): float(rms[e]) for e in bad}

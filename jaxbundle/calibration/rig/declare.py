@@ -10,7 +10,9 @@ reference camera relative to every body at every epoch, the mounting b_k, R_k of
 the place c_j, P_j of every board on its body (but the first of a body, which is its frame), the
 free parameters of every camera, and the points X unless known: with a σ they are weighted; free
 ones, of one board only, carry the datum by inner constraints (7, including scale). Mountings and
-places are the same at all epochs. The poses of the epochs are eliminated; the reduced system has a
+places are the same at all epochs. Where cameras are not synchronised, the poses of the epochs are
+those of a spline in time, and the clocks of the cameras are unknowns as well
+(`network.kinds.continuous_time`). The poses of the epochs are eliminated; the reduced system has a
 few tens of unknowns, plus three per unknown point.
 
 Source: Luhmann, Robson, Kyle and Boehm (2014), Close-Range Photogrammetry and 3D Imaging, section
@@ -26,18 +28,28 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxbundle.calibration.rig.known_mountings import NOTHING_KNOWN, KnownMountings
+from jaxbundle.calibration.rig.trajectory import CONTROLS, TargetMotion
+from jaxbundle.cameras import get_model
+from jaxbundle.cameras.pixel_frame import in_pixels
 from jaxbundle.leastsquares import Result, adjust
 from jaxbundle.leastsquares.datum.motions import similarity
-from jaxbundle.leastsquares.declarations import Motions, ObservationSet, Table
+from jaxbundle.leastsquares.declarations import Kind, Motions, ObservationSet, Table
 from jaxbundle.leastsquares.problem import Problem
 from jaxbundle.leastsquares.quality.snooping import RemovedRow, snoop, without
 from jaxbundle.leastsquares.solution import Solution, find_minimum
 from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network.declare import CameraTable, camera_tables
+from jaxbundle.network.kinds.continuous_time import (
+    CLOCK,
+    CLOCK_PARAMETERS,
+    TRAJECTORY,
+    timed_image_points,
+)
 from jaxbundle.network.kinds.control_points import CONTROL_POINTS
 from jaxbundle.network.kinds.image_points import image_points
 from jaxbundle.network.kinds.mountings import BASES, MOUNTING, observe_mountings
 from jaxbundle.network.tables import EXTERIOR, Camera
+from jaxbundle.types import present
 
 POSES = ("epoch", "mounting")
 # The tables of poses on the way from a point to the camera: of boards that are bodies of their own,
@@ -51,6 +63,12 @@ def _scale(motion: Float[Array, "7"], mounting: PoseValue) -> PoseValue:
 
 
 _OF_OBJECT = similarity(("point",), ("epoch",))
+# What is known of a clock beforehand.
+CLOCK_PRIOR = Kind(
+    "clocks", lambda clock, given: clock - given, (CLOCK,), CLOCK_PARAMETERS, snooped=""
+)
+
+
 # A similarity of the object that also transforms poses and bases.
 FLOATING = Motions(_OF_OBJECT.names, (*_OF_OBJECT.actions, ("mounting", _scale)), _OF_OBJECT.curved)
 
@@ -72,6 +90,7 @@ class Rig:
       boards, in their own frames; `place`: c_j and P_j of every board, None if every board is a
       body of its own; `body`: of every board the index of the first board of its body.
     - `known`: what is given of the mountings.
+    - `trajectory`: of cameras that are not synchronised; every photograph is then an epoch.
     """
 
     cameras: tuple[Camera, ...]
@@ -94,6 +113,24 @@ class Rig:
     place: PoseValue | None = None
     body: tuple[int, ...] = (0,)
     known: KnownMountings = NOTHING_KNOWN
+    trajectory: TargetMotion | None = None
+
+    @property
+    def lines(self) -> Float[np.ndarray, " n"]:
+        """Of every image point the row of the image relative to the middle one, heights of the
+        image."""
+        found = np.zeros(len(self.xy))
+        for k, camera in enumerate(self.cameras):
+            own, size = self.camera == k, present(camera.image_size)
+            uv = in_pixels(self.xy[own], get_model(camera.model), size, camera.pixel_size)
+            found[own] = (uv[:, 1] - (size[1] - 1) / 2) / size[1]
+        return found
+
+    def poses(self, values: Mapping[str, Any]) -> PoseValue:
+        """The pose of every epoch, of the values of the tables."""
+        if self.trajectory is None:
+            return values["epoch"]
+        return self.trajectory.view_poses(values[TRAJECTORY], values[CLOCK])
 
     @property
     def epoch_of_rows(self) -> tuple[str, ...]:
@@ -131,7 +168,7 @@ def declare_rig(rig: Rig) -> tuple[list[Table], list[ObservationSet]]:
     free = seen if rig.points_free else np.full(len(rig.points), rig.point_sigma is not None)
     names = [camera.id for camera in rig.cameras]
     tables = [
-        Table("epoch", rig.pose, labels=rig.epochs, parameters=EXTERIOR),
+        *_tables_of_poses(rig),
         Table(
             MOUNTING,
             rig.mounting,
@@ -153,6 +190,30 @@ def declare_rig(rig: Rig) -> tuple[list[Table], list[ObservationSet]]:
                 parameters=EXTERIOR,
             )
         )
+    observations = _image_points(rig)
+    observations += _given_mountings(rig)
+    if rig.point_sigma is not None:
+        every = np.arange(len(rig.points))
+        control = CONTROL_POINTS((every,), rig.points, sigma=rig.point_sigma, name="control")
+        observations.append(control)
+    return tables, observations
+
+
+def _tables_of_poses(rig: Rig) -> list[Table]:
+    """The poses of the epochs; or control poses of a spline, and clocks."""
+    if rig.trajectory is None:
+        return [Table("epoch", rig.pose, labels=rig.epochs, parameters=EXTERIOR)]
+    clocks, names = rig.trajectory.clocks, [camera.id for camera in rig.cameras]
+    return [
+        Table(TRAJECTORY, rig.trajectory.poses, parameters=EXTERIOR, title="control pose"),
+        Table(CLOCK, clocks.value, free=clocks.free, labels=names, parameters=CLOCK_PARAMETERS),
+    ]
+
+
+def _image_points(rig: Rig) -> list[ObservationSet]:
+    """The observations of the images, and what is known of the clocks beforehand."""
+    if rig.trajectory is not None:
+        return _timed_image_points(rig, rig.trajectory)
     observations = []
     for table, rows in rig.sets:
         k = rig.camera[rows]
@@ -164,12 +225,31 @@ def declare_rig(rig: Rig) -> tuple[list[Table], list[ObservationSet]]:
         observations.append(
             kind(touched, rig.xy[rows], sigma=rig.sigma[rows], name=table.image_set)
         )
-    observations += _given_mountings(rig)
-    if rig.point_sigma is not None:
-        every = np.arange(len(rig.points))
-        control = CONTROL_POINTS((every,), rig.points, sigma=rig.point_sigma, name="control")
-        observations.append(control)
-    return tables, observations
+    return observations
+
+
+def _timed_image_points(rig: Rig, trajectory: TargetMotion) -> list[ObservationSet]:
+    line, board = rig.lines, None if rig.place is None else "board"
+    unused = trajectory.run[rig.epoch] < 0
+    observations = []
+    for table, rows in rig.sets:
+        k, epoch = rig.camera[rows], rig.epoch[rows]
+        first, instant = trajectory.intervals(epoch, line[rows])
+        controls = (first + j for j in range(CONTROLS))
+        touched = (*controls, k, k, np.searchsorted(table.cameras, k), rig.point[rows])
+        if board:
+            touched = rig.board_of_points[rig.point[rows]], *touched
+        kind = timed_image_points(table.model, "measured", table.name, MOUNTING, board)
+        sigma = np.where(unused[rows, None], np.inf, rig.sigma[rows])
+        measured = (rig.xy[rows], instant)
+        observations.append(kind(touched, measured, sigma=sigma, name=table.image_set))
+    clocks = trajectory.clocks
+    sigma = np.where(clocks.free, clocks.prior, np.inf)
+    weighted = np.flatnonzero(np.isfinite(sigma).any(1))
+    if len(weighted):
+        given = CLOCK_PRIOR((weighted,), clocks.value[weighted], sigma=sigma[weighted])
+        observations.append(given)
+    return observations
 
 
 def _free_mountings(rig: Rig) -> Float[np.ndarray, "cameras 6"]:
@@ -201,10 +281,11 @@ def adjust_rig(rig: Rig, max_iterations: int = 50, **options: Any) -> Result:
     """
     # only points that are seen carry the datum; the bases scale with them (`FLOATING`)
     free = {"datum": {"point": np.unique(rig.point)}, "motions": FLOATING}
-    # the epochs, with six unknowns each and by far the most, are eliminated
+    # the epochs, with six unknowns each and by far the most, are eliminated; of control poses an
+    # observation touches four
     return adjust(
         *declare_rig(rig),
-        eliminate="epoch",
+        eliminate="epoch" if rig.trajectory is None else None,
         max_iterations=max_iterations,
         **(free if rig.points_free else {}),
         **options,

@@ -41,15 +41,15 @@ def rig_errors(rig: Rig, found: Solution, settings: CorrelationSettings) -> Erro
         rig.sigma[used],
         len(stack_rows(found, found.residuals)),
     )
-    components = components_of(rays, _scene(found), rig.cameras, settings)
+    components = components_of(rays, _scene(rig, found), rig.cameras, settings)
     components = with_given_points_and_others(components, rays, found, settings)
     return fit_error_model(found, components, settings.estimation) if components else None
 
 
-def _scene(found: Solution) -> StationsAndPoints:
+def _scene(rig: Rig, found: Solution) -> StationsAndPoints:
     """The stations of all photographs in the frames of their bodies, X0_e + M_eᵀ·b_k, and the
     points."""
-    position, rotation = (np.asarray(x) for x in found.values["epoch"])
+    position, rotation = (np.asarray(x) for x in rig.poses(found.values))
     base = np.asarray(found.values["mounting"].position)
     turned = np.einsum("eij,ki->kej", np.asarray(_matrices(rotation)), base)
     X = np.asarray(found.values["point"])[:, :3]

@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
 def network_of_views(found: "RigCalibration") -> Network | None:
     """The photographs of all cameras, tied by mountings (table `rigs`), with the image points that
-    were used; None where a network has no words for the rig: several boards, or something known of
-    the mountings."""
+    were used; None where a network has no words for the rig: several boards, something known of
+    the mountings, or cameras that are not synchronised."""
     rig = found.rig
-    if len(rig.boards) > 1 or rig.known.mountings or rig.known.bases:
+    if len(rig.boards) > 1 or rig.trajectory or rig.known.mountings or rig.known.bases:
         return None
     used = found.used
     views, image = np.unique(

@@ -9,6 +9,7 @@ from jaxbundle.calibration.verdict import (
 )
 from jaxbundle.io.text.csv_tables import table_rows
 from jaxbundle.network.columns import count
+from jaxbundle.network.kinds.continuous_time import RATE
 from jaxbundle.report import observations
 from jaxbundle.report.layout import (
     clean,
@@ -40,6 +41,12 @@ def rig_text(rig: "RigCalibration") -> str:
         lines += heading(title)
         lines += table(("", "value", "σ", "unit"), mounting_rows(m, unit), "lrrl")
         lines += ["", "Correlations", *table(("", *MOUNTED), correlation_rows(m), "l" + "r" * 6)]
+    if rig.clocks:
+        lines += heading("Clocks: common time = t + offset + rate·(t − middle) + read-out·line")
+        lines += table(("camera", "unknown", "value", "σ", "unit"), clock_rows(rig), "llrrl")
+        for name, clock in rig.clocks.items():
+            for unknown, why in clock.held.items():
+                lines += paragraph(f"- {unknown} of {clean(name)}: {why}", hanging=2)
     lines += heading("Advice on the mountings")
     for item in rig.advice:
         lines += paragraph(f"- {item}", hanging=2)
@@ -132,6 +139,15 @@ def rig_parameter_rows(rig: "RigCalibration", name: str) -> list[tuple[str, str,
     return [(n, *estimate(rig.parameters[name][n], s)) for n, s in rig.stated_sigma[name].items()]
 
 
+def clock_rows(rig: "RigCalibration") -> list[tuple[str, str, str, str, str]]:
+    """The unknowns of clocks that were estimated: camera, name, value, σ, unit."""
+    return [
+        (clean(name), unknown, *estimate(*clock.values[unknown]), "" if unknown == RATE else "s")
+        for name, clock in rig.clocks.items()
+        for unknown in clock.estimated
+    ]
+
+
 def _rig_quality(rig: "RigCalibration", name: str) -> dict:
     return {
         "coverage": coverage_dict(rig.coverage(name)),
@@ -195,6 +211,7 @@ def rig_dict(rig: "RigCalibration", brief: bool = False) -> dict:
             "bodies": [list(body) for body in rig.bodies],
             "places": {name: _mounting_dict(m) for name, m in rig.placements.items()},
         },
+        "clocks": {name: clock.to_dict() for name, clock in rig.clocks.items()},
         "ties_by_motion": [dataclasses.asdict(tie) for tie in rig.ties],
         "separate_boards": [list(names) for names in rig.separate],
         "advice": rig.advice,

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,17 +17,21 @@ from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.quality import DRAWN, GRID, Coverage, UncertaintyMap
 from jaxbundle.calibration.result import Calibration
 from jaxbundle.calibration.rig.advice import advise_rig
+from jaxbundle.calibration.rig.clocks import Clock
 from jaxbundle.calibration.rig.connections import Connections
 from jaxbundle.calibration.rig.declare import Rig, used_rays
 from jaxbundle.calibration.rig.errors import rig_errors
 from jaxbundle.calibration.rig.mounting import POSE, Mounting, mounting_of, placement_of
+from jaxbundle.calibration.rig.next_view import NextView, next_view
 from jaxbundle.calibration.rig.quality import rig_coverage, rig_points, rig_uncertainty
+from jaxbundle.calibration.rig.synchronize import clocks_of
 from jaxbundle.cameras import get_model
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.io.networks.rig_result import network_of_rig
 from jaxbundle.leastsquares import Result
 from jaxbundle.leastsquares.quality.error_components import ErrorModel, Errors, IndependentErrors
 from jaxbundle.network.blunders import Removed, either_of
+from jaxbundle.network.kinds.continuous_time import CLOCK
 from jaxbundle.network.tables import EXTERIOR, Camera, Network, units_of
 from jaxbundle.results import TableMethods
 from jaxbundle.system.programs import compile_once
@@ -47,6 +51,7 @@ class RigCalibration(TableMethods):
     - `board`: its points [points, 3]; of several boards `bodies` and `placements`;
     - `ties`: cameras that only the motion of the rig ties (`MotionTie`); `separate`: boards of a
       body that nothing relates; `advice`;
+    - `clocks` of cameras that are not synchronised (`Clock`);
     - `epochs`; `left_out`, and `contradicting` ones that were kept: epoch and reason; `removed` by
       data snooping; `residuals`: a table like that of an `Adjustment`; `rms` (pixels) by camera;
     - `error_model`: of errors that image points share; `covariance`, `mountings`, `placements` and
@@ -66,6 +71,7 @@ class RigCalibration(TableMethods):
         left_out: Sequence[tuple[str, str]],
         contradicting: Sequence[tuple[str, str]] = (),
         connections: Connections | None = None,
+        held_clocks: Mapping[str, Mapping[str, str]] | None = None,
     ):
         self.cameras, self.rig, self.result = cameras, rig, result
         self._maps: dict[tuple, UncertaintyMap] = {}
@@ -73,6 +79,8 @@ class RigCalibration(TableMethods):
         self.left_out, self.contradicting = tuple(left_out), tuple(contradicting)
         self.ties = () if connections is None else connections.ties
         self.separate = () if connections is None else connections.separate
+        self._next_views: dict[str, NextView | None] = {}
+        self._held_clocks = dict(held_clocks or {})
 
     @property
     def names(self) -> list[str]:
@@ -166,7 +174,9 @@ class RigCalibration(TableMethods):
         return w / self.sigma0
 
     def _photograph(self, camera: int, epoch: int) -> str:
-        return f"{self.names[camera]} {self.rig.epochs[epoch]}"
+        name = self.rig.epochs[epoch]
+        # of cameras that are not synchronised an epoch is a photograph, and named with its camera
+        return name if self.rig.trajectory is not None else f"{self.names[camera]} {name}"
 
     @property
     def removed(self) -> list[Removed]:
@@ -192,8 +202,18 @@ class RigCalibration(TableMethods):
         the frame of its own."""
         return self.values("point") + present(self.rig.centroids)[self.rig.board_of_points]
 
+    @functools.cached_property
+    def clocks(self) -> dict[str, Clock]:
+        """The clocks of cameras that are not synchronised, by camera; empty otherwise."""
+        if self.rig.trajectory is None:
+            return {}
+        covariance = self.errors.covariance(CLOCK)
+        return clocks_of(self.rig, self.values(CLOCK), covariance, self._held_clocks)
+
     def values(self, table: str) -> Any:
-        """The adjusted rows of a table of unknowns."""
+        """The adjusted rows of a table of unknowns; of "epoch" the poses of all epochs."""
+        if table == "epoch":
+            return jax.tree.map(np.asarray, self.rig.poses(self.result.minimum.values))
         return jax.tree.map(np.asarray, self.result.minimum.values[table])
 
     @functools.cached_property
@@ -327,6 +347,13 @@ class RigCalibration(TableMethods):
         """What would determine the mountings better, in words."""
         return advise_rig(self)
 
+    def next_view(self, name: str) -> NextView | None:
+        """The place of a board that would determine the mounting of a camera best, with the σ that
+        follows; None if there is none that it sees together with another camera."""
+        if name not in self._next_views:
+            self._next_views[name] = next_view(self, name)
+        return self._next_views[name]
+
     def camera(self, name: str) -> Camera:
         """A camera with the parameters of the common adjustment, held."""
         return dataclasses.replace(self.cameras[name].camera, parameters=self.parameters[name])
@@ -431,6 +458,8 @@ class RigCalibration(TableMethods):
         ]
         for name, m in self.mountings.items():
             lines.append(f"{name}: base {m.length:.6g} ± {m.length_sigma:.2g}")
+        for name, clock in self.clocks.items():
+            lines += [f"clock of {name}: {said}" for said in clock.in_words()]
         return "\n".join(lines)
 
 

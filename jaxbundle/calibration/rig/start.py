@@ -54,6 +54,10 @@ class RigBoards:
         return first + np.arange(len(self.boards[name].ids))
 
 
+# By the name of a camera, of every photograph its epoch.
+Keys = Mapping[str, Mapping[str, str]]
+
+
 class CameraViews(NamedTuple):
     """The views of one camera.
 
@@ -111,18 +115,24 @@ def collect_boards(
     return RigBoards(boards, body)
 
 
-def sort_views(calibrations: Mapping[str, Calibration], boards: RigBoards) -> list[CameraViews]:
-    """Board and epoch of every view of every camera.
+def keys_by_name(calibrations: Mapping[str, Calibration]) -> Keys:
+    """The epoch of every photograph of every camera, by their names.
 
     **Raises:** `InputError` if the photographs cannot be paired by their names.
     """
     photographs = {
         name: tuple(dict.fromkeys(one.views.photographs)) for name, one in calibrations.items()
     }
-    keys = {
+    return {
         name: dict(zip(photographs[name], own))
         for name, own in epoch_keys(photographs, connected=False).items()
     }
+
+
+def sort_views(
+    calibrations: Mapping[str, Calibration], boards: RigBoards, keys: Keys
+) -> list[CameraViews]:
+    """Board and epoch of every view of every camera."""
     found = []
     for name, one in calibrations.items():
         views = one.views
@@ -141,23 +151,30 @@ def start_rig(
     bodies: Mapping[str, Sequence[str]] | None = None,
     fixed: bool = False,
     known: KnownMountings = NOTHING_KNOWN,
+    nearly: Keys | None = None,
 ) -> tuple[Rig, Connections]:
     """The rig with start values, and the image points that the calibration of each camera kept.
 
     **Arguments:** `bodies`: by name, boards that are fixed to each other; `fixed`: all are;
-    `known`: what is given of the mountings.
+    `known`: what is given of the mountings; `nearly`: the epochs of photographs that are nearly
+    simultaneous. Start values are by these, and then every photograph is an epoch of its own.
 
     **Raises:** `InputError`, `NotSolvedError` if the cameras do not hang together
     (`connections.connect`).
     """
     boards = collect_boards(calibrations, bodies, fixed)
-    cameras = sort_views(calibrations, boards)
-    epochs = list(dict.fromkeys(key for camera in cameras for key in camera.epoch))
-    names, views = list(boards.boards), _board_views(cameras, boards, epochs)
+    keys = nearly or keys_by_name(calibrations)
+    cameras = sort_views(calibrations, boards, keys)
+    epochs = epochs_of(cameras)
+    names, views = list(boards.boards), board_views(cameras, boards, epochs)
     body = list(dict.fromkeys(boards.body.values()))
     numbers = [body.index(boards.body[name]) for name in names]
     given = known.positions(list(calibrations))
     found = connect(list(calibrations), names, numbers, views, given)
+    if nearly is not None:
+        cameras = sort_views(calibrations, boards, keys_of_photographs(calibrations))
+        epochs = epochs_of(cameras)
+        views = board_views(cameras, boards, epochs)
     reference = [next(g[0] for g in found.bodies if j in g) for j in range(len(names))]
     rows = _best_views(views, reference)
     poses = [body_pose(view, found) for view in rows.values()]
@@ -207,7 +224,20 @@ def _best_views(
     return found
 
 
-def _board_views(
+def keys_of_photographs(calibrations: Mapping[str, Calibration]) -> Keys:
+    """Every photograph as an epoch of its own, named by camera and photograph."""
+    return {
+        name: {photograph: f"{name} {photograph}" for photograph in one.views.photographs}
+        for name, one in calibrations.items()
+    }
+
+
+def epochs_of(cameras: Sequence[CameraViews]) -> list[str]:
+    """The epochs of all cameras, each once."""
+    return list(dict.fromkeys(key for camera in cameras for key in camera.epoch))
+
+
+def board_views(
     cameras: Sequence[CameraViews], boards: RigBoards, epochs: Sequence[str]
 ) -> list[BoardView]:
     """The poses of all views, boards relative to their centroids."""

@@ -1,0 +1,128 @@
+"""`jaxbundle calibrate-wand`: cameras around a room, from a wand of known length."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from jaxbundle.cli import calibration_options as options
+from jaxbundle.cli.app import Force, Json, Quiet, app
+from jaxbundle.errors import InputError
+
+COMMAND = "calibrate-wand"
+REPORT, RESULT, RIG = "report.txt", "result.json", "rig"
+
+
+@app.command(COMMAND, example="left=left.csv right=right.csv --cameras cameras.toml --length 0.5")
+def calibrate_wand(  # noqa: PLR0913 - the options of the command
+    markers: Annotated[
+        list[str],
+        typer.Argument(
+            help="NAME=FILE.csv of each camera: frame, marker, x, y of the markers; the first "
+            "camera is the reference"
+        ),
+    ],
+    cameras: Annotated[
+        list[str],
+        typer.Option(
+            help="file of cameras by these names, or NAME=FILE for one; repeatable: the interior "
+            "orientations"
+        ),
+    ],
+    length: Annotated[
+        list[str], typer.Option(help="of the wand, in --unit; of more markers A,B=LENGTH, each")
+    ],
+    sigma_length: Annotated[float, typer.Option(help="σ of a length")] = 1e-4,
+    sigma_image: options.SigmaImage = None,
+    free: Annotated[
+        str, typer.Option(help="parameters of the cameras to estimate: fx,fy,…; default: none")
+    ] = "",
+    unit: options.Unit = "m",
+    json: Json = "",
+    out: Annotated[Path | None, typer.Option(help="folder for report, JSON, rig files")] = None,
+    force: Force = False,
+    quiet: Quiet = False,
+) -> None:
+    """Find where cameras that stand still are, with σ, from a wand that is waved before them."""
+    import dataclasses
+
+    import jaxbundle
+    from jaxbundle.calibration.files import fill_rig, json_text
+    from jaxbundle.cli.calibration_outputs import words
+    from jaxbundle.cli.outputs import check_json_target, print_result
+    from jaxbundle.io.writing.folders import replace_folder
+
+    tables = dict(split_named(one, "NAME=FILE.csv") for one in markers)
+    if len(tables) < len(markers):
+        raise InputError("two tables are given of one camera; expected one for each")
+    check_json_target(json, [*tables.values(), *cameras])
+    known = cameras_by_name(cameras, list(tables))
+    own = tuple(words(free))
+    for name, camera in known.items():
+        known[name] = dataclasses.replace(camera, free=own)
+    result = jaxbundle.calibrate_wand(
+        tables,
+        known,
+        lengths_given(length),
+        sigma_length=sigma_length,
+        sigma_image=sigma_image,
+        object_unit=unit,
+    )
+    if out is not None:
+        with replace_folder(out, COMMAND, (REPORT, RESULT, RIG), force) as folder:
+            (folder / REPORT).write_text(result.report(), encoding="utf-8")
+            (folder / RESULT).write_text(json_text(result.to_dict()), encoding="utf-8")
+            fill_rig(result.network(), folder / RIG)
+    print_result(result, json, quiet)
+
+
+def split_named(given: str, expected: str) -> tuple[str, str]:
+    """A name and what is given of it."""
+    name, equals, rest = given.partition("=")
+    if not (name and equals and rest):
+        raise InputError(f"got {given!r}; expected {expected}")
+    return name, rest
+
+
+def cameras_by_name(files: Sequence[str], names: Sequence[str]) -> dict:
+    """Interior orientations by the name of the camera."""
+    from jaxbundle.io import read_cameras
+    from jaxbundle.network.columns import list_some
+
+    found = {}
+    for given in files:
+        name, equals, path = given.partition("=")
+        if equals and not Path(given).exists():
+            cameras = read_cameras(path)
+            if len(cameras) != 1:
+                raise InputError(f"{path}: has {len(cameras)} cameras; expected one, {name!r}")
+            found[name] = cameras[0]
+        else:
+            found |= {camera.id: camera for camera in read_cameras(given)}
+    missing = [name for name in names if name not in found]
+    if missing:
+        raise InputError(
+            f"--cameras: no camera {missing[0]!r}; the files have "
+            f"{list_some(list(found)) or 'none'}; expected a camera of each name, or --cameras "
+            f"{missing[0]}=FILE"
+        )
+    return {name: found[name] for name in names}
+
+
+def lengths_given(given: Sequence[str]) -> float | dict[tuple[str, str], float]:
+    """A length, or lengths by their markers."""
+    expected = "a length, or MARKER,MARKER=LENGTH for each"
+    try:
+        if len(given) == 1 and "=" not in given[0]:
+            return float(given[0])
+        found = {}
+        for one in given:
+            pair, value = split_named(one, expected)
+            a, b = pair.split(",")
+            found[a.strip(), b.strip()] = float(value)
+        return found
+    except ValueError as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"--length: got {', '.join(given)}; expected {expected}") from None
