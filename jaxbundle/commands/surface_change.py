@@ -130,6 +130,7 @@ def change(  # noqa: PLR0913 (public: the options of the command, all but two by
     )
     _check_systems(first, second)
     masks = [open_cells(path) for path in (stable, regions) if path is not None]
+    # masks are on the same lattice: the result has the cells that all of them have
     first, second, *masks = align(first, second, masks)
     if same_adjustment:
         if before_orientation is None or after_orientation is None:
@@ -142,7 +143,8 @@ def change(  # noqa: PLR0913 (public: the options of the command, all but two by
         (first, second),
         same_adjustment,
     )
-    whole = [_read_mask(mask) for mask in masks]
+    given = [path for path in (stable, regions) if path is not None]
+    whole = [_read_mask(path, mask) for path, mask in zip(given, masks)]
     chosen = whole.pop(0) != 0 if stable is not None else None
     labels = whole.pop(0) if regions is not None else None
     found = find_change(
@@ -171,16 +173,18 @@ def _open(
             raise InputError(f"--{name}-error {key}{did_you_mean(key, SURFACE_ERRORS)}")
         if not (np.isfinite(value) and value >= 0):
             raise InputError(f"--{name}-error {key}={value:g}: a number from 0 on is expected")
+    cell = errors.get("cell", 0.0)
     if isinstance(given, HeightGrid):
-        return given
-    path, cell = Path(given), errors.get("cell", 0.0)
+        return _with_cell_error(given, cell)
+    path = Path(given)
     if path.suffix.lower() in CLOUD_FILES:
+        if sigma is not None:
+            raise InputError(f"{path}: is a cloud, whose points have σ; omit --{name}-sigma")
         if size is None:
             raise InputError(f"{path}: is a cloud; give the --size of the cells to compare")
         dsm = make_dsm(read_cloud(path), size)
         found = HeightGrid(dsm.height, dsm.sigma, dsm.x, dsm.y, dsm.size, dsm.system)
-        if cell:
-            found = dataclasses.replace(found, sigma=np.hypot(np.nan_to_num(found.sigma), cell))
+        found = _with_cell_error(found, cell)
         has_sigma = bool(np.isfinite(found.sigma).any())
     else:
         found = dataclasses.replace(open_cells(path), more_sigma=cell)
@@ -196,14 +200,29 @@ def _open(
     return found
 
 
-def _read_mask(cells: CellSource) -> Int[np.ndarray, "rows columns"]:
+def _with_cell_error(grid: HeightGrid, cell: float) -> HeightGrid:
+    """A surface with the stated error of every cell; cells without σ have that alone."""
+    if not cell:
+        return grid
+    return dataclasses.replace(grid, sigma=np.hypot(np.nan_to_num(grid.sigma), cell))
+
+
+def _read_mask(path: str | Path, cells: CellSource) -> Int[np.ndarray, "rows columns"]:
     """A raster of whole numbers, 0 where there is nothing."""
     rows, columns = cells.shape
     found = np.zeros((rows, columns), np.int32)
     # 512 rows of 10 000 cells are 40 MB
     for first in range(0, rows, 512):
         part = slice(first, min(first + 512, rows))
-        found[part] = np.nan_to_num(cells.window(part, slice(0, columns)).height)
+        values = np.nan_to_num(cells.window(part, slice(0, columns)).height)
+        # a fraction would be cut to another region, or a stable cell to none
+        strange = (values != np.rint(values)) | (np.abs(values) >= 2**31)
+        if strange.any():
+            raise InputError(
+                f"{path}: has a cell of {values[strange][0]:g}; whole numbers below 2³¹ are "
+                "expected, 0 for none"
+            )
+        found[part] = values
     return found
 
 
@@ -245,5 +264,18 @@ def _orientations(
             made.append(None)
             continue
         others = [one.names for one in chosen if one is not None] if same else []
-        made.append(oriented_errors(mine, set().union(*others), cells.system))
-    return made[0], made[1]
+        errors = oriented_errors(mine, set().union(*others), cells.system)
+        # of another project all columns of L would be 0, and the errors missing in silence
+        if not errors.sees(cells):
+            raise InputError(
+                f"{path}: no cell of the surface is in two of its images; is it the project of "
+                "this surface, in its coordinate system?"
+            )
+        made.append(errors)
+    one, other = made
+    if same and one is not None and other is not None and not one.are_those_of(other):
+        raise InputError(
+            "--same-adjustment: the orientations of both surfaces are not those of one adjustment; "
+            "give its folder twice"
+        )
+    return one, other

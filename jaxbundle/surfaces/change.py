@@ -174,6 +174,7 @@ class _Tiles:
         core = tuple(
             slice(i.start - o.start, i.stop - o.start) for i, o in zip(inner, (rows, columns))
         )
+        # the cells around are for the sums of pairs; for slopes `UncertainCells` reads more itself
         before, after = self.before.window(rows, columns), self.after.window(rows, columns)
         d, own = after.height - before.height, np.hypot(before.sigma, after.sigma)
         with np.errstate(invalid="ignore"):
@@ -200,6 +201,8 @@ class _NormalEquations:
 
     def solve(self, together: float) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
         """t̂ and P; `together` of the cells count as one."""
+        # the identity is the prior of t, whose σ are in L: with fewer stable cells than errors the
+        # matrix is regular, too, and t of an error that they do not show is 0
         P = np.linalg.inv(np.eye(len(self.right)) + self.matrix / together)
         return P @ self.right / together, P
 
@@ -231,6 +234,7 @@ def find_change(
     side = int(np.sqrt(settings.tile_numbers / (16 + 4 * k)))
     # a tile of which the cells around are most would be slow
     tiles = _Tiles(before, after, same_errors, max(side, 8 * settings.reach), settings.reach)
+    # of one tile, all three passes use what the first has read; of several only one has room
     read = lru_cache(1)(tiles.read)
     every, quiet = (_NormalEquations(np.zeros((k, k)), np.zeros(k)) for _ in range(2))
     usable = _sum_up(tiles, read, every, quiet, stable)
@@ -238,6 +242,7 @@ def find_change(
     together, scale = float(rho.sum()), max(ratio, 1.0) if settings.enlarge_sigma else 1.0
     t, P = np.zeros(k), np.eye(k)
     if stable is not None:
+        # Σ of cells is scale² times the given one, and only every together-th cell is a new one
         t, P = quiet.solve(together * scale**2)
     reduction = _Reduction(t, _root(P).T, scale)
     limit = float(norm.ppf(1 - level / 2))
@@ -357,9 +362,15 @@ def _scatter_of(
         rest = ((tile.d - np.tensordot(t, tile.L, 1)) / tile.own)[tile.core]
         fields.append(rest if len(chosen) == 1 else rest.astype(np.float32))
     of_cells = np.concatenate([f[np.isfinite(f)] for f in fields])
-    most = 3 * max(robust_sigma(of_cells), 1e-300)
+    most = 3 * robust_sigma(of_cells)
+    # unchanged cells are about 0; if most cells have changed together none may be, and those about
+    # their median show the same scatter. At least half of them are within one σ there: never none,
+    # of which the scatter, and with it every σ, would be NaN
+    middle = float(np.median(of_cells))
+    if abs(middle) > most:
+        fields = [f - middle for f in fields]
     with np.errstate(invalid="ignore"):
-        quiet = [np.abs(f) < most for f in fields]
+        quiet = [np.abs(f) <= most for f in fields]
     rho = correlation_of([np.where(q, f, 0.0) for f, q in zip(fields, quiet)], quiet, settings)
     return rho, float(robust_sigma(np.concatenate([f[q] for f, q in zip(fields, quiet)])))
 
@@ -381,9 +392,11 @@ def correlation_of(
     total, number = np.zeros((2, 2 * reach + 1, 2 * reach + 1))
     for a, inside in parts:
         total += _pairs(np.where(inside, a, 0.0), reach)
+        # counts: what FFT leaves of a 0 would be a divisor
         number += np.round(_pairs(np.asarray(inside, float), reach))
     with np.errstate(invalid="ignore", divide="ignore"):
         rho = np.where(number > 0, total / number, 0.0)
+    # over its value in the middle, so that σ given too large or small do not count
     middle = rho[reach, reach]
     rho = rho / middle if middle > 0 else np.zeros_like(rho)
     k = np.arange(-reach, reach + 1)
@@ -398,6 +411,7 @@ def correlation_of(
 
 def _pairs(a: Grid, reach: int) -> Float[np.ndarray, "m m"]:
     """Sums of the products of all pairs of cells by their distance."""
+    # a tile at the edge may be smaller than the reach, which is that of the largest
     a = np.pad(a, [(0, max(reach + 1 - n, 0)) for n in a.shape])
     around = tuple(slice(n - 1 - reach, n + reach) for n in a.shape)
     return fftconvolve(a, a[::-1, ::-1], "full")[around]
@@ -434,7 +448,8 @@ class _VolumeSums:
         self.cells += int(core.sum())
         self.sum += float(np.sum(d[part], where=core))
         self.shared += np.sum(LP[:, *part], axis=(1, 2), where=core)
-        # ΣΣ ρᵢⱼ·σᵢ·σⱼ by one convolution
+        # ΣΣ ρᵢⱼ·σᵢ·σⱼ by one convolution; i in the core and j also around it, so that pairs across
+        # the edges of tiles count twice in all, as within them
         if min(own.shape) < len(rho):
             beside = ndimage.convolve(own, rho, mode="constant")
         else:
@@ -444,6 +459,7 @@ class _VolumeSums:
     def region(self, size: float) -> Region:
         """The volume."""
         a = size**2
+        # ρ and σ are not negative; a rounding of the FFT may be
         variance = max(self.variance, 0.0) + self.shared @ self.shared
         mean, volume = self.sum / self.cells, a * self.sum
         sigma = float(a * np.sqrt(variance))

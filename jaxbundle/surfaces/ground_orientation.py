@@ -49,6 +49,7 @@ def _orientation(
     form: Form | None = None,
     domain: BiasDomain | None = None,
 ) -> GroundOrientation:
+    # without a row in the covariance: held in the refinement, so that it has no error
     held = joint.index(every) < 0
     columns = tuple(np.flatnonzero(~held).tolist())
     return GroundOrientation(joint, tuple(every[k] for k in columns), columns, form, domain)
@@ -73,6 +74,7 @@ def scanner_orientation(
     jitter = any(" jitter " in name for name in of("image", id))
     look = {"across": 0, "along": 0}
     for word in look:
+        # coefficients are counted by their largest exponent: lower ones may be held, and not listed
         named = [name for name in of("sensor", sensor) if f"look angle {word}" in name]
         look[word] = max((int(name.rpartition("^")[2]) + 1 for name in named), default=0)
     # only which unknowns there are matters here: σ are those of the covariance
@@ -102,7 +104,9 @@ def scanner_derivative(
     assert form is not None
     kind = ScannerPoint(image.corrections, earth, form.sizes)
     number = sum(form.sizes)
+    # at changes of 0, since the image is the refined one
     zero = np.zeros(form.image_unknowns), np.zeros(number - form.image_unknowns)
+    # `refinement` has (line, pixel), a view (u, v) = (pixel, line): turned round, and back below
     lines, _ = lines_of(kind, image, form, np.zeros(3), *zero, X, places[:, ::-1])
     B = np.asarray(_by_unknowns(kind, number, form.image_unknowns, X, lines))
     return B[:, ::-1, list(orientation.columns)]
@@ -125,5 +129,6 @@ def bias_derivative(
 ) -> Float[Array, "2 12"]:
     """∂(sample, line) of one point by all terms of a bias, of lines before those of samples."""
     terms = jnp.stack(bias_terms(domain, *project(rpc, longitude, latitude, h)))
+    # rows are (u, v) = (sample, line), columns as `names_of_terms`: those of lines first
     none = jnp.zeros_like(terms)
     return jnp.stack([jnp.concatenate([none, terms]), jnp.concatenate([terms, none])])

@@ -66,6 +66,8 @@ class HeightGrid:
             else np.zeros_like(self.height)
             for axis in (0, 1)
         )
+        # rows go south. Beside a gap the slope is unknown: taken as level, since NaN would make all
+        # shared errors of the cell NaN
         return np.nan_to_num(np.stack([right, -down]))
 
 
@@ -136,8 +138,11 @@ class StatedSurfaceErrors:
         if self.vertical:
             modes.append(np.full((rows, columns), self.vertical))
         if self.horizontal:
+            # a surface moved by dx has at a place the height z(x − dx) = z − ∂z/∂x·dx
             modes += [-self.horizontal * slope for slope in grid.slopes()]
         if self.tilt:
+            # about the middle: about the origin of a map, 5000 km away, a tilt of 1e-6 would be a
+            # shift of 5 m
             east = grid.x + (np.arange(columns) + 0.5) * grid.size - self.middle[0]
             north = grid.y - (np.arange(rows) + 0.5) * grid.size - self.middle[1]
             both = (east, north[:, None])
@@ -191,6 +196,7 @@ class UncertainCells:
 
     def window(self, rows: slice, columns: slice) -> HeightGrid:
         """The cells of a part; slopes at its edges are those of the whole."""
+        # one cell more on each side, of which the differences at the edges are
         wide = [
             slice(max(part.start - 1, 0), min(part.stop + 1, n))
             for part, n in zip((rows, columns), self.shape)
@@ -221,7 +227,8 @@ def align(
     first = [max(p[k] for p in places) for k in (0, 1)]
     last = [min(p[k] + g.shape[k] for p, g in zip(places, grids)) for k in (0, 1)]
     if min(last[k] - first[k] for k in (0, 1)) < 1:
-        raise InputError("the two surfaces do not overlap: check their coordinate systems")
+        masks = " and the rasters of --stable and --regions" if more else ""
+        raise InputError(f"the two surfaces{masks} do not overlap: check their coordinate systems")
     return tuple(
         grid.part(*(slice(first[k] - p[k], last[k] - p[k]) for k in (0, 1)))
         for grid, p in zip(grids, places)

@@ -98,8 +98,7 @@ def orientation_covariance(
     C, errors = np.zeros((len(X), 3, 3)), orientation_errors(views)
     if not errors.uncertain:
         return C
-    # the matrices S of 32 768 points and four photographs take 20 MB a core
-    together = 1 << 15
+    together = _points_at_once(errors)
 
     def compute(first: int) -> None:
         rows = slice(first, first + together)
@@ -121,7 +120,7 @@ def orientation_modes(
     orientations, S·W: points that share images share them, and M·Mᵀ is their covariance."""
     errors = views if isinstance(views, OrientationErrors) else orientation_errors(views)
     M = np.zeros((len(X), errors.root.shape[1]))
-    together = 1 << 15
+    together = _points_at_once(errors)
 
     def compute(first: int) -> None:
         rows = slice(first, first + together)
@@ -130,6 +129,12 @@ def orientation_modes(
     with ThreadPoolExecutor(available_cores()) as pool:
         list(pool.map(compute, range(0, len(X), together)))
     return M
+
+
+def _points_at_once(errors: OrientationErrors) -> int:
+    """Points whose S·W are computed together."""
+    # 4 million numbers, 34 MB a core: 32 768 points of seven photographs, fewer of a large block
+    return max(256, min(1 << 15, (1 << 22) // max(3 * errors.root.shape[1], 1)))
 
 
 def _square_root(C: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:

@@ -11,11 +11,11 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import list_some
-from jaxbundle.surfaces.height_cells import HeightGrid, Modes
+from jaxbundle.surfaces.height_cells import CellSource, HeightGrid, Modes
 from jaxbundle.surfaces.inputs import read_orientations
 from jaxbundle.surfaces.orientation import (
     OrientationErrors,
@@ -74,21 +74,50 @@ class OrientedErrors:
         rows, columns = np.nonzero(np.isfinite(grid.height))
         if not len(rows):
             return found
-        height = grid.height[rows, columns]
-        x, y = grid.x + (columns + 0.5) * grid.size, grid.y - (rows + 0.5) * grid.size
         slopes = grid.slopes()[:, rows, columns]
-        direction = np.stack([-slopes[0], -slopes[1], np.ones(len(x))], 1)
-        X, direction = self._to_images(np.stack([x, y, height], 1), direction)
+        direction = np.stack([-slopes[0], -slopes[1], np.ones(len(rows))], 1)
+        X = _centres(grid, rows, columns)
+        X, direction = self._to_images(X, direction)
+        used = self._used(X)
+        seen = used.any(1)
+        M = orientation_modes(self.errors, X[seen], used[seen], direction[seen])
+        found[:, rows[seen], columns[seen]] = M.T
+        return found
+
+    def are_those_of(self, other: "OrientedErrors") -> bool:
+        """Whether the independent errors are the same ones, column by column."""
+        one, two = self.errors, other.errors
+        if [v.name for v in one.views] != [v.name for v in two.views]:
+            return False
+        if one.root.shape != two.root.shape:
+            return False
+        # unknowns have different units; W of the same covariance differs by roundings at most
+        scale = np.maximum(np.abs(one.root).max(1, initial=0.0), 1e-300)[:, None]
+        return bool(np.allclose(one.root / scale, two.root / scale, rtol=0.0, atol=1e-6))
+
+    def sees(self, cells: CellSource) -> bool:
+        """Whether two of the images see any cell."""
+        rows, columns = cells.shape
+        # 512 rows of 10 000 cells are 40 MB, of which 10 000 cells show it
+        for first in range(0, rows, 512):
+            grid = cells.window(slice(first, min(first + 512, rows)), slice(0, columns))
+            at = np.argwhere(np.isfinite(grid.height))
+            at = at[:: max(1, len(at) // 10_000)]
+            if not len(at):
+                continue
+            X = _centres(grid, *at.T)
+            if self._used(self._to_images(X, np.zeros_like(X))[0]).any():
+                return True
+        return False
+
+    def _used(self, X: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n views"]:
+        """Which images a cell is from: all that it is made of and that contain it."""
         used = np.zeros((len(X), len(self.uses)), bool)
         for k, (view, mine) in enumerate(zip(self.errors.views, self.uses)):
             if mine:
                 used[:, k] = is_inside(view, view.project(X))
         # a cell of one image has no height from it
-        used &= used.sum(1, keepdims=True) > 1
-        seen = used.any(1)
-        M = orientation_modes(self.errors, X[seen], used[seen], direction[seen])
-        found[:, rows[seen], columns[seen]] = M.T
-        return found
+        return used & (used.sum(1, keepdims=True) > 1)
 
     def _to_images(
         self, X: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "n 3"]
@@ -97,8 +126,17 @@ class OrientedErrors:
         if self.around is None or self.system is None:
             return X, direction
         X = from_map(X[:, 0], X[:, 1], X[:, 2], self.around, self.system)
+        # n·dX_map = (Jᵀn)·dX: one vector a cell, instead of J·S·W, which has k columns
         J = map_derivative(X, self.around, self.system)
         return X, np.einsum("ni,nij->nj", direction, J)
+
+
+def _centres(
+    grid: HeightGrid, rows: Int[np.ndarray, " n"], columns: Int[np.ndarray, " n"]
+) -> Float[np.ndarray, "n 3"]:
+    """The points of some cells."""
+    x, y = grid.x + (columns + 0.5) * grid.size, grid.y - (rows + 0.5) * grid.size
+    return np.stack([x, y, grid.height[rows, columns]], 1)
 
 
 def oriented_errors(chosen: ChosenImages, others: Set[str], system: str | None) -> OrientedErrors:
@@ -112,12 +150,14 @@ def oriented_errors(chosen: ChosenImages, others: Set[str], system: str | None) 
             f"{chosen.path}: its images are on the Earth, the surface has no coordinate system; "
             "give it one (gdal_edit.py -a_srs)"
         )
+    # in the order of the project, and with those of the other surface: L of both then have the same
+    # columns, and the common part of an error leaves their difference
     kept = [view for view in chosen.views if view.name in (chosen.names | others)]
     errors = orientation_errors(kept)
     if not errors.uncertain:
         raise InputError(
-            f"{chosen.path}: no covariance of its orientations; adjust it with --out and give the "
-            "folder"
+            f"{chosen.path}: no covariance of its orientations; adjust it with --out (images of "
+            "scanners and RPC: pushbroom refine --out) and give the folder"
         )
     uses = tuple(view.name in chosen.names for view in kept)
     return OrientedErrors(errors, uses, chosen.around, system)

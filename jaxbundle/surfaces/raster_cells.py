@@ -43,6 +43,7 @@ class RasterCells:
         if self.sigma is not None:
             sigma = self.sigma.values(rows, columns)
         if self.more_sigma > 0:
+            # also of cells without σ of their own, which would else be unknown
             sigma = np.hypot(np.nan_to_num(sigma), self.more_sigma)
         x, y = self.x + columns.start * self.size, self.y - rows.start * self.size
         return HeightGrid(values, sigma, x, y, self.size, self.system)
@@ -53,6 +54,7 @@ class RasterCells:
         window = (top + rows.start, top + rows.stop), (left + columns.start, left + columns.stop)
         with open_raster(self.path) as source:
             values = read_values(self.path, source, band, window)
+            # whole numbers of decimetres are common: without scale and offset ten times as high
             return source.scales[band - 1] * values + source.offsets[band - 1]
 
     def part(self, rows: slice, columns: slice) -> "RasterCells":
@@ -75,6 +77,7 @@ class RasterCells:
         if own:
             with open_raster(path) as source:
                 names = list(source.descriptions)
+            # the first band contains the errors that the columns of L carry: they would count twice
             if OWN_SIGMA in names:
                 found = dataclasses.replace(found, band=names.index(OWN_SIGMA) + 1)
         row, column = place_of(self, found)
@@ -99,6 +102,7 @@ def open_cells(path: str | Path) -> RasterCells:
         raise InputError(
             f"{path}: the raster is rotated; expected rows along X, columns along Y (gdalwarp)"
         )
+    # 1e-6: over 10 000 cells a hundredth of a cell, which `place_of` allows
     if place.a <= 0 or abs(place.a + place.e) > 1e-6 * place.a:
         raise InputError(
             f"{path}: square cells, north up, are expected; it has {place.a:g} × {place.e:g}: "

@@ -136,6 +136,7 @@ def read_refined_views(
             if isinstance(orientation, Rpc)
             else orientation[0]
         )
+        # the size alone is needed: a view of one number instead of gigabytes of pixels
         nothing = np.broadcast_to(np.uint8(0), (image.lines, image.pixels))
         view = _view(one.id, nothing, orientation, around)
         _add_covariance(view, orientation, one, block)
@@ -146,14 +147,17 @@ def read_refined_views(
 def _with_blocks(files: Sequence[Path]) -> tuple[list[Path], list[RefinedBlock | None]]:
     """Files, for the folder of a refinement all of its images, and the refinements they are of."""
     every: list[Path] = []
+    of_every: list[RefinedBlock | None] = []
     known: dict[Path, RefinedBlock | None] = {}
     for path in files:
         place = path if path.is_dir() else path.parent
         if place not in known:
             known[place] = read_refined_orientations(place)
         block = known[place]
-        every += [one.file for one in block.images] if path.is_dir() and block else [path]
-    return every, [known[path.parent] for path in every]
+        mine = [one.file for one in block.images] if path.is_dir() and block else [path]
+        every += mine
+        of_every += [block] * len(mine)
+    return every, of_every
 
 
 def _pixels_of(one: RefinedFile, folder: Path | None) -> Path | None:
@@ -193,6 +197,7 @@ def _add_covariance(
     if joint is None:
         return
     if isinstance(orientation, Rpc):
+        # compensated coefficients have a domain of their own; the bias belongs to the given ones
         domain = one.domain if one.domain is not None else domain_of_bias(orientation)
         view.orientation = rpc_orientation(joint, one.id, domain)
     else:

@@ -122,7 +122,7 @@ def match_tie_points(
     """
     pyramids = [make_pyramid(view.grey, settings.levels) for view in views]
     lost: Counter[str] = Counter()
-    messages: list[str] = []
+    failed: list[tuple[int, int]] = []
     rows: list[tuple[np.ndarray, np.ndarray, Places, np.ndarray]] = []
     known: list[list[Places]] = [[] for _ in views]
     number = 0
@@ -139,12 +139,13 @@ def match_tie_points(
             if pair is None:
                 # from the other side it is the same
                 if i < j:
-                    messages.append(f"{base.name} and {views[j].name}: too few matches")
+                    failed.append((i, j))
                 continue
             place[:, j], found[:, j], sigma[:, j], in_base[:, j] = pair
         others = found.sum(1)
         tied = np.flatnonzero(others)
         found[tied, i], place[tied, i] = True, uv[tied]
+        # the base is measured once, at the corner: the mean variance of what its pairs say
         mean = (in_base[tied] ** 2).sum(1) / others[tied, None]
         sigma[tied, i] = np.sqrt(mean)
         for j in range(len(views)):
@@ -162,7 +163,25 @@ def match_tie_points(
         )
     image, point, uv, s = (np.concatenate(columns) for columns in zip(*rows))
     names = tuple(view.name for view in views)
-    return TiePoints(names, image, point, uv[:, ::-1], s[:, ::-1], dict(lost), tuple(messages))
+    messages = _describe_untied(names, failed, image, point)
+    return TiePoints(names, image, point, uv[:, ::-1], s[:, ::-1], dict(lost), messages)
+
+
+def _describe_untied(
+    names: Sequence[str],
+    failed: Sequence[tuple[int, int]],
+    image: Int[np.ndarray, " n"],
+    point: Int[np.ndarray, " n"],
+) -> tuple[str, ...]:
+    """Which pairs whose matching has failed share no point."""
+    shown = np.zeros((int(point.max(initial=-1)) + 1, len(names)), bool)
+    shown[point, image] = True
+    # corners near known points are not matched again: a pair may be tied by an earlier base alone
+    return tuple(
+        f"{names[i]} and {names[j]}: too few matches"
+        for i, j in failed
+        if not (shown[:, i] & shown[:, j]).any()
+    )
 
 
 def _new_corners(
@@ -221,6 +240,7 @@ def _search_heights(
     out = np.full((3, len(uv)), np.nan)
     rows = np.flatnonzero(np.isfinite(wide).all(1) & (wide[:, 0] < wide[:, 1]))
     wide = wide[rows]
+    # heights per pixel of the curve; below a pixel the whole range is one step
     pixels = np.maximum(segments(base, other, uv[rows], wide).length, 1.0)
     rate, q = (wide[:, 1] - wide[:, 0]) / pixels, wide
     for level in range(len(pyramids[0].levels) - 1, -1, -1):
@@ -254,6 +274,7 @@ def _refine_pair(
     good = window.usable & is_confirmed(match, start, limits)
     good &= has_texture(base.grey, uv, match.sigma0, half, limits.windows.min_texture)
     lost["not confirmed by least squares matching"] += int((~good).sum())
+    # along the curve heights move a match, across it only errors do
     across = np.stack([-window.other_axis[:, 1], window.other_axis[:, 0]], 1)
     across = across / np.linalg.norm(across, axis=1, keepdims=True)
     off = np.einsum("ni,ni->n", match.uv - start, across)
@@ -268,6 +289,7 @@ def _refine_pair(
     C = np.where(good[:, None, None], C, 0.0)
     predicted = np.sqrt(np.einsum("ni,nij,nj->n", across, C, across)[good])
     C = C * robust_sigma(rest[good] / predicted) ** 2
+    # A carries the base to the other image: errors there are A⁻¹ times as large in the base
     back = np.linalg.inv(np.where(good[:, None, None], match.A, np.eye(2)))
     in_base = back @ C @ np.swapaxes(back, 1, 2)
     out = _PairMatches(np.zeros((n, 2)), np.zeros(n, bool), np.zeros((n, 2)), np.zeros((n, 2)))
