@@ -32,7 +32,7 @@ from jaxbundle.batches.camera import (
 )
 from jaxbundle.batches.compiled import ProgramKey, Rows, in_double, solve_portion, tests_of_points
 from jaxbundle.batches.correlated import (
-    TRACED,
+    SUMS,
     ComponentSums,
     scatter_of_portion,
     sums_of_portion,
@@ -182,7 +182,7 @@ def _traced(
     if together:
         many = found & (views >= DEFAULTS.min_images)
         chosen = np.flatnonzero(many if many.any() else found)
-        step = max(len(chosen) / TRACED, 1)
+        step = max(len(chosen) / SUMS.traced, 1)
         found = np.zeros(len(cameras), bool)
         found[chosen[np.arange(0, len(chosen), step).astype(int)]] = True
     return found

@@ -13,9 +13,10 @@ and with the triangular factors L of a view and R of the camera the effects of t
 
 so that covariances need only W·V·Wᵀ, W·V·Zᵀ and Z·V·Zᵀ of every V = F·Fᵀ: no row of all
 observations is solved for. T of errors along tracks and of given points, of which a camera has
-thousands of columns, is from `PROBES` random combinations of them.
+thousands of columns, is from random combinations of them (`SumSettings`).
 """
 
+import dataclasses
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -43,18 +44,33 @@ COMPONENTS = (
     "along tracks",
     "given points",
 )
-FIELD, TRACKS, GIVEN = 1, 5, 6
+FIELD, TRACKS, GIVEN = map(
+    COMPONENTS.index, ("field on the sensor", "along tracks", "given points")
+)
 # Columns of the components by view among five: displacements of x and y.
 BY_VIEW = (slice(0, 2), slice(2, 3), slice(3, 5))
-# Random combinations of the columns of errors along tracks, and of given points: of matrices of
-# rank r their sums of squares are right to √(2/(16·r)), 5 % for r = 50.
-PROBES = 16
-# Cameras of a batch that its traces are from, which are nearly the same in all: where those of a
-# camera differ by a tenth, their mean is right to 1.3 %.
-TRACED = 64
-# Draws that the covariance of the forms of a camera is from, right to √(2/16) = 35 %: degrees of
-# freedom, which it is for, need no more.
-DRAWS = 16
+
+
+@dataclasses.dataclass(frozen=True)
+class SumSettings:
+    """How many random numbers and cameras sums are from that would take too long exactly.
+
+    **Fields:**
+
+    - `probes`: random combinations of the columns of errors along tracks, and of given points: of
+      matrices of rank r their sums of squares are right to √(2/(16·r)), 5 % for r = 50.
+    - `traced`: cameras of a batch that its traces are from, which are nearly the same in all: where
+      those of a camera differ by a tenth, their mean is right to 1.3 %.
+    - `draws` that the covariance of the forms of a camera is from, right to √(2/16) = 35 %: degrees
+      of freedom, which it is for, need no more.
+    """
+
+    probes: int = 16
+    traced: int = 64
+    draws: int = 16
+
+
+SUMS = SumSettings()
 
 
 class ComponentSums(NamedTuple):
@@ -209,10 +225,10 @@ def scatter_of_portion(
         seen, at, theta = given
         spans, roots = _spans_and_roots(key.model, key.free, settings, seen, at)
         spans, roots = _single((spans, roots))
-        e = roots.draw(_single(theta), jax.random.key(settings.estimation.seed), DRAWS)
+        e = roots.draw(_single(theta), jax.random.key(settings.estimation.seed), SUMS.draws)
         q = roots.forms(spans.residuals(e)).astype(float)
         away = q - q.mean(0)
-        return away.T @ away / (DRAWS - 1)
+        return away.T @ away / (SUMS.draws - 1)
 
     def of_camera(given: tuple[Sightings, CameraUnknowns, Array]) -> Float[Array, "k k"]:
         none = lambda _: jnp.zeros((len(COMPONENTS),) * 2)
@@ -348,7 +364,7 @@ def _traces(
         cubes = cubes.at[k].set(S.sums(through))
     # of random combinations of the columns of the others
     keys = jax.random.split(jax.random.key(settings.estimation.seed))
-    signs = lambda key, *shape: jax.random.rademacher(key, (PROBES, *shape), dtype=float)
+    signs = lambda key, *shape: jax.random.rademacher(key, (SUMS.probes, *shape), dtype=float)
     errors = [
         roots.along_tracks(signs(keys[0], *spans.v.shape)),
         roots.of_points(signs(keys[1], 3, len(roots.points))),
@@ -359,18 +375,18 @@ def _traces(
         products = roots.products(u)
         found = roots.forms(u).mean(0)
         T = T.at[k].set(found)
-        flat = [x.reshape(PROBES, -1) / jnp.sqrt(PROBES) for x in products[:2]]
+        flat = [x.reshape(SUMS.probes, -1) / jnp.sqrt(SUMS.probes) for x in products[:2]]
         pairs = FewColumns(flat[0].T @ flat[0], flat[1].T @ flat[0], flat[1].T @ flat[1])
         cubes = cubes.at[k].set(S.sums(pairs))
         # half of them again: M·F·(Fᵀ·M·F·ξ)
-        half = [x[: PROBES // 2] for x in products]
+        half = [x[: SUMS.probes // 2] for x in products]
         e = roots.along_tracks(half[2]) if k == TRACKS else roots.of_points(half[3])
         z = spans.residuals(e)
         more = [x * y for x, y in zip(roots.products(z), half)]
         own = jnp.zeros(count).at[k].set(jnp.sum(z**2)).at[FIELD].set(jnp.sum(more[0]))
         for j, columns in enumerate(BY_VIEW, FIELD + 1):
             own = own.at[j].set(jnp.sum(more[1][..., columns]))
-        cubes = cubes.at[k, k].set(own / (PROBES // 2))
+        cubes = cubes.at[k, k].set(own / (SUMS.probes // 2))
     T = T.at[:, TRACKS].set(T[TRACKS]).at[:, GIVEN].set(T[GIVEN])
     both = (T[TRACKS, GIVEN] + T[GIVEN, TRACKS]) / 2
     T = T.at[TRACKS, GIVEN].set(both).at[GIVEN, TRACKS].set(both)

@@ -14,9 +14,9 @@ from jaxtyping import Bool, Float
 from jaxbundle.adjustment.quality.correlated_errors import DEFAULTS, CorrelationSettings
 from jaxbundle.batches.correlated import (
     COMPONENTS,
-    DRAWS,
     FIELD,
     GIVEN,
+    SUMS,
     TRACKS,
     ComponentSums,
 )
@@ -63,6 +63,7 @@ def batch_errors(
     known, none = np.nan_to_num(factor * theta), np.isnan(theta).all(1)
     covariance = np.einsum("nk,nkij->nij", known, np.nan_to_num(sums.interior))
     variance = np.einsum("nk,nkvi->nvi", known, np.nan_to_num(sums.pose))
+    # zero would read as without any error
     covariance[none], variance[none] = np.nan, np.nan
     return BatchErrors(np.sqrt(theta), covariance, variance)
 
@@ -112,22 +113,26 @@ def _common_sizes(
     take over; θ of the independent part is that of every camera."""
     T, q = sums.T, sums.q
     theta, factor = np.full(shown.shape, np.nan), np.ones(shown.shape)
-    if not shown[:, 0].any():
+    known = np.flatnonzero(shown[:, 0])
+    if not (shown[:, 0] & sums.traced).any():
+        # without any traces independent errors alone
+        theta[known, 0] = np.clip(q[known, 0] / T[known, 0, 0], 0, None)
         return theta, factor
     of = np.flatnonzero(shown[np.argmax(shown.sum(1) * sums.traced)])
     block = np.ix_(of, of)
     good = np.flatnonzero(shown[:, of].all(1))
     traced = good[sums.traced[good]]
+    # q is the sum of all cameras, T of those with traces: scaled to as many
     times = len(good) / len(traced)
     together = times * T[traced].sum(0)[block]
     cubes = times * sums.cubes[traced].sum(0)[np.ix_(of, of, of)]
     common = SizeEquations(together, False, critical, cubes).solve(q[good].sum(0)[of])[0]
-    known = np.flatnonzero(shown[:, 0])
     theta[np.ix_(known, of)] = common
+    # E q_0 = Σ θ_k·tr(M·V_k): what the common sizes leave of a camera's own vᵀv
     shared = T[known][:, 0, of[1:]] @ common[1:]
     theta[known, 0] = np.clip((q[known, 0] - shared) / T[known, 0, 0], 0, None)
     if common[1:].any():
-        if len(traced) >= 2 * DRAWS:
+        if len(traced) >= 2 * SUMS.draws:
             # q of that many cameras are draws themselves, of errors as they are
             away = q[traced][:, of] - T[traced][:, of][..., of] @ common
             forms = times * away.T @ away

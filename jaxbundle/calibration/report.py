@@ -84,6 +84,7 @@ def _camera(calibration: "Calibration") -> list[str]:
     lines += table(("parameter", "value", "σ"), rows, "lrr")
     rms = calibration.rms
     removed = len(calibration.adjustment.removed)
+    # the first as OpenCV states it, the second to compare with σ of a coordinate
     lines += ["", f"RMS of an image point {rms:.4f} px, of a coordinate {rms / np.sqrt(2):.4f} px"]
     lines += [f"Removed as gross errors: {count(removed, 'image point')}"] if removed else []
     return lines

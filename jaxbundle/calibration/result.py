@@ -174,6 +174,7 @@ class Calibration(TableMethods):
         missed = find_missing_affinity(self.adjustment)
         if missed is not None and missed.missed:
             found = [*found, str(missed)]
+        # image points are removed one by one: only counted by corner do they show a bad print
         problem = self.adjustment.problem
         removed = [
             row for one in self.adjustment.removed if one.kind == "image" for row in one.rows

@@ -58,9 +58,16 @@ def calibrate_wand(  # noqa: PLR0913 - the options of the command
         raise InputError("two tables are given of one camera; expected one for each")
     check_json_target(json, [*tables.values(), *cameras])
     known = cameras_by_name(cameras, list(tables))
+    # what the files say is free was so in another adjustment: here it is given, unless asked for
     own = tuple(words(free))
     for name, camera in known.items():
-        known[name] = dataclasses.replace(camera, free=own)
+        sigma = {parameter: s for parameter, s in camera.sigma.items() if parameter in own}
+        observed = {
+            parameter: camera.observed[parameter]
+            for parameter in sigma
+            if parameter in camera.observed
+        }
+        known[name] = dataclasses.replace(camera, free=own, sigma=sigma, observed=observed)
     result = jaxbundle.calibrate_wand(
         tables,
         known,
@@ -93,8 +100,10 @@ def cameras_by_name(files: Sequence[str], names: Sequence[str]) -> dict:
     found = {}
     for given in files:
         name, equals, path = given.partition("=")
+        # a file whose path has "=" is meant as a whole
         if equals and not Path(given).exists():
             cameras = read_cameras(path)
+            # the name in the file may be another one: which is meant must be clear
             if len(cameras) != 1:
                 raise InputError(f"{path}: has {len(cameras)} cameras; expected one, {name!r}")
             found[name] = cameras[0]

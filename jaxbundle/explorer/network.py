@@ -103,6 +103,7 @@ class NetworkView:
         model = self.adjustment.error_model
         if model is None:
             return found
+        # the same sizes in the moved network: they are of cameras and pictures, not of geometry
         sigma0 = self.adjustment.sigma0
         errors = precision(self.problem, data, sigma0=sigma0, errors=model.widened_sizes)
         return _larger(found, jax.tree.map(np.asarray, errors))

@@ -94,8 +94,8 @@ class TiePoints(TableMethods):
         """Counts in lines."""
         found = self.to_dict()
         rays = ", ".join(f"{n} with {k}" for k, n in found["rays"].items())
-        lines = [f"{found['points']} tie points, by rays: {rays}; median σ "
-                 f"{found['median_sigma']:.3g} pixels"]  # fmt: skip
+        median = f"median σ {found['median_sigma']:.3g} pixels"
+        lines = [f"{found['points']} tie points, by rays: {rays}; {median}"]
         lines += [f"    {n:8} matches: {reason}" for reason, n in self.rejected.items()]
         return "\n".join([*lines, *self.messages])
 

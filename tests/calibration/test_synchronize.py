@@ -146,6 +146,9 @@ def test_times_in_every_form(tmp_path):
     )
     found = times_of_photographs(CAMERAS, table)
     assert found == {"left": {"f_07.png": 0.5, "f_09.png": 0.6}, "right": {"x/f_1.png": 3.25}}
+    table.write_text("camera,image,time\nleft,f_07.png,0.5\nleft,f_07.png,0.6\n")
+    with pytest.raises(InputError, match="image 'f_07.png' of camera 'left' is there twice"):
+        times_of_photographs(CAMERAS, table)
 
 
 @pytest.mark.parametrize(("given", "words"), [
@@ -183,6 +186,8 @@ def test_times_on_the_command_line(tmp_path):
     ({"synchronize": "offset"}, "times of the photographs are missing"),
     ({"synchronize": "ofset", "times": 30}, "synchronize must be one of offset, rate, read-out"),
     ({"times": 30}, "give synchronize"),
+    ({"synchronize": True, "times": 30}, "synchronize: got True; expected unknowns"),
+    ({"synchronize": "offset", "times": 30, "board_free": True}, "board_free: points"),
 ])  # fmt: skip
 def test_options_that_contradict(options, words):
     with pytest.raises(InputError, match=words):

@@ -14,7 +14,7 @@ camera. Gross errors are removed camera by camera, then those that only the moun
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -93,8 +93,9 @@ def calibrate_rig(
       other closely, as frames of a video; `times`: of them, frames per second (the last number in a
       name is that of the frame), by camera if they differ; or seconds by camera and name; or the
       path of a table with columns camera, image, time.
-    - `board_sigma` (object unit), `board_free` (one board only), `snooping`, `significance`,
-      `max_iterations` of cameras and rig, and further `options` of the cameras: as in `calibrate`.
+    - `board_sigma` (object unit), `board_free` (one board only, not with `synchronize`),
+      `snooping`, `significance`, `max_iterations` of cameras and rig, and further `options` of
+      the cameras: as in `calibrate`.
       Without snooping, epochs that contradict the mounting are kept and listed in `contradicting`.
     - `progress(stage, done, total)`: photographs searched, a stage for every camera.
 
@@ -105,7 +106,7 @@ def calibrate_rig(
     check_test(options.get("snooping", "pope"), options.get("significance", 0.001))
     _check(photographs)
     known = known_mountings(mountings, bases, list(photographs))
-    unknowns = _unknowns_of_clocks(synchronize, times)
+    unknowns = _unknowns_of_clocks(synchronize, times, bool(options.get("board_free")))
     if bodies is not None:
         bodies = require_lists("bodies", bodies, "{'room': ['front', 'rear']}")
     if fixed and bodies:
@@ -128,11 +129,18 @@ def calibrate_rig(
     return _adjust_together(calibrations, rig, connections, **given)
 
 
-def _unknowns_of_clocks(synchronize: str | Sequence[str], times: Any) -> tuple[str, ...]:
+def _unknowns_of_clocks(
+    synchronize: str | Sequence[str], times: Any, board_free: bool
+) -> tuple[str, ...]:
     """The unknowns of clocks.
 
-    **Raises:** `InputError` for others, or without times."""
+    **Raises:** `InputError` for others, without times, or with free points."""
     words = synchronize.split(",") if isinstance(synchronize, str) else synchronize
+    if not (isinstance(words, Collection) and all(isinstance(word, str) for word in words)):
+        raise InputError(
+            f"synchronize: got {show(synchronize)}; expected unknowns of the clocks, of "
+            f"{', '.join(CLOCK_PARAMETERS)}"
+        )
     found = tuple(word.strip() for word in words if word.strip())
     for word in found:
         one_of("synchronize", word, CLOCK_PARAMETERS)
@@ -140,6 +148,12 @@ def _unknowns_of_clocks(synchronize: str | Sequence[str], times: Any) -> tuple[s
         raise InputError(f"synchronize: the times of the photographs are missing (times); {HOW}")
     if times is not None and not found:
         raise InputError("times: are for cameras that are not synchronised; give synchronize, too")
+    if found and board_free:
+        # a similarity of the points has no action on control poses (`declare.FLOATING`)
+        raise InputError(
+            "board_free: points of a board are not free where cameras are not synchronised; "
+            "expected board_sigma, or known points"
+        )
     return found
 
 

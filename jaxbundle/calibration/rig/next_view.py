@@ -101,12 +101,14 @@ def next_view(
     rig: "RigCalibration", camera: str, settings: NextViewSettings = NEXT_VIEW
 ) -> NextView | None:
     """The place of a board that would determine the mounting of a camera best; None if no board
-    that moves by itself can be seen by it and another one, or nothing is gained."""
+    that moves by itself can be seen by it and another one, for the reference, and where cameras
+    are not synchronised."""
     given = rig.rig
     alone = [b for b, first in enumerate(given.body) if given.body.count(first) == 1]
     if given.trajectory is not None or not alone or camera not in rig.mountings:
         return None
     seen = np.bincount(given.board_of_points[given.point], minlength=len(given.boards))
+    # one board, or the trials would be multiplied: that with most image points
     board = max(alone, key=lambda b: seen[b])
     points = rig.values("point")[given.board_of_points == board]
     poses, facts = _places(rig, camera, settings)
@@ -125,6 +127,7 @@ def next_view(
     own = starts[names.index(camera)] + np.arange(3)
     before = float(np.sqrt(np.linalg.eigvalsh(C[np.ix_(own, own)])[-1]))
     best = None
+    # seen by this camera alone, the unknown pose takes all that it says on the mounting
     for n in np.flatnonzero(there[names.index(camera)] & (there.sum(0) > 1)):
         after = _sigma_with(C, J[n], J_pose[n], own)
         if best is None or after < best.after:
@@ -147,6 +150,7 @@ def _sigma_with(
     own: np.ndarray,
 ) -> float:
     """σ of the base in its weakest direction with one more photograph of all cameras."""
+    # by factors of QR: J_pᵀ·J_p would square the condition of a small board far away
     Q, _ = np.linalg.qr(J_pose)
     A = J - Q @ (Q.T @ J)
     AC = A @ C
@@ -175,6 +179,7 @@ def _whitened(
     inside = ((uv > 0) & (uv < size - 1)).all(-1) & (along < 0) & np.isfinite(J).all((-2, -1))
     there = inside.mean(1) >= settings.min_part
     own = rig.rig.camera == k
+    # a posteriori, as C is
     sigma = rig.sigma0 * np.median(rig.rig.sigma[own], axis=0)
     J = np.where((inside & there[:, None])[..., None, None], J / sigma[:, None], 0.0)
     J = J.reshape(len(J), -1, J.shape[-1])

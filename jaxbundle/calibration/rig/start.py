@@ -172,6 +172,7 @@ def start_rig(
     given = known.positions(list(calibrations))
     found = connect(list(calibrations), names, numbers, views, given)
     if nearly is not None:
+        # relations are known now; of a motion each photograph has a time and so a pose of its own
         cameras = sort_views(calibrations, boards, keys_of_photographs(calibrations))
         epochs = epochs_of(cameras)
         views = board_views(cameras, boards, epochs)
@@ -292,8 +293,10 @@ def _rays(
     network, views = camera.calibration.adjustment.problem.network, camera.calibration.views
     rays, used = network.observations, quality.used_rays(camera.calibration.adjustment.problem)
     names = list(boards.boards)
+    # of a video every photograph is an epoch: a search of the list for each takes the square
+    number = {key: e for e, key in enumerate(epochs)}
     at = {
-        view: row_of[epochs.index(key), reference[names.index(board)]]
+        view: row_of[number[key], reference[names.index(board)]]
         for view, board, key in zip(views.names, camera.board, camera.epoch)
     }
     point = dict(zip(views.board.ids, camera.rows))

@@ -108,6 +108,7 @@ def start_unsynchronized(
     bodies_of = list(dict.fromkeys(boards.body.values()))
     body = [bodies_of.index(name) for name in boards.body.values()]
     speeds = speeds_of_cameras(views, time, body, frame, settings.offsets)
+    # without a significant correlation from zero: `_undetermined` says what remains open
     offset = np.nan_to_num(start_offsets(speeds, frame, settings.offsets))
     clocks = _start_clocks(calibrations, times, offset, frame, estimated, settings)
     rig, connections = start_rig(
@@ -143,6 +144,8 @@ def with_trajectory(rig: Rig, trajectory: TargetMotion, pose: PoseValue, spacing
     clocks = trajectory.clocks
     common = clocks.common(trajectory.camera, trajectory.time)
     body = _body_of_rows(rig)
+    # an interval without photographs leaves control poses open; 1.5 frames: if knots are closer
+    # than frames, runs still end only where a frame is missing
     runs, run = plan_runs(body, common, spacing, max(spacing, 1.5 * trajectory.frame))
     if not runs:
         raise InputError(
@@ -152,7 +155,10 @@ def with_trajectory(rig: Rig, trajectory: TargetMotion, pose: PoseValue, spacing
         )
     poses = control_poses(runs, run, common, pose)
     return dataclasses.replace(
-        rig, trajectory=dataclasses.replace(trajectory, run=run, runs=runs, poses=poses)
+        rig,
+        trajectory=dataclasses.replace(
+            trajectory, run=run, runs=runs, poses=poses, spacing=spacing
+        ),
     )
 
 
@@ -194,6 +200,7 @@ def _start_clocks(
     settings: SynchronizationSettings,
 ) -> Clocks:
     own = [np.array([*times[name].values()]) for name in calibrations]
+    # about the first photograph, offset and rate would correlate by √3/2
     middle = np.array([(t.min() + t.max()) / 2 for t in own])
     free = np.array([[name in estimated for name in CLOCK_PARAMETERS]] * len(own))
     # the clock of the reference is the common one, but it may have a rolling shutter, too
@@ -234,7 +241,8 @@ def _knots(
     """The distance of knots at which splines of the motions in the single cameras have the least
     AIC, corrected for small samples (Hurvich and Tsai, 1989), seconds.
 
-    A motion is that of three corners of a board in the frame of a camera."""
+    A motion is that of three corners of a board in the frame of a camera: coordinates, of which a
+    spline is linear in its controls, where rotations would need iterations."""
     tracks: dict[tuple[int, int], list[BoardView]] = {}
     for view in views:
         tracks.setdefault((view.camera, view.board), []).append(view)
@@ -261,6 +269,7 @@ def _aic(t: Float[np.ndarray, " n"], x: Float[np.ndarray, "n 9"], spacing: float
     intervals = max(round((t[-1] - t[0]) / spacing), 1)
     step = (t[-1] - t[0]) / intervals
     knots = t[0] + step * np.arange(-3, intervals + 4)
+    # rounding may put the last photograph beyond the last knot, where the basis ends
     inner = np.clip(t, knots[3], knots[-4] - 1e-9 * step)
     A = BSpline.design_matrix(inner, knots, 3).toarray()
     n, p = A.shape
@@ -285,6 +294,7 @@ def adjust_unsynchronized(
     if not found.converged:
         return rig, found, {}
     rig = _with_clocks(_started_at(rig, found), start)
+    # one iteration for its normal equations alone: its values are not used
     probe = adjust_rig(rig, 1)
     at = Solution(probe.problem, probe.problem.data.start)
     held = _undetermined(rig, at, present(rig.trajectory).sigma0 ** 2, settings)
@@ -335,7 +345,7 @@ def _adjust_until_assigned(
     rig: Rig, settings: SynchronizationSettings, max_iterations: int
 ) -> tuple[Rig, Result]:
     """Adjusted until every instant is in its interval of knots."""
-    for _ in range(settings.max_rounds):
+    for left in reversed(range(settings.max_rounds)):
         found = adjust_rig(rig, max_iterations)
         trajectory = present(rig.trajectory)
         values = found.minimum.values
@@ -344,7 +354,8 @@ def _adjust_until_assigned(
         spacing = min(run.spacing for run in trajectory.runs)
         if np.abs(common[0] - common[1]).max() < settings.max_move * spacing:
             break
-        if not np.isfinite(common[0]).all():
+        # control poses belong to the knots they were found with: the last rig keeps these
+        if left == 0 or not np.isfinite(common[0]).all():
             break
         rig = _planned_again(dataclasses.replace(rig, pose=rig.poses(values)), new)
     return rig, found
@@ -352,8 +363,8 @@ def _adjust_until_assigned(
 
 def _planned_again(rig: Rig, trajectory: TargetMotion) -> Rig:
     """The rig with knots by other clocks."""
-    spacing = max(run.spacing for run in present(rig.trajectory).runs)
-    return with_trajectory(rig, trajectory, rig.pose, spacing)
+    # not that of the runs: one of few photographs has wider knots, which are no rule for others
+    return with_trajectory(rig, trajectory, rig.pose, trajectory.spacing)
 
 
 def _undetermined(
@@ -376,6 +387,7 @@ def _undetermined(
         for j, name in enumerate(CLOCK_PARAMETERS):
             if not clocks.free[k, j] or 3 * sigma[j] < settings.min_frames_known * frame:
                 continue
+            # σ with the mounting held, C_jj − cᵀ·M⁻¹·c: if that is small, the two are exchangeable
             M, c = C[3:, 3:], C[3:, j]
             known = np.sqrt(max(C[j, j] - c @ np.linalg.pinv(M) @ c, 0.0)) * effect[j]
             why = (

@@ -51,16 +51,20 @@ def _of_camera(camera: str, photographs: list[str], given: Any) -> dict[str, flo
     if isinstance(given, Mapping):
         found = {}
         for photograph in photographs:
+            # tables of frames have names of files, photographs may have folders before theirs
             key = photograph if photograph in given else Path(photograph).name
             if key not in given:
                 known = did_you_mean(key, [str(k) for k in given])
                 raise InputError(f"times of camera {camera!r}: none of {key!r}{known}")
             found[photograph] = _seconds(camera, key, given[key])
     else:
+        # True is an int of Python, and 1 frame per second would be a surprise
         good = isinstance(given, int | float | np.number) and not isinstance(given, bool)
         if not (good and 0 < given < np.inf):
             raise InputError(f"times of camera {camera!r}: got {show(given)}; {HOW}")
         found = {name: _number(camera, name) / float(given) for name in photographs}
+    # two poses of one target at one instant contradict each other: IMG_7 beside copies of it, or
+    # numbers that begin again in another folder
     seconds, count = np.unique([*found.values()], return_counts=True)
     if (count > 1).any():
         at = float(seconds[count > 1][0])
@@ -97,9 +101,13 @@ def _number(camera: str, photograph: str) -> int:
 def _read(path: Path) -> dict[str, dict[str, float]]:
     """The table of a file."""
     table: Columns = read_csv(path)
+    # `jaxbundle frames` writes the folder of a video, which names its camera
     camera = "camera" if "camera" in table.values else "video"
     columns = [table.column(name) for name in (camera, "image", "time")]
     found: dict[str, dict[str, float]] = {}
     for name, image, time in zip(*columns):
-        found.setdefault(str(name), {})[str(image)] = _seconds(str(name), str(image), time)
+        own = found.setdefault(str(name), {})
+        if str(image) in own:
+            raise InputError(f"{path}: image {image!r} of camera {name!r} is there twice")
+        own[str(image)] = _seconds(str(name), str(image), time)
     return found

@@ -71,6 +71,8 @@ class WandCalibration(TableMethods):
     def mountings(self) -> dict[str, Mounting]:
         """The mounting of every camera but the first in the frame of that, with its covariance."""
         row = {name: k for k, name in enumerate(self.adjustment.problem.network.images.id)}
+        # poses of the network are in the datum of all points (inner constraints): only relative
+        # ones, and their σ, do not depend on it
         first, found = row[self.names[0]], {}
         for name in self.names[1:]:
             at = _relative(self.adjustment.values["image"], first, row[name])
@@ -226,10 +228,16 @@ def _marks(camera: str, given: Any) -> Marks:
         where = f"markers of camera {camera!r}, frame {frame}"
         if not np.isfinite(xy).all():
             raise InputError(f"{where}: got x {show(x)}, y {show(y)}; expected pixels")
-        if name and (str(frame), str(name)) in seen:
+        if str(name) and (str(frame), str(name)) in seen:
             raise InputError(f"{where}: marker {name!r} is there twice")
         seen.add((str(frame), str(name)))
         found.append((str(frame), str(name), *xy))
+    without = next((mark for mark in found if not mark[1]), None)
+    if without is not None and any(name for _, name, *_ in found):
+        raise InputError(
+            f"markers of camera {camera!r}, frame {without[0]}: a marker has no name, others have; "
+            "expected a name for each, or for none"
+        )
     return found
 
 
@@ -241,11 +249,17 @@ def _pairs(
     if not isinstance(lengths, Mapping):
         if len(names) != 2:
             raise InputError(
-                f"lengths: one is given, of two markers, but the markers are {list_some(names)}; "
+                "lengths: one is given, of two markers, but the markers are "
+                f"{list_some(names) or 'without names'}; "
                 'expected the length of each pair, such as {("A", "B"): 0.5}'
             )
         lengths = {(names[0], names[1]): lengths}
     for pair, length in lengths.items():
+        of_two = isinstance(pair, tuple) and len({*pair}) == len(pair) == 2
+        if not (of_two and all(isinstance(name, str) for name in pair)):
+            raise InputError(
+                f'lengths: of {show(pair)}; expected two markers, such as {{("A", "B"): 0.5}}'
+            )
         positive(f"lengths: of {' and '.join(pair)}", length)
         for name in pair if names else ():
             if name not in names:
@@ -311,6 +325,7 @@ def _network(
     for own in marks.values():
         for frame, name, *_ in own:
             rays[f"{frame}:{name}"] = rays.get(f"{frame}:{name}", 0) + 1
+    # one ray and one known distance are as many observations as a point has unknowns
     seen = {point for point, number in rays.items() if number > 1}
     rows = [
         (camera, f"{frame}:{name}", x, y)

@@ -149,8 +149,8 @@ def read_refined_orientations(folder: Path) -> RefinedBlock | None:
 def _check_owners(path: Path, images: list[RefinedFile], covariance: OrientationCovariance) -> None:
     """Refuse unknowns of images that are not there: the σ would be too small."""
     owners = {("image", one.id) for one in images} | {("sensor", one.sensor) for one in images}
-    strange = sorted({f"{kind} {id}" for kind, id, _ in covariance.unknowns if
-                      (kind, id) not in owners})  # fmt: skip
+    covered = {(kind, id) for kind, id, _ in covariance.unknowns}
+    strange = sorted(f"{kind} {id}" for kind, id in covered - owners)
     if strange:
         raise InputError(
             f"{path}: has unknowns of {list_some(strange, 3, str)}, which {TABLE} does not list; "

@@ -33,6 +33,7 @@ class Traces:
 
         **Returns:** the products F_kᵀ·M·F with them."""
         products = [np.asarray(other.T @ remaining.T) for other in self.F]
+        # T_0k = tr(M·V_k) = tr(F_kᵀ·M·F_k), as M·M = M, and T_kj = ‖F_jᵀ·M·F_k‖²
         self.T[0, k + 1] += np.sum(columns * remaining)
         self.T[1:, k + 1] += [np.sum(y**2) for y in products]
         if exact:
@@ -42,6 +43,7 @@ class Traces:
             few = [*self.products]
             for i in few:
                 for j in few:
+                    # E (F_iᵀ·M·F_k·ξ)ᵀ·S_ij·(F_jᵀ·M·F_k·ξ)
                     cube = np.sum((S[i, j] @ products[j]) * products[i])
                     self.cubes[1 + k, 1 + i, 1 + j] += cube
         return products[k]
@@ -49,6 +51,7 @@ class Traces:
     def add_cubes(self, k: int, remaining: Columns, again: Columns, times: float) -> None:
         """Cubes of the root k with itself, from some combinations of its columns, of which M·F·ξ is
         `remaining` and M·F·(FᵀM·F·ξ) is `again`; `times` as many there are."""
+        # with S = FᵀM·F, ‖M·F·S·ξ‖² = ξᵀ·S³·ξ, whose expectation is tr S³
         self.cubes[1 + k, 1 + k, 1 + k] = times * np.sum(again**2)
         for j in self.products:
             y = [np.asarray(self.F[j].T @ rows.T) for rows in (again, remaining)]

@@ -55,6 +55,7 @@ class Instant(NamedTuple):
 def place_on_spline(controls: Sequence[Posed], u: Scalar, X: Triple) -> Triple:
     """p + Mᵀ·X at a place u between the knots."""
     at = spline_position([one.centre for one in controls], u)
+    # M(t)ᵀ·X = M_iᵀ·(M_i·M(t)ᵀ·X): only steps between controls have parts of the basis
     turns = [one.rotation for one in controls]
     turned = turn_back_by_steps([_step(*pair) for pair in zip(turns, turns[1:])], u, X)
     return tuple(a + b for a, b in zip(at, turns[0].apply_inverse(turned)))
