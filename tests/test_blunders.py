@@ -89,6 +89,7 @@ def test_snooping_of_many_blunders(network, clean):
     assert max(differences(found, clean)) < 1.5
 
 
+@pytest.mark.further
 def test_baarda_finds_them_too(network):
     spoilt, bad, size = with_blunders(network, 2, 0.01)
     found = adjust(spoilt, snooping="baarda", significance=1e-5)

@@ -254,6 +254,7 @@ def test_numbers_that_overflow_have_no_names(result):
     assert undetermined(problem, problem.data.start) == []
 
 
+@pytest.mark.further
 def test_an_undetermined_parameter_is_named():
     """Vertical images of a plane: the principal distance and the heights are not separable."""
     stations = jaxbundle.aerial_block(

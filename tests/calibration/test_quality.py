@@ -68,6 +68,7 @@ def root_mean_square(images):
     return np.sqrt(images.var(0, ddof=1).mean(1))
 
 
+@pytest.mark.further
 def test_uncertainty_in_the_camera_frame_is_that_of_a_sample(sample):
     calibration, batch = sample
     images = image_of(batch.interior, rays_of(render.LENS.parameters, UV)[None])

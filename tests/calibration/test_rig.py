@@ -405,6 +405,19 @@ def test_what_is_no_rig_is_refused(rig):
         calibrate_rig(rig.cameras, snooping="tau")
 
 
+def test_what_is_given_is_checked(both):
+    given = both.cameras
+    for options, said in (
+        ({"mountings": {"x": {"position": [0, 0, 0]}}}, "no camera 'x' is given"),
+        ({"mountings": {"left": {"position": [0, 0, 0]}}}, "'left' is the reference camera"),
+        ({"bodies": {"room": ["wall"]}}, "body 'room': no camera has seen a board 'wall'"),
+        ({"bodies": {"room": ["board"]}, "fixed": True}, "give either fixed or bodies"),
+        ({"seen_by": {"wall": ["left"]}}, "seen_by: there is no board 'wall'"),
+    ):
+        with pytest.raises(InputError, match=said):
+            calibrate_rig(given, **options)
+
+
 def test_a_rig_is_judged_and_certified(rig):
     import jaxbundle
 

@@ -64,6 +64,7 @@ def test_the_numbers_are_those_of_its_parts(document, tmp_path):
     assert "Budget of c" in str(document)
 
 
+@pytest.mark.further
 def test_cameras_that_are_held_are_no_measurands(document):
     result = document.result
     import dataclasses

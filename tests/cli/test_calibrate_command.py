@@ -30,6 +30,7 @@ def calibrate(command):
     return lambda *arguments: command("calibrate", *arguments)
 
 
+@pytest.mark.further
 def test_photographs_to_camera(calibrate, folder, tmp_path, monkeypatch):
     drawn = []
     monkeypatch.setattr(jaxbundle.calibration.files, "save_plots", lambda *a: drawn.append(a))

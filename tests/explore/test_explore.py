@@ -696,6 +696,7 @@ def test_in_the_frame_of_a_widget_a_control_changes_the_numbers(tmp_path):
         assert [line for line in browser.console if "can escape its sandboxing" not in line] == []
 
 
+@pytest.mark.further
 def test_sigma_are_the_larger_under_correlated_errors():
     """As the report has them, where photographs have an affine distortion each."""
     rng, n = np.random.default_rng(3), 9

@@ -207,6 +207,7 @@ def test_a_camera_without_an_interface_beside_one_with(row):
     assert result.converged and 0.8 < result.sigma0 < 1.2
 
 
+@pytest.mark.further
 def test_a_surface_moves_with_a_free_network_and_a_held_one_fixes_it(above):
     """Inner datum: a free surface leaves the seven of a similarity open; a held one gives its
     height and tilts; two shifts, a rotation and the scale stay open."""

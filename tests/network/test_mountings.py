@@ -74,6 +74,7 @@ def mounting_of(result):
 GIVEN = {"position": T.tolist(), "angles": ANGLES.tolist()}
 
 
+@pytest.mark.further
 def test_a_held_mounting_is_held_and_gives_the_scale(simulated):
     """From start values that are 3 % too large: the size of the truth comes back."""
     network = rig(scaled(simulated.network, 1.03), mounting={"right": GIVEN})

@@ -99,7 +99,10 @@ def blocks_of(image, surface, spacing):
             yield system.nodes(surface, *grid.centres(row + steps, column + steps))
 
 
-@pytest.mark.parametrize("kind", ["rpc", "rigorous", "restless"])
+@pytest.mark.parametrize("kind", [
+    "rpc", pytest.param("rigorous", marks=pytest.mark.further),
+    pytest.param("restless", marks=pytest.mark.further),
+])  # fmt: skip
 def test_interpolated_positions_are_those_of_the_model(folder, monkeypatch, kind):
     """Within the tolerance, on terrain; what bends faster than it allows is projected itself."""
     image = satellite() if kind == "restless" else smooth_image(LINES, PIXELS)
@@ -288,6 +291,7 @@ def test_sigma_against_draws():
     assert abs(found[2] - C[0, 1]) < 0.1 * np.sqrt(C[0, 0] * C[1, 1])
 
 
+@pytest.mark.further
 def test_a_map_of_sigma(folder, tmp_path):
     """From an RPC: the stated ground, and the height times the slope of the sight."""
     with pytest.raises(InputError, match="states no error.*ground"):

@@ -185,6 +185,7 @@ def test_heights_of_zero_are_unknown(drone, handheld):
     assert abs(result.point_values[k, 2] - drone.truth[1, 2] - OFFSET[2]) < 3 * SATELLITE[2]
 
 
+@pytest.mark.further
 def test_check_points_are_compared_and_never_used(drone, handheld):
     X = handheld.copy()
     X[3] += [40.0, 0.0, 0.0]

@@ -192,6 +192,7 @@ def test_a_change_has_the_covariance_of_the_refinement(folder, tmp_path):
         jaxbundle.change(before, after, before_orientation=out, before_images="A")
 
 
+@pytest.mark.further
 def test_the_files_of_a_refinement_are_checked(folder, tmp_path):
     out = folder / "out"
     block_ = read_refined_orientations(out)

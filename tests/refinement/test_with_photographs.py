@@ -201,6 +201,7 @@ def test_together_is_better_than_each_alone(case, equations):
     assert 0.6 < np.mean(normed) / 3 < 1.5
 
 
+@pytest.mark.further
 def test_biases_come_back(case):
     result, _, truth, _ = case
     assert (np.abs(result.estimate[:2] - truth[:2]) < 3 * result.inspection.sigma[:2]).all()
@@ -209,6 +210,7 @@ def test_biases_come_back(case):
     }  # fmt: skip
 
 
+@pytest.mark.further
 def test_photographs_and_points_at_the_solution(case, tmp_path):
     """Written and read; collinearity in numpy leaves the residuals of the adjustment."""
     result, _, _, unknown = case
