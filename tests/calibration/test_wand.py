@@ -63,8 +63,8 @@ def errors(found):
 
 @pytest.mark.further
 def test_a_chain_of_cameras_by_a_wand():
-    """Each frame is seen by three neighbours only, the first and the last camera never see the same;
-    two markers with names; truth within σ, the scale from the wand: twice the length is twice the
+    """Each frame is seen by three neighbours only, none by the first and the last camera; two
+    markers with names; truth within σ, the scale from the wand: twice the length, twice the
     bases."""
     two = {"A": 0.0, "C": 0.5}
     chain = waved(60, markers=two, seen=lambda k, f: f % 2 in (k - 2, k - 1, k))
