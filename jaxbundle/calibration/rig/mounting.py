@@ -1,6 +1,7 @@
 """A mounting with its covariance: from the pose that is adjusted to base and angles."""
 
 import dataclasses
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -12,6 +13,7 @@ from jaxtyping import Array, Float
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.geometry import omega_phi_kappa_from_matrix, omega_phi_kappa_near
 from jaxbundle.leastsquares import Pose, PoseValue
+from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
@@ -53,6 +55,20 @@ class Mounting:
         """The largest σ of the base in any direction, and this direction."""
         size, axes = np.linalg.eigh(self.covariance[:3, :3])
         return float(np.sqrt(max(size[2], 0.0))), axes[:, 2]
+
+
+def table_of_mountings(mountings: Mapping[str, Mounting]) -> dict[str, np.ndarray]:
+    """One row a mounting: columns camera, X0, Y0, Z0 (of the base, object unit), omega, phi, kappa
+    (degrees), their σ (sX0, …), base and sbase (its length)."""
+    values = np.array([[*m.base, *m.angles] for m in mountings.values()]).reshape(-1, POSE)
+    sigma = np.array([m.sigma for m in mountings.values()]).reshape(-1, POSE)
+    return {
+        "camera": np.array([*mountings], dtype=object),
+        **dict(zip(EXTERIOR, values.T)),
+        **{f"s{name}": column for name, column in zip(EXTERIOR, sigma.T)},
+        "base": np.array([m.length for m in mountings.values()]),
+        "sbase": np.array([m.length_sigma for m in mountings.values()]),
+    }
 
 
 @partial(compile_once, static=0)

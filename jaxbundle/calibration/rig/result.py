@@ -21,7 +21,13 @@ from jaxbundle.calibration.rig.clocks import Clock
 from jaxbundle.calibration.rig.connections import Connections
 from jaxbundle.calibration.rig.declare import Rig, used_rays
 from jaxbundle.calibration.rig.errors import rig_errors
-from jaxbundle.calibration.rig.mounting import POSE, Mounting, mounting_of, placement_of
+from jaxbundle.calibration.rig.mounting import (
+    POSE,
+    Mounting,
+    mounting_of,
+    placement_of,
+    table_of_mountings,
+)
 from jaxbundle.calibration.rig.next_view import NextView, next_view
 from jaxbundle.calibration.rig.quality import rig_coverage, rig_points, rig_uncertainty
 from jaxbundle.calibration.rig.synchronize import clocks_of
@@ -32,7 +38,7 @@ from jaxbundle.leastsquares import Result
 from jaxbundle.leastsquares.quality.error_components import ErrorModel, Errors, IndependentErrors
 from jaxbundle.network.blunders import Removed, either_of
 from jaxbundle.network.kinds.continuous_time import CLOCK
-from jaxbundle.network.tables import EXTERIOR, Camera, Network, units_of
+from jaxbundle.network.tables import Camera, Network, units_of
 from jaxbundle.results import TableMethods
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, present
@@ -440,16 +446,7 @@ class RigCalibration(TableMethods):
     def table(self) -> dict[str, np.ndarray]:
         """One row a mounting: columns camera, X0, Y0, Z0 (of the base, object unit), omega,
         phi, kappa (degrees), their σ (sX0, …), base and sbase (its length)."""
-        mountings = self.mountings
-        values = np.array([[*m.base, *m.angles] for m in mountings.values()]).reshape(-1, POSE)
-        sigma = np.array([m.sigma for m in mountings.values()]).reshape(-1, POSE)
-        return {
-            "camera": np.array([*mountings], dtype=object),
-            **dict(zip(EXTERIOR, values.T)),
-            **{f"s{name}": column for name, column in zip(EXTERIOR, sigma.T)},
-            "base": np.array([m.length for m in mountings.values()]),
-            "sbase": np.array([m.length_sigma for m in mountings.values()]),
-        }
+        return table_of_mountings(self.mountings)
 
     def __str__(self) -> str:
         lines = [

@@ -20,7 +20,7 @@ from jaxtyping import Array
 from jaxbundle.adjustment.adjust import adjust
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.arguments import positive, show
-from jaxbundle.calibration.rig.mounting import POSE, Mounting, mounting_of
+from jaxbundle.calibration.rig.mounting import Mounting, mounting_of, table_of_mountings
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import (
@@ -33,7 +33,7 @@ from jaxbundle.io.text.csv_tables import read_csv
 from jaxbundle.leastsquares import PoseValue
 from jaxbundle.network.build import make_network
 from jaxbundle.network.columns import count, did_you_mean, list_some
-from jaxbundle.network.tables import EXTERIOR, Camera, Network
+from jaxbundle.network.tables import Camera, Network
 from jaxbundle.results import TableMethods
 
 # A marker in an image: frame, name of the marker, x, y (pixels).
@@ -106,16 +106,7 @@ class WandCalibration(TableMethods):
     def table(self) -> dict[str, np.ndarray]:
         """One row a mounting: columns camera, X0, Y0, Z0 (of the base, object unit), omega, phi,
         kappa (degrees), their σ (sX0, …), base and sbase (its length)."""
-        mountings = self.mountings
-        values = np.array([[*m.base, *m.angles] for m in mountings.values()]).reshape(-1, POSE)
-        sigma = np.array([m.sigma for m in mountings.values()]).reshape(-1, POSE)
-        return {
-            "camera": np.array([*mountings], dtype=object),
-            **dict(zip(EXTERIOR, values.T)),
-            **{f"s{name}": column for name, column in zip(EXTERIOR, sigma.T)},
-            "base": np.array([m.length for m in mountings.values()]),
-            "sbase": np.array([m.length_sigma for m in mountings.values()]),
-        }
+        return table_of_mountings(self.mountings)
 
     def report(self) -> str:
         return f"{self}\n\n{self.adjustment.report()}"
