@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from jaxbundle.network.tables import Network
 from jaxbundle.orientation import batched
@@ -67,12 +67,16 @@ def _by_rays(network: Network, sights: Sights, model: Model) -> Similarity | Non
 def to_scale(network: Network, model: Model) -> tuple[Model, str]:
     """The model with the scale of the distances, or of the bases of rigs, if any, and its
     reference."""
-    scale = scale_of_distances(network, model)
-    if scale is None:
-        scale = _scale_of_other_lengths(network, model)
+    scale = scale_of_lengths(network, model)
     if scale is None:
         return model, "in an arbitrary frame and scale"
     return model.transform(scale * np.eye(3), np.zeros(3)), "to scale, in an arbitrary frame"
+
+
+def scale_of_lengths(network: Network, model: Model) -> float | None:
+    """What the lengths of a model are multiplied by: by the distances, or by the bases of rigs."""
+    scale = scale_of_distances(network, model)
+    return _scale_of_other_lengths(network, model) if scale is None else scale
 
 
 def scale_of_distances(network: Network, model: Model) -> float | None:
@@ -99,18 +103,23 @@ def _scale_of_other_lengths(network: Network, model: Model) -> float | None:
     return float(np.median(ratios)) if ratios else None
 
 
-def join(sights: Sights, model: Model, part: Model) -> Model | None:
+def join(network: Network, sights: Sights, model: Model, part: Model) -> Model | None:
     """A model merged with a second one; None if nothing connects them.
 
     The similarity is found from common points, or from the pose of a common image and the distances
-    to its points."""
+    to common points, without these from known lengths in either."""
     both = model.known & part.known
-    if not both.any():
-        return None
     shared = np.flatnonzero(model.placed & part.placed)
-    if len(shared):
+    if not both.any():
+        lengths = [scale_of_lengths(network, one) for one in (model, part)]
+        if not len(shared) or None in lengths:
+            return None
+        found = _by_an_image(model, part, shared[0], lengths[1] / lengths[0])
+    elif len(shared):
         seen = np.bincount(sights.image, both[sights.point], minlength=sights.images)
-        found = _by_an_image(model, part, shared[seen[shared].argmax()], both)
+        image = shared[seen[shared].argmax()]
+        to, off = (np.linalg.norm(m.X[both] - m.X0[image], axis=1) for m in (model, part))
+        found = _by_an_image(model, part, image, np.median(to / off))
     else:
         found = similarity(part.X[both], model.X[both])
     if found is None:
@@ -128,13 +137,10 @@ def join(sights: Sights, model: Model, part: Model) -> Model | None:
     )
 
 
-def _by_an_image(
-    model: Model, part: Model, image: Index, both: Bool[np.ndarray, " points"]
-) -> Similarity:
-    to, off = (np.linalg.norm(m.X[both] - m.X0[image], axis=1) for m in (model, part))
-    # The scale from one image common to both: the distances from it to common points. Its attitude
-    # in both models gives the rotation, its position the shift.
-    A = np.median(to / off) * model.M[image].T @ part.M[image]
+def _by_an_image(model: Model, part: Model, image: Index, scale: float) -> Similarity:
+    """By the pose of an image common to both: its attitude gives the rotation, its position the
+    shift."""
+    A = scale * model.M[image].T @ part.M[image]
     return A, model.X0[image] - A @ part.X0[image]
 
 

@@ -5,7 +5,8 @@
 2. If no image can be resected, given coordinates of tie points count as known.
 3. If this fails too, or images are left, a model starts from two of them: among the pairs with many
    common points one with good intersection angles, oriented relatively (five points). It grows;
-   unreached images are joined by relative orientation to an oriented image. Finally a similarity
+   unreached images are joined by relative orientation to an oriented image, at the scale of common
+   points or of known lengths in both parts. Finally a similarity
    transforms the model to control points or given positions (`frames`); without these it keeps its
    own frame.
 4. Images with few agreeing rays are resected again from the points of the others.
@@ -226,7 +227,7 @@ def _control_contradicts(
 
 def _describe_mirror(network: Network, seen: Sights, settings: StartValueSettings) -> str:
     """Whether a model without control fits it only as a mirror image, in words."""
-    model = _grow_from_a_pair(seen, Model.empty(seen), None, settings)
+    model = _grow_from_a_pair(network, seen, Model.empty(seen), None, settings)
     return "" if model is None else describe_mirror(network, model, settings)
 
 
@@ -242,11 +243,11 @@ def _orient(
         model = approximate if approximate.placed.any() else model
     fixed = model.placed.any()
     while not model.placed.all():
-        part = _grow_from_a_pair(seen, model, improve, settings)
+        part = _grow_from_a_pair(network, seen, model, improve, settings)
         if part is None:
             break
         if model.placed.any():
-            part = join(seen, model, part)
+            part = join(network, seen, model, part)
             assert part is not None, "a pair is taken only if it can be joined"
         model = part
         grow(seen, model, improve=improve, settings=settings)
@@ -328,7 +329,11 @@ def _with_approximate_points(network: Network, model: Model, settings: StartValu
 
 
 def _grow_from_a_pair(
-    seen: Sights, model: Model, improve: Improve | None, settings: StartValueSettings
+    network: Network,
+    seen: Sights,
+    model: Model,
+    improve: Improve | None,
+    settings: StartValueSettings,
 ) -> Model | None:
     """The best of the models grown from a few good pairs of unoriented images; if some are
     oriented, from pairs with one of them, to a model that can be joined to theirs."""
@@ -346,7 +351,7 @@ def _grow_from_a_pair(
         grow(seen, part, new | old, improve, settings)
         rows = new[seen.image]
         good = int((misclosures(seen, part) < seen.tolerance[seen.image])[rows].sum())
-        if good > most and not (linked and join(seen, model, part) is None):
+        if good > most and not (linked and join(network, seen, model, part) is None):
             best, most = part, good
         if most >= settings.sufficient_share * rows.sum():
             break

@@ -103,6 +103,7 @@ def rig(both):
     return both.rig
 
 
+@pytest.mark.further
 def test_a_rig_leaves_the_program(both, rig, tmp_path):
     """The files of `--out`, and those that `convert` makes of the JSON, are the same; the mounting
     in them is the truth."""

@@ -81,6 +81,23 @@ def test_a_chain_of_cameras_by_a_wand():
     assert network.images.id == NAMES and "c3: base" in str(found)
 
 
+@pytest.mark.further
+def test_a_chain_of_pairs():
+    """Every frame is seen by two neighbours: of two pairs with a camera in common, only the lengths
+    of the wand give the ratio of the bases."""
+    two = {"A": 0.0, "C": 0.5}
+    chain = waved(90, markers=two, seen=lambda k, f: f % 3 in (k - 1, k))
+    found = jaxbundle.calibrate_wand(chain, CAMERAS, 0.5, sigma_length=1e-4, sigma_image=0.1)
+    assert found.converged and 0.85 < found.adjustment.sigma0 < 1.15
+    over, turns = errors(found)
+    assert np.abs(over).max() < 4 and turns.max() < 2e-3
+    # the shared camera alone does not tie them
+    rows = {name: np.array(chain["c2"][name]) for name in chain["c2"]}
+    rows = {name: one[rows["frame"] % 3 != 1] for name, one in rows.items()}
+    with pytest.raises(jaxbundle.NotSolvedError, match="c2|c3"):
+        jaxbundle.calibrate_wand({**chain, "c2": rows}, CAMERAS, 0.5, sigma_length=1e-4)
+
+
 def test_markers_without_names_are_told_apart():
     """By the ratio of their distances, in every frame with three; others are counted."""
     for table in waved(noise=0.2).values():

@@ -132,9 +132,9 @@ def test_a_pair_continues_an_oriented_part_only_if_it_can_be_joined_to_it(monkey
     monkeypatch.setattr(start_values, "grow", lambda *_: None)
     monkeypatch.setattr(start_values, "misclosures", misclosures)
     monkeypatch.setattr(
-        start_values, "join", lambda seen, model, part: None if part is grown[0] else model
+        start_values, "join", lambda _, seen, model, part: None if part is grown[0] else model
     )
-    found = start_values._grow_from_a_pair(seen, model, None, DEFAULTS)
+    found = start_values._grow_from_a_pair(None, seen, model, None, DEFAULTS)
     assert found is grown[1 if oriented else 0]
 
 

@@ -175,8 +175,7 @@ def calibrate_wand(
     - `sigma_length` of these, `sigma_image` in pixels (default: a unit of weight).
     - `options`: of `jaxbundle.adjust`.
 
-    Cameras are oriented one after the other by frames that two cameras before them have seen: of a
-    chain, frames that three neighbours see are needed.
+    Cameras are oriented one after the other: each needs frames that it shares with one before it.
 
     **Raises:** `InputError` naming camera, frame and marker; `NotSolvedError` if the cameras do not
     hang together.
