@@ -219,6 +219,7 @@ def test_gauss_newton_finds_the_same_minimum(simulation, result):
     assert other.vtpv == pytest.approx(result.vtpv, rel=1e-10)
 
 
+@pytest.mark.further
 def test_gauss_newton_that_strays_is_not_taken_for_a_minimum(simulation):
     """It may end in another minimum, or not at all, but never where vᵀPv could still fall."""
     rng = np.random.default_rng(0)

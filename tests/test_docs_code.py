@@ -48,12 +48,14 @@ def test_start():
     assert page["result"].redundancy == 23
 
 
+@pytest.mark.further
 def test_refraction():
     page = run_page("refraction")
     water = page["result"].further_unknowns["interface"]["water"]["Z0"]
     assert abs(water["value"] - 1) < 4 * water["sigma"]
 
 
+@pytest.mark.further
 def test_hand_eye():
     page = run_page("hand_eye")
     camera = page["found"].camera()
@@ -61,6 +63,7 @@ def test_hand_eye():
     assert (abs(camera[:3, 3] - [0, 0, 0.1]) < 4 * sigma).all()
 
 
+@pytest.mark.further
 def test_known_surfaces():
     page = run_page("known_surfaces")
     found = page["result"].further_unknowns["declination"]["cam"]["declination"]

@@ -136,6 +136,7 @@ def twins():
     return with_rays(network(stations), lambda i, p: p not in ("24", "25") or i in ("4", "5"))
 
 
+@pytest.mark.further
 def test_points_seen_only_from_one_place_are_left_out_by_name(twins):
     """They made the whole network singular."""
     result = jaxbundle.adjust(twins)

@@ -87,7 +87,7 @@ def shell(only_shell):
 FURTHER = (
     "a_real_facade", "calibrate_and_trust", "calibrate_through_pixels",
     "four_photographs_to_a_surface", "gradient_checked_experiment", "lapan_a3", "next_photograph",
-    "rolling_shutter_on_a_drone", "ten_thousand_cameras", "two_strips_to_a_dsm",
+    "rolling_shutter_on_a_drone", "ten_thousand_cameras", "thesis_network", "two_strips_to_a_dsm",
     "two_video_cameras", "weights_learned_from_data",
     "which_camera_model",
 )  # fmt: skip

@@ -163,7 +163,8 @@ def test_coordinates_where_no_image_is_name_their_origin_or_unit(camera, misread
 @pytest.mark.parametrize("camera, sigma, said", [
     (MM, 0.3, "0.3 mm, looks like one in pixels; it is expected in mm: 0.0018 (times 0.006)"),
     (MM, 1.8, "1.8 mm, looks like one in µm; it is expected in mm: 0.0018 (times 0.001)"),
-    (PX, 0.0018, "looks like one in mm; it is expected in px"),
+    pytest.param(PX, 0.0018, "looks like one in mm; it is expected in px",
+                 marks=pytest.mark.further),
 ])  # fmt: skip
 def test_a_sigma_in_another_unit_is_said_with_the_factor(camera, sigma, said):
     given = network(camera)
@@ -256,7 +257,8 @@ def said_of(given) -> str:
     return said
 
 
-@pytest.mark.parametrize("unit", [pytest.param(1.0, marks=pytest.mark.further), 100.0])
+@pytest.mark.further
+@pytest.mark.parametrize("unit", [1.0, 100.0])
 def test_a_mirrored_control_is_named_whatever_the_unit_of_weight(unit):
     """σ that nobody stated only scale σ0: the residuals, in principal distances, are the same."""
     given = network(dataclasses.replace(PX, free=("fx", "cx", "cy")), **CONTROL)

@@ -177,7 +177,9 @@ def test_parameters_that_are_hardly_separated_are_named_at_the_limit():
     assert "fy of camera cam" in named and "omega" not in named and "fx" not in named
 
 
-@pytest.mark.parametrize("size", [None, (0.006, 0.006)])
+@pytest.mark.parametrize("size", [
+    None, pytest.param((0.006, 0.006), marks=pytest.mark.further),
+])  # fmt: skip
 def test_c_in_pixels_is_named_where_the_adjustment_fails(size):
     """c begins at 4000 of 0.006 mm, and is free."""
     pixels = Camera("cam", "brown", {"c": 4000.0}, free=("c",), pixel_size=size)
@@ -268,6 +270,7 @@ def test_what_repeats_another_is_named():
     assert line.count("repeats") == 5 and " and " in line
 
 
+@pytest.mark.further
 def test_an_observation_without_derivatives_is_named():
     """An angle at a point whose other end starts in the same place."""
     given = network(RING)

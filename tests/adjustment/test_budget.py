@@ -147,6 +147,7 @@ def test_a_design_has_a_budget_before_anything_is_measured():
     assert planned.effects[0, 0] == pytest.approx(camera[0], rel=1e-4)
 
 
+@pytest.mark.further
 def test_the_influence_of_a_measurement_is_what_shifting_it_does():
     found = held_network()
     problem = found.problem

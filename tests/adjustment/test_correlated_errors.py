@@ -115,6 +115,7 @@ def test_halves_show_what_classical_sigma_lack(clean, shaken):
     assert by_points.dof == len(CAMERA.free)
 
 
+@pytest.mark.further
 def test_a_half_is_that_of_its_image_points_alone(shaken):
     """A network of every other photograph, adjusted from its own start values."""
     network = shaken.network
@@ -178,6 +179,7 @@ def test_a_saved_result_keeps_error_model_and_halves(shaken, tmp_path, monkeypat
     assert np.sqrt(shaken.covariance(name, classical=True)[0, 0]) == pytest.approx(f["sigma"])
 
 
+@pytest.mark.further
 def test_comparisons_use_sigma_under_correlated_errors(clean, shaken, tmp_path):
     """Of two sessions with errors of photographs, which classical σ call different."""
     other = jaxbundle.adjust(disturbed(clean, 6, affine=0.4), correlated=True)
@@ -264,6 +266,7 @@ def test_everything_that_states_a_sigma_asks_the_error_model(shaken):
         jaxbundle.precision(shaken.problem, start, errors={"principal": 0.1})
 
 
+@pytest.mark.further
 def test_errors_of_given_points_are_found(clean):
     """Columns are the changes of residuals if held points move; with displaced points the component
     is found in its size, and the principal distance is off by more than classical σ."""
@@ -291,6 +294,7 @@ def test_errors_of_given_points_are_found(clean):
     assert size.name == "given points" and 0.5 < size.size < 0.75 and size.score > 20
 
 
+@pytest.mark.further
 def test_check_points_share_the_errors_of_the_network():
     """One by one, the errors of a component displace network and check points: the sum of squares
     is the covariance of a model with this component alone. Without distortion, by which errors of
@@ -360,6 +364,7 @@ def test_components_that_chance_explains_are_left_out(clean):
     assert 0.01 < share < 0.15
 
 
+@pytest.mark.further
 def test_finished_jobs_of_one_camera_are_compared(clean, shaken, tmp_path):
     """A result, a saved one and a network; another principal point in one of them is seen."""
     rays = clean.observations

@@ -52,6 +52,7 @@ def test_a_network_solved_by_iteration_is_the_same_network(dense):
     assert "conjugate gradients" in found.report()
 
 
+@pytest.mark.further
 def test_a_network_solved_in_a_band_is_the_same_network(dense):
     """Images with common points stand close in the band."""
     found = jaxbundle.adjust(street(), reduction="banded")

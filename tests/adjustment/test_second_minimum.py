@@ -184,6 +184,7 @@ def test_the_threshold_is_that_of_the_likelihood_ratio():
 # --- one image ------------------------------------------------------------------------------------
 
 
+@pytest.mark.further
 @pytest.mark.parametrize("start", ["true", "other"])
 def test_a_board_seen_from_afar_has_both_solutions(start):
     sigma = 1e-4  # E of about 6
@@ -332,6 +333,7 @@ def views_of_a_board(distance, sigma, turned=()):
     return network(board(), xy, sigma, X0, M)
 
 
+@pytest.mark.further
 def test_views_of_a_calibration_are_turned_back():
     camera = Camera("cam", "brown", {"c": C}, ("c", "K1"))
     right, given = (

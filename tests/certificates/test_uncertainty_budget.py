@@ -82,6 +82,7 @@ def test_the_sum_of_the_budget_is_the_covariance():
     assert len(rows["image"]) == dense.J.shape[0]
 
 
+@pytest.mark.further
 @pytest.mark.parametrize(("noise", "tolerance"), [(1e-6, 1e-5), (1.0, 0.05)])
 def test_types_of_inputs_are_kept_apart(noise, tolerance):
     """Image coordinates by their residuals, control and distances as stated: the law of

@@ -156,7 +156,7 @@ def test_what_a_process_dies_of_spoils_its_task_alone():
     assert "ValueError" in found[9999].why or "OSError" in found[9999].why
 
 
-@pytest.mark.parametrize("quiet", [(), ("--quiet",)])
+@pytest.mark.parametrize("quiet", [pytest.param((), marks=pytest.mark.further), ("--quiet",)])
 def test_a_photograph_without_memory_is_named_and_searched_again(
     command, tmp_path, monkeypatch, quiet
 ):

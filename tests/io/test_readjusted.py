@@ -110,6 +110,7 @@ def test_removed_observations_stay_out(georeferenced, tmp_path):
     assert_allclose(again.image_values, spoilt.image_values, atol=1e-7)
 
 
+@pytest.mark.further
 @pytest.mark.parametrize("table, text, said", [
     ("exterior_priors", "image,X0,Y0,Z0,omega,phi,kappa,sX0,sY0,sZ0,somega,sphi,skappa\n"
      "1,1,,,,,,,,,,,\n", "X0 and sX0: give both or neither"),

@@ -168,6 +168,7 @@ def test_cofactors_of_the_band_are_those_of_the_dense_system(ways):
     assert total == pytest.approx(problem.counts.redundancy, abs=1e-5)
 
 
+@pytest.mark.further
 @pytest.mark.parametrize("ways", [*CASES.values()][:1], ids=[*CASES][:1], indirect=True)
 def test_iteration_plans_no_pairs_and_finds_the_minimum(ways):
     problem, data, _ = ways["iterative"]

@@ -224,6 +224,7 @@ def test_a_mounting_starts_where_the_images_are_unless_it_is_held(sigma):
     np.testing.assert_allclose(alone.rotation, R, atol=1e-12)
 
 
+@pytest.mark.further
 def test_start_values_have_the_scale_of_the_base(simulated):
     """Without any start value, twice: the object is as large as the base says."""
     for factor in (1.0, 1000.0):

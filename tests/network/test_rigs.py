@@ -141,6 +141,7 @@ def test_what_is_wrong_is_named(simulated, rows, section, message):
         jaxbundle.make_problem(mounted(simulated.network, rows, **section))
 
 
+@pytest.mark.further
 def test_residuals_of_angles_have_the_unit_of_the_network(simulated):
     """Those of mountings, of attitudes and of measured angles, and no others."""
     network = mounted(simulated.network)

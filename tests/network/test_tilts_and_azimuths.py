@@ -124,6 +124,7 @@ def test_sigma_is_that_of_a_sample(free):
     assert (ratio > 0.88).all() and (ratio < 1.12).all(), ratio
 
 
+@pytest.mark.further
 def test_a_camera_that_looks_down_is_levelled_by_its_other_axes():
     down = jaxbundle.simulate_with_truth(
         jaxbundle.aerial_block(2, 3, height=50.0, footprint=(60.0, 40.0)),

@@ -125,6 +125,7 @@ def test_the_smallest_redundancy_number(plain, oracle):
     assert smallest_redundancy(problem) == pytest.approx(oracle[1].min(), rel=1e-5)
 
 
+@pytest.mark.further
 def test_gradient_against_differences(network, site):
     """By stations, directions, roll and targets, with all conditions soft."""
     conditions = dataclasses.replace(

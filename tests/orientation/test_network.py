@@ -393,6 +393,7 @@ def test_a_principal_distance_far_from_the_truth():
     assert (found.vtpv, found.redundancy) == pytest.approx(counts, rel=1e-9)
 
 
+@pytest.mark.further
 def test_an_image_first_placed_by_repeated_parts_is_placed_again():
     """Of the points of the first pair, image '1' shows others that look alike: as from where '2'
     is. Most of its points, known only later, do not agree with that."""

@@ -223,6 +223,7 @@ def test_a_point_is_found_though_its_first_passages_are_beside_it():
             assert np.isnan(found.line[0, k])
 
 
+@pytest.mark.further
 def test_nothing_is_seen_through_the_earth():
     """In a whole orbit every point has the Earth between it and the camera half of the time."""
     t = np.arange(-30.0, 5700.0, 10.0)
@@ -277,6 +278,7 @@ def test_an_image_that_turns_back_or_spins_has_no_footprint():
         assert (make_search(spinning, None).footprint is not None) == once
 
 
+@pytest.mark.further
 def test_derivatives_by_every_parameter():
     """`project_near` against differences, each leaf of the image in a random direction."""
     image = satellite("hermite", "slerp", corrections=Corrections(True, True, False))

@@ -58,6 +58,7 @@ def with_rpc(folder, rpc, error=0.1):
     return path
 
 
+@pytest.mark.further
 def test_corrections_are_those_that_agree_with_the_rpc(tmp_path, uncorrected):
     found = read_scanner(with_rpc(tmp_path, uncorrected))
     assert found.image.corrections == Corrections()

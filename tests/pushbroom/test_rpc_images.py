@@ -103,6 +103,7 @@ def test_located_and_projected_as_the_rigorous_image(folder, name, tmp_path):
     assert (back["status"] == "in the image").all() and (back["count"] == 1).all()
 
 
+@pytest.mark.further
 def test_what_is_off_the_image_or_the_domain_is_said(folder, tmp_path):
     (tmp_path / "places.csv").write_text("line,pixel\n300,200\n650,200\n")
     told = []
@@ -186,6 +187,7 @@ def test_hidden_terrain_is_hidden_for_both(scene):
     np.testing.assert_array_equal(shown[20:], (seen & ~hidden)[20:])
 
 
+@pytest.mark.further
 def test_info_says_the_same_of_both(folder):
     own = pushbroom.info(folder / "scanner.toml", height=700.0).to_dict()
     found = pushbroom.info(folder / "image.tif", height=700.0).to_dict()
@@ -229,6 +231,7 @@ def test_the_ground_is_where_the_polynomials_hold(tmp_path, scene):
     assert len(told) == 3 and all("1000 to 3000 m, not for 0" in line for line in told)
 
 
+@pytest.mark.further
 def test_coefficients_of_the_whole_image_beside_a_tile_are_said(scene, tmp_path):
     write_picture(tmp_path / "tile.tif", LINES // 2)
     write_rpc(tmp_path / "tile_RPC.TXT", scene[1])

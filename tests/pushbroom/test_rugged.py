@@ -188,10 +188,8 @@ def rugged():
     return located
 
 
-@pytest.mark.parametrize("case", [
-    case if case == CASES[0] else pytest.param(case, marks=pytest.mark.further)
-    for case in CASES
-])  # fmt: skip
+@pytest.mark.further
+@pytest.mark.parametrize("case", CASES)
 def test_on_the_ellipsoid(rugged, case):
     *corrections, roll = case
     found, expected = ours(corrections, Ground(EARTH), roll), rugged(corrections, roll)

@@ -121,6 +121,7 @@ def test_a_corrected_image_is_the_scene(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["image.tif", "map.tif"]
 
 
+@pytest.mark.further
 def test_terrain_that_hides_terrain():
     """A ridge seen from the side, against heights along the sights in numpy."""
     roll = [{"kind": "sine", "amplitude": 0.02, "period": 3.0}, 0.6]

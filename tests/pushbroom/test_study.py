@@ -27,6 +27,7 @@ def table():
     return table_of(FLIGHT, "bias", "0.01,0.1", DRAWS, 0, None)
 
 
+@pytest.mark.further
 def test_what_the_table_states(table):
     assert abs(table.altitude / HEIGHT - 1) < 1e-3
     np.testing.assert_allclose(table.field_of_view, 2 * np.arctan(1000 * 0.065 / 700))

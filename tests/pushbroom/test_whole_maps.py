@@ -99,10 +99,8 @@ def blocks_of(image, surface, spacing):
             yield system.nodes(surface, *grid.centres(row + steps, column + steps))
 
 
-@pytest.mark.parametrize("kind", [
-    "rpc", pytest.param("rigorous", marks=pytest.mark.further),
-    pytest.param("restless", marks=pytest.mark.further),
-])  # fmt: skip
+@pytest.mark.further
+@pytest.mark.parametrize("kind", ["rpc", "rigorous", "restless"])
 def test_interpolated_positions_are_those_of_the_model(folder, monkeypatch, kind):
     """Within the tolerance, on terrain; what bends faster than it allows is projected itself."""
     image = satellite() if kind == "restless" else smooth_image(LINES, PIXELS)

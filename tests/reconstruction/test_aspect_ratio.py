@@ -57,6 +57,7 @@ def test_without_an_observed_ratio_nothing_is_contradicted():
     assert contradicted_ratios(SimpleNamespace(problem=SimpleNamespace(network=network))) == {}
 
 
+@pytest.mark.further
 def test_the_ratio_of_the_photographs_alone_is_that_without_the_observation(squeezed):
     (found,) = contradicted_ratios(squeezed).values()
     alone = jaxbundle.adjust(release(photographs(fy=903.0), ["cam"]))

@@ -5,6 +5,7 @@ import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 import jaxbundle
 from jaxbundle import Camera, grid_of_targets, ring_of_stations, simulate
@@ -24,6 +25,7 @@ def with_a_distant_point():
     return network.replace(observations=rays.take(keep))
 
 
+@pytest.mark.further
 def test_distant_points_of_two_rays_do_not_define_the_datum():
     network = with_a_distant_point()
     distant = network.points.id[-1]

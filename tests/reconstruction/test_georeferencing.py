@@ -86,7 +86,7 @@ def test_the_ground_is_within_its_sigma(drone, good):
     assert np.all(np.abs(X - drone.truth) < 4 * sigma[rows])
 
 
-@pytest.fixture(scope="module", params=[True, pytest.param(False, marks=pytest.mark.further)],
+@pytest.fixture(scope="module", params=[pytest.param(True, marks=pytest.mark.further), False],
                 ids=["positions", "no positions"])  # fmt: skip
 def spoilt(drone, handheld, request):
     """With a wrong name, a bad point and a check point."""
@@ -172,6 +172,7 @@ def test_two_wrong_points_are_no_exchange(drone, handheld, monkeypatch):
     assert not any("it fits" in point.verdict for point in points.values())
 
 
+@pytest.mark.further
 def test_heights_of_zero_are_unknown(drone, handheld):
     X = handheld * [1, 1, 0]
     result, points, table = controlled(drone, drone.given(X))
@@ -208,6 +209,7 @@ def test_positions_that_contradict_control_are_told_with_numbers():
     assert good.contradictions(np.array([10.0, 10.0, 100.0]), "m") == []
 
 
+@pytest.mark.further
 def test_control_that_cannot_give_a_frame_is_refused(drone, handheld):
     roles = ("control", "control", *["check"] * (CONTROL - 2))
     with pytest.raises(InputError, match="expected 3, got 2"):

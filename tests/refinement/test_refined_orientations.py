@@ -57,6 +57,7 @@ def local(scene, around):
     return np.asarray(around.local(*geodetic(WGS84, tuple(scene.X.T)))).T
 
 
+@pytest.mark.further
 def test_a_bias_moves_projections_as_its_derivative_says(scene, refined, around):
     joint, image = joint_covariance(refined), refined.image("R1")
     view = RpcView("R1", grey(image), image.rpc, around)

@@ -67,6 +67,7 @@ def moved(data, field, place, h):
     return eqx.tree_at(at, data, at(data).at[place].add(h))
 
 
+@pytest.mark.further
 def test_precision_is_that_of_the_dense_inverse(problem, program):
     _, found = program(problem.data)
     dense = dense_covariance(problem, problem.data)
