@@ -1,11 +1,10 @@
 """All tests run in float64, which the package itself never switches on.
 
 Compiled programs are kept in .cache/jax, so that test processes, the command line and notebooks
-share them; a process drops its own when it holds more than `MOST` after a test, or `MOST_AT_END`
-after a file, whose programs serve few others: a worker then stays under 2 GB, and far from the
-65 530 memory maps that Linux allows a process. Programs are compiled with little optimisation, and
-in one piece (pieces for several threads cost an eighth more): here compiling takes longer than
-running.
+share them; a process drops its own when it holds more than `MOST` after a test: a worker then stays
+under 2 GB, and far from the 65 530 memory maps that Linux allows a process. Programs are compiled
+with little optimisation, and in one piece (pieces for several threads cost an eighth more): here
+compiling takes longer than running.
 """
 
 import ctypes
@@ -77,8 +76,8 @@ def pytest_xdist_make_scheduler(config, log):
 
 
 MEMORY = Path("/proc/self/statm")
-MOST, MOST_AT_END = 1.3e9, 1.0e9
-"""Bytes; a single test may add 0.6e9 before it ends."""
+MOST = 1.6e9
+"""Bytes; a single test may add 0.2e9 before it ends, others ask for `memory_at_hand`."""
 WORTH = 150e6
 """Bytes that have come since the last time, for another to be worth it."""
 
@@ -107,29 +106,33 @@ def keep_freed_memory() -> None:
 keep_freed_memory()
 
 
-def drop_compiled_programs(most: float) -> None:
-    """If more than this is held, when what was freed has gone back to the system."""
+def trim() -> None:
+    """What was freed goes back to the system."""
+    if give_back := getattr(ctypes.CDLL(None), "malloc_trim", None):
+        give_back(0)
+
+
+def drop_compiled_programs() -> None:
     global held
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", lambda _: None)
-    if memory() > max(most, held + WORTH):
-        trim(0)
-    if memory() > max(most, held + WORTH):
-        jax.clear_caches()
-        gc.collect()
-        trim(0)
-        held = memory()
+    jax.clear_caches()
+    gc.collect()
+    trim()
+    held = memory()
 
 
 @pytest.fixture(autouse=True)
-def drop_after_test():
+def bound_memory():
     yield
-    drop_compiled_programs(MOST)
+    if memory() > max(MOST, held + WORTH):
+        trim()
+    if memory() > max(MOST, held + WORTH):
+        drop_compiled_programs()
 
 
-@pytest.fixture(autouse=True, scope="module")
-def drop_after_file():
-    yield
-    drop_compiled_programs(MOST_AT_END)
+@pytest.fixture(scope="module")
+def memory_at_hand():
+    """For tests that need much of it."""
+    drop_compiled_programs()
 
 
 @pytest.fixture

@@ -136,6 +136,7 @@ def test_in_a_local_frame():
     np.testing.assert_allclose(found.line[0], lines, atol=1e-6)
 
 
+@pytest.mark.further
 def test_where_a_point_is_that_is_not_in_the_image():
     image = rocking(0.0, 1.0)
     # the line of detectors is 0.3 mm ahead of the axis of 120 mm: 2.5 m on the ground

@@ -46,7 +46,7 @@ BANDS = 3
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def folder(tmp_path_factory, memory_at_hand):
     """image.tif of three bands of 16 bits with RPC, the rigorous scanner.toml, dem.tif, and tiles/
     that are its four quarters."""
     folder = tmp_path_factory.mktemp("maps")

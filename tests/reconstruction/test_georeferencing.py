@@ -86,8 +86,9 @@ def test_the_ground_is_within_its_sigma(drone, good):
     assert np.all(np.abs(X - drone.truth) < 4 * sigma[rows])
 
 
-@pytest.fixture(scope="module", params=[pytest.param(True, marks=pytest.mark.further), False],
-                ids=["positions", "no positions"])  # fmt: skip
+@pytest.fixture(scope="module", params=[
+    pytest.param(positions, marks=pytest.mark.further) for positions in (True, False)
+], ids=["positions", "no positions"])  # fmt: skip
 def spoilt(drone, handheld, request):
     """With a wrong name, a bad point and a check point."""
     named, row = swapped(drone.named, "gcp04", "gcp00")

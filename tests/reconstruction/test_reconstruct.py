@@ -27,7 +27,7 @@ SETTINGS = ReconstructionSettings(FeatureSettings(number=1500), points=250)
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
+def made(tmp_path_factory, memory_at_hand):
     """Truth, and what was made of six photographs with scale bars between coded targets, one of
     another scene, one cut short, one that is there twice, one without texture, a blurred copy of
     one and a reduced one of another; and the folder of matches."""

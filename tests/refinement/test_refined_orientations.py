@@ -106,6 +106,7 @@ def test_corrections_of_a_scanner_move_projections_as_their_derivative_says():
         np.testing.assert_allclose(B[:, :, k], expected, atol=0.01 * size, err_msg=str(every[k]))
 
 
+@pytest.mark.further
 def test_the_covariance_of_points_is_that_of_check_points(scene, refined, around):
     """Measurement and orientation together: what the adjustment says of check points."""
     joint, views = joint_covariance(refined), []

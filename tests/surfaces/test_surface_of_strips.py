@@ -54,6 +54,7 @@ def test_points_are_projected_where_they_came_from(view):
     np.testing.assert_allclose(view.project(X), uv, atol=1e-5)
 
 
+@pytest.mark.further
 def test_the_derivative_is_that_of_the_projection(view):
     uv = np.array([[30.0, 40], [70, 90]])
     X = view.points(uv, np.array([3.0, 8.0]))
