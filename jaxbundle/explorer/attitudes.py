@@ -81,7 +81,10 @@ def choose_angles(forms: AttitudeForms, values: Mapping[str, Any]) -> Mapping[st
             if form["walk"] != known["walk"]:
                 # ten steps in the image, where the file says nothing
                 _change(
-                    parts, "walk", {"sigma": np.radians(form["walk"])}, {"step": forms.duration / 10}
+                    parts,
+                    "walk",
+                    {"sigma": np.radians(form["walk"])},
+                    {"step": forms.duration / 10},
                 )
             changed[name] = parts
     return {**forms.given, **changed} if changed else forms.given

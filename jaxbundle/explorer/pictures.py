@@ -33,17 +33,24 @@ from jaxbundle.pushbroom.image_to_ground import locate_points
 from jaxbundle.pushbroom.rectification import (
     BLOCK_SIZE,
     NODE_STEP,
+    TOLERANCE,
     MapNodes,
     block_places,
     geographic_nodes,
     local_nodes,
 )
 from jaxbundle.pushbroom.resampling import resample
+from jaxbundle.pushbroom.search_settings import SearchSettings
 from jaxbundle.pushbroom.surfaces import GroundSurface
 from jaxbundle.report.layout import significant
 from jaxbundle.report.page.markup import figure, paragraph
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
+
+FEW_POINTS = SearchSettings(with_footprint=False, piece_tolerance=1e-3, max_shared_pieces=512)
+"""For the nodes of a single block, in pictures that show no thousandth of a pixel: images whose
+trajectories need up to 512 pieces share compiled programs."""
+
 
 class GroundFrame(NamedTuple):
     """The plane of the scene: its origin, axes east, north and up as rows, and the square pixels of
@@ -105,7 +112,9 @@ def frame_around(
     side = float((high - low).max())
     low, high = low - margin * side, high + margin * side
     # no finer than the pixels of the picture, no more than a block of a map
-    finest = side / max(-(-n // step) for n, step in zip((image.lines, image.pixels), _steps(image)))
+    finest = side / max(
+        -(-n // step) for n, step in zip((image.lines, image.pixels), _steps(image))
+    )
     size = max(float((high - low).max()) / BLOCK_SIZE, finest)
     columns, rows = (min(int(np.ceil(v / size)), BLOCK_SIZE) for v in high - low)
     left, top = float(low[0]), float(high[1])
@@ -126,8 +135,9 @@ def take_pictures(
     step = _steps(truth)
     lines, pixels = (np.arange(0.0, n, k) for n, k in zip((truth.lines, truth.pixels), step))
     image = take_image(truth, surface, jnp.asarray(scene), frame.place, lines, resampling, pixels)
-    search = make_search(recorded, surface.earth)
-    places = block_places(recorded, search, surface, _nodes_of(frame, surface))
+    search = make_search(recorded, surface.earth, FEW_POINTS)
+    nodes = _nodes_of(frame, surface)
+    places = block_places(recorded, search, surface, nodes, tolerance=TOLERANCE * min(step))
     rows, columns = frame.rows, frame.columns
     if places is None:
         return Taken(scene, image, step, np.full_like(scene, np.nan))

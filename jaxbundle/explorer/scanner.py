@@ -470,9 +470,7 @@ class FlightView:
                 self._scenes[kind] = frame, pattern(frame)
         return self._scenes[kind]
 
-    def _draw_pictures(
-        self, chosen: Chosen, values: Mapping[str, Any]
-    ) -> tuple[str, float | None]:
+    def _draw_pictures(self, chosen: Chosen, values: Mapping[str, Any]) -> tuple[str, float | None]:
         """The pictures, and the difference of map and scene; words in their place where there are
         none, since the numbers are of use without them."""
         try:
@@ -729,9 +727,7 @@ _positions = jax.jit(
 
 
 @partial(jax.jit, static_argnums=2)
-def _angles(
-    image: PushbroomImage, lines: Float[Array, " n"], orbital: bool
-) -> Float[Array, "3 n"]:
+def _angles(image: PushbroomImage, lines: Float[Array, " n"], orbital: bool) -> Float[Array, "3 n"]:
     """Pitch, roll, yaw of the platform at some lines, radians."""
 
     def of_line(line: Array) -> Float[Array, "3"]:

@@ -64,7 +64,10 @@ def tracks_of(track: Mapping[str, Any], image: PushbroomImage, earth: Ellipsoid 
     orbit = {**orbit, "height": float(track["height"])} if "height" in track else {}
     if "end" in track:
         # as high over the middle of the track's ends
-        orbit = {**USUAL, "height": shorten_number(np.linalg.norm(ends, axis=1).mean() - earth.a, 6)}
+        orbit = {
+            **USUAL,
+            "height": shorten_number(np.linalg.norm(ends, axis=1).mean() - earth.a, 6),
+        }
     radius = np.linalg.norm(ends, axis=1)
     length = np.linalg.norm(ends[1] - ends[0]) * float(earth.a) / radius.mean()
     altitude = radius.mean() - float(earth.a)

@@ -52,7 +52,9 @@ def signal(
     get = lambda key, default=0.0: float(description.get(key, default))
     for key in ("period", "step"):
         if not get(key, 1.0) > 0:
-            raise InputError(f"signal {kind!r}: {key} is {get(key):g}; a positive number of seconds")
+            raise InputError(
+                f"signal {kind!r}: {key} is {get(key):g}; a positive number of seconds"
+            )
     passed = np.asarray(t) - start
     match kind:
         case "linear":
