@@ -60,10 +60,11 @@ def read_points(
         warnings += said
     if "tie_points" in section:
         given = {id for part in parts for id in part.id}
+        known: set[tuple[object, ...]] = set()
         for path in section.paths("tie_points", "a CSV table of measurements of tie points"):
             table = read_csv(path)
             table.check_names(MEASURED[:4], MEASURED[4:])
-            tables.append(table)
+            tables.append(_without_repeated(table, known))
             new = [id for id in dict.fromkeys(table.values["point"]) if id not in given]
             given |= set(new)
             parts.append(_tie_points(new, Source(str(path))))
@@ -78,6 +79,18 @@ def read_points(
     known = [image.id for image in images]
     table = _join_tables(tables)
     return points, _observations(table, ids, known, section, points.source.name), warnings
+
+
+def _without_repeated(table: Columns, known: set[tuple[object, ...]]) -> Columns:
+    """A table of tie points without the measurements that an earlier one has, `known`: a corner of
+    an image is the same measurement in the tables of all its pairs. These are added to `known`."""
+    rows = list(zip(*(table.values[name] for name in MEASURED[:4])))
+    kept = np.array([k for k, row in enumerate(rows) if row not in known], int)
+    known |= set(rows)
+    if len(kept) == len(rows):
+        return table
+    values = {name: [column[k] for k in kept] for name, column in table.values.items()}
+    return Columns(values, table.source.take(kept))
 
 
 def _control_points(control: ControlFile, path: Path, earth: Ellipsoid | None) -> GroundPoints:
