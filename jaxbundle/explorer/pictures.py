@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 
 from jaxbundle.choices import Resampling
 from jaxbundle.errors import InputError
-from jaxbundle.geometry.ellipsoid import Ellipsoid, geodetic
+from jaxbundle.geometry.ellipsoid import geodetic
 from jaxbundle.geometry.vectors import along
 from jaxbundle.io.rasters.scenes import SceneRaster
 from jaxbundle.photographs.opencv import need_opencv
@@ -172,7 +172,7 @@ def scene_of_raster(
     X = _ground_below(frame, surface, *np.indices((frame.rows, frame.columns), float))
     row, column = raster.place(X)
     # means of as many pixels as fit into one of the scene: single ones would be noise
-    steps = [_pixels_between(v, axis) for axis, v in enumerate((row, column))]
+    steps = [_pixels_between(v) for v in (row, column)]
     bands = _means(bands, steps)
     row, column = ((v + 0.5) / k - 0.5 for v, k in zip((row, column), steps))
     found = np.asarray(_resample(bands, row, column, "bilinear"))
@@ -241,7 +241,7 @@ def _ground_below(
     return X.reshape(3, *x.shape)
 
 
-def _pixels_between(position: Float[np.ndarray, "rows columns"], axis: int) -> int:
+def _pixels_between(position: Float[np.ndarray, "rows columns"]) -> int:
     """Pixels of a raster, along one of its axes, in a pixel of the scene."""
     steps = [np.nanmedian(np.abs(np.diff(position, axis=k))) for k in (0, 1)]
     return max(1, int(np.nan_to_num(max(steps))))

@@ -29,6 +29,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxbundle.choices import RESAMPLINGS, Resampling
 from jaxbundle.errors import InputError
+from jaxbundle.explorer.attitudes import attitude_controls, attitude_forms, choose_angles
 from jaxbundle.explorer.page import (
     Choice,
     Control,
@@ -39,7 +40,6 @@ from jaxbundle.explorer.page import (
     make_page,
     place,
 )
-from jaxbundle.explorer.attitudes import attitude_controls, attitude_forms, choose_angles
 from jaxbundle.explorer.pictures import (
     GroundFrame,
     Taken,

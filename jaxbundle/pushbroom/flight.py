@@ -1,9 +1,10 @@
 """Simulation: a true trajectory, its records by instruments, and the image.
 
 The true angles are sums of signals (`signals`) on a circular orbit about the rotating Earth, from
-one place above the Earth to another, or on a straight line above a plane. Instruments sample position and attitude at their rates, with errors
-(`noise`). The image processing uses only these samples: its trajectory is interpolated from them.
-Without errors only the interpolation error remains.
+one place above the Earth to another, or on a straight line above a plane. Instruments sample
+position and attitude at their rates, with errors (`noise`). The image processing uses only these
+samples: its trajectory is interpolated from them. Without errors only the interpolation error
+remains.
 """
 
 import dataclasses

@@ -39,7 +39,7 @@ def signal(
     **Arguments:** `description` a number, or `{"kind": …}` with the keys of the kind; missing ones
     are 0 (period or step 1 s). A walk draws from `rng`.
 
-    **Raises:** `InputError` for unknown kinds and keys, and periods and steps that are not positive.
+    **Raises:** `InputError` for unknown kinds and keys, periods and steps that are not positive.
     """
     if isinstance(description, int | float):
         return np.full(len(t), float(description))

@@ -55,8 +55,8 @@ def _orientation(
     if strange:
         # left out it would count as held, and σ would be too small
         raise InputError(
-            f"{' '.join(strange[0][:2])} has no unknown {strange[0][2]!r}; the names are those that "
-            "pushbroom refine writes"
+            f"{' '.join(strange[0][:2])} has no unknown {strange[0][2]!r}; the names are those "
+            "that pushbroom refine writes"
         )
     # without a row in the covariance: held in the refinement, so that it has no error
     held = joint.index(every) < 0

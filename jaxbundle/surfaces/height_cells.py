@@ -2,7 +2,6 @@
 cells and the errors that cells share."""
 
 import dataclasses
-from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np

@@ -13,9 +13,9 @@ from pyarrow.parquet import read_table
 
 from jaxbundle.batches import work
 from jaxbundle.batches.run_on_files import key_of, run_batch
-from jaxbundle.system.paths import relative_path
 from jaxbundle.errors import InputError
 from jaxbundle.io.writing.fingerprints import of_input
+from jaxbundle.system.paths import relative_path
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "convergent4"
 FREE = ["fx", "fy", "k1"]
