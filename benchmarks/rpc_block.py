@@ -79,19 +79,20 @@ def cover(draws: int, photographs: int = 20) -> dict:
         truth = np.concatenate([values.ravel() for values in truth.values()])
         # unknowns are in the order: line scanners, RPC, photographs, camera
         owners = np.array([name.owner for name in found.names])
-        order = np.concatenate([np.flatnonzero(np.char.startswith(owners, start))
-                                for start in ("image S", "image R", "photograph ", "camera ")])  # fmt: skip
+        starts = ("image S", "image R", "photograph ", "camera ")
+        order = np.concatenate(
+            [np.flatnonzero(np.char.startswith(owners, start)) for start in starts]
+        )
         ratio = (found.estimate[order] - truth) / sigma[order]
-        kinds = owners[order]
-        of = lambda start: ratio[np.char.startswith(kinds, start)]
+        of = {start: ratio[np.char.startswith(owners[order], start)] for start in starts}
         chosen = at.declared.rays.points
         off = np.einsum("pij,pj->pi", found.points.axes[chosen], found.positions - scene.X[chosen])
         ties = np.array([scene.roles[k] == "tie" for k in chosen])
         of_points = (off / (at.point_sigma / found.sigma0))[ties]
         check = found.check
         parts = {
-            "biases": of("image R"), "attitudes": of("image S"), "photographs": of("photograph "),
-            "principal distance": of("camera "), "tie points": of_points.ravel(),
+            "biases": of["image R"], "attitudes": of["image S"], "photographs": of["photograph "],
+            "principal distance": of["camera "], "tie points": of_points.ravel(),
             "check points": (check.difference / check.sigma * found.sigma0).ravel(),
         }  # fmt: skip
         for name, values in parts.items():

@@ -1,6 +1,6 @@
 """RPC: million points per second of processor, beside GDAL, shareloc and rpcm.
 
-    OPENBLAS_NUM_THREADS=1 python benchmarks/rpc_speed.py [--points N] [--peers PYTHON] [--json FILE]
+    OPENBLAS_NUM_THREADS=1 python benchmarks/rpc_speed.py [--points N] [--peers PYTHON]
 
 The coefficients are those of the image of `pushbroom.py`: 10 000 lines of 8000 pixels of 4.7 m from
 500 km, all terms in use. Every program reads them from the tags of one GeoTIFF, and gets the same
@@ -9,9 +9,10 @@ is that of the processor, all threads together; the best of several rounds count
 must agree with ours within a thousandth of a pixel, otherwise the exit status is 1; so must the
 8 million points a second that are required from the image to the ground.
 
-GDAL is called through rasterio, with its default threshold of 0.1 pixel and with 1e-6 pixel. shareloc and rpcm (`rpc_speed_peers.py`) run in the interpreter
-`--peers`, of an environment of their own (`pip install shareloc rpcm`); those that are not
-installed there are left out. shareloc stops at 1e-6 pixel, rpcm at 1e-9 of half the image.
+GDAL is called through rasterio, with its default threshold of 0.1 pixel and with 1e-6 pixel.
+shareloc and rpcm (`rpc_speed_peers.py`) run in the interpreter `--peers`, of an environment of
+their own (`pip install shareloc rpcm`); those that are not installed there are left out. shareloc
+stops at 1e-6 pixel, rpcm at 1e-9 of half the image.
 """
 
 import json

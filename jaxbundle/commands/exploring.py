@@ -75,8 +75,8 @@ def explore(  # noqa: PLR0913 (public: the options of the command, all but one b
     - `correlated`: of a network: σ under errors that image points share, as by `adjust`.
     - `photo`: a photograph to undistort; `image_size`, pixels, `pixel_size`, mm: where the camera
       has none.
-    - `truth`: scanner file of the truth; `scene`: georeferenced raster for the pictures of a scanner,
-      a pattern without.
+    - `truth`: scanner file of the truth.
+    - `scene`: georeferenced raster for the pictures of a scanner; without one, a pattern.
     - `port`: 0: any that is free; `progress`: of the adjustment; `tell`: called with warnings and
       what the server says.
 

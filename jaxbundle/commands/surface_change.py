@@ -303,8 +303,8 @@ def _orientations(
         if seen < 1:
             warnings.append(
                 f"{path}: {100 * (1 - seen):.3g} % of the cells with a height are in fewer than "
-                "two of its images: their σ have no errors of orientations, and are too small if they "
-                "were made of other images"
+                "two of its images: their σ have no errors of orientations, and are too small if "
+                "they were made of other images"
             )
         made.append(errors)
     one, other = made

@@ -503,7 +503,8 @@ def test_a_flight_has_an_orbit_and_a_straight_track(scanner, flight):
     values = scanner.values({})
     assert values["track"] == STRAIGHT and values["height"] == 500e3
     assert choose_track(scanner.tracks, values) is flight.flight.track
-    turned = choose_track(scanner.tracks, values | {"end_X": 400.0, "end_Y": 200.0, "start_Z": 900.0})
+    other_ends = {"end_X": 400.0, "end_Y": 200.0, "start_Z": 900.0}
+    turned = choose_track(scanner.tracks, values | other_ends)
     assert turned == {"start": [300.0, 200.0, 900.0], "end": [400.0, 200.0, 800.0]}
     orbit = choose_track(scanner.tracks, values | {"track": ORBIT, "inclination": 90.0})
     assert orbit["height"] == 500e3 and orbit["inclination"] == np.pi / 2

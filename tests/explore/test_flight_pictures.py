@@ -1,6 +1,6 @@
 """Pictures and trajectories of a flight in the explorer, against geometry written here.
 
-A camera over a plane at the height H: the pixel u of a level line at Y looks at X = X₀ + H·tan β(u);
+A camera over a plane at the height H: the pixel u of a level line at Y looks at X = X₀ + H·tan β;
 a roll of ρ adds to β, right side down, which turns the view to the left. Scenes that are linear in
 X and Y are interpolated exactly by every kernel, so that the pictures are as good as the geometry.
 """
@@ -137,7 +137,8 @@ def test_the_map_follows_an_error_of_roll(view):
 
 def test_pictures_are_on_the_page_and_follow_the_sliders(view):
     first = view.answer({})
-    found = re.findall(r'alt="(\w+)" src="data:image/png;base64,([^"]+)"', first["parts"]["pictures"])
+    image = r'alt="(\w+)" src="data:image/png;base64,([^"]+)"'
+    found = re.findall(image, first["parts"]["pictures"])
     assert [name for name, _ in found] == ["scene", "distorted", "corrected"]
     json.dumps(first)
     rolled = view.answer({"roll": 0.1})
@@ -264,7 +265,8 @@ def test_a_raster_is_shown_where_it_is(view):
     fine = frame.size / 4
     x = np.arange(-80.0, 80.0, fine)
     grey = (RAMP[0] * x + RAMP[1] * x[::-1, None])[None]
-    place = lambda X: ((x[-1] + frame.origin[1] - X[1]) / fine, (X[0] - frame.origin[0] - x[0]) / fine)
+    place = lambda X: ((x[-1] + frame.origin[1] - X[1]) / fine,
+                       (X[0] - frame.origin[0] - x[0]) / fine)  # fmt: skip
     found = scene_of_raster(SceneRaster(grey, "float64", place), frame, Plane())
     east, south = np.diff(found[0], axis=1), np.diff(found[0], axis=0)
     # one scale of grey values for both directions

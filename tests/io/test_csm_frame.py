@@ -323,10 +323,11 @@ def framelet_of(isd, k):
     t = isd["starting_ephemeris_time"] + EXPOSURE / 2 + k * DELAY
     single = copy.deepcopy(isd) | {"name_model": "USGS_ASTRO_FRAME_SENSOR_MODEL",
                                    "image_lines": HEIGHT}  # fmt: skip
-    for name, of in (("body_rotation", [0.3, -0.2, 0.7]), ("instrument_pointing", [-0.5, 1.1, 0.2])):
-        rate = [0.0, 0.0, 1e-3] if name == "body_rotation" else [2e-3, -1e-3, 5e-4]
+    for name, of, rate in (("body_rotation", [0.3, -0.2, 0.7], [0.0, 0.0, 1e-3]),
+                           ("instrument_pointing", [-0.5, 1.1, 0.2], [2e-3, -1e-3, 5e-4])):
         q = Rotation.from_rotvec(of) * Rotation.from_rotvec((t - NOW) * np.array(rate))
-        single[name] |= {"ephemeris_times": [t], "quaternions": [q.as_quat()[[3, 0, 1, 2]].tolist()]}
+        row = q.as_quat()[[3, 0, 1, 2]].tolist()
+        single[name] |= {"ephemeris_times": [t], "quaternions": [row]}
     position = single["instrument_position"]
     X = np.array(position["positions"][0]) + (t - position["ephemeris_times"][0]) * np.array(
         position["velocities"][0]
@@ -359,8 +360,8 @@ def test_framelets_are_photographs(reverse, tmp_path):
 @pytest.mark.parametrize("changes, message", [
     ({"framelets_flipped": True}, "mirror image"), ({"framelet_height": 0}, "framelet_height"),
     ({"interframe_delay": -1.0}, "interframe_delay is -1"), ({"framelet_height": 999}, "less than"),
-    ({"framelet_order_reversed": "yes"}, "true or false"), ({"detector_line_summing": 4}, "summing"),
-    ({"interframe_delay": 5.0}, "the image needs"),
+    ({"framelet_order_reversed": "yes"}, "true or false"), ({"interframe_delay": 5.0}, "needs"),
+    ({"detector_line_summing": 4}, "summing"),
 ])  # fmt: skip
 def test_framelets_that_are_refused(changes, message, tmp_path):
     with pytest.raises(InputError, match=message) as refused:

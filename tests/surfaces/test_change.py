@@ -299,7 +299,8 @@ def test_masks_mark_cells_and_cut_none(files):
     for name, values, x in (("whole", marked, 1000.0), ("part", marked[:12, 5:70], 1010.0),
                             ("wide", wide, 1000.0 - 4 * SIZE)):  # fmt: skip
         write(files / f"{name}.tif", values, "uint8", None, x=x)
-    one = jaxbundle.change(*given, stable=files / "whole.tif", regions=files / "whole.tif", **errors)
+    whole = files / "whole.tif"
+    one = jaxbundle.change(*given, stable=whole, regions=whole, **errors)
     assert one.change.known.sum() == ROWS * COLUMNS - 1
     for name in ("part", "wide"):
         mask = files / f"{name}.tif"
