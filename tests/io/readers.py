@@ -526,14 +526,14 @@ def _(folder):
 
 @reader("control network of ISIS", lambda f: read_control_network(f / "network.pvl"))
 def _(folder):
-    from test_isis_points import GOOD
+    from isis_samples import GOOD
 
     (folder / "network.pvl").write_text(GOOD + "End_Object\nEnd\n")
 
 
 @reader("residuals of jigsaw", lambda f: read_jigsaw_residuals(f / "residuals.csv"))
 def _(folder):
-    from test_isis_points import RESIDUALS
+    from isis_samples import RESIDUALS
 
     row = "P{},/data/left.cub,s{},0.1,0.2,{}.5,7.25,0.3,-0.4,0.5\n"
     rows = [row.format(k // 2, k % 2, 3 * k) for k in range(6)]

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from isis_samples import GOOD, HEAD, RESIDUALS, measure, point
 from rpc_block import SIGMA_CONTROL, block
 from scipy.spatial.transform import Rotation
 
@@ -30,41 +31,6 @@ B = "{SERIAL}:1"
 bias_degree = 1
 bias = [6.0, 0.8]
 """
-HEAD = """Object = ControlNetwork
-  NetworkId    = test
-  TargetName   = Earth
-  Description  = "Of a test,
-                  in two lines"
-  Version      = 5
-"""
-
-
-def measure(serial, line, sample, more=""):
-    return f"""
-    Group = ControlMeasure
-      SerialNumber   = {serial}
-      MeasureType    = RegisteredSubPixel
-      ChooserName    = jigsaw
-      Sample         = {sample + 1!r}
-      Line           = {line + 1!r}
-      SampleResidual = 0.3 <pixels>
-      LineResidual   = -0.4 <pixels>{more}
-    End_Group
-"""
-
-
-def point(id, kind, X, covariance, measures):
-    lines = [f"\n  Object = ControlPoint\n    PointType = {kind}\n    PointId   = {id}"]
-    for axis, value in zip("XYZ", X):
-        lines.append(f"\n    # a comment of Apriori{axis}\n    Apriori{axis} = {value!r} <meters>")
-    if covariance is not None:
-        six = [repr(float(v)) for v in covariance[np.triu_indices(3)]]
-        # two lines, as of ISIS
-        matrix = f"({', '.join(six[:4])},\n       {', '.join(six[4:])})"
-        lines.append(f"    AprioriCovarianceMatrix = {matrix}")
-    return "\n".join(lines) + "\n" + "".join(measures) + "  End_Object\n"
-
-
 def serial_of(k):
     return f"{SERIAL}:{k}" if k < 2 else "right"
 
@@ -155,12 +121,6 @@ def test_what_is_ignored_or_rejected_is_left_out_and_told(tmp_path):
     assert "1 measurement rejected by jigsaw" in found.messages[1]
 
 
-RESIDUALS = """,,,x image,y image,Measured,Measured,sample,line,Residual Vector
-Point,Image,Image,coordinate,coordinate,Sample,Line,residual,residual,Magnitude
-Label,Filename,Serial Number,(mm),(mm),(pixels),(pixels),(pixels),(pixels),(pixels),Rejected
-"""
-
-
 def test_residuals_of_jigsaw_are_measurements(scene, folder):
     _, points, observations = scene
     rows = [
@@ -182,9 +142,6 @@ def test_residuals_of_jigsaw_are_measurements(scene, folder):
     # by the names of their files, without serial numbers; control is none
     assert len(file.observations) == len(observations) and set(file.points.role) == {"tie"}
     np.testing.assert_array_equal(file.observations.image, observations.image)
-
-
-GOOD = HEAD + point("P", "Constrained", [1e6, 2e6, 3e6], np.eye(3), [measure("s", 4.0, 7.0)])
 
 
 @pytest.mark.parametrize("text, words", [
