@@ -18,6 +18,7 @@ from jaxbundle.commands.scanner_tables import ScannerTable
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.geometry.ellipsoid import WGS84
+from jaxbundle.io.rasters.extent import pole_in_image
 from jaxbundle.io.scanner.rpc import read_rpc, write_rpc
 from jaxbundle.io.text.csv_tables import read_csv
 from jaxbundle.io.text.known_keys import UnknownKeys
@@ -70,7 +71,7 @@ def fit(
 
     **Raises:** `InputError`; `NotSolvedError` if the fit does not converge.
     """
-    path, check = Path(source), None
+    path, check, pole = Path(source), None, None
     low, high = heights
     if not (np.isfinite([low, high]).all() and low < high):
         raise InputError(
@@ -87,6 +88,7 @@ def fit(
         if file.earth != WGS84:
             tell(f"{path}: the ellipsoid is not WGS84, as other programs assume")
         found, check = fit_image(file.image, file.earth, (low, high), ridge=ridge)
+        pole = pole_in_image(file.image, file.earth)
     if not found.converged:
         raise NotSolvedError(
             f"{path}: the fit does not converge; give a larger --ridge than "
@@ -95,10 +97,14 @@ def fit(
     checks = {"fit": found.check} | ({"check": check} if check is not None else {})
     largest = max(c.largest.max() for c in checks.values())
     if largest > 0.5:  # pixel: places may then fall into the neighbouring one
+        reason = "the coefficients do not follow jitter faster than a cubic over the image"
+        if pole is not None:
+            reason = (
+                f"it shows the {pole}, where no polynomials of longitude and latitude follow it"
+            )
         tell(
-            f"{path}: residuals up to {largest:.3g} pixel: the coefficients do not follow "
-            "jitter faster than a cubic over the image; cut it into shorter pieces, or use the "
-            "rigorous model"
+            f"{path}: residuals up to {largest:.3g} pixel: {reason}; cut it into shorter pieces, or "
+            "use the rigorous model"
         )
     figures: dict[str, float] = {"points": len(found.check.residuals)}
     for name, one in checks.items():
