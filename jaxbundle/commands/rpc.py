@@ -103,8 +103,8 @@ def fit(
                 f"it shows the {pole}, where no polynomials of longitude and latitude follow it"
             )
         tell(
-            f"{path}: residuals up to {largest:.3g} pixel: {reason}; cut it into shorter pieces, or "
-            "use the rigorous model"
+            f"{path}: residuals up to {largest:.3g} pixel: {reason}; cut it into shorter pieces, "
+            "or use the rigorous model"
         )
     figures: dict[str, float] = {"points": len(found.check.residuals)}
     for name, one in checks.items():

@@ -51,9 +51,9 @@ def polar_model(path):
     """Heights 100 + x/1000 + y/2000 in a polar system, 1600 km wide about the pole."""
     y, x = 800e3 - 4e3 * np.indices((400, 400))
     heights = 100 - x / 1e3 + y / 2e3
+    place = rasterio.Affine(4e3, 0, -802e3, 0, -4e3, 802e3)
     with rasterio.open(path, "w", driver="GTiff", width=400, height=400, count=1, dtype="float32",
-                       crs="EPSG:3995",
-                       transform=rasterio.Affine(4e3, 0, -802e3, 0, -4e3, 802e3)) as to:  # fmt: skip
+                       crs="EPSG:3995", transform=place) as to:  # fmt: skip
         to.write(heights.astype("float32")[None])
     return path
 

@@ -223,7 +223,8 @@ def test_stated_errors_become_pixels(scene):
 def test_together_with_rigorous_images_and_photographs():
     """Twelve images with RPC, six line scanners, twenty photographs: the truth, σ of a few draws
     (of 200: benchmarks/rpc_block.py), blunders, an undetermined bias."""
-    scene, rng, ratio = block(photographs=20), np.random.default_rng(3), []
+    scene, rng = block(photographs=20), np.random.default_rng(3)
+    largest, squares = [], []
     for _ in range(3):
         arguments, bias = scene.draw(rng)
         frames, to_truth, distance = scene.draw_photographs(rng)
@@ -232,14 +233,20 @@ def test_together_with_rigorous_images_and_photographs():
             "image R": bias, "image S": scene.attitudes, "photograph ": to_truth,
             "camera ": np.array([distance]),
         }  # fmt: skip
+        error = np.array(result.estimate)
         for owner, values in truth.items():
-            of = [k for k, n in enumerate(result.names) if n.owner.startswith(owner)]
-            sigma = result.inspection.sigma[of] / result.sigma0
-            ratio.append((result.estimate[of] - values.ravel()) / sigma)
-    # 633 errors: their RMS has a σ of 0.03, and one of 4 σ is 4 % likely
-    ratio = np.concatenate(ratio)
-    assert len(ratio) == 633
-    assert np.abs(ratio).max() < 4.5 and 0.9 < np.sqrt(np.mean(ratio**2)) < 1.1
+            error[[k for k, n in enumerate(result.names) if n.owner.startswith(owner)]] -= (
+                values.ravel()
+            )
+        C = result.covariance / result.sigma0**2
+        scale = np.sqrt(np.diagonal(C))
+        normed = error / scale
+        largest.append(np.abs(normed).max())
+        # the errors of one draw have much in common: by their whole covariance, χ² with 211
+        squares.append(normed @ np.linalg.solve(C / np.outer(scale, scale), normed))
+    # 633 in all: their mean square has a σ of √(2/633) = 0.056; one of 4.5 σ is 0.4 % likely
+    assert len(error) == 211 and max(largest) < 4.5
+    assert abs(np.sum(squares) / 633 - 1) < 0.2
     assert result.global_test()["passed"]
     assert min(result.rays()) >= 3
     # rigorous images first, and everything by id

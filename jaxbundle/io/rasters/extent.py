@@ -61,7 +61,7 @@ def image_extent(image: PushbroomImage, earth: Ellipsoid, places: int = 17) -> E
 
 
 def pole_in_image(image: PushbroomImage, earth: Ellipsoid, places: int = 17) -> str | None:
-    """ "North Pole" or "South Pole", if the image shows it; None if not, or if its border misses the
+    """The pole that an image shows, in words; None if it shows none, or if its border misses the
     ground.
 
     The longitudes along the border of the image then lead once around the Earth.
