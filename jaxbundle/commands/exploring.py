@@ -109,8 +109,8 @@ def explore(  # noqa: PLR0913 (public: the options of the command, all but one b
     elif path is None:
         raise InputError(f"kind: {_named(input)} is no file of a scanner")
     else:
-        files = (Path(one) if one else None for one in (truth, scene))
-        view = _view_scanner(Path(path), *files, tell)
+        reference, shown = (Path(one) if one else None for one in (truth, scene))
+        view = _view_scanner(Path(path), reference, shown, tell)
     return Server(view, port, tell)
 
 

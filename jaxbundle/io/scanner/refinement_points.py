@@ -81,11 +81,11 @@ def read_points(
             )
     if "tie_points" in section:
         given = {id for part in parts for id in part.id}
-        known: set[tuple[object, ...]] = set()
+        measured: set[tuple[object, ...]] = set()
         for path in section.paths("tie_points", "a CSV table of measurements of tie points"):
             table = read_csv(path)
             table.check_names(MEASURED[:4], MEASURED[4:])
-            tables.append(_without_repeated(table, known))
+            tables.append(_without_repeated(table, measured))
             new = [id for id in dict.fromkeys(table.values["point"]) if id not in given]
             given |= set(new)
             parts.append(_tie_points(new, Source(str(path))))
