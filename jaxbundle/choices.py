@@ -56,7 +56,7 @@ NETWORK_FILES = {
     "anipose": "a .toml of anipose, Pose2Sim, FreeMoCap: [cam_0] with matrix, rotation, …",
     "rig": "result.json of jaxbundle calibrate --rig",
     "rig-line": "a line of jaxbundle batch: FILE.jsonl#KEY",
-    "csm-frame": "an ISD (.json) of a frame camera, USGS_ASTRO_FRAME_SENSOR_MODEL",
+    "csm-frame": "an ISD (.json) of a frame or push-frame camera (CSM), or a frame camera's state",
     "nvm": "an .nvm file of VisualSFM",
     "alicevision": "an .sfm or .json of AliceVision",
     "realityscan": "a folder with .xmp of RealityScan, or its .csv of camera parameters",

@@ -28,6 +28,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.results.json_lines import JsonLines
 from jaxbundle.io.writing.locks import hold_lock
 from jaxbundle.measure.boards import Board
+from jaxbundle.system.paths import relative_path
 from jaxbundle.types import Progress
 
 # The stage in reports of progress.
@@ -155,11 +156,7 @@ def key_of(path: str | Path, file: str | Path) -> str:
     folder, name = os.path.split(os.path.abspath(path))
     # the folder without links, but not the input itself, whose name the user gave
     path = os.path.join(os.path.realpath(folder), name)
-    try:
-        path = os.path.relpath(path, os.path.dirname(os.path.realpath(file)))
-    except ValueError:  # another drive
-        pass
-    return Path(path).as_posix()
+    return Path(relative_path(path, os.path.dirname(os.path.realpath(file)))).as_posix()
 
 
 def check_part(part: Sequence[int]) -> None:

@@ -26,6 +26,9 @@ def explore(  # noqa: PLR0913 - the options of the command
     image_size: Annotated[str, typer.Option(help="W,H in pixels, if missing in the camera")] = "",
     pixel_size: Annotated[str, typer.Option(help="W,H in mm, if missing in the camera")] = "",
     truth: Annotated[Path | None, typer.Option(help="scanner file of the truth")] = None,
+    scene: Annotated[
+        Path | None, typer.Option(help="georeferenced raster for the pictures of a scanner")
+    ] = None,
     set: Settings = None,
     format: Format = None,
     control: Control = None,
@@ -56,6 +59,7 @@ def explore(  # noqa: PLR0913 - the options of the command
             image_size=pair("--image-size", image_size),
             pixel_size=pair("--pixel-size", pixel_size),
             truth=truth,
+            scene=scene,
             overrides=tuple(set or ()),
             format=format,
             control=control,

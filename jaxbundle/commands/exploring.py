@@ -23,6 +23,7 @@ from jaxbundle.io import read_network
 from jaxbundle.io.cameras.camera_files import is_camera_file
 from jaxbundle.io.cameras.result_json import is_result
 from jaxbundle.io.formats import recognise_format
+from jaxbundle.io.rasters.scenes import read_scene
 from jaxbundle.io.scanner.flight import read_flight
 from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.io.text.csv_tables import read_text, read_toml
@@ -49,6 +50,7 @@ def explore(  # noqa: PLR0913 (public: the options of the command, all but one b
     image_size: Pair | None = None,
     pixel_size: Pair | None = None,
     truth: str | Path | None = None,
+    scene: str | Path | None = None,
     overrides: Sequence[str] = (),
     format: str | None = None,
     control: str | Path | None = None,
@@ -74,6 +76,7 @@ def explore(  # noqa: PLR0913 (public: the options of the command, all but one b
     - `photo`: a photograph to undistort; `image_size`, pixels, `pixel_size`, mm: where the camera
       has none.
     - `truth`: scanner file of the truth.
+    - `scene`: georeferenced raster for the pictures of a scanner; without one, a pattern.
     - `port`: 0: any that is free; `progress`: of the adjustment; `tell`: called with warnings and
       what the server says.
 
@@ -88,7 +91,7 @@ def explore(  # noqa: PLR0913 (public: the options of the command, all but one b
             "--correlated": correlated,
         },
         CAMERA: {"--photo": photo, **sizes},
-        SCANNER: {"--truth": truth},
+        SCANNER: {"--truth": truth, "--scene": scene},
     }
     path = input if isinstance(input, str | Path) else None
     found = kind or (NETWORK if format else recognise(input))
@@ -106,7 +109,8 @@ def explore(  # noqa: PLR0913 (public: the options of the command, all but one b
     elif path is None:
         raise InputError(f"kind: {_named(input)} is no file of a scanner")
     else:
-        view = _view_scanner(Path(path), Path(truth) if truth else None, tell)
+        reference, shown = (Path(one) if one else None for one in (truth, scene))
+        view = _view_scanner(Path(path), reference, shown, tell)
     return Server(view, port, tell)
 
 
@@ -214,7 +218,9 @@ def _view_camera(
     return CameraView(camera, sigma, picture, trace_files(files, {}))
 
 
-def _view_scanner(path: Path, truth: Path | None, tell: Callable[[str], object]) -> FlightView:
+def _view_scanner(
+    path: Path, truth: Path | None, scene: Path | None, tell: Callable[[str], object]
+) -> FlightView:
     """A scanner file, or a flight file, which has a track."""
     known = None
     if truth is not None:
@@ -222,15 +228,19 @@ def _view_scanner(path: Path, truth: Path | None, tell: Callable[[str], object])
         for warning in opened.warnings:
             tell(warning)
         known = opened.image
-    files = [path, *([] if truth is None else [truth])]
-    origin = trace_files(files, {})
+    origin = trace_files([path, *(one for one in (truth, scene) if one is not None)], {})
+    shown = lambda earth: None if scene is None else read_scene(scene, earth)
     if path.suffix.lower() == ".toml" and "track" in read_toml(path):
         if known is not None:
             raise InputError("--truth: a flight file contains its truth; omit it")
         flight = read_flight(path)
         name = flight.file.section("scanner").text("name", path.stem)
-        return FlightView(name, flight.flight, flight.earth, origin=origin)
+        return FlightView(
+            name, flight.flight, flight.earth, origin=origin, scene=shown(flight.earth)
+        )
     scanner = read_scanner(path)
     for warning in scanner.warnings:
         tell(warning)
-    return FlightView(scanner.name, scanner.image, scanner.earth, known, origin)
+    return FlightView(
+        scanner.name, scanner.image, scanner.earth, known, origin, scene=shown(scanner.earth)
+    )

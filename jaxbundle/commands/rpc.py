@@ -3,9 +3,12 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
+import jax
 import numpy as np
 
+from jaxbundle.choices import TESTS
 from jaxbundle.commands.scanner_inputs import (
     Message,
     check_spheroid,
@@ -18,13 +21,19 @@ from jaxbundle.commands.scanner_tables import ScannerTable
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.geometry.ellipsoid import WGS84
+from jaxbundle.io.rasters.extent import pole_in_image
+from jaxbundle.io.rasters.geoid import undulations
+from jaxbundle.io.rasters.maps import MapSystem
 from jaxbundle.io.scanner.rpc import read_rpc, write_rpc
 from jaxbundle.io.text.csv_tables import read_csv
 from jaxbundle.io.text.known_keys import UnknownKeys
+from jaxbundle.leastsquares.quality.distributions import critical_w
 from jaxbundle.network.columns import Columns
-from jaxbundle.pushbroom.rpc.bias import apply_bias, fit_bias
+from jaxbundle.pushbroom.rpc.bias import RpcBias, apply_bias, fit_bias, project_compensated
 from jaxbundle.pushbroom.rpc.fitting import RpcCheck, RpcTable, fit_image, fit_rpc
 from jaxbundle.pushbroom.rpc.polynomials import Rpc, RpcStatus, locate_points_on, project_points
+from jaxbundle.system.programs import compile_once
+from jaxbundle.types import present
 
 COLUMNS = ("longitude", "latitude", "height", "line", "sample")
 GROUND_SIGMA = ("seast", "snorth", "sheight")
@@ -70,7 +79,7 @@ def fit(
 
     **Raises:** `InputError`; `NotSolvedError` if the fit does not converge.
     """
-    path, check = Path(source), None
+    path, check, pole = Path(source), None, None
     low, high = heights
     if not (np.isfinite([low, high]).all() and low < high):
         raise InputError(
@@ -87,6 +96,7 @@ def fit(
         if file.earth != WGS84:
             tell(f"{path}: the ellipsoid is not WGS84, as other programs assume")
         found, check = fit_image(file.image, file.earth, (low, high), ridge=ridge)
+        pole = pole_in_image(file.image, file.earth)
     if not found.converged:
         raise NotSolvedError(
             f"{path}: the fit does not converge; give a larger --ridge than "
@@ -95,10 +105,14 @@ def fit(
     checks = {"fit": found.check} | ({"check": check} if check is not None else {})
     largest = max(c.largest.max() for c in checks.values())
     if largest > 0.5:  # pixel: places may then fall into the neighbouring one
+        reason = "the coefficients do not follow jitter faster than a cubic over the image"
+        if pole is not None:
+            reason = (
+                f"it shows the {pole}, where no polynomials of longitude and latitude follow it"
+            )
         tell(
-            f"{path}: residuals up to {largest:.3g} pixel: the coefficients do not follow "
-            "jitter faster than a cubic over the image; cut it into shorter pieces, or use the "
-            "rigorous model"
+            f"{path}: residuals up to {largest:.3g} pixel: {reason}; cut it into shorter pieces, "
+            "or use the rigorous model"
         )
     figures: dict[str, float] = {"points": len(found.check.residuals)}
     for name, one in checks.items():
@@ -160,27 +174,64 @@ def compensate(
     *,
     model: str = "shift",
     sigma: float = 1.0,
+    snooping: str = "none",
+    significance: float = 0.001,
+    crs: str | None = None,
+    geoid: str | Path | None = None,
 ) -> ScannerRpc:
     """Remove the bias of coefficients that control points show. Of arrays: `fit_bias`,
     `apply_bias`.
 
-    **Arguments:** `control`: table longitude, latitude, height, line, sample[, id, seast, snorth,
-    sheight] (degrees, metres, pixels); `model`: "shift", "affine" or "quadratic", in the image;
-    `sigma`: of measured lines and samples, pixels.
+    **Arguments:**
 
-    **Returns:** the compensated coefficients; of every control point residuals, redundancy numbers
-    and w; the bias with σ.
+    - `control`: table longitude, latitude, height, line, sample[, id, role, seast, snorth, sheight]
+      (degrees, metres, pixels); `role` is `control`, the default, or `check`: compared only.
+    - `model`: "shift", "affine" or "quadratic", in the image; `sigma`: of measured lines and
+      samples, pixels.
+    - `snooping`: "none", "baarda" or "pope": points whose w is beyond the limit of this
+      `significance` are left out, the worst one first.
+    - `crs`: a projected system, in which the table has x and y instead of longitude and latitude;
+      `geoid`: heights are above it, as of `locate`.
+
+    **Returns:** the compensated coefficients; of every point residuals, of control points
+    redundancy numbers and w, and what it was used for; the bias with σ, the RMS of check points.
 
     **Raises:** `InputError`.
     """
+    if snooping not in ("none", *TESTS):
+        raise InputError(f"snooping {snooping!r}; one of none, {', '.join(TESTS)} is expected")
+    if not 0 < significance < 1:
+        raise InputError(f"significance is {significance:g}; between 0 and 1 is expected")
     given = read_rpc(Path(coefficients))
-    table, columns = _read_points(Path(control), ("id", *GROUND_SIGMA))
-    ground = None
+    optional = ("id", "role", *GROUND_SIGMA)
+    table, columns = _read_points(Path(control), optional, crs, geoid)
+    ground = np.zeros((len(columns), 3))
     if any(name in columns.values for name in GROUND_SIGMA):
         ground = np.stack([columns.numbers(name, required=True) for name in GROUND_SIGMA], 1)
-    found = fit_bias(
-        given, table, model=model, sigma=sigma, ground_sigma=ground, source=columns.source
+    role = _roles(columns)
+    fit = lambda rows: fit_bias(
+        given,
+        RpcTable(*(np.asarray(column)[rows] for column in table)),
+        model=model,
+        sigma=sigma,
+        ground_sigma=ground[rows],
+        source=columns.source.take(rows),
     )
+    used = np.flatnonzero(role == "control")
+    if not len(used):
+        raise InputError(f"{columns.source.name}: no control point; role is check in all rows")
+    found = fit(used)
+    while snooping != "none" and found.redundancy > 0:
+        w = np.nan_to_num(np.abs(found.w))
+        limit = critical_w(snooping, significance, w.size, found.redundancy, found.sigma0)
+        # with one point less at least as many as the bias needs, and one that tests it
+        least = len(found.cofactor) // 2 + 1
+        if w.max() <= limit or len(used) <= least:
+            break
+        worst = int(w.max(1).argmax())
+        role[used[worst]] = "removed"
+        used = np.delete(used, worst)
+        found = fit(used)
     changed, left = apply_bias(given, found.bias)
     # the same terms in lines and in samples
     k = len(found.cofactor) // 2
@@ -189,20 +240,80 @@ def compensate(
     figures = {"sigma0": found.sigma0, "redundancy": found.redundancy, **dict(zip(names, values))}
     sigmas = np.sqrt(np.diag(found.covariance)).tolist()
     figures |= {f"s_{name}": s for name, s in zip(names, sigmas)}
+    residuals = _residuals_of_all(given, found.bias, table)
+    figures |= {"control_points": len(used), "removed_points": int((role == "removed").sum())}
+    if (check := role == "check").any():
+        rms = np.sqrt(np.mean(residuals[check] ** 2, axis=0))
+        figures |= {"check_points": int(check.sum())}
+        figures |= {f"check_rms_{a}": float(v) for a, v in zip(("line", "sample"), rms)}
     if left is not None:
         figures |= _figures("refit", left)
-    rows = {"id": _ids(columns)}
+    spread = lambda values: _in_rows(values, used, len(columns))
+    rows: dict[str, Any] = {"id": _ids(columns), "role": role.tolist()}
     for i, axis in enumerate(("line", "sample")):
-        rows |= {f"v_{axis}": found.residuals[:, i], f"r_{axis}": found.redundancy_numbers[:, i]}
-        rows |= {f"w_{axis}": found.w[:, i]}
+        rows |= {f"v_{axis}": residuals[:, i]}
+        rows |= {f"r_{axis}": spread(found.redundancy_numbers[:, i])}
+        rows |= {f"w_{axis}": spread(found.w[:, i])}
     return ScannerRpc(rows, figures, changed)
 
 
-def _read_points(path: Path, optional: tuple[str, ...] = ()) -> tuple[RpcTable, Columns]:
+def _roles(columns: Columns) -> np.ndarray:
+    """What every point is for: control or check."""
+    if "role" not in columns.values:
+        return np.full(len(columns), "control", object)
+    roles = np.array(columns.ids("role"), object)
+    if (strange := ~np.isin(roles, ("control", "check"))).any():
+        row = int(strange.argmax())
+        raise InputError(
+            f"{columns.source(row)}: role is {roles[row]!r}; control or check is expected"
+        )
+    return roles
+
+
+def _residuals_of_all(rpc: Rpc, bias: RpcBias, table: RpcTable) -> np.ndarray:
+    """Computed with the bias minus measured, of all points [n, 2]."""
+    computed = _images(rpc, bias, *map(np.asarray, table[:3]))
+    return np.stack([np.asarray(c) - m for c, m in zip(computed, table[3:])], 1)
+
+
+_images = compile_once(jax.vmap(project_compensated, (None, None, 0, 0, 0)), ())
+
+
+def _in_rows(values: np.ndarray, rows: np.ndarray, number: int) -> np.ndarray:
+    """Values of some rows among all, NaN for the others."""
+    out = np.full(number, np.nan)
+    out[rows] = values
+    return out
+
+
+def _read_points(
+    path: Path,
+    optional: tuple[str, ...] = (),
+    crs: str | None = None,
+    geoid: str | Path | None = None,
+) -> tuple[RpcTable, Columns]:
     columns = read_csv(path)
-    columns.check_names(COLUMNS, ("id", *optional))
+    names = COLUMNS if crs is None else ("x", "y", *COLUMNS[2:])
+    columns.check_names(names, ("id", *optional))
+    if crs is None:
+        east, north, height = geographic(columns)
+    else:
+        x, y, height = (columns.numbers(name, required=True) for name in names[:3])
+        place = present(MapSystem(WGS84, crs).transformer).transform(x, y, direction="INVERSE")
+        east, north = np.radians(place)
+        if (bad := ~(np.isfinite(east) & np.isfinite(north))).any():
+            row = int(bad.argmax())
+            raise InputError(
+                f"{columns.source(row)}: x, y are no place of {crs}; check their order"
+            )
+    if geoid is not None:
+        N = np.diagonal(undulations(Path(geoid), np.degrees(east), np.degrees(north)))
+        if (missing := ~np.isfinite(N)).any():
+            row = int(missing.argmax())
+            raise InputError(f"{columns.source(row)}: {geoid} has no height of the geoid there")
+        height = height + N
     measured = (columns.numbers(name, required=True) for name in COLUMNS[3:])
-    return RpcTable(*geographic(columns), *measured), columns
+    return RpcTable(east, north, height, *measured), columns
 
 
 def _ids(columns: Columns) -> Sequence[str]:

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid, earth_fixed
-from jaxbundle.io.rasters.extent import image_extent, rpc_extent
+from jaxbundle.io.rasters.extent import image_extent, pole_in_image, rpc_extent
 from jaxbundle.io.rasters.geoid import add_geoid
 from jaxbundle.io.rasters.terrain_models import read_terrain
 from jaxbundle.io.scanner.read import EXPECTED_PRODUCTS, PRODUCTS, read_scanner
@@ -59,6 +59,13 @@ def surface_of(
             extent = rpc_extent(image if isinstance(image, Rpc) else image.rpc)
         elif image is not None and earth is not None:
             extent = image_extent(image, earth)
+            pole = pole_in_image(image, earth) if extent is None else None
+            if pole is not None:
+                raise InputError(
+                    f"{dem}: the image shows the {pole}, where the cells of a terrain model in "
+                    "longitude and latitude, to which every model is resampled, fall apart; give "
+                    "--height instead, or cut the image there"
+                )
         terrain = read_terrain(dem, earth, extent, above_geoid=geoid is not None)
         return terrain if geoid is None else add_geoid(terrain, Path(geoid))
     if earth is None:

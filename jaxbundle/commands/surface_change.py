@@ -24,6 +24,7 @@ from jaxbundle.surfaces.height_cells import (
     UncertainCells,
     align,
     middle_of,
+    place_of,
 )
 from jaxbundle.surfaces.oriented_errors import OrientedErrors, choose_images, oriented_errors
 from jaxbundle.surfaces.point_files import read_cloud
@@ -41,9 +42,11 @@ NOTHING_SHARED = (
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class ChangeResult(TableMethods):
-    """The change between two surfaces: `change` cell by cell."""
+    """The change between two surfaces: `change` cell by cell; `warnings`: what makes its σ
+    doubtful."""
 
     change: SurfaceChange
+    warnings: tuple[str, ...] = ()
 
     @cached_property
     def figures(self) -> Mapping[str, Any]:
@@ -51,8 +54,8 @@ class ChangeResult(TableMethods):
         return summary(self.change)
 
     def to_dict(self) -> dict[str, Any]:
-        """Counts, shares and volumes as plain dicts and numbers."""
-        return without_nan(dict(self.figures))
+        """Counts, shares, volumes and warnings as plain dicts, lists and numbers."""
+        return without_nan({**self.figures, "warnings": list(self.warnings)})
 
     def table(self) -> dict[str, np.ndarray]:
         """The regions with their volumes; first all cells."""
@@ -80,7 +83,7 @@ class ChangeResult(TableMethods):
                 f"{name}: {region.cells} cells, mean {region.mean:.4g}, volume "
                 f"{region.volume:.6g}, σ {region.sigma:.3g}"
             )
-        return "\n".join(lines)
+        return "\n".join([*lines, *(f"warning: {words}" for words in self.warnings)])
 
 
 def change(  # noqa: PLR0913 (public: the options of the command, all but two by name)
@@ -129,24 +132,25 @@ def change(  # noqa: PLR0913 (public: the options of the command, all but two by
         after, after_sigma, after_errors or {}, size, "after", after_orientation is not None
     )
     _check_systems(first, second)
-    masks = [open_cells(path) for path in (stable, regions) if path is not None]
-    # masks are on the same lattice: the result has the cells that all of them have
-    first, second, *masks = align(first, second, masks)
+    first, second = align(first, second)
     if same_adjustment:
         if before_orientation is None or after_orientation is None:
             raise InputError("--same-adjustment: give --before-orientation and --after-orientation")
         if {*(before_errors or ()), *(after_errors or ())} - {"cell"}:
             raise InputError("--same-adjustment: of stated errors only cell can be given")
-    oriented = _orientations(
+    oriented, warnings = _orientations(
         (before_orientation, after_orientation),
         (before_images, after_images),
         (first, second),
         same_adjustment,
     )
-    given = [path for path in (stable, regions) if path is not None]
-    whole = [_read_mask(path, mask) for path, mask in zip(given, masks)]
-    chosen = whole.pop(0) != 0 if stable is not None else None
-    labels = whole.pop(0) if regions is not None else None
+    for given, cells, errors, name in zip(
+        (before, after), (first, second), oriented, ("before", "after")
+    ):
+        if errors is not None and not isinstance(given, HeightGrid):
+            warnings += _doubled_sigma(Path(given), cells, name)
+    chosen = None if stable is None else _read_mask(stable, first) != 0
+    labels = None if regions is None else _read_mask(regions, first)
     found = find_change(
         _with_errors(first, oriented[0], before_errors or {}),
         _with_errors(second, oriented[1], after_errors or {}),
@@ -155,7 +159,20 @@ def change(  # noqa: PLR0913 (public: the options of the command, all but two by
         labels,
         same_adjustment,
     )
-    return ChangeResult(found)
+    return ChangeResult(found, tuple(warnings))
+
+
+def _doubled_sigma(path: Path, cells: CellSource, name: str) -> list[str]:
+    """What is said of σ of cells that may contain the errors of the orientations already."""
+    if isinstance(cells, RasterCells):
+        if cells.sigma is None or cells.sigma.without_orientation:
+            return []
+        path = cells.sigma.path
+    return [
+        f"{path}: has no σ of its own, without the errors of the orientations; where its σ contain "
+        f"them they count twice with --{name}-orientation, and changes are missed: give a model of "
+        "surface --dsm, whose file of σ has both, or leave the option out"
+    ]
 
 
 def _open(
@@ -208,13 +225,23 @@ def _with_cell_error(grid: HeightGrid, cell: float) -> HeightGrid:
 
 
 def _read_mask(path: str | Path, cells: CellSource) -> Int[np.ndarray, "rows columns"]:
-    """A raster of whole numbers, 0 where there is nothing."""
-    rows, columns = cells.shape
-    found = np.zeros((rows, columns), np.int32)
+    """A raster of whole numbers on the lattice of some cells, 0 where there is nothing: it marks
+    cells, and need not have all of them."""
+    mask = open_cells(path)
+    found = np.zeros(cells.shape, np.int32)
+    row, column = place_of(mask, cells)
+    rows, columns = (
+        slice(max(at, 0), min(at + n, size))
+        for at, n, size in zip((row, column), mask.shape, cells.shape)
+    )
+    if rows.start >= rows.stop or columns.start >= columns.stop:
+        raise InputError(f"{path}: has no cell of the surfaces; check its coordinate system")
     # 512 rows of 10 000 cells are 40 MB
-    for first in range(0, rows, 512):
-        part = slice(first, min(first + 512, rows))
-        values = np.nan_to_num(cells.window(part, slice(0, columns)).height)
+    for start in range(rows.start, rows.stop, 512):
+        part = slice(start, min(start + 512, rows.stop))
+        there = slice(part.start - row, part.stop - row)
+        across = slice(columns.start - column, columns.stop - column)
+        values = np.nan_to_num(mask.window(there, across).height)
         # a fraction would be cut to another region, or a stable cell to none
         strange = (values != np.rint(values)) | (np.abs(values) >= 2**31)
         if strange.any():
@@ -222,7 +249,7 @@ def _read_mask(path: str | Path, cells: CellSource) -> Int[np.ndarray, "rows col
                 f"{path}: has a cell of {values[strange][0]:g}; whole numbers below 2³¹ are "
                 "expected, 0 for none"
             )
-        found[part] = values
+        found[part, columns] = values
     return found
 
 
@@ -254,9 +281,10 @@ def _orientations(
     patterns: tuple[str, str],
     surfaces: tuple[CellSource, CellSource],
     same: bool,
-) -> tuple[OrientedErrors | None, OrientedErrors | None]:
-    """The errors of the orientations of both surfaces. Of `same` adjustment they are those of all
-    its images that either was made of, in one order."""
+) -> tuple[tuple[OrientedErrors | None, OrientedErrors | None], list[str]]:
+    """The errors of the orientations of both surfaces, and warnings. Of `same` adjustment they are
+    those of all its images that either was made of, in one order."""
+    warnings: list[str] = []
     made: list[OrientedErrors | None] = []
     chosen = [None if p is None else choose_images(p, text) for p, text in zip(paths, patterns)]
     for path, mine, cells in zip(paths, chosen, surfaces):
@@ -266,10 +294,17 @@ def _orientations(
         others = [one.names for one in chosen if one is not None] if same else []
         errors = oriented_errors(mine, set().union(*others), cells.system)
         # of another project all columns of L would be 0, and the errors missing in silence
-        if not errors.sees(cells):
+        seen = errors.share_seen(cells)
+        if seen == 0:
             raise InputError(
                 f"{path}: no cell of the surface is in two of its images; is it the project of "
                 "this surface, in its coordinate system?"
+            )
+        if seen < 1:
+            warnings.append(
+                f"{path}: {100 * (1 - seen):.3g} % of the cells with a height are in fewer than "
+                "two of its images: their σ have no errors of orientations, and are too small if "
+                "they were made of other images"
             )
         made.append(errors)
     one, other = made
@@ -278,4 +313,4 @@ def _orientations(
             "--same-adjustment: the orientations of both surfaces are not those of one adjustment; "
             "give its folder twice"
         )
-    return one, other
+    return (one, other), warnings

@@ -1,9 +1,10 @@
-"""The line scanner explorer: interpolation, attitude errors, corrections, and ground height.
+"""The line scanner explorer: track and attitude trajectories, interpolation, attitude errors,
+corrections, ground height, and pictures of a scene.
 
 Two kinds of files. Changes of a *scanner file* are compared with the unchanged image, or with a
 known truth. A *flight file* is simulated: the records of its instruments, sampled, noisy
-and interpolated by the chosen methods, are compared with the true trajectory; its rates and σ are
-controls too.
+and interpolated by the chosen methods, are compared with the true trajectory; its track, the form
+of its attitudes, its rates and σ are controls too.
 
 Attitude errors are given as roll, pitch, yaw of the camera (R·exp([ε]×)) and put into the rows of
 the table, so that the exported flight file has them. Ground places are those of `locate`, the error
@@ -16,9 +17,9 @@ import io
 import tempfile
 import zipfile
 from collections.abc import Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -26,7 +27,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from jaxbundle.choices import RESAMPLINGS, Resampling
 from jaxbundle.errors import InputError
+from jaxbundle.explorer.attitudes import attitude_controls, attitude_forms, choose_angles
 from jaxbundle.explorer.page import (
     Choice,
     Control,
@@ -37,8 +40,19 @@ from jaxbundle.explorer.page import (
     make_page,
     place,
 )
+from jaxbundle.explorer.pictures import (
+    GroundFrame,
+    Taken,
+    draw_pictures,
+    frame_around,
+    pattern,
+    scene_of_raster,
+    take_pictures,
+    without_pictures,
+)
 from jaxbundle.explorer.tracks import (
     ORBIT,
+    PLACES,
     STRAIGHT,
     Tracks,
     choose_track,
@@ -48,7 +62,9 @@ from jaxbundle.explorer.tracks import (
     tracks_of,
 )
 from jaxbundle.explorer.view import File, Given, check_keys, number, switch, word
+from jaxbundle.geometry import omega_phi_kappa_from_matrix
 from jaxbundle.geometry.ellipsoid import Ellipsoid, earth_fixed, geodetic
+from jaxbundle.io.rasters.scenes import SceneRaster
 from jaxbundle.io.scanner.writing import write_scanner_image
 from jaxbundle.plotting import image_map
 from jaxbundle.plotting.files import png
@@ -63,21 +79,28 @@ from jaxbundle.pushbroom.error_propagation import (
     spread_positions,
 )
 from jaxbundle.pushbroom.flight import Flight, measured_image, true_image, with_errors_in_rows
-from jaxbundle.pushbroom.image import PushbroomImage, make_image, pose_at
+from jaxbundle.pushbroom.image import PushbroomImage, make_image, pose_at, recorded_pose
 from jaxbundle.pushbroom.image_to_ground import locate_points
 from jaxbundle.pushbroom.interpolation import METHODS, TimeTable
 from jaxbundle.pushbroom.noise import Noise, Sigma, zero_errors
 from jaxbundle.pushbroom.study import altitude_and_view
 from jaxbundle.pushbroom.surfaces import Ground, GroundSurface, Height, Plane
-from jaxbundle.pushbroom.trajectory import AttitudeTable, Trajectory, trajectory_in_pieces
+from jaxbundle.pushbroom.trajectory import (
+    AttitudeTable,
+    Trajectory,
+    orbital_frame,
+    trajectory_in_pieces,
+)
 from jaxbundle.report.layout import clean, significant
 from jaxbundle.report.page import UNKNOWN, Origin, Page, Section
-from jaxbundle.report.page.charts import Curve, draw_field, draw_plan
+from jaxbundle.report.page.charts import ChartLayout, Curve, draw_curves, draw_field, draw_plan
 from jaxbundle.report.page.markup import figure, grid, paragraph
+from jaxbundle.types import present
 
 # The index of an angle in an attitude error: about right (pitch), forward (roll), up (yaw).
 ANGLES = {"roll": 1, "pitch": 0, "yaw": 2}
-POSITIVE_KEYS = ("altitude", "speed", "height")
+# Ends of the keys of values that are not negative: of σ, and of walks; the height of an orbit.
+POSITIVE_KEYS = ("white", "walk")
 FLIGHT_FILE, TABLE_FILE, PICTURE_FILE = "flight.zip", "accuracy.csv", "error_map.png"
 
 
@@ -96,7 +119,9 @@ class FlightView:
 
     **Arguments:** `given` the image, or the flight; `earth`: the ellipsoid, None in a local frame;
     `truth`: an image that is true, the given one if none is given; `cells`: parts of the image,
-    along lines and pixels, of the error map, with irregular positions in each.
+    along lines and pixels, of the error map, with irregular positions in each; `scene`: a raster
+    that the pictures show, in the coordinates of the Earth or the local frame of the image; without
+    one they show a pattern.
     """
 
     def __init__(
@@ -107,8 +132,10 @@ class FlightView:
         truth: PushbroomImage | None = None,
         origin: Origin = UNKNOWN,
         cells: tuple[int, int] = (7, 6),
+        scene: SceneRaster | None = None,
     ):
-        self.cells = cells
+        self.cells, self.raster = cells, scene
+        self._scenes: dict[str, tuple[GroundFrame, np.ndarray]] = {}
         self.name, self.earth, self.origin = name, earth, origin
         self.flight = given if isinstance(given, Flight) else None
         self.image = measured_image(given) if isinstance(given, Flight) else given
@@ -121,6 +148,13 @@ class FlightView:
         self.tracks = (
             None if self.flight is None else tracks_of(self.flight.track, self.image, earth)
         )
+        self.forms = (
+            None
+            if self.flight is None
+            else attitude_forms(
+                self.flight.angles, self.flight.period * max(self.flight.lines - 1, 1)
+            )
+        )
 
     # --- values -----------------------------------------------------------------------------
 
@@ -132,10 +166,11 @@ class FlightView:
         ways = [m for m in METHODS if m != "hermite" or position.rates is not None]
         turns = [m for m in METHODS if m != "hermite"] + ["slerp"] * quaternions
         found: list[Control] = []
-        if self.tracks is not None:
+        if self.tracks is not None and self.forms is not None:
             found += [
-                Choice("track", "trajectory", self.tracks.kind, (ORBIT, STRAIGHT)),
+                Choice("track", "trajectory", self.tracks.kind, (ORBIT, PLACES, STRAIGHT)),
                 *track_controls(self.tracks),
+                *attitude_controls(self.forms),
             ]
         found += [
             Choice(
@@ -171,7 +206,11 @@ class FlightView:
                 Switch(name, name.replace("_", " "), on)
                 for name, on in zip(Corrections._fields, self.image.corrections)
             ]
-        return [*found, Number("ground", "height of the ground", 0.0, "m")]
+        return [
+            *found,
+            Number("ground", "height of the ground", 0.0, "m"),
+            Choice("resampling", "resampling of the pictures", "bilinear", RESAMPLINGS),
+        ]
 
     def values(self, given: Given) -> dict[str, Any]:
         """All values by key, by default those of the file.
@@ -181,8 +220,12 @@ class FlightView:
         found: dict[str, Any] = {}
         for one in self.controls:
             if isinstance(one, Number):
-                lowest = 0.0 if one.key.endswith("white") or one.key in POSITIVE_KEYS else -np.inf
-                found[one.key] = number(given, one.key, one.value, lowest)
+                positive = one.key.endswith(POSITIVE_KEYS) or one.key == "height"
+                found[one.key] = number(given, one.key, one.value, 0.0 if positive else -np.inf)
+                if one.key.endswith("period") and not found[one.key] > 0:
+                    raise InputError(f"{one.key} is {found[one.key]:g}; above 0 is expected")
+                if one.key.endswith("latitude") and not abs(found[one.key]) <= 90:
+                    raise InputError(f"{one.key} is {found[one.key]:g}; from -90 to 90 is expected")
                 if one.key.endswith("rate") and not 0 < found[one.key] <= 1000:
                     raise InputError(f"{one.key} is {found[one.key]:g}; above 0, to 1000 Hz")
             elif isinstance(one, Switch):
@@ -199,9 +242,10 @@ class FlightView:
         if self.flight is not None and self.tracks is not None:
             flight = self._flight_with(self.flight, self.tracks, values)
             image = measured_image(flight)
-            if flight.track != self.flight.track:
+            given = self.flight
+            if flight.track is not given.track or flight.angles is not given.angles:
                 truth = true_image(flight)
-            earth = self.tracks.earth if values["track"] == ORBIT else None
+            earth = None if values["track"] == STRAIGHT else self.tracks.earth
         trajectory = Trajectory(
             _table_with(image.trajectory.position, values["position_interpolation"]),
             _attitude_with(image.trajectory.attitude, values["attitude_interpolation"]),
@@ -242,6 +286,7 @@ class FlightView:
             flight,
             noise=noise,
             track=choose_track(tracks, values),
+            angles=choose_angles(present(self.forms), values),
             **{n: values[n] for n in names},
         )
 
@@ -249,8 +294,9 @@ class FlightView:
 
     def answer(self, given: Given) -> dict[str, Any]:
         """`parts`; `rms`, `ce90`, `largest` of the errors on the ground, metres; `errors`: the RMS
-        of each part of the image [lines, pixels]; `expected`: rows of the accuracy table; `idle`:
-        controls without effect."""
+        of each part of the image [lines, pixels]; `expected`: rows of the accuracy table;
+        `difference`: of the map and the scene, RMS of 255 grey values; `idle`: controls without
+        effect."""
         values = self.values(given)
         chosen = _in_pieces(self.choose(values))
         errors = self._errors(chosen)
@@ -264,8 +310,11 @@ class FlightView:
         rms, ce90 = np.sqrt(np.mean(length**2)), np.quantile(length, 0.9)
         told = {"rms": float(rms), "ce90": float(ce90), "largest": float(length.max())}
         field = self._rms_of_cells(length)
+        pictures, difference = self._draw_pictures(chosen, values)
         return {
             "parts": {
+                "flight": self._draw_flight(chosen),
+                "pictures": pictures,
                 "ground": self._draw_ground(chosen),
                 "errors": self._draw_errors(field, told),
                 "accuracy": self._list(told, errors, expected),
@@ -273,6 +322,7 @@ class FlightView:
             **told,
             "errors": field.tolist(),
             "expected": expected,
+            "difference": difference,
             "idle": self._idle(values),
         }
 
@@ -326,9 +376,11 @@ class FlightView:
                         ),
                         draw_controls(controls, live),
                         draw_tools(live, exports),
+                        place("flight"),
                     ]
                 ),
             ),
+            Section("pictures-section", "Pictures", place("pictures"), "Pictures"),
             Section("accuracy-section", "Accuracy", place("accuracy"), "Accuracy"),
             Section("errors-section", "Error map", place("errors"), "Error map"),
             Section("ground-section", "Ground track and footprint", place("ground"), "Ground"),
@@ -384,6 +436,88 @@ class FlightView:
                 }
             )
         return rows
+
+    # --- pictures ---------------------------------------------------------------------------
+
+    def take_pictures(self, given: Given) -> Taken:
+        """Scene, image and map with these values.
+
+        **Raises:** `InputError`."""
+        values = self.values(given)
+        return self._take_pictures(_in_pieces(self.choose(values)), values)
+
+    def _take_pictures(self, chosen: Chosen, values: Mapping[str, Any]) -> Taken:
+        frame, scene = self._scene(values.get("track", ""), chosen)
+        images = chosen.truth, chosen.image
+        return take_pictures(scene, frame, *images, chosen.surface, _kernel(values))
+
+    def _scene(self, kind: str, chosen: Chosen) -> tuple[GroundFrame, np.ndarray]:
+        """The scene around the image of the file, or of a track of another kind with its first
+        values: it stays where it is when values change."""
+        if chosen.earth is not None and chosen.earth.a != chosen.earth.b:
+            raise InputError("the ellipsoid has three different axes")
+        if kind not in self._scenes:
+            truth = self.truth
+            if self.flight is not None and self.tracks is not None and kind != self.tracks.kind:
+                track = choose_track(self.tracks, self.values({"track": kind}))
+                truth = true_image(dataclasses.replace(self.flight, track=track))
+            surface = _surface_at(0.0, chosen.earth)
+            frame = frame_around(truth, surface, _outline(truth))
+            fits = (chosen.earth is None) == (self.earth is None)
+            if self.raster is not None and fits:
+                self._scenes[kind] = frame, scene_of_raster(self.raster, frame, surface)
+            else:
+                self._scenes[kind] = frame, pattern(frame)
+        return self._scenes[kind]
+
+    def _draw_pictures(self, chosen: Chosen, values: Mapping[str, Any]) -> tuple[str, float | None]:
+        """The pictures, and the difference of map and scene; words in their place where there are
+        none, since the numbers are of use without them."""
+        try:
+            taken = self._take_pictures(chosen, values)
+            frame, _ = self._scene(values.get("track", ""), chosen)
+            return draw_pictures(taken, frame, _kernel(values)), taken.rms
+        except InputError as error:
+            return without_pictures(error), None
+
+    def _draw_flight(self, chosen: Chosen, places: int = 240) -> str:
+        """The ends of the track; roll, pitch and yaw over the lines, true and as recorded, in the
+        orbital or the local frame."""
+        image, earth, _, truth = chosen
+        lines = np.linspace(0, image.lines - 1, places)
+        angles = [
+            np.degrees(_angles(one, jnp.asarray(lines), earth is not None))
+            for one in (truth, image)
+        ]
+        charts = []
+        for name, k in ANGLES.items():
+            curves = [
+                Curve(label, lines, values[k], None, kind)
+                for values, label, kind in zip(angles, ("true", "recorded"), ("second", "first"))
+            ]
+            drawn = draw_curves(curves, "line", f"{name} [°]", layout=ChartLayout(height=220))
+            charts.append(figure(drawn, name))
+        ends = np.array(_positions(truth, jnp.asarray([0.0, image.lines - 1.0])))
+        if earth is None:
+            header = ("track", "X [m]", "Y [m]", "Z [m]")
+            rows = [[f"{v:.3f}" for v in P] for P in ends]
+        else:
+            header = ("track", "longitude [°]", "latitude [°]", "height [m]")
+            geodetic_ends = np.array([[float(v) for v in geodetic(earth, tuple(P))] for P in ends])
+            rows = [
+                (f"{np.degrees(a):.6f}", f"{np.degrees(b):.6f}", f"{h:.1f}")
+                for a, b, h in geodetic_ends
+            ]
+        seconds = float(image.times.time(image.lines - 1.0) - image.times.time(0.0))
+        length = np.linalg.norm(ends[1] - ends[0])
+        told = f"{seconds:.6g} s, {length:.6g} m"
+        if seconds > 0:
+            told += f", {length / seconds:.6g} m/s"
+        return (
+            grid(header, [("first line", *rows[0]), ("last line", *rows[1])])
+            + paragraph(f"From the first line to the last: {told}.", "hint")
+            + f'<div class="pictures">\n{"".join(charts)}</div>\n'
+        )
 
     def _draw_ground(self, chosen: Chosen) -> str:
         image, earth, surface, truth = chosen
@@ -567,6 +701,10 @@ def _with_value(control: Control, value: Any) -> Control:
     return control._replace(value=value)
 
 
+def _kernel(values: Mapping[str, Any]) -> Resampling:
+    return cast(Resampling, values["resampling"])
+
+
 def _control(controls: list[Control], key: str) -> Control:
     return next(one for one in controls if one.key == key)
 
@@ -586,6 +724,18 @@ _pieces = jax.jit(trajectory_in_pieces)
 _positions = jax.jit(
     lambda image, lines: jax.vmap(lambda line: pose_at(image, image.times.time(line)).P)(lines)
 )
+
+
+@partial(jax.jit, static_argnums=2)
+def _angles(image: PushbroomImage, lines: Float[Array, " n"], orbital: bool) -> Float[Array, "3 n"]:
+    """Pitch, roll, yaw of the platform at some lines, radians."""
+
+    def of_line(line: Array) -> Float[Array, "3"]:
+        P, R, V = recorded_pose(image, image.times.time(line))
+        # angles are those of the transpose, as of ω, φ, κ
+        return omega_phi_kappa_from_matrix((orbital_frame(P, V).T @ R if orbital else R).T)
+
+    return jax.vmap(of_line, out_axes=1)(lines)
 
 
 @jax.jit

@@ -25,9 +25,10 @@ class AncillarySettings:
     """Limits of the checks of ancillary tables.
 
     - `rounded_length`: a quaternion whose length deviates from 1 by more is mentioned; components
-      with four decimals explain as much.
+      with three decimals, and components that other programs have adjusted one by one, explain as
+      much, and leave the direction where it is.
     - `max_length_error`: four numbers whose length deviates by more are no quaternion but a column
-      too many, angles or zeros. Components adjusted by other programs deviate by 1e-3.
+      too many, angles or zeros.
     - `extrapolated_steps`, `min_extrapolation`, `max_extrapolation`: product tables may end so many
       of their steps before the image, but at least and at most these times in seconds. In these a
       satellite falls ½·9 m/s²·t² = 1 cm and 1 m, mostly along the line of sight: what an
@@ -36,7 +37,7 @@ class AncillarySettings:
       1e-7 s in double precision, written dates to microseconds.
     """
 
-    rounded_length: float = 1e-4
+    rounded_length: float = 1e-3
     max_length_error: float = 0.1
     extrapolated_steps: float = 2.0
     min_extrapolation: float = 0.05

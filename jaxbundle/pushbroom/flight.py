@@ -1,9 +1,10 @@
 """Simulation: a true trajectory, its records by instruments, and the image.
 
-The true angles are sums of signals (`signals`) on a circular orbit about the rotating Earth, or on
-a straight line above a plane. Instruments sample position and attitude at their rates, with errors
-(`noise`). The image processing uses only these samples: its trajectory is interpolated from them.
-Without errors only the interpolation error remains.
+The true angles are sums of signals (`signals`) on a circular orbit about the rotating Earth, from
+one place above the Earth to another, or on a straight line above a plane. Instruments sample
+position and attitude at their rates, with errors (`noise`). The image processing uses only these
+samples: its trajectory is interpolated from them. Without errors only the interpolation error
+remains.
 """
 
 import dataclasses
@@ -40,7 +41,9 @@ class Flight:
     - `lines`, `pixels`, `period`, `optics`, `mounting`: the scanner.
     - `track`: `{"height", "inclination", "node", "argument"}` of a circular orbit, or
       `{"state", "at", "j2"}` of one Earth-fixed state vector (`orbit`), or
-      `{"start", "velocity"}` of a straight line in a local frame.
+      `{"start", "velocity"}` or `{"start", "end"}` of a straight line in a local frame, or
+      `{"start", "end", "centre"}`, Earth-fixed, of an arc about the centre of the Earth; the ends
+      are those of the first and the last line.
     - `angles`: signals of pitch, roll, yaw, in the orbital frame or the local one.
     - `position_rate`, `attitude_rate`: of the instruments, in Hz; `noise`: their errors.
     - `position_interpolation`, `attitude_interpolation`: of the samples.
@@ -121,12 +124,16 @@ def take_image(
     to_scene: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
     lines: Float[np.ndarray, " lines"],
     resampling: Resampling = "bilinear",
+    pixels: Float[np.ndarray, " pixels"] | None = None,
 ) -> Float[np.ndarray, "bands lines pixels"]:
     """Lines of the image of a scene; NaN outside the scene.
 
-    **Arguments:** `to_scene(X)` gives row and column in the scene of points X [3, lines, pixels].
+    **Arguments:** `to_scene(X)` gives row and column in the scene of points X [3, lines, pixels];
+    `pixels` of the lines, all by default.
     """
-    X = np.asarray(_ground(image, surface, lines, np.arange(image.pixels, dtype=float)))
+    if pixels is None:
+        pixels = np.arange(image.pixels, dtype=float)
+    X = np.asarray(_ground(image, surface, lines, pixels))
     row, column = to_scene(X)
     return np.asarray(_resample(scene, row, column, resampling))
 
@@ -159,6 +166,14 @@ def _samples(flight: Flight, rate: float) -> Float[np.ndarray, " rows"]:
 
 def _position(flight: Flight, rate: float, method: str) -> TimeTable:
     t, track = _samples(flight, rate), dict(flight.track)
+    if "end" in track:
+        start, end = (np.asarray(track[k], float) for k in ("start", "end"))
+        duration = flight.period * (flight.lines - 1)
+        _check_ends(start, end, duration)
+        if "centre" in track:
+            P, V = arc_between(t, start, end, duration, np.asarray(track["centre"], float))
+            return position_table(t, P, V, method=method)
+        track["velocity"] = (end - start) / duration
     if "start" in track:
         # a straight line is interpolated exactly
         start, velocity = (np.asarray(track[k], float) for k in ("start", "velocity"))
@@ -182,5 +197,50 @@ def _attitude(flight: Flight, rate: float, method: str) -> AttitudeTable:
         parts = parts if isinstance(parts, list | tuple) else [parts]
         rng = [np.random.default_rng([flight.seed, axis, k]) for k in range(len(parts))]
         angles.append(sum(signal(part, t, 0.0, r) for part, r in zip(parts, rng)))
-    reference = "earth" if "start" in flight.track else "orbit"
+    local = "start" in flight.track and "centre" not in flight.track
+    reference = "earth" if local else "orbit"
     return attitude_table(t, np.stack(angles, 1), method=method, reference=reference)
+
+
+def arc_between(
+    t: Float[np.ndarray, " rows"],
+    start: Float[np.ndarray, "3"],
+    end: Float[np.ndarray, "3"],
+    duration: float,
+    centre: Float[np.ndarray, "3"],
+) -> tuple[Float[np.ndarray, "rows 3"], Float[np.ndarray, "rows 3"]]:
+    """Positions (m) and velocities (m/s) at times t from `start` at 0 to `end` at `duration`.
+
+    The direction from the centre turns at a constant rate in the plane of both, the distance from
+    it changes linearly:
+
+        P = C + r·(cos α·u + sin α·w),    r = r₀ + ṙ·t,    α = α̇·t
+
+    with u towards the start and w at a right angle to it, in the plane.
+
+    **Raises:** `InputError` where both are on one line with the centre on opposite sides, which
+    leaves the plane open."""
+    towards = np.stack([start, end]) - centre
+    r = np.linalg.norm(towards, axis=1)
+    u, v = towards / r[:, None]
+    across = np.linalg.norm(np.cross(u, v))
+    # below this the direction of w is lost in the rounding of coordinates
+    aligned = across < 1e-12
+    if aligned and u @ v < 0:
+        raise InputError("track: start and end are opposite places of the Earth; give others")
+    w = np.zeros(3) if aligned else (v - (u @ v) * u) / across
+    turn, climb = np.arctan2(across, u @ v) / duration, (r[1] - r[0]) / duration
+    cos, sin = (f(turn * t)[:, None] for f in (np.cos, np.sin))
+    distance = (r[0] + climb * t)[:, None]
+    outward, forward = cos * u + sin * w, cos * w - sin * u
+    return centre + distance * outward, climb * outward + distance * turn * forward
+
+
+def _check_ends(
+    start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], duration: float
+) -> None:
+    """Refuse a track without length, or without time to fly it."""
+    if not duration > 0:
+        raise InputError("track: start and end need an image of two lines at least")
+    if (start == end).all():
+        raise InputError("track: start and end are the same place; give two")

@@ -93,7 +93,9 @@ def make_search(
     pieces = make_pieces(image, earth, settings)
     samples = sample_times(pieces, settings.search_times)
     line = fit_line(image.optics, image.pixels)
-    footprint = make_footprint(image, pieces, samples, line, earth, settings)
+    footprint = None
+    if settings.with_footprint:
+        footprint = make_footprint(image, pieces, samples, line, earth, settings)
     if footprint is None:
         samples = sample_times(pieces, settings.fine_search_times)
     return Search(pieces, footprint, samples, line, earth, settings)

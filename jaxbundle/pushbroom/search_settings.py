@@ -26,6 +26,8 @@ class SearchSettings:
     Footprint (`footprint`; lattice, speed, margin and error are not critical: images either advance
     steadily or turn back):
 
+    - `with_footprint`: without one every point is searched for, which takes ten times as long and a
+      third of the compilation: for a few hundred points of an image that keeps changing.
     - `footprint_heights`: lowest and highest height of points, metres, if the camera is more than
       twice as high: the Earth from the Dead Sea to Mount Everest.
     - `footprint_lattice`: times, pixels and heights of the lattice for cubic polynomials.
@@ -69,6 +71,7 @@ class SearchSettings:
     equal_times: float = 1e-6
     max_shared_pieces: int = 128
     times_at_once: int = 1024
+    with_footprint: bool = True
     footprint_heights: tuple[float, float] = (-1000.0, 10_000.0)
     footprint_lattice: tuple[int, int, int] = (17, 9, 4)
     min_relative_speed: float = 0.1

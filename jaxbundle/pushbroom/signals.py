@@ -39,7 +39,7 @@ def signal(
     **Arguments:** `description` a number, or `{"kind": …}` with the keys of the kind; missing ones
     are 0 (period or step 1 s). A walk draws from `rng`.
 
-    **Raises:** `InputError` for unknown kinds and keys.
+    **Raises:** `InputError` for unknown kinds and keys, periods and steps that are not positive.
     """
     if isinstance(description, int | float):
         return np.full(len(t), float(description))
@@ -50,6 +50,11 @@ def signal(
         if key not in ("kind", *KEYS[kind]):
             raise InputError(f"signal {kind!r}: unknown key {key!r}{did_you_mean(key, KEYS[kind])}")
     get = lambda key, default=0.0: float(description.get(key, default))
+    for key in ("period", "step"):
+        if not get(key, 1.0) > 0:
+            raise InputError(
+                f"signal {kind!r}: {key} is {get(key):g}; a positive number of seconds"
+            )
     passed = np.asarray(t) - start
     match kind:
         case "linear":
@@ -66,9 +71,13 @@ def signal(
 
 def _walk(passed: Times, sigma: float, step: float, rng: np.random.Generator) -> Times:
     """A random walk that is 0 at the start, the spline through one node in every step."""
-    # From a fixed time on, so that one seed gives one walk for any requested times; a minute before
-    # the start, as tables begin some rows before the image.
-    nodes = np.arange(-60.0, passed[-1] + 3 * step, step)
-    steps = sigma * np.sqrt(step) * rng.normal(size=len(nodes))
-    spline = CubicSpline(nodes, np.cumsum(steps))
-    return spline(passed) - spline(0.0)
+    # Forward and backward from the start by steps of their own: one seed gives one walk for any
+    # requested times. The end of a spline acts by a factor of 2 − √3 less at every node, so that 20
+    # nodes beyond the requested times leave nothing of it.
+    after, before = (20 + int(np.ceil(max(end, 0.0) / step)) for end in (passed[-1], -passed[0]))
+    forward, backward = (
+        np.cumsum(sigma * np.sqrt(step) * one.normal(size=n))
+        for one, n in zip(rng.spawn(2), (after, before))
+    )
+    values = np.concatenate([backward[::-1], [0.0], forward])
+    return CubicSpline(step * np.arange(-before, after + 1), values)(passed)

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.io.networks.orientation_covariance import OrientationCovariance, Unknown
 from jaxbundle.pushbroom.image import PushbroomImage
@@ -49,6 +50,14 @@ def _orientation(
     form: Form | None = None,
     domain: BiasDomain | None = None,
 ) -> GroundOrientation:
+    owners = {unknown[:2] for unknown in every}
+    strange = [u for u in joint.unknowns if u[:2] in owners and u not in every]
+    if strange:
+        # left out it would count as held, and σ would be too small
+        raise InputError(
+            f"{' '.join(strange[0][:2])} has no unknown {strange[0][2]!r}; the names are those "
+            "that pushbroom refine writes"
+        )
     # without a row in the covariance: held in the refinement, so that it has no error
     held = joint.index(every) < 0
     columns = tuple(np.flatnonzero(~held).tolist())
@@ -56,7 +65,9 @@ def _orientation(
 
 
 def rpc_orientation(joint: OrientationCovariance, id: str, domain: BiasDomain) -> GroundOrientation:
-    """Of an image with RPC; `domain` of the coefficients that were refined."""
+    """Of an image with RPC; `domain` of the coefficients that were refined.
+
+    **Raises:** `InputError` for unknowns that it cannot have."""
     every = tuple(("image", id, name) for name in names_of_terms(len(TERM_NAMES)))
     return _orientation(joint, every, domain=domain)
 
@@ -69,14 +80,18 @@ def scanner_orientation(
     earth: Ellipsoid | None,
     knot_spacing: float,
 ) -> GroundOrientation:
-    """Of a rigorous image; `knot_spacing` of its jitter, seconds."""
+    """Of a rigorous image; `knot_spacing` of its jitter, seconds.
+
+    **Raises:** `InputError` for unknowns that it cannot have."""
     of = lambda *owner: [name for *known, name in joint.unknowns if (*known,) == owner]
     jitter = any(" jitter " in name for name in of("image", id))
     look = {"across": 0, "along": 0}
     for word in look:
         # coefficients are counted by their largest exponent: lower ones may be held, and not listed
         named = [name for name in of("sensor", sensor) if f"look angle {word}" in name]
-        look[word] = max((int(name.rpartition("^")[2]) + 1 for name in named), default=0)
+        # one without a number is refused below, like all that is not known
+        exponents = [text for name in named if (text := name.rpartition("^")[2]).isdecimal()]
+        look[word] = max((int(text) + 1 for text in exponents), default=0)
     # only which unknowns there are matters here: σ are those of the covariance
     freedom = Freedom(
         jitter=(1.0, 1.0, 1.0) if jitter else (0.0, 0.0, 0.0),

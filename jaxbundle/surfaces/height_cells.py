@@ -2,7 +2,6 @@
 cells and the errors that cells share."""
 
 import dataclasses
-from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -215,24 +214,22 @@ class UncertainCells:
         return dataclasses.replace(self, cells=self.cells.part(rows, columns))
 
 
-def align(
-    before: CellSource, after: CellSource, more: Sequence[CellSource] = ()
-) -> tuple[CellSource, ...]:
-    """The common cells of grids, of the first two and `more`.
+def align(before: CellSource, after: CellSource) -> tuple[CellSource, CellSource]:
+    """The common cells of two grids.
 
     **Raises:** `InputError` if they are not on one lattice, or do not overlap.
     """
-    grids = before, after, *more
+    grids = before, after
     places = [place_of(grid, before) for grid in grids]
     first = [max(p[k] for p in places) for k in (0, 1)]
     last = [min(p[k] + g.shape[k] for p, g in zip(places, grids)) for k in (0, 1)]
     if min(last[k] - first[k] for k in (0, 1)) < 1:
-        masks = " and the rasters of --stable and --regions" if more else ""
-        raise InputError(f"the two surfaces{masks} do not overlap: check their coordinate systems")
-    return tuple(
+        raise InputError("the two surfaces do not overlap: check their coordinate systems")
+    one, other = (
         grid.part(*(slice(first[k] - p[k], last[k] - p[k]) for k in (0, 1)))
         for grid, p in zip(grids, places)
     )
+    return one, other
 
 
 def place_of(grid: CellSource, lattice: CellSource) -> tuple[int, int]:

@@ -14,7 +14,9 @@ from jaxbundle.system.rasters import check_georeference, open_raster, read_value
 @dataclasses.dataclass(frozen=True)
 class RasterCells:
     """A band of a raster, north up, as the heights of square cells; `sigma`: of these, of the same
-    cells, and `more_sigma`, of every cell; `first`: row and column of its first cell in the file.
+    cells, and `more_sigma`, of every cell; `first`: row and column of its first cell in the file;
+    `without_orientation`: of a file of σ: the band says that it is without the errors of the
+    orientations.
     """
 
     path: Path
@@ -27,6 +29,7 @@ class RasterCells:
     first: tuple[int, int] = (0, 0)
     sigma: "RasterCells | None" = None
     more_sigma: float = 0.0
+    without_orientation: bool = False
 
     @property
     def shared_errors(self) -> int:
@@ -79,7 +82,8 @@ class RasterCells:
                 names = list(source.descriptions)
             # the first band contains the errors that the columns of L carry: they would count twice
             if OWN_SIGMA in names:
-                found = dataclasses.replace(found, band=names.index(OWN_SIGMA) + 1)
+                band = names.index(OWN_SIGMA) + 1
+                found = dataclasses.replace(found, band=band, without_orientation=True)
         row, column = place_of(self, found)
         inside = row >= 0 and column >= 0
         inside &= row + self.shape[0] <= found.shape[0] and column + self.shape[1] <= found.shape[1]

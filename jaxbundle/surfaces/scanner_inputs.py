@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, geodetic
+from jaxbundle.io.networks.orientation_covariance import FILE as COVARIANCE_FILE
 from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.io.scanner.refined_orientations import (
     TABLE,
@@ -196,13 +197,16 @@ def _add_covariance(
     joint = block.covariance
     if joint is None:
         return
-    if isinstance(orientation, Rpc):
-        # compensated coefficients have a domain of their own; the bias belongs to the given ones
-        domain = one.domain if one.domain is not None else domain_of_bias(orientation)
-        view.orientation = rpc_orientation(joint, one.id, domain)
-    else:
-        spacing = one.knot_spacing
-        view.orientation = scanner_orientation(joint, one.id, one.sensor, *orientation, spacing)
+    try:
+        if isinstance(orientation, Rpc):
+            # compensated coefficients have a domain of their own; the bias belongs to the given
+            domain = one.domain if one.domain is not None else domain_of_bias(orientation)
+            view.orientation = rpc_orientation(joint, one.id, domain)
+        else:
+            given = one.id, one.sensor, *orientation, one.knot_spacing
+            view.orientation = scanner_orientation(joint, *given)
+    except InputError as error:
+        raise InputError(f"{one.file.parent / COVARIANCE_FILE}: {error}") from None
 
 
 def is_ground_image(path: Path) -> bool:

@@ -61,22 +61,36 @@ class TiePointSettings:
 @dataclasses.dataclass(frozen=True)
 class TiePoints(TableMethods):
     """Measurements of tie points: names of images; of each measurement the image, the number of
-    the point, line and pixel, and their σ; `rejected`: numbers of matches by reason; messages."""
+    the point, line and pixel, and their σ; `base`: by points the image whose corner it is;
+    `rejected`: numbers of matches by reason; messages.
+
+    A point is named after this image and its place there, T:IMAGE:LINE:PIXEL: tables of several
+    calls can be joined, since the same name is the same point."""
 
     images: tuple[str, ...]
     image: Int[np.ndarray, " n"]
     point: Int[np.ndarray, " n"]
     xy: Float[np.ndarray, "n 2"]
     sigma: Float[np.ndarray, "n 2"]
+    base: Int[np.ndarray, " points"]
     rejected: dict[str, int]
     messages: tuple[str, ...] = ()
 
     def table(self) -> dict[str, np.ndarray]:
         """Columns image, point, line, pixel, sline, spixel; one row a measurement."""
         names = np.array(self.images, object)
-        points = np.array([f"T{k + 1}" for k in self.point], object)
         columns = zip(("line", "pixel", "sline", "spixel"), (*self.xy.T, *self.sigma.T))
+        points = np.array(self.names, object)[self.point]
         return {"image": names[self.image], "point": points, **dict(columns)}
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the points, by their numbers."""
+        (of_base,) = np.nonzero(self.image == self.base[self.point])
+        rows = of_base[np.argsort(self.point[of_base])]
+        # hundredths of a pixel: places of one image are farther apart
+        place = lambda k: ":".join(f"{v:.2f}".rstrip("0").rstrip(".") for v in self.xy[k])
+        return [f"T:{self.images[self.image[k]]}:{place(k)}" for k in rows]
 
     def to_dict(self) -> dict:
         """Counts as plain numbers."""
@@ -125,7 +139,7 @@ def match_tie_points(
     failed: list[tuple[int, int]] = []
     rows: list[tuple[np.ndarray, np.ndarray, Places, np.ndarray]] = []
     known: list[list[Places]] = [[] for _ in views]
-    number = 0
+    number, bases = 0, []
     for i, base in enumerate(views):
         uv = _new_corners(base, known[i], spacing, settings)
         partners = [j for j in range(len(views)) if j != i and score(base, bounds[i], views[j])]
@@ -154,6 +168,7 @@ def match_tie_points(
             rows.append((np.full(len(mine), j), at, place[mine, j], sigma[mine, j]))
             known[j].append(place[mine, j])
         number += len(tied)
+        bases.append(np.full(len(tied), i))
         if progress:
             progress("tie points", i + 1, len(views))
     if not number:
@@ -164,7 +179,9 @@ def match_tie_points(
     image, point, uv, s = (np.concatenate(columns) for columns in zip(*rows))
     names = tuple(view.name for view in views)
     messages = _describe_untied(names, failed, image, point)
-    return TiePoints(names, image, point, uv[:, ::-1], s[:, ::-1], dict(lost), messages)
+    places, sigmas = uv[:, ::-1], s[:, ::-1]
+    base_of = np.concatenate(bases)
+    return TiePoints(names, image, point, places, sigmas, base_of, dict(lost), messages)
 
 
 def _describe_untied(

@@ -15,6 +15,7 @@ from jaxbundle.batches import work
 from jaxbundle.batches.run_on_files import key_of, run_batch
 from jaxbundle.errors import InputError
 from jaxbundle.io.writing.fingerprints import of_input
+from jaxbundle.system.paths import relative_path
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "convergent4"
 FREE = ["fx", "fy", "k1"]
@@ -62,6 +63,17 @@ def test_a_key_is_the_same_however_the_path_is_written(start, tmp_path, monkeypa
     }  # fmt: skip
     assert key_of(tmp_path / "model" / "", file) == "model"
     assert key_of(tmp_path / "a.toml", tmp_path / "out" / "results.jsonl") == "../a.toml"
+
+
+def test_a_path_on_another_drive_is_absolute(monkeypatch, tmp_path):
+    """As `os.path.relpath` of Windows says: `ValueError`."""
+
+    def no_way(path, start):
+        raise ValueError("path is on mount 'D:', start on mount 'C:'")
+
+    monkeypatch.setattr(os.path, "relpath", no_way)
+    assert relative_path(tmp_path / "a.tif", "elsewhere") == str(tmp_path / "a.tif")
+    assert key_of(tmp_path / "a.toml", tmp_path / "b.jsonl") == (tmp_path / "a.toml").as_posix()
 
 
 @pytest.mark.parametrize("options, said", [

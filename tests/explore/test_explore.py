@@ -37,7 +37,7 @@ from jaxbundle.explorer.network import NetworkView
 from jaxbundle.explorer.page import Number, draw_controls, draw_tools, make_page, place
 from jaxbundle.explorer.scanner import FLIGHT_FILE, PICTURE_FILE, TABLE_FILE, FlightView
 from jaxbundle.explorer.server import MOST_BYTES, Server, page_file
-from jaxbundle.explorer.tracks import ORBIT, STRAIGHT, USUAL, choose_track
+from jaxbundle.explorer.tracks import ENDS, GEODETIC, LOCAL, ORBIT, STRAIGHT, USUAL, choose_track
 from jaxbundle.explorer.view import File, check_keys, number
 from jaxbundle.explorer.widget import reply, show
 from jaxbundle.io.scanner.flight import read_flight
@@ -499,19 +499,19 @@ def test_the_flight_file_holds_what_was_chosen(scanner, tmp_path):
 
 @pytest.mark.further
 def test_a_flight_has_an_orbit_and_a_straight_track(scanner, flight):
-    """The other track begins at usual values; the given one is that of the file."""
+    """The other tracks begin at usual values; the given one is that of the file."""
     values = scanner.values({})
     assert values["track"] == STRAIGHT and values["height"] == 500e3
     assert choose_track(scanner.tracks, values) is flight.flight.track
-    turned = choose_track(scanner.tracks, values | {"heading": 90.0, "altitude": 900.0})
-    assert turned["start"] == [300.0, 200.0, 900.0]
-    speed = np.hypot(5.0, 60.0)
-    assert_allclose(turned["velocity"], [speed, 0, 0], atol=1e-12)
+    other_ends = {"end_X": 400.0, "end_Y": 200.0, "start_Z": 900.0}
+    turned = choose_track(scanner.tracks, values | other_ends)
+    assert turned == {"start": [300.0, 200.0, 900.0], "end": [400.0, 200.0, 800.0]}
     orbit = choose_track(scanner.tracks, values | {"track": ORBIT, "inclination": 90.0})
     assert orbit["height"] == 500e3 and orbit["inclination"] == np.pi / 2
     found = scanner.answer({"track": ORBIT})
     chosen = scanner.choose(scanner.values({"track": ORBIT}))
-    assert chosen.earth is not None and {"altitude", "speed", "heading"} == set(found["idle"])
+    other = {f"{end}_{axis}" for end in ENDS for axis in (*GEODETIC, *LOCAL)}
+    assert chosen.earth is not None and other == set(found["idle"])
     direct = ground_errors(chosen.image, chosen.truth, chosen.surface, *scanner.positions)
     assert_allclose(found["errors"], rms_of_cells(direct), atol=1e-6)
     # From 500 km rather than 800 m: an error of roll grows with it.
@@ -611,9 +611,13 @@ def test_in_a_browser_a_control_changes_the_numbers(kind, network, scanner, tmp_
             browser.until(f"document.getElementById('{part}').innerText !== ''")
             before = browser.value(f"document.getElementById('{part}').innerText")
             idle = browser.value(
-                "[...document.querySelectorAll('input:disabled')].map(one => one.dataset.key)"
+                "[...document.querySelectorAll('input:disabled')]"
+                ".map(one => one.dataset.key ?? one.dataset.slides)"
             )
-            assert idle == ([*USUAL, *Corrections._fields] if kind == "scanner" else [])
+            places = [f"{end}_{axis}" for end in ENDS for axis in GEODETIC]
+            of_scanner = [*USUAL, *places, *Corrections._fields]
+            # number fields, and the sliders of those that have one
+            assert [*dict.fromkeys(idle)] == (of_scanner if kind == "scanner" else [])
             if kind == "network":
                 browser.value("""(() => { const field = document.getElementById("move-Z0");
                     field.value = Number(field.value) + 0.3;
@@ -626,6 +630,10 @@ def test_in_a_browser_a_control_changes_the_numbers(kind, network, scanner, tmp_
             browser.until(f"document.getElementById('{part}').innerText !== {json.dumps(before)}")
             browser.until("document.getElementById('explore-said').textContent === ''")
             assert browser.value(f"document.getElementById('{part}').innerText") != before
+            if kind == "scanner":
+                shown = browser.value("[...document.querySelectorAll('#pictures img')]"
+                                      ".map(one => one.naturalWidth > 0 && one.alt)")  # fmt: skip
+                assert shown == ["scene", "distorted", "corrected"]
             assert browser.console == []
             assert browser.requests and all(
                 url.startswith((server.address, "data:")) for url in browser.requests

@@ -40,6 +40,7 @@ from jaxbundle.io.networks.orientation_covariance import (
 )
 from jaxbundle.io.results.json_lines import JsonLines
 from jaxbundle.io.scanner.asp_points import read_gcp, read_match
+from jaxbundle.io.scanner.isis_points import read_control_network, read_jigsaw_residuals
 from jaxbundle.io.scanner.refined_orientations import read_refined_orientations
 from jaxbundle.io.writing.folders import check_folder, read_marker, replace_folder
 from jaxbundle.measure.boards import Board
@@ -521,6 +522,22 @@ def _(folder):
         '[scanner]\nsource = "isd.json"\ninterpolation = "lagrange"\n\n[corrections]\n'
         "refraction = true\naberration = false\n"
     )
+
+
+@reader("control network of ISIS", lambda f: read_control_network(f / "network.pvl"))
+def _(folder):
+    from isis_samples import GOOD
+
+    (folder / "network.pvl").write_text(GOOD + "End_Object\nEnd\n")
+
+
+@reader("residuals of jigsaw", lambda f: read_jigsaw_residuals(f / "residuals.csv"))
+def _(folder):
+    from isis_samples import RESIDUALS
+
+    row = "P{},/data/left.cub,s{},0.1,0.2,{}.5,7.25,0.3,-0.4,0.5\n"
+    rows = [row.format(k // 2, k % 2, 3 * k) for k in range(6)]
+    (folder / "residuals.csv").write_text(RESIDUALS + "".join(rows))
 
 
 # --- rasters ------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 written here in numpy and scipy alone."""
 
 import copy
+import dataclasses
 import json
 
 import numpy as np
@@ -244,13 +245,131 @@ def test_what_is_refused_by_name(name, tmp_path):
     assert "image_7.json" in str(refused.value)
 
 
-def test_scanners_send_it_here_and_states_are_no_support_data(tmp_path):
+def test_scanners_send_it_here(tmp_path):
     path = write(tmp_path, support_data())
     with pytest.raises(InputError, match="FRAME_SENSOR_MODEL.*as a photograph"):
         read_scanner(path)
-    path.write_text("USGS_ASTRO_FRAME_SENSOR_MODEL\n" + path.read_text())
-    with pytest.raises(InputError, match="a model state of a frame camera; give the support data"):
+    path.write_text(json.dumps(push_frame()))
+    with pytest.raises(InputError, match="PUSH_FRAME_SENSOR_MODEL.*one for each framelet"):
+        read_scanner(path)
+
+
+@pytest.mark.parametrize("changes", [{}, EXACT["radtan"][1], BEHIND, TRANSVERSE])
+def test_a_model_state_is_what_it_was_made_of(changes, tmp_path):
+    """As usgscsm writes it: the pose of the body, the fields of the ISD under other names."""
+    isd = support_data(**changes)
+    X0, m = pose(isd)
+    ((kind, values),) = isd["optical_distortion"].items()
+    coefficients = values.get("coefficients") or [*values["x"], *values["y"]]
+    state = {
+        "m_modelName": "USGS_ASTRO_FRAME_SENSOR_MODEL", "m_sensorName": "NAC", "m_nLines": 300,
+        "m_nSamples": 400, "m_focalLength": isd["focal_length_model"]["focal_length"],
+        "m_iTransL": isd["focal2pixel_lines"], "m_iTransS": isd["focal2pixel_samples"],
+        "m_ccdCenter": [312.25, 420.5], "m_detectorLineSumming": 2, "m_detectorSampleSumming": 2,
+        "m_startingDetectorLine": 8, "m_startingDetectorSample": 4,
+        "m_distortionType": {"radial": 0, "transverse": 1, "radtan": 7}[kind],
+        "m_opticalDistCoeffs": coefficients,
+        "m_currentParameterValue": [*X0, *Rotation.from_matrix(m).as_quat()],
+    }  # fmt: skip
+    path = tmp_path / "state.json"
+    write_state = lambda: path.write_text(f"{state['m_modelName']}\n{json.dumps(state)}")
+    write_state()
+    net, again = read_network(path), read_csm_frame(write(tmp_path, isd))
+    np.testing.assert_allclose(net.images.position, again.images.position, rtol=1e-13)
+    np.testing.assert_allclose(net.images.angles, again.images.angles, atol=1e-12)
+    assert net.cameras[0].model == again.cameras[0].model
+    assert net.cameras[0].parameters == pytest.approx(again.cameras[0].parameters, rel=1e-12)
+    state["m_lineTimes"] = [0.0, 0.1]
+    write_state()
+    with pytest.raises(InputError, match="state.json: jitter"):
         read_network(path)
+    path.write_text("USGS_ASTRO_PUSH_FRAME_SENSOR_MODEL\n{}")
+    with pytest.raises(InputError, match="a model state of 'USGS_ASTRO_PUSH_FRAME"):
+        read_network(path)
+
+
+HEIGHT, DELAY, EXPOSURE = 20, 0.5, 0.04
+
+
+def push_frame(**changes) -> dict:
+    """The ISD of 15 framelets of a camera that moves and turns, with tables of ten rows."""
+    t = NOW + np.linspace(-5.0, 5.0, 10)
+    rows = {"ephemeris_times": t.tolist(), "reference_frame": 1}
+    turn = lambda v, rate: (
+        Rotation.from_rotvec(v) * Rotation.from_rotvec(np.outer(t - NOW, rate))
+    ).as_quat()[:, [3, 0, 1, 2]].tolist()
+    X0, V = np.array([120.0, -340.0, 56.0]), np.array([0.4, 0.9, -0.3])
+    base = support_data()
+    isd = base | {
+        "name_model": "USGS_ASTRO_PUSH_FRAME_SENSOR_MODEL", "framelet_height": HEIGHT,
+        "framelets_flipped": False, "framelet_order_reversed": False, "interframe_delay": DELAY,
+        "exposure_duration": EXPOSURE, "starting_ephemeris_time": NOW - 3.6,
+        "detector_line_summing": 1, "detector_sample_summing": 1, "image_lines": 15 * HEIGHT,
+        "starting_detector_line": 300, "starting_detector_sample": 220,
+        "body_rotation": {**rows, "quaternions": turn([0.3, -0.2, 0.7], [0.0, 0.0, 1e-3])},
+        "instrument_pointing": {
+            **rows, "quaternions": turn([-0.5, 1.1, 0.2], [2e-3, -1e-3, 5e-4]),
+            "constant_rotation": base["instrument_pointing"]["constant_rotation"],
+        },
+        "instrument_position": {**rows, "positions": (X0 + np.outer(t - NOW, V)).tolist(),
+                                "velocities": np.tile(V, (10, 1)).tolist()},
+    }  # fmt: skip
+    return isd | changes
+
+
+def framelet_of(isd, k):
+    """The ISD of a photograph with the state of framelet k in time: exact, since positions of the
+    tables are linear in time and rotations are about fixed axes at constant rates."""
+    t = isd["starting_ephemeris_time"] + EXPOSURE / 2 + k * DELAY
+    single = copy.deepcopy(isd) | {"name_model": "USGS_ASTRO_FRAME_SENSOR_MODEL",
+                                   "image_lines": HEIGHT}  # fmt: skip
+    for name, of, rate in (("body_rotation", [0.3, -0.2, 0.7], [0.0, 0.0, 1e-3]),
+                           ("instrument_pointing", [-0.5, 1.1, 0.2], [2e-3, -1e-3, 5e-4])):
+        q = Rotation.from_rotvec(of) * Rotation.from_rotvec((t - NOW) * np.array(rate))
+        row = q.as_quat()[[3, 0, 1, 2]].tolist()
+        single[name] |= {"ephemeris_times": [t], "quaternions": [row]}
+    position = single["instrument_position"]
+    X = np.array(position["positions"][0]) + (t - position["ephemeris_times"][0]) * np.array(
+        position["velocities"][0]
+    )
+    position |= {"ephemeris_times": [t], "positions": [X.tolist()], "velocities": None}
+    return single
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+def test_framelets_are_photographs(reverse, tmp_path):
+    isd = push_frame(framelet_order_reversed=reverse, **EXACT["radial"][1])
+    net = read_network(write(tmp_path, isd))
+    assert net.images.id[:2] == ("image_7-000", "image_7-001") and len(net.images.id) == 15
+    assert net.cameras[0].image_size == (400, HEIGHT) and len(net.cameras) == 1
+    for k in (0, 4, 14):
+        single = framelet_of(isd, 14 - k if reverse else k)
+        X0, m = pose(single)
+        np.testing.assert_allclose(net.images.position[k], X0, atol=1e-6)
+        np.testing.assert_allclose(matrix(net.images.angles[k]).T @ np.diag([1, -1, -1]), m,
+                                   atol=1e-9)  # fmt: skip
+        # through the camera: points on the rays of pixels of the framelet, by usgscsm's formulas
+        X = ground_points(single)
+        expected = ground_to_image(single, X)
+        chosen = dataclasses.replace(
+            net, images=dataclasses.replace(net.images, position=net.images.position[k : k + 1],
+                                            angles=net.images.angles[k : k + 1]))  # fmt: skip
+        np.testing.assert_allclose(images(chosen, X), expected, atol=2e-6)
+
+
+@pytest.mark.parametrize("changes, message", [
+    ({"framelets_flipped": True}, "mirror image"), ({"framelet_height": 0}, "framelet_height"),
+    ({"interframe_delay": -1.0}, "interframe_delay is -1"), ({"framelet_height": 999}, "less than"),
+    ({"framelet_order_reversed": "yes"}, "true or false"), ({"interframe_delay": 5.0}, "needs"),
+    ({"detector_line_summing": 4}, "summing"),
+])  # fmt: skip
+def test_framelets_that_are_refused(changes, message, tmp_path):
+    with pytest.raises(InputError, match=message) as refused:
+        read_csm_frame(write(tmp_path, push_frame(**changes)))
+    assert "image_7.json" in str(refused.value)
+    # lines that fill no framelet are told
+    net = read_csm_frame(write(tmp_path, push_frame(image_lines=15 * HEIGHT + 3)))
+    assert "3 more lines" in net.warnings[-1]
 
 
 def test_the_command_converts_it(command, tmp_path):

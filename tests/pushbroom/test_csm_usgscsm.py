@@ -235,7 +235,7 @@ def test_adjusted_quaternions_are_normalised(tmp_path):
     usgscsm divides by."""
     expected = read_csm(write_state(tmp_path, model_state()))
     q = np.reshape(model_state()["m_quaternions"], (-1, 4))
-    length = 1 + np.random.default_rng(3).uniform(-3e-4, 3e-4, (len(q), 1))
+    length = 1 + np.random.default_rng(3).uniform(-3e-3, 3e-3, (len(q), 1))
     state = lambda q: write_state(tmp_path, model_state(m_quaternions=np.ravel(q).tolist()))
     found = read_csm(state(length * q))
     for a, b in zip(jax.tree.leaves(found.image), jax.tree.leaves(expected.image), strict=True):
@@ -243,8 +243,8 @@ def test_adjusted_quaternions_are_normalised(tmp_path):
     said = [line for line in found.warnings if line not in expected.warnings]
     assert len(said) == 1 and "state.json" in said[0] and "normalised" in said[0]
     assert f"{length.max():.6f}" in said[0]
-    # what rounding explains is not worth a word
-    found = read_csm(state(np.round(q, 5)))
+    # what rounding explains, or a small adjustment, is not worth a word
+    found = read_csm(state((1 + 0.3 * (length - 1)) * np.round(q, 5)))
     assert found.warnings == expected.warnings
 
 

@@ -123,10 +123,9 @@ def distances(name):
 
 @real
 def test_states_adjusted_by_another_program_are_read():
-    """Lengths of quaternions from 0.99992 to 1.00029."""
+    """Lengths of quaternions from 0.99992 to 1.00029: less than is worth a word."""
     found = read_scanner(FOLDER / "jitter_solved_a.adjusted_state.json")
-    (said,) = found.warnings
-    assert "0.999920 to 1.000286" in said and "normalised" in said
+    assert found.warnings == ()
 
 
 @real

@@ -102,6 +102,61 @@ def test_a_bias_is_removed(tmp_path, run):
     assert check_rpc(read_rpc(tmp_path / "b.txt"), shifted).largest.max() < 1e-6
 
 
+def test_check_points_snooping_maps_and_heights_above_the_geoid(tmp_path, run):
+    """The same control in a map system with heights above a geoid, two points of it for checks and
+    one with a blunder, gives the bias of the good ones."""
+    import rasterio
+    from pyproj import Transformer
+
+    write_rpc(tmp_path / "a.txt", RPC)
+    true = table_of(RPC, (3, 3, 2))
+    rng = np.random.default_rng(0)
+    measured = true._replace(line=true.line + 4 + 0.1 * rng.normal(size=18),
+                             sample=true.sample - 9 + 0.1 * rng.normal(size=18))  # fmt: skip
+    measured.line[7] += 3.0
+    degrees = np.degrees(true.longitude), np.degrees(true.latitude)
+    zone = 32601 + int((degrees[0][0] + 180) // 6) + (100 if degrees[1][0] < 0 else 0)
+    x, y = Transformer.from_crs("EPSG:4326", f"EPSG:{zone}", always_xy=True).transform(*degrees)
+    # N = 30 m + 2 m a degree of longitude
+    west, north = np.floor(degrees[0].min()) - 1, np.ceil(degrees[1].max()) + 1
+    N = lambda longitude: 30 + 2 * (longitude - west)
+    with rasterio.open(tmp_path / "geoid.tif", "w", driver="GTiff", width=41, height=41, count=1,
+                       dtype="float64", crs="EPSG:4326",
+                       transform=rasterio.Affine(0.1, 0, west, 0, -0.1, north)) as to:  # fmt: skip
+        to.write(np.tile(N(west + 0.05 + 0.1 * np.arange(41)), (1, 41, 1)))
+    rows = ["x,y,height,line,sample,id,role"]
+    for k in range(18):
+        role = "check" if k in (3, 11) else "control"
+        values = x[k], y[k], true.height[k] - N(degrees[0][k]), measured.line[k], measured.sample[k]
+        rows.append(",".join(map(repr, map(float, values))) + f",P{k},{role}")
+    (tmp_path / "control.csv").write_text("\n".join(rows))
+    given = ("compensate", tmp_path / "a.txt", "--control", tmp_path / "control.csv", "--out",
+             tmp_path / "b.txt", "--sigma", 0.1, "--crs", f"EPSG:{zone}", "--geoid",
+             tmp_path / "geoid.tif", "--json", "-")  # fmt: skip
+    status, out, err = run(*given, "--snooping", "pope")
+    told = json.loads(out)
+    assert status == 0, err
+    roles = {row["id"]: row["role"] for row in told["rows"]}
+    assert [id for id, role in roles.items() if role == "removed"] == ["P7"]
+    assert (told["control_points"], told["removed_points"], told["check_points"]) == (15, 1, 2)
+    good = np.array([k for k in range(18) if roles[f"P{k}"] == "control"])
+    # a shift: the mean of the differences of the good control points
+    mean = np.mean(measured.line[good] - true.line[good])
+    assert told["line_shift"] == pytest.approx(mean, abs=1e-6)
+    check = np.array([3, 11])
+    rms = np.sqrt(np.mean((true.line[check] + mean - measured.line[check]) ** 2))
+    assert told["check_rms_line"] == pytest.approx(rms, abs=1e-6)
+    assert told["rows"][3]["w_line"] is None and told["rows"][7]["v_line"] < -2.5
+    status, out, _ = run(*given)
+    assert json.loads(out)["removed_points"] == 0
+    for text, words in (("P3,chek", "control or check"), (None, "no control point")):
+        content = "\n".join(rows)
+        content = content.replace(*(("P3,check", text) if text else (",control", ",check")))
+        (tmp_path / "control.csv").write_text(content)
+        status, _, err = run(*given)
+        assert status == 2 and words in err
+
+
 def test_what_is_refused(tmp_path, run):
     write_rpc(tmp_path / "a.txt", RPC)
     table = write_table(tmp_path / "few.csv", table_of(RPC, (3, 3, 3)))

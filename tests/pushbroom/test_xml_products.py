@@ -321,8 +321,26 @@ def test_a_stated_unit_is_used(tmp_path):
     (tmp_path / "DIM.XML").write_text(text, encoding="latin-1")
     assert float(read_scanner(tmp_path / "DIM.XML").image.times.period) == pytest.approx(PERIOD)
     (tmp_path / "DIM.XML").write_text(text.replace('"S"', '"h"'), encoding="latin-1")
-    with pytest.raises(InputError, match="LINE_PERIOD is in 'h'; expected one of s, ms"):
+    with pytest.raises(InputError, match="LINE_PERIOD is in 'h'; expected one of s, second"):
         read_scanner(tmp_path / "DIM.XML")
+
+
+def test_units_in_words_of_whole_products(tmp_path):
+    """"microsecond" of Pléiades Neo; polynomials of Pléiades whose times state seconds."""
+    text = dimap(unit=1e6).replace("PHR_", "PNEO_")
+    text = text.replace("<LINE_PERIOD>", '<LINE_PERIOD unit="microsecond">')
+    (tmp_path / "DIM.XML").write_text(text, encoding="latin-1")
+    assert float(read_scanner(tmp_path / "DIM.XML").image.times.period) == pytest.approx(PERIOD)
+    images = []
+    stated = dimap().replace("<OFFSET>", '<OFFSET unit="s">')
+    stated = stated.replace("<SCALE>3.0", '<SCALE unit="ms">3000.0')
+    assert stated != dimap()
+    for text in (dimap(), stated):
+        (tmp_path / "DIM.XML").write_text(text, encoding="latin-1")
+        images.append(read_scanner(tmp_path / "DIM.XML"))
+        assert images[-1].warnings == images[0].warnings
+    for a, b in zip(*(jax.tree.leaves(i.image) for i in images), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-9)
 
 
 def test_biases_are_reported(tmp_path):

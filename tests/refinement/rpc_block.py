@@ -1,17 +1,26 @@
 """A block of RPC images and rigorous scanner images that see the same ground, by simulation.
 
 Twelve images by polynomials, 3 m a pixel, look at it from three directions along and across the
-track; six line scanners, 20 m a pixel, along theirs. Every point is in some images of each.
+track; six line scanners, 20 m a pixel, along theirs. Every point is in some images of each. Where
+asked for, photographs from an aircraft see it too, with free orientations and an uncertain
+principal distance.
 """
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from refinement_scenes import ARCSEC, LINES, PERIOD, PIXELS
 
+from jaxbundle.geometry import (
+    matrix_from_omega_phi_kappa,
+    omega_phi_kappa_from_matrix,
+    quaternion_from_matrix,
+)
 from jaxbundle.geometry.ellipsoid import WGS84, earth_fixed, geodetic
-from jaxbundle.network.tables import Observations
+from jaxbundle.geometry.quaternions import quaternion_difference
+from jaxbundle.network.tables import Camera, Distances, Images, Network, Observations, Points
 from jaxbundle.pushbroom.ancillary import attitude_table, position_table
 from jaxbundle.pushbroom.earth_frames import circular_orbit
 from jaxbundle.pushbroom.ground_to_image import make_search, project_points
@@ -34,6 +43,9 @@ SHIFT, VARIATION = 6.0, 0.8
 SIGMA_RPC, SIGMA_SCANNER, SIGMA_CONTROL = 0.4, 0.3, 0.5
 """Of measurements, pixels, and of control coordinates, metres."""
 FREE = Freedom(attitude=3 * (np.inf,))
+SIGMA_PHOTOGRAPH, PRINCIPAL_DISTANCE, SIGMA_DISTANCE, FLYING_HEIGHT = 0.006, 100.0, 0.02, 8000.0
+"""Of photographs: image coordinates, principal distance and its σ in mm, height above ground in m:
+0.5 m on the ground."""
 
 
 def scanner_image(pitch, argument, node=1.9):
@@ -109,9 +121,11 @@ class Block:
     seen: np.ndarray
     terms: np.ndarray
     attitudes: np.ndarray
+    stations: tuple | None = None
 
     def draw(self, rng, noise=1.0):
-        """Arguments of `refine`, and the bias of every RPC image [images, 2, terms]."""
+        """Arguments of `refine` but those of photographs, and the bias of every RPC image
+        [images, 2, terms]."""
         rpc = [one for one in self.images if isinstance(one, RpcScannerImage)]
         places, sigma = self.places.copy(), np.full(self.places.shape, SIGMA_SCANNER)
         sigma[: len(rpc)] = SIGMA_RPC
@@ -133,9 +147,71 @@ class Block:
         )  # fmt: skip
         return (self.images, points, observations), bias
 
+    def draw_photographs(self, rng, noise=1.0):
+        """The network of the photographs; the changes from its start values to the truth: of every
+        orientation [photographs, 6], and of the principal distance."""
+        position, M = self.stations
+        n, off = len(position), SIGMA_DISTANCE * rng.normal()
+        image, point, xy = [], [], []
+        for k in range(n):
+            r, s, q = M[k] @ (self.X - position[k]).T
+            places = -(PRINCIPAL_DISTANCE + off) * np.stack([r, s], 1) / q[:, None]
+            seen = np.flatnonzero((np.abs(places) < 115.0).all(1))  # a frame of 23 cm
+            image.append(np.full(len(seen), k))
+            point.append(seen)
+            xy.append(places[seen] + noise * SIGMA_PHOTOGRAPH * rng.normal(size=(len(seen), 2)))
+        xy = np.concatenate(xy)
+        moved, turned = 5.0 * rng.normal(size=(n, 3)), 1e-4 * rng.normal(size=(n, 3))
+        angles = np.asarray(_angles(jnp.asarray(M))) + turned
+        to_truth = np.asarray(_turns(jnp.asarray(M), jnp.asarray(angles)))
+        nothing = np.full(self.X.shape, np.nan)
+        camera = Camera("frame", "brown", {"c": PRINCIPAL_DISTANCE}, ("c",), {"c": SIGMA_DISTANCE})
+        network = Network(
+            (camera,),
+            Images(tuple(f"F{k}" for k in range(n)), np.zeros(n, int), position + moved, angles,
+                   np.full((n, 6), np.nan)),
+            Points(tuple(f"P{k}" for k in range(len(self.X))), ("tie",) * len(self.X), nothing,
+                   nothing),
+            Observations(np.concatenate(image), np.concatenate(point), xy,
+                         np.full(xy.shape, SIGMA_PHOTOGRAPH)),
+            Distances.none(),
+        )  # fmt: skip
+        return network, np.concatenate([-moved, to_truth], 1), off
 
-def block(rpc=12, scanner=6, points=60, control=8, checks=4, degree=1, rays=4, seed=1):
-    """A block of so many images and points, each point in about `rays` images of each type."""
+
+_angles = jax.jit(jax.vmap(omega_phi_kappa_from_matrix))
+
+
+@jax.jit
+@jax.vmap
+def _turns(M, angles):
+    """The rotation in the camera frame from the one of angles to M."""
+    start = quaternion_from_matrix(matrix_from_omega_phi_kappa(angles))
+    return quaternion_difference(quaternion_from_matrix(M), start)
+
+
+def stations_above(place, half, number, rng):
+    """Positions [n, 3] and matrices [n, 3, 3] of nearly vertical photographs in rows above a
+    rectangle, longitude and latitude ± half."""
+    columns = int(np.ceil(np.sqrt(number)))
+    k = np.arange(number)
+    rows = -(-number // columns)
+    u = (k % columns) / max(columns - 1, 1) * 2 - 1
+    v = (k // columns) / max(rows - 1, 1) * 2 - 1
+    longitude, latitude = place[0] + 0.7 * half[0] * u, place[1] + 0.7 * half[1] * v
+    ground = longitude, latitude, np.full(number, 400.0 + FLYING_HEIGHT)
+    X = np.stack([np.asarray(a) for a in earth_fixed(WGS84, ground)], 1)
+    axes = np.asarray(east_north_up(WGS84, X))
+    turn = rng.normal(size=(number, 3)) * [0.03, 0.03, 0.05]
+    turn[:, 2] += np.pi / 2 * (k % 2)  # crossed: κ and the principal distance are determined
+    return X, np.asarray(jax.vmap(matrix_from_omega_phi_kappa)(jnp.asarray(turn))) @ axes
+
+
+def block(
+    rpc=12, scanner=6, points=60, control=8, checks=4, degree=1, rays=4, seed=1, photographs=0
+):
+    """A block of so many images and points, each point in about `rays` images of each type, and in
+    the photographs that see it."""
     rng = np.random.default_rng(seed)
     rigorous, place = scanners(scanner) if scanner else ([], np.array([0.4, 0.7]))
     polynomials = [rpc_image(place, k, rng) for k in range(rpc)]
@@ -172,7 +248,8 @@ def block(rpc=12, scanner=6, points=60, control=8, checks=4, degree=1, rays=4, s
     for p in np.flatnonzero(seen.sum(0) < 3):
         seen[np.flatnonzero(on[:, p])[:3], p] = True
     roles = ("control",) * control + ("check",) * checks + ("tie",) * (points - control - checks)
-    return Block(images, X, roles, places, seen, np.array(terms), attitudes)
+    stations = stations_above(place, half, photographs, rng) if photographs else None
+    return Block(images, X, roles, places, seen, np.array(terms), attitudes, stations)
 
 
 def moved(observations, row, by):

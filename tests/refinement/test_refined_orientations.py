@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import rasterio
 from pyproj import Transformer
-from rpc_block import block
+from rpc_block import block, scanner_image
 from test_refine_rpc_files import TEXT, write_files
 from typer.testing import CliRunner
 
@@ -192,6 +192,70 @@ def test_a_change_has_the_covariance_of_the_refinement(folder, tmp_path):
     assert two.change.modes == 12 and two.change.sigma[20, 20] > found.change.sigma[20, 20]
     with pytest.raises(InputError, match="A names 1 of its images"):
         jaxbundle.change(before, after, before_orientation=out, before_images="A")
+
+
+@pytest.mark.further
+def test_what_makes_sigma_doubtful_is_said(folder, tmp_path):
+    """Cells that fewer than two images see, and σ that may have the errors already."""
+    before = surface(tmp_path / "before.tif", folder, 400.0, 0.1)
+    after = surface(tmp_path / "after.tif", folder, 400.0, 0.1)
+    out = folder / "out"
+    found = jaxbundle.change(before, after, before_orientation=out)
+    (told,) = found.warnings
+    assert "before_sigma.tif: has no σ of its own" in told and "count twice" in told
+    assert found.to_dict()["warnings"] == [told] and f"warning: {told}" in str(found)
+    assert not jaxbundle.change(before, after, after_errors={"vertical": 0.1}).warnings
+    # the right half of the surface is moved out of the images, 12 km wide
+    with rasterio.open(before) as source:
+        profile, (height,) = source.profile, source.read()
+    wide = np.tile(height, (1, 10))
+    for stem, value in (("before", wide), ("before_sigma", 0.1 + 0 * wide),
+                        ("after", wide), ("after_sigma", 0.1 + 0 * wide)):  # fmt: skip
+        with rasterio.open(tmp_path / f"wide_{stem}.tif", "w",
+                           **{**profile, "width": wide.shape[1]}) as to:  # fmt: skip
+            to.write(value[None].astype("float32"))
+    found = jaxbundle.change(
+        tmp_path / "wide_before.tif", tmp_path / "wide_after.tif", before_orientation=out
+    )
+    (share,) = [w for w in found.warnings if "fewer than two of its images" in w]
+    number = float(share.split(": ")[1].split(" %")[0])
+    # cells with the errors of the orientations have a larger σ: counted cell by cell
+    plain = np.isclose(found.change.sigma, found.change.sigma.min(), rtol=1e-9)
+    assert number == pytest.approx(100 * plain.mean(), abs=1.0) and 20 < number < 90
+
+
+@pytest.mark.further
+def test_an_edited_covariance_is_refused(folder, tmp_path):
+    copy = tmp_path / "copy"
+    copy.mkdir()
+    for path in (folder / "out").iterdir():
+        if path.is_file():
+            (copy / path.name).write_bytes(path.read_bytes())
+    text = (copy / "precision.csv").read_text()
+    lines = text.splitlines()
+    first = lines[1].split(",")
+    for edited, words in (
+        (text.replace("line shift", "line shaft", 1), "precision.csv: image A has no unknown"),
+        (text.replace(",".join(lines[2].split(",")[:3]), ",".join(first[:3]), 1), "listed twice"),
+        (text.replace(first[3], "wide", 1), "σ above 0"),
+        (text.replace("image,A", "picture,A", 1), "which refined.csv does not list"),
+    ):
+        (copy / "precision.csv").write_text(edited)
+        with pytest.raises(InputError, match=words):
+            read_refined_views(copy)
+    # correlations of no errors: 1 between two that a third is correlated with in opposite ways
+    cells = [line.split(",") for line in lines]
+    cells[2][4], cells[3][4], cells[3][5] = "0.99", "0.99", "-0.99"
+    (copy / "precision.csv").write_text("\n".join(map(",".join, cells)))
+    with pytest.raises(InputError, match="not those of any errors"):
+        read_refined_views(copy)
+
+
+def test_an_unknown_of_a_scanner_without_exponent_is_refused():
+    unknown = ("sensor", "cam", "look angle across û^two")
+    joint = OrientationCovariance((unknown,), np.eye(1))
+    with pytest.raises(InputError, match=r"sensor cam has no unknown 'look angle across û\^two'"):
+        scanner_orientation(joint, "S0", "cam", scanner_image(0.0, 0.1), WGS84, 1.0)
 
 
 @pytest.mark.further

@@ -220,14 +220,33 @@ def test_stated_errors_become_pixels(scene):
 
 
 @pytest.mark.further
-def test_together_with_rigorous_images():
-    """Twelve images with RPC and six line scanners: truth within 3 σ, σ0 near 1, three rays."""
-    scene = block()
-    arguments, bias = scene.draw(np.random.default_rng(3))
-    result = refine(*arguments)
-    of_rpc = [k for k, n in enumerate(result.names) if n.owner.startswith("image R")]
-    error = (result.estimate[of_rpc] - bias.ravel()) / result.inspection.sigma[of_rpc]
-    assert np.abs(error).max() < 4 and 0.8 < error.std() < 1.2
+def test_together_with_rigorous_images_and_photographs():
+    """Twelve images with RPC, six line scanners, twenty photographs: the truth, σ of a few draws
+    (of 200: benchmarks/rpc_block.py), blunders, an undetermined bias."""
+    scene, rng = block(photographs=20), np.random.default_rng(3)
+    largest, squares = [], []
+    for _ in range(3):
+        arguments, bias = scene.draw(rng)
+        frames, to_truth, distance = scene.draw_photographs(rng)
+        result = refine(*arguments, frames)
+        truth = {
+            "image R": bias, "image S": scene.attitudes, "photograph ": to_truth,
+            "camera ": np.array([distance]),
+        }  # fmt: skip
+        error = np.array(result.estimate)
+        for owner, values in truth.items():
+            error[[k for k, n in enumerate(result.names) if n.owner.startswith(owner)]] -= (
+                values.ravel()
+            )
+        C = result.covariance / result.sigma0**2
+        scale = np.sqrt(np.diagonal(C))
+        normed = error / scale
+        largest.append(np.abs(normed).max())
+        # the errors of one draw have much in common: by their whole covariance, χ² with 211
+        squares.append(normed @ np.linalg.solve(C / np.outer(scale, scale), normed))
+    # 633 in all: their mean square has a σ of √(2/633) = 0.056; one of 4.5 σ is 0.4 % likely
+    assert len(error) == 211 and max(largest) < 4.5
+    assert abs(np.sum(squares) / 633 - 1) < 0.2
     assert result.global_test()["passed"]
     assert min(result.rays()) >= 3
     # rigorous images first, and everything by id
@@ -241,7 +260,7 @@ def test_together_with_rigorous_images():
     X = points.X.copy()
     X[2] += 15.0 * points.axes[2, 0]
     wrong = moved(moved(observations, rpc, [6.0, 0.0]), rigorous, [0.0, -5.0])
-    found = refine(images, dataclasses.replace(points, X=X), wrong, snooping="pope")
+    found = refine(images, dataclasses.replace(points, X=X), wrong, frames, snooping="pope")
     named = [blunder.name for blunder in found.removed]
     told = [f"point P{observations.point[k]} in image {images[observations.image[k]].id}"
             for k in (rpc, rigorous)]  # fmt: skip
@@ -250,7 +269,7 @@ def test_together_with_rigorous_images():
     free = [dataclasses.replace(one, bias_sigma=prior_of_bias(1)) if one.id == "R7" else one
             for one in images]  # fmt: skip
     with pytest.raises(NotSolvedError, match="do not determine the .* of image R7"):
-        refine(free, points, observations.take(observations.image != 7))
+        refine(free, points, observations.take(observations.image != 7), frames)
 
 
 @pytest.mark.further

@@ -288,6 +288,31 @@ def test_the_command_writes_maps_and_volumes(files, command):
     assert "region 1" in str(result)
 
 
+def test_masks_mark_cells_and_cut_none(files):
+    """A raster of stable cells, or of regions, that has a part of the surface only, and one that
+    reaches beyond it: as one of all cells that is 0 elsewhere."""
+    marked = np.zeros((ROWS, COLUMNS))
+    marked[2:12, 5:70] = 1
+    errors = {"before_errors": {"vertical": 0.5}, "after_errors": {"vertical": 0.5}}
+    given = files / "before.tif", files / "after.tif"
+    wide = np.pad(marked, ((0, 3), (4, 6)))
+    for name, values, x in (("whole", marked, 1000.0), ("part", marked[:12, 5:70], 1010.0),
+                            ("wide", wide, 1000.0 - 4 * SIZE)):  # fmt: skip
+        write(files / f"{name}.tif", values, "uint8", None, x=x)
+    whole = files / "whole.tif"
+    one = jaxbundle.change(*given, stable=whole, regions=whole, **errors)
+    assert one.change.known.sum() == ROWS * COLUMNS - 1
+    for name in ("part", "wide"):
+        mask = files / f"{name}.tif"
+        other = jaxbundle.change(*given, stable=mask, regions=mask, **errors)
+        np.testing.assert_array_equal(other.change.difference, one.change.difference)
+        np.testing.assert_array_equal(other.change.sigma, one.change.sigma)
+        assert other.change.regions == one.change.regions
+    write(files / "away.tif", marked, "uint8", None, x=9000.0)
+    with pytest.raises(InputError, match="away.tif: has no cell of the surfaces"):
+        jaxbundle.change(*given, stable=files / "away.tif")
+
+
 def test_sigma_without_orientations_are_used_with_their_covariance(files):
     """The second band of the file of σ, where it is described so."""
     from jaxbundle.surfaces.raster_cells import OWN_SIGMA, open_cells

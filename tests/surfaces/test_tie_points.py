@@ -7,7 +7,10 @@ import pytest
 from test_surface_of_strips import ground, strip, view_of, write_strips
 
 from jaxbundle.errors import InputError
+from jaxbundle.io.scanner.refinement_points import _join_tables, _without_repeated
 from jaxbundle.io.text.csv_tables import read_csv
+from jaxbundle.network.columns import Columns
+from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom import tie
 from jaxbundle.surfaces.tie_points import (
     TiePoints,
@@ -93,10 +96,35 @@ def test_heights_unlike_their_neighbours_are_blunders():
 
 def test_tie_points_as_a_table():
     found = TiePoints(("A", "B", "C"), np.array([0, 1, 0, 2, 1]), np.array([0, 0, 1, 1, 1]),
-                      np.arange(10.0).reshape(5, 2), np.full((5, 2), 0.1), {"why": 3})  # fmt: skip
+                      np.arange(10.0).reshape(5, 2), np.full((5, 2), 0.1), np.array([0, 1]),
+                      {"why": 3})  # fmt: skip
     table = found.table()
     assert table["image"].tolist() == ["A", "B", "A", "C", "B"]
-    assert table["point"].tolist() == ["T1", "T1", "T2", "T2", "T2"]
+    # after the corner in the image that it was chosen in
+    assert table["point"].tolist() == 2 * ["T:A:0:1"] + 3 * ["T:B:8:9"]
     assert table["line"].tolist() == [0, 2, 4, 6, 8] and table["spixel"][0] == 0.1
     assert found.to_dict()["rays"] == {"2": 1, "3": 1}
     assert "2 tie points, by rays: 1 with 2, 1 with 3" in str(found)
+
+
+def test_tables_of_several_pairs_are_joined_without_merging_other_points():
+    """A corner of A matched in B and, by another call, in C is one point, measured once in A; all
+    others are points of their own."""
+    sigma = lambda n: np.full((n, 2), 0.1)
+    make = lambda names, image, point, xy, base: TiePoints(
+        names, np.array(image), np.array(point), np.array(xy, float), sigma(len(image)),
+        np.array(base), {},
+    )  # fmt: skip
+    first = make(("A", "B"), [0, 1, 0, 1], [0, 0, 1, 1], [[8, 9], [7, 9], [3, 4], [2, 4]], [0, 0])
+    second = make(("A", "C"), [0, 1, 0, 1], [0, 0, 1, 1], [[8, 9], [6, 5], [5, 5], [4, 1]], [0, 1])
+    tables, known = [], set()
+    for k, one in enumerate((first, second)):
+        columns = {name: list(map(str, values)) for name, values in one.table().items()}
+        tables.append(_without_repeated(Columns(columns, Source(f"{k}.csv")), known))
+    joined = _join_tables(tables)
+    rays = {}
+    for image, point in zip(joined.values["image"], joined.values["point"]):
+        rays.setdefault(point, []).append(image)
+    assert sorted(map(tuple, rays.values())) == [("A", "B"), ("A", "B", "C"), ("A", "C")]
+    # rows keep their numbers in messages
+    assert joined.source(4) == "observations, row 2 of 1.csv"

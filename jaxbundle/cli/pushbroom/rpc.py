@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from jaxbundle.choices import RPC_BIASES
+from jaxbundle.choices import RPC_BIASES, TESTS
 from jaxbundle.cli.app import Application, choice
 from jaxbundle.cli.certificate_options import Accept
 from jaxbundle.cli.pushbroom.app import Csv, Dem, Geoid, Json, Level, pushbroom
@@ -81,15 +81,28 @@ def apply(
 
 
 @rpc.command(example="out/image_RPC.TXT --control control.csv --out out/shifted_RPC.TXT")
-def compensate(
+def compensate(  # noqa: PLR0913 - the options of the command
     coefficients: RpcFile,
     control: Annotated[
         Path,
-        typer.Option(help="table longitude,latitude,height,line,sample[,id,seast,snorth,sheight]"),
+        typer.Option(
+            help="table longitude,latitude,height,line,sample[,id,role,seast,snorth,sheight]; "
+            "role: control or check"
+        ),
     ],
     out: Out,
     model: Annotated[str, choice(RPC_BIASES, "in the image")] = "shift",
     sigma: Annotated[float, typer.Option(help="σ of measured lines and samples, pixels")] = 1.0,
+    snooping: Annotated[
+        str, choice(("none", *TESTS), "points beyond its limit are left out")
+    ] = "none",
+    significance: Annotated[float, typer.Option(help="of snooping")] = 0.001,
+    crs: Annotated[
+        str | None, typer.Option(help="projected system: the table has x,y,height,…")
+    ] = None,
+    geoid: Annotated[
+        Path | None, typer.Option(help="heights are above it: raster, or name of a PROJ grid")
+    ] = None,
     csv: Csv = None,
     accept: Accept = None,
     json: Figures = "",
@@ -104,7 +117,16 @@ def compensate(
     # the tags of a raster may be replaced in place
     keep_inputs([control], out=out, csv=csv, json=json)
     keep_inputs([coefficients], csv=csv, json=json, out=None if out.suffix in RASTERS else out)
-    found = line_scanners.rpc.compensate(coefficients, control, model=model, sigma=sigma)
+    found = line_scanners.rpc.compensate(
+        coefficients,
+        control,
+        model=model,
+        sigma=sigma,
+        snooping=snooping,
+        significance=significance,
+        crs=crs,
+        geoid=geoid,
+    )
     found.write(out)
     accepted = accept_result(found, accept)
     write_rows(found.columns, csv, json, found.figures, accepted)

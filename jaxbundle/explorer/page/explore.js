@@ -37,7 +37,10 @@ function showWork(busy) {
 
 function putAnswer(answer) {
   for (const field of document.querySelectorAll("[data-key]")) {
-    if (explored.live) field.disabled = (answer.idle ?? []).includes(field.dataset.key);
+    if (!explored.live) continue;
+    field.disabled = (answer.idle ?? []).includes(field.dataset.key);
+    const slider = document.querySelector(`[data-slides="${CSS.escape(field.dataset.key)}"]`);
+    if (slider !== null) slider.disabled = field.disabled;
   }
   for (const [id, html] of Object.entries(answer.parts ?? {})) {
     document.getElementById(id).innerHTML = html;

@@ -1,7 +1,8 @@
-"""Frame cameras of the Community Sensor Model: support data (ISD) as ALE writes them.
+"""Frame and push-frame cameras of the Community Sensor Model: support data (ISD) as ALE writes
+them, and the model states of frame cameras.
 
-A file is one photograph: its camera, its projection centre and its attitude in the frame of the
-body. The fields have the meaning of usgscsm:
+A file of a frame camera is one photograph: its camera, its projection centre and its attitude in
+the frame of the body. The fields have the meaning of usgscsm:
 
     sample = u + ½, line = v + ½                      (½, ½): centre of the first pixel
     detector = (line, sample)·summing + starting_detector
@@ -16,7 +17,17 @@ is `radial`. With another centre, and for `transverse`, cubic polynomials of (x'
 camera is fitted and the difference reported. A mirror image (samples × lines against the view) has
 no camera here.
 
-Source: usgscsm, UsgsAstroFrameSensorModel.cpp and Distortion.cpp; ALE's formatters.
+A push-frame camera takes framelets of some lines, one under the other in its image, each as a frame
+camera does, at the time
+
+    t = starting_ephemeris_time + exposure_duration/2 + k·interframe_delay
+
+of its middle, k = 0 the first in time: from the bottom of the image if framelet_order_reversed. The
+file is as many photographs, NAME-000 the uppermost one, of one camera. Line l of the image is line
+l − k·framelet_height of framelet k, also where usgscsm cuts lines that neighbours show too.
+
+Source: usgscsm, UsgsAstroFrameSensorModel.cpp, UsgsAstroPushFrameSensorModel.cpp and
+Distortion.cpp; ALE's formatters.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -40,7 +51,10 @@ from jaxbundle.types import Scalar
 
 # As in `io/scanner/csm.py`, which is imported on use: every command that reads a network would
 # load line scanners otherwise, a fifteenth of the time of a small adjustment.
-MODEL = "USGS_ASTRO_FRAME_SENSOR_MODEL"
+MODEL, PUSH_FRAME = "USGS_ASTRO_FRAME_SENSOR_MODEL", "USGS_ASTRO_PUSH_FRAME_SENSOR_MODEL"
+FRAMELETS = ("framelet_height", "framelets_flipped", "framelet_order_reversed",
+             "interframe_delay", "exposure_duration", "starting_ephemeris_time",
+             "num_lines_overlap")  # fmt: skip
 KEYS = Keys(
     (
         *("name_model", "name_sensor", "image_lines", "image_samples", "center_ephemeris_time"),
@@ -49,12 +63,13 @@ KEYS = Keys(
         *("focal_length_model", "detector_center", "focal2pixel_lines", "focal2pixel_samples"),
         *("optical_distortion", "starting_detector_line", "starting_detector_sample"),
         *("projection", "geotransform", "jitter"),
+        *FRAMELETS,
     ),
     {
         **dict.fromkeys(
             ("isis_camera_version", "name_platform", "image_identifier", "naif_keywords",
              "interpolation_method", "number_of_*", "dt_ephemeris", "t0_ephemeris", "dt_quaternion",
-             "t0_quaternion", "b_summing", "exposure_duration", "starting_ephemeris_time"),
+             "t0_quaternion", "b_summing", "ending_ephemeris_time"),
             "names and sources; times of one photograph",
         ),
         **dict.fromkeys(
@@ -66,47 +81,110 @@ KEYS = Keys(
 
 
 def is_csm_frame(path: Path) -> bool:
-    """Whether a JSON file names the model of frame cameras."""
-    return path.suffix.lower() == ".json" and MODEL.encode() in beginning(path, 100_000)
+    """Whether a JSON file names the model of frame or push-frame cameras."""
+    if path.suffix.lower() != ".json":
+        return False
+    start = beginning(path, 100_000)
+    return any(model.encode() in start for model in (MODEL, PUSH_FRAME))
 
 
 def read_csm_frame(path: str | Path, overrides: Sequence[str] = ()) -> Network:
-    """The photograph of an ISD, with the name of the file; lengths in metres, in the frame of the
-    body. Nothing can be adjusted.
+    """The photograph of an ISD or a model state, with the name of the file, or the photographs of
+    the framelets of a push-frame camera; lengths in metres, in the frame of the body. Nothing can
+    be adjusted.
 
     **Raises:** `InputError` naming file and field: missing, not a number, a distortion without a
-    camera here; for model states, maps, crops and mirror images.
+    camera here; for states of push-frame cameras, maps, crops and mirror images.
     """
     from jaxbundle.io.scanner.csm import refuse_map
     from jaxbundle.io.scanner.csm_trajectory import pose_at_centre
 
     path = Path(path)
-    text = read_text(path)
-    if not text.lstrip().startswith("{"):
-        raise InputError(f"{path}: a model state of a frame camera; give the support data (ISD)")
-    isd = JsonFields(path, read_object(path, text, "an ISD"))
-    if isd.get("name_model") != MODEL:
-        raise InputError(
-            f"{path}: name_model is {show(isd.get('name_model'))}; {MODEL} is expected: give the "
-            "support data (ISD) of a frame camera, no model state"
-        )
-    unknown = UnknownKeys()
-    unknown.check(isd.document, KEYS, path)
+    isd, unknown = _support_data(path)
     refuse_map(isd)
     if isd.get("jitter") is not None:
         raise InputError(f"{path}: jitter, of a rolling shutter, is not supported")
     plane = _focal_plane(isd)
     id = str(isd.get("name_sensor") or path.stem)
+    if isd.get("name_model") == PUSH_FRAME:
+        plane, X0, R, warnings = _framelets(isd, plane)
+        names = [f"{path.stem}-{k:03d}" for k in range(len(X0))]
+    else:
+        centre, turn, warnings = pose_at_centre(isd)
+        X0, R, names = centre[None], turn.as_matrix()[None], [path.stem]
     camera = _camera(id, isd, plane)
-    X0, R, warnings = pose_at_centre(isd)
     # from the body into our frame, of which the plane has the axes in the frame of the ISD
-    M = plane.axes @ R.as_matrix().T
-    images = image_columns(
-        Source(str(path), None, "photograph"), [path.stem], [id], M[None], X0[None]
-    )
+    M = plane.axes @ np.swapaxes(R, 1, 2)
+    source = Source(str(path), None, "photograph")
+    images = image_columns(source, names, [id] * len(names), M, X0)
     document = foreign_document(path.stem, [entry_of(camera)], object_unit="m")
     told = (*warnings, *fit_messages([camera]), *unknown.messages())
     return assemble(path, document, overrides, images, warnings=told)
+
+
+def _support_data(path: Path) -> tuple[JsonFields, UnknownKeys]:
+    """The fields of an ISD, or of a state in the form of one; keys that are not understood."""
+    text, unknown = read_text(path), UnknownKeys()
+    if not text.lstrip().startswith("{"):
+        from jaxbundle.io.scanner.csm_state import frame_support_data_of
+
+        # a state: the name of its model, then an object
+        name, _, rest = text.lstrip().partition("\n")
+        if name.strip() != MODEL:
+            raise InputError(
+                f"{path}: a model state of {show(name.strip()[:60])}; expected one of {MODEL}, or "
+                "support data (ISD)"
+            )
+        state = JsonFields(path, read_object(path, rest, "a model state"))
+        return JsonFields(path, frame_support_data_of(state)), unknown
+    isd = JsonFields(path, read_object(path, text, "an ISD"))
+    if isd.get("name_model") not in (MODEL, PUSH_FRAME):
+        raise InputError(
+            f"{path}: name_model is {show(isd.get('name_model'))}; {MODEL} or {PUSH_FRAME} is "
+            "expected: give the support data (ISD) of a frame or push-frame camera"
+        )
+    unknown.check(isd.document, KEYS, path)
+    return isd, unknown
+
+
+def _framelets(
+    isd: JsonFields, plane: "FocalPlane"
+) -> tuple["FocalPlane", Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"], tuple[str, ...]]:
+    """The plane of a framelet; projection centres, rotations camera → body of all of them, from the
+    top of the image; warnings."""
+    from jaxbundle.io.scanner.csm_trajectory import poses_at
+
+    height, lines = isd.integer("framelet_height", least=1), plane.size[1]
+    if isd.number("detector_line_summing", 1.0) != 1:
+        raise InputError(f"{isd.path}: detector_line_summing of framelets is not supported")
+    flags = {
+        name: isd.get(name, False) for name in ("framelets_flipped", "framelet_order_reversed")
+    }
+    for name, value in flags.items():
+        if not isinstance(value, bool):
+            raise InputError(f"{isd.path}: {name} is {show(value)}; true or false is expected")
+    if flags["framelets_flipped"]:
+        raise InputError(
+            f"{isd.path}: framelets_flipped: the lines of every framelet are in reverse order, a "
+            "mirror image, which no camera here has; turn them round and set it to false"
+        )
+    number, rest = divmod(lines, height)
+    warnings = []
+    if rest:
+        warnings.append(
+            f"{isd.path}: {lines} lines are {number} framelets of {height} and {rest} more lines, "
+            "which are left out"
+        )
+    if number == 0:
+        raise InputError(f"{isd.path}: {lines} lines are less than a framelet of {height}")
+    delay = isd.number("interframe_delay")
+    if not delay > 0:
+        raise InputError(f"{isd.path}: interframe_delay is {delay:g}; seconds above 0 are expected")
+    k = np.arange(number)
+    k = k[::-1] if flags["framelet_order_reversed"] else k
+    first = isd.number("starting_ephemeris_time") + isd.number("exposure_duration") / 2
+    P, R, said = poses_at(isd, first - isd.number("center_ephemeris_time") + k * delay)
+    return plane._replace(size=(plane.size[0], height)), P, R.as_matrix(), (*said, *warnings)
 
 
 class FocalPlane(NamedTuple):

@@ -91,6 +91,20 @@ def read_orientation_covariance(path: str | Path, radians: float) -> Orientation
     unknowns = tuple(
         (str(a).strip(), str(b).strip(), str(c).strip()) for a, b, c in zip(kinds, ids, names)
     )
+    seen: dict[Unknown, int] = {}
+    for k, unknown in enumerate(unknowns):
+        if unknown in seen:
+            raise InputError(
+                f"{table.source(k)}: {' '.join(unknown)} is listed twice, also in "
+                f"{table.source(seen[unknown])}"
+            )
+        seen[unknown] = k
+    # correlations are written with all digits: what is below 0 is rounding of them, or edited
+    if n and np.linalg.eigvalsh(R)[0] < -1e-6 * n:
+        raise InputError(
+            f"{path}: the correlations are not those of any errors (an eigenvalue of "
+            f"{np.linalg.eigvalsh(R)[0]:.3g}); take the file as it was written"
+        )
     return OrientationCovariance(unknowns, np.outer(sigma, sigma) * R)
 
 

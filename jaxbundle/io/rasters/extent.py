@@ -60,6 +60,24 @@ def image_extent(image: PushbroomImage, earth: Ellipsoid, places: int = 17) -> E
     return _around(longitude, latitude)
 
 
+def pole_in_image(image: PushbroomImage, earth: Ellipsoid, places: int = 17) -> str | None:
+    """The pole that an image shows, in words; None if it shows none, or if its border misses the
+    ground.
+
+    The longitudes along the border of the image then lead once around the Earth.
+
+    **Arguments:** `places`: lines and pixels of the lattice, as of `image_extent`."""
+    lines, pixels = (np.linspace(0, n - 1, places) for n in (image.lines, image.pixels))
+    X = np.asarray(_locate(image, Height(level=0.0, earth=earth), lines, pixels))
+    border = np.concatenate([X[:, 0], X[:, 1:, -1], X[:, -1, -2::-1], X[:, -2::-1, 0]], axis=1)
+    if not np.isfinite(border).all():
+        return None
+    turn = np.diff(np.unwrap(np.arctan2(border[1], border[0]))).sum()
+    if abs(turn) < np.pi:
+        return None
+    return "North Pole" if border[2].mean() > 0 else "South Pole"
+
+
 def rpc_extent(rpc: Rpc) -> Extent | None:
     """The validity domain of coefficients."""
     ends = np.array([-REACH, REACH])

@@ -73,8 +73,11 @@ KEYS = Keys(
         ),
     },
 )
-# The model of frame cameras (`io.networks.csm_frame`).
-FRAME_MODEL = "USGS_ASTRO_FRAME_SENSOR_MODEL"
+# The models of frame and push-frame cameras (`io.networks.csm_frame`), and what they are read as.
+FRAME_MODELS = {
+    "USGS_ASTRO_FRAME_SENSOR_MODEL": "a photograph",
+    "USGS_ASTRO_PUSH_FRAME_SENSOR_MODEL": "photographs, one for each framelet",
+}
 
 
 def read_csm(
@@ -148,7 +151,8 @@ def _read_support_data(path: Path, unknown: UnknownKeys) -> tuple[JsonFields, in
     refuse_map(isd)
     model = isd.get("name_model", MODEL)
     if model != MODEL:
-        hint = " (`jaxbundle convert` reads it as a photograph)" if model == FRAME_MODEL else ""
+        kind = FRAME_MODELS.get(str(model))
+        hint = "" if kind is None else f" (`jaxbundle convert` reads it as {kind})"
         raise InputError(f"{path}: name_model is {show(model)}{hint}; {MODEL} is expected")
     unknown.check(isd.document, KEYS, path)
     return isd, order

@@ -19,6 +19,7 @@ from jaxbundle.io.text.json_fields import JsonFields
 from jaxbundle.network.columns import show
 
 MODEL = "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL"
+FRAME_MODEL = "USGS_ASTRO_FRAME_SENSOR_MODEL"
 # By their number, `m_distortionType`.
 DISTORTIONS = (
     "radial",
@@ -82,7 +83,7 @@ def support_data_of(state: JsonFields) -> tuple[dict[str, Any], int]:
         "detector_sample_summing": number("m_detectorSampleSumming", 1),
         "starting_detector_line": number("m_startingDetectorLine", 0),
         "starting_detector_sample": number("m_startingDetectorSample", 0),
-        "optical_distortion": _distortion(state),
+        "optical_distortion": distortion_of(state),
         "radii": {
             "semimajor": number("m_majorAxis"),
             "semiminor": number("m_minorAxis"),
@@ -90,6 +91,35 @@ def support_data_of(state: JsonFields) -> tuple[dict[str, Any], int]:
         },
     }
     return isd, PLATFORM_ORDERS[int(flag)]
+
+
+def frame_support_data_of(state: JsonFields) -> dict[str, Any]:
+    """The state of a frame camera as an ISD of the older form: the seven parameters of its pose are
+    the projection centre, metres, and the quaternion camera → body, scalar last.
+
+    **Raises:** `InputError` naming file and field.
+    """
+    number, array = state.number, state.array
+    if len(array("m_lineTimes", (None,), [])):
+        raise InputError(f"{state.path}: jitter, of a rolling shutter, is not supported")
+    pose, centre = array("m_currentParameterValue", (7,)), array("m_ccdCenter", (2,))
+    return {
+        "name_model": FRAME_MODEL,
+        "name_sensor": state.get("m_sensorName") or "",
+        "image_lines": number("m_nLines"),
+        "image_samples": number("m_nSamples"),
+        "sensor_position": {"positions": [pose[:3].tolist()], "unit": "m"},
+        "sensor_orientation": {"quaternions": [pose[3:].tolist()]},
+        "focal_length_model": {"focal_length": number("m_focalLength")},
+        "focal2pixel_lines": array("m_iTransL", (3,)).tolist(),
+        "focal2pixel_samples": array("m_iTransS", (3,)).tolist(),
+        "detector_center": {"line": float(centre[0]), "sample": float(centre[1])},
+        "detector_sample_summing": number("m_detectorSampleSumming", 1),
+        "detector_line_summing": number("m_detectorLineSumming", 1),
+        "starting_detector_line": number("m_startingDetectorLine", 0),
+        "starting_detector_sample": number("m_startingDetectorSample", 0),
+        "optical_distortion": distortion_of(state),
+    }
 
 
 def _check_unadjusted(state: JsonFields) -> None:
@@ -111,7 +141,8 @@ def _rows(state: JsonFields, key: str, n: int) -> list[list[float]]:
     return values.reshape(-1, n).tolist()
 
 
-def _distortion(state: JsonFields) -> dict[str, dict[str, Any]]:
+def distortion_of(state: JsonFields) -> dict[str, dict[str, Any]]:
+    """The distortion of a state in the form of an ISD."""
     kind = state.number("m_distortionType")
     if kind not in range(len(DISTORTIONS)):
         raise InputError(

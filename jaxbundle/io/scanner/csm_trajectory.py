@@ -111,19 +111,43 @@ def pose_at_centre(isd: JsonFields) -> tuple[Float[np.ndarray, "3"], Rotation, t
             isd, "sensor_orientation", isd.array("sensor_orientation.quaternions", (1, 4))
         )
         return P[0], R[0], lengths
+    P, R, warnings = poses_at(isd, np.zeros(1))
+    return P[0], R[0], warnings
+
+
+def poses_at(
+    isd: JsonFields, when: Float[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, "n 3"], Rotation, tuple[str, ...]]:
+    """Poses at times, seconds since the centre time: projection centres, the rotations from the
+    camera into the frame of the body, and warnings. A table with a single row holds for all times;
+    others hold for one step beyond their ends.
+
+    **Raises:** `InputError` naming file and field.
+    """
     body_times, body, body_lengths = _turns(isd, "body_rotation")
     times, pointing, lengths = _turns(isd, "instrument_pointing")
     position_times = _times(isd, "instrument_position")
-    centre = lambda t: t if len(t) == 1 else np.zeros(1)
+    for name, rows in (
+        ("body_rotation", body_times),
+        ("instrument_pointing", times),
+        ("instrument_position", position_times),
+    ):
+        if len(rows) > 1 and len(when) > 1:
+            step = np.diff(rows).max()
+            if when.min() < rows[0] - step or when.max() > rows[-1] + step:
+                raise InputError(
+                    f"{isd.path}: {name} has times from {rows[0]:.6g} to {rows[-1]:.6g} s of the "
+                    f"centre time, the image needs {when.min():.6g} to {when.max():.6g} s"
+                )
+    of_table = lambda t: t if len(t) == 1 else when
     if len(position_times) == 1:
         scale = unit_of(isd, "instrument_position", "km")
         inertial, said = scale * isd.array("instrument_position.positions", (1, 3)), ()
     else:
         at, said = _positions(isd, position_times)
-        inertial = at(np.zeros(1))
-    X0 = body(centre(position_times)).apply(inertial)[0]
-    when = centre(times)
-    R = (body(when) * pointing(when).inv())[0]
+        inertial = at(when)
+    X0 = body(of_table(position_times)).apply(inertial)
+    R = body(of_table(times)) * pointing(of_table(times)).inv()
     return X0, R, (*body_lengths, *lengths, *said)
 
 

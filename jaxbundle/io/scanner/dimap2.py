@@ -45,7 +45,11 @@ MODEL = "Geometric_Data/Refined_Model"
 EARLY_MODEL = "Geometric_Data/Sensor_Model_Characteristics"
 # Units of LINE_PERIOD by METADATA_PROFILE, if START and END do not determine them.
 PROFILES = {"PHR": 1e-3, "PNEO": 1e-6, "S6": 1e-6, "S7": 1e-6}
-TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "microseconds": 1e-6}
+TIME_UNITS = {
+    **dict.fromkeys(("s", "second", "seconds"), 1.0),
+    **dict.fromkeys(("ms", "millisecond", "milliseconds"), 1e-3),
+    **dict.fromkeys(("us", "µs", "microsecond", "microseconds"), 1e-6),
+}
 # Levels whose pixels are those of the camera.
 LEVELS = ("SENSOR", "PRIMARY")
 
@@ -213,10 +217,10 @@ def _polynomial(
     """The attitudes of a polynomial, as a table from a second before the image to one after."""
     key = names.polynomials
     start = seconds(epoch, epoch.astype("datetime64[D]"))
-    offset = file.number(f"{key}/OFFSET") - start
+    offset, scale = (_seconds(file, f"{key}/{name}") for name in ("OFFSET", "SCALE"))
+    offset -= start
     day = 86400.0
     offset -= day * np.round(offset / day)  # a strip over midnight
-    scale = file.number(f"{key}/SCALE")
     if scale == 0:
         raise InputError(f"{file.path}: SCALE of {key.rpartition('/')[2]} is 0")
     # Through eight rows Lagrange's polynomial of degree 7 is exact for those of low degree;
@@ -225,6 +229,12 @@ def _polynomial(
     parts = [file.numbers(names.coefficients.format(k)) for k in range(4)]
     values = np.stack([np.polyval(c[::-1], (rows - offset) / scale) for c in parts], 1)
     return rows, *_rotations(values, source)
+
+
+def _seconds(file: XmlFields, key: str) -> float:
+    """A time in the unit that it states, seconds by default."""
+    unit = _unit(file, file.find(key), TIME_UNITS)
+    return file.number(key) * (1.0 if unit is None else unit)
 
 
 def _rotations(

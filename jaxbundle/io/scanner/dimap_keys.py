@@ -15,7 +15,7 @@ BASE = {
     "version": "of a dictionary",
     "name": FOOTPRINT,
 }
-# Positions, velocities and line periods state their units.
+# Positions, line periods and the times of polynomials state their units.
 WITH_UNIT = Keys(("unit",))
 
 DIMAP2_DOCUMENT = Keys(
@@ -121,6 +121,8 @@ DIMAP2: dict[str, Keys] = {
     "LOCATION_VALUES": WITH_UNIT,
     "Attitudes": Keys(("Polynomial_Quaternions", "Quaternion_List"), {"ATTITUDES_USED": STATE}),
     "Polynomial_Quaternions": Keys(("OFFSET", "SCALE", "Q0", "Q1", "Q2", "Q3")),
+    "OFFSET": WITH_UNIT,
+    "SCALE": WITH_UNIT,
     **{f"Q{k}": Keys(("COEFFICIENTS",), {"DEGREE": COUNTED}) for k in range(4)},
     "Quaternion_List": Keys(("Quaternion",)),
     "Quaternion": Keys(("TIME", "Q0", "Q1", "Q2", "Q3"), {"Q_STATUS": STATE}),

@@ -15,7 +15,7 @@ c = 700.0
 pitch = 0.0065
 
 [track]                             # height, inclination, node, argument; or state; or start and
-                                    # velocity
+                                    # end; with a local Earth start and velocity or end
 height = 505000.0
 inclination = 97.4
 
@@ -42,7 +42,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.geometry.ellipsoid import Ellipsoid
+from jaxbundle.geometry.ellipsoid import Ellipsoid, earth_fixed
 from jaxbundle.io.scanner.scanner_file import ANGLES, earth_of, mounting_of, optics_of
 from jaxbundle.io.text.sections import TomlFile, TomlSection, read_sections
 from jaxbundle.network.columns import did_you_mean
@@ -51,7 +51,8 @@ from jaxbundle.pushbroom.noise import Noise, Sigma
 from jaxbundle.pushbroom.signals import KEYS
 
 ORBIT = ("height", "inclination", "node", "argument")
-LINE = ("start", "velocity")
+LINE = ("start", "velocity", "end")
+ENDS = ("start", "end")
 STATE = ("state", "at", "j2")
 RATES = ("position_rate", "attitude_rate")
 METHODS = ("position_interpolation", "attitude_interpolation")
@@ -118,7 +119,13 @@ def _read_track(file: TomlFile, earth: Ellipsoid | None) -> dict[str, Any]:
     track = file.section("track")
     if earth is None:
         track.check_keys(LINE)
-        return {k: track.numbers(k, 3) for k in LINE}
+        if "velocity" in track and "end" in track:
+            raise InputError(f"{track.where}velocity and end are both given; give one of them")
+        return {k: track.numbers(k, 3) for k in ("start", "end" if "end" in track else "velocity")}
+    if "start" in track or "end" in track:
+        track.check_keys(ENDS)
+        places = {k: _place(track, k, file.radians, earth) for k in ENDS}
+        return {**places, "centre": np.zeros(3)}
     if "state" in track:
         track.check_keys(STATE)
         j2 = track.switch("j2") or "j2" not in track
@@ -126,6 +133,18 @@ def _read_track(file: TomlFile, earth: Ellipsoid | None) -> dict[str, Any]:
     track.check_keys(ORBIT)
     angles = {k: file.radians * track.number(k, 0.0) for k in ORBIT[1:]}
     return {"height": track.number("height"), **angles}
+
+
+def _place(track: TomlSection, key: str, radians: float, earth: Ellipsoid) -> np.ndarray:
+    """A position Earth-fixed, of longitude, latitude and height."""
+    longitude, latitude, height = track.numbers(key, 3)
+    if not abs(radians * latitude) <= np.pi / 2:
+        raise InputError(
+            f"{track.where}{key} has a latitude of {latitude:g}; longitude, latitude, height are "
+            "expected, in the unit of angles and metres"
+        )
+    place = radians * longitude, radians * latitude, height
+    return np.array([float(v) for v in earth_fixed(earth, place)])
 
 
 def _sigma(section: TomlSection, name: str, radians: float) -> Sigma:

@@ -16,7 +16,6 @@ Unknowns that are not listed are held.
 """
 
 import dataclasses
-import os
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +36,7 @@ from jaxbundle.network.columns import list_some
 from jaxbundle.pushbroom.rpc.bias import BiasDomain, domain_of_bias
 from jaxbundle.refinement import Refinement, RpcScannerImage
 from jaxbundle.refinement.freedom import UnknownName
+from jaxbundle.system.paths import relative_path
 
 TABLE = "refined.csv"
 HEAD = ("id", "file", "raster", "sensor", "knot_spacing", *BiasDomain._fields)
@@ -96,7 +96,7 @@ def write_refined_orientations(
     for one in file.images:
         raster = find_raster(file.sources[one.id])
         # from where the folder will be: now it has a temporary name
-        known = "" if raster is None else os.path.relpath(raster, place)
+        known = "" if raster is None else relative_path(raster, place)
         if isinstance(one, RpcScannerImage):
             domain = domain_of_bias(one.image.rpc)
             rows.append((one.id, f"{one.id}{file.rpc_ending}", known, "", "", *domain))

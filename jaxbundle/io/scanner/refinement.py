@@ -5,7 +5,8 @@
 points = "points.csv"               # id,role,X,Y,Z[,sX,sY,sZ], or
                                     # id,role,longitude,latitude,height[,sE,sN,sh]
 observations = "observations.csv"   # image,point,line,pixel[,sline,spixel]; or a list of such
-                                    # files, and .match and .gcp of Ames Stereo Pipeline
+                                    # files, .match and .gcp of Ames Stereo Pipeline, control
+                                    # networks (.pvl, .net) and residuals.csv of ISIS
 tie_points = "ties.csv"             # the same columns, of tie points only, which need no row in
                                     # points (`pushbroom tie` writes it); or a list
 frames = "photographs"              # a project of photographs that share points
@@ -23,6 +24,9 @@ significance = 0.001
 A = "a/scanner.toml"
 B = "b/scanner.toml"
 C = "c.tif"
+
+[serial_numbers]                    # by which ISIS knows images, where not by their files
+A = "MRO/CTX/0881034911:066"
 
 [models]                            # rigorous | rpc, of products that have both
 B = "rigorous"
@@ -90,6 +94,7 @@ SECTIONS = {
     ),
     "images": (),
     "models": (),
+    "serial_numbers": (),
     "sensors": (),
     "unknowns": (),
 }
@@ -136,6 +141,11 @@ def read_refinement(path: str | Path) -> RefineFile:
     sources = {one.id: file.section("images").path(one.id, "an image") for one in images}
     names = {re.sub("(?i)_rpc$", "", sources[one.id].stem): one.id for one in images}
     names |= {one.id: one.id for one in images}
+    serial = file.section("serial_numbers")
+    for id in serial.values:
+        if id not in sources:
+            raise InputError(f"{serial.where}{id}: no such image{did_you_mean(id, list(sources))}")
+        names[serial.text(id)] = id
     points, observations, said = read_points(section, names, images, frames, radians)
     warnings += said
     snooping = section.text("snooping", "none")

@@ -1,4 +1,4 @@
-"""Points and measurements of a refine file: CSV tables, and files of Ames Stereo Pipeline."""
+"""Points and measurements of a refine file: CSV tables, files of Ames Stereo Pipeline and ISIS."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -15,14 +15,20 @@ from jaxbundle.io.scanner.asp_points import (
     read_gcp,
     read_match,
 )
+from jaxbundle.io.scanner.isis_points import (
+    IsisPoints,
+    is_jigsaw_residuals,
+    read_control_network,
+    read_jigsaw_residuals,
+)
 from jaxbundle.io.text.csv_tables import read_csv
 from jaxbundle.io.text.sections import TomlSection
-from jaxbundle.network.columns import Columns, count
+from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.tables import STATED, UNIT, Network, Observations, Source
 from jaxbundle.refinement.refining import east_north_up
 from jaxbundle.refinement.tables import AnyScannerImage, GroundPoints, check_points_table
 
-GCP, MATCH = ".gcp", ".match"
+GCP, MATCH, ISIS = ".gcp", ".match", (".pvl", ".net")
 MEASURED = ("image", "point", "line", "pixel", "sline", "spixel")
 
 
@@ -38,13 +44,15 @@ def read_points(
     **Arguments:** `names`: ids of images by the names that other programs know them by.
     """
     ties_alone = "tie_points" in section and "observations" not in section
-    files = [] if ties_alone else section.paths("observations", "a CSV table, .match or .gcp")
+    files = [] if ties_alone else section.paths("observations", "a CSV table, .match, .gcp or .pvl")
     by_suffix = {s: [f for f in files if f.suffix.lower() == s] for s in (GCP, MATCH)}
-    tables = [read_csv(f) for f in files if f.suffix.lower() not in by_suffix]
+    of_isis = [f for f in files if f.suffix.lower() in ISIS or is_jigsaw_residuals(f)]
+    others = (*by_suffix[GCP], *by_suffix[MATCH], *of_isis)
+    tables = [read_csv(f) for f in files if f not in others]
     for table in tables:
         table.check_names(MEASURED[:4], MEASURED[4:])
     parts, warnings = [], []
-    if "points" in section or not (by_suffix[GCP] or by_suffix[MATCH] or ties_alone):
+    if "points" in section or not (len(others) or ties_alone):
         parts.append(_points_of(section.table("points"), images[0].earth, radians))
     for path in by_suffix[GCP]:
         control = read_gcp(path)
@@ -58,12 +66,26 @@ def read_points(
         tables.append(table)
         parts.append(ties)
         warnings += said
+    for path in of_isis:
+        given = {id for part in parts for id in part.id}
+        network = path.suffix.lower() in ISIS
+        found = read_control_network(path) if network else read_jigsaw_residuals(path)
+        warnings += found.messages
+        table, unknown = _measured_by_isis(found, path, names)
+        tables.append(table)
+        parts.append(_points_of_isis(found, path, given))
+        if unknown:
+            warnings.append(
+                f"{path}: measurements in images that are not in [images]: {list_some(unknown, 3)}"
+                "; of serial numbers give [serial_numbers]"
+            )
     if "tie_points" in section:
         given = {id for part in parts for id in part.id}
+        measured: set[tuple[object, ...]] = set()
         for path in section.paths("tie_points", "a CSV table of measurements of tie points"):
             table = read_csv(path)
             table.check_names(MEASURED[:4], MEASURED[4:])
-            tables.append(table)
+            tables.append(_without_repeated(table, measured))
             new = [id for id in dict.fromkeys(table.values["point"]) if id not in given]
             given |= set(new)
             parts.append(_tie_points(new, Source(str(path))))
@@ -78,6 +100,18 @@ def read_points(
     known = [image.id for image in images]
     table = _join_tables(tables)
     return points, _observations(table, ids, known, section, points.source.name), warnings
+
+
+def _without_repeated(table: Columns, known: set[tuple[object, ...]]) -> Columns:
+    """A table of tie points without the measurements that an earlier one has, `known`: a corner of
+    an image is the same measurement in the tables of all its pairs. These are added to `known`."""
+    rows = list(zip(*(table.values[name] for name in MEASURED[:4])))
+    kept = np.array([k for k, row in enumerate(rows) if row not in known], int)
+    known |= set(rows)
+    if len(kept) == len(rows):
+        return table
+    values = {name: [column[k] for k in kept] for name, column in table.values.items()}
+    return Columns(values, table.source.take(kept))
 
 
 def _control_points(control: ControlFile, path: Path, earth: Ellipsoid | None) -> GroundPoints:
@@ -119,6 +153,44 @@ def _measured_control(
     return Columns(values, Source(str(path), control.row[point], "line")), ", ".join(
         sorted(unknown)
     )
+
+
+def _points_of_isis(found: IsisPoints, path: Path, given: set[str]) -> GroundPoints:
+    """The points of a file of ISIS that are not given otherwise: σ along the axes of each one's
+    covariance."""
+    kept = np.array([k for k, id in enumerate(found.id) if id not in given], int)
+    variances, vectors = np.linalg.eigh(found.covariance[kept])
+    X = found.X[kept].copy()
+    roles = [found.role[k] for k in kept]
+    # tie points begin at the intersection of their rays
+    X[np.array(roles, object) == "tie"] = np.nan
+    return GroundPoints(
+        tuple(found.id[k] for k in kept),
+        tuple(roles),
+        X,
+        np.sqrt(np.maximum(variances, 0.0)),
+        np.swapaxes(vectors, 1, 2),
+        ("first axis", "second axis", "third axis"),
+        Source(str(path), found.row[kept], "line"),
+    )
+
+
+def _measured_by_isis(
+    found: IsisPoints, path: Path, names: Mapping[str, str]
+) -> tuple[Columns, list[str]]:
+    """The measurements of a file of ISIS as a table, and its images that nobody knows."""
+    images = [next((names[n] for n in known if n in names), None) for known in found.image]
+    unknown = sorted({known[0] for known, id in zip(found.image, images) if id is None})
+    kept = np.array([k for k, id in enumerate(images) if id is not None], int)
+    sigma = [[None if np.isnan(v) else v for v in found.xy_sigma[kept, k].tolist()] for k in (0, 1)]
+    values = {
+        "image": [images[k] for k in kept],
+        "point": [found.id[p] for p in found.point[kept]],
+        **dict(zip(("line", "pixel"), found.xy[kept].T.tolist())),
+        **dict(zip(("sline", "spixel"), sigma)),
+    }
+    table = Columns(values, Source(str(path), found.ray_row[kept], "line"), may_be_empty=True)
+    return table, unknown
 
 
 def _matched(

@@ -1,0 +1,343 @@
+"""Points and measurements of ISIS: control networks as text, and the residuals of jigsaw.
+
+A control network (`cnetbin2pvl` writes it of a binary one) is PVL:
+
+    Object = ControlNetwork
+      Object = ControlPoint
+        PointType = Constrained                 Free (Tie), Fixed (Ground)
+        PointId   = …
+        AprioriX  = 1485514.8 <meters>          AprioriY, AprioriZ; AdjustedX, …
+        AprioriCovarianceMatrix = (XX, XY, XZ, YY, YZ, ZZ)         m²
+        Group = ControlMeasure
+          SerialNumber = Odyssey/THEMIS_IR/698683699.000
+          Sample = 281.08
+          Line   = 11156.10
+          SampleSigma, LineSigma, SampleResidual, LineResidual, Ignore, JigsawRejected
+        End_Group
+      End_Object
+    End_Object
+
+`residuals.csv` of jigsaw has three lines of head; then point, file, serial number, x, y (mm),
+sample, line, their residuals, the length of these (pixels), and * where jigsaw rejected it.
+
+Samples and lines are 1 at the centre of the first pixel. Points are in the frame of the body.
+Source: ISIS, ControlPointV0005.cpp and BundleSolutionInfo.cpp.
+"""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.text.csv_tables import read_text
+from jaxbundle.io.text.xml_fields import number_in
+from jaxbundle.network.columns import count, show
+from jaxbundle.system.file_content import ENDS_EARLY, beginning
+
+# The beginning of jigsaw's residuals, and their fields without the last.
+RESIDUALS_HEAD = ",,,x image,y image,"
+RESIDUALS_FIELDS = 10
+ROLES = {"free": "tie", "tie": "tie", "fixed": "control", "ground": "control",
+         "constrained": "control"}  # fmt: skip
+METRES = {"": 1.0, "m": 1.0, "meters": 1.0, "km": 1000.0, "kilometers": 1000.0}
+
+
+class IsisPoints(NamedTuple):
+    """Points: ids, roles, X, Y, Z (metres, NaN unknown), their covariance (0: fixed), the line of
+    each; measurements: the names by which the image is known, point, line and pixel, σ of these
+    (NaN: not stated), the line of each; messages."""
+
+    id: list[str]
+    role: list[str]
+    X: Float[np.ndarray, "points 3"]
+    covariance: Float[np.ndarray, "points 3 3"]
+    row: Int[np.ndarray, " points"]
+    image: list[tuple[str, ...]]
+    point: Int[np.ndarray, " rays"]
+    xy: Float[np.ndarray, "rays 2"]
+    xy_sigma: Float[np.ndarray, "rays 2"]
+    ray_row: Int[np.ndarray, " rays"]
+    messages: tuple[str, ...]
+
+
+def is_jigsaw_residuals(path: Path) -> bool:
+    """Whether a file begins as the residuals of jigsaw."""
+    return beginning(path, len(RESIDUALS_HEAD)).lower() == RESIDUALS_HEAD.lower().encode()
+
+
+class _Entry(NamedTuple):
+    """A statement: upper-case name, value, line."""
+
+    name: str
+    value: str
+    line: int
+
+
+def read_control_network(path: str | Path) -> IsisPoints:
+    """The points and measurements of a control network in PVL. Those to be ignored, and those that
+    jigsaw has rejected, are left out with a message.
+
+    **Raises:** `InputError` naming file and line; for a binary network.
+    """
+    path = Path(path)
+    if b"ProtoBuffer" in beginning(path, 2000):
+        raise InputError(
+            f"{path}: a binary control network; make text of it (ISIS: cnetbin2pvl "
+            f"from={path.name} to=network.pvl) and give that"
+        )
+    points: list[tuple] = []
+    rays: list[tuple] = []
+    left_out = {"ignored": 0, "rejected by jigsaw": 0}
+    residuals = []
+    seen: dict[str, int] = {}
+    for fields, measures in _points_of(path):
+        if _is_true(fields, "IGNORE"):
+            left_out["ignored"] += len(measures)
+            continue
+        point = _point(path, fields)
+        if point[0] in seen:
+            raise InputError(
+                f"{path}, line {point[4]}: point {point[0]!r} occurs twice, also in line "
+                f"{seen[point[0]]}"
+            )
+        seen[point[0]] = point[4]
+        for measure in measures:
+            reason = next((words for key, words in (("IGNORE", "ignored"), ("JIGSAWREJECTED",
+                           "rejected by jigsaw")) if _is_true(measure, key)), None)  # fmt: skip
+            if reason is not None:
+                left_out[reason] += 1
+                continue
+            rays.append((len(points), *_measure(path, measure)))
+            residuals.append([_number(path, measure, f"{k}RESIDUAL") for k in ("LINE", "SAMPLE")])
+        points.append(point)
+    if not points:
+        raise InputError(f"{path}: no control point; expected Object = ControlPoint in it")
+    said = [
+        f"{path}: {count(n, 'measurement')} {why}, left out" for why, n in left_out.items() if n
+    ]
+    said += _describe_residuals(path, np.array(residuals).reshape(-1, 2))
+    return _gather(points, rays, said)
+
+
+def read_jigsaw_residuals(path: str | Path) -> IsisPoints:
+    """The measurements of jigsaw's residuals, all of tie points; those that it has rejected are
+    left out with a message.
+
+    **Raises:** `InputError` naming file and line.
+    """
+    path, points, rays, residuals, rejected = Path(path), {}, [], [], 0
+    for number, text in enumerate(read_text(path).splitlines(), 1):
+        # three lines of head
+        if number <= 3 or not text.strip():
+            continue
+        fields, where = [field.strip() for field in text.split(",")], f"{path}, line {number}"
+        if len(fields) not in (RESIDUALS_FIELDS, RESIDUALS_FIELDS + 1):
+            raise InputError(
+                f"{where}: {len(fields)} fields; expected point, file, serial number, x, y, "
+                "sample, line, two residuals and their length"
+            )
+        if fields[RESIDUALS_FIELDS:] == ["*"]:
+            rejected += 1
+            continue
+        sample, line, dx, dy = (number_in(word, where) for word in fields[5:9])
+        point = points.setdefault(fields[0], (len(points), number))[0]
+        names = (Path(fields[1]).stem, fields[2])
+        rays.append((point, names, (line - 1, sample - 1), (np.nan, np.nan), number))
+        residuals.append((dy, dx))
+    if not rays:
+        raise InputError(f"{path}: no measurement; expected one a line, after three lines of head")
+    said = [f"{path}: {count(rejected, 'measurement')} rejected by jigsaw, left out"]
+    said = (said if rejected else []) + _describe_residuals(path, np.array(residuals))
+    unknown = (np.full(3, np.nan), np.zeros((3, 3)))
+    return _gather([(id, "tie", *unknown, row) for id, (_, row) in points.items()], rays, said)
+
+
+def _gather(points: list[tuple], rays: list[tuple], said: list[str]) -> IsisPoints:
+    id, role, X, covariance, row = zip(*points)
+    point, image, xy, sigma, ray_row = zip(*rays) if rays else ((), (), (), (), ())
+    return IsisPoints(
+        list(id),
+        list(role),
+        np.array(X, float),
+        np.array(covariance, float),
+        np.array(row, int),
+        list(image),
+        np.array(point, int),
+        np.array(xy, float).reshape(-1, 2),
+        np.array(sigma, float).reshape(-1, 2),
+        np.array(ray_row, int),
+        tuple(said),
+    )
+
+
+def _describe_residuals(path: Path, residuals: Float[np.ndarray, "n 2"]) -> list[str]:
+    """What the file says of its own adjustment: the RMS of its residuals."""
+    known = residuals[np.isfinite(residuals).all(1)]
+    if not len(known):
+        return []
+    line, sample = np.sqrt(np.mean(known**2, axis=0))
+    return [
+        f"{path}: residuals of jigsaw in {count(len(known), 'measurement')}: RMS {line:.3g} lines, "
+        f"{sample:.3g} samples"
+    ]
+
+
+Fields = dict[str, _Entry]
+
+
+def _points_of(path: Path) -> Iterator[tuple[Fields, list[Fields]]]:
+    """The fields of every point, and those of its measurements."""
+    blocks: list[str] = []
+    fields: Fields = {}
+    measures: list[Fields] = []
+    version = 5.0
+    for entry in _statements(path):
+        where = f"{path}, line {entry.line}"
+        if entry.name in ("OBJECT", "GROUP"):
+            blocks.append(entry.value.upper())
+            if blocks[-1] == "CONTROLPOINT":
+                fields, measures = {}, []
+                if version < 3:
+                    raise InputError(
+                        f"{path}: version {version:g} of control networks, of before 2012, has "
+                        "other fields; write it again (ISIS: cnetbin2pvl)"
+                    )
+            elif blocks[-1] == "CONTROLMEASURE":
+                measures.append({})
+        elif entry.name in ("END_OBJECT", "END_GROUP"):
+            if not blocks:
+                raise InputError(f"{where}: {entry.name} without a beginning")
+            if blocks.pop() == "CONTROLPOINT":
+                yield fields, measures
+        elif blocks[-1:] == ["CONTROLPOINT"]:
+            fields[entry.name] = entry
+        elif blocks[-1:] == ["CONTROLMEASURE"]:
+            if not measures:
+                raise InputError(f"{where}: a measure outside of a point")
+            measures[-1][entry.name] = entry
+        elif entry.name == "VERSION" and blocks == ["CONTROLNETWORK"]:
+            version = number_in(entry.value, where)
+    if blocks:
+        raise InputError(f"{path}: {blocks[-1]} is not closed{ENDS_EARLY}")
+
+
+def _statements(path: Path) -> Iterator[_Entry]:
+    """Names and values; lists in brackets and texts in quotes may have several lines."""
+    waiting: tuple[str, str, int] | None = None
+    for number, text in enumerate(read_text(path, fallback="latin-1").splitlines(), 1):
+        line = text.strip()
+        if waiting is not None:
+            name, value, first = waiting
+            value = f"{value} {line}"
+        else:
+            if not line or line.startswith("#"):
+                continue
+            if line.upper() == "END":
+                return
+            match = re.match(r"(\w+)\s*=\s*(.*)$", line)
+            if match is None and line.upper() in ("END_OBJECT", "END_GROUP"):
+                match = re.match(r"(\w+)(.*)$", line)
+            if match is None:
+                raise InputError(
+                    f"{path}, line {number}: {show(line[:60])}; NAME = value is expected"
+                )
+            name, value, first = match[1].upper(), match[2].strip(), number
+        open_list = value.startswith("(") and ")" not in value
+        open_text = value.count('"') % 2 == 1
+        waiting = (name, value, first) if open_list or open_text else None
+        if waiting is None:
+            yield _Entry(name, value.strip('"') if value.startswith('"') else value, first)
+    if waiting is not None:
+        raise InputError(f"{path}, line {waiting[2]}: {waiting[0]} is not closed{ENDS_EARLY}")
+
+
+def _is_true(fields: Fields, name: str) -> bool:
+    return name in fields and fields[name].value.lower() in ("true", "yes")
+
+
+def _number(path: Path, fields: Fields, name: str) -> float:
+    """A number without its unit; NaN if it is missing."""
+    if name not in fields:
+        return float("nan")
+    entry = fields[name]
+    return number_in(entry.value.partition("<")[0].strip(), f"{path}, line {entry.line}: {name}")
+
+
+def _length(path: Path, fields: Fields, name: str) -> float:
+    """Metres; NaN if missing."""
+    value = _number(path, fields, name)
+    if name in fields:
+        unit = fields[name].value.partition("<")[2].rstrip("> ").lower()
+        if unit not in METRES:
+            line = fields[name].line
+            raise InputError(f"{path}, line {line}: {name} in {show(unit)}; meters are expected")
+        value *= METRES[unit]
+    return value
+
+
+def _point(path: Path, fields: Fields) -> tuple[str, str, np.ndarray, np.ndarray, int]:
+    """Id, role, place, covariance and line of a point."""
+    if "POINTID" not in fields or "POINTTYPE" not in fields:
+        line = min((entry.line for entry in fields.values()), default=0)
+        raise InputError(f"{path}, line {line}: a control point without PointId or PointType")
+    id, kind = fields["POINTID"], fields["POINTTYPE"]
+    role = ROLES.get(kind.value.lower())
+    if role is None:
+        raise InputError(
+            f"{path}, line {kind.line}: PointType {show(kind.value)}; Free, Fixed or Constrained "
+            "is expected"
+        )
+    X = np.full(3, np.nan)
+    # what a network knew before it was adjusted is the observation
+    for source in ("APRIORI", "ADJUSTED"):
+        if not np.isfinite(X).all():
+            X = np.array([_length(path, fields, f"{source}{axis}") for axis in "XYZ"])
+    C = np.zeros((3, 3))
+    if role == "control":
+        if not np.isfinite(X).all():
+            raise InputError(
+                f"{path}, line {id.line}: point {id.value!r} is {kind.value}, without AprioriX, "
+                "AprioriY, AprioriZ"
+            )
+        if kind.value.lower() == "constrained":
+            C = _covariance(path, fields, id)
+    return id.value, role, X, C, id.line
+
+
+def _covariance(path: Path, fields: Fields, id: _Entry) -> Float[np.ndarray, "3 3"]:
+    """The covariance of a constrained point, m²."""
+    entry = fields.get("APRIORICOVARIANCEMATRIX")
+    if entry is None:
+        raise InputError(
+            f"{path}, line {id.line}: point {id.value!r} is Constrained, without "
+            "AprioriCovarianceMatrix"
+        )
+    where = f"{path}, line {entry.line}: AprioriCovarianceMatrix"
+    words = re.sub(r"<[^>]*>|[()]", " ", entry.value).replace(",", " ").split()
+    if len(words) != 6:
+        raise InputError(
+            f"{where} has {len(words)} numbers; six of its upper triangle are expected"
+        )
+    C = np.zeros((3, 3))
+    C[np.triu_indices(3)] = [number_in(word, where) for word in words]
+    C = C + np.triu(C, 1).T
+    if np.linalg.eigvalsh(C)[0] < -1e-9 * np.trace(C):
+        raise InputError(f"{where} is no covariance: it has a negative eigenvalue")
+    return C
+
+
+def _measure(
+    path: Path, fields: Fields
+) -> tuple[tuple[str, ...], tuple[float, float], tuple[float, float], int]:
+    """Serial number, line and pixel, their σ, the line of a measurement."""
+    line = min((entry.line for entry in fields.values()), default=0)
+    missing = [name for name in ("SERIALNUMBER", "SAMPLE", "LINE") if name not in fields]
+    if missing:
+        raise InputError(f"{path}, line {line}: a measure without {', '.join(missing)}")
+    place = _number(path, fields, "LINE") - 1, _number(path, fields, "SAMPLE") - 1
+    sigma = _number(path, fields, "LINESIGMA"), _number(path, fields, "SAMPLESIGMA")
+    return (fields["SERIALNUMBER"].value,), place, sigma, fields["SERIALNUMBER"].line
