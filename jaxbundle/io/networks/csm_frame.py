@@ -52,9 +52,15 @@ from jaxbundle.types import Scalar
 # As in `io/scanner/csm.py`, which is imported on use: every command that reads a network would
 # load line scanners otherwise, a fifteenth of the time of a small adjustment.
 MODEL, PUSH_FRAME = "USGS_ASTRO_FRAME_SENSOR_MODEL", "USGS_ASTRO_PUSH_FRAME_SENSOR_MODEL"
-FRAMELETS = ("framelet_height", "framelets_flipped", "framelet_order_reversed",
-             "interframe_delay", "exposure_duration", "starting_ephemeris_time",
-             "num_lines_overlap")  # fmt: skip
+FRAMELETS = (
+    "framelet_height",
+    "framelets_flipped",
+    "framelet_order_reversed",
+    "interframe_delay",
+    "exposure_duration",
+    "starting_ephemeris_time",
+    "num_lines_overlap",
+)
 KEYS = Keys(
     (
         *("name_model", "name_sensor", "image_lines", "image_samples", "center_ephemeris_time"),

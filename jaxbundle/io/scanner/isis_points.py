@@ -38,11 +38,18 @@ from jaxbundle.io.text.xml_fields import number_in
 from jaxbundle.network.columns import count, show
 from jaxbundle.system.file_content import ENDS_EARLY, beginning
 
-# The beginning of jigsaw's residuals, and their fields without the last.
+# The beginning of jigsaw's residuals, and their fields; a measure it rejected has one more, "*".
 RESIDUALS_HEAD = ",,,x image,y image,"
-RESIDUALS_FIELDS = 10
-ROLES = {"free": "tie", "tie": "tie", "fixed": "control", "ground": "control",
-         "constrained": "control"}  # fmt: skip
+FIELDS = ("point", "file", "serial", "x", "y", "sample", "line", "dx", "dy", "length")
+# Measures that are not used, by their keyword.
+LEFT_OUT = {"IGNORE": "ignored", "JIGSAWREJECTED": "rejected by jigsaw"}
+ROLES = {
+    "free": "tie",
+    "tie": "tie",
+    "fixed": "control",
+    "ground": "control",
+    "constrained": "control",
+}
 METRES = {"": 1.0, "m": 1.0, "meters": 1.0, "km": 1000.0, "kilometers": 1000.0}
 
 
@@ -106,8 +113,9 @@ def read_control_network(path: str | Path) -> IsisPoints:
             )
         seen[point[0]] = point[4]
         for measure in measures:
-            reason = next((words for key, words in (("IGNORE", "ignored"), ("JIGSAWREJECTED",
-                           "rejected by jigsaw")) if _is_true(measure, key)), None)  # fmt: skip
+            reason = next(
+                (words for key, words in LEFT_OUT.items() if _is_true(measure, key)), None
+            )
             if reason is not None:
                 left_out[reason] += 1
                 continue
@@ -135,12 +143,9 @@ def read_jigsaw_residuals(path: str | Path) -> IsisPoints:
         if number <= 3 or not text.strip():
             continue
         fields, where = [field.strip() for field in text.split(",")], f"{path}, line {number}"
-        if len(fields) not in (RESIDUALS_FIELDS, RESIDUALS_FIELDS + 1):
-            raise InputError(
-                f"{where}: {len(fields)} fields; expected point, file, serial number, x, y, "
-                "sample, line, two residuals and their length"
-            )
-        if fields[RESIDUALS_FIELDS:] == ["*"]:
+        if not 0 <= len(fields) - len(FIELDS) <= 1:
+            raise InputError(f"{where}: {len(fields)} fields; expected {', '.join(FIELDS)}")
+        if fields[len(FIELDS) :] == ["*"]:
             rejected += 1
             continue
         sample, line, dx, dy = (number_in(word, where) for word in fields[5:9])
