@@ -73,6 +73,8 @@ def choose_angles(forms: AttitudeForms, values: Mapping[str, Any]) -> Mapping[st
     changed = {}
     for name, known in forms.known.items():
         form = {key: values[f"{name}_{key}"] for key in FORM}
+        # Controls show rounded values: an angle that nobody has moved keeps those of the file, to
+        # the last digit, and its pictures stay.
         if form != known:
             parts = [dict(p) if isinstance(p, Mapping) else p for p in _parts(forms.given, name)]
             sine = {"amplitude": np.radians(form["amplitude"]), "period": form["period"]}

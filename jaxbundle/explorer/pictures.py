@@ -66,6 +66,7 @@ class GroundFrame(NamedTuple):
 
     def place(self, X: Float[np.ndarray, "3 *shape"]) -> tuple[np.ndarray, np.ndarray]:
         """Row and column of points of the ground."""
+        # (0, 0) is the middle of the first pixel, as in all images; left and top are its border.
         x, y = np.tensordot(self.axes[:2], X - self.origin.reshape(3, *[1] * (X.ndim - 1)), 1)
         return (self.top - y) / self.size - 0.5, (x - self.left) / self.size - 0.5
 

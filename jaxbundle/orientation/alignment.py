@@ -111,11 +111,15 @@ def join(network: Network, sights: Sights, model: Model, part: Model) -> Model |
     both = model.known & part.known
     shared = np.flatnonzero(model.placed & part.placed)
     if not both.any():
+        # Two pairs of a chain have an image in common and no point: the ratio of their bases is in
+        # no image point, only in known lengths of both.
         lengths = [scale_of_lengths(network, one) for one in (model, part)]
         if not len(shared) or None in lengths:
             return None
         found = _by_an_image(model, part, shared[0], lengths[1] / lengths[0])
     elif len(shared):
+        # The common image gives all but the scale. A similarity by the points would also take
+        # rotation and shift from them, and of two bundles points are known worst in depth.
         seen = np.bincount(sights.image, both[sights.point], minlength=sights.images)
         image = shared[seen[shared].argmax()]
         to, off = (np.linalg.norm(m.X[both] - m.X0[image], axis=1) for m in (model, part))
