@@ -44,19 +44,24 @@ class ControlChoice:
         return [*wrong, *(f"{id} is not used: {why}" for id, why in self.reasons.items())]
 
 
+def has_doubtful_heights(points: Points) -> bool:
+    """Whether the heights of control are all 0, several, and no σ is stated for them: spreadsheets
+    and forms write 0 for what is not known."""
+    heights = points.position[:, 2]
+    stated = np.isfinite(points.sigma[:, 2]) | (np.array(points.role) == "fixed")
+    return len(points) >= MIN_CONTROL and not heights.any() and not stated.any()
+
+
 def without_unknown_heights(block: OrientedBlock) -> tuple[Points, str]:
     """Control whose heights are all 0 without heights, if satellite positions contradict them; and
     what was decided."""
     points = block.frame.points
-    # spreadsheets and forms write 0 for what is not known: suspected if there are several points,
-    # all of them 0, without a σ that somebody stated for a height
-    heights = points.position[:, 2]
-    if len(points) < MIN_CONTROL or heights.any() or np.isfinite(points.sigma[:, 2]).any():
+    if not has_doubtful_heights(points):
         return points, ""
     if not block.has_positions:
         return points, (
-            "the heights of all control points are 0: used as the file states them; "
-            "their residuals show how far the ground is from this plane"
+            "the heights of all control points are 0: used as the file states them, with a σ not "
+            "below that in the plane (state sZ for heights that are 0)"
         )
     rows = [block.row_of_determined[id] for id in points.id if id in block.row_of_determined]
     spread = block.network.images.sigma[:, 2]
@@ -112,6 +117,19 @@ def assess_control(
         (bool(lacking[0]), bool(lacking[1])),
         max(of_group.factor for of_group in of_groups),
     )
+
+
+def with_heights_as_in_plane(control: Points, assessed: Assessment) -> Points:
+    """Control with the estimated σ in the plane as that of heights, where these have a smaller one:
+    a block that bends to a plane of zeros leaves no residuals that would show their errors."""
+    sigma = control.sigma.copy()
+    estimated = _is_estimated(control, [2])[:, 0]
+    # one σ for all estimated ones
+    plane = float(assessed.sigma[:, 0].max())
+    if not estimated.any() or assessed.sigma[:, 2].max() >= plane:
+        return control
+    sigma[estimated, 2] = plane
+    return dataclasses.replace(control, sigma=sigma)
 
 
 def _is_estimated(control: Points, axes: Sequence[int]) -> Bool[np.ndarray, "n axes"]:

@@ -140,11 +140,16 @@ class ControlTable:
 
 
 def describe_sigma(
-    given: Float[np.ndarray, "n 3"], assessed: Assessment, fixed: Sequence[str], unit: str
+    given: Float[np.ndarray, "n 3"],
+    assessed: Assessment,
+    fixed: Sequence[str],
+    unit: str,
+    heights_as_in_plane: bool = False,
 ) -> str:
     """Where the σ of control come from, in one line.
 
-    **Arguments:** `given` σ, NaN: not given; `fixed`: ids of points that are held."""
+    **Arguments:** `given` σ, NaN: not given; `fixed`: ids of points that are held;
+    `heights_as_in_plane`: σ of heights that are all 0 is that in the plane."""
     words = []
     unknown = np.isnan(given)
     stated = given[np.isfinite(given)]
@@ -164,7 +169,9 @@ def describe_sigma(
             continue
         sigma = float(assessed.sigma[:, k][unknown[:, k]][0])
         r = assessed.redundancy[0 if k == 0 else 1]
-        if assessed.assumed[0 if k == 0 else 1]:
+        if k == 2 and heights_as_in_plane:
+            how = "as in the plane: heights that are all 0 are not taken for better ones"
+        elif assessed.assumed[0 if k == 0 else 1]:
             how = (
                 "assumed, 2 pixels on the ground, because its residuals do not show a larger "
                 "one (state it with --control-sigma)"

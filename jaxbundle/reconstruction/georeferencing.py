@@ -28,6 +28,8 @@ from jaxbundle.reconstruction.control_choice import (
     ControlChoice,
     assess_control,
     choose_control,
+    has_doubtful_heights,
+    with_heights_as_in_plane,
     without_unknown_heights,
 )
 from jaxbundle.reconstruction.control_table import (
@@ -74,6 +76,10 @@ def georeference(
     # in object units: a pixel is larger on the ground the higher the camera
     assumed = block.settings.assumed_pixels * block.ground_sample_distance
     usable, assessed = assess_control(block, control, usable, assumed)
+    given = control.sigma
+    if has_doubtful_heights(control):
+        control = with_heights_as_in_plane(control, assessed)
+        usable, assessed = assess_control(block, control, usable, assumed)
     choice = choose_control(block, control, measured, usable, assessed, assumed)
     if not block.has_positions and choice.used.sum() < MIN_CONTROL:
         raise InputError(
@@ -94,7 +100,8 @@ def georeference(
     used = result.problem.used
     fixed = [id for id, role in zip(control.id, control.role) if role == "fixed"]
     free = np.array([role == "control" for role in control.role])
-    words = describe_sigma(control.sigma[free], choice.assessed(free), fixed, "m")
+    as_in_plane = np.isnan(given[free, 2]) & np.isfinite(control.sigma[free, 2])
+    words = describe_sigma(given[free], choice.assessed(free), fixed, "m", bool(as_in_plane.any()))
     positions = camera_positions(result)
     notes = [heights] * bool(heights) + choice.remarks()
     notes += [] if positions is None else positions.contradictions(block.settings.offset_sigma, "m")

@@ -1,6 +1,7 @@
 """Control and satellite positions of a simulated drone block: what is used, named and written."""
 
 import csv
+import dataclasses
 import datetime
 import json
 import subprocess
@@ -17,6 +18,7 @@ from jaxbundle.cli.outputs import write_targets
 from jaxbundle.cli.reconstruct_files import write_reconstruction
 from jaxbundle.errors import InputError
 from jaxbundle.network.kinds import Antennas
+from jaxbundle.network.tables import Points
 from jaxbundle.photographs.exif import Exif
 from jaxbundle.reconstruction import georeferencing, page
 from jaxbundle.reconstruction.block import (
@@ -25,7 +27,11 @@ from jaxbundle.reconstruction.block import (
     camera_positions,
     describe_block,
 )
-from jaxbundle.reconstruction.control_choice import ControlChoice
+from jaxbundle.reconstruction.control_choice import (
+    ControlChoice,
+    has_doubtful_heights,
+    with_heights_as_in_plane,
+)
 from jaxbundle.reconstruction.controlled_network import network_with_control
 from jaxbundle.reconstruction.georeferencing import georeference
 from jaxbundle.reconstruction.oriented_block import OrientedBlock
@@ -185,6 +191,21 @@ def test_heights_of_zero_are_unknown(drone, handheld):
     assert np.isnan(positions.offset[2]) and np.isfinite(positions.offset[:2]).all()
     k = result.problem.network.points.id.index("gcp01")
     assert abs(result.point_values[k, 2] - drone.truth[1, 2] - OFFSET[2]) < 3 * SATELLITE[2]
+
+
+def test_heights_of_zero_have_the_sigma_of_the_plane_if_theirs_is_smaller():
+    """A block bends to a plane of zeros: residuals show nothing of their errors."""
+    unknown = np.full((4, 3), np.nan)
+    X = np.arange(12.0).reshape(4, 3) * [1, 1, 0]
+    flat = Points(tuple("abcd"), ("control",) * 4, X, unknown)
+    assert has_doubtful_heights(flat)
+    assert not has_doubtful_heights(dataclasses.replace(flat, position=X + [0, 0, 1]))
+    stated = dataclasses.replace(flat, sigma=np.where([0, 0, 1], 0.1, unknown))
+    assert not has_doubtful_heights(stated)
+    for height, expected in ((0.02, [np.nan, np.nan, 0.8]), (1.9, [np.nan] * 3)):
+        assessed = SimpleNamespace(sigma=np.tile([0.8, 0.8, height], (3, 1)))
+        found = with_heights_as_in_plane(flat, assessed).sigma
+        np.testing.assert_array_equal(found, np.tile(expected, (4, 1)))
 
 
 @pytest.mark.further
