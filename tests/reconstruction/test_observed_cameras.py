@@ -36,7 +36,7 @@ def network(stated, aspect_sigma=2e-4, lens=(0, 1), positions=None):
                             image == 0, np.zeros((n, 3), np.uint8))  # fmt: skip
     of = Cameras(cameras, (0, 0, 1, 1), stated, False, (), lens)
     further = FurtherData(no_named_points(), positions=positions)
-    return photograph_network(photographs, of, measured, further, "part", aspect_sigma)
+    return photograph_network(photographs, of, measured, further, "part", aspect_sigma, "deg")
 
 
 def rows(network):
