@@ -40,7 +40,8 @@ def need_values(network: Network, model: str = "", format: str = "", points: boo
     for table, values, thing, what in tables[: 3 if points else 2]:
         for row, *_ in np.argwhere(~np.isfinite(values))[:1]:
             raise InputError(
-                f"{table.source(row)}: {thing} {table.id[row]!r} has no {what} to be written"
+                f"{table.source(row)}: {thing} {table.id[row]!r} has no {what} to be written: "
+                "convert the result of jaxbundle orient or adjust, which compute what is missing"
             )
 
 
