@@ -191,7 +191,8 @@ def one_focal_length(camera: Camera, format: str) -> float:
     if p["fx"] != p["fy"]:
         raise InputError(
             f"camera {camera.id!r}: {format} has one focal length, but fx is {p['fx']:.9g} and fy "
-            f'{p["fy"]:.9g}; adjust the camera with tie = [["fx", "fy"]]'
+            f'{p["fy"]:.9g}; adjust the camera with tie = [["fx", "fy"]] '
+            f"(--set camera.{camera.id}.tie=fx+fy)"
         )
     return p["fx"]
 
