@@ -129,6 +129,7 @@ _HOME = {
         "read_network",
         "write_project",
     ),
+    "jaxbundle.io.networks.opensfm_objects": ("from_opensfm",),
     "jaxbundle.io.networks.pycolmap_objects": (
         "from_pycolmap",
         "to_pycolmap",

@@ -96,6 +96,7 @@ from jaxbundle.float64 import enable_x64 as enable_x64
 from jaxbundle.io import convert as convert
 from jaxbundle.io import read_network as read_network
 from jaxbundle.io import write_project as write_project
+from jaxbundle.io.networks.opensfm_objects import from_opensfm as from_opensfm
 from jaxbundle.io.networks.pycolmap_objects import from_pycolmap as from_pycolmap
 from jaxbundle.io.networks.pycolmap_objects import to_pycolmap as to_pycolmap
 from jaxbundle.leastsquares import Data as Data
@@ -195,6 +196,7 @@ __all__ = [
     "example",
     "explore",
     "frames",
+    "from_opensfm",
     "from_pycolmap",
     "grid_of_targets",
     "hand_eye",

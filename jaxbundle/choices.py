@@ -6,6 +6,7 @@ them without importing JAX.
 
 from typing import Literal, get_args
 
+ANGLE_UNIT_NAMES = ("rad", "deg", "gon")
 METHODS = ("levenberg-marquardt", "gauss-newton")
 # Solvers of the reduced system.
 REDUCTIONS = ("dense", "banded", "iterative")

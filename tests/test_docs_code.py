@@ -43,6 +43,16 @@ def test_statistics():
     assert trace(page["result"]) < trace(page["minimal"])
 
 
+def test_the_output_in_the_readme_is_what_its_code_prints():
+    """Of lines that no rounding changes: the number of iterations may differ by one."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    code, shown = re.search(r"```python\n(.*?)```\n\n```text\n(.*?)```", text, re.S).groups()
+    assert "print(result)" in code
+    printed = str(jaxbundle.adjust(re.search(r'read_network\("(.*?)"\)', code)[1]))
+    lines = [line for line in shown.splitlines() if "iterations" not in line and "…" not in line]
+    assert len(lines) > 6 and not {*lines} - {*printed.splitlines()}
+
+
 def test_start():
     page = run_page("start")
     assert page["result"].redundancy == 23

@@ -17,10 +17,18 @@ from jaxbundle.explorer.network import NetworkView
 from jaxbundle.explorer.server import page_file
 from jaxbundle.network.tables import Camera
 from jaxbundle.plotting import views
+from jaxbundle.plotting.style import extent
 from jaxbundle.plotting.ticks import label_coordinates, label_ticks, offset_in_words
-from jaxbundle.plotting.views import LARGEST_ELLIPSES, PROBABILITY, SAMPLED_ELLIPSES, thin_out
+from jaxbundle.plotting.views import (
+    PERSPECTIVE,
+    PLAN,
+    PROBABILITY,
+    EllipseSettings,
+    choose_ellipses,
+    thin_out,
+)
 from jaxbundle.report.layout import coordinate_decimals, digits_of, estimate
-from jaxbundle.report.page import Addition, InputFile, Origin, compose, compose_failure
+from jaxbundle.report.page import Addition, InputFile, Origin, compose, compose_failure, scene
 from jaxbundle.report.page.charts import Curve, draw_curves
 from jaxbundle.report.page.markup import grid
 from jaxbundle.system import clock
@@ -181,16 +189,39 @@ def test_a_blunder_is_detectable_from_the_same_size_in_text_and_page(convergent4
 def test_of_many_points_the_largest_and_a_spread_sample_are_drawn():
     rng = np.random.default_rng(0)
     xyz, large = rng.uniform(0, [700, 500, 20], (6000, 3)), rng.lognormal(size=6000)
-    rows = thin_out(xyz, large)
-    assert len(set(rows.tolist())) == len(rows) <= LARGEST_ELLIPSES + SAMPLED_ELLIPSES
-    assert set(np.argsort(-large)[:LARGEST_ELLIPSES]) <= set(rows.tolist())
+    rows = thin_out(xyz, large, 700, PLAN)
+    assert len(set(rows.tolist())) == len(rows) <= PLAN.largest + PLAN.sampled
+    assert set(np.argsort(-large)[: PLAN.largest]) <= set(rows.tolist())
     quarter = (xyz[rows, 0] > 350) + 2 * (xyz[rows, 1] > 250)
     assert np.bincount(quarter, minlength=4).min() > 0.2 * len(rows)
     few = rows[:40]
-    assert_array_equal(thin_out(xyz[few], large[few]), np.arange(40))
-    # all at one place, or along a line
-    assert len(thin_out(0 * xyz, large)) <= LARGEST_ELLIPSES + SAMPLED_ELLIPSES
-    assert len(thin_out(xyz * [1, 0, 0], large)) > LARGEST_ELLIPSES + 100
+    assert_array_equal(thin_out(xyz[few], large[few], 700, PLAN), np.arange(40))
+    # all at one place, or along a line, where as many have room beside each other
+    assert len(thin_out(0 * xyz, large, 700, PLAN)) == PLAN.largest + 1
+    beside = 1 / (2.5 * PLAN.smallest)
+    assert PLAN.largest + 0.9 * beside < len(thin_out(xyz * [1, 0, 0], large, 700, PLAN))
+    # the object is a tenth of the network: its ellipses have no room beside each other
+    assert len(thin_out(xyz, large, 7000, PLAN)) < PLAN.largest + 0.02 * beside**2
+
+
+def test_ellipsoids_too_wide_to_be_drawn_are_marked_and_said(convergent4, monkeypatch):
+    """One point hardly determined: its ellipsoid would cover the others."""
+    covariance = np.array(convergent4.point_covariance)
+    covariance[3] *= 100.0**2
+    monkeypatch.setitem(vars(convergent4), "point_covariance", covariance)
+    _, size = extent(np.concatenate([convergent4.point_values, convergent4.image_values[:, :3]]))
+    found = choose_ellipses(convergent4, size, PERSPECTIVE)
+    half_axis = np.sqrt(np.linalg.eigvalsh(covariance)[:, -1])
+    assert found.wide.tolist() == [3] and 3 not in found.rows and len(found.rows) == 9
+    assert (found.factor * half_axis[found.rows] <= PERSPECTIVE.longest * size).all()
+    assert found.selection == "of 9 of 10 points (too wide to be drawn: 1)"
+    ax = convergent4.plot_perspective()
+    assert "too wide" in ax.get_title(loc="left")
+    (rings,) = [c for c in ax.collections if "too wide" in str(c.get_label())]
+    assert len(rings.get_offsets()) == 1
+    from matplotlib import pyplot
+
+    pyplot.close(ax.figure)
 
 
 def test_the_probability_of_an_ellipsoid_is_that_of_chi_squared():
@@ -199,16 +230,18 @@ def test_the_probability_of_an_ellipsoid_is_that_of_chi_squared():
 
 
 def test_a_page_says_which_ellipsoids_it_draws(convergent4, monkeypatch):
-    scene = data_of("".join(compose(convergent4)), "network-data")
-    assert scene["ellipsoids"]["points"] == list(range(10))
-    assert "1σ" in scene["drawn"] and "20 %" in scene["drawn"] and " of " not in scene["drawn"]
-    monkeypatch.setattr(views, "LARGEST_ELLIPSES", 2)
-    monkeypatch.setattr(views, "SAMPLED_ELLIPSES", 4)
-    scene = data_of("".join(compose(convergent4)), "network-data")
-    rows = scene["ellipsoids"]["points"]
+    drawing = data_of("".join(compose(convergent4)), "network-data")
+    assert drawing["ellipsoids"]["points"] == list(range(10))
+    words = drawing["drawn"]
+    assert "1σ" in words and "20 %" in words and " of " not in words
+    few = EllipseSettings(largest=2, sampled=4)
+    monkeypatch.setattr(views, "PLAN", few)
+    monkeypatch.setattr(scene, "SCENE", few)
+    drawing = data_of("".join(compose(convergent4)), "network-data")
+    rows = drawing["ellipsoids"]["points"]
     assert 2 < len(rows) <= 6
     assert f"of {len(rows)} of 10 points: the 2 largest and {len(rows) - 2} others" in (
-        scene["drawn"]
+        drawing["drawn"]
     )
     ax = convergent4.plot_plan()
     assert f"{len(rows)} of 10 points" in ax.get_title(loc="left")

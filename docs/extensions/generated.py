@@ -7,6 +7,8 @@ A fenced block of one of these kinds is replaced before Sphinx reads the page:
 - `{commands}`: empty; every command, from the parsers of the command line.
 
 `docs/index.md` needs none: its lists of links are the table of contents, a part for each heading.
+Before them the first page of the site has what the README says; a reader of the repository has the
+README itself.
 """
 
 import functools
@@ -15,6 +17,7 @@ import inspect
 import re
 import types
 from collections.abc import Iterator
+from pathlib import Path
 
 import typer
 
@@ -29,9 +32,22 @@ LINK = re.compile(r"^ *- \[[^\]]*\]\(([^)#]+\.(?:md|ipynb))\)", re.M)
 def expand_page(app, docname: str, source: list[str]) -> None:
     """Replace the blocks of a page; Sphinx calls it when it has read one."""
     if docname == app.config.root_doc:
-        source[0] = add_contents(source[0])
+        readme = Path(app.srcdir) / "README.md"
+        app.env.note_dependency(str(readme))  # a changed README is read again
+        source[0] = add_contents(add_readme(source[0], readme.read_text(encoding="utf-8")))
     makers = {"names": list_names, "room": list_room, "commands": list_commands}
     source[0] = BLOCK.sub(lambda block: makers[block[1]](block[2].split()), source[0])
+
+
+def add_readme(text: str, readme: str) -> str:
+    """The first page with what the README has between its picture and its last section, which lists
+    pages as this one does, in place of what follows the picture here."""
+    top, readme_top = (re.match(r".*?^!\[.*?$", page, re.M | re.S) for page in (text, readme))
+    body = readme[readme_top.end() : readme.rindex("\n## ")]
+    # links of README are from the folder above
+    body = re.sub(r"\]\((?!https?:|#)", "](../", body).replace("](../docs/", "](")
+    lists = text[text.index("\n## ") :]
+    return f"{top[0]}\n{body}{lists}"
 
 
 def add_contents(text: str) -> str:
@@ -40,10 +56,10 @@ def add_contents(text: str) -> str:
     parts = [first]
     for section in sections:
         caption = section.split("\n", 1)[0]
-        pages = "\n".join(LINK.findall(section))
-        parts.append(
-            f"## {section}\n\n```{{toctree}}\n:hidden:\n:caption: {caption}\n\n{pages}\n```\n\n"
-        )
+        pages, contents = "\n".join(LINK.findall(section)), ""
+        if pages:
+            contents = f"```{{toctree}}\n:hidden:\n:caption: {caption}\n\n{pages}\n```\n\n"
+        parts.append(f"## {section}\n\n{contents}")
     return "".join(parts)
 
 

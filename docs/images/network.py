@@ -14,7 +14,7 @@ import jaxbundle
 
 jaxbundle.enable_x64()
 azimuth = np.linspace(-2.6, -0.5, 6)
-centres = np.stack([4.5 * np.cos(azimuth), 4.5 * np.sin(azimuth), np.full(6, 2.6)], 1)
+centres = np.stack([3.4 * np.cos(azimuth), 3.4 * np.sin(azimuth), np.full(6, 2.4)], 1)
 stations = jaxbundle.stations_looking_at(
     centres, (0.0, 0.0, 0.0), roll=np.pi / 2 * (np.arange(6) % 2)
 )

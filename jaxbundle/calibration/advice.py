@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from jaxbundle.calibration.quality import Coverage, CrossValidation
 from jaxbundle.cameras import CameraModel
 from jaxbundle.leastsquares.quality.weakness import VAGUE_RATIO
+from jaxbundle.report.lens_advice import RICHER
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,7 +89,7 @@ def advice(
     if rms > settings.max_rms:
         found.append(
             f"the residuals are large (RMS {rms:.2f} px): look for blur, movement, a bent "
-            "board (--board-sigma), or free more parameters"
+            "board (--board-sigma), or another camera model (--models)"
         )
     if validation is not None and validation.test > settings.max_test:
         found.append(
@@ -100,9 +101,12 @@ def advice(
 
 
 def suggest(
-    t: dict[str, float], model: CameraModel, settings: AdviceSettings = ADVICE
+    t: dict[str, float], model: CameraModel, which: str, settings: AdviceSettings = ADVICE
 ) -> list[str]:
-    """Suggestions in words, for a calibration that may be good as it is."""
+    """Suggestions in words, for a calibration that may be good as it is; `which` parameters the
+    camera should have (`report.lens_advice`)."""
+    if which == RICHER:
+        return []
     weak = [name for name, value in t.items() if value < settings.min_t and name not in model.core]
     if not weak or model.prior:
         return []

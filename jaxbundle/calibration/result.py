@@ -12,8 +12,8 @@ from jaxtyping import Array, Float
 from jaxbundle import plotting
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.calibration import quality
-from jaxbundle.calibration.advice import advice, often_removed, suggest
-from jaxbundle.calibration.affinity import find_missing_affinity
+from jaxbundle.calibration.advice import ADVICE, advice, often_removed, suggest
+from jaxbundle.calibration.affinity import MissingAffinity, find_missing_affinity
 from jaxbundle.calibration.bias import CalibrationBias, find_bias
 from jaxbundle.calibration.mapping_error import MappingError, mapping_error
 from jaxbundle.calibration.quality import Coverage, CrossValidation, UncertaintyMap
@@ -22,7 +22,8 @@ from jaxbundle.display import print_anywhere
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.measure.views import BoardViews
 from jaxbundle.network.tables import Camera
-from jaxbundle.report.correlated import stated_sigma_of
+from jaxbundle.report.correlated import has_field, stated_sigma_of
+from jaxbundle.report.lens_advice import advise_parameters, is_hardly_determined
 from jaxbundle.results import TableMethods
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, present
@@ -149,7 +150,23 @@ class Calibration(TableMethods):
     @property
     def suggestions(self) -> list[str]:
         """What would make a good calibration better."""
-        return suggest(self._significance, get_model(self.camera.model))
+        which = advise_parameters(is_hardly_determined(self.adjustment), self._lacks_parameters)
+        return suggest(self._significance, get_model(self.camera.model), which)
+
+    @functools.cached_property
+    def _missing_affinity(self) -> MissingAffinity | None:
+        return find_missing_affinity(self.adjustment)
+
+    @property
+    def _lacks_parameters(self) -> bool:
+        """Whether the residuals have a part that the camera model does not have."""
+        affinity, bias = self._missing_affinity, self.bias
+        return (
+            self.rms > ADVICE.max_rms
+            or (affinity is not None and affinity.missed)
+            or (bias is not None and "camera" in bias.found)
+            or has_field(self.adjustment)
+        )
 
     @property
     def _significance(self) -> dict[str, float]:
@@ -171,7 +188,7 @@ class Calibration(TableMethods):
             # only if it was made: four more adjustments are not made for an advice
             self.__dict__.get("cross_validation"),
         )
-        missed = find_missing_affinity(self.adjustment)
+        missed = self._missing_affinity
         if missed is not None and missed.missed:
             found = [*found, str(missed)]
         # image points are removed one by one: only counted by corner do they show a bad print

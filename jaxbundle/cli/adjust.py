@@ -134,7 +134,8 @@ def adjust(  # noqa: PLR0913 - the options of the command
 
     jaxbundle.use_cores(cores)
     judged = CertificateOptions(accept, certificate, details, lengths)
-    print_report = json != "-" and not (quiet and is_in_file(json, out, html, save))
+    written = is_in_file(json, out, html, save, certificate, gis)
+    print_report = json != "-" and not (quiet and written)
     if join or cluster:
         if json in ("-", "/dev/stdout", "/dev/fd/1"):
             raise InputError(

@@ -163,7 +163,7 @@ class CalibrationOutputs:
         if judgement is not None and self.json:
             document |= judgement.json
         text = json_text(document) if self.json else ""
-        written = is_in_file(self.json, self.out, self.html)
+        written = is_in_file(self.json, self.out, self.html, self.judged.certificate)
         silent = self.json == "-" or (self.quiet and written)
         report = "" if silent else head_line(origin) + (compared or found).report()
         if report and judgement is not None:

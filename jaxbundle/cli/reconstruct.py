@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from jaxbundle.choices import CODED_TARGETS, MATCHED_PAIRS, TIE_POINTS
+from jaxbundle.choices import ANGLE_UNIT_NAMES, CODED_TARGETS, MATCHED_PAIRS, TIE_POINTS
 from jaxbundle.cli.app import Check, Correlated, Force, Html, Json, Quiet, app, choice
 from jaxbundle.cli.certificate_options import (
     Accept,
@@ -61,6 +61,7 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
         bool,
         typer.Option("--camera-per-folder", help="every folder has a camera of its own"),
     ] = False,
+    angle_unit: Annotated[str, choice(ANGLE_UNIT_NAMES, "of the results")] = "deg",
     correlated: Correlated = True,
     json: Json = "",
     html: Html = "",
@@ -125,6 +126,7 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
             points=points,
             square_pixels=square_pixels,
             camera_per_folder=camera_per_folder,
+            angle_unit=angle_unit,
             correlated=correlated,
             store=store,
             progress=tell,
@@ -140,6 +142,7 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
             "--pairs": pairs,
             "--points": points,
             "--no-square-pixels": True if not square_pixels else None,
+            "--angle-unit": angle_unit,
             "--no-correlated": True if not correlated else None,
             **judged.settings,
         },

@@ -82,7 +82,8 @@ def open_calibration(
     if is_result(path):
         results = read_calibrated(path)
         cameras, covariances = [c for c, _ in results], {c.id: C for c, C in results}
-    elif is_camera_file(path):
+    # a project of oriented photographs alone, as `surface` takes it, has cameras but no points
+    elif is_camera_file(path) or (path.is_file() and recognise_format(path) == "project"):
         cameras = read_cameras(path)
     elif path.exists() and recognise_format(path) is None:
         raise InputError(

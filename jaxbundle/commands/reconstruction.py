@@ -36,6 +36,7 @@ def reconstruct(  # noqa: PLR0913 (public: the options of the command, all but o
     points: int | None = None,
     square_pixels: bool = True,
     camera_per_folder: bool = False,
+    angle_unit: str | None = None,
     correlated: bool = True,
     settings: ReconstructionSettings = DEFAULT,
     store: str | Path | None = None,
@@ -60,6 +61,7 @@ def reconstruct(  # noqa: PLR0913 (public: the options of the command, all but o
       `settings`.
     - `square_pixels`: observe fy/fx as 1; otherwise both focal lengths are unknown.
     - `camera_per_folder`: photographs of two folders were taken with two cameras.
+    - `angle_unit` of the results: `"deg"`, `"gon"` or `"rad"`.
     - `correlated`: state σ under errors that image points share, and compare halves by photographs,
       of eight photographs or more (`Adjustment.error_model`, `Adjustment.replication`).
     - `store`: folder of features and matches, for a repeated run.
@@ -77,6 +79,8 @@ def reconstruct(  # noqa: PLR0913 (public: the options of the command, all but o
         settings = replace(settings, detection=FeatureSettings(features))
     if truth("camera_per_folder", camera_per_folder):
         settings = replace(settings, camera_per_folder=True)
+    if angle_unit is not None:
+        settings = replace(settings, angle_unit=angle_unit)
     if truth("uncoded", uncoded):
         settings = replace(settings, uncoded=True)
     if pairs is not None:

@@ -20,11 +20,12 @@ from jaxtyping import Float, Int
 
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.pixel_frame import pixel_frame
+from jaxbundle.choices import ANGLE_UNIT_NAMES
 from jaxbundle.errors import InputError
 from jaxbundle.network.tables import Camera
 
 # Radians in one unit.
-ANGLE_UNITS = {"rad": 1.0, "deg": math.pi / 180, "gon": math.pi / 200}
+ANGLE_UNITS = dict(zip(ANGLE_UNIT_NAMES, (1.0, math.pi / 180, math.pi / 200), strict=True))
 
 IMAGE_UNITS = ("mm", "px")
 

@@ -4,6 +4,7 @@ matplotlib is imported by the drawing functions, so that the package works witho
 """
 
 import math
+import textwrap
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -87,8 +88,9 @@ def quiet_3d(ax: "Axes3D") -> None:
 
 
 def title(ax: "Axes", text: str, detail: str = "") -> None:
-    """A title with a line of detail; names from files are never read as formulas."""
-    lines = f"{plain(text)}\n{detail}" if detail else plain(text)
+    """A title with lines of detail; names from files are never read as formulas."""
+    # 75 letters of 10 points are as wide as a figure
+    lines = "\n".join([plain(text), *textwrap.wrap(detail, 75)])
     ax.set_title(lines, fontsize=10, color=INK, loc="left", parse_math=False)
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxbundle.plotting.style import axes, axes_3d
+from jaxbundle.plotting.style import axes, axes_3d, quiet_3d
 from jaxbundle.plotting.ticks import label_coordinates
 
 if TYPE_CHECKING:  # with them come scanners and matching, which an adjustment does without
@@ -30,8 +30,13 @@ def cloud_perspective(
     few = cloud.take(np.arange(0, len(cloud), max(1, -(-len(cloud) // max_points))))
     sigma = few.sigma[:, "XYZ".index(axis)]
     limit = np.nanpercentile(sigma, 95) if np.isfinite(sigma).any() else 1.0
-    drawn = view.scatter(*few.X.T, c=sigma, s=1.0, cmap="viridis", vmin=0, vmax=limit, linewidths=0)
+    # marks that touch their neighbours: of an area of about 300 by 300 typographical points
+    mark = np.clip(300**2 / max(len(few), 1), 1.0, 16.0)
+    drawn = view.scatter(
+        *few.X.T, c=sigma, s=mark, cmap="viridis", vmin=0, vmax=limit, linewidths=0
+    )
     view.set_box_aspect(np.maximum(np.ptp(few.X, axis=0), 1e-9))
+    quiet_3d(view)
     view.figure.colorbar(drawn, ax=view, label=f"σ{axis}", shrink=0.6)
     for name in "xyz":
         label_coordinates(view, name, "")

@@ -1,6 +1,7 @@
 """The network as a map and in perspective: points by role, cameras as pyramids, error ellipses."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -19,6 +20,7 @@ from jaxbundle.plotting.style import (
     INK,
     MAX_LABELS,
     ROLE_STYLE,
+    RUST,
     axes,
     axes_3d,
     extent,
@@ -39,9 +41,48 @@ if TYPE_CHECKING:
 
     from jaxbundle.adjustment.result import Adjustment
 
-# Of more points than these together, the largest error ellipses are drawn, and as many others at
-# most, spread evenly: an image of 1000 pixels has room for about 300 that can be told apart.
-LARGEST_ELLIPSES, SAMPLED_ELLIPSES = 20, 280
+
+@dataclass(frozen=True)
+class EllipseSettings:
+    """Which error ellipses of points are drawn, and how large.
+
+    **Fields:**
+
+    - `dimensions`: 2 for ellipses of X and Y, 3 for ellipsoids.
+    - `largest`, `sampled`: of more points than these together, the largest ones, and at most so
+      many others, spread evenly. An image of 1000 pixels has room for about 300 ellipses that can
+      be told apart.
+    - `smallest`, `widest`: limits of the median largest half-axis, as parts of the size of the
+      network: longer than the mark of its point, and not so long that neighbours lie across each
+      other.
+    - `longest`: points with a longer half-axis are marked, and their ellipses not drawn: a few of
+      poorly determined points would cover the network. Of a tenth, the whole ellipse is a fifth of
+      the drawing.
+    """
+
+    dimensions: int = 2
+    largest: int = 20
+    sampled: int = 280
+    smallest: float = 0.012
+    widest: float = 0.03
+    longest: float = 0.1
+
+
+PLAN = EllipseSettings()
+# Sections of an ellipsoid are three ellipses, and points behind each other share their place in the
+# picture: a fifth as many. None is hidden by the mark of its own point.
+PERSPECTIVE = EllipseSettings(3, 10, 50, 0.02, 0.06)
+# A drawing that can be turned and enlarged.
+SCENE = EllipseSettings(3)
+# Points whose ellipses are too wide to be drawn.
+TOO_WIDE = {
+    "s": 16,
+    "marker": "o",
+    "facecolors": "none",
+    "edgecolors": RUST,
+    "linewidths": 0.6,
+    "label": "ellipse too wide to be drawn",
+}
 # Probability that a normally distributed error of 2 or 3 coordinates is inside its 1σ ellipse or
 # ellipsoid: 1 − exp(−1/2), and erf(√½) − √(2/π)·exp(−1/2).
 PROBABILITY = {2: "39 %", 3: "20 %"}
@@ -135,11 +176,13 @@ def network_perspective(adjustment: "Adjustment", ax: "Axes3D | None" = None) ->
     **Returns:** matplotlib 3D `Axes`, in the object unit.
     """
     view = axes_3d(ax, (7.5, 6.5))
+    from matplotlib.colors import to_rgba
     from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
     points, centres = _points(adjustment), adjustment.image_values[:, :3]
     _, size = extent(np.concatenate([points["xyz"], centres]))
     pyramids = camera_pyramids(adjustment, pyramid_size(centres, size))
+    ellipses = choose_ellipses(adjustment, size, PERSPECTIVE)
     edges = pyramid_lines(pyramids).reshape(-1, 2, 3)
     faces = Poly3DCollection(pyramids[:, 1:], facecolors=BLUE, alpha=0.12, edgecolors="none")
     view.add_collection3d(faces)
@@ -153,24 +196,25 @@ def network_perspective(adjustment: "Adjustment", ax: "Axes3D | None" = None) ->
                 label=f"{role} points",
                 linewidths=0,
                 depthshade=False,
-                **_lighter(role, len(points["id"])),
+                **_behind_ellipsoids(role, len(points["id"]), ellipses),
             )
-    ellipses = choose_ellipses(adjustment, size, widest=0.1)  # none is hidden by its own point
     if ellipses.total:
-        sections = principal_sections(adjustment, ellipses)
-        drawn = Line3DCollection(
-            list(sections),
-            colors=BLUE,
+        drawn = Poly3DCollection(
+            list(principal_sections(adjustment, ellipses)),
+            facecolors=to_rgba(BLUE, 0.1),
+            edgecolors=to_rgba(BLUE, 0.8),
             linewidths=0.6,
-            alpha=0.6 if len(ellipses.rows) == ellipses.total else 0.3,
             label=f"error ellipsoids (1σ, {PROBABILITY[3]}) {ellipses.exaggeration}",
         )
         view.add_collection3d(drawn)
+    if len(ellipses.wide):
+        places = adjustment.point_values[ellipses.wide]
+        view.scatter(*places.T, depthshade=False, **TOO_WIDE)
     everything = np.concatenate([points["xyz"], pyramids.reshape(-1, 3)])
     low, high = _inside(everything)
     for name, a, b in zip("xyz", low, high):
         getattr(view, f"set_{name}lim")(a, b)
-    view.set_box_aspect(np.maximum(high - low, 0.05 * (high - low).max()), zoom=0.95)
+    view.set_box_aspect(np.maximum(high - low, 0.05 * (high - low).max()), zoom=1.0)
     quiet_3d(view)
     unit = adjustment.network.object_unit
     for name in "xyz":
@@ -271,17 +315,30 @@ def _lighter(role: str, number: int) -> dict[str, Any]:
     return style | {"s": style["s"] / factor}
 
 
+def _behind_ellipsoids(role: str, number: int, ellipses: "Ellipses") -> dict[str, Any]:
+    """Marks of tie points that leave their ellipsoids visible: smaller, and pale if many have none;
+    of those that have one, its centre is the point."""
+    style = _lighter(role, number)
+    if role != "tie" or not ellipses.total:
+        return style
+    pale = {} if len(ellipses.rows) == ellipses.total else {"alpha": 0.35}
+    return style | {"s": min(style["s"], 4)} | pale
+
+
 # Left, right, low, top of a text, pixels.
 Box = tuple[float, float, float, float]
 
 
 class Ellipses(NamedTuple):
     """Error ellipses to draw: the rows of their points, the number of points that have one, and the
-    factor of their exaggeration."""
+    factor of their exaggeration; the rows of points whose ellipses are too wide, and how many of
+    the rows are the largest of the others."""
 
     rows: Int[np.ndarray, " drawn"]
     total: int
     factor: float
+    wide: Int[np.ndarray, " wide"] = np.zeros(0, int)
+    largest: int = 0
 
     @property
     def exaggeration(self) -> str:
@@ -291,48 +348,68 @@ class Ellipses(NamedTuple):
     @property
     def selection(self) -> str:
         """Which ones are drawn if there are more."""
-        drawn = len(self.rows)
+        drawn, wide = len(self.rows), len(self.wide)
         if drawn == self.total:
             return ""
-        return (
-            f"of {drawn} of {self.total} points: the {LARGEST_ELLIPSES} largest and "
-            f"{drawn - LARGEST_ELLIPSES} others"
-        )
+        words = f"of {drawn} of {self.total} points"
+        if wide:
+            words += f" (too wide to be drawn: {wide})"
+        if drawn + wide < self.total:
+            rest = " of the rest" if wide else ""
+            words += f": the {self.largest} largest{rest} and {drawn - self.largest} others"
+        return words
 
 
-def choose_ellipses(adjustment: "Adjustment", size: float, widest: float = 0.03) -> Ellipses:
-    """The error ellipses of points for a network of this size: at most `LARGEST_ELLIPSES` +
-    `SAMPLED_ELLIPSES`, in a visible and comparable size: of half the median distance of neighbours,
-    but at most `widest` of the network's size."""
-    covariance = adjustment.point_covariance[:, :2, :2]
-    large = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
-    there = np.flatnonzero(adjustment.located & np.isfinite(large) & (large > 0))
+def choose_ellipses(adjustment: "Adjustment", size: float, settings: EllipseSettings) -> Ellipses:
+    """The error ellipses of points for a network of this size, in a visible and comparable size: a
+    half-axis of half the median distance of neighbours, within the limits of the `settings`."""
+    dimensions = settings.dimensions
+    covariance = adjustment.point_covariance[:, :dimensions, :dimensions]
+    known = np.isfinite(covariance).all((1, 2))
+    half_axis = np.zeros(len(covariance))
+    half_axis[known] = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance[known])[:, -1], 0))
+    there = np.flatnonzero(adjustment.located & (half_axis > 0))
     if not len(there):
         return Ellipses(there, 0, 1.0)
-    rows = there[thin_out(adjustment.point_values[there], large[there])]
-    neighbour = _neighbour(adjustment.point_values[rows, :2])
-    # an ellipse is visible, and two neighbours hardly touch
-    reach = np.clip(0.45 * neighbour, 0.012 * size, widest * size)
-    return Ellipses(rows, len(there), round_number(reach / np.median(large[rows])))
+    places, half_axis = adjustment.point_values[there], half_axis[there]
+    rows = thin_out(places, half_axis, size, settings)
+    neighbour = _neighbour(places[rows, :dimensions])
+    reach = np.clip(0.45 * neighbour, settings.smallest * size, settings.widest * size)
+    longest = settings.longest * size
+    # one in twenty at most is too wide
+    middle, most = np.quantile(half_axis, [0.5, 0.95], method="lower")
+    factor = round_number(min(reach / middle, longest / most))
+    wide = factor * half_axis > longest
+    rest = np.flatnonzero(~wide)
+    rows = rest[thin_out(places[rest], half_axis[rest], size, settings)]
+    largest = settings.largest if len(rows) < len(rest) else 0
+    return Ellipses(there[rows], len(there), factor, there[wide], largest)
 
 
 def thin_out(
-    xyz: Float[np.ndarray, "n 3"], large: Float[np.ndarray, " n"]
+    xyz: Float[np.ndarray, "n 3"],
+    large: Float[np.ndarray, " n"],
+    size: float,
+    settings: EllipseSettings,
 ) -> Int[np.ndarray, " drawn"]:
     """The rows to draw, ascending: all if they are few, else the largest, and of the others the
-    first in each cell of a grid across the two wider axes."""
-    if len(large) <= LARGEST_ELLIPSES + SAMPLED_ELLIPSES:
+    first in each cell of a grid across the two wider axes, whose cells have room for an ellipse of
+    a network of this `size`."""
+    if len(large) <= settings.largest + settings.sampled:
         return np.arange(len(large))
-    first, others = np.split(np.argsort(-large, kind="stable"), [LARGEST_ELLIPSES])
+    first, others = np.split(np.argsort(-large, kind="stable"), [settings.largest])
     others = np.sort(others)
     low, high = np.quantile(xyz, [0.01, 0.99], axis=0)
     wide = np.argsort(low - high)[:2]
     sides = np.maximum((high - low)[wide], 1e-12 * max(float((high - low).max()), 1e-300))
-    cells = np.maximum(np.sqrt(SAMPLED_ELLIPSES * sides / sides[::-1]).astype(int), 1)
-    cells = np.minimum(cells, SAMPLED_ELLIPSES)
+    # two half-axes, and half of one between neighbours; along a line cells are as many as ellipses
+    room = 2.5 * settings.smallest * size
+    sampled = np.clip(np.prod(np.maximum(sides / room, 1)), 1, settings.sampled)
+    cells = np.maximum(np.sqrt(sampled * sides / sides[::-1]).astype(int), 1)
+    cells = np.minimum(cells, int(sampled))
     at = np.clip((xyz[others][:, wide] - low[wide]) / sides * cells, 0, cells - 1).astype(int)
     _, sample = np.unique(at[:, 0] * cells[1] + at[:, 1], return_index=True)
-    return np.sort(np.concatenate([first, others[sample[:SAMPLED_ELLIPSES]]]))
+    return np.sort(np.concatenate([first, others[sample[: settings.sampled]]]))
 
 
 def error_ellipses(adjustment: "Adjustment", ellipses: Ellipses, corners: int = 49) -> np.ndarray:
@@ -374,9 +451,12 @@ def _draw_ellipses(adjustment: "Adjustment", ax: "Axes", size: float) -> tuple[n
     drawn, in words."""
     from matplotlib.collections import LineCollection
 
-    ellipses = choose_ellipses(adjustment, size)
+    ellipses = choose_ellipses(adjustment, size, PLAN)
     if not ellipses.total:
         return np.zeros((0, 1, 2)), ""
+    if len(ellipses.wide):
+        places = adjustment.point_values[ellipses.wide, :2]
+        ax.scatter(*places.T, zorder=6, **TOO_WIDE)
     polygons = error_ellipses(adjustment, ellipses)
     drawn = LineCollection(
         list(polygons),

@@ -39,10 +39,12 @@ def photograph_network(
     extra: FurtherData,
     name: str,
     aspect_sigma: float,
+    angle_unit: str,
 ) -> Network:
     """The network of the photographs with measurements; image coordinates in pixels.
 
-    **Arguments:** `aspect_sigma`: of fy/fx about 1; infinite: not observed."""
+    **Arguments:** `aspect_sigma`: of fy/fx about 1; infinite: not observed; `angle_unit` of the
+    results."""
     # without tie points of features the named ones connect the photographs
     rows = np.unique(measured.image if len(measured) else extra.named.image).tolist()
     of = [cameras.camera_of[k] for k in rows]
@@ -76,6 +78,7 @@ def photograph_network(
         observations,
         distances or None,
         image_unit="px",
+        angle_unit=angle_unit,
         name=name,
         sigma_origin=ESTIMATED,
         # positions give frame and scale; without them inner constraints define the frame, and scale

@@ -433,7 +433,13 @@ class _ReconstructionRun:
         inside = [p for p in pairs if set(p.images) <= set(group)]
         measured = self._measure(features, inside)
         network = photograph_network(
-            self.photographs, self.cameras, measured, self.further, name, settings.aspect_sigma
+            self.photographs,
+            self.cameras,
+            measured,
+            self.further,
+            name,
+            settings.aspect_sigma,
+            settings.angle_unit,
         )
         self._begin("start values")
         named = {(self.names[p.images[0]], self.names[p.images[1]]): p for p in inside}
@@ -497,7 +503,13 @@ class _ReconstructionRun:
         )
         extra = dataclasses.replace(self.further, named=join_named(self.further.named, plain))
         network = photograph_network(
-            self.photographs, self.cameras, measured, extra, name, settings.aspect_sigma
+            self.photographs,
+            self.cameras,
+            measured,
+            extra,
+            name,
+            settings.aspect_sigma,
+            settings.angle_unit,
         )
         return self._adjust_first(network, measured, pairs)
 

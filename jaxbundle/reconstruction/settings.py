@@ -5,6 +5,7 @@ import dataclasses
 from jaxbundle.arguments import integer, one_of
 from jaxbundle.choices import MATCHED_PAIRS
 from jaxbundle.errors import InputError
+from jaxbundle.network.rules import CHOICES, check_choice
 from jaxbundle.reconstruction.adjusting import WeightingSettings
 from jaxbundle.reconstruction.folding import SuperpositionSettings
 from jaxbundle.reconstruction.oriented_block import ControlSettings
@@ -37,6 +38,8 @@ class ReconstructionSettings:
     """Threads, all cores if 0."""
     significance: float = 0.001
     """Significance of data snooping: the probability that a good measurement is removed."""
+    angle_unit: str = "deg"
+    """Unit of the angles of the result and their σ: "deg", "gon" or "rad"."""
     camera_per_folder: bool = False
     """The photographs of every folder have a camera of their own. Otherwise those of one make,
     model, serial number, focal length and size share one."""
@@ -77,6 +80,7 @@ class ReconstructionSettings:
     def __post_init__(self):
         one_of("pairs", self.pairs, MATCHED_PAIRS)
         integer("points", self.points)
+        check_choice("angle_unit", self.angle_unit, CHOICES["angle_unit"])
         if not self.natural_points and self.targets is None:
             raise InputError(
                 "features none: coded targets alone connect the photographs; give targets, such as "

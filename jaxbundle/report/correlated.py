@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from jaxbundle.leastsquares.quality.error_components import IMAGE
 from jaxbundle.report.layout import clean, heading, paragraph, significant, table
+from jaxbundle.report.lens_advice import ADVICE_ON_FIELD, advise_parameters, is_hardly_determined
 from jaxbundle.types import present
 
 if TYPE_CHECKING:
@@ -35,10 +36,10 @@ REPLICATION_LEGEND = (
     "photographs: they cannot show these errors."
 )
 DIFFERENCE_HEADER = ("parameter", "difference", "σ", "in σ", "σ correlated", "in it")
+FIELD = "field on the sensor"
 # What a component says about camera or measurement, with its size, and what can be done about it.
 REMARKS = {
-    "field on the sensor": "a field of {} common to all photographs, which the lens model does not "
-    "have: choose a richer lens model",
+    FIELD: "a field of {} common to all photographs, which the lens model does not have: ",
     "principal point by photograph": "the principal point moves by {} between photographs",
     "principal distance by photograph": "the principal distance changes between photographs, by {} "
     "at the edge of the image: hold focus and zoom",
@@ -111,6 +112,14 @@ def component_rows(adjustment: "Adjustment") -> list[tuple[str, str, str, str, s
     ]
 
 
+def has_field(adjustment: "Adjustment") -> bool:
+    """Whether image points share a field on the sensor, which the lens model does not have."""
+    model = adjustment.error_model
+    return model is not None and any(
+        size.size > 0 and size.name.startswith(FIELD) for size in model.sizes
+    )
+
+
 def remarks(adjustment: "Adjustment") -> list[str]:
     """What the components that were found say, in sentences, the most significant first."""
     unit, said = adjustment.image_unit, []
@@ -119,8 +128,11 @@ def remarks(adjustment: "Adjustment") -> list[str]:
         name, of, camera = size.name.partition(" of ")
         if size.size > 0 and name in REMARKS:
             amount = f"{significant(size.size, 2)} {unit if size.unit == IMAGE else 'a priori σ'}"
-            camera = f"camera {clean(camera)}: " if of else ""
-            said.append(camera + REMARKS[name].format(amount))
+            words = REMARKS[name].format(amount)
+            if name == FIELD:
+                poor = is_hardly_determined(adjustment, camera)
+                words += ADVICE_ON_FIELD[advise_parameters(poor, True)]
+            said.append((f"camera {clean(camera)}: " if of else "") + words)
     return said
 
 
@@ -182,14 +194,11 @@ def not_looked_for(model: "ErrorModel") -> str:
     found = " ".join(size.name for size in model.sizes)
     if "by photograph" not in found:
         return (
-            "Errors of photographs and a field on the sensor were not looked for: they need eight "
+            f"Errors of photographs and a {FIELD} were not looked for: they need eight "
             "photographs of a camera."
         )
-    if "field on the sensor" not in found:
-        return (
-            "A field on the sensor was not looked for: it needs four image points for each of its "
-            "splines."
-        )
+    if FIELD not in found:
+        return f"A {FIELD} was not looked for: it needs four image points for each of its splines."
     return ""
 
 

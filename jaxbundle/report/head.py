@@ -28,6 +28,7 @@ from jaxbundle.report.layout import (
     significant,
     table,
 )
+from jaxbundle.report.lens_advice import FEWER_PARAMETERS
 from jaxbundle.report.rig_scale import scale_of_rigs
 from jaxbundle.types import present
 
@@ -70,8 +71,7 @@ LARGER_SIGMA = (
 )
 # What determines the unknowns of each table.
 ADVICE_FOR = {
-    "camera": "Free fewer camera parameters, or give them a prior σ; c needs depth or convergent "
-    "images, x0 and y0 need images rolled about their axis.",
+    "camera": FEWER_PARAMETERS,
     "image": "An image needs three or more well spread points whose coordinates are determined.",
     "point": "A point needs rays from two directions or more.",
 }

@@ -12,6 +12,7 @@ from jaxbundle.adjustment.problem import make_problem
 from jaxbundle.adjustment.quality.correlated_errors import splines
 from jaxbundle.adjustment.quality.given_points import given_points_component, wendland
 from jaxbundle.adjustment.quality.replication import compared_parameters
+from jaxbundle.adjustment.quality.weakness import Weakness
 from jaxbundle.leastsquares.quality import error_components
 from jaxbundle.leastsquares.quality.error_effects import stack_rows
 from jaxbundle.leastsquares.solution import Solution
@@ -102,6 +103,13 @@ def test_a_field_on_the_sensor_is_found(clean):
     assert "sigma_correlated" in told["images"][clean.images.id[0]]["X0"]
     assert "Correlated errors" in result.report()
     assert len(result.to_pandas("cameras")["sigma_correlated"])
+    of_field = lambda: next(line for line in correlated.remarks(result) if "a field of" in line)
+    assert "choose a richer lens model" in of_field() and "ewer" not in " ".join(result.warnings)
+    # a camera that the photographs hardly determine gets no further parameters
+    vars(result)["weakness"] = Weakness(("fx of camera cam",), 0.07)
+    assert "Free fewer camera parameters" in " ".join(result.warnings)
+    assert "richer" not in of_field() and "no further parameters" in of_field()
+    del vars(result)["weakness"]
 
 
 def test_halves_show_what_classical_sigma_lack(clean, shaken):

@@ -30,6 +30,13 @@ from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.io import read_cameras, read_network, read_opencv
 from jaxbundle.io.cameras.result_json import read_calibrated
 from jaxbundle.plotting import write_figures
+from jaxbundle.report.lens_advice import (
+    ADVICE_ON_FIELD,
+    FEWER,
+    RICHER,
+    SIGNIFICANT_ONLY,
+    advise_parameters,
+)
 
 DRAWS = 416
 GRID = (3, 3)
@@ -301,8 +308,20 @@ def test_what_is_missing_is_said():
     assert said.startswith("3 of 11 photographs repeat the pose of another")
     (said,) = often_removed(["2-1", "1-3", "1-3", "1-3", "1-3", "2-1"], 9)
     assert said.startswith("point 1-3 of the board was removed in 4 of 9 photographs")
-    (suggestion,) = suggest({"fx": 900.0, "k3": 0.4}, get_model("opencv"))
-    assert suggestion.startswith("not significant: k3 (t 0.4)")
+    model, t = get_model("opencv"), {"fx": 900.0, "k3": 0.4}
+    for which in (FEWER, SIGNIFICANT_ONLY):
+        (suggestion,) = suggest(t, model, which)
+        assert suggestion.startswith("not significant: k3 (t 0.4)")
+    assert suggest(t, model, RICHER) == []
+
+
+def test_more_and_fewer_parameters_are_never_advised_together():
+    """The rule of `report.lens_advice`: a camera that photographs hardly determine gets no more
+    parameters; what a model lacks is added before significance is asked."""
+    assert advise_parameters(True, True) == advise_parameters(True, False) == FEWER
+    assert advise_parameters(False, True) == RICHER
+    assert advise_parameters(False, False) == SIGNIFICANT_ONLY
+    assert "richer" in ADVICE_ON_FIELD[RICHER] and "richer" not in ADVICE_ON_FIELD[FEWER]
 
 
 def test_report_and_json_and_files(calibration, folder, tmp_path):

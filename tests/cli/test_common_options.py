@@ -97,6 +97,8 @@ def test_quiet_prints_the_result_alone(command, scanner, arguments):
 @pytest.mark.parametrize("arguments, option, name", [
     (LOCATE, "--csv", "points.csv"), (LOCATE, "--json", "points.json"),
     (("adjust", "examples/convergent4/project.toml"), "--json", "result.json"),
+    (("adjust", "examples/convergent4/project.toml"), "--gis", "network.gpkg"),
+    (("adjust", "examples/convergent4/project.toml"), "--certificate", "certificate.html"),
     (PLAN, "--out", "block"),
     (("example", "convergent4"), None, "first"),
 ], ids=lambda given: "-".join(given[:2]) if isinstance(given, tuple) else None)  # fmt: skip

@@ -51,22 +51,34 @@ def dump(folder, name, kind, **content):
 
 
 def write(folder, internals=None, control=4, **frame):
-    """`POINTS` seen by the images of `exchange_cases`; the first points are control."""
+    """`POINTS` seen by the images of `exchange_cases`; the first points are control.
+
+    With all that the specification requires: pyopf 1.4.1 resolves it, and the COLMAP model that its
+    `opf2colmap` makes of it has the same cameras, orientations, points, colours, image points."""
     uv = [pixels(matrix(a), X0) for a, X0 in zip(ANGLES, POSITION)]
     dump(folder, "list.json", "camera-list",
          cameras=[{"id": id, "uri": f"file:///c:/my%20photos/{n}.jpg"}
                   for id, n in zip(CAMERA, "abc")])  # fmt: skip
-    dump(folder, "input.json", "input-cameras", captures=[],
-         sensors=[{"id": 3, "name": "drone", "image_size_px": [1280, 720], "bands": []}])
     own = {"type": "perspective", "principal_point_px": C, "focal_length_px": F,
            "radial_distortion": R, "tangential_distortion": T}  # fmt: skip
+    seen = {"sensor_id": 3, "model_source": "database", "pixel_type": "uint8",
+            "pixel_range": {"min": 0, "max": 255}, "image_orientation": 1}  # fmt: skip
+    dump(folder, "input.json", "input-cameras",
+         captures=[{"id": 100 + k, "reference_camera_id": id, "time": "2024-05-01T10:00:00Z",
+                    "rig_model_source": "not_applicable", "cameras": [{"id": id, **seen}]}
+                   for k, id in enumerate(CAMERA)],
+         sensors=[{"id": 3, "name": "drone", "image_size_px": [1280, 720], "pixel_size_um": 2.4,
+                   "shutter_type": "global", "bands": [{"name": "Red", "weight": 1.0}],
+                   "internals": own}])  # fmt: skip
     dump(folder, "calibrated.json", "calibrated-cameras",
          sensors=[{"id": 3, "internals": internals or own}],
          cameras=[{"id": id, "sensor_id": 3, "position": (X0 + SHIFT).tolist(),
                    "orientation_deg": np.degrees(a).tolist()}
                   for id, a, X0 in zip(CAMERA, ANGLES, POSITION)])  # fmt: skip
     dump(folder, "points.json", "input-control-points", mtps=[],
-         gcps=[{"id": f"G{p}", "is_checkpoint": p == 3, "geolocation": {},
+         gcps=[{"id": f"G{p}", "is_checkpoint": p == 3,
+                "geolocation": {"crs": {"definition": "EPSG:25832"}, "coordinates": [0, 0, 0],
+                                "sigmas": [0.01, 0.01, 0.02]},
                 "marks": [{"camera_id": id, "position_px": xy[p].tolist(), "accuracy": 1.0}
                           for id, xy in zip(CAMERA, uv)]} for p in range(control)])  # fmt: skip
     dump(folder, "projected.json", "projected-control-points",

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from jaxbundle.commands.cameras import open_camera
 from jaxbundle.errors import InputError
 from jaxbundle.io import read_network, read_project, write_opencv, write_project
 from jaxbundle.io.formats import FORMATS
@@ -455,3 +456,9 @@ def test_acceptance_cases_are_ready_to_be_adjusted(path, tmp_path):
     network = read_network(path)
     assert check_network(network).warnings == ()
     assert_same(read_project(write_project(network, tmp_path)), network, rtol=1e-15)
+
+
+def test_the_camera_of_a_project_without_points():
+    """Oriented photographs alone, as `surface` takes them, have a camera to give."""
+    camera = open_camera(ROOT / "examples" / "four_photographs" / "project.toml")
+    assert camera.parameters["fx"] == 320 and camera.image_size == (320, 240)

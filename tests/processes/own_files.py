@@ -18,13 +18,16 @@ import numpy as np
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
-ROOMS = ("", "measure", "reconstruction", "surfaces", "io", "refinement", "cli")
+ROOMS = (
+    "", "measure", "reconstruction", "surfaces", "io", "refinement", "cli", "pushbroom",
+)  # fmt: skip
 sys.path[:0] = [*(str(ROOT / "tests" / room) for room in ROOMS), str(ROOT / "benchmarks")]
 
 import jaxbundle  # noqa: E402
 
 BOARD, SQUARE = (9, 6), 0.03
 PHOTOGRAPHS = sorted((EXAMPLES / "board").glob("photo_*.jpg"))[:12]
+TARGETS = sorted((EXAMPLES / "targets" / "photos").glob("photo_*.jpg"))
 
 OWN_NAMES = {
     "docs/howto/coming_from.md": """
@@ -266,6 +269,29 @@ def write_rpc_images(path: Path) -> None:
     write_satellite(path.parent)
 
 
+def write_product(path: Path) -> None:
+    """A satellite image with RPC, terrain in tiles, and a geoid 20 m above the ellipsoid under the
+    name of PROJ's."""
+    import tempfile
+
+    import rasterio
+    from test_whole_maps import write_product
+
+    with tempfile.TemporaryDirectory() as folder:
+        made = write_product(Path(folder))
+        for file in made.glob("image*"):
+            shutil.copy(file, path.parent)
+        shutil.copytree(made / "tiles", path.parent / "tiles")
+    with rasterio.open(path.parent / "tiles" / "00.tif") as tile:
+        west, north = tile.transform.c, tile.transform.f
+    grid = {
+        "driver": "GTiff", "width": 12, "height": 12, "count": 1, "dtype": "float32",
+        "crs": "EPSG:4326", "transform": rasterio.Affine(0.5, 0, west - 2, 0, -0.5, north + 2),
+    }  # fmt: skip
+    with rasterio.open(path.parent / "us_nga_egm96_15.tif", "w", **grid) as geoid:
+        geoid.write(np.full((12, 12), 20, "float32"), 1)
+
+
 def write_strips(path: Path) -> None:
     from test_surface_of_strips import write_strips
 
@@ -281,6 +307,54 @@ def write_sparse_model(path: Path) -> None:
     folder = path / "sparse" / "0"
     folder.parent.mkdir(parents=True)
     write_colmap(draw(0)[0], folder)
+
+
+def write_metashape(path: Path) -> None:
+    """A project of Metashape: ten photographs around 80 tie points, measured with 0.3 pixels."""
+    from test_metashape import P, published
+    from test_metashape_projects import pack, ply
+
+    from jaxbundle.geometry import matrix_from_omega_phi_kappa
+
+    square = P | {"b1": 0.0}
+    stations = jaxbundle.ring_of_stations(10, 3.0, 3.0, roll_every=2)
+    X, rng = jaxbundle.cloud_of_targets(80, (1.6, 1.6, 0.8), seed=3), np.random.default_rng(1)
+    number, images, cameras, entries = np.arange(len(X)), {}, "", ""
+    for i, (X0, angles) in enumerate(zip(stations.position, stations.angles)):
+        M = np.asarray(matrix_from_omega_phi_kappa(angles))
+        uv = np.stack(published(*((X - X0) @ M.T * [1, -1, -1]).T, b1=0.0), 1)
+        seen = (uv > 5).all(1) & (uv < [1275, 715]).all(1)
+        uv = uv[seen] + rng.normal(0, 0.3, (seen.sum(), 2))
+        images[f"p{i}_ply"] = ply(("x", "y", "size", "id"), *uv.T, np.ones(len(uv)), number[seen],
+                                  text="double")  # fmt: skip
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = M.T * [1, -1, -1], X0
+        values = " ".join(map(repr, T.ravel().tolist()))
+        cameras += (f'<camera id="{i}" sensor_id="0" label="photo_{i}.jpg"><transform>{values}'
+                    "</transform></camera>")  # fmt: skip
+        entries += f'<projections camera_id="{i}" path="p{i}.ply"/>'
+    calibration = "".join(f"<{name}>{value}</{name}>" for name, value in square.items())
+    sensor = (
+        '<sensor id="0" label="cam" type="frame"><resolution width="1280" height="720"/>'
+        '<calibration type="frame" class="adjusted"><resolution width="1280" height="720"/>'
+        f"{calibration}</calibration></sensor>"
+    )
+    path.write_text('<document version="1.2.0" path="{projectname}.files/project.zip"/>')
+    files = path.with_suffix(".files")
+    pack(files / "project.zip",
+         doc_xml='<document version="1.2.0"><chunks next_id="1" active_id="0">'
+                 '<chunk id="0" path="0/chunk.zip"/></chunks></document>')  # fmt: skip
+    pack(files / "0" / "chunk.zip",
+         doc_xml=f'<chunk label="c" enabled="true"><sensors>{sensor}</sensors>'
+                 f"<cameras>{cameras}</cameras><frames next_id=\"1\">"
+                 '<frame id="0" path="0/frame.zip"/></frames></chunk>')  # fmt: skip
+    pack(files / "0" / "0" / "frame.zip", doc_xml="<frame/>")
+    pack(files / "0" / "0" / "point_cloud" / "point_cloud.zip",
+         doc_xml='<point_cloud version="1.2.0"><tracks path="tracks.ply"/>'
+                 f'<points path="points0.ply"/>{entries}</point_cloud>',
+         points0_ply=ply(("x", "y", "z", "id"), *X.T, number, text="double"),
+         tracks_ply=ply(("red", "green", "blue"), *np.full((3, len(X)), 90), text="uchar"),
+         **images)  # fmt: skip
 
 
 OWN: dict[str, Callable[[Path], None]] = {
@@ -316,6 +390,11 @@ OWN: dict[str, Callable[[Path], None]] = {
     "a.tif": write_rpc_images,
     "ahead.toml": write_strips,
     "scene": write_sparse_model,
+    "block.psx": write_metashape,
+    "image.tif": write_product,
+    "camera_a": lambda path: copy_photographs(path, TARGETS[::2]),
+    "camera_b": lambda path: copy_photographs(path, TARGETS[1::2]),
+    "bars.csv": lambda path: shutil.copy(EXAMPLES / "targets" / "bars.csv", path),
 }  # fmt: skip
 MADE_BY = {
     "docs/calibrate.md": ["cameras.npz"], "docs/reconstruct.md": ["surveyed"],

@@ -39,6 +39,7 @@ NOT_RUN = {
     "make test": "the tests themselves",
     "pip install": "installs: `make test-oldest` and `make test-newest` do",
     "srun": "needs SLURM",
+    "chromium": "needs a browser",
     "--join host": "needs two machines",
     "--join machine0": "needs 16 machines",
 }

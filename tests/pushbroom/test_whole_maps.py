@@ -47,9 +47,12 @@ BANDS = 3
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, memory_at_hand):
+    return write_product(tmp_path_factory.mktemp("maps"))
+
+
+def write_product(folder):
     """image.tif of three bands of 16 bits with RPC, the rigorous scanner.toml, dem.tif, and tiles/
     that are its four quarters."""
-    folder = tmp_path_factory.mktemp("maps")
     image = smooth_image(LINES, PIXELS)
     write_scanner_image(folder, "scanner", image, WGS84, prefix="", angle_unit="deg")
     values = np.random.default_rng(1).integers(1, 3000, (BANDS, LINES, PIXELS)).astype("uint16")

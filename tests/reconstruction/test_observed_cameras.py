@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 
 import jaxbundle
+from jaxbundle.errors import InputError
 from jaxbundle.network.tables import Camera
 from jaxbundle.photographs.exif import Exif, StatedDistance
 from jaxbundle.reconstruction.camera_priors import observed_parameters
 from jaxbundle.reconstruction.named import no_named_points
 from jaxbundle.reconstruction.network import FurtherData, photograph_network
 from jaxbundle.reconstruction.photographs import Cameras, Photograph
+from jaxbundle.reconstruction.settings import ReconstructionSettings
 from jaxbundle.reconstruction.square_pixels import release
 from jaxbundle.reconstruction.starting import _with_distances
 from jaxbundle.tiepoints import camera_starts
@@ -22,7 +24,7 @@ SIZE = (3000, 2000)
 FILE = StatedDistance(2350.0, 117.5, "focal length and sensor")
 
 
-def network(stated, aspect_sigma=2e-4, lens=(0, 1), positions=None):
+def network(stated, aspect_sigma=2e-4, lens=(0, 1), positions=None, angle_unit="deg"):
     """Two cameras, whose start values come from matches, with two photographs each."""
     cameras = tuple(
         Camera(id, "opencv", {"fx": 2100.0, "fy": 2100.0, "cx": 1499.5, "cy": 999.5, "k1": 0.05},
@@ -36,7 +38,8 @@ def network(stated, aspect_sigma=2e-4, lens=(0, 1), positions=None):
                             image == 0, np.zeros((n, 3), np.uint8))  # fmt: skip
     of = Cameras(cameras, (0, 0, 1, 1), stated, False, (), lens)
     further = FurtherData(no_named_points(), positions=positions)
-    return photograph_network(photographs, of, measured, further, "part", aspect_sigma)
+    return photograph_network(photographs, of, measured, further, "part", aspect_sigma,
+                              angle_unit)  # fmt: skip
 
 
 def rows(network):
@@ -108,3 +111,11 @@ def test_what_nothing_scales_has_no_unit_of_length():
     alone, placed = network((None, None)), network((None, None), positions=(np.eye(4, 3),) * 2)
     assert (alone.object_unit, alone.datum) == ("unit", "inner")
     assert (placed.object_unit, placed.datum) == ("m", "control")
+
+
+def test_angles_have_the_unit_of_the_settings():
+    assert ReconstructionSettings().angle_unit == "deg"
+    assert network((FILE, None)).angle_unit == "deg"
+    assert network((FILE, None), angle_unit="gon").angle_unit == "gon"
+    with pytest.raises(InputError, match="angle_unit.*furlong"):
+        ReconstructionSettings(angle_unit="furlong")

@@ -40,7 +40,8 @@ def need_values(network: Network, model: str = "", format: str = "", points: boo
     for table, values, thing, what in tables[: 3 if points else 2]:
         for row, *_ in np.argwhere(~np.isfinite(values))[:1]:
             raise InputError(
-                f"{table.source(row)}: {thing} {table.id[row]!r} has no {what} to be written"
+                f"{table.source(row)}: {thing} {table.id[row]!r} has no {what} to be written: "
+                "convert the result of jaxbundle orient or adjust, which compute what is missing"
             )
 
 
@@ -190,7 +191,8 @@ def one_focal_length(camera: Camera, format: str) -> float:
     if p["fx"] != p["fy"]:
         raise InputError(
             f"camera {camera.id!r}: {format} has one focal length, but fx is {p['fx']:.9g} and fy "
-            f'{p["fy"]:.9g}; adjust the camera with tie = [["fx", "fy"]]'
+            f'{p["fy"]:.9g}; adjust the camera with tie = [["fx", "fy"]] '
+            f"(--set camera.{camera.id}.tie=fx+fy)"
         )
     return p["fx"]
 

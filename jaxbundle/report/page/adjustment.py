@@ -8,7 +8,7 @@ from jaxbundle.report import head
 from jaxbundle.report.layout import clean
 from jaxbundle.report.page import sections
 from jaxbundle.report.page.document import NOTHING, Listing, Page, Section, write
-from jaxbundle.report.page.markup import facts, grid, paragraph
+from jaxbundle.report.page.markup import facts, paragraph
 from jaxbundle.report.page.origin import UNKNOWN, Origin
 from jaxbundle.report.page.overview import explain_failure, give_verdict, list_messages
 from jaxbundle.report.page.scene import describe_frames, describe_network
@@ -101,7 +101,7 @@ def describe(
         return Page(title, [first, *also.sections], origin, settings, also.tables)
     noted = list_messages("Notes", adjustment.notes)
     findings = also.conclude(adjustment).findings
-    first = give_verdict(findings, warnings, also.overview, noted, *_whole(adjustment))
+    first = give_verdict(findings, warnings, also.overview, noted, *_result(adjustment))
     drawings: dict[str, Any] = {
         "network-data": describe_network(adjustment),
         "frames": describe_frames(adjustment),
@@ -111,15 +111,11 @@ def describe(
     return Page(title, shown, origin, settings, tables, drawings)
 
 
-def _whole(adjustment: "Adjustment") -> list[str]:
-    """Summary numbers."""
+def _result(adjustment: "Adjustment") -> list[str]:
+    """The main values, and what their σ are."""
     return [
         "<h3>Result</h3>\n",
         facts(row for row in summary(adjustment) if row[0] not in REPEATED_LINES),
-        "<h3>Variance factor</h3>\n",
-        facts(head.variance_facts(adjustment)),
-        "<h3>Counts</h3>\n",
-        grid(("", "", ""), head.count_rows(adjustment), "words"),
         paragraph(SIGMA_NOTE),
         paragraph(head.LARGER_SIGMA) if adjustment.error_model is not None else "",
     ]

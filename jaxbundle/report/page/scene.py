@@ -10,6 +10,7 @@ from jaxbundle.plotting.frame import image_frame
 from jaxbundle.plotting.style import extent, micrometres, round_number
 from jaxbundle.plotting.views import (
     PROBABILITY,
+    SCENE,
     camera_pyramids,
     choose_ellipses,
     pyramid_size,
@@ -30,7 +31,7 @@ def describe_network(adjustment: "Adjustment") -> dict[str, Any]:
     near = adjustment.point_values[adjustment.located]
     centre, size = extent(np.concatenate([near, centres]))
     pyramids = camera_pyramids(adjustment, pyramid_size(centres, size)) - centre
-    ellipsoids = choose_ellipses(adjustment, size)
+    ellipsoids = choose_ellipses(adjustment, size, SCENE)
     largest = np.sqrt(np.trace(adjustment.image_covariance[:, :3, :3], axis1=1, axis2=2))
     if not ellipsoids.total and largest.max(initial=0.0) > 0:
         # no point has one: the largest of the stations is a twentieth of the network
@@ -43,7 +44,7 @@ def describe_network(adjustment: "Adjustment") -> dict[str, Any]:
         "factor": ellipsoids.factor,
         "ellipsoids": {
             "points": ellipsoids.rows.tolist(),
-            "images": thin_out(centres, np.nan_to_num(largest)).tolist(),
+            "images": thin_out(centres, np.nan_to_num(largest), size, SCENE).tolist(),
         },
         "drawn": " ".join(
             [

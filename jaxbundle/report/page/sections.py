@@ -15,7 +15,7 @@ from jaxbundle.report.layout import clean, fixed, significant
 from jaxbundle.report.observations import count_by_class
 from jaxbundle.report.page.charts import Curve, draw_curves, draw_histogram
 from jaxbundle.report.page.document import Section
-from jaxbundle.report.page.markup import figure, grid, items, paragraph, text
+from jaxbundle.report.page.markup import facts, figure, grid, items, paragraph, text
 from jaxbundle.report.unknowns import validity
 
 if TYPE_CHECKING:
@@ -24,7 +24,9 @@ if TYPE_CHECKING:
 
 def collect(adjustment: "Adjustment") -> Iterator[Section]:
     """All sections of a solved adjustment between its verdict and its tables."""
+    # a picture soon after the verdict, numbers behind it
     yield network()
+    yield variance_factor(adjustment)
     yield photographs()
     yield from cameras(adjustment)
     yield residuals(adjustment)
@@ -47,6 +49,16 @@ def network() -> Section:
         '<p id="network-said" aria-live="polite"></p>\n',
     ]
     return Section("network", "Network", "".join(parts), "Network")
+
+
+def variance_factor(adjustment: "Adjustment") -> Section:
+    """Variance factor and counts."""
+    parts = [
+        facts(head.variance_facts(adjustment)),
+        "<h3>Counts</h3>\n",
+        grid(("", "", ""), head.count_rows(adjustment), "words"),
+    ]
+    return Section("variance", "Variance factor", "".join(parts), "Variance factor")
 
 
 def photographs(test: str = "τ") -> Section:
