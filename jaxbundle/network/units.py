@@ -25,7 +25,9 @@ from jaxbundle.errors import InputError
 from jaxbundle.network.tables import Camera
 
 # Radians in one unit.
-ANGLE_UNITS = dict(zip(ANGLE_UNIT_NAMES, (1.0, math.pi / 180, math.pi / 200), strict=True))
+ANGLE_UNITS: dict[str, float] = dict(
+    zip(ANGLE_UNIT_NAMES, (1.0, math.pi / 180, math.pi / 200), strict=True)
+)
 
 IMAGE_UNITS = ("mm", "px")
 
