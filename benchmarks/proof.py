@@ -212,7 +212,7 @@ def drone(real: Path, folder: Path) -> Iterator[str]:
     )
     yield ""
     yield paragraph(f"{len(result['images'])} of 41 photographs are oriented. Control points:")
-    metres = lambda given: ["" if given[axis] is None else f"{given[axis]:.2f}" for axis in "XY"]
+    metres = lambda given: ["–" if given[axis] is None else f"{given[axis]:.2f}" for axis in "XY"]
     yield from head("point", "", "rays", "dE, m", "dN, m", "predicted by all others: dE", "dN")
     for name, point in part["control"]["points"].items():
         predicted = (point["prediction"] or {"error": {"X": None, "Y": None}})["error"]
