@@ -138,6 +138,7 @@ def take_pictures(
     image = take_image(truth, surface, jnp.asarray(scene), frame.place, lines, resampling, pixels)
     search = make_search(recorded, surface.earth, FEW_POINTS)
     nodes = _nodes_of(frame, surface)
+    # Of a large image every `step`th pixel is there: a tolerance of pixels of the picture.
     places = block_places(recorded, search, surface, nodes, tolerance=TOLERANCE * min(step))
     rows, columns = frame.rows, frame.columns
     if places is None:
@@ -279,5 +280,7 @@ def _drop(
     surface: GroundSurface, o: Float[Array, "3 n"], d: Float[Array, "3"]
 ) -> Float[Array, "3 n"]:
     """The points of the surface on rays of one direction."""
+    # Verticals of the plane, not of the ellipsoid: parallel rays, so that scene and map are the same
+    # projection of the ground.
     drop = lambda o: along(o, d, surface.distance(o, d))
     return jnp.stack(jax.vmap(drop, in_axes=1)(o))

@@ -93,6 +93,7 @@ def _scale_of_other_lengths(network: Network, model: Model) -> float | None:
     """The median of the given lengths of further kinds by those in the model."""
     if not network.further or not model.placed.any():
         return None
+    # Kinds compute lengths, such as bases of rigs, from poses: of a network of the placed images.
     placed = np.flatnonzero(model.placed)
     images = network.images.take(placed)
     oriented = dataclasses.replace(

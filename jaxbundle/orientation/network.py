@@ -246,6 +246,8 @@ def _orient(
         part = _grow_from_a_pair(network, seen, model, improve, settings)
         if part is None:
             break
+        # A part of its own frame and scale: images that see too few known points for a resection
+        # have points in common with one oriented image, or lengths that are known.
         if model.placed.any():
             part = join(network, seen, model, part)
             assert part is not None, "a pair is taken only if it can be joined"

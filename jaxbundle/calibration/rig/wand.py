@@ -318,7 +318,8 @@ def _network(
     for own in marks.values():
         for frame, name, *_ in own:
             rays[f"{frame}:{name}"] = rays.get(f"{frame}:{name}", 0) + 1
-    # one ray and one known distance are as many observations as a point has unknowns
+    # one ray and one known distance are as many observations as a point has unknowns: such a point
+    # would be met exactly, and on either of two places along its ray
     seen = {point for point, number in rays.items() if number > 1}
     rows = [
         (camera, f"{frame}:{name}", x, y)

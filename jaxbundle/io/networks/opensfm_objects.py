@@ -40,6 +40,8 @@ def from_opensfm(reconstruction: Any, tracks: Any = None, overrides: Sequence[st
         raise InputError(
             "OpenSfM is needed, which made these objects; without it, read_network of its folder"
         ) from None
+    # By files rather than attributes: these differ between versions of OpenSfM, the files hardly,
+    # and their conventions stay in one reader.
     with tempfile.TemporaryDirectory() as folder:
         document = opensfm_io.reconstructions_to_json([reconstruction])
         (Path(folder) / RECONSTRUCTION).write_text(json.dumps(document), encoding="utf-8")
