@@ -280,7 +280,7 @@ def _drop(
     surface: GroundSurface, o: Float[Array, "3 n"], d: Float[Array, "3"]
 ) -> Float[Array, "3 n"]:
     """The points of the surface on rays of one direction."""
-    # Verticals of the plane, not of the ellipsoid: parallel rays, so that scene and map are the same
+    # Verticals of the plane, not of the ellipsoid: parallel rays, so that scene and map are one
     # projection of the ground.
     drop = lambda o: along(o, d, surface.distance(o, d))
     return jnp.stack(jax.vmap(drop, in_axes=1)(o))
