@@ -181,8 +181,9 @@ def test_an_arc_leads_from_start_to_end():
     unit = P / np.linalg.norm(P, axis=1)[:, None]
     between = np.arccos(np.clip((unit[1:] * unit[:-1]).sum(1), -1, 1))
     np.testing.assert_allclose(between, between[0], rtol=1e-5)
-    with pytest.raises(InputError, match="opposite"):
-        arc_between(t, start, -start, 60.0, np.zeros(3))
+    for other, words in ((-start, "opposite"), (1.01 * start, "above one place")):
+        with pytest.raises(InputError, match=words):
+            arc_between(t, start, other, 60.0, np.zeros(3))
 
 
 def test_a_flight_file_has_start_and_end(tmp_path):
@@ -238,6 +239,8 @@ def test_a_walk_grows_with_the_root_of_time_and_does_not_depend_on_the_times_ask
     # σ of an RMS of 800 draws: 2.5 %
     np.testing.assert_allclose(ends[:, 1].std(), 0.3 * np.sqrt(4.0), rtol=0.1)
     t = np.linspace(-2.0, 9.0, 100)
+    with pytest.raises(InputError, match="step is 1e-08 s, .* give a longer one"):
+        signal({"kind": "walk", "step": 1e-8}, t, 0.0, np.random.default_rng(0))
     longer = np.concatenate([t, np.linspace(9.1, 80.0, 50)])
     np.testing.assert_allclose(walk(7, longer)[:100], walk(7, t), atol=1e-9)
 

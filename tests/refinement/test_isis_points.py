@@ -150,6 +150,8 @@ def test_residuals_of_jigsaw_are_measurements(scene, folder):
     (GOOD.replace("AprioriX =", "Apriori =") + "End_Object\nEnd\n", "without AprioriX"),
     (GOOD.replace("<meters>", "<degrees>") + "End_Object\nEnd\n", "meters are expected"),
     (GOOD.replace("(1.0, 0.0", "(-1.0, 0.0") + "End_Object\nEnd\n", "negative eigenvalue"),
+    (GOOD.replace("(1.0, 0.0", "(0.0, 0.0") + "End_Object\nEnd\n", "no error in one direction"),
+    (GOOD.replace("End_Group", "") + "End_Object\nEnd\n", "END_OBJECT without a beginning"),
     (GOOD.replace("(1.0, ", "(") + "End_Object\nEnd\n", "has 5 numbers"),
     (GOOD.replace("Line           = 5.0", "Line = five") + "End_Object\nEnd\n", "line 28: LINE"),
     (GOOD.replace("SerialNumber", "Serial") + "End_Object\nEnd\n", "without SERIALNUMBER"),
@@ -181,6 +183,9 @@ def test_serial_numbers_of_no_image_are_refused(folder):
     text = (folder / "refine.toml").read_text()
     (folder / "refine.toml").write_text(text.replace('A = "WV03', 'C = "WV03'))
     with pytest.raises(InputError, match=r"\[serial_numbers\].*C: no such image"):
+        read_refinement(folder / "refine.toml")
+    (folder / "refine.toml").write_text(text.replace(f"{SERIAL}:1", f"{SERIAL}:0"))
+    with pytest.raises(InputError, match="by which A is known already"):
         read_refinement(folder / "refine.toml")
     (folder / "refine.toml").write_text(text.replace(f'A = "{SERIAL}:0"\n', ""))
     told = read_refinement(folder / "refine.toml").warnings
