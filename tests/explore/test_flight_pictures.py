@@ -145,9 +145,9 @@ def test_pictures_are_on_the_page_and_follow_the_sliders(view):
     later = re.findall(r"base64,([^\"]+)", rolled["parts"]["pictures"])
     assert later[0] == found[0][1] and later[1] == found[1][1] and later[2] != found[2][1]
     assert rolled["difference"] > first["difference"]
-    swung = view.answer({"yaw_amplitude": 2.0, "resampling": "nearest"})
+    swung = view.answer({"yaw_amplitude": 2.0, "resampling": "cubic"})
     assert re.findall(r"base64,([^\"]+)", swung["parts"]["pictures"])[1] != found[1][1]
-    assert "nearest" in swung["parts"]["pictures"]
+    assert "cubic" in swung["parts"]["pictures"]
 
 
 def test_start_and_end_are_those_of_the_lines(view):

@@ -68,11 +68,36 @@ def folder(scene, tmp_path):
     return tmp_path
 
 
+def test_a_network_gives_its_points_and_measurements(scene, folder):
+    _, points, observations = scene
+    file = read_refinement(folder / "refine.toml")
+    assert any("RMS 0.4 lines, 0.3 samples" in words for words in file.warnings)
+    row = [points.id.index(id) for id in file.points.id]
+    assert sorted(row) == list(range(len(points.id))) and file.points.role.count("control") == 6
+    for k, p in enumerate(row):
+        assert file.points.role[k] == points.role[p]
+        if points.role[p] == "control":
+            np.testing.assert_allclose(file.points.X[k], points.X[p], rtol=1e-15)
+            np.testing.assert_allclose(file.points.sigma[k], SIGMA_CONTROL, rtol=1e-12)
+        else:
+            # tie points have none
+            assert np.isnan(file.points.X[k]).all()
+    of = lambda o, names: sorted(
+        (int(i), names[p], *xy) for i, p, xy in zip(o.image, o.point, np.asarray(o.xy).tolist())
+    )
+    np.testing.assert_allclose(
+        np.array([r[2:] for r in of(file.observations, file.points.id)]),
+        np.array([r[2:] for r in of(observations, points.id)]), rtol=1e-14,
+    )  # fmt: skip
+    assert [r[:2] for r in of(file.observations, file.points.id)] == [
+        r[:2] for r in of(observations, points.id)
+    ]
+
+
+@pytest.mark.further
 def test_a_network_gives_the_refinement_of_its_points(scene, folder):
     _, points, observations = scene
     file = read_refinement(folder / "refine.toml")
-    assert file.points.role.count("control") == 6 and len(file.observations) == len(observations)
-    assert any("RMS 0.4 lines, 0.3 samples" in words for words in file.warnings)
     found = refine(file.images, file.points, file.observations)
     direct = refine(file.images, points, observations)
     np.testing.assert_allclose(found.estimate, direct.estimate, atol=1e-5)
