@@ -16,7 +16,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.explorer.attitudes import attitude_forms, choose_angles
 from jaxbundle.explorer.pictures import scene_of_raster, take_pictures
 from jaxbundle.explorer.scanner import FlightView
-from jaxbundle.explorer.tracks import PLACES, STRAIGHT, choose_track
+from jaxbundle.explorer.tracks import ORBIT, PLACES, STRAIGHT, choose_track
 from jaxbundle.geometry.ellipsoid import WGS84, earth_fixed, geodetic
 from jaxbundle.io.rasters.scenes import SceneRaster
 from jaxbundle.io.scanner.flight import read_flight
@@ -305,3 +305,15 @@ def test_over_the_earth_the_map_is_the_scene():
     # from place to place: the same places at first
     told = view.answer(exact | {"track": PLACES})
     assert told["difference"] is not None and told["rms"] < 100.0
+
+
+@pytest.mark.further
+def test_a_track_in_other_coordinates_than_the_scene_shows_a_pattern(view):
+    frame, _ = ramp_over(view)
+    place = lambda X: (frame.origin[1] - X[1] + 100.0, X[0] - frame.origin[0] + 100.0)
+    raster = SceneRaster(np.add(*np.indices((200, 200), float))[None], "float64", place)
+    with_raster = FlightView("r", view.flight, view.earth, scene=raster)
+    for kind, said in ((STRAIGHT, False), (ORBIT, True)):
+        chosen = with_raster.choose(values := with_raster.values({"track": kind}))
+        drawn, _ = with_raster._draw_pictures(chosen, values)
+        assert ("a pattern is in its place" in drawn) == said
