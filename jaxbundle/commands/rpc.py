@@ -22,14 +22,20 @@ from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.io.rasters.extent import pole_in_image
-from jaxbundle.io.rasters.geoid import undulations
+from jaxbundle.io.rasters.geoid import undulations_at
 from jaxbundle.io.rasters.maps import MapSystem
 from jaxbundle.io.scanner.rpc import read_rpc, write_rpc
 from jaxbundle.io.text.csv_tables import read_csv
 from jaxbundle.io.text.known_keys import UnknownKeys
 from jaxbundle.leastsquares.quality.distributions import critical_w
 from jaxbundle.network.columns import Columns
-from jaxbundle.pushbroom.rpc.bias import RpcBias, apply_bias, fit_bias, project_compensated
+from jaxbundle.pushbroom.rpc.bias import (
+    RpcBias,
+    apply_bias,
+    check_domain,
+    fit_bias,
+    project_compensated,
+)
 from jaxbundle.pushbroom.rpc.fitting import RpcCheck, RpcTable, fit_image, fit_rpc
 from jaxbundle.pushbroom.rpc.polynomials import Rpc, RpcStatus, locate_points_on, project_points
 from jaxbundle.system.programs import compile_once
@@ -209,9 +215,13 @@ def compensate(
     if any(name in columns.values for name in GROUND_SIGMA):
         ground = np.stack([columns.numbers(name, required=True) for name in GROUND_SIGMA], 1)
     role = _roles(columns)
+    # the others are checked by the fit
+    check = np.flatnonzero(role == "check")
+    taken = lambda rows: RpcTable(*(np.asarray(column)[rows] for column in table))
+    check_domain(given, taken(check), columns.source.take(check))
     fit = lambda rows: fit_bias(
         given,
-        RpcTable(*(np.asarray(column)[rows] for column in table)),
+        taken(rows),
         model=model,
         sigma=sigma,
         ground_sigma=ground[rows],
@@ -242,9 +252,9 @@ def compensate(
     figures |= {f"s_{name}": s for name, s in zip(names, sigmas)}
     residuals = _residuals_of_all(given, found.bias, table)
     figures |= {"control_points": len(used), "removed_points": int((role == "removed").sum())}
-    if (check := role == "check").any():
+    if len(check):
         rms = np.sqrt(np.mean(residuals[check] ** 2, axis=0))
-        figures |= {"check_points": int(check.sum())}
+        figures |= {"check_points": len(check)}
         figures |= {f"check_rms_{a}": float(v) for a, v in zip(("line", "sample"), rms)}
     if left is not None:
         figures |= _figures("refit", left)
@@ -288,26 +298,32 @@ def _in_rows(values: np.ndarray, rows: np.ndarray, number: int) -> np.ndarray:
 
 def _read_points(
     path: Path,
-    optional: tuple[str, ...] = (),
+    optional: tuple[str, ...] = ("id",),
     crs: str | None = None,
     geoid: str | Path | None = None,
 ) -> tuple[RpcTable, Columns]:
     columns = read_csv(path)
     names = COLUMNS if crs is None else ("x", "y", *COLUMNS[2:])
-    columns.check_names(names, ("id", *optional))
+    columns.check_names(names, optional)
     if crs is None:
         east, north, height = geographic(columns)
     else:
         x, y, height = (columns.numbers(name, required=True) for name in names[:3])
-        place = present(MapSystem(WGS84, crs).transformer).transform(x, y, direction="INVERSE")
-        east, north = np.radians(place)
+        transformer = present(MapSystem(WGS84, crs).transformer)
+        if present(transformer.target_crs).is_vertical:
+            # its heights would be taken for heights above the ellipsoid
+            raise InputError(
+                f"--crs {crs}: has a system of heights; give its horizontal part, and --geoid for "
+                "heights that are not above the ellipsoid"
+            )
+        east, north = np.radians(transformer.transform(x, y, direction="INVERSE"))
         if (bad := ~(np.isfinite(east) & np.isfinite(north))).any():
             row = int(bad.argmax())
             raise InputError(
                 f"{columns.source(row)}: x, y are no place of {crs}; check their order"
             )
     if geoid is not None:
-        N = np.diagonal(undulations(Path(geoid), np.degrees(east), np.degrees(north)))
+        N = undulations_at(Path(geoid), np.degrees(east), np.degrees(north))
         if (missing := ~np.isfinite(N)).any():
             row = int(missing.argmax())
             raise InputError(f"{columns.source(row)}: {geoid} has no height of the geoid there")

@@ -229,7 +229,11 @@ def _read_mask(path: str | Path, cells: CellSource) -> Int[np.ndarray, "rows col
     cells, and need not have all of them."""
     mask = open_cells(path)
     found = np.zeros(cells.shape, np.int32)
-    row, column = place_of(mask, cells)
+    try:
+        _check_systems(cells, mask)
+        row, column = place_of(mask, cells)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
     rows, columns = (
         slice(max(at, 0), min(at + n, size))
         for at, n, size in zip((row, column), mask.shape, cells.shape)
@@ -262,7 +266,7 @@ def _check_systems(first: CellSource, second: CellSource) -> None:
     one, other = (pyproj.CRS.from_user_input(grid.system) for grid in (first, second))
     if not one.equals(other, ignore_axis_order=True):
         raise InputError(
-            f"the surfaces are in different coordinate systems, {one.name} and {other.name}; "
+            f"two rasters are in different coordinate systems, {one.name} and {other.name}; "
             "transform one (gdalwarp -t_srs)"
         )
 

@@ -463,12 +463,15 @@ class FlightView:
                 truth = true_image(dataclasses.replace(self.flight, track=track))
             surface = _surface_at(0.0, chosen.earth)
             frame = frame_around(truth, surface, _outline(truth))
-            fits = (chosen.earth is None) == (self.earth is None)
-            if self.raster is not None and fits:
+            if self.raster is not None and self._has_coordinates_of_raster(chosen):
                 self._scenes[kind] = frame, scene_of_raster(self.raster, frame, surface)
             else:
                 self._scenes[kind] = frame, pattern(frame)
         return self._scenes[kind]
+
+    def _has_coordinates_of_raster(self, chosen: Chosen) -> bool:
+        """Whether the track is over the Earth, or above a plane, as the one of the file is."""
+        return (chosen.earth is None) == (self.earth is None)
 
     def _draw_pictures(self, chosen: Chosen, values: Mapping[str, Any]) -> tuple[str, float | None]:
         """The pictures, and the difference of map and scene; words in their place where there are
@@ -476,7 +479,11 @@ class FlightView:
         try:
             taken = self._take_pictures(chosen, values)
             frame, _ = self._scene(values.get("track", ""), chosen)
-            return draw_pictures(taken, frame, _kernel(values)), taken.rms
+            drawn = draw_pictures(taken, frame, _kernel(values))
+            if self.raster is not None and not self._has_coordinates_of_raster(chosen):
+                words = "The scene has coordinates of the file's track: a pattern is in its place."
+                drawn = paragraph(words, "hint") + drawn
+            return drawn, taken.rms
         except InputError as error:
             return without_pictures(error), None
 

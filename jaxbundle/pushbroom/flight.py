@@ -196,7 +196,10 @@ def _attitude(flight: Flight, rate: float, method: str) -> AttitudeTable:
         parts = flight.angles.get(name, 0.0)
         parts = parts if isinstance(parts, list | tuple) else [parts]
         rng = [np.random.default_rng([flight.seed, axis, k]) for k in range(len(parts))]
-        angles.append(sum(signal(part, t, 0.0, r) for part, r in zip(parts, rng)))
+        try:
+            angles.append(sum(signal(part, t, 0.0, r) for part, r in zip(parts, rng)))
+        except InputError as error:
+            raise InputError(f"{name}: {error}") from None
     local = "start" in flight.track and "centre" not in flight.track
     reference = "earth" if local else "orbit"
     return attitude_table(t, np.stack(angles, 1), method=method, reference=reference)
@@ -218,17 +221,17 @@ def arc_between(
 
     with u towards the start and w at a right angle to it, in the plane.
 
-    **Raises:** `InputError` where both are on one line with the centre on opposite sides, which
-    leaves the plane open."""
+    **Raises:** `InputError` where both are on one line with the centre, which leaves the plane
+    open."""
     towards = np.stack([start, end]) - centre
     r = np.linalg.norm(towards, axis=1)
     u, v = towards / r[:, None]
     across = np.linalg.norm(np.cross(u, v))
     # below this the direction of w is lost in the rounding of coordinates
-    aligned = across < 1e-12
-    if aligned and u @ v < 0:
-        raise InputError("track: start and end are opposite places of the Earth; give others")
-    w = np.zeros(3) if aligned else (v - (u @ v) * u) / across
+    if across < 1e-12:
+        where = "opposite places of the Earth" if u @ v < 0 else "above one place of the Earth"
+        raise InputError(f"track: start and end are {where}, which gives no direction; give others")
+    w = (v - (u @ v) * u) / across
     turn, climb = np.arctan2(across, u @ v) / duration, (r[1] - r[0]) / duration
     cos, sin = (f(turn * t)[:, None] for f in (np.cos, np.sin))
     distance = (r[0] + climb * t)[:, None]

@@ -74,7 +74,14 @@ def _walk(passed: Times, sigma: float, step: float, rng: np.random.Generator) ->
     # Forward and backward from the start by steps of their own: one seed gives one walk for any
     # requested times. The end of a spline acts by a factor of 2 − √3 less at every node, so that 20
     # nodes beyond the requested times leave nothing of it.
-    after, before = (20 + int(np.ceil(max(end, 0.0) / step)) for end in (passed[-1], -passed[0]))
+    after, before = (20 + np.ceil(max(end, 0.0) / step) for end in (passed[-1], -passed[0]))
+    # 1 kHz for a quarter of an hour; more would fill the memory
+    if not after + before <= 1e6:
+        raise InputError(
+            f"signal 'walk': step is {step:g} s, {after + before:.3g} in the time of the image; "
+            "give a longer one"
+        )
+    after, before = int(after), int(before)
     forward, backward = (
         np.cumsum(sigma * np.sqrt(step) * one.normal(size=n))
         for one, n in zip(rng.spawn(2), (after, before))

@@ -16,7 +16,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.explorer.attitudes import attitude_forms, choose_angles
 from jaxbundle.explorer.pictures import scene_of_raster, take_pictures
 from jaxbundle.explorer.scanner import FlightView
-from jaxbundle.explorer.tracks import PLACES, STRAIGHT, choose_track
+from jaxbundle.explorer.tracks import ORBIT, PLACES, STRAIGHT, choose_track
 from jaxbundle.geometry.ellipsoid import WGS84, earth_fixed, geodetic
 from jaxbundle.io.rasters.scenes import SceneRaster
 from jaxbundle.io.scanner.flight import read_flight
@@ -145,9 +145,9 @@ def test_pictures_are_on_the_page_and_follow_the_sliders(view):
     later = re.findall(r"base64,([^\"]+)", rolled["parts"]["pictures"])
     assert later[0] == found[0][1] and later[1] == found[1][1] and later[2] != found[2][1]
     assert rolled["difference"] > first["difference"]
-    swung = view.answer({"yaw_amplitude": 2.0, "resampling": "nearest"})
+    swung = view.answer({"yaw_amplitude": 2.0, "resampling": "cubic"})
     assert re.findall(r"base64,([^\"]+)", swung["parts"]["pictures"])[1] != found[1][1]
-    assert "nearest" in swung["parts"]["pictures"]
+    assert "cubic" in swung["parts"]["pictures"]
 
 
 def test_start_and_end_are_those_of_the_lines(view):
@@ -181,8 +181,9 @@ def test_an_arc_leads_from_start_to_end():
     unit = P / np.linalg.norm(P, axis=1)[:, None]
     between = np.arccos(np.clip((unit[1:] * unit[:-1]).sum(1), -1, 1))
     np.testing.assert_allclose(between, between[0], rtol=1e-5)
-    with pytest.raises(InputError, match="opposite"):
-        arc_between(t, start, -start, 60.0, np.zeros(3))
+    for other, words in ((-start, "opposite"), (1.01 * start, "above one place")):
+        with pytest.raises(InputError, match=words):
+            arc_between(t, start, other, 60.0, np.zeros(3))
 
 
 def test_a_flight_file_has_start_and_end(tmp_path):
@@ -238,6 +239,8 @@ def test_a_walk_grows_with_the_root_of_time_and_does_not_depend_on_the_times_ask
     # σ of an RMS of 800 draws: 2.5 %
     np.testing.assert_allclose(ends[:, 1].std(), 0.3 * np.sqrt(4.0), rtol=0.1)
     t = np.linspace(-2.0, 9.0, 100)
+    with pytest.raises(InputError, match="step is 1e-08 s, .* give a longer one"):
+        signal({"kind": "walk", "step": 1e-8}, t, 0.0, np.random.default_rng(0))
     longer = np.concatenate([t, np.linspace(9.1, 80.0, 50)])
     np.testing.assert_allclose(walk(7, longer)[:100], walk(7, t), atol=1e-9)
 
@@ -302,3 +305,15 @@ def test_over_the_earth_the_map_is_the_scene():
     # from place to place: the same places at first
     told = view.answer(exact | {"track": PLACES})
     assert told["difference"] is not None and told["rms"] < 100.0
+
+
+@pytest.mark.further
+def test_a_track_in_other_coordinates_than_the_scene_shows_a_pattern(view):
+    frame, _ = ramp_over(view)
+    place = lambda X: (frame.origin[1] - X[1] + 100.0, X[0] - frame.origin[0] + 100.0)
+    raster = SceneRaster(np.add(*np.indices((200, 200), float))[None], "float64", place)
+    with_raster = FlightView("r", view.flight, view.earth, scene=raster)
+    for kind, said in ((STRAIGHT, False), (ORBIT, True)):
+        chosen = with_raster.choose(values := with_raster.values({"track": kind}))
+        drawn, _ = with_raster._draw_pictures(chosen, values)
+        assert ("a pattern is in its place" in drawn) == said

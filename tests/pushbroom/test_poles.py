@@ -16,6 +16,7 @@ from jaxbundle.pushbroom.surfaces import Height
 from jaxbundle.pushbroom.terrain import Terrain
 
 LINES, PIXELS = 300, 200
+SOME_LINES, SOME_PIXELS = np.array([0.0, 150.0, 299.0]), np.array([10.0, 100.0, 190.0])
 
 
 def image_between(start, end):
@@ -58,13 +59,21 @@ def polar_model(path):
     return path
 
 
-def test_polar_terrain_beside_the_pole_and_at_it(tmp_path):
+def test_terrain_at_a_pole_is_refused_and_a_height_is_not(tmp_path):
+    path, at_pole = polar_model(tmp_path / "polar.tif"), image_between(*PLACES["North Pole"])
+    with pytest.raises(InputError, match=r"polar.tif: the image shows the North Pole.*--height"):
+        surface_of(WGS84, None, path, at_pole)
+    X = np.asarray(locate_points(at_pole, Height(50.0, WGS84), SOME_LINES, SOME_PIXELS))
+    np.testing.assert_allclose(np.asarray(geodetic(WGS84, tuple(X))[2]), 50.0, atol=1e-6)
+
+
+@pytest.mark.further
+def test_polar_terrain_beside_the_pole(tmp_path):
     path = polar_model(tmp_path / "polar.tif")
     image = image_between(*PLACES["beside"])
     surface = surface_of(WGS84, None, path, image)
     assert isinstance(surface, Terrain)
-    lines, pixels = (np.array([0.0, 150.0, 299.0]), np.array([10.0, 100.0, 190.0]))
-    X = np.asarray(locate_points(image, surface, lines, pixels))
+    X = np.asarray(locate_points(image, surface, SOME_LINES, SOME_PIXELS))
     longitude, latitude, h = (np.asarray(v) for v in geodetic(WGS84, tuple(X)))
     from pyproj import Transformer
 
@@ -72,9 +81,3 @@ def test_polar_terrain_beside_the_pole_and_at_it(tmp_path):
     x, y = to_map.transform(np.degrees(longitude), np.degrees(latitude))
     # the model in its own system; cells of 4 km, twice interpolated, of a plane
     np.testing.assert_allclose(h, 100 + x / 1e3 + y / 2e3, atol=0.5)
-    with pytest.raises(InputError, match=r"polar.tif: the image shows the North Pole.*--height"):
-        surface_of(WGS84, None, path, image_between(*PLACES["North Pole"]))
-    # a height is one there
-    at_pole = image_between(*PLACES["North Pole"])
-    X = np.asarray(locate_points(at_pole, Height(50.0, WGS84), lines, pixels))
-    np.testing.assert_allclose(np.asarray(geodetic(WGS84, tuple(X))[2]), 50.0, atol=1e-6)

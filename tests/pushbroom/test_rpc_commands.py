@@ -149,12 +149,21 @@ def test_check_points_snooping_maps_and_heights_above_the_geoid(tmp_path, run):
     assert told["rows"][3]["w_line"] is None and told["rows"][7]["v_line"] < -2.5
     status, out, _ = run(*given)
     assert json.loads(out)["removed_points"] == 0
-    for text, words in (("P3,chek", "control or check"), (None, "no control point")):
-        content = "\n".join(rows)
-        content = content.replace(*(("P3,check", text) if text else (",control", ",check")))
+    # a check point measured in another image
+    values = rows[4].split(",")
+    away = ",".join([*values[:3], "1e7", *values[4:]])
+    for old, new, words in (
+        ("P3,check", "P3,chek", "control or check"), (",control", ",check", "no control point"),
+        (rows[4], away, "line 5: line 10000000 is outside"),
+    ):  # fmt: skip
+        content = "\n".join(rows).replace(old, new)
         (tmp_path / "control.csv").write_text(content)
         status, _, err = run(*given)
         assert status == 2 and words in err
+    with_heights = [f"EPSG:{zone}+5773" if a == f"EPSG:{zone}" else a for a in given]
+    (tmp_path / "control.csv").write_text("\n".join(rows))
+    status, _, err = run(*with_heights)
+    assert status == 2 and "has a system of heights" in err
 
 
 def test_what_is_refused(tmp_path, run):

@@ -68,11 +68,36 @@ def folder(scene, tmp_path):
     return tmp_path
 
 
+def test_a_network_gives_its_points_and_measurements(scene, folder):
+    _, points, observations = scene
+    file = read_refinement(folder / "refine.toml")
+    assert any("RMS 0.4 lines, 0.3 samples" in words for words in file.warnings)
+    row = [points.id.index(id) for id in file.points.id]
+    assert sorted(row) == list(range(len(points.id))) and file.points.role.count("control") == 6
+    for k, p in enumerate(row):
+        assert file.points.role[k] == points.role[p]
+        if points.role[p] == "control":
+            np.testing.assert_allclose(file.points.X[k], points.X[p], rtol=1e-15)
+            np.testing.assert_allclose(file.points.sigma[k], SIGMA_CONTROL, rtol=1e-12)
+        else:
+            # tie points have none
+            assert np.isnan(file.points.X[k]).all()
+    of = lambda o, names: sorted(
+        (int(i), names[p], *xy) for i, p, xy in zip(o.image, o.point, np.asarray(o.xy).tolist())
+    )
+    np.testing.assert_allclose(
+        np.array([r[2:] for r in of(file.observations, file.points.id)]),
+        np.array([r[2:] for r in of(observations, points.id)]), rtol=1e-14,
+    )  # fmt: skip
+    assert [r[:2] for r in of(file.observations, file.points.id)] == [
+        r[:2] for r in of(observations, points.id)
+    ]
+
+
+@pytest.mark.further
 def test_a_network_gives_the_refinement_of_its_points(scene, folder):
     _, points, observations = scene
     file = read_refinement(folder / "refine.toml")
-    assert file.points.role.count("control") == 6 and len(file.observations) == len(observations)
-    assert any("RMS 0.4 lines, 0.3 samples" in words for words in file.warnings)
     found = refine(file.images, file.points, file.observations)
     direct = refine(file.images, points, observations)
     np.testing.assert_allclose(found.estimate, direct.estimate, atol=1e-5)
@@ -150,6 +175,8 @@ def test_residuals_of_jigsaw_are_measurements(scene, folder):
     (GOOD.replace("AprioriX =", "Apriori =") + "End_Object\nEnd\n", "without AprioriX"),
     (GOOD.replace("<meters>", "<degrees>") + "End_Object\nEnd\n", "meters are expected"),
     (GOOD.replace("(1.0, 0.0", "(-1.0, 0.0") + "End_Object\nEnd\n", "negative eigenvalue"),
+    (GOOD.replace("(1.0, 0.0", "(0.0, 0.0") + "End_Object\nEnd\n", "no error in one direction"),
+    (GOOD.replace("End_Group", "") + "End_Object\nEnd\n", "END_OBJECT without a beginning"),
     (GOOD.replace("(1.0, ", "(") + "End_Object\nEnd\n", "has 5 numbers"),
     (GOOD.replace("Line           = 5.0", "Line = five") + "End_Object\nEnd\n", "line 28: LINE"),
     (GOOD.replace("SerialNumber", "Serial") + "End_Object\nEnd\n", "without SERIALNUMBER"),
@@ -181,6 +208,9 @@ def test_serial_numbers_of_no_image_are_refused(folder):
     text = (folder / "refine.toml").read_text()
     (folder / "refine.toml").write_text(text.replace('A = "WV03', 'C = "WV03'))
     with pytest.raises(InputError, match=r"\[serial_numbers\].*C: no such image"):
+        read_refinement(folder / "refine.toml")
+    (folder / "refine.toml").write_text(text.replace(f"{SERIAL}:1", f"{SERIAL}:0"))
+    with pytest.raises(InputError, match="by which A is known already"):
         read_refinement(folder / "refine.toml")
     (folder / "refine.toml").write_text(text.replace(f'A = "{SERIAL}:0"\n', ""))
     told = read_refinement(folder / "refine.toml").warnings

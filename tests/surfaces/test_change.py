@@ -311,6 +311,9 @@ def test_masks_mark_cells_and_cut_none(files):
     write(files / "away.tif", marked, "uint8", None, x=9000.0)
     with pytest.raises(InputError, match="away.tif: has no cell of the surfaces"):
         jaxbundle.change(*given, stable=files / "away.tif")
+    write(files / "zone.tif", marked, "uint8", None, crs="EPSG:32632")
+    with pytest.raises(InputError, match="zone.tif: two rasters are in different coordinate"):
+        jaxbundle.change(*given, stable=files / "zone.tif")
 
 
 def test_sigma_without_orientations_are_used_with_their_covariance(files):

@@ -45,6 +45,13 @@ def undulations(
     geoid: Path, longitude: Float[np.ndarray, " columns"], latitude: Float[np.ndarray, " rows"]
 ) -> Float[np.ndarray, "rows columns"]:
     """N in metres at longitudes × latitudes in degrees; NaN outside the grid."""
+    return undulations_at(geoid, longitude[None], latitude[:, None])
+
+
+def undulations_at(
+    geoid: Path, longitude: Float[np.ndarray, "*#shape"], latitude: Float[np.ndarray, "*#shape"]
+) -> Float[np.ndarray, "*shape"]:
+    """N in metres at points, degrees; NaN outside the grid."""
     if not Path(geoid).exists():
         return _undulations_by_proj(geoid, longitude, latitude)
     extent = Extent(longitude.min(), latitude.min(), longitude.max(), latitude.max())
@@ -57,10 +64,10 @@ def undulations(
 
 def _bilinear(
     values: Float[np.ndarray, "grid_rows grid_columns"],
-    row: Float[np.ndarray, " rows"],
-    column: Float[np.ndarray, " columns"],
-) -> Float[np.ndarray, "rows columns"]:
-    """Values at rows × columns; NaN outside, or if a NaN has a weight."""
+    row: Float[np.ndarray, "*#shape"],
+    column: Float[np.ndarray, "*#shape"],
+) -> Float[np.ndarray, "*shape"]:
+    """Values at rows and columns; NaN outside, or if a NaN has a weight."""
     edge = 1e-6  # cells: by rounding of degrees a point of the border may lie beyond it
     inside = lambda place, n: np.where(
         (place >= -edge) & (place <= n - 1 + edge), np.clip(place, 0, n - 1), np.nan
@@ -69,15 +76,20 @@ def _bilinear(
         (np.clip(np.nan_to_num(np.floor(p)).astype(int), 0, n - 2), p)
         for p, n in zip(map(inside, (row, column), values.shape), values.shape)
     )
-    u, v = (u - i)[:, None], v - k
+    u, v = u - i, v - k
     # a NaN beside a point that lies on a line of the grid has the weight 0, but 0·NaN is NaN
-    rows = np.where(u == 0, 0, u * values[i + 1]) + np.where(u == 1, 0, (1 - u) * values[i])
-    return np.where(v == 0, 0, v * rows[:, k + 1]) + np.where(v == 1, 0, (1 - v) * rows[:, k])
+    between = lambda w, low, high: (
+        np.where(w == 0, 0, w * high) + np.where(w == 1, 0, (1 - w) * low)
+    )
+    in_row = lambda i: between(v, values[i, k], values[i, k + 1])
+    return between(u, in_row(i), in_row(i + 1))
 
 
 def _undulations_by_proj(
-    name: str | Path, longitude: Float[np.ndarray, " columns"], latitude: Float[np.ndarray, " rows"]
-) -> Float[np.ndarray, "rows columns"]:
+    name: str | Path,
+    longitude: Float[np.ndarray, "*#shape"],
+    latitude: Float[np.ndarray, "*#shape"],
+) -> Float[np.ndarray, "*shape"]:
     """N of a grid of PROJ."""
     try:
         import pyproj.datadir
@@ -97,6 +109,6 @@ def _undulations_by_proj(
             f"is {folder}); give a raster of the geoid, or fetch the "
             "grid with projsync"
         ) from None
-    x, y = np.meshgrid(longitude, latitude)
+    x, y = (np.array(v) for v in np.broadcast_arrays(longitude, latitude))
     N = transformer.transform(x, y, np.zeros_like(x))[2]
     return np.where(np.isfinite(N), N, np.nan)

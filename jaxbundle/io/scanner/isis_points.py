@@ -196,38 +196,39 @@ Fields = dict[str, _Entry]
 
 def _points_of(path: Path) -> Iterator[tuple[Fields, list[Fields]]]:
     """The fields of every point, and those of its measurements."""
-    blocks: list[str] = []
+    blocks: list[tuple[str, str]] = []
     fields: Fields = {}
     measures: list[Fields] = []
     version = 5.0
     for entry in _statements(path):
         where = f"{path}, line {entry.line}"
         if entry.name in ("OBJECT", "GROUP"):
-            blocks.append(entry.value.upper())
-            if blocks[-1] == "CONTROLPOINT":
+            blocks.append((entry.name, entry.value.upper()))
+            if blocks[-1][1] == "CONTROLPOINT":
                 fields, measures = {}, []
                 if version < 3:
                     raise InputError(
                         f"{path}: version {version:g} of control networks, of before 2012, has "
                         "other fields; write it again (ISIS: cnetbin2pvl)"
                     )
-            elif blocks[-1] == "CONTROLMEASURE":
+            elif blocks[-1][1] == "CONTROLMEASURE":
                 measures.append({})
         elif entry.name in ("END_OBJECT", "END_GROUP"):
-            if not blocks:
-                raise InputError(f"{where}: {entry.name} without a beginning")
-            if blocks.pop() == "CONTROLPOINT":
+            kind = entry.name.removeprefix("END_")
+            if not blocks or blocks[-1][0] != kind:
+                raise InputError(f"{where}: {entry.name} without a beginning of this {kind}")
+            if blocks.pop()[1] == "CONTROLPOINT":
                 yield fields, measures
-        elif blocks[-1:] == ["CONTROLPOINT"]:
+        elif blocks and blocks[-1][1] == "CONTROLPOINT":
             fields[entry.name] = entry
-        elif blocks[-1:] == ["CONTROLMEASURE"]:
+        elif blocks and blocks[-1][1] == "CONTROLMEASURE":
             if not measures:
                 raise InputError(f"{where}: a measure outside of a point")
             measures[-1][entry.name] = entry
-        elif entry.name == "VERSION" and blocks == ["CONTROLNETWORK"]:
+        elif entry.name == "VERSION" and blocks == [("OBJECT", "CONTROLNETWORK")]:
             version = number_in(entry.value, where)
     if blocks:
-        raise InputError(f"{path}: {blocks[-1]} is not closed{ENDS_EARLY}")
+        raise InputError(f"{path}: {blocks[-1][1]} is not closed{ENDS_EARLY}")
 
 
 def _statements(path: Path) -> Iterator[_Entry]:
@@ -330,8 +331,15 @@ def _covariance(path: Path, fields: Fields, id: _Entry) -> Float[np.ndarray, "3 
     C = np.zeros((3, 3))
     C[np.triu_indices(3)] = [number_in(word, where) for word in words]
     C = C + np.triu(C, 1).T
-    if np.linalg.eigvalsh(C)[0] < -1e-9 * np.trace(C):
+    least = np.linalg.eigvalsh(C)[0]
+    if least < -1e-9 * np.trace(C):
         raise InputError(f"{where} is no covariance: it has a negative eigenvalue")
+    # below this eigenvalues are rounding: it would hold the point along an axis of chance
+    if least <= 1e-14 * np.trace(C):
+        raise InputError(
+            f"{where} has no error in one direction; give σ above 0 for all, or make the point "
+            "Fixed"
+        )
     return C
 
 

@@ -69,7 +69,7 @@ from jaxbundle.io.rasters.terrain_models import read_terrain
 from jaxbundle.io.scanner.refinement_images import read_images
 from jaxbundle.io.scanner.refinement_points import read_points
 from jaxbundle.io.text.sections import TomlSection, read_sections
-from jaxbundle.network.columns import did_you_mean
+from jaxbundle.network.columns import did_you_mean, show
 from jaxbundle.network.tables import Network, Observations
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.refinement.refining import TESTS
@@ -145,7 +145,13 @@ def read_refinement(path: str | Path) -> RefineFile:
     for id in serial.values:
         if id not in sources:
             raise InputError(f"{serial.where}{id}: no such image{did_you_mean(id, list(sources))}")
-        names[serial.text(id)] = id
+        number = serial.text(id)
+        if names.get(number, id) != id:
+            raise InputError(
+                f"{serial.where}{id} = {show(number)}, by which {names[number]} is known already; "
+                "every image has a serial number of its own"
+            )
+        names[number] = id
     points, observations, said = read_points(section, names, images, frames, radians)
     warnings += said
     snooping = section.text("snooping", "none")

@@ -115,7 +115,7 @@ def fit_bias(
             f"{source(int(bad.argmax()))}: the coefficients have no image of this point; check "
             "longitude, latitude, height and their order"
         )
-    _check_domain(rpc, control, source)
+    check_domain(rpc, control, source)
     terms = np.stack(bias_terms(rpc, computed[:, 0], computed[:, 1]), 1)[:, :k]
     singular = np.linalg.svd(terms, compute_uv=False)
     # 1e-6 of 10 000 pixels is a hundredth of a pixel: points so near a line do not fix its sides
@@ -205,9 +205,13 @@ def apply_bias(rpc: Rpc, bias: RpcBias) -> tuple[Rpc, RpcCheck | None]:
     return fitted, check_rpc(fitted, table)
 
 
-def _check_domain(rpc: Rpc, control: RpcTable, source: Source) -> None:
+def check_domain(rpc: Rpc, control: RpcTable, source: Source) -> None:
     """Refuse points outside the domain of the coefficients: another area, another image,
-    swapped."""
+    swapped.
+
+    **Arguments:** `source` names the rows of `control`.
+
+    **Raises:** `InputError` naming the row, what is outside, and the domain."""
     longitude, latitude, height, line, sample = control
     axes = (
         ("longitude", np.degrees(longitude), "°", "look at coordinates and their order"),
