@@ -183,13 +183,13 @@ def write_view_of_rig(path: Path, side: int, seed: int = 0) -> None:
 
 
 def write_video(path: Path, side: int) -> None:
-    """A camera of the rig, moved by hand from place to place before a board: 11 of them, with
+    """A camera of the rig, moved by hand from place to place before a board: eight of them, with
     rests."""
     import render
     from board_photographs import PATTERN
     from scipy.spatial.transform import Rotation
 
-    rng, steps, moving, resting = np.random.default_rng(4), 11, 14, 3
+    rng, steps, moving, resting = np.random.default_rng(4), 8, 13, 2
     azimuth = 2 * np.pi * np.arange(steps) / 5
     tilt = rng.uniform(12, 30, steps)
     places = np.stack([
