@@ -4,6 +4,7 @@
 the variables that a page takes from its reader.
 """
 
+import dataclasses
 import json
 import re
 import shutil
@@ -20,6 +21,7 @@ ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
 ROOMS = (
     "", "measure", "reconstruction", "surfaces", "io", "refinement", "cli", "pushbroom",
+    "calibration",
 )  # fmt: skip
 sys.path[:0] = [*(str(ROOT / "tests" / room) for room in ROOMS), str(ROOT / "benchmarks")]
 
@@ -178,6 +180,49 @@ def write_view_of_rig(path: Path, side: int, seed: int = 0) -> None:
     for k, (M, X0) in enumerate(rig_poses(seed)[side]):
         grey = render.photograph(render.LENS, M, X0, PATTERN, seed=100 * side + k)
         cv2.imwrite(str(path / f"{'lr'[side]}_{k:03}.png"), grey)
+
+
+def write_video(path: Path, side: int) -> None:
+    """A camera of the rig, moved by hand from place to place before a board: eight of them, with
+    rests."""
+    import render
+    from board_photographs import PATTERN
+    from scipy.spatial.transform import Rotation
+
+    rng, steps, moving, resting = np.random.default_rng(4), 8, 13, 2
+    azimuth = 2 * np.pi * np.arange(steps) / 5
+    tilt = rng.uniform(12, 30, steps)
+    places = np.stack([
+        tilt * np.cos(azimuth), tilt * np.sin(azimuth), rng.uniform(-25, 25, steps),
+        *(0.12 + rng.uniform(-0.02, 0.02, steps), 0.075 + rng.uniform(-0.02, 0.02, steps)),
+        rng.uniform(0.46, 0.58, steps),
+    ], 1)  # fmt: skip
+    turn = Rotation.from_euler("y", 3, degrees=True).as_matrix()
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 25, (480, 360))
+    for begin, end in zip(places, places[1:]):
+        part = np.concatenate([np.arange(moving) / moving, np.ones(resting)])
+        for share in part**3 * (10 - 15 * part + 6 * part**2):  # without jumps of acceleration
+            omega, phi, kappa, x, y, distance = begin + share * (end - begin)
+            M, X0 = render.pose(omega, phi, kappa, (x, y), distance)
+            if side:
+                M, X0 = turn @ M, X0 + M.T @ [0.04, 0.0, 0.0]
+            grey = render.photograph(render.LENS, M, X0, PATTERN, noise=0.5)
+            video.write(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR))
+    video.release()
+
+
+def write_wand(path: Path, camera: str) -> None:
+    """What a camera saw of the two ends of a wand; beside it the file of all cameras."""
+    from test_wand import CAMERAS, waved
+
+    from jaxbundle.io import write_cameras
+
+    names = {"left": "c0", "right": "c1"}
+    rows = waved(40, markers={"A": 0.0, "B": 0.5})[names[camera]]
+    lines = [",".join(map(str, row)) for row in zip(*rows.values())]
+    path.write_text("\n".join([",".join(rows), *lines]) + "\n", encoding="utf-8")
+    known = [dataclasses.replace(CAMERAS[own], id=name) for name, own in names.items()]
+    write_cameras(known, path.parent / "cameras.toml")
 
 
 def write_rigs(path: Path) -> None:
@@ -390,6 +435,10 @@ OWN: dict[str, Callable[[Path], None]] = {
     "a.tif": write_rpc_images,
     "ahead.toml": write_strips,
     "scene": write_sparse_model,
+    "left.mp4": lambda path: write_video(path, 0),
+    "right.mp4": lambda path: write_video(path, 1),
+    "left.csv": lambda path: write_wand(path, "left"),
+    "right.csv": lambda path: write_wand(path, "right"),
     "block.psx": write_metashape,
     "image.tif": write_product,
     "camera_a": lambda path: copy_photographs(path, TARGETS[::2]),
