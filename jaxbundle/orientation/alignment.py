@@ -114,10 +114,10 @@ def join(network: Network, sights: Sights, model: Model, part: Model) -> Model |
     if not both.any():
         # Two pairs of a chain have an image in common and no point: the ratio of their bases is in
         # no image point, only in known lengths of both.
-        lengths = [scale_of_lengths(network, one) for one in (model, part)]
-        if not len(shared) or None in lengths:
+        own, other = scale_of_lengths(network, model), scale_of_lengths(network, part)
+        if not len(shared) or own is None or other is None:
             return None
-        found = _by_an_image(model, part, shared[0], lengths[1] / lengths[0])
+        found = _by_an_image(model, part, shared[0], other / own)
     elif len(shared):
         # The common image gives all but the scale. A similarity by the points would also take
         # rotation and shift from them, and of two bundles points are known worst in depth.
