@@ -225,6 +225,27 @@ def write_wand(path: Path, camera: str) -> None:
     write_cameras(known, path.parent / "cameras.toml")
 
 
+def write_raster(path: Path, values: np.ndarray, dtype: str = "float32") -> None:
+    import rasterio
+
+    rows, columns = values.shape
+    with rasterio.open(path, "w", driver="GTiff", width=columns, height=rows, count=1, dtype=dtype,
+                       crs="EPSG:32633",
+                       transform=rasterio.Affine(1, 0, 1000, 0, -1, 2000)) as target:  # fmt: skip
+        target.write(values.astype(dtype), 1)
+
+
+def write_heights(path: Path, seed: int) -> None:
+    """A surface model with its σ, in the second year with a heap; beside it where it is stable."""
+    i, j = np.indices((60, 80))
+    heap = 2.0 * (seed % 2) * (np.hypot(i - 30, j - 40) < 8)
+    path.mkdir()
+    noise = np.random.default_rng(seed).normal(0, 0.1, i.shape)
+    write_raster(path / "dsm.tif", 100 + np.sin(i / 9) + 0.05 * j + heap + noise)
+    write_raster(path / "dsm_sigma.tif", np.full(i.shape, 0.1))
+    write_raster(path.parent / "stable.tif", j < 25, "uint8")
+
+
 def write_rigs(path: Path) -> None:
     for seed, name in enumerate(("car_1", "car_2")):
         for side, camera in enumerate(("left", "right")):
@@ -439,6 +460,8 @@ OWN: dict[str, Callable[[Path], None]] = {
     "right.mp4": lambda path: write_video(path, 1),
     "left.csv": lambda path: write_wand(path, "left"),
     "right.csv": lambda path: write_wand(path, "right"),
+    "spring_2024": lambda path: write_heights(path, 0),
+    "spring_2025": lambda path: write_heights(path, 1),
     "block.psx": write_metashape,
     "image.tif": write_product,
     "camera_a": lambda path: copy_photographs(path, TARGETS[::2]),
