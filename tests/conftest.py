@@ -76,8 +76,8 @@ def pytest_xdist_make_scheduler(config, log):
 
 
 MEMORY = Path("/proc/self/statm")
-MOST = 1.6e9
-"""Bytes; a single test may add 0.2e9 before it ends, others ask for `memory_at_hand`."""
+MOST = 1.4e9
+"""Bytes; a single test may add 0.4e9 before it ends, others ask for `memory_at_hand`."""
 WORTH = 150e6
 """Bytes that have come since the last time, for another to be worth it."""
 
