@@ -194,6 +194,7 @@ def test_c_in_pixels_is_named_where_the_adjustment_fails(size):
     assert result.undetermined and "is c in pixels" in told
 
 
+@pytest.mark.further
 def test_c_in_pixels_is_the_first_cause_of_a_far_off_chi_square():
     """It cannot be distinguished from a long lens; only misfits are checked for it."""
     lens = Camera("cam", "brown", {"c": 400.0}, free=("c",))

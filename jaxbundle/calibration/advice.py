@@ -124,7 +124,7 @@ def often_removed(
     often = [(n, name) for name, n in Counter(points).items() if n >= settings.min_removed]
     return [
         f"point {name} of the board was removed in {n} of {views} photographs: it is not where it "
-        "is given; look at the print there"
+        "is given; look at the print there, or estimate the points of the board (--board-free)"
         for n, name in sorted(often, reverse=True)
     ]
 

@@ -29,7 +29,8 @@ from jaxbundle.calibration.rig.network import network_of_views
 from jaxbundle.calibration.several_report import calibrations_dict as calibrations_dict
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
-from jaxbundle.io import adjusted_network, write_opencv
+from jaxbundle.io import adjusted_network
+from jaxbundle.io.cameras.opencv_writing import opencv_text
 from jaxbundle.io.formats import TARGETS
 from jaxbundle.io.networks.colmap import FILES as COLMAP_FILES
 from jaxbundle.io.networks.colmap import fill_colmap
@@ -158,15 +159,16 @@ def _fill(
         return
     network = adjusted_network(calibration.adjustment)
     fill_project(network, folder / ADJUSTED)
-    remark = _write_foreign(network, folder, name)
-    text = camera_text(calibration.camera, calibration.stated_sigma, *remark)
+    remark = _write_foreign(network, folder, name, calibration.limits)
+    text = camera_text(calibration.camera, calibration.stated_sigma, *calibration.limits, *remark)
     write_text(folder / f"{name}.toml", text)
     if plots:
         save_plots(calibration, folder, progress)
 
 
-def _write_foreign(network: Network, folder: Path, name: str) -> list[str]:
-    """The camera for OpenCV and COLMAP; the error of a conversion of its model, in words."""
+def _write_foreign(network: Network, folder: Path, name: str, limits: Sequence[str]) -> list[str]:
+    """The camera for OpenCV, with its `limits`, and COLMAP; the error of a conversion of its model,
+    in words."""
     remark = []
     model = get_model(network.cameras[0].model)
     if model.name not in FOREIGN:
@@ -177,7 +179,8 @@ def _write_foreign(network: Network, folder: Path, name: str) -> list[str]:
         except InputError as error:
             return [f"not written for OpenCV and COLMAP: {error}"]
         remark = [f"{name}.yaml and {COLMAP}: {conversion}" for conversion in cost.values()]
-    write_opencv(network.cameras[0], folder / f"{name}.yaml")
+    comments = "".join(f"# {limit}\n" for limit in limits)
+    write_text(folder / f"{name}.yaml", opencv_text(network.cameras[0]) + comments)
     fill_colmap(network, folder / COLMAP)
     return remark
 

@@ -14,6 +14,7 @@ from jaxbundle.io.results.result_json import result_dict, verdict_dict
 from jaxbundle.measure.boards import Board, BoardSet
 from jaxbundle.measure.views import BoardViews
 from jaxbundle.network.columns import count
+from jaxbundle.report.head import first_facts
 from jaxbundle.report.layout import (
     WITHOUT_SIGMA,
     clean,
@@ -39,12 +40,28 @@ MAPS_HEADER = ("point held in", "middle", "corners")
 
 def text(calibration: "Calibration") -> str:
     """Photographs, camera, quality and advice, followed by the report of the adjustment."""
-    lines = [*_photographs(calibration)]
-    if calibration.converged:
-        lines += [*_camera(calibration), *_quality(calibration), *_advice(calibration)]
-    body = "\n".join(line.rstrip() for line in lines)
     verdict = conclude_calibration(calibration) if calibration.converged else None
-    return f"{body}\n\n{calibration.adjustment.report(verdict=verdict)}"
+    body = _join([*_photographs(calibration), *_assessment(calibration)])
+    return f"{body}\n{calibration.adjustment.report(verdict=verdict)}"
+
+
+def summary(calibration: "Calibration") -> str:
+    """The verdict, photographs, camera, quality and advice: a page or two."""
+    if not calibration.converged:
+        return text(calibration)
+    verdict = facts(first_facts(calibration.adjustment, conclude_calibration(calibration)))
+    return _join([*_photographs(calibration), "", *verdict, *_assessment(calibration)])
+
+
+def _assessment(calibration: "Calibration") -> list[str]:
+    """Camera, quality and advice, of what has a solution."""
+    if not calibration.converged:
+        return []
+    return [*_camera(calibration), *_quality(calibration), *_advice(calibration)]
+
+
+def _join(lines: Sequence[str]) -> str:
+    return "\n".join(line.rstrip() for line in lines) + "\n"
 
 
 def _photographs(calibration: "Calibration") -> list[str]:

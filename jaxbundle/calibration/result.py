@@ -24,6 +24,7 @@ from jaxbundle.measure.views import BoardViews
 from jaxbundle.network.tables import Camera
 from jaxbundle.report.correlated import has_field, stated_sigma_of
 from jaxbundle.report.lens_advice import advise_parameters, is_hardly_determined
+from jaxbundle.report.verdict import judge_replication
 from jaxbundle.results import TableMethods
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, present
@@ -144,8 +145,21 @@ class Calibration(TableMethods):
 
     @property
     def advice(self) -> list[str]:
-        """Warnings in words, and advice on further photographs (without cross-validation)."""
-        return [*self.shortcomings, *self.suggestions]
+        """Warnings in words, those of the adjustment about the camera among them, and advice on
+        further photographs (without cross-validation)."""
+        return [*self.shortcomings, *self.limits, *self._contradictions, *self.suggestions]
+
+    @property
+    def limits(self) -> list[str]:
+        """Where in the image the camera is not valid, in words."""
+        message = self.adjustment.distortion_reach[self.name].message
+        return [] if message is None else [message]
+
+    @property
+    def _contradictions(self) -> list[str]:
+        """Halves of the photographs that contradict each other, in words."""
+        found = judge_replication(self.adjustment)
+        return [f"{found.brief}: {found.words}"] if found is not None and found.lowers else []
 
     @property
     def suggestions(self) -> list[str]:

@@ -53,12 +53,21 @@ class Calibrations(TableMethods):
 
     def report(self) -> str:
         """The verdict on several cameras, the report of their rig, and those of all cameras."""
+        return self._in_words([one.report() for one in self.cameras.values()])
+
+    def summary(self) -> str:
+        """The same without the reports of the adjustments: a page or two a camera."""
+        from jaxbundle.calibration.report import summary
+
+        return self._in_words([summary(one) for one in self.cameras.values()])
+
+    def _in_words(self, of_cameras: Sequence[str]) -> str:
         from jaxbundle.calibration.rig.report import rig_text
         from jaxbundle.calibration.several_report import several_text
 
         parts = [] if len(self.cameras) == 1 else [several_text(self)]
         parts += [] if self.rig is None else [rig_text(self.rig)]
-        return "\n\n".join([*parts, *(one.report() for one in self.cameras.values())])
+        return "\n\n".join([*parts, *of_cameras])
 
 
 def calibrate_cameras(

@@ -96,7 +96,8 @@ def cross_validation_in_words(calibration: "Calibration") -> list[str]:
         f"the camera of either leaves an RMS of {checked.rms_other:.4f} px in the other half, "
         f"where its own leaves {checked.rms_own:.4f} px. The two differ by "
         f"{abs(checked.difference[largest]):.1f} σ in {largest}, the most; test of all parameters "
-        f"together {checked.test:.2f} (1 expected)."
+        f"together {checked.test:.2f} (1 expected). Errors of the board are in both halves and do "
+        "not show here."
     ]
     if checked.comparison is not None:
         sentences.append(f"Their images, over the whole image: {checked.comparison}.")

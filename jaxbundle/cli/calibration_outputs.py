@@ -165,9 +165,13 @@ class CalibrationOutputs:
         text = json_text(document) if self.json else ""
         written = is_in_file(self.json, self.out, self.html, self.judged.certificate)
         silent = self.json == "-" or (self.quiet and written)
-        report = "" if silent else head_line(origin) + (compared or found).report()
-        if report and judgement is not None:
-            report += judgement.text
+        # with a folder, the whole report is there: hundreds of lines
+        whole = self.out is None or compared is not None
+        report = "" if silent else (compared or found).report() if whole else found.summary()
+        if report:
+            report = head_line(origin) + report + ("" if judgement is None else judgement.text)
+        if report and self.out is not None:
+            report += f"\nReport: {self.out / REPORT}, as a page: {self.out / PAGE}"
         show("writing", 0, 1)
         also = NO_ADDITION if judgement is None else judgement.addition
         page = partial(compose_calibrations, found, origin, compared, also)

@@ -82,7 +82,7 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
     """Reconstruct a network from photographs: tie points, self-calibration, adjustment."""
     import jaxbundle
     from jaxbundle.cli.camera_inputs import calibration_given
-    from jaxbundle.cli.outputs import check_writable, trace_files
+    from jaxbundle.cli.outputs import PAGE, REPORT, check_writable, trace_files
     from jaxbundle.cli.progress import staging
     from jaxbundle.cli.reconstruct_files import COMMAND, FILES, keep_matches, write_reconstruction
     from jaxbundle.commands.reconstruction import open_control
@@ -153,11 +153,11 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
         judge.write(judgement)
     if not quiet and json != "-":
         for part in result.parts:
-            print(f"{part.name}: {conclude_part(result, part).words}")
+            print(f"{result.prefix(part)}{conclude_part(result, part).words}")
         print(result)
         if judgement is not None:
             print(judgement.text)
-        print(out)
+        print(f"Report: {out / REPORT}, as a page: {out / PAGE}")
     if surface:
         _surface(out, photos[0], force, quiet)
     judge.end(judgement)

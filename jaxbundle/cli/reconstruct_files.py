@@ -79,7 +79,7 @@ def write_reconstruction(
     with write_result(json, text, out, COMMAND, FILES, force, html, page) as new:
         if new is None:
             return
-        verdict = f"{first.name}: {conclude_part(found, first).words}"
+        verdict = f"{found.prefix(first)}{conclude_part(found, first).words}"
         told = f"{verdict}\n{found}\n\n{describe_part(found, first)}"
         _write_part(found, first, new, plots, told, also, progress, origin.computed, more)
         for number, part in enumerate(found.parts[1:], 2):

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 @dataclasses.dataclass(frozen=True)
 class Removed:
-    """A removed observation: kind, row in the arrays of its kind, a name for reports, test value.
-    `others`: rows of inseparable observations, removed with it."""
+    """A removed observation: kind, row in the arrays of its kind, a name for reports, test value,
+    NaN where what remains cannot test it. `others`: rows of inseparable observations, removed with
+    it."""
 
     kind: str
     row: int

@@ -89,7 +89,7 @@ PROBABILITY = {2: "39 %", 3: "20 %"}
 
 
 def network_plan(adjustment: "Adjustment", ax: "Axes | None" = None) -> "Axes":
-    """The network seen from above: points by role, cameras, error ellipses of X and Y.
+    """The network seen along Z: points by role, cameras, error ellipses of X and Y.
 
     The ellipses are 1σ (a posteriori) and exaggerated; legend and title state the factor, and of
     which points they are drawn (`choose_ellipses`). A camera is the pyramid of its image corners,
@@ -123,7 +123,8 @@ def network_plan(adjustment: "Adjustment", ax: "Axes | None" = None) -> "Axes":
     unit = adjustment.network.object_unit
     for name in "xy":
         label_coordinates(ax, name, unit)
-    title(ax, f"{adjustment.network.name}: plan", selection and f"error ellipses {selection}")
+    name = f"{adjustment.network.name}: seen along Z"
+    title(ax, name, selection and f"error ellipses {selection}")
     _legend_below(ax)
     away = centres - pyramids[:, 1:].mean(1)
     upper_right = np.full((len(points["id"]), 2), 0.7)

@@ -24,7 +24,7 @@ from jaxbundle.report.page import (
 from jaxbundle.report.page.adjustment import NO_ADDITION
 from jaxbundle.report.page.columns import Column
 from jaxbundle.report.page.markup import facts, grid, items
-from jaxbundle.report.verdict import BAD, DOUBTFUL, GOOD, Verdict, conclude
+from jaxbundle.report.verdict import BAD, DOUBTFUL, GOOD, NOTED, Verdict, conclude
 
 # Findings of an adjustment that do not apply: σ are estimated from the residuals.
 INAPPLICABLE = ("χ² test",)
@@ -113,13 +113,14 @@ def _judge_fit(part: ReconstructedPart) -> Finding:
     """The fit of the measurements, relative to their σ from matching."""
     words = ", ".join(f"{significant(f, 3)} ({kind})" for kind, f in part.factors.items())
     worst = part.misfit
-    state = BAD if worst >= WRONG_MISFIT else DOUBTFUL if worst >= DOUBTFUL_MISFIT else GOOD
+    state = BAD if worst >= WRONG_MISFIT else DOUBTFUL if worst >= DOUBTFUL_MISFIT else NOTED
+    times = f"residuals {significant(worst)} times their σ from matching"
     return Finding(
         "Fit",
         state,
-        f"residuals relative to their σ from matching: {words}; these "
-        "factors are in all σ of the result",
-        f"residuals {significant(worst)} times their σ from matching",
+        f"residuals relative to their σ from matching: {words}; these factors are in all σ of the "
+        "result, so that the residuals cannot contradict them",
+        "σ of image points estimated from their residuals" if state == NOTED else times,
     )
 
 

@@ -192,9 +192,12 @@ class _ReconstructionRun:
         )
         files = {p.name: p.path for p in self.photographs}
         warnings = [said for _, said in sorted(self.warnings, key=lambda warning: -warning[0])]
-        return Reconstruction(
-            tuple(parts), self.left_out, tuple(self.notes), said, files, tuple(warnings), self.title
+        # the only part needs no name
+        only = f"{parts[0].name}: " if len(parts) == 1 else ""
+        notes, warned = (
+            tuple(text.removeprefix(only) for text in texts) for texts in (self.notes, warnings)
         )
+        return Reconstruction(tuple(parts), self.left_out, notes, said, files, warned, self.title)
 
     def _match(self) -> tuple[list[Features], list[FeatureMatches]]:
         """Features and matches, without those of duplicates and marks; or the named points."""
@@ -478,6 +481,12 @@ class _ReconstructionRun:
         absolute = control is not None or self.further.positions is not None
         block = describe_block(result, exif, self.system if absolute else "")
         part = ReconstructedPart(name, result, weighted.factors, block, control, no_control)
+        if not (absolute or self.further.distances):
+            self.notes.append(
+                f"{name}: position, orientation and scale are arbitrary: control points "
+                "(--control), distances between targets (--targets, --distances) or positions in "
+                "the files of the photographs determine them"
+            )
         if part.misfit >= DOUBTFUL_MISFIT:
             self._warn(f"{name}: {misfit_in_words(part)}", part.misfit)
         for said in (*self._compare_with_files(result), *doubts):

@@ -97,6 +97,10 @@ class Reconstruction(TableMethods):
             "misfit": np.array([part.misfit for part in self.parts], dtype=float),
         }
 
+    def prefix(self, part: ReconstructedPart) -> str:
+        """What precedes a sentence about a part; empty if it is the only one."""
+        return f"{part.name}: " if len(self.parts) > 1 else ""
+
     def report(self) -> str:
         """The summary, and the report of every part."""
         parts = [f"{part.name}\n\n{part.adjustment.report()}" for part in self.parts]
@@ -105,18 +109,18 @@ class Reconstruction(TableMethods):
     def __str__(self) -> str:
         lines = [f"warning: {said}" for said in self.warnings]
         lines += [
-            f"{part.name}: {count(len(part.adjustment.network.images), 'photograph')}, "
+            f"{self.prefix(part)}{count(len(part.adjustment.network.images), 'photograph')}, "
             f"{count(count_points(part.adjustment), 'point')}, "
             f"σ0 {part.adjustment.sigma0:.3f}{distances_found(part.adjustment)}"
             for part in self.parts
         ]
         lines += [
-            f"warning: {part.name}: {said}"
+            f"warning: {self.prefix(part)}{said}"
             for part in self.parts
             for said in (*part.adjustment.weakness.lines, *part.adjustment.doubts)
         ]
         lines += [
-            f"{part.name}: {name}: {words}"
+            f"{self.prefix(part)}{name}: {words}"
             for part in self.parts
             for name, words in first_facts(part.adjustment)
         ]

@@ -33,7 +33,8 @@ REPLICATION_LEGEND = (
     "Differences of the interior orientations of two halves that share no image point. d² is their "
     "square over its covariance; the mean of d²/n is 1 where σ are right. Halves by photographs of "
     "one camera share the remainder of its lens model, halves by points all that belongs to "
-    "photographs: they cannot show these errors."
+    "photographs, and all halves the errors of given coordinates, as of a bent board: they cannot "
+    "show these errors."
 )
 DIFFERENCE_HEADER = ("parameter", "difference", "σ", "in σ", "σ correlated", "in it")
 FIELD = "field on the sensor"

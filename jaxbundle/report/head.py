@@ -103,9 +103,12 @@ def first_facts(
         said = {about for about, _ in rows}
         rows += [row for row in correlated.first_facts(adjustment) if row[0] not in said]
     rows += [("Attention", clean(text)) for text in adjustment.findings]
-    if words := left_out_in_words(adjustment):
-        rows.append(("Left out", f"{words}: see Notes, and left_out in the JSON"))
-    return rows
+    left_out = left_out_in_words(adjustment)
+    said = [f"{left_out}: see Notes, and left_out in the JSON"] if left_out else []
+    if removed := adjustment.removed:
+        words = count(sum(len(item.rows) for item in removed), "observation")
+        said.append(f"{words} removed by data snooping: listed there, and removed in the JSON")
+    return [*rows, ("Left out", "; ".join(said))] if said else rows
 
 
 def left_out_in_words(adjustment: "Adjustment") -> str:
@@ -281,8 +284,8 @@ def convergence(adjustment: "Adjustment") -> list[str]:
     ]
     if adjustment.removed or adjustment.eliminated or adjustment.sigma_factors:
         lines += paragraph(
-            "The table shows the last of several adjustments: observations or parameters were "
-            "removed, or σ estimated, in between (see below)."
+            "This is the last of several adjustments, which began at the result of the one before: "
+            "observations or parameters were removed, or σ estimated, in between (see below)."
         )
     return lines
 

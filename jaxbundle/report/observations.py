@@ -211,6 +211,11 @@ def removals(adjustment: Any) -> list[str]:
                 "Either of: one of these rays is wrong, but the point does not show which, "
                 "and none of them is used."
             )
+        if any(math.isnan(item.test) for item in adjustment.removed):
+            lines += paragraph(
+                "–: was suspected, and the rays that remain do not determine its point, so that "
+                "nothing tests it again."
+            )
     if adjustment.eliminated:
         names = ", ".join(clean(name) for name in adjustment.eliminated)
         lines += heading("Eliminated parameters")

@@ -262,6 +262,10 @@ def _rays(rays: Int[np.ndarray, " points"]) -> list[str]:
 def _list_of_points(adjustment: "Adjustment", most: int) -> list[str]:
     found = adjustment.points
     total = len(found["id"])
+    unit = clean(adjustment.network.object_unit)
+    lines = heading(f"Points: coordinates in {unit}")
+    if not (adjustment.problem.table("point").free > 0).any():
+        return [*lines, f"All {count(total, 'point')} are held where they are given (points.csv)."]
     shown = np.arange(min(total, most))
     spread = {axis: stated_sigma(found, axis) for axis in "XYZ"}
     places = [coordinate_decimals(spread[axis]) for axis in "XYZ"]
@@ -275,10 +279,9 @@ def _list_of_points(adjustment: "Adjustment", most: int) -> list[str]:
         )
         for i in shown
     ]
-    unit = clean(adjustment.network.object_unit)
     header = ("point", "role", "X", "Y", "Z", "σX", "σY", "σZ", "rays")
     return [
-        *heading(f"Points: coordinates in {unit}"),
+        *lines,
         *table(header, rows, "llrrrrrrr"),
         *_left_out(total, most, "point", "points.csv"),
     ]

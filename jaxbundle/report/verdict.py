@@ -149,7 +149,7 @@ def _tested(
 
 
 def _correlated(adjustment: "Adjustment") -> list[Finding]:
-    """σ that shared errors make larger, and halves of the network that contradict each other."""
+    """σ that shared errors make larger, and the comparison of halves of the network."""
     found = []
     if adjustment.error_model is not None:
         ratio, said = adjustment.sigma_ratio, remarks(adjustment)
@@ -161,16 +161,20 @@ def _correlated(adjustment: "Adjustment") -> list[Finding]:
     elif why := adjustment.why_no_error_model:
         brief = "no look at correlated errors"
         found.append(Finding("Correlated errors", NOTED, f"not looked for: {why}", brief))
-    if (halves := adjustment.replication) is not None:
-        words, brief = halves.sentence, f"halves by {halves.by} contradict each other"
-        if not halves.splits:
-            state, brief = NOTED, "halves not compared"
-        else:
-            state = DOUBTFUL if halves.probability < LEVEL else GOOD
-            limit = chi2_quantile(1 - LEVEL, halves.dof) / halves.dof
-            words += f"; in one of 1000 cases they differ by more than {limit:.2f} by chance"
-        found.append(Finding("Replication", state, words, brief))
-    return found
+    return [*found, *filter(None, [judge_replication(adjustment)])]
+
+
+def judge_replication(adjustment: "Adjustment") -> Finding | None:
+    """The finding about halves of the network; None if they were not adjusted."""
+    halves = adjustment.replication
+    if halves is None:
+        return None
+    if not halves.splits:
+        return Finding("Replication", NOTED, halves.sentence, "halves not compared")
+    limit = np.sqrt(chi2_quantile(1 - LEVEL, halves.dof) / halves.dof)
+    words = f"{halves.sentence}; in one of 1000 cases by more than {limit:.2f} by chance"
+    state = DOUBTFUL if halves.probability < LEVEL else GOOD
+    return Finding("Replication", state, words, f"halves by {halves.by} contradict each other")
 
 
 def _second_minima(adjustment: "Adjustment") -> list[Finding]:
@@ -357,7 +361,8 @@ def judge_blunders(
         return Finding("Blunders", DOUBTFUL, words, brief)
     # more than chance explains, but none that stands out: σ of some are too small
     many = over > explained_by_chance(len(size))
-    return Finding("Blunders", NOTED if many else GOOD, words, count(over, "large residual"))
+    brief = f"{count(over, 'large residual')} where chance gives {significant(expected, 2)}"
+    return Finding("Blunders", NOTED if many else GOOD, words, brief)
 
 
 def _compare_largest(largest: float, limit: float, number: int) -> str:

@@ -50,6 +50,7 @@ def of_batch(network, **options):
     )
 
 
+@pytest.mark.further
 def test_sizes_and_sigma_are_those_of_an_adjustment(network):
     result = jaxbundle.adjust(network, correlated=True)
     found = of_batch(network, correlated="camera")

@@ -73,6 +73,7 @@ def test_the_minimum_is_one(name):
     assert (np.diff(taken) < 1e-12 * taken[1:]).all()
 
 
+@pytest.mark.further
 def test_from_start_values_ten_times_as_bad():
     problem, minimum = adjusted(SHARED)
     worse = make_problem(synthetic(**NETWORKS[SHARED], disturbance=10)[0])

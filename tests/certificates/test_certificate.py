@@ -30,6 +30,7 @@ def document(field):
     )
 
 
+@pytest.mark.further
 def test_the_page_has_every_part_once_and_nothing_of_others_unescaped(document):
     html = document.html()
     page = Page(html)

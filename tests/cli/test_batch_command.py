@@ -61,6 +61,7 @@ def ended(process: subprocess.Popen, file: Path, lines: int, how: signal.Signals
     return process.returncode, told
 
 
+@pytest.mark.further
 @pytest.mark.slow
 def test_ended_at_any_moment_a_run_goes_on_where_it_was(run, cameras, tmp_path):
     file = tmp_path / "results.jsonl"

@@ -52,6 +52,7 @@ def searched(monkeypatch):
     return found
 
 
+@pytest.mark.further
 def test_a_folder_a_camera(command, tmp_path, monkeypatch):
     """In separate processes, from the command; a bad folder has its line, the others theirs."""
     monkeypatch.chdir(tmp_path)

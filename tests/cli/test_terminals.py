@@ -70,7 +70,8 @@ def run(*arguments, kind):
     return done.returncode, out, err
 
 
-@pytest.mark.parametrize("kind", ["cp1252", pytest.param("C", marks=pytest.mark.further)])
+@pytest.mark.further
+@pytest.mark.parametrize("kind", ["cp1252", "C"])
 def test_report_iterations_and_files(kind, project, tmp_path):
     out = tmp_path / "out"
     options = ("--verbose", "--no-plots", "--out", out)

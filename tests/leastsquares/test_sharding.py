@@ -51,9 +51,8 @@ def assert_same(found, name):
         np.testing.assert_allclose(a, b, rtol=1e-7, atol=1e-8)
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param("network", marks=pytest.mark.further), "traverse, iterative"]
-)
+@pytest.mark.further
+@pytest.mark.parametrize("name", ["network", "traverse, iterative"])
 def test_on_two_devices(name):
     assert_same(on_two_devices()[name], name)
 

@@ -189,7 +189,7 @@ def test_start_values_through_a_window(dived):
     assert result.converged and len(result.images["id"]) == 8 and 0.85 < result.sigma0 < 1.15
 
 
-@pytest.mark.parametrize("row", [FLAT, DOME])
+@pytest.mark.parametrize("row", [FLAT, pytest.param(DOME, marks=pytest.mark.further)])
 def test_a_camera_without_an_interface_beside_one_with(row):
     """In the air and in the water: the dry camera sees as it would alone."""
     dry = dataclasses.replace(CAMERA, id="dry")

@@ -75,6 +75,7 @@ def test_the_mounting_is_found(simulated, result):
     assert "Mounting" in result.report()
 
 
+@pytest.mark.further
 def test_in_a_batch(simulated, result, tmp_path):
     """The line of a rig names its mountings, and they are part of the population."""
     path = jaxbundle.write_project(mounted(simulated.network), tmp_path / "pair")

@@ -358,6 +358,7 @@ def test_in_a_project_and_back(seen, tmp_path):
     assert again.settings == one.settings and again.image == one.image
 
 
+@pytest.mark.further
 def test_the_command_and_the_function(seen, tmp_path, command, capsys):
     """A project and a table of poses: matrices, σ, the repeatability of the robot."""
     rows = hands(seen, noise=1.0)

@@ -155,6 +155,7 @@ def test_a_station_turns_to_its_point():
         np.testing.assert_allclose(M @ away / np.linalg.norm(away), [0, 0, -1], atol=1e-12)
 
 
+@pytest.mark.further
 def test_a_row_of_stations_spreads_out(designed, site):
     assert designed.gain > 2
     assert designed.path[0].aim > designed.path[-1].aim

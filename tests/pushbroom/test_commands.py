@@ -78,6 +78,7 @@ def write_scene(path):
     return path
 
 
+@pytest.mark.further
 def test_from_a_flight_to_a_map(tmp_path, flight, run):
     scene, out = write_scene(tmp_path / "scene.tif"), tmp_path / "out"
     status, said, _ = run("simulate", flight, "--out", out, "--scene", scene)

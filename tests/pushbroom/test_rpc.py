@@ -82,6 +82,7 @@ def test_derivatives_of_the_way_back():
         np.testing.assert_allclose(exact, numeric, rtol=2e-6)
 
 
+@pytest.mark.further
 def test_second_derivatives_of_the_way_back():
     """Along a direction of the place and of all coefficients, against differences of the first."""
     rng = np.random.default_rng(1)

@@ -66,6 +66,7 @@ def test_the_minimum_is_that_of_scipy():
     np.testing.assert_allclose(computed, theirs, atol=2e-4)
 
 
+@pytest.mark.further
 def test_covariance_by_monte_carlo():
     """σ a posteriori, and the scatter of lines and samples at other points, within a few %."""
     noise, draws, tau = 0.3, 150, 0.01

@@ -33,6 +33,7 @@ def test_what_the_table_states(table):
     np.testing.assert_allclose(table.field_of_view, 2 * np.arctan(1000 * 0.065 / 700))
 
 
+@pytest.mark.further
 def test_errors_follow_the_closed_form(table):
     """RMS = h·√[(1 + 2V²/3 + V⁴/5)·σr² + σp² + V²/3·σy²]; drawn within three of its own σ."""
     V = 1000 * 0.065 / 700

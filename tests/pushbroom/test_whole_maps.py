@@ -134,6 +134,7 @@ def test_interpolated_positions_are_those_of_the_model(folder, monkeypatch, kind
     assert compared > 50_000 and used
 
 
+@pytest.mark.further
 def test_bands_types_and_no_data(folder, tmp_path):
     """Values of no data stay apart from those that show it by chance; lanczos keeps a constant."""
     for nodata, kind in ((7, "nearest"), (65535, "lanczos"), (None, "nearest")):

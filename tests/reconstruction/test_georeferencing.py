@@ -76,6 +76,7 @@ def test_positions_are_observed_with_an_offset(drone, good):
     assert "estimated from the residuals" in table.sigma
 
 
+@pytest.mark.further
 def test_sigma_of_control_is_estimated_and_used(good):
     _, points, _ = good
     assert all(p.used for p in points.values())

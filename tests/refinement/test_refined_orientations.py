@@ -280,6 +280,7 @@ def test_the_files_of_a_refinement_are_checked(folder, tmp_path):
         read_refined_orientations(copy)
 
 
+@pytest.mark.further
 def test_a_folder_of_refined_images_is_an_input_of_surface(folder, tmp_path):
     """All of its images; their pixels where they were, or in --photos."""
     from jaxbundle.surfaces.scanner_inputs import is_ground_image, read_ground_views

@@ -173,7 +173,8 @@ def satellite(tmp_path_factory):
     return folder, write_satellite(folder)
 
 
-@pytest.mark.parametrize("dense", [(), pytest.param(("--dense",), marks=pytest.mark.further)])
+@pytest.mark.further
+@pytest.mark.parametrize("dense", [(), ("--dense",)])
 def test_rpc_images_become_a_cloud_in_a_map_system(satellite, tmp_path, command, dense):
     folder, around = satellite
     out = tmp_path / "out"

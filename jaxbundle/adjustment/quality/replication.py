@@ -150,15 +150,12 @@ class Replication(TableMethods):
         what = "jobs" if self.by == "jobs" else f"halves by {self.by}"
         if not self.splits:
             return f"{what} cannot be compared: {'; '.join(self.failed)}"
-        said = f"{what} differ by d²/n {self.ratio:.2f} of classical σ"
+        said = f"{what} differ by {np.sqrt(self.ratio):.2f} times their classical σ"
         if self.model is not None:
-            said += f", {self.ratio_correlated:.2f} of σ under correlated errors"
-        return f"{said} (n = {self.dof}; {self.expected} expected)"
-
-    @property
-    def expected(self) -> str:
-        """The d²/n that is expected, in words."""
-        return "1" if self.band is None else f"{self.band[0]:.2f} to {self.band[1]:.2f}"
+            said += f", {np.sqrt(self.ratio_correlated):.2f} times σ under correlated errors"
+        low, high = (1.0, 1.0) if self.band is None else np.sqrt(self.band)
+        expected = f"{low:.2f} to {high:.2f}" if low < high else "1"
+        return f"{said} (RMS of {count(self.dof, 'parameter')}; {expected} expected)"
 
     def table(self) -> dict[str, np.ndarray]:
         """One row a parameter of a split: columns split, camera, parameter, difference, sigma,
@@ -203,13 +200,15 @@ class Replication(TableMethods):
         if self.by == "jobs":
             what = f"Jobs of one camera: {count(len(self.splits), 'pair')}"
         lines = [
-            f"{what}, {count(self.dof, 'parameter')}",
+            f"{what}, {count(self.dof, 'parameter')}; d²/n: square of their difference in σ, 1 "
+            "where σ are right",
             f"d²/n with classical σ              {self.ratio:.2f}",
         ]
         if self.model is not None:
             lines.append(f"d²/n with σ of correlated errors   {self.ratio_correlated:.2f}")
         if self.band is not None:
-            lines.append(f"expected of these, with 95 %       {self.expected}")
+            low, high = self.band
+            lines.append(f"expected of these, with 95 %       {low:.2f} to {high:.2f}")
         if self.model is not None and (lacking := not_looked_for(self.model)):
             lines.append(lacking)
         return "\n".join([*lines, *(f"not adjusted: {why}" for why in self.failed)])

@@ -50,8 +50,8 @@ Adjust = Callable[[Problem, Values], Solution]
 
 @dataclasses.dataclass(frozen=True)
 class RemovedRow:
-    """A removed observation: its set, row, residual (None: all) and test value. `others`: rows of
-    inseparable observations, removed with it."""
+    """A removed observation: its set, row, residual (None: all) and test value, NaN where what
+    remains cannot test it. `others`: rows of inseparable observations, removed with it."""
 
     set: str
     row: int
@@ -144,7 +144,8 @@ def snoop(
         again = lambda problem, values: readjust(problem, values, adjust_from)
         found = _solve(whole, removed, excluded, found.values, again)
     if doubtful:
-        removed = list(_with_tests(whole, found, removed))
+        unit = found.sigma0 if test == "pope" and found.sigma0 > 0 else 1.0
+        removed = list(_with_tests(whole, found, touched, removed, unit))
     if removed:
         found = _solve(whole, removed, excluded, found.values, adjust_from)
     return found, removed
@@ -303,32 +304,31 @@ def _passing(
 ) -> set[tuple[str, int, int | None]]:
     """Sets, rows and residuals of removed observations that agree with the adjustment without
     them."""
-    aside = np.zeros(0, bool)
-    if touched.eliminated is not None:
-        free = lambda problem: problem.table(touched.eliminated).free.any(1)
-        aside = free(whole) & ~free(found.problem)
-    # What remains of an excluded row agrees with anything.
-    excluded = lambda r, row: touched.own[r.set][row] >= 0 and aside[touched.own[r.set][row]]
     return {
         (r.set, row, r.residual)
-        for r, tests in _test_removed(whole, found, removed)
+        for r, tests in _test_removed(whole, found, touched, removed)
         for row, test in zip(r.rows, tests)
-        if test < critical and not excluded(r, row)
+        if test < critical
     }
 
 
 def _with_tests(
-    whole: Problem, found: Solution, removed: Sequence[RemovedRow]
+    whole: Problem,
+    found: Solution,
+    touched: _Touched,
+    removed: Sequence[RemovedRow],
+    unit: float,
 ) -> Iterable[RemovedRow]:
-    """What was removed, with the tests of initially doubtful observations."""
-    for r, tests in _test_removed(whole, found, removed):
-        yield r if np.isfinite(r.test) else dataclasses.replace(r, test=tests[0])
+    """What was removed, with the tests of initially doubtful observations, in `unit`."""
+    for r, tests in _test_removed(whole, found, touched, removed):
+        yield r if np.isfinite(r.test) else dataclasses.replace(r, test=max(tests) / unit)
 
 
 def _test_removed(
-    whole: Problem, found: Solution, removed: Sequence[RemovedRow]
+    whole: Problem, found: Solution, touched: _Touched, removed: Sequence[RemovedRow]
 ) -> Iterable[tuple[RemovedRow, list[float]]]:
-    """Each of the removed with the test of its rows against what remains.
+    """Each of the removed with the test of its rows against what remains; NaN in rows of an
+    excluded eliminated row, which agrees with anything.
 
     Two residuals removed from one correlated observation are tested in separate passes, each
     without the other, which would predict it."""
@@ -338,6 +338,11 @@ def _test_removed(
         together.setdefault((r.set, r.row), []).append(r)
     others = lambda r: [x for x in together[r.set, r.row] if x is not r] if correlated(r) else []
     place = lambda r: together[r.set, r.row].index(r) if correlated(r) else 0
+    aside = np.zeros(0, bool)
+    if touched.eliminated is not None:
+        free = lambda problem: problem.table(touched.eliminated).free.any(1)
+        aside = free(whole) & ~free(found.problem)
+    excluded = lambda r, row: touched.own[r.set][row] >= 0 and aside[touched.own[r.set][row]]
     for turn in sorted({place(r) for r in removed}):
         of = [r for r in removed if place(r) == turn]
         rest = [x for r in of for x in others(r)]
@@ -345,7 +350,8 @@ def _test_removed(
         tests = {o: _finite(t) for o, t in found.predicted_tests(data).items()}
         for r in of:
             residual = r.residual if r.residual is not None else slice(None)
-            yield r, [float(np.max(tests[r.set][row, residual])) for row in r.rows]
+            of_rows = np.max(tests[r.set][list(r.rows)][:, residual].reshape(len(r.rows), -1), 1)
+            yield r, np.where([excluded(r, row) for row in r.rows], np.nan, of_rows).tolist()
 
 
 def _remove(weight: Float[np.ndarray, "n ..."], removed: RemovedRow) -> None:
