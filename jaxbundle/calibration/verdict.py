@@ -100,5 +100,8 @@ def cross_validation_in_words(calibration: "Calibration") -> list[str]:
         "not show here."
     ]
     if checked.comparison is not None:
-        sentences.append(f"Their images, over the whole image: {checked.comparison}.")
+        sentences.append(
+            "Their images, over the whole image, also where nothing was measured: "
+            f"{checked.comparison}."
+        )
     return sentences

@@ -20,7 +20,8 @@ def run():
     ]
     return _ReconstructionRun(
         photographs, {}, SimpleNamespace(notes=()), ReconstructionSettings(),
-        SimpleNamespace(drop_unused=lambda: None), lambda *_: None, SimpleNamespace(positions=None),
+        SimpleNamespace(drop_unused=lambda: None), lambda *_: None,
+        SimpleNamespace(positions=None, distances=()),
     )  # fmt: skip
 
 
