@@ -440,7 +440,7 @@ class _ReconstructionRun:
             self.cameras,
             measured,
             self.further,
-            name,
+            self._title_of(name),
             settings.aspect_sigma,
             settings.angle_unit,
         )
@@ -493,6 +493,12 @@ class _ReconstructionRun:
             self._warn(f"{name}: {said}")
         return part, dict(oriented.images_not_placed)
 
+    def _title_of(self, part: str) -> str:
+        """The name of the network of a part: that of the job, from the second part on with the
+        part's own."""
+        first = part in ("", "part 1")
+        return self.title if first and self.title else ", ".join(filter(None, (self.title, part)))
+
     def _complete(
         self,
         name: str,
@@ -516,7 +522,7 @@ class _ReconstructionRun:
             self.cameras,
             measured,
             extra,
-            name,
+            self._title_of(name),
             settings.aspect_sigma,
             settings.angle_unit,
         )
