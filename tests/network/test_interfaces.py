@@ -7,6 +7,8 @@ import pytest
 from further_checks import check_jacobians, sample
 
 import jaxbundle
+from jaxbundle.adjustment.quality.fixed_quantities import find_causes
+from jaxbundle.cli.budget_option import held_of
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.io.results.result_project import adjusted_network, readjustable_network
@@ -246,6 +248,18 @@ def test_what_is_wrong_is_named(dived, change, message):
     row = change if change.get("type") == "dome" else FLAT | change
     with pytest.raises(InputError, match=message):
         with_interfaces(dived.network, row)
+
+
+def test_the_error_of_a_held_index_has_no_unit(dived):
+    """In a project in degrees an angle is one, an index of refraction is not."""
+    network = with_interfaces(dived.network, FLAT).replace(angle_unit="deg")
+    problem = jaxbundle.make_problem(network)
+    held = {"medium:window:index": 1e-4, "flat port:window:omega": 1e-3}
+    index, omega = find_causes(problem, {t.name: t.value for t in problem.tables}, held)
+    assert not index.angle and omega.angle
+    names = ("medium:window:index=1e-4", "flat port:window:omega=0.1")
+    given = held_of(list(names), network)
+    assert list(given.values()) == pytest.approx([1e-4, np.radians(0.1)])
 
 
 def test_what_does_not_go_together_is_named(dived):

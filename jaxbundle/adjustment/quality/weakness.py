@@ -27,7 +27,7 @@ from jaxbundle.leastsquares.quality.weakness import (
     find_weak_unsolved,
 )
 from jaxbundle.network.columns import count, list_some
-from jaxbundle.network.kinds.base import ANGLES, LENGTHS
+from jaxbundle.network.kinds.base import ANGLES, LENGTHS, RATIOS
 from jaxbundle.network.kinds.rolling_shutter import READ_OUT
 from jaxbundle.report.head import ADVICE_FOR
 from jaxbundle.types import AnyArray
@@ -201,7 +201,7 @@ def _extents(inspection: Inspection) -> Extents:
     mean = float(of_image[of_image > 0].mean()) if (of_image > 0).any() else 1.0
     for name in problem.further_tables:
         given = problem.table(name)
-        judged = [(p in LENGTHS) / mean + (p in ANGLES) for p in given.parameters]
+        judged = [(p in LENGTHS) / mean + (p in ANGLES | RATIOS) for p in given.parameters]
         if any(judged):
             found[name] = np.tile(judged, (given.rows, 1))
         if name == READ_OUT:

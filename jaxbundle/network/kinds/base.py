@@ -14,6 +14,7 @@ from jaxbundle.leastsquares.declarations import Kind, ObservationSet, Table
 from jaxbundle.network.columns import Columns, did_you_mean
 from jaxbundle.network.tables import Images, Network, Points, Rows, Source, row_indices
 
+# Unknowns of further tables that are lengths, in the object unit.
 LENGTHS = frozenset(
     (
         "ax",
@@ -37,22 +38,10 @@ LENGTHS = frozenset(
 POSE_UNITS = (*["length"] * 3, *["angle"] * 3)
 # Errors of instruments that are angles, in tables of numbers.
 INSTRUMENT_ANGLES = ("declination", "zero right", "zero up", "zero view")
-# Unknowns of further tables that are lengths or angles: their σ are compared with the point
-# distance and with a radian; those of indices of refraction with 1.
-ANGLES = frozenset(
-    (
-        "omega",
-        "phi",
-        "kappa",
-        "turn x",
-        "turn y",
-        "turn z",
-        *INSTRUMENT_ANGLES,
-        "index",
-        "index_window",
-        "index_camera",
-    )
-)
+# Unknowns of further tables that are angles, in the unit of the project.
+ANGLES = frozenset(("omega", "phi", "kappa", "turn x", "turn y", "turn z", *INSTRUMENT_ANGLES))
+# Unknowns without a unit: indices of refraction.
+RATIOS = frozenset(("index", "index_window", "index_camera"))
 
 
 class Contribution(NamedTuple):
