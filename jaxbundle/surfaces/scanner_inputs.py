@@ -302,9 +302,16 @@ def from_map(
     crs: str,
 ) -> Float[np.ndarray, "n 3"]:
     """Points of map coordinates."""
-    degrees = _transformer(crs).transform(x, y, direction="INVERSE")
-    east, north = np.radians(degrees)
+    east, north = np.radians(to_degrees(x, y, crs))
     return np.asarray(around.local(east, north, np.asarray(h, float))).T
+
+
+def to_degrees(
+    x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], crs: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Longitude and latitude of map coordinates."""
+    longitude, latitude = _transformer(crs).transform(x, y, direction="INVERSE")
+    return np.asarray(longitude), np.asarray(latitude)
 
 
 def _transformer(crs: str) -> "pyproj.Transformer":
