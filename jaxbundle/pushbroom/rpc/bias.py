@@ -120,7 +120,8 @@ def fit_bias(
             "longitude, latitude, height and their order"
         )
     check_domain(rpc, control, source)
-    terms = np.stack(bias_terms(rpc, computed[:, 0], computed[:, 1]), 1)[:, :k]
+    # with numbers of NumPy: JAX would compile every operation for each number of points
+    terms = np.stack(bias_terms(domain_of_bias(rpc), *computed.T), 1)[:, :k]
     singular = np.linalg.svd(terms, compute_uv=False)
     # 1e-6 of 10 000 pixels is a hundredth of a pixel: points so near a line do not fix its sides
     if singular[-1] < 1e-6 * singular[0]:
