@@ -48,8 +48,9 @@ Or the file of a product, with changes:
 source = "image.json"
 interpolation = "lagrange"          # CSM files: usgscsm | lagrange
 extrapolate = 2.0                   # CSM files: seconds by which tables may end before the image
+corrections = "auto"                # those that the RPC of the product confirms; the default
 
-[corrections]
+[corrections]                       # instead: the ones given, others as usual for the product
 refraction = true
 ```
 """
@@ -96,6 +97,7 @@ SECTIONS = {
         "source",
         "interpolation",
         "extrapolate",
+        "corrections",
     ),
     "times": ("first", "period", "table"),
     "position": (*KINDS, "at", "j2", "frame", "span", "step", *INTERPOLATION),
