@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from jaxbundle.surfaces.dsm import Dsm, make_dsm
 from jaxbundle.surfaces.files import report_of, text_of
 from jaxbundle.surfaces.height_reference import (
     HeightReference,
+    check_cells,
     heights_of_ground_images,
     heights_of_photographs,
     no_height_reference,
@@ -50,8 +51,16 @@ from jaxbundle.types import Progress
 DEFAULT = SurfaceSettings()
 # The lowest and the highest height searched.
 Heights = tuple[float, float]
-# The options --crs, --geoid and --heights.
-_Wanted = tuple[str | None, str | Path | None, str | None]
+
+
+class _Wanted(NamedTuple):
+    """The options --crs, --geoid and --heights; whether a model is made."""
+
+    crs: str | None
+    geoid: str | Path | None
+    heights: str | None
+    model: bool
+
 
 
 @print_in_one_screen
@@ -158,7 +167,7 @@ def surface(  # noqa: PLR0913 (public: the options of the command, all but one b
         match = _match_ground_images
     else:
         match = _match_photographs
-    wanted = crs, geoid, heights
+    wanted = _Wanted(crs, geoid, heights, dsm is not None)
     made = match(inputs, folder, between, pairs, wanted, {**options, "progress": progress}, say)
     views = choose_views(made.views, orthophoto_of) if orthophoto or orthophoto_of else []
     model = None if dsm is None else make_dsm(made.surface.cloud, dsm)
@@ -190,7 +199,9 @@ def _match_photographs(
 ) -> _Matched:
     if photos is None:
         raise InputError("--photos is missing: the folder of the photographs")
-    reference = heights_of_photographs(*wanted)
+    reference = heights_of_photographs(wanted.crs, wanted.geoid, wanted.heights)
+    if wanted.model:
+        check_cells(reference, metres=False)
     views, network, messages = read_views(inputs[0], photos)
     if reference.geoid is not None:
         if network.object_unit != "m":
@@ -225,12 +236,14 @@ def _match_ground_images(
     views, around = read_ground_views(inputs, photos)
     if len(views) < 2:
         raise InputError(f"{inputs[0]}: one image; a surface needs at least two")
-    crs, geoid, above = wanted
+    crs, geoid, above, model = wanted
     if around is None:
         no_height_reference(geoid, above)
         reference = HeightReference()
     else:
         reference = heights_of_ground_images(system_of(around, crs), geoid, above)
+        if model:
+            check_cells(reference, metres=True)
     if reference.geoid is not None and around is not None and reference.horizontal is not None:
         x, y = _corners(views, around, reference.horizontal)
         inside = reference.as_computed(heights or (0.0, 0.0), x, y)

@@ -14,7 +14,7 @@ from jaxbundle.arguments import one_of
 from jaxbundle.choices import ELLIPSOID, GEOID, HEIGHTS
 from jaxbundle.errors import InputError
 from jaxbundle.io.rasters.geoid import undulations_at
-from jaxbundle.io.rasters.vertical import GRIDS, split_system, usual_grid, with_heights_above
+from jaxbundle.io.rasters.vertical import GRIDS, split_system, unit_of, usual_grid, with_heights_above
 from jaxbundle.surfaces.cloud import Cloud
 from jaxbundle.surfaces.scanner_inputs import to_degrees
 
@@ -142,6 +142,27 @@ def heights_of_photographs(
         stated = heights is not None or parts.above_ellipsoid
         words = "above the ellipsoid, of the block" if stated else ""
     return HeightReference(crs, parts.horizontal, words)
+
+
+def check_cells(reference: HeightReference, metres: bool) -> None:
+    """Refuse a system in which a model cannot have square cells in the unit of its heights.
+
+    **Arguments:** `metres`: heights are in metres.
+
+    **Raises:** `InputError`."""
+    if reference.horizontal is None:
+        return
+    unit, factor = unit_of(reference.horizontal)
+    if factor is None:
+        raise InputError(
+            f"--dsm: --crs {reference.horizontal} is in {unit}, in which cells are not square; "
+            "give a projected system"
+        )
+    if metres and factor != 1:
+        raise InputError(
+            f"--dsm: --crs {reference.horizontal} is in {unit}, heights are in metres; give a "
+            "system in metres"
+        )
 
 
 def no_height_reference(geoid: str | Path | None, heights: str | None) -> HeightReference:

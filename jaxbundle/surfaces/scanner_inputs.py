@@ -74,6 +74,13 @@ def read_ground_views(
         for path, one in zip(files, refined)
     ]
     around = _common_neighbourhood(files, [orientation for orientation, _ in found])
+    rasters = [raster.resolve() for _, raster in found]
+    for k, raster in enumerate(rasters):
+        if raster in rasters[:k]:
+            raise InputError(
+                f"{files[k]}: its raster {raster.name} is also that of "
+                f"{files[rasters.index(raster)]}; a surface needs different images"
+            )
     names = [raster.name for _, raster in found]
     if len({*names}) < len(names):
         names = [str(raster) for _, raster in found]

@@ -8,6 +8,7 @@ from surface_scenes import write_geoid
 from jaxbundle.errors import InputError
 from jaxbundle.io.rasters.vertical import split_system, with_heights_above
 from jaxbundle.surfaces.height_reference import (
+    check_cells,
     heights_of_ground_images,
     heights_of_photographs,
     no_height_reference,
@@ -80,6 +81,17 @@ def test_heights_of_photographs(crs, geoid, heights, words, sign):
 def test_what_contradicts_is_refused(choose, crs, geoid, heights, said):
     with pytest.raises(InputError, match=said):
         choose(crs, geoid, heights)
+
+
+@pytest.mark.parametrize("crs, metres, said", [
+    ("EPSG:4326", False, "is in degree"), ("EPSG:2263", True, "survey foot, heights are in metres"),
+])  # fmt: skip
+def test_cells_of_a_model_are_in_the_unit_of_the_heights(crs, metres, said):
+    with pytest.raises(InputError, match=said):
+        check_cells(heights_of_photographs(crs, None, None), metres)
+    check_cells(heights_of_photographs("EPSG:2263", None, None), metres=False)
+    check_cells(heights_of_photographs(None, None, None), metres=True)
+    check_cells(heights_of_ground_images(UTM, None, None), metres=True)
 
 
 def test_a_local_frame_has_no_geoid():

@@ -231,6 +231,12 @@ def test_rpc_images_become_a_cloud_in_a_map_system(satellite, tmp_path, command,
     assert 0.55 < np.sqrt(np.mean(w[np.abs(w) < 5] ** 2)) < 1.3
 
 
+def test_one_image_twice(satellite, tmp_path, command):
+    folder, _ = satellite
+    told = command("surface", folder / "a.tif", folder / "a.tif", "--out", tmp_path / "out")
+    assert told.status == 2 and "its raster a.tif is also that of" in told.err
+
+
 def test_a_satellite_surface_above_the_geoid(satellite, tmp_path, command):
     """The heights of the cloud are those of the scene minus N; --zmin and --zmax are above the
     geoid, too; the DSM says so, and is read back as the ellipsoidal one."""

@@ -112,6 +112,15 @@ def horizontal_system(crs: str | None) -> str | None:
     return None if crs is None else split_system(crs).horizontal
 
 
+def unit_of(crs: str) -> tuple[str, float | None]:
+    """The unit of x and y of a system, and its metres; None for angles."""
+    import pyproj
+
+    system = pyproj.CRS.from_user_input(crs)
+    axis = system.axis_info[0]
+    return axis.unit_name, None if system.is_geographic else axis.unit_conversion_factor
+
+
 def name_system(crs: str) -> str:
     """The name of the map of a system, such as "WGS 84 / UTM zone 32N"."""
     import pyproj
