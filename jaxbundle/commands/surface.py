@@ -62,7 +62,6 @@ class _Wanted(NamedTuple):
     model: bool
 
 
-
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Surface(TableMethods):

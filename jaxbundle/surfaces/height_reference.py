@@ -14,7 +14,13 @@ from jaxbundle.arguments import one_of
 from jaxbundle.choices import ELLIPSOID, GEOID, HEIGHTS
 from jaxbundle.errors import InputError
 from jaxbundle.io.rasters.geoid import undulations_at
-from jaxbundle.io.rasters.vertical import GRIDS, split_system, unit_of, usual_grid, with_heights_above
+from jaxbundle.io.rasters.vertical import (
+    GRIDS,
+    split_system,
+    unit_of,
+    usual_grid,
+    with_heights_above,
+)
 from jaxbundle.surfaces.cloud import Cloud
 from jaxbundle.surfaces.scanner_inputs import to_degrees
 
