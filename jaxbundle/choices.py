@@ -125,6 +125,8 @@ MATCHED_PAIRS = ("auto", "all", "sequence", "place", "alike")
 
 # Points matched for a surface.
 SURFACE_POINTS = ("grid", "edges", "corners")
+# What the heights of a surface are above.
+ELLIPSOID, GEOID = HEIGHTS = ("ellipsoid", "geoid")
 CLOUD_FILES = (".csv", ".ply", ".las", ".laz", ".dxf")
 # The point that replaces those of a cube.
 CUBE_POINTS = ("mean", "corner", "best")
