@@ -111,17 +111,22 @@ def files_of(names: Sequence[str]) -> list[str]:
         ]
         found += [f"rig_{name}.toml", f"rig_{name}_*.png"] if place else []
     if len(names) > 1:
-        found += [
-            f"{RIG}/{file}"
-            for file in (
-                CONVERSIONS,
-                STEREO_PAIRS,
-                *(name for name, _ in RIG_FILES.values()),
-                *(f"{name}/{file}" for name, files in RIG_FILES.values() for file in files),
-            )
-        ]
+        found += rig_files()
         found += [f"{ADJUSTED}/{file}" for file in NETWORK_FILES]
     return found
+
+
+def rig_files() -> list[str]:
+    """Files that `fill_rig` may write into the folder `RIG`, pairs of cameras as patterns."""
+    return [
+        f"{RIG}/{file}"
+        for file in (
+            CONVERSIONS,
+            STEREO_PAIRS,
+            *(name for name, files in RIG_FILES.values() if not files),
+            *(f"{name}/{file}" for name, files in RIG_FILES.values() for file in files),
+        )
+    ]
 
 
 def write_calibration(

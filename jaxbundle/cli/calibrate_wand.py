@@ -13,7 +13,7 @@ from jaxbundle.cli.app import Force, Json, Quiet, app, choice
 from jaxbundle.errors import InputError
 
 COMMAND = "calibrate-wand"
-REPORT, RESULT, RIG, MARKERS = "report.txt", "result.json", "rig", "markers"
+REPORT, RESULT, MARKERS = "report.txt", "result.json", "markers"
 
 
 @app.command(COMMAND, example="left=left.mp4 right=right.mp4 --cameras cameras.toml --length 0.5")
@@ -36,8 +36,9 @@ def calibrate_wand(  # noqa: PLR0913 - the options of the command
         list[str], typer.Option(help="of the wand, in --unit; of more markers A,B=LENGTH, each")
     ],
     sigma_length: Annotated[
-        float, typer.Option(help="σ of a length, the same error in all frames")
-    ] = 1e-4,
+        float | None,
+        typer.Option(help="σ of a length, the same error in all frames; default: 0.1 mm"),
+    ] = None,
     sigma_image: options.SigmaImage = None,
     marker_kind: Annotated[
         str, choice(MARKERS_OF_A_WAND, "than what is behind them", "--markers")
@@ -56,7 +57,7 @@ def calibrate_wand(  # noqa: PLR0913 - the options of the command
     import dataclasses
 
     import jaxbundle
-    from jaxbundle.calibration.files import fill_rig, json_text
+    from jaxbundle.calibration.files import RIG, file_name, fill_rig, json_text, rig_files
     from jaxbundle.calibration.rig.wand_markers import Mark
     from jaxbundle.cli.calibration_outputs import words
     from jaxbundle.cli.outputs import check_json_target, print_result
@@ -88,7 +89,7 @@ def calibrate_wand(  # noqa: PLR0913 - the options of the command
             sources,
             known,
             lengths_given(length),
-            sigma_length=sigma_length,
+            sigma_length=sigma_of_length(sigma_length, unit),
             sigma_image=sigma_image,
             object_unit=unit,
             blobs=BlobSettings(dark=marker_kind == "dark"),
@@ -96,14 +97,27 @@ def calibrate_wand(  # noqa: PLR0913 - the options of the command
             progress=tell,
         )
     if out is not None:
-        with replace_folder(out, COMMAND, (REPORT, RESULT, RIG, MARKERS), force) as folder:
+        tables = {name: f"{MARKERS}/{file_name(name)}.csv" for name in sources}
+        files = (REPORT, RESULT, *rig_files(), *tables.values())
+        with replace_folder(out, COMMAND, files, force) as folder:
             (folder / REPORT).write_text(result.report(), encoding="utf-8")
             (folder / RESULT).write_text(json_text(result.to_dict()), encoding="utf-8")
             fill_rig(result.network(), folder / RIG)
             (folder / MARKERS).mkdir()
             for name, marks in result.markers.items():
-                write_csv(folder / MARKERS / f"{name}.csv", Mark._fields, marks)
-    print_result(result, json, quiet)
+                write_csv(folder / tables[name], Mark._fields, marks)
+    if json or out is None or not quiet:
+        print_result(result, json, quiet)
+
+
+def sigma_of_length(given: float | None, unit: str) -> float:
+    """σ of the lengths in their unit, 0.1 mm if not given.
+
+    **Raises:** `InputError` if that is not known in this unit."""
+    in_unit = {"m": 1e-4, "cm": 1e-2, "mm": 0.1}
+    if given is None and unit not in in_unit:
+        raise InputError(f"--sigma-length: expected the σ of the lengths in {unit}")
+    return in_unit[unit] if given is None else given
 
 
 def split_named(given: str, expected: str) -> tuple[str, str]:

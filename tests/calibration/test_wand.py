@@ -150,6 +150,14 @@ def test_two_markers_that_look_alike():
     assert not again["c3"] and again["c0"] and "do not tell the two markers apart" in said[0]
 
 
+def test_another_wand_is_said():
+    """Lengths that no frame fits: the ratio that the markers have is said, within perspective."""
+    marks = [Mark(str(f), "", x, y) for f, _, x, y in zip(*waved()["c0"].values())]
+    for pairs in ({("A", "B"): 0.1, ("B", "C"): 0.4}, {("A", "B"): 0.05, ("A", "C"): 0.5}):
+        with pytest.raises(InputError, match=r"as 1 : \d+\.00; those in a line are at 1 : 2\.[2-5]"):
+            name_three("c0", marks, CAMERAS["c0"], pairs, WandSettings())
+
+
 NAMELESS = {"frame": [1, 1, 1], "x": [0.0, 1, 2], "y": [0.0, 0, 0]}
 
 
@@ -270,6 +278,8 @@ def test_a_wand_in_images(filmed, tmp_path, command):
         m, (base, _) = found["mountings"][name], truth(k)
         sigma = np.sqrt(np.diag(m["covariance"]))[:3]
         assert np.abs((np.array(m["base"]) - base) / sigma).max() < 4
+    # the folder is its own: written again
+    assert command("calibrate-wand", *given, *rest, "--out", tmp_path / "out").status == 0
     written = [f"{name}={tmp_path / 'out' / 'markers' / name}.csv" for name in NAMES[:3]]
     again = command("calibrate-wand", *written, *rest, "--json", tmp_path / "again.json")
     assert again.status == 0, again.err
@@ -287,7 +297,7 @@ def test_frames_that_nothing_ties():
 
 
 def test_cameras_and_lengths_of_the_command(tmp_path):
-    from jaxbundle.cli.calibrate_wand import cameras_by_name, lengths_given
+    from jaxbundle.cli.calibrate_wand import cameras_by_name, lengths_given, sigma_of_length
     from jaxbundle.io import write_cameras
 
     file = tmp_path / "cameras.toml"
@@ -300,3 +310,7 @@ def test_cameras_and_lengths_of_the_command(tmp_path):
     for bad in (["half"], ["A=0.5"], ["A,B=x"]):
         with pytest.raises(InputError, match="--length"):
             lengths_given(bad)
+    assert sigma_of_length(None, "m") == 1e-4 and sigma_of_length(None, "mm") == 0.1
+    assert sigma_of_length(0.5, "inch") == 0.5
+    with pytest.raises(InputError, match="--sigma-length: .*inch"):
+        sigma_of_length(None, "inch")

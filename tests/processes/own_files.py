@@ -211,6 +211,34 @@ def write_video(path: Path, side: int) -> None:
     video.release()
 
 
+def write_wand_video(path: Path, camera: str) -> None:
+    """A wand of three markers before a camera; beside it the file of both cameras."""
+    import cv2
+    import wand_scenes as scenes
+    from test_wand import CAMERAS, PLACES, ROTATIONS
+
+    from jaxbundle.io import write_cameras
+
+    size, names = (640, 480), {"left": "c0", "right": "c1"}
+    half = {"fx": 500.0, "fy": 500.0, "cx": 319.5, "cy": 239.5}
+    known = {
+        name: dataclasses.replace(
+            CAMERAS[own], id=name, parameters={**CAMERAS[own].parameters, **half}, image_size=size
+        )
+        for name, own in names.items()
+    }
+    k = int(names[camera][1])
+    seen = scenes.markers_in_images(
+        known[camera], ROTATIONS[k], PLACES[k], scenes.wave(40), [0, 0.3, 1]
+    )
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 30, size)
+    for uv in seen:
+        grey = scenes.render_frame(uv, size, np.random.default_rng(k))
+        video.write(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR))
+    video.release()
+    write_cameras([*known.values()], path.parent / "wand.toml")
+
+
 def write_wand(path: Path, camera: str) -> None:
     """What a camera saw of the two ends of a wand; beside it the file of all cameras."""
     from test_wand import CAMERAS, waved
@@ -458,6 +486,8 @@ OWN: dict[str, Callable[[Path], None]] = {
     "scene": write_sparse_model,
     "left.mp4": lambda path: write_video(path, 0),
     "right.mp4": lambda path: write_video(path, 1),
+    "wand_left.mp4": lambda path: write_wand_video(path, "left"),
+    "wand_right.mp4": lambda path: write_wand_video(path, "right"),
     "left.csv": lambda path: write_wand(path, "left"),
     "right.csv": lambda path: write_wand(path, "right"),
     "spring_2024": lambda path: write_heights(path, 0),

@@ -16,10 +16,12 @@ Recognition 33; Mitchelson and Hilton (2003), Wand-based multiple camera studio 
 """
 
 import dataclasses
-from collections.abc import Mapping
+import functools
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -67,26 +69,18 @@ class WandCalibration(TableMethods):
     def converged(self) -> bool:
         return self.adjustment.converged
 
-    @property
+    @functools.cached_property
     def mountings(self) -> dict[str, Mounting]:
         """The mounting of every camera but the first in the frame of that, with its covariance."""
         row = {name: k for k, name in enumerate(self.adjustment.problem.network.images.id)}
-        # poses of the network are in the datum of all points (inner constraints): only relative
-        # ones, and their σ, do not depend on it
-        first, found = row[self.names[0]], {}
-        for name in self.names[1:]:
-            at = _relative(self.adjustment.values["image"], first, row[name])
-            R = matrix_from_quaternion(at.rotation)
-
-            def change(values: Mapping[str, Any], k: int = row[name], R: Array = R) -> Array:
-                moved = _relative(values["image"], first, k)
-                turn = rotation_vector_from_matrix(matrix_from_quaternion(moved.rotation) @ R.T)
-                return jnp.concatenate([jnp.asarray(moved.position), turn])
-
-            C = np.array(self.adjustment.covariance_of(change))
-            base = np.asarray(at.position)
-            C[:3, :3] += self.scale_sigma**2 * np.outer(base, base)
-            found[name] = mounting_of(PoseValue(*map(np.asarray, at)), C)
+        first, *others = (row[name] for name in self.names)
+        C = np.asarray(self.adjustment.covariance_of(_Mountings(first, tuple(others))))
+        found = {}
+        for k, name in enumerate(self.names[1:]):
+            at = _relative(self.adjustment.values["image"], first, others[k])
+            own, base = C[6 * k : 6 * k + 6, 6 * k : 6 * k + 6].copy(), np.asarray(at.position)
+            own[:3, :3] += self.scale_sigma**2 * np.outer(base, base)
+            found[name] = mounting_of(PoseValue(*map(np.asarray, at)), own)
         return found
 
     def network(self) -> Network:
@@ -145,6 +139,27 @@ class WandCalibration(TableMethods):
         return "\n".join([*lines, *(f"note: {said}" for said in self.notes)])
 
 
+@dataclasses.dataclass(frozen=True)
+class _Mountings:
+    """Bases and small turns of cameras in the frame of the first, as a function of all unknowns;
+    equal ones share a program.
+
+    Poses of networks are in the datum of all points (inner constraints): only relative ones, and
+    their σ, do not depend on it."""
+
+    first: int
+    others: tuple[int, ...]
+
+    def __call__(self, values: Mapping[str, Any]) -> Array:
+        changes = []
+        for k in self.others:
+            at = _relative(values["image"], self.first, k)
+            R = matrix_from_quaternion(at.rotation)
+            turn = rotation_vector_from_matrix(R @ jax.lax.stop_gradient(R).T)
+            changes += [jnp.asarray(at.position), turn]
+        return jnp.concatenate(changes)
+
+
 def _relative(images: PoseValue, first: int, k: int) -> PoseValue:
     """The pose of an image in the frame of another one."""
     M = matrix_from_quaternion(images.rotation[first])
@@ -177,7 +192,8 @@ def calibrate_wand(
     - `cameras`: interior orientation by name; what is `free` of it is estimated as well.
     - `lengths`: between two markers, by their names: `{("A", "B"): 0.5}`; or that of a wand of two.
     - `sigma_length` of these, the same error in all frames; `sigma_image` in pixels (default: a
-      unit of weight; of markers in images as measured, instead of which it is used if given).
+      unit of weight; of markers in images in proportion to the measured σ, times what their
+      residuals say: a variance component).
     - `settings`: how markers without names (all in images) are told apart: three in a line,
       unevenly spaced, by their distances; two that look alike by their rays. `blobs`: what a marker
       is in an image, such as `BlobSettings(dark=True)`.
@@ -211,11 +227,35 @@ def calibrate_wand(
     marks = {name: (measured if name in images else tables)[name] for name in markers}
     marks, said = name_markers(marks, cameras, pairs, settings or WandSettings())
     notes += said
-    network, said = _network(marks, cameras, pairs, sigma_length, sigma_image, object_unit)
+    declare = lambda marks: _network(marks, cameras, pairs, sigma_length, sigma_image, object_unit)
+    network, said = declare(marks)
+    result = adjust(network, **options)
+    if images and sigma_image is None and result.converged:
+        # σ by the noise of the grey values: compression smooths it, and shifts centres by more.
+        # They are weights of the markers among each other; residuals give their size
+        factor = _residuals_over_sigma(result, images)
+        for name in images:
+            marks[name] = [m._replace(sx=factor * m.sx, sy=factor * m.sy) for m in marks[name]]
+        result = adjust(declare(marks)[0], **options)
+        said += [f"σ of markers in images: {factor:.2f} times what the noise says, by residuals"]
+    longest = max(pairs.values())
+    # nobody waves a wand of ten metres; in millimetres it would be one of a centimetre at least
+    if object_unit == "m" and longest > 10:
+        said += [f"the wand is {longest:g} m long: is this in mm? Lengths and σ are of one unit"]
     scale = sigma_length / float(np.sqrt(np.sum(np.square([*pairs.values()]))))
-    return WandCalibration(
-        adjust(network, **options), tuple(markers), scale, (*notes, *said), marks
-    )
+    return WandCalibration(result, tuple(markers), scale, (*notes, *said), marks)
+
+
+def _residuals_over_sigma(result: Adjustment, cameras: Collection[str]) -> float:
+    """√(Σ(v/σ)²/Σr) of the image points of some cameras: the size of their σ (a variance
+    component)."""
+    table = result.residuals
+    rows = (table["kind"] == "image") & np.isin(table["image"].astype(str), [*cameras])
+    ratio, r = (table["v"] / table["sigma"])[rows], table["r"][rows]
+    taken = np.isfinite(ratio) & (r > 0)
+    size = float(np.sqrt((ratio[taken] ** 2).sum() / max(r[taken].sum(), 1.0)))
+    # exact images leave nothing
+    return size if size > 0 else 1.0
 
 
 def _marks(camera: str, given: Any) -> Marks:

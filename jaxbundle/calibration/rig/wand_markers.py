@@ -121,15 +121,25 @@ def name_three(
         )
     near, far = ends if away[0] < away[1] else ends[::-1]
     found: Marks = []
+    seen_ratios: list[float] = []
     without = ambiguous = 0
+    ratio, depth = max(away) / min(away), settings.depth_ratio
     for seen in _by_frame(marks).values():
         uv = np.array([(mark.x, mark.y) for mark in seen])
-        possible = _possible_wands(uv, interior, max(away) / min(away), settings)
+        straight = _straight_triples(uv, interior, settings)
+        possible = [rows for rows, observed in straight if 1 / depth < observed / ratio < depth]
         without += not possible
         ambiguous += len(possible) > 1
+        seen_ratios += [observed for _, observed in straight]
         if len(possible) == 1:
             by = zip((near, names[middle], far), possible[0])
             found += [seen[k]._replace(marker=name) for name, k in by]
+    if not found:
+        usual = f"; those in a line are at 1 : {np.median(seen_ratios):.1f}" if seen_ratios else ""
+        raise InputError(
+            f"camera {camera!r}: no frame shows three markers in a line whose distances from the "
+            f"middle one are as 1 : {ratio:.2f}{usual}"
+        )
     said = [
         f"camera {camera!r}: {count(number, 'frame')} {why} not used"
         for number, why in (
@@ -141,25 +151,24 @@ def name_three(
     return found, said
 
 
-def _possible_wands(
-    uv: Float[np.ndarray, "n 2"], interior: Camera, ratio: float, settings: WandSettings
-) -> list[tuple[int, int, int]]:
-    """Rows of three blobs that can be the near end, the middle and the far end of the wand."""
+def _straight_triples(
+    uv: Float[np.ndarray, "n 2"], interior: Camera, settings: WandSettings
+) -> list[tuple[tuple[int, int, int], float]]:
+    """Three blobs in a line, as rows of the near end, the middle and the far end, and the ratio of
+    the distances of far and near end from the middle."""
     xy, found = ideal_features(interior, uv), []
     for rows in combinations(range(len(uv)), 3):
         apart = {pair: np.linalg.norm(uv[pair[0]] - uv[pair[1]]) for pair in combinations(rows, 2)}
         if min(apart.values()) < settings.min_distance or not np.isfinite(xy[[*rows]]).all():
             continue
-        first, last = max(apart, key=lambda pair: apart[pair])
-        (middle,) = {*rows} - {first, last}
-        line, a, b = xy[last] - xy[first], xy[middle] - xy[first], xy[middle] - xy[last]
+        near, far = max(apart, key=lambda pair: apart[pair])
+        (middle,) = {*rows} - {near, far}
+        line, a, b = xy[far] - xy[near], xy[middle] - xy[near], xy[middle] - xy[far]
         bend = abs(line[0] * a[1] - line[1] * a[0]) / (line @ line)
         if np.linalg.norm(a) > np.linalg.norm(b):
-            first, last, a, b = last, first, b, a
-        off = np.linalg.norm(b) / np.linalg.norm(a) / ratio
-        depth = settings.depth_ratio
-        if bend < settings.max_bend and 1 / depth < off < depth:
-            found.append((first, middle, last))
+            near, far, a, b = far, near, b, a
+        if bend < settings.max_bend:
+            found.append(((near, middle, far), float(np.linalg.norm(b) / np.linalg.norm(a))))
     return found
 
 
@@ -226,9 +235,9 @@ def _name_two(
     ]
     for camera, own in marks.items():
         number = len(_by_frame(own)) - len(frames[camera])
-        said += [f"camera {camera!r}: {count(number, 'frame')} without two markers not used"] * bool(
-            number
-        )
+        said += [
+            f"camera {camera!r}: {count(number, 'frame')} without two markers not used"
+        ] * bool(number)
     if not any(found.values()):
         raise InputError(
             "the two markers look alike, and the rays of no two cameras tell them apart: expected "
@@ -252,9 +261,7 @@ def _turns_of_pair(
 ) -> Turns:
     """Of the common frames of two cameras whose assignment is clear, which it is."""
     common = [
-        frame
-        for frame in one
-        if frame in other and np.isfinite([one[frame], other[frame]]).all()
+        frame for frame in one if frame in other and np.isfinite([one[frame], other[frame]]).all()
     ]
     # 5 points determine an orientation and 5 frames have 20 pairings, half of them wrong; with
     # three times as many a wrong one does not agree by chance
