@@ -110,13 +110,13 @@ def calibrate_wand(  # noqa: PLR0913 - the options of the command
         print_result(result, json, quiet)
 
 
-def sigma_of_length(given: float | None, unit: str) -> float:
+def sigma_of_length(given: float | None, unit: str, option: str = "--sigma-length") -> float:
     """σ of the lengths in their unit, 0.1 mm if not given.
 
     **Raises:** `InputError` if that is not known in this unit."""
     in_unit = {"m": 1e-4, "cm": 1e-2, "mm": 0.1}
     if given is None and unit not in in_unit:
-        raise InputError(f"--sigma-length: expected the σ of the lengths in {unit}")
+        raise InputError(f"{option}: expected the σ of the lengths in {unit}")
     return in_unit[unit] if given is None else given
 
 
@@ -128,7 +128,7 @@ def split_named(given: str, expected: str) -> tuple[str, str]:
     return name, rest
 
 
-def cameras_by_name(files: Sequence[str], names: Sequence[str]) -> dict:
+def cameras_by_name(files: Sequence[str], names: Sequence[str], option: str = "--cameras") -> dict:
     """Interior orientations by the name of the camera."""
     from jaxbundle.io import read_cameras
     from jaxbundle.network.columns import list_some
@@ -148,8 +148,8 @@ def cameras_by_name(files: Sequence[str], names: Sequence[str]) -> dict:
     missing = [name for name in names if name not in found]
     if missing:
         raise InputError(
-            f"--cameras: no camera {missing[0]!r}; the files have "
-            f"{list_some(list(found)) or 'none'}; expected a camera of each name, or --cameras "
+            f"{option}: no camera {missing[0]!r}; the files have "
+            f"{list_some(list(found)) or 'none'}; expected a camera of each name, or {option} "
             f"{missing[0]}=FILE"
         )
     return {name: found[name] for name in names}

@@ -124,11 +124,12 @@ def frames_of_video(path: Path) -> Iterator[UInt8[np.ndarray, "rows columns"]]:
     """The grey values of all frames of a video.
 
     **Raises:** `InputError` if it is not a video, or has no frames."""
-    number = 0
+    empty = True
     with _opened(path) as video:
-        for number, grey in enumerate(_grey_frames(video), 1):
+        for grey in _grey_frames(video):
+            empty = False
             yield grey
-    if not number:
+    if empty:
         raise InputError(f"{path}: a video without frames")
 
 

@@ -154,7 +154,7 @@ def test_another_wand_is_said():
     """Lengths that no frame fits: the ratio that the markers have is said, within perspective."""
     marks = [Mark(str(f), "", x, y) for f, _, x, y in zip(*waved()["c0"].values())]
     for pairs in ({("A", "B"): 0.1, ("B", "C"): 0.4}, {("A", "B"): 0.05, ("A", "C"): 0.5}):
-        with pytest.raises(InputError, match=r"as 1 : \d+\.00; those in a line are at 1 : 2\.[2-5]"):
+        with pytest.raises(InputError, match=r"as 1 : \d+\.00; those in a line are at 1 : 2\."):
             name_three("c0", marks, CAMERAS["c0"], pairs, WandSettings())
 
 

@@ -2,8 +2,10 @@
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
+from scipy.spatial.transform import Rotation
 
 from jaxbundle.cameras import get_model, project
+from jaxbundle.measure import Board, BoardViews
 
 
 def markers_in_images(camera, R, X0, ends, places):
@@ -22,6 +24,33 @@ def wave(frames, seed=5, length=0.5):
     along = rng.normal(size=(frames, 3))
     along *= length / np.linalg.norm(along, axis=1)[:, None]
     return np.stack([middle - along / 2, middle + along / 2], 1)
+
+
+BOARD = Board(8, 6, 0.1)
+
+
+def views_of_board(room, name, seed=0, epochs=12, noise=0.1):
+    """A board in the middle of the `room`, turned towards its first two cameras, as one sees it."""
+    shape, rng = np.random.default_rng(3), np.random.default_rng([seed, 7, int(name[1])])
+    k, camera = int(name[1]), room.CAMERAS[name]
+    p, size = tuple(camera.parameters.values()), np.array(camera.image_size)
+    z = (room.PLACES[0] + room.PLACES[1]) / 2 - [0, 0, 1]
+    z /= np.linalg.norm(z)
+    x = np.cross([0, 0, 1.0], z) / np.linalg.norm(np.cross([0, 0, 1.0], z))
+    facing = np.stack([x, np.cross(z, x), z], 1)
+    names, found = [], []
+    for epoch in range(epochs):
+        angles = [*shape.uniform(-25, 25, 2), 90 * (epoch % 4)]
+        R = facing @ Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
+        X = (BOARD.points - BOARD.points.mean(0)) @ R.T + [0, 0, 1] + shape.uniform(-0.5, 0.5, 3)
+        ray = (X - room.PLACES[k]) @ room.ROTATIONS[k].T
+        uv = np.stack([np.asarray(a) for a in project(get_model(camera.model), p, *ray.T)], -1)
+        inside = ((uv > 3) & (uv < size - 4)).all(1)
+        uv = np.where(inside[:, None], uv + noise * rng.normal(size=uv.shape), np.nan)
+        if inside.sum() >= 20:
+            names.append(f"f_{epoch:03d}.png")
+            found.append(uv)
+    return BoardViews(BOARD, tuple(names), camera.image_size, np.array(found))
 
 
 def render_frame(uv, size, rng, radius=3.0, dark=False, lamps=((100, 60),)):

@@ -57,13 +57,15 @@ COLUMNS = "frame, x, y, marker, sx and sy (σ)"
 class WandCalibration(TableMethods):
     """Cameras calibrated by a wand; **Fields:** `adjustment`: the result of all observations;
     `names` of the cameras, the first is the reference; `scale_sigma`: relative σ of the scale, by
-    the lengths of the wand; `notes`: what was not used; `markers` by camera, with their names."""
+    the lengths of the wand; `notes`: what was not used; `markers` by camera, with their names;
+    `lengths` between them."""
 
     adjustment: Adjustment
     names: tuple[str, ...]
     scale_sigma: float = 0.0
     notes: tuple[str, ...] = ()
     markers: Mapping[str, Marks] = dataclasses.field(default_factory=dict, repr=False)
+    lengths: Mapping[tuple[str, str], float] = dataclasses.field(default_factory=dict)
 
     @property
     def converged(self) -> bool:
@@ -243,7 +245,7 @@ def calibrate_wand(
     if object_unit == "m" and longest > 10:
         said += [f"the wand is {longest:g} m long: is this in mm? Lengths and σ are of one unit"]
     scale = sigma_length / float(np.sqrt(np.sum(np.square([*pairs.values()]))))
-    return WandCalibration(result, tuple(markers), scale, (*notes, *said), marks)
+    return WandCalibration(result, tuple(markers), scale, (*notes, *said), marks, pairs)
 
 
 def _residuals_over_sigma(result: Adjustment, cameras: Collection[str]) -> float:

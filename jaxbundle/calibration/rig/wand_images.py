@@ -1,6 +1,5 @@
 """Markers of a wand measured in photographs or a video of every camera."""
 
-import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
