@@ -12,6 +12,8 @@ METHODS = ("levenberg-marquardt", "gauss-newton")
 REDUCTIONS = ("dense", "banded", "iterative")
 # Robust estimators.
 ESTIMATORS = ("huber", "cauchy", "tukey")
+# What the markers of a wand are in an image.
+MARKERS_OF_A_WAND = ("bright", "dark")
 # Tests of data snooping.
 TESTS = ("pope", "baarda")
 # Where a priori σ come from: somebody stated them; nobody did, so that they are units of weight;

@@ -460,7 +460,7 @@ def _rig_rms(subject: Subject, argument: str) -> QuantityValues:
     if argument and argument not in rig.rms:
         raise InputError(f"there is no camera {argument!r}{did_you_mean(argument, rig.rms)}")
     chosen = {f"camera {n}": v for n, v in rig.rms.items() if argument in ("", n)}
-    return QuantityValues(chosen, "px", _pitch([one.camera for one in rig.cameras.values()]))
+    return QuantityValues(chosen, "px", _pitch([rig.camera(n) for n in rig.names]))
 
 
 def _rig_sigma(subject: Subject, argument: str) -> QuantityValues:
@@ -473,7 +473,7 @@ def _rig_sigma(subject: Subject, argument: str) -> QuantityValues:
         camera, _, name = name.rpartition(":")
     if camera not in ("*", *rig.names):
         raise InputError(f"there is no camera {camera!r}{did_you_mean(camera, rig.names)}")
-    cameras = {n: rig.cameras[n].camera for n in rig.names if camera in ("*", n)}
+    cameras = {n: rig.camera(n) for n in rig.names if camera in ("*", n)}
     values = {f"{name} of camera {n}": rig.sigma[n][name] for n in cameras if name in rig.sigma[n]}
     if not values:
         require_parameter(cameras.values(), name)
