@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxbundle.adjustment.quality.correlated_errors import DEFAULTS, CorrelationSettings
 from jaxbundle.batches.correlated import (
@@ -22,7 +22,7 @@ from jaxbundle.batches.correlated import (
     ComponentParts,
     ComponentTraces,
 )
-from jaxbundle.leastsquares.quality.estimated_sizes import SizeEquations, widening
+from jaxbundle.leastsquares.quality.estimated_sizes import SizeEquations, widening, widenings
 from jaxbundle.leastsquares.quality.size_traces import with_traces
 
 
@@ -123,11 +123,15 @@ class SizedParts(NamedTuple):
             interior[:, 0], pose[:, 0] = sums.interior, sums.pose
         return SizedParts(factor, interior, pose)
 
-    def tables(self, n: int, of: np.ndarray) -> list[Float[np.ndarray, "k unknowns"]]:
-        """The variances that components of θ = 1 give the unknowns of a camera, and of its
+    def tables(
+        self, some: Int[np.ndarray, " n"], of: Int[np.ndarray, " k"]
+    ) -> list[Float[np.ndarray, "n k unknowns"]]:
+        """The variances that components of θ = 1 give the unknowns of some cameras, and of their
         views."""
-        interior = np.diagonal(self.interior[n, of], axis1=1, axis2=2)
-        return [interior, np.nan_to_num(self.pose[n, of].reshape(len(of), -1))]
+        block = np.ix_(some, of)
+        interior = np.diagonal(self.interior[block], axis1=2, axis2=3)
+        pose = self.pose[block].reshape(len(some), len(of), -1)
+        return [np.nan_to_num(interior), np.nan_to_num(pose)]
 
 
 def _sizes_of_each(
@@ -151,7 +155,8 @@ def _sizes_of_each(
         of = np.flatnonzero(shown[n])
         block = np.ix_(of, of)
         known = theta[n, of], T[n][block], forms[n][block]
-        parts.factor[n, of] = widening(*known, parts.tables(n, of))
+        tables = [table[0] for table in parts.tables(np.array([n]), of)]
+        parts.factor[n, of] = widening(*known, tables)
     return theta, parts
 
 
@@ -193,6 +198,6 @@ def _common_sizes(
         forms = times * away.T @ away
     else:
         forms = times * programs.scatter(np.nan_to_num(theta))[traced].sum(0)[block]
-    for n in known.tolist():
-        parts.factor[n, of] = widening(theta[n, of], together, forms, parts.tables(n, of))
+    tables = parts.tables(known, of)
+    parts.factor[np.ix_(known, of)] = widenings(theta[np.ix_(known, of)], together, forms, tables)
     return theta, parts

@@ -4,7 +4,6 @@ results in the order of the cameras and views of the user.
 Portions come one after the other: large products use all cores, and two programs that wait for the
 same threads never end."""
 
-import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -13,7 +12,7 @@ from jaxtyping import Bool, Float, Shaped
 
 from jaxbundle.adjustment.quality.correlated_errors import DEFAULTS
 from jaxbundle.batches.camera import CONVERGED
-from jaxbundle.batches.compiled import ProgramKey, Rows, in_double
+from jaxbundle.batches.compiled import ProgramKey, Rows
 from jaxbundle.batches.correlated import (
     COMPONENTS,
     SUMS,
@@ -112,7 +111,8 @@ def _adjusted(portion: Portion, rows: Rows) -> tuple[Sightings, CameraUnknowns]:
     weight = np.asarray(portion.seen.weight) * rows["views"][:, :, None]
     if "removed" in rows:
         weight = weight * ~rows["removed"]
-    seen = in_double(dataclasses.replace(portion.seen, weight=weight))
+    numbers = portion.seen.point, portion.seen.xy, weight
+    seen = Sightings(*(np.asarray(x, float) for x in numbers))
     return seen, CameraUnknowns(rows["interior"], rows["quaternion"], rows["shift"])
 
 
