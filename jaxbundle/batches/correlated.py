@@ -386,16 +386,24 @@ class OntoSpans(NamedTuple):
 
 
 def _spans(model: CameraModel, free: tuple[int, ...], seen: Sightings, at: CameraUnknowns) -> Spans:
-    x, y = (jnp.stack(columns, -1) for columns in design(model, free, seen, at))
-    rows = jnp.stack([x, y], 1)  # [views, 2, points, 6 + k + 1]
-    E, J, v = rows[..., :POSE], rows[..., POSE:-1], rows[..., -1]
+    columns = [jnp.stack(axis, 1) for axis in design(model, free, seen, at)]
+    rows = jnp.stack(columns, 2)  # [views, 6 + k + 1, 2, points]
+    E, J, v = rows[:, :POSE], rows[:, POSE:-1], rows[:, -1]
     W, L = _orthonormal(E, jnp.asarray(seen.weight))
-    WJ = jnp.einsum("veap,vapk->vek", W, J)
-    Z, R = _orthonormal_of_all(J - jnp.einsum("veap,vek->vapk", W, WJ))
+    WJ = _products(W, J)
+    Z, R = _orthonormal_of_all(J - jnp.einsum("vek,veap->vkap", WJ, W))
     # ray = M·X + t: of a point as of the shift, turned
     turns = jax.vmap(matrix_from_quaternion)(at.rotation)
-    by_point = jnp.einsum("vapi,vij->vapj", E[..., :3], turns)
-    return Spans(W, Z, L, R, WJ, v, by_point)
+    by_point = [sum(turns[:, i, j, None, None] * E[:, i] for i in range(3)) for j in range(3)]
+    return Spans(W, Z, L, R, WJ, v, jnp.stack(by_point, -1))
+
+
+def _products(
+    a: Float[Array, "views m 2 points"], b: Float[Array, "views n 2 points"]
+) -> Float[Array, "views m n"]:
+    """Of all rows of the views."""
+    flat = lambda x: x.reshape(*x.shape[:2], -1)
+    return flat(a) @ flat(b).swapaxes(1, 2)
 
 
 def _spans_and_roots(
@@ -600,29 +608,26 @@ def _of_poses(
 
 
 def _orthonormal(
-    E: Float[Array, "views 2 points 6"], used: Float[Array, "views points"]
+    E: Float[Array, "views 6 2 points"], used: Float[Array, "views points"]
 ) -> tuple[Float[Array, "views 6 2 points"], Float[Array, "views 6 6"]]:
-    """Rows W that span the columns of every view, and L of EᵀE = L·Lᵀ; of views without points W is
+    """Rows W that span those of every view, and L of EEᵀ = L·Lᵀ; of views without points W is
     zero."""
-    N = jnp.einsum("vape,vapf->vef", E, E)
+    N = _products(E, E)
     none = ~(used.sum(1) > 0)
     scale = jax.lax.rsqrt(jnp.where(none[:, None], 1.0, jnp.diagonal(N, axis1=1, axis2=2)))
     N = N * scale[:, :, None] * scale[:, None, :] + none[:, None, None] * jnp.eye(POSE)
     L = jnp.linalg.cholesky(N)
-    solve = jax.vmap(lambda l, b: jax.scipy.linalg.solve_triangular(l, b, lower=True))
-    views, _, points, _ = E.shape
-    flat = (E * scale[:, None, None, :]).reshape(views, 2 * points, POSE).swapaxes(1, 2)
-    return solve(L, flat).reshape(views, POSE, 2, points), L / scale[:, :, None]
+    eye = jnp.broadcast_to(jnp.eye(POSE), N.shape)
+    inverse = jax.scipy.linalg.solve_triangular(L, eye, lower=True) * scale[:, None, :]
+    return jnp.einsum("vef,vfap->veap", inverse, E), L / scale[:, :, None]
 
 
 def _orthonormal_of_all(
-    J: Float[Array, "views 2 points k"],
+    J: Float[Array, "views k 2 points"],
 ) -> tuple[Float[Array, "views k 2 points"], Float[Array, "k k"]]:
-    """Rows Z that span the columns of all views together, and R of JᵀJ = R·Rᵀ."""
-    N = jnp.einsum("vapk,vapl->kl", J, J)
+    """Rows Z that span those of all views together, and R of JJᵀ = R·Rᵀ."""
+    N = jnp.sum(_products(J, J), 0)
     scale = jax.lax.rsqrt(jnp.diagonal(N))
     R = jnp.linalg.cholesky(N * scale[:, None] * scale)
-    flat = (J * scale).reshape(-1, len(scale)).T
-    views, _, points, k = J.shape
-    Z = jax.scipy.linalg.solve_triangular(R, flat, lower=True)
-    return Z.reshape(k, views, 2, points).swapaxes(0, 1), R / scale[:, None]
+    inverse = jax.scipy.linalg.solve_triangular(R, jnp.eye(len(R)), lower=True) * scale
+    return jnp.einsum("kl,vlap->vkap", inverse, J), R / scale[:, None]
