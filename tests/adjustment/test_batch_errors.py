@@ -85,8 +85,8 @@ def test_traces_are_those_of_an_adjustment(network, monkeypatch):
 
     monkeypatch.setattr(jaxbundle.batches.calibrate, "batch_errors", watched)
     of_batch(network, correlated="camera")
-    T, equations = seen[0].T[0], result.error_model.equations
-    cubes = with_traces(seen[0].cubes[0], T)
+    T, equations = seen[0].traces.T[0], result.error_model.equations
+    cubes = with_traces(seen[0].traces.cubes[0], T)
     # 16 random combinations of the columns of the last two; rest: exact to single precision
     few = np.ix_(range(5), range(5))
     np.testing.assert_allclose(T[few], equations.T[few], rtol=1e-3)
