@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxbundle.arguments import numeric_array
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.io.rasters.maps import describe_distance
@@ -159,6 +160,8 @@ def surface(  # noqa: PLR0913 (public: the options of the command, all but one b
         raise InputError("--orthophoto: needs --dsm, the size of its pixels")
     # read before matching, which takes minutes: its errors come at once
     given = read_cloud(check).X if isinstance(check, str | Path) else check
+    if given is not None:
+        given = numeric_array("check", given, "coordinates X, Y, Z [n, 3]")
     options = {"points": points, "step": step, "dense": dense, "settings": settings}
     say = tell or (lambda _: None)
     # photographs come in one folder, scanner and RPC images one by one

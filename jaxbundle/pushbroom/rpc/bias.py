@@ -29,7 +29,7 @@ from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, earth_fixed, geodetic
 from jaxbundle.geometry.vectors import Vector, along
 from jaxbundle.leastsquares.indexing.indices import round_up
 from jaxbundle.network.tables import Source
-from jaxbundle.pushbroom.rpc.fitting import RpcCheck, RpcTable, check_rpc, fit_rpc
+from jaxbundle.pushbroom.rpc.fitting import RpcCheck, RpcTable, check_rpc, fit_rpc, plain_table
 from jaxbundle.pushbroom.rpc.polynomials import DOMAIN_MARGIN, Rpc, Scalar, project, project_points
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
@@ -100,7 +100,7 @@ def fit_bias(
     require_x64()
     if model not in MODELS:
         raise InputError(f"unknown bias {model!r}; one of {', '.join(MODELS)} is expected")
-    control = RpcTable(*(np.asarray(column, float) for column in control))
+    control = plain_table(control)
     n, k = len(control.line), MODELS[model]
     for name, column in zip(control._fields, control):
         if (bad := ~np.isfinite(column)).any():
