@@ -80,8 +80,7 @@ def find_still_scene(frames: Iterable[Grey], settings: BlobSettings) -> StillSce
         number += 1
     if number < 3:
         raise InputError(
-            f"{count(number, 'frame')}; expected three or more, with the wand at different "
-            "places"
+            f"{count(number, 'frame')}; expected three or more, with the wand at different places"
         )
     stack = _brighten(np.array(kept), settings)
     # of an even number the lower of the middle two: a marker in half of the frames is none of it
