@@ -27,8 +27,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxbundle.adjustment.quality.correlated_errors import CorrelationSettings
+from jaxbundle.adjustment.quality.given_points import GIVEN_POINTS
 from jaxbundle.batches.compiled import ProgramKey, exterior_slopes
 from jaxbundle.batches.error_roots import (
+    GIVEN_AXES,
     correlation_of_given,
     correlation_of_views,
     displacements_by_view,
@@ -36,7 +38,7 @@ from jaxbundle.batches.error_roots import (
     field_form,
     fields_of_camera,
     given_points,
-    mean_square_of_given,
+    mean_squares_of_given,
     places_on_sensor,
     root_of_views,
 )
@@ -59,10 +61,10 @@ COMPONENTS = (
     "principal distance by view",
     "affine by view",
     "along tracks",
-    "given points",
+    *GIVEN_POINTS,
 )
 FIELD, TRACKS, GIVEN = map(
-    COMPONENTS.index, ("field on the sensor", "along tracks", "given points")
+    COMPONENTS.index, ("field on the sensor", "along tracks", GIVEN_POINTS[0])
 )
 # Columns of the components by view among five: displacements of x and y.
 BY_VIEW = (slice(0, 2), slice(2, 3), slice(3, 5))
@@ -179,7 +181,8 @@ class Roots(eqx.Module):
         field, of_view, track, point = products
         square = lambda a: jnp.sum(a**2, range(1, a.ndim))
         parts = [square(u), square(field), *(square(of_view[..., of]) for of in BY_VIEW)]
-        return jnp.stack([*parts, square(track), square(point)], 1)
+        of_points = [square(point[:, of]) for of in GIVEN_AXES]
+        return jnp.stack([*parts, square(track), *of_points], 1)
 
     def along_tracks(self, z: Float[Array, "r views 2 points"]) -> Array:
         """F·z of errors along tracks."""
@@ -203,7 +206,8 @@ class Roots(eqx.Module):
         of_view = jnp.repeat(size[2:TRACKS], jnp.array([2, 1, 2]), total_repeat_length=5)
         e += jnp.einsum("vapc,rvc->rvap", self.by_view, of_view * normal(2, views, 5))
         e += size[TRACKS] * self.along_tracks(normal(3, views, 2, points))
-        return e + size[GIVEN] * self.of_points(normal(4, 3, points))
+        of_axes = jnp.repeat(size[GIVEN:], jnp.array([2, 1]), total_repeat_length=3)
+        return e + self.of_points(of_axes[:, None] * normal(4, 3, points))
 
 
 def _single(tree: Any) -> Any:
@@ -314,12 +318,13 @@ def _forms(
     K = correlation_of_views(at, used, settings.reach, seen)
     along_tracks = jnp.sum(jnp.einsum("vw,wap->vap", K, v) * v)
     # sums over leading axes, which are vectorised
-    given, square = given_points(used), jnp.sum(by_point**2, (0, 1))
+    given, squares = given_points(used), jnp.sum(by_point**2, 1)
     K = correlation_of_given(jnp.asarray(seen.point), used, settings)
     point = jnp.sum(by_point * by_axis, (1, 2)) * given
-    of_points = jnp.sum((point @ K) * point) / mean_square_of_given(used, square)
+    of_axes = jnp.sum((point @ K) * point, 1) / mean_squares_of_given(used, squares)
+    of_points = [jnp.sum(of_axes[of]) for of in GIVEN_AXES]
     field = field_form(place, used, v, settings)
-    q = jnp.stack([jnp.sum(v**2), field, *by_view, along_tracks, of_points])
+    q = jnp.stack([jnp.sum(v**2), field, *by_view, along_tracks, *of_points])
     parts: list[Any] = [q, jnp.sum(given).astype(float)]
     return ComponentForms(*parts)
 
@@ -349,9 +354,9 @@ def _parts(
         splines, octaves, _ = fields_of_camera(place, used, settings)
         return _of_columns(*_onto_field(spans, splines, octaves), 2 * used.sum())
 
-    def of_given() -> Covariances:
+    def of_given(axes: slice) -> Covariances:
         K = correlation_of_given(jnp.asarray(seen.point), used, settings)
-        by_point = effects_of_given(used, spans.by_point)
+        by_point = effects_of_given(used, spans.by_point)[..., axes]
         return _of_given(spans, by_point, jnp.linalg.cholesky(K))
 
     def along_tracks() -> Covariances:
@@ -367,7 +372,7 @@ def _parts(
         if_wanted(FIELD, of_field),
         *_by_view(spans, displacements_by_view(on_sensor, used)),
         if_wanted(TRACKS, along_tracks),
-        if_wanted(GIVEN, of_given),
+        *(if_wanted(GIVEN + n, partial(of_given, of)) for n, of in enumerate(GIVEN_AXES)),
     ]
     interior = jnp.stack([_of_interior(spans, c) for c in found])
     slopes = jax.vmap(exterior_slopes, (0, 0, None, None))(at.rotation, at.shift, axes, middle)
@@ -502,10 +507,11 @@ def _traces(spans: Spans, roots: Roots, signs: tuple[Array, Array]) -> Component
         through = FewColumns(field.T @ field, by_view.T @ field, by_view.T @ by_view)
         cubes = cubes.at[k].set(S.sums(through))
     # of random combinations of the columns of the others
-    errors = [roots.along_tracks(signs[0]), roots.of_points(signs[1])]
+    masks = [jnp.zeros((3, 1)).at[axes].set(1.0) for axes in GIVEN_AXES]
+    errors = [roots.along_tracks(signs[0]), *(roots.of_points(signs[1] * one) for one in masks)]
     remaining = jnp.stack([c.remaining for c in _covariances(spans, roots, projected)])
     spans, roots = _single((spans, roots))
-    for k, e in zip((TRACKS, GIVEN), _single(errors)):
+    for k, e in zip(range(TRACKS, count), _single(errors)):
         u = spans.residuals(e)
         products = roots.products(u)
         found = roots.forms_of(u, products).mean(0)
@@ -515,16 +521,20 @@ def _traces(spans: Spans, roots: Roots, signs: tuple[Array, Array]) -> Component
         cubes = cubes.at[k].set(S.sums(pairs))
         # half of them again: M·F·(Fᵀ·M·F·ξ)
         half = [x[: SUMS.probes // 2] for x in products]
-        e = roots.along_tracks(half[2]) if k == TRACKS else roots.of_points(half[3])
+        e = (
+            roots.along_tracks(half[2])
+            if k == TRACKS
+            else roots.of_points(half[3] * _single(masks[k - GIVEN]))
+        )
         z = spans.residuals(e)
         more = [x * y for x, y in zip(roots.products(z), half)]
         own = jnp.zeros(count).at[k].set(jnp.sum(z**2)).at[FIELD].set(jnp.sum(more[0]))
         for j, columns in enumerate(BY_VIEW, FIELD + 1):
             own = own.at[j].set(jnp.sum(more[1][..., columns]))
         cubes = cubes.at[k, k].set(own / (SUMS.probes // 2))
-    T = T.at[:, TRACKS].set(T[TRACKS]).at[:, GIVEN].set(T[GIVEN])
-    both = (T[TRACKS, GIVEN] + T[GIVEN, TRACKS]) / 2
-    T = T.at[TRACKS, GIVEN].set(both).at[GIVEN, TRACKS].set(both)
+    # of two of them from the combinations of both
+    both = (T[TRACKS:, TRACKS:] + T[TRACKS:, TRACKS:].T) / 2
+    T = T.at[:, TRACKS:].set(T[TRACKS:].T).at[TRACKS:, TRACKS:].set(both)
     T = T.astype(float).at[0].set(remaining).at[:, 0].set(remaining)
     parts: list[Any] = [T, cubes.astype(float)]
     return ComponentTraces(*parts)
@@ -540,7 +550,7 @@ def _covariances(spans: Spans, roots: Roots, of: OntoSpans) -> list[Covariances]
         _of_columns(of.WB, of.ZB, rows),
         *_by_view(spans, roots.by_view),
         _along_tracks(spans, roots.used, roots.views @ roots.views.T),
-        _of_given(spans, roots.by_point, roots.points),
+        *(_of_given(spans, roots.by_point[..., axes], roots.points) for axes in GIVEN_AXES),
     ]
 
 
@@ -577,9 +587,9 @@ def _along_tracks(
 
 
 def _of_given(
-    spans: Spans, by_point: Float[Array, "views 2 points 3"], root: Float[Array, "points points"]
+    spans: Spans, by_point: Float[Array, "views 2 points axes"], root: Float[Array, "points points"]
 ) -> Covariances:
-    """Of errors of given points with a root of their correlation."""
+    """Of errors of given points along some axes with a root of their correlation."""
     W, Z = spans.W, spans.Z
     WG = jnp.einsum("veap,vapd->vedp", W, by_point) @ root
     ZG = jnp.einsum("vkap,vapd->kdp", Z, by_point) @ root

@@ -14,6 +14,10 @@ from jaxbundle.adjustment.quality.given_points import correlation_of_points, wen
 from jaxbundle.batches.normal import CameraUnknowns, Sightings
 from jaxbundle.geometry import matrix_from_quaternion
 
+# Principal axes of the object in each component of given points: the normal of the plane that fits
+# them is the last.
+GIVEN_AXES = (slice(0, 2), slice(2, 3))
+
 
 def places_on_sensor(
     xy: Float[Array, "views points 2"], used: Float[Array, "views points"]
@@ -157,19 +161,23 @@ def correlation_of_given(
 def effects_of_given(
     used: Float[Array, "views points"], by_point: Float[Array, "views 2 points 3"]
 ) -> Float[Array, "views 2 points 3"]:
-    """The effects of errors of given points, of a mean square of one in an image coordinate."""
+    """The effects of errors of given points along the principal axes, those in the plane of the
+    points and those across it each of a mean square of one in an image coordinate."""
     by_point = by_point * given_points(used)[:, None]
-    return by_point / jnp.sqrt(mean_square_of_given(used, jnp.sum(by_point**2, (1, 3))))
+    squares = jnp.moveaxis(jnp.sum(by_point**2, 1), -1, 0)
+    return by_point / jnp.sqrt(mean_squares_of_given(used, squares))
 
 
-def mean_square_of_given(
-    used: Float[Array, "views points"], squares: Float[Array, "views points"]
-) -> Float[Array, ""]:
-    """The mean square of the effects of given points in an image coordinate, from their `squares`
-    in both coordinates and along all axes."""
+def mean_squares_of_given(
+    used: Float[Array, "views points"], squares: Float[Array, "3 views points"]
+) -> Float[Array, "3"]:
+    """The mean squares of the effects of given points in an image coordinate that belong to each
+    axis, from their `squares` in both coordinates: in the plane of both axes together."""
     given = given_points(used)
     rows = 2 * jnp.maximum(jnp.sum(used * given), 1)
-    return jnp.maximum(jnp.sum(squares * given), jnp.finfo(float).tiny) / rows
+    total = jnp.sum(squares * given, (1, 2))
+    of_components = [jnp.broadcast_to(jnp.sum(total[of]), total[of].shape) for of in GIVEN_AXES]
+    return jnp.maximum(jnp.concatenate(of_components), jnp.finfo(float).tiny) / rows
 
 
 def correlation_of_views(
