@@ -197,7 +197,7 @@ def run_bal(problem: str, given: argparse.Namespace) -> dict:
     from jaxbundle.leastsquares.problem import make_solver, pad_data
 
     network = jaxbundle.check_network(jaxbundle.read_network(problem))
-    problem = jaxbundle.make_problem(network, reduction=given.reduction).system
+    problem = jaxbundle.make_problem(network, reduction=given.reduction)
     solver, data = make_solver(problem, max_steps=300), pad_data(problem, problem.data)
 
     def timed():

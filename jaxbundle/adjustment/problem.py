@@ -27,8 +27,8 @@ from jaxbundle.network.declare import DeclaredNetwork, declare, order_cameras
 from jaxbundle.network.kinds.base import among
 from jaxbundle.network.kinds.image_points import image_coordinates
 from jaxbundle.network.retraction import TurnAboutSeen
+from jaxbundle.network.subsets import split_check_points
 from jaxbundle.network.tables import Network, require_network
-from jaxbundle.network.undetermined import split_check_points
 from jaxbundle.types import AnyArray, present
 
 HELD = 1e-6

@@ -22,8 +22,8 @@ from jaxtyping import Bool, Float, Int
 from jaxbundle.adjustment.adjust import adjust
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.network.subsets import keep_points
 from jaxbundle.network.tables import Network
-from jaxbundle.network.undetermined import keep_points
 from jaxbundle.orientation.network import find_start_values
 from jaxbundle.reconstruction.datum import choose_datum_points
 

@@ -10,8 +10,8 @@ from jaxtyping import Float, Int, UInt8
 
 from jaxbundle.io.results.result_project import readjustable_network
 from jaxbundle.network.kinds import Antennas, ExteriorPriors
+from jaxbundle.network.subsets import keep_points
 from jaxbundle.network.tables import GREY, Distances, LeftOut, Network, Points, Source
-from jaxbundle.network.undetermined import keep_points
 from jaxbundle.network.units import from_image_unit
 from jaxbundle.reconstruction.control_choice import ControlChoice
 from jaxbundle.reconstruction.oriented_block import MeasuredPoint, OrientedBlock

@@ -20,8 +20,8 @@ from jaxbundle.adjustment.adjust import adjust
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.kinds import Ties
+from jaxbundle.network.subsets import keep_images, keep_points
 from jaxbundle.network.tables import Images, Network
-from jaxbundle.network.undetermined import keep_images, keep_points
 from jaxbundle.reconstruction.camera_priors import ASPECT, observed_parameters, with_observed
 
 # Normalised deviation, 3.29, beyond which chance (one in a thousand, either sign) does not explain

@@ -18,8 +18,8 @@ from jaxtyping import Bool
 from jaxbundle.adjustment.orient import orient
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.errors import NotSolvedError
+from jaxbundle.network.subsets import keep_images, keep_points
 from jaxbundle.network.tables import Camera, Network
-from jaxbundle.network.undetermined import keep_images, keep_points
 from jaxbundle.orientation.network import Oriented
 from jaxbundle.orientation.rays import TOLERANCE
 from jaxbundle.reconstruction.camera_priors import observed_parameters, with_observed

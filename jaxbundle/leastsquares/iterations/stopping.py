@@ -153,9 +153,9 @@ class Approach(eqx.Module):
         #     if rejected   near ← 0.1·near
         #
         # Alternatives on BAL 49: with an undamped step after every good one, every second
-        # evaluation was wasted; with the tenfold narrowing after a rejection as well, 5 of 60; with
-        # the condition on q as well (measured with 0.1 instead of 0.5) none, and a street of 200
-        # images converges after 31 evaluations instead of 36.
+        # evaluation was wasted; with the tenfold narrowing after a rejection as well, 5 of the
+        # first 60; with the condition on q as well (measured with 0.1 instead of 0.5) none, and a
+        # street of 200 images converges after 31 evaluations instead of 36.
         rules = self.settings
         # A rejected undamped step was tried too early.
         near = jnp.where(jnp.isinf(last_size) & ~accept, rules.narrowing * self.near, self.near)
