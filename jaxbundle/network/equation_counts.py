@@ -11,6 +11,7 @@ from jaxtyping import Int
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.kinds.base import among, rows_of
+from jaxbundle.network.subsets import keep_images, keep_points, record_left_out
 from jaxbundle.network.tables import (
     EXTERIOR,
     Network,
