@@ -17,14 +17,14 @@ from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import transform_point, transform_pose
 from jaxbundle.geometry.similarity import compose, helmert_point
-from jaxbundle.leastsquares.datum.motions import SEVEN
+from jaxbundle.leastsquares.datum.motions import SIMILARITY_PARAMETERS
 from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.network.columns import list_some
 from jaxbundle.orientation.absolute import absolute_orientation
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
-SCALE = SEVEN.index("scale")
+SCALE = SIMILARITY_PARAMETERS.index("scale")
 
 
 @dataclasses.dataclass(frozen=True)

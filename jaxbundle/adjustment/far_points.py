@@ -260,7 +260,7 @@ def _are_pulled_outward(problem: NetworkProblem, values: Values) -> Bool[np.ndar
     free = _hold_at_infinity(problem, np.zeros(number, bool), values)
     solution, slope = Solution(free, values), np.zeros(number)
     for name, rows in problem.image_rows.items():
-        along = solution.residuals[name] * solution.by_eliminated[name][:, :, 2]
+        along = solution.residuals[name] * solution.jacobian_eliminated[name][:, :, 2]
         np.add.at(slope, problem.point[rows], along.sum(1))
     return slope > 0
 

@@ -55,7 +55,7 @@ from jaxbundle.errors import NotSolvedError
 from jaxbundle.io.results.result_json import result_dict
 from jaxbundle.leastsquares.adjust import TableResult, table_result
 from jaxbundle.leastsquares.any_distance import is_at_infinity
-from jaxbundle.leastsquares.datum.motions import SEVEN
+from jaxbundle.leastsquares.datum.motions import SIMILARITY_PARAMETERS
 from jaxbundle.leastsquares.indexing.indices import round_up
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
 from jaxbundle.leastsquares.indexing.rows import Values
@@ -375,7 +375,7 @@ class Adjustment:
         # Only the excess over the datum counts: the observations that fix it fit exactly, whatever
         # their σ.
         held = 3 * int(points.has_role("fixed").sum()) + int((images.sigma == 0).sum())
-        needed = max(len(SEVEN) - self.counts.datum - held, 0)
+        needed = max(len(SIMILARITY_PARAMETERS) - self.counts.datum - held, 0)
         return self.counts.pseudo_observations > needed
 
     def global_test(self, significance: float = 0.05) -> dict:

@@ -19,9 +19,8 @@ from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.leastsquares.datum.defect import find_open_motions, make_datum, survey_motions
 from jaxbundle.leastsquares.declarations import Kind, Motions, ObservationSet, Table
-from jaxbundle.leastsquares.equations.normal import Tangent
 from jaxbundle.leastsquares.indexing.indices import Sizes, common, finish, round_up
-from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.indexing.plan import Plan, Tangent
 from jaxbundle.leastsquares.indexing.planner import make_plan
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
 from jaxbundle.leastsquares.indexing.rows import (

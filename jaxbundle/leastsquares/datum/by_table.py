@@ -15,8 +15,7 @@ from jaxtyping import Array, Float
 from jaxbundle.leastsquares.datum import conditions as datum
 from jaxbundle.leastsquares.datum.motions import JointMotion, move_at_once
 from jaxbundle.leastsquares.declarations import Motions
-from jaxbundle.leastsquares.equations.normal import Tangent
-from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.indexing.plan import Plan, Tangent
 from jaxbundle.leastsquares.indexing.rows import Declared, Values
 from jaxbundle.leastsquares.spaces import Space
 from jaxbundle.system.programs import compile_once
@@ -59,15 +58,15 @@ def move_into_datum(
     curved, free = present(declared.motions).curved, _free(declared, plan, values)
     size = float(datum.largest(pinned.weight, start))
 
-    def further(values: Values) -> tuple[Values, float]:
+    def one_step(values: Values) -> tuple[Values, float]:
         tables = {name: values[name] for name in pinned.weight}
         moves = directions_of_motions(declared, tables)
         away = {
             name: _of_rows(partial(_difference, declared.spaces[name]), value, start[name])
             for name, value in tables.items()
         }
-        missing, slope = datum.equations(pinned, moves, away)
-        step = datum.limit_step(pinned.gauge @ -np.linalg.solve(slope, missing), curved)
+        misclosure, slope = datum.datum_conditions(pinned, moves, away)
+        step = datum.limit_step(pinned.gauge @ -np.linalg.solve(slope, misclosure), curved)
         moved = _move_tables(declared, free, step, values)
         change = {
             name: jax.tree.map(np.subtract, moved[name], values[name]) for name in pinned.weight
@@ -79,7 +78,7 @@ def move_into_datum(
     with np.errstate(all="ignore"):
         while datum.moves_on(size, distance, before, count):
             try:
-                moved, new = further(values)
+                moved, new = one_step(values)
             except np.linalg.LinAlgError:
                 return values, False
             values, distance, before, count = moved, new, distance, count + 1

@@ -3,8 +3,8 @@
 import jax
 import jax.numpy as jnp
 
-from jaxbundle.leastsquares.equations.normal import AnyTangent, Rows, Tangent
-from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.equations.normal import AnyTangent, Rows
+from jaxbundle.leastsquares.indexing.plan import Plan, Tangent
 from jaxbundle.leastsquares.indexing.rows import Declared, Values
 from jaxbundle.leastsquares.spaces import Frame
 

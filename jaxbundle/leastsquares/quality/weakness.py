@@ -27,9 +27,9 @@ from jaxbundle.leastsquares.equations.elimination import (
     regularise_diagonal,
     solve,
 )
-from jaxbundle.leastsquares.equations.normal import Normal, Tangent, normal_equations
+from jaxbundle.leastsquares.equations.normal import Normal, normal_equations
 from jaxbundle.leastsquares.equations.reduced import flat, split
-from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.indexing.plan import Plan, Tangent
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
 from jaxbundle.leastsquares.indexing.rows import Data, Declared, Values, lay_out_data
 from jaxbundle.leastsquares.problem import Problem
@@ -107,8 +107,8 @@ def _weak(
         return Weak()
     per_extent = _of_columns(problem, extents)
     if at_hand:
-        own = found.cofactors.own
-        variance = {g: np.diagonal(np.asarray(own[g]), axis1=1, axis2=2) for g in plan.kept}
+        blocks = found.cofactors.diagonal_blocks
+        variance = {g: np.diagonal(np.asarray(blocks[g]), axis1=1, axis2=2) for g in plan.kept}
         sigma = np.sqrt(np.asarray(flat(plan.kept, variance))) * per_extent
     else:
         sigma = _sigma_of_weakest(found, factor, per_extent)
