@@ -51,7 +51,7 @@ class FarPointSettings:
       parametrisation, and out of the datum, that would have settled.
     - `evaluations_between_checks` of points pulled beyond infinity, or back; doubled whenever no
       point changed. A compromise between iterations with the wrong points held and the cost of a
-      check, which is that of a residual; not critical.
+      check, which is that of a residual.
     - `max_releases`: a point released this often stays at infinity. It ends the cycles that an
       active set may have; few points are released more than once.
     """

@@ -32,8 +32,8 @@ from jaxbundle.network.tables import Network, require_network
 from jaxbundle.types import AnyArray, present
 
 NEGLIGIBLE_MOTION = 1e-6
-"""Below this part of a motion a datum direction counts as none. The directions are unit vectors:
-a motion that is open has a part of the size of one, a determined one rounding. Not critical."""
+"""A datum direction with a smaller part of a motion does not contain it. The directions are unit
+vectors: a motion that is open has a part of the size of one, a determined one rounding."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -158,7 +158,7 @@ def make_problem(
         (retraction or Retraction)(declared),
     )
     problem = problem if motions is None else _with_datum(problem, datum)
-    # Sorting so many observations leaves megabytes in the allocator.
+    # Sorting more observations than this leaves megabytes in the allocator.
     if sum(o.number for o in observations) > 10_000:
         return_freed_memory()
     return problem

@@ -141,7 +141,7 @@ def named_as_features(named: NamedMeasurements, photographs: int) -> list[Featur
 
 
 def match_named(named: NamedMeasurements, photographs: int, least: int) -> list[FeatureMatches]:
-    """Pairs of photographs with at least so many common names, as matches of
+    """Pairs of photographs with at least `least` common names, as matches of
     `named_as_features`."""
     names = np.array(named.name, object)
     row = [

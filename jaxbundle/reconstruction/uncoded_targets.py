@@ -100,7 +100,7 @@ class _Search:
         return d / np.linalg.norm(d, axis=1, keepdims=True)
 
     def accept(self, least: int) -> None:
-        """Accept the points with at least so many rays, pair by pair."""
+        """Accept the points with at least `least` rays, pair by pair."""
         n = len(self.rows)
         for i in range(n):
             for j in range(i + 1, n):

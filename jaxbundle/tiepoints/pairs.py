@@ -13,7 +13,8 @@ from jaxbundle.tiepoints.matching import count_matches_of_largest
 
 @dataclasses.dataclass(frozen=True)
 class CandidateSettings:
-    """Settings of the selection of pairs: one in vain costs a matching, one missed a connection."""
+    """Settings of the selection of pairs: a needless pair costs one matching run; a missed pair
+    loses a connection."""
 
     all_pairs_up_to: int = 60
     """Maximum number of photographs with all pairs matched: 1770 pairs, each a product of two

@@ -217,7 +217,7 @@ def _orient_by_rows(
         settings.first_factor * tolerance[keys],
     )
     poses = {k: (M[i], b[i]) for i, k in enumerate(rows) if part[i] > 0}
-    # matches and orientation by turns, the second time with those of the final tolerance
+    # Matches and orientation alternately, the second time with those of the final tolerance.
     for factor in (settings.first_factor, 1.0):
         poses = _improve(poses, rows, xy1, xy2, factor * tolerance, settings.min_matches)
     agreed = {}

@@ -26,7 +26,7 @@ from jaxbundle.types import present
 
 # Relative size of J·G below which a direction counts as open. Rounding gives about 1e-14, more if
 # coordinates are much larger than the network; what fixes a datum by less than 1e-10 of its
-# observations' own terms is no observation of it. Not critical from 1e-12 to 1e-8.
+# observations' own terms is no observation of it. Values from 1e-12 to 1e-8 decide alike.
 MAX_OPEN_EFFECT = 1e-10
 
 

@@ -155,7 +155,7 @@ class Further(abc.ABC):
         return 1
 
 
-# "from" is a word of Python: the field of this column has another name.
+# "from" is a reserved word of Python: the field of this column has another name.
 COLUMNS_OF_FIELDS = {"start": "from"}
 
 
