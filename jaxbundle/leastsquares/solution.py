@@ -59,8 +59,8 @@ from jaxbundle.types import AnyArray, present
 # Placeholder of the plan in a factor returned by a compiled function.
 PLAN_PLACEHOLDER = "the plan"
 
-# Problems with at least this many observations are distributed over several devices; of smaller ones
-# (5 ms an iteration) the devices would wait for each other longer than they compute.
+# Problems with at least this many observations are distributed over several devices; of smaller
+# ones (5 ms an iteration) the devices would wait for each other longer than they compute.
 MIN_SHARED_OBSERVATIONS = 10_000
 
 # By the name of the set, rows in the given order.

@@ -18,8 +18,8 @@ from jaxbundle.system.rasters import read_heights
 # Triangles near the start value of a point, of which the nearest counts: one and the 12 that share
 # a corner with it in a regular mesh, rounded up.
 CANDIDATES = 16
-# The exact distance is computed of this many triangles with the smallest bounds: long thin ones have
-# small bounds and large distances.
+# The exact distance is computed of this many triangles with the smallest bounds: long thin ones
+# have small bounds and large distances.
 BOUNDED = 128
 # Nodes of a grid on either side of the start value of a point.
 REACH = 4
