@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float, Int
 from jaxbundle.adjustment.adjust import adjust
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.leastsquares.quality.distributions import NORMAL_SIGMA_BY_MAD
 from jaxbundle.network.subsets import keep_points
 from jaxbundle.network.tables import Network
 from jaxbundle.orientation.network import find_start_values
@@ -377,8 +378,7 @@ def _factors(
         checked = np.isfinite(normalised_residual) & (redundancy > 0.05)
         if checked.sum() < 2 * settings.min_measurements:
             continue
-        # 1.4826 = 1/Φ⁻¹(3/4): the median of |v| of a normal distribution as its σ
-        scale = 1.4826 * np.median(normalised_residual[checked])
+        scale = NORMAL_SIGMA_BY_MAD * np.median(normalised_residual[checked])
         # the choice of good ones and the factor depend on each other; five rounds settle both
         for _ in range(5):
             good = checked & (normalised_residual < gross * max(scale, 1e-9))
