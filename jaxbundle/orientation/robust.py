@@ -115,9 +115,9 @@ def robust_limit(
     """OUTLIER_LIMIT·σ with σ = 1.4826·(1 + 5/(n − size))·median e (Rousseeuw and Leroy, 1987, p.
     202)."""
     redundancy = jnp.maximum(jnp.sum(present) - size, 1)
-    # The bracket corrects for the median being too small in a sample chosen to minimise it. At least
-    # 1e-11, a hundred thousand roundings of coordinates of size 1: of exact data the median is
-    # rounding, and half would be gross errors.
+    # The bracket corrects for the median being too small in a sample chosen to minimise it. At
+    # least 1e-11, a hundred thousand roundings of coordinates of size 1: of exact data the median
+    # is rounding, and half would be gross errors.
     sigma = jnp.maximum(NORMAL_SIGMA_BY_MAD * (1 + 5 / redundancy) * _median(e, present), 1e-11)
     return OUTLIER_LIMIT * sigma
 

@@ -21,7 +21,7 @@ from jaxbundle.network.tables import Camera, Network
 from jaxbundle.orientation import batched
 from jaxbundle.reconstruction.adjusting import WeightedAdjustment
 from jaxbundle.tiepoints.track_measurement import Measurements
-from jaxbundle.tiepoints.verified_pairs import ideal_features, present_size
+from jaxbundle.tiepoints.verified_pairs import ideal_features, required_image_size
 
 
 @dataclasses.dataclass(frozen=True)
@@ -183,7 +183,7 @@ def _measured_rays(
 def _field_of_view(camera: Camera) -> Float[np.ndarray, "2 2"]:
     """Limits of x and y, c = 1, of the middle of each side: the corners of a lens with distortion
     reach farther, which costs a few points."""
-    columns, rows = present_size(camera)
+    columns, rows = required_image_size(camera)
     u, v = (columns - 1) / 2, (rows - 1) / 2
     ideal = ideal_features(camera, np.array([[0, v], [2 * u, v], [u, 0], [u, 2 * v]]))
     return np.stack([ideal.min(0), ideal.max(0)])

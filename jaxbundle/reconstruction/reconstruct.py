@@ -70,7 +70,7 @@ from jaxbundle.tiepoints.camera_starts import start_cameras
 from jaxbundle.tiepoints.duplicates import find_duplicates
 from jaxbundle.tiepoints.features import Features, memory_of_features
 from jaxbundle.tiepoints.matching import FeatureMatches
-from jaxbundle.tiepoints.still import without_marks
+from jaxbundle.tiepoints.static_marks import without_marks
 from jaxbundle.tiepoints.store import Store
 from jaxbundle.tiepoints.track_measurement import Measurements, measure_tracks, no_measurements
 from jaxbundle.tiepoints.tracks import choose_tracks, make_tracks

@@ -24,7 +24,7 @@ from jaxbundle.orientation.network import Oriented
 from jaxbundle.orientation.rays import TOLERANCE
 from jaxbundle.reconstruction.camera_priors import observed_parameters, with_observed
 from jaxbundle.reconstruction.misplaced import MisplacedSettings, NamedPairs, find_misplaced
-from jaxbundle.tiepoints.verified_pairs import present_size
+from jaxbundle.tiepoints.verified_pairs import required_image_size
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,7 +147,7 @@ def _try_other_distances(
 ) -> Iterator[Network]:
     cameras = {c.id: c for c in network.cameras if c.id in guessed and c.image_size is not None}
     for factor in settings.other_distances if cameras else ():
-        distances = {id: factor * max(present_size(c)) for id, c in cameras.items()}
+        distances = {id: factor * max(required_image_size(c)) for id, c in cameras.items()}
         ratios = [cameras[id].parameters["fx"] / f for id, f in distances.items()]
         if any(max(r, 1 / r) > settings.distinct_ratio for r in ratios):
             yield _with_distances(network, distances)

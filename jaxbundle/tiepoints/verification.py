@@ -211,12 +211,12 @@ def _orient_by_rows(
         return {}
     keys = np.array(list(rows))
     few = [rows[k][choose(len(rows[k]))] for k in rows]
-    M, b, part, _ = batched.orient_pairs(
+    M, b, share, _ = batched.orient_pairs(
         [xy1[k][r] for k, r in zip(rows, few)],
         [xy2[k][r] for k, r in zip(rows, few)],
         settings.first_factor * tolerance[keys],
     )
-    poses = {k: (M[i], b[i]) for i, k in enumerate(rows) if part[i] > 0}
+    poses = {k: (M[i], b[i]) for i, k in enumerate(rows) if share[i] > 0}
     # Matches and orientation alternately, the second time with those of the final tolerance.
     for factor in (settings.first_factor, 1.0):
         poses = _improve(poses, rows, xy1, xy2, factor * tolerance, settings.min_matches)
@@ -293,11 +293,20 @@ def _agree(
     line2, line1 = np.cross(b, a1) @ M.T, np.cross(back, b)
     square = (line2[:, :2] ** 2).sum(1) + (line1[:, :2] ** 2).sum(1)
     e = np.abs((a2 * line2).sum(1)) / np.sqrt(np.maximum(square, 1e-300))
-    # the signs of both depths s, s₁·a₁ − s₂·Mᵀ·a₂ = b, by normal equations whose determinant is > 0
-    aa, cc, dot = (a1**2).sum(1), (back**2).sum(1), (a1 * back).sum(1)
-    first, second = a1 @ b, back @ b
-    front = (cc * first - dot * second > 0) & (dot * first - aa * second > 0)
-    return (e < tolerance) & front
+    # The determinant is positive: the signs of both depths are those of the numerators.
+    first, second, _ = depths_of_rays(a1, back, b)
+    return (e < tolerance) & (first > 0) & (second > 0)
+
+
+def depths_of_rays(
+    a: Float[np.ndarray, "n 3"], c: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "3"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """The depths s and t of the nearest points s·a and b + t·c of rays in one system, times their
+    determinant (0 for parallel rays), and this: the normal equations of s·a − t·c = b. In NumPy, of
+    many numbers of matches; `orientation.relative.distances_along_rays` is the same for JAX."""
+    aa, cc, dot = (a**2).sum(1), (c**2).sum(1), (a * c).sum(1)
+    first, second = a @ b, c @ b
+    return cc * first - dot * second, dot * first - aa * second, aa * cc - dot * dot
 
 
 def _improve(
@@ -347,6 +356,15 @@ def rotation_angle(M: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n"]:
     across = M - np.swapaxes(M, -1, -2)
     sine = np.sqrt((across**2).sum((-2, -1)) / 8)
     return np.arctan2(sine, (np.trace(M, axis1=-2, axis2=-1) - 1) / 2)
+
+
+def loop_misclosure(
+    ij: Float[np.ndarray, "*n 3 3"],
+    jk: Float[np.ndarray, "*n 3 3"],
+    ik: Float[np.ndarray, "*n 3 3"],
+) -> Float[np.ndarray, "*n"]:
+    """The angle of M_jk·M_ij·M_ikᵀ around three photographs, radians; 0 if the rotations close."""
+    return rotation_angle(jk @ ij @ np.swapaxes(ik, -1, -2))
 
 
 def _used_slots(rows: Sequence[Int[np.ndarray, " _"]]) -> Float[np.ndarray, "pairs slots"]:

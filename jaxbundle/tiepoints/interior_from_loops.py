@@ -27,7 +27,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxbundle.tiepoints.verification import Pair, refine_rotations, rotation_angle
+from jaxbundle.tiepoints.pair_graph import label_connected
+from jaxbundle.tiepoints.verification import Pair, loop_misclosure, refine_rotations
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +73,7 @@ class OrientedPairs:
     """Pairs oriented with a camera, and the coordinates, c = 1, of their matches with another."""
 
     pairs: Sequence[Pair]
-    ideal: Callable[[Interior], Sequence[tuple[np.ndarray, np.ndarray]]]
+    ideal_with: Callable[[Interior], Sequence[tuple[np.ndarray, np.ndarray]]]
 
 
 def close_rotations(
@@ -127,10 +128,10 @@ def _search(
         return None
 
     def total(x: Interior) -> float:
-        M = refine_rotations(pairs, oriented.ideal(x))
+        M = refine_rotations(pairs, oriented.ideal_with(x))
         ij, jk, ik = (M[column] for column in loops.T)
         # a pair that cannot be refined with this camera counts as a half turn
-        angle = np.nan_to_num(rotation_angle(jk @ ij @ np.swapaxes(ik, 1, 2)), nan=np.pi)
+        angle = np.nan_to_num(loop_misclosure(ij, jk, ik), nan=np.pi)
         misclosure = independent * np.log1p((angle / settings.sigma_rotation) ** 2).mean()
         off = (x[0] - middle) / settings.sigma_log_distance, x[1] / settings.sigma_k1
         return misclosure + off[0] ** 2 + off[1] ** 2
@@ -155,16 +156,11 @@ def _search(
 def count_independent(pairs: Sequence[tuple[int, int]]) -> int:
     """The number of independent loops of pairs: edges − nodes + connected components, the
     dimension of the cycle space of a graph."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    photographs, ends = np.unique(np.reshape(pairs, (-1, 2)), return_inverse=True)
-    shape = (len(photographs), len(photographs))
     if not len(pairs):
         return 0
-    i, j = ends.reshape(-1, 2).T
-    groups, _ = connected_components(coo_array((np.ones(len(i)), (i, j)), shape), directed=False)
-    return len(pairs) - len(photographs) + groups
+    photographs, ends = np.unique(np.reshape(pairs, (-1, 2)), return_inverse=True)
+    groups = label_connected(len(photographs), ends.reshape(-1, 2).tolist()).max() + 1
+    return int(len(pairs) - len(photographs) + groups)
 
 
 def find_loops(pairs: Sequence[tuple[int, int]]) -> Int[np.ndarray, "loops 3"]:
