@@ -115,8 +115,8 @@ def reconstruct(
         photographs, settings.targets, control, settings.workers, settings.uncoded
     )
     notes += name_other_files(given)
-    positions, said = find_positions(photographs, control)
-    notes += said
+    positions, messages = find_positions(photographs, control)
+    notes += messages
     framed = positions is not None and positions.define_frame
     notes += name_unused(named, control, distances, 1 if framed else MIN_CONTROL)
     # attitudes are those of the map: without positions in it the frame has another orientation
@@ -186,18 +186,20 @@ class _ReconstructionRun:
             for program in prepared:
                 program.result()
         parts = self._make_parts(features, matches, pairs)
-        said = tuple(
+        verified = tuple(
             (self.names[p.images[0]], self.names[p.images[1]], p.match_count, len(p), p.kind)
             for p in pairs
         )
         files = {p.name: p.path for p in self.photographs}
-        warnings = [said for _, said in sorted(self.warnings, key=lambda warning: -warning[0])]
+        warnings = [text for _, text in sorted(self.warnings, key=lambda warning: -warning[0])]
         # the only part needs no name
         only = f"{parts[0].name}: " if len(parts) == 1 else ""
         notes, warned = (
             tuple(text.removeprefix(only) for text in texts) for texts in (self.notes, warnings)
         )
-        return Reconstruction(tuple(parts), self.left_out, notes, said, files, warned, self.title)
+        return Reconstruction(
+            tuple(parts), self.left_out, notes, verified, files, warned, self.title
+        )
 
     def _match(self) -> tuple[list[Features], list[FeatureMatches]]:
         """Features and matches, without those of duplicates and marks; or the named points."""
@@ -435,15 +437,7 @@ class _ReconstructionRun:
         settings = self.settings
         inside = [p for p in pairs if set(p.images) <= set(group)]
         measured = self._measure(features, inside)
-        network = photograph_network(
-            self.photographs,
-            self.cameras,
-            measured,
-            self.further,
-            self._title_of(name),
-            settings.aspect_sigma,
-            settings.angle_unit,
-        )
+        network = self._make_network(name, measured, self.further)
         self._begin("start values")
         named = {(self.names[p.images[0]], self.names[p.images[1]]): p for p in inside}
         oriented, weighted, note = self._adjust_first(network, measured, named)
@@ -462,7 +456,15 @@ class _ReconstructionRun:
                 f"{name}: {count(weighted.unused_points, 'point')} of two rays not used: with "
                 "them the measurements contradict each other, as on an object that repeats itself"
             )
-        control, no_control = None, ""
+        part = self._finish_part(name, weighted)
+        for doubt in (*self._compare_with_files(part.adjustment), *doubts):
+            self._warn(f"{name}: {doubt}")
+        return part, dict(oriented.images_not_placed)
+
+    def _finish_part(self, name: str, weighted: WeightedAdjustment) -> ReconstructedPart:
+        """An adjusted part in the system of its control, if there is any, with errors that image
+        points share, and notes on what is arbitrary or doubtful."""
+        settings, control, no_control = self.settings, None, ""
         if self.frame is not None:
             # wrong control costs the frame, not the reconstruction
             try:
@@ -489,15 +491,21 @@ class _ReconstructionRun:
             )
         if part.misfit >= DOUBTFUL_MISFIT:
             self._warn(f"{name}: {misfit_in_words(part)}", part.misfit)
-        for said in (*self._compare_with_files(result), *doubts):
-            self._warn(f"{name}: {said}")
-        return part, dict(oriented.images_not_placed)
+        return part
 
-    def _title_of(self, part: str) -> str:
-        """The name of the network of a part: that of the job, from the second part on with the
-        part's own."""
-        first = part in ("", "part 1")
-        return self.title if first and self.title else ", ".join(filter(None, (self.title, part)))
+    def _make_network(self, part: str, measured: Measurements, further: FurtherData) -> Network:
+        """The network of a part, without start values. Its name is that of the job, from the second
+        part on with the part's own."""
+        first = part in ("", "part 1") and self.title
+        return photograph_network(
+            self.photographs,
+            self.cameras,
+            measured,
+            further,
+            self.title if first else ", ".join(filter(None, (self.title, part))),
+            self.settings.aspect_sigma,
+            self.settings.angle_unit,
+        )
 
     def _complete(
         self,
@@ -517,15 +525,7 @@ class _ReconstructionRun:
             f"{len(plain)} of {len(discs)} discs"
         )
         extra = dataclasses.replace(self.further, named=join_named(self.further.named, plain))
-        network = photograph_network(
-            self.photographs,
-            self.cameras,
-            measured,
-            extra,
-            self._title_of(name),
-            settings.aspect_sigma,
-            settings.angle_unit,
-        )
+        network = self._make_network(name, measured, extra)
         return self._adjust_first(network, measured, pairs)
 
     def _compare_with_files(self, result: Adjustment) -> list[str]:
@@ -619,10 +619,12 @@ class _ReconstructionRun:
     def _adjust(self, oriented: Oriented, measured: Measurements) -> tuple[WeightedAdjustment, str]:
         """The adjustment from start values, and a note on attitudes."""
         placed, note = with_attitudes(oriented.network, self.names, self.further.attitudes)
-        kinds, names = _kinds_of_measurements(placed, measured, self.names)
+        classes, class_names = _classify_measurements(placed, measured, self.names)
         significance, weighting = self.settings.significance, self.settings.weighting
-        placed, kept = leave_out_features(placed, kinds == -1, weighting)
-        weighted = adjust_weighted(placed, kinds[kept], names, significance, self._begin, weighting)
+        placed, kept = leave_out_features(placed, classes == -1, weighting)
+        weighted = adjust_weighted(
+            placed, classes[kept], class_names, significance, self._begin, weighting
+        )
         return weighted, note
 
 
@@ -643,17 +645,17 @@ def _not_solved(result: Adjustment) -> NotSolvedError:
     )
 
 
-def _kinds_of_measurements(
+def _classify_measurements(
     network: Network, measured: Measurements, names: Sequence[str]
 ) -> tuple[Int[np.ndarray, " rays"], dict[int, str]]:
-    """The kind of every observation, and the names of kinds, each of which has its own factor of
-    σ."""
+    """The class of every observation, and the names of classes, each of which has its own factor
+    of σ."""
     columns = (measured.image, measured.track, measured.level)
     level = {(names[i], track_name(t)): l for i, t, l in zip(*(c.tolist() for c in columns))}
     rays, images, points = network.observations, network.images.id, network.points.id
     ids = [(images[i], points[p]) for i, p in zip(rays.image.tolist(), rays.point.tolist())]
     # the coarser the level, the fewer its matches: from the second on they share a factor
-    kinds = np.array([min(level[ray], 2) if ray in level else 3 for ray in ids], int)
+    classes = np.array([min(level[ray], 2) if ray in level else 3 for ray in ids], int)
     words = {
         -1: "features not matched",
         0: "matched in the original",
@@ -661,4 +663,4 @@ def _kinds_of_measurements(
         2: "matched at a quarter or smaller",
         3: "named points",
     }
-    return kinds, words
+    return classes, words
