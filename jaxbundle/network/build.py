@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from jaxbundle.arguments import text
+from jaxbundle.arguments import show, text
 from jaxbundle.cameras import CameraModel, is_known
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import (
@@ -36,7 +36,6 @@ from jaxbundle.network.columns import (
     count,
     did_you_mean,
     is_missing,
-    show,
 )
 from jaxbundle.network.kinds import KINDS, SECTIONS, Further
 from jaxbundle.network.rules import (

@@ -13,8 +13,7 @@ from typing import Any, SupportsIndex
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxbundle.arguments import refuse_traced
-from jaxbundle.arguments import show as show
+from jaxbundle.arguments import refuse_traced, show
 from jaxbundle.cameras.names import closest_name
 from jaxbundle.errors import InputError
 from jaxbundle.network.tables import Source

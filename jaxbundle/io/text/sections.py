@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import read_csv, read_toml
 from jaxbundle.io.text.toml_text import assignments
-from jaxbundle.network.columns import Columns, did_you_mean, show
+from jaxbundle.network.columns import Columns, did_you_mean
 from jaxbundle.network.units import ANGLE_UNITS
 
 
