@@ -34,8 +34,8 @@ from jaxbundle.network.columns import (
     RepeatedIds,
     as_columns,
     count,
-    did_you_mean,
     is_missing,
+    refuse_unknown,
 )
 from jaxbundle.network.kinds import KINDS, SECTIONS, Further
 from jaxbundle.network.rules import (
@@ -207,8 +207,7 @@ def make_further(given: Mapping[str, Any], radians: float, where: str = "") -> t
     **Raises:** `InputError`, also for an unknown name, and for settings without a table."""
     known = (*KINDS, *SECTIONS)
     for name in given:
-        if name not in known:
-            raise InputError(f"{where}unknown table {name!r}{did_you_mean(name, known)}")
+        refuse_unknown(name, known, where, "table")
     made = []
     for name, kind in KINDS.items():
         settings = given.get(kind.SECTION, {})
@@ -265,10 +264,7 @@ def _camera(
     if isinstance(model, CameraModel) or is_known(model):
         known = model_of(model, where).parameters
         for key in parameters:
-            if key not in known:
-                raise InputError(
-                    f"{where}unknown key {key!r}{did_you_mean(key, (*CAMERA_FIELDS, *known))}"
-                )
+            refuse_unknown(key, (*CAMERA_FIELDS, *known), where)
     sigma, observed = row.get("sigma", {}), row.get("observed", {})
     for key, given in (("sigma", sigma), ("observed", observed)):
         if not isinstance(given, Mapping):

@@ -245,6 +245,20 @@ def did_you_mean(name: str, known: Iterable[str], *, listing: bool = True) -> st
     return f"; known: {', '.join(known)}" if listing and known else ""
 
 
+def refuse_unknown(name: str, known: Iterable[str], where: str, noun: str = "key") -> None:
+    """Refuse a name other than the `known` ones, as a probable typing error: a setting that is
+    silently ignored would give another result than the user expects.
+
+    **Arguments:** `where` begins the message; `noun`: what the name is of, `section` in brackets.
+
+    **Raises:** `InputError`.
+    """
+    known = tuple(known)
+    if name not in known:
+        shown = f"[{name}]" if noun == "section" else repr(name)
+        raise InputError(f"{where}unknown {noun} {shown}{did_you_mean(name, known)}")
+
+
 def quote(name: Any) -> str:
     """A name in quotes."""
     return repr(str(name))
