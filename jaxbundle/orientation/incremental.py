@@ -191,11 +191,11 @@ def _place_images(
     images, rows, R, xy = _in_planes(sights, model, images, settings)
     if not len(images):
         return 0
-    X0, M, part = batched.resect(
+    X0, M, share = batched.resect(
         xy, [model.X[sights.point[r]] for r in rows], sights.tolerance[images]
     )
     number = np.minimum([len(r) for r in rows], batched.SLOTS)
-    good = (part >= settings.agreeing_share) & (part * number >= settings.min_points)
+    good = (share >= settings.agreeing_share) & (share * number >= settings.min_points)
     for i, image in enumerate(images):
         if good[i]:
             model.place(image, X0[i], R[i].T @ M[i])
