@@ -115,7 +115,7 @@ def influence(given: Adjustment | NetworkProblem, of: Any = CAMERAS) -> Influenc
         name: np.concatenate([column(*part[:4]) for part in parts])[used]
         for name, column in COLUMNS.items()
     }
-    # in units of the classical σ, of which each observation has its share
+    # In units of the classical σ, of which each observation has its share.
     unit = request_results(inspection, IndependentErrors(found, 1.0), of).sigma
     size = np.maximum(unit, 1e-300)
     return Influence(

@@ -550,12 +550,12 @@ class Adjustment:
         """One split of the network into halves, adjusted and compared; None if not requested."""
         if not self.halves_by or not self.converged:
             return None
-        # of held cameras alone there is nothing to compare
+        # Of held cameras alone there is nothing to compare.
         cameras = range(len(self.problem.network.cameras))
         if not any(len(self.problem.free_parameters(c)[1]) for c in cameras):
             return None
         failed = []
-        # a random half may have all rolled photographs, or none, and not determine the camera
+        # A random half may have all rolled photographs, or none, and not determine the camera.
         for second in random_halves(self.problem.network, self.halves_by, MAX_SPLITS, 0):
             try:
                 split = self.compare_halves(second)

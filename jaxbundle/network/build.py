@@ -346,7 +346,7 @@ def _make_images(table: Columns, cameras: Sequence[Camera], radians: float) -> I
 
 
 def _make_points(table: Columns) -> Points:
-    # all columns of coordinates, and of colours, or none
+    # All columns of coordinates, and of colours, or none.
     needed = [n for group in (AXES, POINT_COLOURS) if {*group} & {*table.values} for n in group]
     table.check_names(
         ("id", *needed), ("role", *AXES, *POINT_SIGMAS, *POINT_COLOURS, *POINT_ERRORS)
@@ -383,7 +383,7 @@ def _make_observations(
 ) -> Observations:
     table.check_names(OBSERVATION_COLUMNS, OBSERVATION_SIGMAS)
     if table.values.keys().isdisjoint(OBSERVATION_SIGMAS):
-        # millions of rows of other programs have none
+        # Millions of rows of other programs have none.
         sigma, missing = np.full((len(table), 2), sigma_image or 1.0), len(table) > 0
     else:
         stated = _matrix(table, OBSERVATION_SIGMAS)

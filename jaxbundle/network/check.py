@@ -170,7 +170,7 @@ def _check_images(network: Network) -> None:
     hint = "are these degrees?" if unit == "rad" else f"is {unit!r} right?"
     _refuse(
         images,
-        # a turn, and a little for rounding: degrees read as radians are nearly always more
+        # A turn, and a little for rounding: degrees read as radians are nearly always more.
         np.abs(images.angles) > 2 * math.pi * 1.01,
         "image",
         lambda row, k: (

@@ -141,7 +141,7 @@ def _most_improbable(
     chance explains all."""
     rows = np.flatnonzero(used).tolist()
     few = len(rows) <= MAX_POINTS_FOR_PAIRS
-    # of many points one changes the estimated σ by too little to matter
+    # Of many points one changes the estimated σ by too little to matter.
     common = None if few else _linearise(found, used, used, assumed)
     for tests in ([[i] for i in rows], [list(p) for p in itertools.combinations(rows, 2)] * few):
         if tests and len(tests[0]) <= most:
@@ -274,7 +274,7 @@ def _resolve(
                 s = sigma[group][0] * np.sqrt((Wd[mine] ** 2).sum() / trace)
                 sigma[group] = max(s, assumed)
             if number == 0:
-                # with a σ that dominates C; where the estimate is small, its share is hardly any
+                # With a σ that dominates C; where the estimate is small, its share is hardly any.
                 redundancy[0 if group[:, :2].any() else 1] = float(before[group][0] ** 2 * trace)
         if np.abs(sigma[unknown] / before[unknown] - 1).max() < 1e-3:
             break

@@ -158,7 +158,7 @@ def adjust_weighted(
     )
     try:
         every = weight(network, measurement_class)
-        # two photographs have no points of three rays to compare with
+        # Two photographs have no points of three rays to compare with.
         few = len(network.images) < 3
         if every.adjustment.converged and (few or not _is_doubtful(every, settings)):
             return every
@@ -166,14 +166,14 @@ def adjust_weighted(
         failed = error
     solved = every is not None and every.adjustment.converged
     rays = network.observations
-    # points of another role than tie are checked by their coordinates
+    # Points of another role than tie are checked by their coordinates.
     number = np.bincount(rays.point, minlength=len(network.points))
     several = (number > 2) | ~network.points.has_role("tie")
     clear, measurement_class = keep_points(network, several), measurement_class[several[rays.point]]
     try:
         clearer = weight(clear, measurement_class)
     except (InputError, NotSolvedError):
-        # a photograph has hardly any of these points, or they do not determine it
+        # A photograph has hardly any of these points, or they do not determine it.
         if failed is not None:
             raise failed from None
     else:
@@ -219,7 +219,7 @@ def _count_agreeing(network: Network, clearer: WeightedAdjustment, tolerance: fl
     )
     values, points = result.image_values, network.points
     tie = points.has_role("tie")[:, None]
-    # images are placed, tie points intersected anew: start values count the rays that agree
+    # Images are placed, tie points intersected anew: start values count the rays that agree.
     images = dataclasses.replace(network.images, position=values[:, :3], angles=values[:, 3:])
     points = dataclasses.replace(points, position=np.where(tie, np.nan, points.position))
     placed = network.replace(cameras=cameras, images=images, points=points)
@@ -236,7 +236,7 @@ def adjust_determined(
     those given."""
     rows = np.arange(len(network.observations))
     adjust_again = lambda: adjust(network, max_iterations=limit_iterations(network), **options)
-    # each round may leave further points with one ray; what six do not end is reported as it is
+    # Each round may leave further points with one ray; what six do not end is reported as it is.
     for _ in range(6):
         try:
             result = adjust_again()
@@ -263,7 +263,7 @@ def limit_iterations(network: Network) -> int:
 
 def _are_determined(network: Network, undetermined: Iterable[str]) -> Bool[np.ndarray, " points"]:
     """False for tie points named among the undetermined."""
-    # as `leastsquares.quality.names` writes them: "X of point 17"
+    # As `leastsquares.quality.names` writes them: "X of point 17".
     lost = {name.partition(" of point ")[2] for name in undetermined}
     tie = network.points.has_role("tie")
     return ~(tie & np.isin(np.array(network.points.id, object), [*lost]))
@@ -292,7 +292,7 @@ def _weight(
             settings.suspect_residual * factor_so_far[rows, None]
         )
         suspects = _pairs_of_ids(result, np.any(beyond, axis=1))
-        # once: a datum that changes with each round would change all σ, too
+        # Once: a datum that changes with each round would change all σ, too.
         network = network.replace(datum_points=choose_datum_points(result))
     for _ in range(settings.max_rounds):
         tell("data snooping")
@@ -311,7 +311,7 @@ def _weight(
         if not result.converged:
             break
         rows = _rows(result, network)
-        # gross errors are removed by now: no limit
+        # Gross errors are removed by now: no limit.
         factor = _factors(*_redundancy(result), measurement_class[rows], settings, np.inf)
         if np.all(np.abs(factor - 1) < settings.last_change):
             break
@@ -375,19 +375,19 @@ def _factors(
     gross: float,
 ) -> Float[np.ndarray, " rays"]:
     """Factors of the σ of every ray, from v/σ, of normalised residuals below `gross` factors."""
-    # of rows that are not judged (below): no division by 0
+    # Of rows that are not judged (below): no division by 0.
     r = np.maximum(r, 1e-3)
     factor = np.ones(len(v))
     for number in np.unique(measurement_class):
         rows = measurement_class == number
         normalised_residual, redundancy = np.abs(v[rows]) / np.sqrt(r[rows]), r[rows]
-        # with r below 0.05 less than a twentieth of an error appears in the residual, as much as
-        # rounding and neglected terms
+        # With r below 0.05 less than a twentieth of an error appears in the residual, as much as
+        # rounding and neglected terms.
         checked = np.isfinite(normalised_residual) & (redundancy > 0.05)
         if checked.sum() < 2 * settings.min_measurements:
             continue
         scale = NORMAL_SIGMA_BY_MAD * np.median(normalised_residual[checked])
-        # the choice of good ones and the factor depend on each other; five rounds settle both
+        # The choice of good ones and the factor depend on each other; five rounds settle both.
         for _ in range(5):
             good = checked & (normalised_residual < gross * max(scale, 1e-9))
             scale = np.sqrt(np.sum(v[rows][good] ** 2) / np.sum(redundancy[good]))

@@ -100,7 +100,7 @@ def refuse_superimposed(
     for i, j in np.argwhere(np.triu(clear, 1)).tolist():
         if (min(place[i], place[j]), max(place[i], place[j])) in matched_pairs:
             compared += 1
-            # in one direction only: a blurred photograph, which lacks the points of the other
+            # In one direction only: a blurred photograph, which lacks the points of the other.
             if few[i, j] and few[j, i]:
                 contradictory.append((i, j))
     contradictory.sort(key=lambda pair: -number[pair])
@@ -143,10 +143,10 @@ def count_shared_points(
     ]
     expected, shared = np.zeros((2, n, n), int)
     for j in range(n):
-        # measured counts, even if it was removed as a gross error: what is missing was not found
+        # Measured counts, even if it was removed as a gross error: what is missing was not found.
         there = np.zeros(len(X), bool)
         there[agreeing[j]] = there[seen[j]] = True
-        # within both limits the base is shorter than the rays: others have no expected points
+        # Within both limits the base is shorter than the rays: others have no expected points.
         near = np.linalg.norm(X0 - X0[j], axis=1) < farthest
         for i in np.flatnonzero(near & (np.arange(n) != j)):
             d = X[agreeing[i]] - X0[j]

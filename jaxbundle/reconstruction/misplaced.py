@@ -47,7 +47,7 @@ def find_misplaced(
     it is not known which of them are right."""
     contradicted = _compare(network, pairs, settings)
     misplaced: dict[str, str] = {}
-    # one at a time: the pairs of a misplaced photograph make its neighbours look wrong, too
+    # One at a time: the pairs of a misplaced photograph make its neighbours look wrong, too.
     while True:
         number = Counter(id for pair in contradicted for id in pair)
         bad = Counter(id for pair, wrong in contradicted.items() if wrong for id in pair)
@@ -74,7 +74,7 @@ def _compare(
         if ids[0] in row and ids[1] in row:
             i, j = (row[id] for id in ids)
             turned = rotation_angle(pair.M @ (M[j] @ M[i].T).T) > settings.max_rotation
-            # in the system of the first camera, as the base of the pair
+            # In the system of the first camera, as the base of the pair.
             base = M[i] @ (X0[j] - X0[i])
             angle = np.arctan2(np.linalg.norm(np.cross(base, pair.b)), base @ pair.b)
             clear = pair.kind != "rotation" and pair.angle > settings.sure_base

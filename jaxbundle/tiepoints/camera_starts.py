@@ -66,7 +66,7 @@ def start_cameras(
     """
     verification = verification or VerificationSettings()
     better, notes, sufficient = list(cameras), [], verification.sufficient_matches
-    # relative to the image centres, which are taken as principal points
+    # Relative to the image centres, which are taken as principal points.
     size = lambda k: np.array(required_image_size(cameras[camera_of[k]]))
     centred = lambda k: features[k].xy - (size(k) - 1) / 2
     for number in dict.fromkeys(lens):
@@ -139,7 +139,7 @@ def _close(
     def orient(x: Interior) -> OrientedPairs:
         quiet = lambda *_: None
         pairs = verify(with_interior(x), camera_of, features, matches, quiet, verification)
-        # only the matches that refine a rotation in every evaluation of the search
+        # Only the matches that refine a rotation in every evaluation of the search.
         pairs = [
             dataclasses.replace(pair, matches=pair.matches[batched.spread(len(pair), MATCH_SLOTS)])
             for pair in pairs
@@ -166,7 +166,7 @@ def _ideal_matches(
     camera = np.concatenate([np.full(len(rows), camera_of[k]) for k, rows in sides])
     ends = np.cumsum([len(rows) for _, rows in sides])[:-1]
 
-    # one call for each camera instead of two for each pair
+    # One call for each camera instead of two for each pair.
     def ideal_with(x: Interior) -> list[tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]]:
         xy, cameras = np.empty_like(uv), with_interior(x)
         for c in own:
@@ -209,7 +209,7 @@ def _choose_loops(
     loops = loops[np.argsort(-weakest, kind="stable")]
     pairs = np.array(list(number)).reshape(-1, 2)
     new, chosen = np.ones(len(loops), bool), np.zeros(len(pairs), bool)
-    # each loop has at least a photograph in common with chosen ones, so that they can share pairs:
+    # Each loop has at least a photograph in common with chosen ones, so that they can share pairs:
     # k loops of k + 2 photographs with 2k + 1 pairs are independent, those apart need 3k pairs. To
     # demand a common pair chose the same 60 pairs of three rendered sets of 24 photographs.
     while chosen.sum() < most:

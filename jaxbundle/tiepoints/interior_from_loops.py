@@ -98,8 +98,8 @@ def close_rotations(
             minima.append(minimum)
     if not minima:
         return start
-    # with a wrong camera few pairs are oriented, and a few loops may close by chance: only minima
-    # with more than half of the largest number of loops are compared
+    # With a wrong camera few pairs are oriented, and a few loops may close by chance: only minima
+    # with more than half of the largest number of loops are compared.
     most = max(minimum.independent for minimum in minima)
     many = [minimum for minimum in minima if 2 * minimum.independent > most]
     best = min(many, key=lambda minimum: minimum.per_loop).interior
@@ -130,14 +130,14 @@ def _search(
     def total(x: Interior) -> float:
         M = refine_rotations(pairs, oriented.ideal_with(x))
         ij, jk, ik = (M[column] for column in loops.T)
-        # a pair that cannot be refined with this camera counts as a half turn
+        # A pair that cannot be refined with this camera counts as a half turn.
         angle = np.nan_to_num(loop_misclosure(ij, jk, ik), nan=np.pi)
         misclosure = independent * np.log1p((angle / settings.sigma_rotation) ** 2).mean()
         off = (x[0] - middle) / settings.sigma_log_distance, x[1] / settings.sigma_k1
         return misclosure + off[0] ** 2 + off[1] ** 2
 
-    # without derivatives: each evaluation refines every pair anew (and may lose rays at the
-    # border), and the sum has kinks where wrong loops close
+    # Without derivatives: each evaluation refines every pair anew (and may lose rays at the
+    # border), and the sum has kinks where wrong loops close.
     simplex = first + np.array([[0, 0], [settings.step_log_distance, 0], [0, settings.step_k1]])
     minimum = minimize(
         total,

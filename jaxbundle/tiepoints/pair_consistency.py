@@ -75,7 +75,7 @@ def split_contradicted(
     **Arguments:** `ideal`: coordinates of the features of every photograph, c = 1.
     """
     loops = _Loops(pairs, ideal, settings)
-    # first with all pairs, wrong ones included, which only orders them
+    # First with all pairs, wrong ones included, which only orders them.
     votes = {ids: [loops.closes(ids, k) for k in loops.thirds(ids)] for ids in loops.pairs}
 
     def strength(pair: Pair) -> tuple[bool, float]:
@@ -85,8 +85,8 @@ def split_contradicted(
         good, bad = closed.count(True), closed.count(False)
         return pair.sure, len(pair) * (1 + good) / (1 + good + bad)
 
-    # greedy, the strongest first, like Kruskal's spanning tree: a wrong pair is then judged by
-    # right ones, and wrong ones that agree with it do not count
+    # Greedy, the strongest first, like Kruskal's spanning tree: a wrong pair is then judged by
+    # right ones, and wrong ones that agree with it do not count.
     accepted: set[PhotographPair] = set()
     group = {k: k for pair in pairs for k in pair.images}
     for pair in sorted(pairs, key=strength, reverse=True):
@@ -96,7 +96,7 @@ def split_contradicted(
             for k in loops.thirds((i, j))
             if {_pair(i, k), _pair(j, k)} <= accepted
         ]
-        # a pair by repeated features must be confirmed, unless nothing else connects its sides
+        # A pair by repeated features must be confirmed, unless nothing else connects its sides.
         needs_no_loop = pair.sure or group[i] != group[j]
         if closed.count(False) <= closed.count(True) and (needs_no_loop or any(closed)):
             accepted.add((i, j))
@@ -175,9 +175,9 @@ class _Loops:
         # photograph that they share; two of the three ratios suffice
         at_j, at_i = self._ratio((i, j), (j, k), 1, 0), self._ratio((i, j), (i, k), 0, 0)
         at_k = self._ratio((j, k), (i, k), 1, 1)
-        # without two of them the bases can have any lengths: of the second equation only β > 0 is
+        # Without two of them the bases can have any lengths: of the second equation only β > 0 is
         # left. If ik is narrow, its base may be the small difference of two opposite ones, of any
-        # direction; if ij or jk is narrow, its base is short, and ik nearly has that of the other
+        # direction; if ij or jk is narrow, its base is short, and ik nearly has that of the other.
         if np.isnan([at_j, at_i, at_k]).sum() > 1:
             between = _is_between(ij.b, ij.M.T @ jk.b, ik.b, self.settings.max_aside)
             return None if between or ik.angle < self.settings.narrow_angle else False

@@ -67,7 +67,7 @@ def _nearest_by_position(
 ) -> list[tuple[int, int]]:
     from scipy.spatial import cKDTree
 
-    # one more: the nearest of each photograph is the photograph itself
+    # One more: the nearest of each photograph is the photograph itself.
     _, rows = cKDTree(place).query(place, k=min(neighbours + 1, len(place)))
     pairs = {(min(i, j), max(i, j)) for i, row in enumerate(rows) for j in row.tolist() if i != j}
     return sorted(pairs)

@@ -147,8 +147,8 @@ def verify_pairs(
         good, M, b = agreed[k]
         if (good & unique[k]).sum() >= settings.sufficient_matches:
             agreed[k] = good & unique[k], M, b
-    # without a base the coplanarity condition is empty, and the robust orientation may fail; a
-    # rotation alone has fewer unknowns and is sought for itself
+    # Without a base the coplanarity condition is empty, and the robust orientation may fail; a
+    # rotation alone has fewer unknowns and is sought for itself.
     turned = {
         k: turn
         for k in usable
@@ -182,7 +182,7 @@ def _find_agreeing(
     these agree. Otherwise only the most distinct ones are tried: for photographs far apart most
     matches may be wrong."""
     rows = {k: r for k, r in rows.items() if len(r) >= settings.min_matches}
-    # the most distinct ones, but all of a few
+    # The most distinct ones, but all of a few.
     distinct = lambda n: batched.spread(
         max(int(settings.distinct_share * n), min(n, batched.SLOTS))
     )
@@ -225,7 +225,7 @@ def _orient_by_rows(
         good = _agree(M, b, xy1[k], xy2[k], tolerance[k])
         use = rows[k][good[rows[k]]]
         enough = len(use) >= max(settings.min_matches, settings.min_share * len(rows[k]))
-        # the smaller eigenvalue of the covariance is the variance across a line
+        # The smaller eigenvalue of the covariance is the variance across a line.
         if enough and all(
             np.linalg.eigvalsh(np.cov(xy[k][use].T))[0] > (settings.min_extent * xy[k].std()) ** 2
             for xy in (xy1, xy2)
@@ -260,8 +260,8 @@ def _find_rotation(
         if first is None or second is None:
             continue
         M = second.T @ first
-        # twice the tolerance: Sampson's distance is 1/√2 of the distance from an epipolar line, and
-        # that is one of the two components of the distance of two rays
+        # Twice the tolerance: Sampson's distance is 1/√2 of the distance from an epipolar line, and
+        # that is one of the two components of the distance of two rays.
         good = np.linalg.norm(one @ M.T - two, axis=1) < 2 * tolerance
         if good.sum() > most:
             most, best = good.sum(), (good, M)
@@ -343,7 +343,7 @@ def refine_rotations(
     rows = [batched.spread(len(pair), MATCH_SLOTS) for pair in pairs]
     weights = _used_slots(rows)
     xy1, xy2 = (np.stack([_fill(xy[i][r]) for xy, r in zip(ideal, rows)]) for i in (0, 1))
-    # with a strong K1 rays of the border have no image: without weight
+    # With a strong K1 rays of the border have no image: without weight.
     weights *= np.isfinite(xy1 + xy2).all(-1)
     xy1, xy2 = np.nan_to_num(xy1), np.nan_to_num(xy2)
     start = [np.stack([getattr(pair, name) for pair in pairs]) for name in ("M", "b")]
@@ -352,7 +352,7 @@ def refine_rotations(
 
 def rotation_angle(M: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n"]:
     """The angle of rotations, radians."""
-    # sin ω from M − Mᵀ, cos ω from the trace: each alone loses half of the digits near 0 or π
+    # sin ω from M − Mᵀ, cos ω from the trace: each alone loses half of the digits near 0 or π.
     across = M - np.swapaxes(M, -1, -2)
     sine = np.sqrt((across**2).sum((-2, -1)) / 8)
     return np.arctan2(sine, (np.trace(M, axis1=-2, axis2=-1) - 1) / 2)
@@ -395,8 +395,8 @@ def _refine(
         M, b = pair
         return root * jax.vmap(sampson_distance, (None, None, 0, 0))(M, b, xy1, xy2)
 
-    # five unknowns; eight steps, since from an orientation by five matches few are needed, and the
-    # choice of matches, not the last digit, limits the result
+    # Five unknowns; eight steps, since from an orientation by five matches few are needed, and the
+    # choice of matches, not the last digit, limits the result.
     (M, b), _ = minimise(misclosures, retract, (M, b), (xy1, xy2, weights), 5, 8)
     return M, b
 

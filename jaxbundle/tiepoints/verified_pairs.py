@@ -76,7 +76,7 @@ def match(
     names = lambda pair: (fingerprints[pair[0]], fingerprints[pair[1]])
     stored = {pair: store.load_matches(*names(pair)) for pair in pairs}
     needed = sorted({k for pair, columns in stored.items() if columns is None for k in pair})
-    # once for each photograph, not for each of its pairs: as much work as a pair
+    # Once for each photograph, not for each of its pairs: as much work as a pair.
     with ThreadPoolExecutor(workers) as pool:
         within = dict(zip(needed, pool.map(distances_within, (features[k] for k in needed))))
 
@@ -106,7 +106,7 @@ def verify(
     **Arguments:** `camera_of`: the camera of every photograph.
     """
     ideal = [ideal_features(cameras[c], f.xy) for c, f in zip(camera_of, features)]
-    # the longer side in units of c
+    # The longer side in units of c.
     size = np.array(
         [max(required_image_size(cameras[c])) / central_distance(cameras[c]) for c in camera_of]
     )

@@ -243,7 +243,7 @@ def turn_start(declared: Declared, plan: Plan, values: Values, start: Values) ->
     given = X - centre, X0 - centre0
     Y, Y0 = stop_gradient(given)
     U, _, Vt = jnp.linalg.svd((Y * p[:, None]).T @ Y0)
-    # no reflection
+    # No reflection.
     R = (U * jnp.stack([1.0, 1.0, jnp.sign(jnp.linalg.det(U @ Vt))])) @ Vt
     turn = implicit_root(
         misalignment, solve_dense, stop_gradient(rotation_vector_from_matrix(R)), p, given

@@ -181,7 +181,7 @@ def solve(factor: NormalFactor, right: Tangent) -> Tangent:
     which are zero then, the solution has none either: passes over all incidences are saved."""
     plan, Z = factor.plan, factor.Z
     e = plan.eliminated if plan.eliminated in right else None
-    # free: held unknowns do not change, whatever a right-hand side has along them.
+    # Free: held unknowns do not change, whatever a right-hand side has along them.
     kept = {g: right[g] * plan.groups[g].free * s for g, s in factor.scale.items()}
     if e is not None:
         free = plan.groups[e].free
