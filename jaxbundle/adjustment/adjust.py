@@ -54,7 +54,7 @@ from jaxbundle.network.tables import Network, Observations, Points
 from jaxbundle.network.unit_mistakes import (
     name_unit_of_positions,
 )
-from jaxbundle.orientation.network import lacks_start_values, without_placeholders
+from jaxbundle.orientation.network import Oriented, lacks_start_values, without_placeholders
 from jaxbundle.orientation.swapped_control import CONTRADICTORY_CONTROL
 from jaxbundle.types import AnyArray, Progress, present
 
@@ -150,16 +150,7 @@ def adjust(  # noqa: PLR0913 - the options of an adjustment
     options: dict[str, Any] = {"search": SEARCHES[method], "max_steps": max_iterations + 1}
     try_again = partial(_try_mirrored, reduction, options)
     mirror = lambda sigma0: name_mirrored(given, sigma0, try_again, largest_sigma0(given))
-    oriented = None
-    if lacks_start_values(given):
-        try:
-            oriented = require_most_oriented(orient(given))
-        except NotSolvedError as error:
-            if CONTRADICTORY_CONTROL in str(error) and (mirrored := mirror(None)):
-                raise NotSolvedError(
-                    f"no start values found: {mirrored}", [*error.undetermined]
-                ) from None
-            raise
+    oriented = _orient(given, mirror) if lacks_start_values(given) else None
     told = (
         options
         if progress is None
@@ -207,6 +198,18 @@ def adjust(  # noqa: PLR0913 - the options of an adjustment
     if not correlated:
         return result
     return result.with_changes(correlations=CORRELATIONS).with_correlated_errors()
+
+
+def _orient(given: Network, mirror: Callable[[float | None], str]) -> Oriented:
+    """Start values of most of a network; an error names mirrored control if that explains it."""
+    try:
+        return require_most_oriented(orient(given))
+    except NotSolvedError as error:
+        if CONTRADICTORY_CONTROL in str(error) and (mirrored := mirror(None)):
+            raise NotSolvedError(
+                f"no start values found: {mirrored}", [*error.undetermined]
+            ) from None
+        raise
 
 
 def _compare_with_start(given: Network, result: Adjustment) -> tuple[str, ...]:

@@ -231,7 +231,6 @@ class _Planner:
         ]
         if not at:
             return None
-        number = len(self.grouping.row_in)
         eliminated, row, used = [], [], []
         for k, t in at:
             p = parts[k]
@@ -241,6 +240,7 @@ class _Planner:
         eliminated, row, used = (np.concatenate(x) for x in (eliminated, row, used))
         # An incidence is a combination of both rows; several observations may share it (an image
         # point and a distance to the same camera).
+        number = len(self.grouping.row_in)
         keys = row[used].astype(np.int64) * number + eliminated[used]
         keys, incidence = np.unique(keys, return_inverse=True)
         # The usual case: every observation is an incidence of its own, and W needs no sum.
@@ -249,20 +249,14 @@ class _Planner:
             p = parts[at[0][0]]
             along, length = p.along, p.length
         else:
-            r, q = keys // number, keys % number
+            row, eliminated = keys // number, keys % number
             along = ("incidences", group)
-            length = self.choose("length", along, default=chunk_length(r, self.settings))
-            order, filled = lay_out(r, q, length)
+            length = self.choose("length", along, default=chunk_length(row, self.settings))
+            order, filled = lay_out(row, eliminated, length)
             place = np.empty(len(keys), np.int64)
             place[order[filled]] = np.flatnonzero(filled)
-            of_all = np.full(len(used), -1)
-            of_all[used] = place[incidence]
-            cuts = np.cumsum([len(parts[k].used) for k, _ in at])[:-1]
-            for (k, t), of_part in zip(at, np.split(of_all, cuts)):
-                p = parts[k]
-                index = as_index(of_part.reshape(-1, p.length), p.along, along, length)
-                p.set("touches", t, incidence=index)
-            eliminated, row, used = q[order], r[order], filled
+            self._set_incidences(parts, at, used, place[incidence], along, length)
+            eliminated, row, used = eliminated[order], row[order], filled
         plan = Incidences(
             as_index(eliminated.reshape(-1, length), along, ("group", self.grouping.eliminate)),
             as_index(row[::length], along, ("group", group)),
@@ -270,6 +264,25 @@ class _Planner:
         places = np.flatnonzero(used)
         eliminated, row = eliminated[places], row[places]
         return _IncidencesInChunks(plan, places, eliminated, row, along, length)
+
+    @staticmethod
+    def _set_incidences(
+        parts: list[_PartInChunks],
+        touches: Sequence[tuple[int, int]],
+        used: Bool[np.ndarray, " places"],
+        place: Int[np.ndarray, " used"],
+        along: Hashable,
+        length: int,
+    ) -> None:
+        """Sets the place of the incidence of every used observation of these touches (part, number
+        of its touch), one after the other."""
+        of_all = np.full(len(used), -1)
+        of_all[used] = place
+        cuts = np.cumsum([len(parts[k].used) for k, _ in touches])[:-1]
+        for (k, t), of_part in zip(touches, np.split(of_all, cuts)):
+            p = parts[k]
+            index = as_index(of_part.reshape(-1, p.length), p.along, along, length)
+            p.set("touches", t, incidence=index)
 
     def find_blocks(
         self, parts: list[_PartInChunks], incidences: dict[str, _IncidencesInChunks]
