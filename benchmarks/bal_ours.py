@@ -21,7 +21,7 @@ import numpy as np  # noqa: E402
 
 import jaxbundle  # noqa: E402
 from jaxbundle.choices import REDUCTIONS  # noqa: E402
-from jaxbundle.leastsquares.iterations.solver import find  # noqa: E402
+from jaxbundle.leastsquares.iterations.solver import minimise_compiled  # noqa: E402
 from jaxbundle.leastsquares.iterations.stopping import LIMIT, RELATIVE_COST, SETTLED, TERMINATIONS  # noqa: E402
 from jaxbundle.leastsquares.problem import make_solver, pad_data  # noqa: E402
 from jaxbundle.leastsquares.sharding import distribute, find_minimum_of_shards  # noqa: E402
@@ -38,7 +38,7 @@ def prepare(path: str, evaluations: int, reduction: str | None):
         shards = distribute(problem)
         return problem, lambda: find_minimum_of_shards(shards, solver)
     data = pad_data(problem, problem.data)
-    return problem, lambda: find(solver, data, data.start)
+    return problem, lambda: minimise_compiled(solver, data, data.start)
 
 
 def main() -> None:

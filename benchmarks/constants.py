@@ -192,17 +192,17 @@ def run_bal(problem: str, given: argparse.Namespace) -> dict:
     import jaxbundle
 
     jaxbundle.enable_x64()
-    from jaxbundle.leastsquares.iterations.solver import find
+    from jaxbundle.leastsquares.iterations.solver import minimise_compiled
     from jaxbundle.leastsquares.iterations.stopping import RELATIVE_COST, SETTLED
     from jaxbundle.leastsquares.problem import make_solver, pad_data
 
     network = jaxbundle.check_network(jaxbundle.read_network(problem))
-    problem = jaxbundle.make_problem(network, reduction=given.reduction).system
+    problem = jaxbundle.make_problem(network, reduction=given.reduction)
     solver, data = make_solver(problem, max_steps=300), pad_data(problem, problem.data)
 
     def timed():
         begin = time.process_time()
-        minimum = jax.block_until_ready(find(solver, data, data.start))
+        minimum = jax.block_until_ready(minimise_compiled(solver, data, data.start))
         return minimum, time.process_time() - begin
 
     minimum, first = timed()

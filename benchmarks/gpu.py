@@ -180,12 +180,12 @@ def _timed(jax, run, least=3, seconds=5.0):
 
 
 def _solve(jax, problem) -> dict:
-    from jaxbundle.leastsquares.iterations.solver import find
+    from jaxbundle.leastsquares.iterations.solver import minimise_compiled
     from jaxbundle.leastsquares.iterations.stopping import TERMINATIONS, converged
     from jaxbundle.leastsquares.problem import make_solver, pad_data
 
     solver, data = make_solver(problem, max_steps=60), pad_data(problem, problem.data)
-    minimum, found = _timed(jax, lambda: find(solver, data, data.start))
+    minimum, found = _timed(jax, lambda: minimise_compiled(solver, data, data.start))
     evaluations = int(minimum.iterations)
     found |= {"evaluations": evaluations, "cost": float(minimum.history.cost[evaluations - 1])}
     found["per evaluation"] = found["best"] / evaluations

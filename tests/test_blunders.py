@@ -22,7 +22,13 @@ from jaxbundle.io import adjusted_network
 from jaxbundle.io.results.result_json import result_dict, result_text
 from jaxbundle.leastsquares.quality import robust, snooping
 from jaxbundle.leastsquares.quality.robust import residual_lengths, robust_scale
-from jaxbundle.leastsquares.quality.snooping import RemovedRow, _passing, _Touched, _worst, without
+from jaxbundle.leastsquares.quality.snooping import (
+    RemovedRow,
+    _passing,
+    _TouchedRows,
+    _worst,
+    without,
+)
 from jaxbundle.leastsquares.solution import Solution, find_minimum
 from jaxbundle.network import Distances
 from jaxbundle.report import text
@@ -105,7 +111,7 @@ def test_what_agrees_comes_back(network):
     removed = [RemovedRow("image", int(row), None, 9.0) for row in (*wrong, *right)]
     less = without(whole, removed)
     found = Solution(less, find_minimum(less, max_steps=101).values)
-    back = {row for _, row, _ in _passing(whole, found, _Touched(whole), removed, 4.5)}
+    back = {row for _, row, _ in _passing(whole, found, _TouchedRows(whole), removed, 4.5)}
     assert back >= set(right)
     assert len(back & set(wrong)) <= 0.05 * len(wrong)
 
@@ -252,7 +258,7 @@ def test_rays_that_cannot_mask_each_other_go_together(network):
     spoilt, bad, _ = with_blunders(network, 1)
     problem = jaxbundle.make_problem(jaxbundle.check_network(spoilt))
     found = Solution(problem, find_minimum(problem, max_steps=101).values)
-    worst = _worst(found, _Touched(problem), found.sigma0, 4.5, 3.29)
+    worst = _worst(found, _TouchedRows(problem), found.sigma0, 4.5, 3.29)
     rows = np.array([r.row for r in worst])
     image, point = problem.image[rows], problem.point[rows]
     assert np.bincount(image).max() > 1 and len(set(point)) == len(rows)

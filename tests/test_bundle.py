@@ -16,7 +16,7 @@ from jaxbundle.io.results.result_json import result_dict, result_text, without_n
 from jaxbundle.io.text import csv_tables
 from jaxbundle.leastsquares.problem import with_data
 from jaxbundle.leastsquares.quality.distributions import tau_quantile
-from jaxbundle.leastsquares.quality.names import undetermined
+from jaxbundle.leastsquares.quality.null_space import undetermined_unknowns
 from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.network.tables import EXTERIOR
 
@@ -252,7 +252,7 @@ def test_numbers_that_overflow_have_no_names(result):
     problem = result.problem
     data = problem.with_image_weights(problem.data, 1e200 * problem.data.weight["image"])
     problem = with_data(problem, data)
-    assert undetermined(problem, problem.data.start) == []
+    assert undetermined_unknowns(problem, problem.data.start) == []
 
 
 @pytest.mark.further

@@ -9,7 +9,7 @@ import pytest
 import jaxbundle
 from jaxbundle import Camera, grid_of_targets, ring_of_stations, simulate
 from jaxbundle.io.results.result_json import result_dict
-from jaxbundle.orientation.determined import have_one_line, see_a_line
+from jaxbundle.orientation.collinear import rays_coincide, see_collinear_points
 from jaxbundle.orientation.incremental import Model
 from jaxbundle.orientation.rays import Sights, in_plane, sights
 from jaxbundle.planning.stations import Stations
@@ -65,7 +65,7 @@ def test_rays_of_one_line_are_recognised_at_the_level_of_the_test(images):
     centres = np.linspace(0, 1, images)[:, None] * along
     s = np.r_[np.linspace(2, 50, 3900), np.linspace(0.3, 0.45, 100)]
     seen, model = random_rays(centres, s[:, None] * along)
-    line, one_place = have_one_line(seen, model, np.ones(4000, bool))
+    line, one_place = rays_coincide(seen, model, np.ones(4000, bool))
     assert 0 <= (~line).sum() <= 12  # expected 4, at 0.1 %; 12 with P < 0.001
     assert not one_place.any()
 
@@ -78,13 +78,13 @@ def test_distant_points_and_near_ones_are_not_of_one_line():
     infinite = rng.uniform(-1, 1, (60, 3)) * 1e7 + [0, 0, -1e9]
     seen, model = random_rays(centres, np.concatenate([near, infinite]))
     model.known[60:] = False
-    assert not have_one_line(seen, model, np.ones(120, bool))[0].any()
+    assert not rays_coincide(seen, model, np.ones(120, bool))[0].any()
 
 
 def test_rays_that_fit_exactly_are_not_tested():
     """σ0 = 0, of exact measurements: every deviation would be significant, and p infinite."""
     seen, model = random_rays(np.array([[0.0, 0, 0], [1, 0, 0]]), np.array([[3.0, 0, 0]]))
-    for found in have_one_line(seen, model, np.ones(1, bool), factor=0.0):
+    for found in rays_coincide(seen, model, np.ones(1, bool), factor=0.0):
         assert not found.any()
 
 
@@ -96,7 +96,7 @@ def test_images_from_one_place_are_named_as_such_for_their_points_only():
     cut = dataclasses.replace(seen, **{
         name: getattr(seen, name)[twice] for name in ("image", "point", "ray", "sigma", "row")
     })  # fmt: skip
-    line, one_place = have_one_line(cut, model, np.ones(40, bool))
+    line, one_place = rays_coincide(cut, model, np.ones(40, bool))
     assert (line == (np.arange(40) < 5)).all() and (one_place == line).all()
 
 
@@ -107,7 +107,7 @@ def test_points_on_a_line_to_the_noise_of_the_rays():
     for off, expected in ((0.5, True), (10, False)):
         shift = off * 10 * SIGMA * np.where(np.arange(12) % 2, 1, -1)[:, None] * [0, 1, 0]
         seen, model = random_rays(centres, along + shift)
-        assert (see_a_line(seen, model) == expected).all()
+        assert (see_collinear_points(seen, model) == expected).all()
 
 
 def test_rays_beyond_the_side_have_coordinates_in_a_turned_camera():

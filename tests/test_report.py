@@ -22,7 +22,7 @@ from jaxbundle.network.blunders import Removed
 from jaxbundle.network.columns import count
 from jaxbundle.network.tables import EXTERIOR, Camera
 from jaxbundle.report import head, layout, observations, unknowns
-from jaxbundle.report.equations import EQUATIONS, equations
+from jaxbundle.report.camera_equations import EQUATIONS, camera_equations
 
 SECTIONS = (
     "Counts",
@@ -363,7 +363,7 @@ def test_warnings_are_printed(convergent4):
 def test_equations_of_every_model():
     families = {name.partition("-N")[0] for name in FAMILIES}
     assert set(EQUATIONS) == {*MODEL_NAMES, *families}
-    assert equations(get_model("spline-6x5-90")) == EQUATIONS["spline"]
+    assert camera_equations(get_model("spline-6x5-90")) == EQUATIONS["spline"]
     for name, lines in EQUATIONS.items():
         assert len(layout.facts([(f"Model {name}", line) for line in lines])) == len(lines)
 

@@ -5,7 +5,7 @@ arrays out); `jaxbundle.adjust` (`adjust.py`) adds start values, the rounds of a
 and the `Adjustment` (`result.py`), whose statistics are in `quality`.
 """
 
-from jaxbundle.adjustment.equations import design_matrix, residuals
+from jaxbundle.adjustment.observation_equations import design_matrix, residuals
 from jaxbundle.adjustment.problem import Counts, NetworkProblem, make_problem
 from jaxbundle.adjustment.solve import solve
 

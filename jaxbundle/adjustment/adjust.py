@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbundle.adjustment.far_points import (
-    minimise_with_infinity,
+    minimise_holding_infinite_points,
 )
 from jaxbundle.adjustment.first_minimum import FirstMinimum, require_most_oriented
 from jaxbundle.adjustment.likely_causes import (
@@ -54,12 +54,12 @@ from jaxbundle.network.tables import Network, Observations, Points
 from jaxbundle.network.unit_mistakes import (
     name_unit_of_positions,
 )
-from jaxbundle.orientation.network import lacks_start_values, without_placeholders
+from jaxbundle.orientation.network import Oriented, lacks_start_values, without_placeholders
 from jaxbundle.orientation.swapped_control import CONTRADICTORY_CONTROL
 from jaxbundle.types import AnyArray, Progress, present
 
 # Name of the undetermined if no single unknown dominates.
-UNNAMED = ("a combination of unknowns that spreads over many of them",)
+UNNAMED = ("a combination of many unknowns",)
 
 
 def adjust(  # noqa: PLR0913 - the options of an adjustment
@@ -150,16 +150,7 @@ def adjust(  # noqa: PLR0913 - the options of an adjustment
     options: dict[str, Any] = {"search": SEARCHES[method], "max_steps": max_iterations + 1}
     try_again = partial(_try_mirrored, reduction, options)
     mirror = lambda sigma0: name_mirrored(given, sigma0, try_again, largest_sigma0(given))
-    oriented = None
-    if lacks_start_values(given):
-        try:
-            oriented = require_most_oriented(orient(given))
-        except NotSolvedError as error:
-            if CONTRADICTORY_CONTROL in str(error) and (mirrored := mirror(None)):
-                raise NotSolvedError(
-                    f"no start values found: {mirrored}", [*error.undetermined]
-                ) from None
-            raise
+    oriented = _orient(given, mirror) if lacks_start_values(given) else None
     told = (
         options
         if progress is None
@@ -168,16 +159,18 @@ def adjust(  # noqa: PLR0913 - the options of an adjustment
     first = FirstMinimum(reduction, also, oriented, told)
     start = first.find(given, outliers=bool(robust or snooping))
     problem, minimum = start.problem, start.minimum
-    again = partial(minimise_with_infinity, **told)
+    again = partial(minimise_holding_infinite_points, **told)
     # The statistics need the factor of the normal matrix even where the iterations did without.
     found = _AdjustmentState(
         problem.network, with_factor(problem), minimum, method, problem.reduction
     )
     # Without `progress`: every candidate would begin the bars anew.
-    look = partial(find_second_minima, minimise=partial(minimise_with_infinity, **options))
+    search = partial(
+        find_second_minima, minimise=partial(minimise_holding_infinite_points, **options)
+    )
     # Before anything is excluded or downweighted because of residuals of the wrong minimum.
     if second_minimum:
-        found.look_for_second_minima(look)
+        found.search_second_minima(search)
     if robust:
         found.weight_robustly(again, robust, significance)
     if found.inspection:
@@ -188,7 +181,7 @@ def adjust(  # noqa: PLR0913 - the options of an adjustment
         if eliminate:
             found.eliminate_parameters(again, critical_t)
         if second_minimum and (robust or snooping or estimate_components or eliminate):
-            found.look_for_second_minima(look)
+            found.search_second_minima(search)
     result = found.adjustment(start.check)
     sigma0 = sigma0_at_end(found.problem, found.minimum) if found.inspection else None
     if found.inspection:
@@ -205,6 +198,18 @@ def adjust(  # noqa: PLR0913 - the options of an adjustment
     if not correlated:
         return result
     return result.with_changes(correlations=CORRELATIONS).with_correlated_errors()
+
+
+def _orient(given: Network, mirror: Callable[[float | None], str]) -> Oriented:
+    """Start values of most of a network; an error names mirrored control if that explains it."""
+    try:
+        return require_most_oriented(orient(given))
+    except NotSolvedError as error:
+        if CONTRADICTORY_CONTROL in str(error) and (mirrored := mirror(None)):
+            raise NotSolvedError(
+                f"no start values found: {mirrored}", [*error.undetermined]
+            ) from None
+        raise
 
 
 def _compare_with_start(given: Network, result: Adjustment) -> tuple[str, ...]:
@@ -236,7 +241,7 @@ class _AdjustmentState:
     minimum: Minimum
     method: str
     reduction: str
-    said: dict[str, Any] = dataclasses.field(default_factory=dict)
+    result_fields: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Arguments of the `Adjustment`."""
     inspected: tuple[NetworkProblem, Minimum, Inspection | None] | None = None
 
@@ -254,8 +259,8 @@ class _AdjustmentState:
         suspects = (name_suspect(self.problem, s) for s in found.suspects(significance))
         self.problem = cast(NetworkProblem, found.found.problem)
         doubt = doubt_of_robust(found.scale, self.problem.counts.redundancy)
-        self.said |= {"robust": robust, "reweighted": found, "suspects": tuple(suspects)}
-        self.said["doubts"] = (doubt,) if doubt else ()
+        self.result_fields |= {"robust": robust, "reweighted": found, "suspects": tuple(suspects)}
+        self.result_fields["doubts"] = (doubt,) if doubt else ()
 
     def remove_blunders(
         self, again: Minimise, test: str, significance: float, doubtful: Iterable[tuple[str, str]]
@@ -263,30 +268,30 @@ class _AdjustmentState:
         self.problem, self.minimum, removed, doubt = snoop_network(
             present(self.inspection), self.minimum, again, test, significance, doubtful
         )
-        self.said |= {"removed": tuple(removed), "doubts": (doubt,) if doubt else ()}
+        self.result_fields |= {"removed": tuple(removed), "doubts": (doubt,) if doubt else ()}
 
     def estimate_components(self, again: Minimise) -> None:
         self.problem, self.minimum, factors = with_components(self.problem, self.minimum, again)
-        self.said["sigma_factors"] = factors
+        self.result_fields["sigma_factors"] = factors
 
     def eliminate_parameters(self, again: Minimise, critical_t: float) -> None:
         self.problem, self.minimum, names = eliminate_parameters(
             self.problem, self.minimum, again, critical_t
         )
-        self.said["eliminated"] = tuple(names)
+        self.result_fields["eliminated"] = tuple(names)
 
-    def look_for_second_minima(self, look: Callable) -> None:
+    def search_second_minima(self, search: Callable) -> None:
         """Take the best minimum and keep those that remain; those left before remain known."""
         if self.inspection is None or not can_have_second(self.problem):
             return
         try:
-            self.problem, self.minimum, found = look(self.inspection, self.minimum)
+            self.problem, self.minimum, found = search(self.inspection, self.minimum)
         except (InputError, NotSolvedError, np.linalg.LinAlgError):
             # The result is as good as before the search.
             return
-        left = [one for one in self.said.get("second_minima", ()) if one.taken]
+        left = [one for one in self.result_fields.get("second_minima", ()) if one.taken]
         left = [one for one in left if not is_said(one, found)]
-        self.said["second_minima"] = (*found, *left)
+        self.result_fields["second_minima"] = (*found, *left)
 
     def adjustment(self, check: tuple[Points, Observations]) -> Adjustment:
         """The result, or the reason why there is none."""
@@ -306,7 +311,7 @@ class _AdjustmentState:
             inspection=inspection,
             weakness=weakness_without_solution(problem, minimum) if unnamed else None,
             findings=likely_causes(problem, minimum, inspection),
-            **self.said,
+            **self.result_fields,
         )
 
 

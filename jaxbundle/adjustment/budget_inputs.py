@@ -178,7 +178,7 @@ def groups_of(
             conversion, unit = part.units[k]
             inverse = part.inverse_sigma[rows]
             u = (scale or 1.0) / inverse
-            # effects are of one σ a priori: c = effect/σ
+            # Effects are of one σ a priori: c = effect/σ.
             c = effect[rows] * inverse[:, None]
             degrees = redundancy if scale is not None else estimated.get(part.kind, math.inf)
             found.append(
@@ -211,7 +211,7 @@ def _estimated_degrees(adjustment: Adjustment) -> dict[str, float]:
     changed = {name for name, f in adjustment.sigma_factors.items() if f != 1}
     known = {group.name for group in groups(adjustment.problem)}
     for kind in {*rows["kind"].tolist()} - {"image"}:
-        # as the groups are named: "control points in X", "distances", "interior orientation"
+        # As the groups are named: "control points in X", "distances", "interior orientation".
         part = "orientation" if kind == "prior" else kind.rstrip("s")
         if any(part in name for name in changed & known):
             found[kind] = float(rows["r"][rows["kind"] == kind].sum())
@@ -238,7 +238,7 @@ def shared_errors(
         if not theta > 0 or component.name == OTHERS:
             continue
         size = np.sqrt((np.asarray(component.root.T @ D.T) ** 2).sum(0)) * factor
-        # a size that is hardly determined: no estimate has less than one degree of freedom
+        # A size that is hardly determined: no estimate has less than one degree of freedom.
         degrees = max(2 * (theta / spread) ** 2, 1.0) if spread > 0 else math.inf
         unit = adjustment.image_unit if component.unit == "image" else ""
         lines.append(
@@ -270,7 +270,7 @@ def held_lines(
     lines = []
     for effect, cause, given in zip(budget.effects, budget.causes, inputs.values()):
         known = given if isinstance(given, HeldInput) else HeldInput(1.0)
-        # a common error has no single σ: its line has that of its amounts, 1
+        # A common error has no single σ: its line has that of its amounts, 1.
         u = known.uncertainty
         scale = adjustment.angle_scale if cause.angle else 1.0
         unit = _unit_of_cause(adjustment, cause.name, cause.angle)

@@ -10,21 +10,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxbundle.adjustment.problem import HELD, NetworkProblem, coordinates
+from jaxbundle.adjustment.problem import NEGLIGIBLE_MOTION, NetworkProblem, coordinates
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.adjustment.unknowns import angles_near
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import transform_point, transform_pose
 from jaxbundle.geometry.similarity import compose, helmert_point
-from jaxbundle.leastsquares.datum.motions import SEVEN
+from jaxbundle.leastsquares.datum.motions import SIMILARITY_PARAMETERS
 from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.network.columns import list_some
 from jaxbundle.orientation.absolute import absolute_orientation
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
-SCALE = SEVEN.index("scale")
+SCALE = SIMILARITY_PARAMETERS.index("scale")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,7 +132,7 @@ _move = compile_once(jax.vmap(transform_point, (None, 0)), ())
 
 def _scale_is_open(problem: NetworkProblem) -> bool:
     datum = problem.plan.datum
-    return datum is not None and np.abs(np.asarray(datum.gauge)[SCALE]).max() > HELD
+    return datum is not None and np.abs(np.asarray(datum.gauge)[SCALE]).max() > NEGLIGIBLE_MOTION
 
 
 class UnknownsInFrame(eqx.Module):

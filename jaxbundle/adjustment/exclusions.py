@@ -1,11 +1,11 @@
 """What takes part in an adjustment: what rays do not determine is left out by name, and what start
 values excluded is tried again with the adjusted orientation.
 
-Before and after the iterations points whose rays are one line, and images that see a line, are
-looked for (`orientation.determined`). After them, everything that was excluded because of start
-values (image points that contradict them, points without intersection, images that could not be
-placed) is placed by the adjusted images and points, as `orient` does, and what agrees takes part in
-the next adjustment.
+Before and after the iterations points whose rays are one line, and images whose points are on one,
+are searched for (`orientation.collinear`). After them, everything that was excluded because of
+start values (image points that contradict them, points without intersection, images that could not
+be placed) is placed by the adjusted images and points, as `orient` does, and what agrees takes part
+in the next adjustment.
 """
 
 import dataclasses
@@ -25,13 +25,14 @@ from jaxbundle.adjustment.problem import NetworkProblem, coordinates, with_coord
 from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network.columns import list_some
+from jaxbundle.network.equation_counts import equations_of
+from jaxbundle.network.subsets import keep_images, keep_points, record_left_out
 from jaxbundle.network.tables import LeftOut, Network
-from jaxbundle.network.undetermined import equations_of, keep_images, keep_points, leave_out
 from jaxbundle.orientation import batched
-from jaxbundle.orientation.determined import have_one_line, see_a_line
+from jaxbundle.orientation.collinear import rays_coincide, see_collinear_points
 from jaxbundle.orientation.incremental import (
-    START_VALUE_DEMANDS,
-    Demands,
+    START_VALUE_LIMITS,
+    IntersectionLimits,
     Model,
     are_held,
     grow,
@@ -43,24 +44,25 @@ from jaxbundle.orientation.missing import explain_missing, note_missing
 from jaxbundle.orientation.rays import Sights, sights
 from jaxbundle.types import AnyArray
 
-# Demands on what comes back. Start values may miss by 3 tolerances (image points) or 4 (rays of a
-# point); adjusted images are better, and blunders should not come back with the others.
-COMES_BACK = Demands(START_VALUE_DEMANDS.angle, 1.0)
+# Limits for what is readmitted. Start values may miss by 3 tolerances (image points) or 4 (rays of
+# a point); adjusted images are better, and blunders should not be readmitted with the others.
+READMISSION_LIMITS = IntersectionLimits(START_VALUE_LIMITS.min_angle, 1.0)
 
 
 @dataclasses.dataclass(frozen=True)
-class Undetermined:
-    """Points and images that rays do not determine, each with the reason."""
+class CollinearGeometry:
+    """Tie points whose rays are one line, and images whose points are on one: rays do not determine
+    them. Each with the reason."""
 
     notes: tuple[LeftOut, ...] = ()
 
     def __bool__(self) -> bool:
         return bool(self.notes)
 
-    def __add__(self, other: "Undetermined") -> "Undetermined":
-        return Undetermined(self.notes + other.notes)
+    def __add__(self, other: "CollinearGeometry") -> "CollinearGeometry":
+        return CollinearGeometry(self.notes + other.notes)
 
-    def spares_most_of(self, network: Network) -> bool:
+    def leaves_majority_of(self, network: Network) -> bool:
         """Whether more than half of the tie points and of the images are determined; otherwise the
         network has no depth, or σ says nothing, and nothing should be left out."""
         number = {
@@ -72,21 +74,21 @@ class Undetermined:
 
     def leave_out(self, network: Network) -> Network:
         """The network without them, with notes."""
-        gone = {
+        excluded = {
             thing: {name for note in self.notes if note.thing == thing for name in note.names}
             for thing in ("tie point", "image")
         }
         keep = lambda ids, names: np.array([id not in names for id in ids], bool)
-        network = keep_points(network, keep(network.points.id, gone["tie point"]))
-        network = keep_images(network, keep(network.images.id, gone["image"]))
+        network = keep_points(network, keep(network.points.id, excluded["tie point"]))
+        network = keep_images(network, keep(network.images.id, excluded["image"]))
         for note in self.notes:
-            network = leave_out(network, note.thing, note.names, note.why)
+            network = record_left_out(network, note.thing, note.names, note.why)
         return network
 
 
-def find_undetermined(
+def find_collinear(
     problem: NetworkProblem, values: Values, factor: float | None
-) -> Undetermined:
+) -> CollinearGeometry:
     """The tie points whose rays are one line, and the images whose points are on a line.
 
     **Arguments:** `factor`: σ0, by which the a priori σ are multiplied; None before the adjustment.
@@ -94,22 +96,22 @@ def find_undetermined(
     network = problem.network
     narrow, flat = _find_candidates(problem, values, factor)
     if not (narrow.any() or flat.any()):
-        return Undetermined()
+        return CollinearGeometry()
     seen = sights(network.replace(cameras=tuple(adjusted_cameras(problem, values).values())))
     model = _adjusted_model(problem, values, network, seen)
-    points, one_place = have_one_line(seen, model, narrow, factor or 1.0)
-    images = flat & see_a_line(seen, model, factor or 1.0)
-    return Undetermined(_notes(network, seen, points, one_place, images))
+    points, one_place = rays_coincide(seen, model, narrow, factor or 1.0)
+    images = flat & see_collinear_points(seen, model, factor or 1.0)
+    return CollinearGeometry(_notes(network, seen, points, one_place, images))
 
 
-def may_be_undetermined(problem: NetworkProblem, values: Values) -> bool:
-    """Whether start values show points or images that rays may not determine: worth a look after a
-    few iterations, before they cost many."""
+def may_be_collinear(problem: NetworkProblem, values: Values) -> bool:
+    """Whether start values show points or images that rays may not determine: they are searched for
+    after a few iterations, before they cost many."""
     narrow, flat = _find_candidates(problem, values, None)
     # Poor start values may put a point so near that its rays seem to converge: points of narrow
     # rays count too, if they would be narrow at the usual distance. But not where some rays are
     # parallel: those points are at any distance from the start (`far_points`), and would drift in
-    # the few iterations before the look.
+    # the few iterations before the check.
     angle = angle_of_rays(problem, values)
     near = (angle < FAR_POINTS.narrow) & (
         _parallax_at_usual_distance(problem, values) < FAR_POINTS.narrow
@@ -189,7 +191,7 @@ def _notes(
         where = where.format(list_some((network.images.id[k] for k in by), 4))
         why = f"whose rays coincide within their noise, {where}: their distance is undetermined"
         groups.append(LeftOut("tie point", of(network.points.id, mask), why))
-    why = "whose points are on one line, about which the image may turn"
+    why = "whose points are on one line, about which their rotation is undetermined"
     groups.append(LeftOut("image", of(network.images.id, images), why))
     return tuple(group for group in groups if group.names)
 
@@ -235,7 +237,7 @@ def _adjusted_model(
     return model
 
 
-def take_back(
+def readmit(
     given: Network, current: Network, problem: NetworkProblem, values: Values, factor: float
 ) -> Network:
     """The given network with everything that agrees with adjusted images and points, and notes of
@@ -243,40 +245,31 @@ def take_back(
 
     **Arguments:** `current`: the part of `given` that was adjusted, with its check points;
     `factor`: σ0."""
-    # The same steps as in `orient` (place images, intersect points, find contradictions), but from
-    # adjusted images, and with a narrower tolerance for what comes back.
-    cameras = adjusted_cameras(problem, values)
-    lens = tuple(cameras.get(camera.id, camera) for camera in given.cameras)
-    seen = sights(given.replace(cameras=lens))
-    model = _adjusted_model(problem, values, given, seen)
-    model.control = are_held(given.points)
-    new = model.control & ~model.known
-    model.X[new], model.known[new] = given.points.position[new], True
+    seen, model, straight = _place_left_out(given, problem, values, factor)
     before = np.isin(np.array(given.points.id, object), np.array(current.points.id, object))
-    straight = see_a_line(seen, model, factor) & ~model.placed
-    grow(seen, model, ~straight)
-    intersect(seen, model, COMES_BACK)
-    place_far_points(seen, model)
     # An image point that was adjusted stays, even if it misses: its residual is judged by the
     # tests. Only what was left out has to agree first.
     used = _are_among(given, current)
-    off = misclosures(seen, model) > COMES_BACK.miss * seen.tolerance[seen.image]
+    off = misclosures(seen, model) > READMISSION_LIMITS.max_miss * seen.tolerance[seen.image]
     wrong = off & ~used[seen.row]
     kept = dataclasses.replace(
         seen,
         **{name: getattr(seen, name)[~wrong] for name in ("image", "point", "ray", "sigma", "row")},
     )
     ties = given.points.has_role("tie") & ~before
-    line, one_place = have_one_line(kept, model, ties, factor)
+    line, one_place = rays_coincide(kept, model, ties, factor)
     network = _with_start_values(given, model)
     images, points = given.images, given.points
     X = network.points.position
-    # A tie point that was left out comes back if its rays meet, even if it has given coordinates.
+    # A tie point that was left out is readmitted if its rays meet, even if it has given
+    # coordinates.
     known = np.isfinite(X).all(1) & (before | model.known | ~given.points.has_role("tie"))
     missing_images, missing_points = explain_missing(given, seen, model, known | line)
-    # Two points are always on one line; that there are too few of them is said elsewhere.
+    # Two points are always on one line; that there are too few of them is reported elsewhere.
     for k in np.flatnonzero(straight & (np.bincount(seen.image, minlength=seen.images) > 2)):
-        missing_images[images.id[k]] = "its points are on one line, about which it may turn"
+        missing_images[images.id[k]] = (
+            "its points are on one line, about which its rotation is undetermined"
+        )
     network = network.replace(
         observations=given.observations.take(np.setdiff1d(np.arange(len(used)), seen.row[wrong]))
     )
@@ -285,10 +278,33 @@ def take_back(
     network = note_missing(network, "image", missing_images, after)
     network = note_missing(network, "point", missing_points, after)
     for note in _notes(given, kept, line, one_place, np.zeros(len(images), bool)):
-        network = leave_out(network, note.thing, note.names, note.why)
+        network = record_left_out(network, note.thing, note.names, note.why)
     rays = given.observations
     names = [f"{points.id[rays.point[k]]} in {images.id[rays.image[k]]}" for k in seen.row[wrong]]
-    return leave_out(network, "image point", names, "that contradict the adjusted orientation")
+    return record_left_out(
+        network, "image point", names, "that contradict the adjusted orientation"
+    )
+
+
+def _place_left_out(
+    given: Network, problem: NetworkProblem, values: Values, factor: float
+) -> tuple[Sights, Model, Bool[np.ndarray, " images"]]:
+    """All rays of `given`, the adjusted images and points with those that were left out placed by
+    them, and which images cannot be placed since their points are on a line."""
+    # The same steps as in `orient` (place images, intersect points), but from adjusted images, and
+    # with a narrower tolerance for what is readmitted.
+    cameras = adjusted_cameras(problem, values)
+    lens = tuple(cameras.get(camera.id, camera) for camera in given.cameras)
+    seen = sights(given.replace(cameras=lens))
+    model = _adjusted_model(problem, values, given, seen)
+    model.control = are_held(given.points)
+    new = model.control & ~model.known
+    model.X[new], model.known[new] = given.points.position[new], True
+    straight = see_collinear_points(seen, model, factor) & ~model.placed
+    grow(seen, model, ~straight)
+    intersect(seen, model, READMISSION_LIMITS)
+    place_far_points(seen, model)
+    return seen, model, straight
 
 
 def _with_start_values(network: Network, model: Model) -> Network:
@@ -321,12 +337,14 @@ def _are_among(given: Network, current: Network) -> Bool[np.ndarray, " rays"]:
     return np.isin(key(given, places), key(current, places))
 
 
-def carry(problem: NetworkProblem, before: NetworkProblem, values: Values) -> Values:
+def transfer_start_values(
+    problem: NetworkProblem, before: NetworkProblem, values: Values
+) -> Values:
     """Start values of a problem: those at which another of the same network ended, by name; its own
     for what that did not have."""
     start = problem.data.start
 
-    def carry_rows(
+    def transfer_rows(
         own: Float[AnyArray, "n k"],
         ids: Sequence[str],
         other: Float[AnyArray, "m k"],
@@ -336,9 +354,9 @@ def carry(problem: NetworkProblem, before: NetworkProblem, values: Values) -> Va
         own, other = np.array(own), np.asarray(other)
         place = {id: k for k, id in enumerate(other_ids)}
         rows = [(k, place[id]) for k, id in enumerate(ids) if id in place]
-        to, of = np.array(rows, int).reshape(-1, 2).T
-        there = np.isfinite(other[of]).all(1)
-        own[to[there]] = (other[of] + shift)[there]
+        to, source = np.array(rows, int).reshape(-1, 2).T
+        finite = np.isfinite(other[source]).all(1)
+        own[to[finite]] = (other[source] + shift)[finite]
         return jax.device_put(own)
 
     network, old, shift = problem.network, before.network, before.origin - problem.origin
@@ -346,12 +364,14 @@ def carry(problem: NetworkProblem, before: NetworkProblem, values: Values) -> Va
     cameras = [c.id for c in network.cameras], [c.id for c in old.cameras]
     own, other = problem.interior_orientation(start), before.interior_orientation(values)
     other = np.asarray(other)[:, : own.shape[1]]
-    found = problem.with_interior_orientation(start, carry_rows(own, cameras[0], other, cameras[1]))
+    found = problem.with_interior_orientation(
+        start, transfer_rows(own, cameras[0], other, cameras[1])
+    )
     position, rotation = start["image"]
     at, turned = values["image"]
     image = PoseValue(
-        carry_rows(position, images[0], at, images[1], shift),
-        carry_rows(rotation, images[0], turned, images[1]),
+        transfer_rows(position, images[0], at, images[1], shift),
+        transfer_rows(rotation, images[0], turned, images[1]),
     )
-    X = carry_rows(coordinates(start), points[0], coordinates(values), points[1], shift)
+    X = transfer_rows(coordinates(start), points[0], coordinates(values), points[1], shift)
     return found | {"image": image, "point": with_coordinates(start["point"], X)}

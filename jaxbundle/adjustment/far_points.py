@@ -33,7 +33,7 @@ from jaxbundle.types import present
 
 @dataclasses.dataclass(frozen=True)
 class FarPointSettings:
-    """Which points may be at any distance, and when that is looked at.
+    """Which points may be at any distance, and when that is checked.
 
     - `narrow`: radians; largest angle between the rays of a point that may be at any distance.
       0.03 is a base of 1/33 of the distance. Larger: well determined points lose their place among
@@ -51,7 +51,7 @@ class FarPointSettings:
       parametrisation, and out of the datum, that would have settled.
     - `evaluations_between_checks` of points pulled beyond infinity, or back; doubled whenever no
       point changed. A compromise between iterations with the wrong points held and the cost of a
-      check, which is that of a residual; not critical.
+      check, which is that of a residual.
     - `max_releases`: a point released this often stays at infinity. It ends the cycles that an
       active set may have; few points are released more than once.
     """
@@ -67,7 +67,7 @@ class FarPointSettings:
 FAR_POINTS = FarPointSettings()
 
 
-def minimise_at_any_distance(
+def minimise_with_far_points(
     problem: NetworkProblem,
     start: Values,
     make: Callable,
@@ -83,35 +83,38 @@ def minimise_at_any_distance(
     narrow = angle < settings.narrow
     if not narrow.any():
         return problem, find_minimum(problem, start, max_steps=max_steps, **options)
-    mostly = lambda chosen: 2 * chosen.sum() >= (angle < np.pi).sum()
+    are_half = lambda chosen: 2 * chosen.sum() >= (angle < np.pi).sum()
     vague = min(settings.vague * noise_of_rays(problem.network), settings.narrow)
-    legs, parallel = [], angle < max(settings.parallel, vague)
+    parallel = angle < max(settings.parallel, vague)
+    runs: list[Minimum] = []
     # First only points whose rays are parallel; if that does not converge, all narrow points. The
     # other parametrisation costs little, but points at any distance carry no datum. Evaluations of
     # a first attempt that fails are forgotten: the second one has all of `max_steps` again.
-    for chosen in (parallel & ~mostly(parallel), None):
+    for chosen in (parallel & ~are_half(parallel), None):
         if chosen is None:
-            patience = settings.evaluations_before_release * (2 if mostly(narrow) else 1)
+            patience = settings.evaluations_before_release * (2 if are_half(narrow) else 1)
             plain = find_minimum(problem, start, max_steps=min(patience, max_steps), **options)
             if inspect_solution(with_factor(problem), plain) or int(plain.iterations) >= max_steps:
                 return problem, plain
-            legs, start = [plain], plain.values
+            runs, start = [plain], plain.values
             chosen = angle_of_rays(problem, start) < settings.narrow
-        left = max_steps - sum(int(leg.iterations) for leg in legs)
+        left = max_steps - sum(int(run.iterations) for run in runs)
         far = _with_far_points(problem, start, chosen, make)
         if far is not None:
-            found, minimum = minimise_with_infinity(
+            found, minimum = minimise_holding_infinite_points(
                 *far, max_steps=left, settings=settings, **options
             )
             if inspect_solution(with_factor(found), minimum):
-                return found, join_legs([*legs, minimum])
+                return found, concatenate_runs([*runs, minimum])
     # It ended before the limit without a solution: further evaluations would change nothing.
-    if int(legs[0].termination) != LIMIT:
-        return problem, legs[0]
-    return problem, join_legs([*legs, find_minimum(problem, start, max_steps=left, **options)])
+    if int(runs[0].termination) != LIMIT:
+        return problem, runs[0]
+    return problem, concatenate_runs(
+        [*runs, find_minimum(problem, start, max_steps=left, **options)]
+    )
 
 
-def minimise_with_infinity(
+def minimise_holding_infinite_points(
     problem: NetworkProblem,
     start: Values,
     *,
@@ -126,27 +129,28 @@ def minimise_with_infinity(
     # The third direction of change of such a point is that of its inverse distance.
     held = problem.table("point").free[:, 2] == 0
     held &= problem.at_any_distance & ~problem.excluded
-    legs, released, steps = [], np.zeros(len(held), int), settings.evaluations_between_checks
+    released, steps = np.zeros(len(held), int), settings.evaluations_between_checks
+    runs: list[Minimum] = []
     # An active set: the inverse distance of a point is free, or held at 0 (infinity) while its
     # rays pull it beyond. Holding changes the mask of free columns only, so that all rounds run the
     # same compiled program.
     problem = _hold_at_infinity(problem, held, start)
     while True:
-        left = max_steps - sum(int(leg.iterations) for leg in legs)
-        legs.append(find_minimum(problem, start, max_steps=min(steps, left), **options))
-        start = legs[-1].values
-        there = at_infinity(problem, start)
-        if there.any():
+        left = max_steps - sum(int(run.iterations) for run in runs)
+        runs.append(find_minimum(problem, start, max_steps=min(steps, left), **options))
+        start = runs[-1].values
+        to_hold = at_infinity(problem, start)
+        if to_hold.any():
             outward = _are_pulled_outward(problem, start)
-            there &= np.where(held, outward | (released >= settings.max_releases), outward)
-            there &= ~problem.excluded
-        released += held & ~there
-        changed = (there != held).any()
-        if left <= steps or not changed and int(legs[-1].termination) != LIMIT:
-            return problem, join_legs(legs)
+            to_hold &= np.where(held, outward | (released >= settings.max_releases), outward)
+            to_hold &= ~problem.excluded
+        released += held & ~to_hold
+        changed = (to_hold != held).any()
+        if left <= steps or not changed and int(runs[-1].termination) != LIMIT:
+            return problem, concatenate_runs(runs)
         steps = settings.evaluations_between_checks if changed else 2 * steps
         if changed:
-            held = there
+            held = to_hold
             problem = _hold_at_infinity(problem, held, start)
 
 
@@ -256,7 +260,7 @@ def _are_pulled_outward(problem: NetworkProblem, values: Values) -> Bool[np.ndar
     free = _hold_at_infinity(problem, np.zeros(number, bool), values)
     solution, slope = Solution(free, values), np.zeros(number)
     for name, rows in problem.image_rows.items():
-        along = solution.residuals[name] * solution.by_eliminated[name][:, :, 2]
+        along = solution.residuals[name] * solution.jacobian_eliminated[name][:, :, 2]
         np.add.at(slope, problem.point[rows], along.sum(1))
     return slope > 0
 
@@ -268,18 +272,18 @@ def _unit(problem: NetworkProblem) -> float:
     return float(np.sqrt(((centres - np.round(centres.mean(0))) ** 2).sum(1).mean()))
 
 
-def join_legs(legs: Sequence[Minimum]) -> Minimum:
-    """Several successive minimisations combined into one. The first evaluation of all but the
-    first is left out: it repeats the last of the previous one (or is that of other start values, as
-    those of a second minimum)."""
-    if len(legs) == 1:
-        return legs[0]
-    rows = [slice(k > 0, int(leg.iterations)) for k, leg in enumerate(legs)]
+def concatenate_runs(runs: Sequence[Minimum]) -> Minimum:
+    """Several successive minimisations combined into one. The first evaluation of every run after
+    the first is left out: it repeats the last of the previous one (or is that of other start
+    values, as those of a second minimum)."""
+    if len(runs) == 1:
+        return runs[0]
+    rows = [slice(k > 0, int(run.iterations)) for k, run in enumerate(runs)]
     column = lambda name: jax.device_put(
-        np.concatenate([np.asarray(getattr(leg.history, name))[of] for leg, of in zip(legs, rows)])
+        np.concatenate([np.asarray(getattr(run.history, name))[r] for run, r in zip(runs, rows)])
     )
     history = History(column("cost"), column("damping"), column("accepted"))
-    return dataclasses.replace(legs[-1], iterations=np.asarray(len(history.cost)), history=history)
+    return dataclasses.replace(runs[-1], iterations=np.asarray(len(history.cost)), history=history)
 
 
 def _unit_vectors(v: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

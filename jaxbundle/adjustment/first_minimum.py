@@ -8,15 +8,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxbundle.adjustment.exclusions import (
-    Undetermined,
-    carry,
-    find_undetermined,
-    may_be_undetermined,
-    take_back,
+    CollinearGeometry,
+    find_collinear,
+    may_be_collinear,
+    readmit,
+    transfer_start_values,
 )
 from jaxbundle.adjustment.far_points import (
-    join_legs,
-    minimise_at_any_distance,
+    concatenate_runs,
+    minimise_with_far_points,
 )
 from jaxbundle.adjustment.likely_causes import (
     noise_factor,
@@ -39,8 +39,8 @@ from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.network.check import check_network
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.kinds.figures import KNOWN_SHAPES, across_rays
+from jaxbundle.network.subsets import split_check_points
 from jaxbundle.network.tables import Network, Observations, Points
-from jaxbundle.network.undetermined import split_check_points
 from jaxbundle.network.unit_mistakes import (
     name_pixels,
 )
@@ -50,14 +50,15 @@ from jaxbundle.orientation.network import Oriented
 
 @dataclasses.dataclass(frozen=True)
 class RoundSettings:
-    """When the rounds of an adjustment exclude and bring back.
+    """When the rounds of an adjustment exclude and readmit.
 
-    - `evaluations_before_look`: evaluations before points that rays may not determine are looked
-      for: the images are then nearly where they end. More: such points drift away meanwhile and
-      slow the iterations; fewer: images that still move make points look weak that are not.
-    - `max_retries`: repeated adjustments with what start values excluded. Each brings back what
-      agrees with a better orientation, most of it the first; what is left after five is said in a
-      warning.
+    - `evaluations_before_check`: evaluations before points that rays may not determine are
+      searched for: the images are then nearly where they end. More: such points drift away
+      meanwhile and slow the iterations; fewer: images that still move make points look weak that
+      are not.
+    - `max_retries`: repeated adjustments with what start values excluded. Each readmits what
+      agrees with a better orientation, most of it the first; what is left after five is reported
+      in a warning.
     - `soft_sigma`: least σ of the points of known shapes, relative to that of a point across a ray,
       with which values to begin from are computed. A shape that turns moves its points along arcs,
       a step along tangents: exact conditions allow short steps only. Boards seen through water
@@ -65,7 +66,7 @@ class RoundSettings:
       alone; with those before them 24 and 5 (0.01), 7 and 6 (0.1), 8 and 7 (0.3).
     """
 
-    evaluations_before_look: int = 6
+    evaluations_before_check: int = 6
     max_retries: int = 5
     soft_sigma: float = 0.1
 
@@ -76,13 +77,13 @@ ROUNDS = RoundSettings()
 class FoundMinimum(NamedTuple):
     """Where the iterations of a network ended.
 
-    `check`: check points and their image points; `undetermined`: what was left out because rays do
+    `check`: check points and their image points; `collinear`: what was left out because rays do
     not determine it; `network`: what was adjusted, with its check points."""
 
     problem: NetworkProblem
     minimum: Minimum
     check: tuple[Points, Observations]
-    undetermined: Undetermined
+    collinear: CollinearGeometry
     network: Network
 
     @property
@@ -122,7 +123,7 @@ class FirstMinimum:
             if len(screened.observations) < len(network.observations):
                 found, network = self._minimise(screened), screened
         left_out = network is not given and network.left_out[len(given.left_out) :]
-        return self._try_again(given, found) if left_out or found.undetermined else found
+        return self._try_again(given, found) if left_out or found.collinear else found
 
     def _try_again(self, given: Network, found: FoundMinimum) -> FoundMinimum:
         """Adjust again, with everything left out because of start values that agrees with the
@@ -133,30 +134,30 @@ class FirstMinimum:
         # Excluded because of start values is not excluded for good: a point that misses by three
         # tolerances of a rough orientation may fit the adjusted one to its σ. What rays do not
         # determine (`final`) stays out, or it would return and leave in every round.
-        rounds, final = 0, Undetermined()
+        rounds, final = 0, CollinearGeometry()
         while found.is_solved:
-            problem, minimum, _, gone, current = found
+            problem, minimum, _, collinear, current = found
             # What the first minimum leaves undetermined may only be so because of what was still
             # missing.
             if rounds:
-                final += gone
-            part, factor = final.leave_out(given), noise_factor(problem, minimum)
+                final += collinear
+            candidates, factor = final.leave_out(given), noise_factor(problem, minimum)
             try:
-                whole = take_back(part, current, problem, minimum.values, factor)
-                whole = check_network(whole)
-                gained = len(whole.observations) - len(current.observations)
+                larger = readmit(candidates, current, problem, minimum.values, factor)
+                larger = check_network(larger)
+                gained = len(larger.observations) - len(current.observations)
                 if gained <= 0 or rounds == self.settings.max_retries:
                     if gained > 0:
-                        whole = whole.warn(
+                        larger = larger.warn(
                             f"{count(gained, 'image point')} left out because of start values "
                             f"would still come back after {rounds} repeated adjustments"
                         )
                     network = problem.network.replace(
-                        warnings=whole.warnings, notes=whole.notes, left_out=whole.left_out
+                        warnings=larger.warnings, notes=larger.notes, left_out=larger.left_out
                     )
                     return found._replace(problem=dataclasses.replace(problem, network=network))
-                carried = partial(carry, before=problem, values=minimum.values)
-                again = self._minimise(whole, carried, look=False)
+                begin = partial(transfer_start_values, before=problem, values=minimum.values)
+                again = self._minimise(larger, begin, check_early=False)
                 solved = again.is_solved
             except (InputError, NotSolvedError):
                 solved = False
@@ -173,53 +174,56 @@ class FirstMinimum:
         self,
         network: Network,
         begin: Callable[[NetworkProblem], Values] | None = None,
-        look: bool = True,
+        check_early: bool = True,
     ) -> FoundMinimum:
         """The minimum of a network without what its rays do not determine; `begin`: gives the
-        values to begin from (default: start values); `look`: whether what rays do not determine is
-        looked for before the minimum, too."""
-        # Three looks at what rays do not determine: at the start values (cheap, but they may be
-        # poor), after a few evaluations (before such points slow the iterations down), and at the
-        # minimum. Each exclusion begins again from where the last iterations ended.
-        gone, factor = Undetermined(), None
+        values to begin from (default: start values); `check_early`: whether what rays do not
+        determine is searched for before the minimum, too."""
+        # What rays do not determine is searched for three times: at the start values (cheap, but
+        # they may be poor), after a few evaluations (before such points slow the iterations down),
+        # and at the minimum. Each exclusion begins again from where the last iterations ended.
+        excluded, factor = CollinearGeometry(), None
         while True:
-            current = check_network(gone.leave_out(network))
+            current = check_network(excluded.leave_out(network))
             used, points, observations = split_check_points(current)
             make = partial(make_problem, used, reduction=self.reduction, also=self.also)
-            try:
-                problem = make()
-            except InputError as error:
-                # Without the control points that were excluded the datum may be open; `orient`
-                # has said why they were.
-                finding = "" if self.oriented is None else self.oriented.finding
-                raise InputError(f"{error} {finding}".strip()) from None
+            problem = self._make_problem(make)
             start = self._soften(problem) if begin is None else begin(problem)
-            legs, left = [], self.options["max_steps"]
-            find = partial(self._find_more, network, gone)
-            more = find(problem, start, factor) if look else Undetermined()
-            if not more and look and may_be_undetermined(problem, start):
-                options = {
-                    **self.options,
-                    "max_steps": min(self.settings.evaluations_before_look, left),
-                }
-                legs, look = [find_minimum(problem, start, **options)], False
-                left -= int(legs[0].iterations)
-                factor, start = noise_factor(problem, legs[0]), legs[0].values
-                more = find(problem, start, factor)
-                begin = partial(carry, before=problem, values=start)
+            left = self.options["max_steps"]
+            runs: list[Minimum] = []
+            find_more = partial(self._find_more, network, excluded)
+            more = find_more(problem, start, factor) if check_early else CollinearGeometry()
+            if not more and check_early and may_be_collinear(problem, start):
+                check_early, few = False, min(self.settings.evaluations_before_check, left)
+                run = find_minimum(problem, start, **{**self.options, "max_steps": few})
+                runs, left = [run], left - int(run.iterations)
+                factor, start = noise_factor(problem, run), run.values
+                more = find_more(problem, start, factor)
+                begin = partial(transfer_start_values, before=problem, values=start)
             if not more:
-                found = problem
                 if left > 0:
                     options = {**self.options, "max_steps": left}
-                    found, last = minimise_at_any_distance(problem, start, make, **options)
-                    legs.append(last)
-                minimum = join_legs(legs)
-                factor = noise_factor(found, minimum)
-                more = find(found, minimum.values, factor)
-                begin = partial(carry, before=found, values=minimum.values)
+                    # Points at any distance make another problem.
+                    problem, run = minimise_with_far_points(problem, start, make, **options)
+                    runs.append(run)
+                minimum = concatenate_runs(runs)
+                factor = noise_factor(problem, minimum)
+                more = find_more(problem, minimum.values, factor)
+                begin = partial(transfer_start_values, before=problem, values=minimum.values)
                 if not more:
-                    return FoundMinimum(found, minimum, (points, observations), gone, current)
-            gone += more
+                    check = points, observations
+                    return FoundMinimum(problem, minimum, check, excluded, current)
+            excluded += more
+
+    def _make_problem(self, make: Callable[[], NetworkProblem]) -> NetworkProblem:
+        """`make()`; an error also says why control points were excluded."""
+        try:
+            return make()
+        except InputError as error:
+            # Without the control points that were excluded the datum may be open; `orient` has
+            # said why they were.
+            finding = "" if self.oriented is None else self.oriented.finding
+            raise InputError(f"{error} {finding}".strip()) from None
 
     def _soften(self, problem: NetworkProblem) -> Values:
         """The values to begin from: start values, or where they lead if the conditions of known
@@ -236,9 +240,11 @@ class FirstMinimum:
         return found.values if converged(found.termination) else start
 
     @staticmethod
-    def _find_more(network: Network, gone: Undetermined, *where: Any) -> Undetermined:
-        more = find_undetermined(*where)
-        return more if (gone + more).spares_most_of(network) else Undetermined()
+    def _find_more(network: Network, excluded: CollinearGeometry, *where: Any) -> CollinearGeometry:
+        """What rays leave undetermined beside the `excluded`; nothing if together these were most
+        of the network."""
+        more = find_collinear(*where)
+        return more if (excluded + more).leaves_majority_of(network) else CollinearGeometry()
 
 
 def require_most_oriented(found: Oriented) -> Oriented:

@@ -108,8 +108,8 @@ def check_gradients(
         extrapolated, error = _differentiate(y, step, tolerance / 10 * scale)
         forward.append(float(jnp.linalg.norm(along - extrapolated)) / scale)
         differences.append(error / scale)
-        apart = abs(float(jnp.vdot(c, along)) - float(jnp.vdot(pulled, d)))
-        reverse.append(apart / (float(jnp.linalg.norm(c)) * scale))
+        difference = abs(float(jnp.vdot(c, along)) - float(jnp.vdot(pulled, d)))
+        reverse.append(difference / (float(jnp.linalg.norm(c)) * scale))
     largest = lambda found: float(np.max(found))  # NaN where one of them is
     return GradientCheck(largest(forward), largest(reverse), tolerance, largest(differences))
 

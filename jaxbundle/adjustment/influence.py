@@ -99,7 +99,7 @@ def influence(given: Adjustment | NetworkProblem, of: Any = CAMERAS) -> Influenc
         )
     found = inspection.solution
     # In reverse: one solution per result gives the derivatives by all measurements.
-    by_set = pull_back(found, found.slopes(results.function))
+    by_set = pull_back(found, found.jacobian_of(results.function))
     of_result = [{o: x[r] for o, x in by_set.items()} for r in range(len(results.asked))]
     parts = list(observations(inspection.problem, *of_result))
     inverse_sigma = np.concatenate([np.ravel(part.inverse_sigma) for part in parts])
@@ -115,7 +115,7 @@ def influence(given: Adjustment | NetworkProblem, of: Any = CAMERAS) -> Influenc
         name: np.concatenate([column(*part[:4]) for part in parts])[used]
         for name, column in COLUMNS.items()
     }
-    # in units of the classical σ, of which each observation has its share
+    # In units of the classical σ, of which each observation has its share.
     unit = request_results(inspection, IndependentErrors(found, 1.0), of).sigma
     size = np.maximum(unit, 1e-300)
     return Influence(

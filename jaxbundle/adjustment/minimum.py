@@ -13,8 +13,11 @@ from jaxbundle.errors import NotSolvedError
 from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.iterations.solver import Minimum
 from jaxbundle.leastsquares.iterations.stopping import LIMIT, SINGULAR, TERMINATIONS, converged
-from jaxbundle.leastsquares.quality.names import undetermined, undetermined_rows
-from jaxbundle.leastsquares.quality.undefined import without_derivatives
+from jaxbundle.leastsquares.quality.nondifferentiable import without_derivatives
+from jaxbundle.leastsquares.quality.null_space import (
+    undetermined_eliminated_unknowns,
+    undetermined_unknowns,
+)
 from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Camera
 
@@ -43,8 +46,8 @@ def names_of_defects(problem: NetworkProblem, minimum: Minimum[Values]) -> list[
         return fallen
     last = _last(problem, minimum)
     if problem.plan.reduction == "dense" and problem.reduced_size <= MAX_FOR_EIGENVECTORS:
-        return undetermined(problem, last)
-    rows = undetermined_rows(problem, last)
+        return undetermined_unknowns(problem, last)
+    rows = undetermined_eliminated_unknowns(problem, last)
     if rows:
         return rows
     singular = bool(converged(int(minimum.termination))) or int(minimum.termination) == SINGULAR
@@ -64,7 +67,7 @@ def name_inseparable(
         return ""
     if problem.reduced_size > MAX_FOR_EIGENVECTORS:
         return ""
-    names = undetermined(problem, _last(problem, minimum), inseparable)
+    names = undetermined_unknowns(problem, _last(problem, minimum), inseparable)
     # Where a camera parameter is open, so are the orientations that follow it: it is the cause.
     names = [name for name in names if " of camera " in name] or names
     if not names:

@@ -15,8 +15,8 @@ from jaxtyping import Float
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.columns import count
+from jaxbundle.network.equation_counts import count_controlled_axes
 from jaxbundle.network.tables import Network
-from jaxbundle.network.undetermined import count_controlled_axes
 from jaxbundle.orientation.image_conventions import (
     EXPECTED_CONVENTION,
     explains_better,

@@ -14,8 +14,8 @@ from jaxbundle.float64 import require_x64
 from jaxbundle.io.formats import as_network
 from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.network.check import check_network
+from jaxbundle.network.subsets import keep_images, keep_points
 from jaxbundle.network.tables import Camera, Distances, Network
-from jaxbundle.network.undetermined import keep_images, keep_points
 from jaxbundle.orientation import batched
 from jaxbundle.orientation.incremental import Model, misclosures
 from jaxbundle.orientation.network import Oriented, find_start_values

@@ -18,7 +18,7 @@ from jaxbundle.float64 import require_x64
 from jaxbundle.leastsquares import problem as engine
 from jaxbundle.leastsquares.any_distance import derivative
 from jaxbundle.leastsquares.datum.defect import CannotHold
-from jaxbundle.leastsquares.datum.motions import SEVEN
+from jaxbundle.leastsquares.datum.motions import SIMILARITY_PARAMETERS
 from jaxbundle.leastsquares.declarations import ObservationSet, Table
 from jaxbundle.leastsquares.indexing.rows import Data, Values
 from jaxbundle.network.camera_tables import CameraTable
@@ -27,13 +27,13 @@ from jaxbundle.network.declare import DeclaredNetwork, declare, order_cameras
 from jaxbundle.network.kinds.base import among
 from jaxbundle.network.kinds.image_points import image_coordinates
 from jaxbundle.network.retraction import TurnAboutSeen
+from jaxbundle.network.subsets import split_check_points
 from jaxbundle.network.tables import Network, require_network
-from jaxbundle.network.undetermined import split_check_points
 from jaxbundle.types import AnyArray, present
 
-HELD = 1e-6
-"""Below this part of a motion a datum direction counts as none. The directions are unit vectors:
-a motion that is open has a part of the size of one, a determined one rounding. Not critical."""
+NEGLIGIBLE_MOTION = 1e-6
+"""A datum direction with a smaller part of a motion does not contain it. The directions are unit
+vectors: a motion that is open has a part of the size of one, a determined one rounding."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -339,7 +339,7 @@ def _datum(
     # With the scale open, all distances shrink to fit a σ that is a length (1 mm from a plane): the
     # minimum would be a network of size 0.
     sized = [one for one in among(network) if one.needs_scale]
-    if sized and np.abs(gauge[SEVEN.index("scale")]).max() > HELD:
+    if sized and np.abs(gauge[SIMILARITY_PARAMETERS.index("scale")]).max() > NEGLIGIBLE_MOTION:
         raise InputError(
             f"{sized[0].source.name}: a σ of {sized[0].TABLE} is a length, but nothing gives the "
             'network a scale: add a distance or control points, or write "exact" (no σ)'

@@ -136,7 +136,7 @@ def with_components(
     """The problem with estimated σ of every group, its minimum, and the factors of σ by group."""
     repeat = _Repeat(again, "with the estimated variance components", minimum)
     # σ̂² of a group is vᵀPv/r of the group (Förstner 1979): iterated, since both depend on all σ.
-    # Groups with too little redundancy keep their σ, which is said in a note.
+    # Groups with too little redundancy keep their σ, which is reported in a note.
     whole, of = Inspection(problem, minimum.values).solution, groups(problem)
     found, factors, unsettled = estimate(whole, of, repeat)
     components = variance_components(found, of, factors)

@@ -55,7 +55,7 @@ from jaxbundle.errors import NotSolvedError
 from jaxbundle.io.results.result_json import result_dict
 from jaxbundle.leastsquares.adjust import TableResult, table_result
 from jaxbundle.leastsquares.any_distance import is_at_infinity
-from jaxbundle.leastsquares.datum.motions import SEVEN
+from jaxbundle.leastsquares.datum.motions import SIMILARITY_PARAMETERS
 from jaxbundle.leastsquares.indexing.indices import round_up
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
 from jaxbundle.leastsquares.indexing.rows import Values
@@ -375,7 +375,7 @@ class Adjustment:
         # Only the excess over the datum counts: the observations that fix it fit exactly, whatever
         # their σ.
         held = 3 * int(points.has_role("fixed").sum()) + int((images.sigma == 0).sum())
-        needed = max(len(SEVEN) - self.counts.datum - held, 0)
+        needed = max(len(SIMILARITY_PARAMETERS) - self.counts.datum - held, 0)
         return self.counts.pseudo_observations > needed
 
     def global_test(self, significance: float = 0.05) -> dict:
@@ -550,12 +550,12 @@ class Adjustment:
         """One split of the network into halves, adjusted and compared; None if not requested."""
         if not self.halves_by or not self.converged:
             return None
-        # of held cameras alone there is nothing to compare
+        # Of held cameras alone there is nothing to compare.
         cameras = range(len(self.problem.network.cameras))
         if not any(len(self.problem.free_parameters(c)[1]) for c in cameras):
             return None
         failed = []
-        # a random half may have all rolled photographs, or none, and not determine the camera
+        # A random half may have all rolled photographs, or none, and not determine the camera.
         for second in random_halves(self.problem.network, self.halves_by, MAX_SPLITS, 0):
             try:
                 split = self.compare_halves(second)

@@ -49,7 +49,7 @@ def cameras(adjustment: "Adjustment") -> dict[str, dict]:
                     "value": value,
                     "sigma": float(sigma[name]) if name in sigma else None,
                     "free": name in sigma,
-                    # by the σ that is shown first: under correlated errors it may be the larger
+                    # By the σ that is shown first: under correlated errors it may be the larger.
                     "t": _significance(
                         value - default.get(name, 0.0),
                         max(sigma[name], correlated.get(name, 0.0)),

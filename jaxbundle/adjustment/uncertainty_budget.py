@@ -334,7 +334,7 @@ def uncertainty_budget(
     measurands = _measurands(adjustment, results, units)
     factor = np.array([one.factor for one in measurands])
     found = inspection.solution
-    slopes = {t: np.asarray(x) for t, x in found.slopes(results.function).items()}
+    slopes = {t: np.asarray(x) for t, x in found.jacobian_of(results.function).items()}
     by_set = pull_back(found, slopes)
     parts = list(
         observations(

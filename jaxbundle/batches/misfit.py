@@ -19,9 +19,8 @@ from jaxtyping import Bool, Float
 
 from jaxbundle.batches.input import Batch
 from jaxbundle.cameras import CameraModel
+from jaxbundle.leastsquares.quality.distributions import NORMAL_SIGMA_BY_MAD
 
-# The standard deviation of a normal distribution over its median absolute deviation, 1/Φ⁻¹(¾).
-MEDIAN_DEVIATION_AS_SIGMA = 1.4826
 # √(mean of squares)/mean of the lengths of normal residuals (Rayleigh's distribution).
 NORMAL = 2 / np.sqrt(np.pi)
 
@@ -80,7 +79,7 @@ def misfits(
     if solved.sum() >= settings.min_cameras:
         # in the logarithm, since an RMS is positive and its scatter proportional to it
         log = np.log(np.maximum(rms[solved], settings.negligible))
-        spread = MEDIAN_DEVIATION_AS_SIGMA * np.median(np.abs(log - np.median(log)))
+        spread = NORMAL_SIGMA_BY_MAD * np.median(np.abs(log - np.median(log)))
         factor = np.exp(max(np.log(settings.min_ratio), settings.max_deviations * spread))
     return found | (rms > factor * rms_beside(rms, solved, settings))
 

@@ -20,9 +20,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.batches.camera import CONVERGED, SOLVED, STATUS, WEAK
-from jaxbundle.batches.misfit import MEDIAN_DEVIATION_AS_SIGMA
 from jaxbundle.errors import InputError
-from jaxbundle.leastsquares.quality.distributions import f_tail
+from jaxbundle.leastsquares.quality.distributions import NORMAL_SIGMA_BY_MAD, f_tail
 from jaxbundle.network.columns import Columns, as_columns
 from jaxbundle.report.layout import significant
 from jaxbundle.report.page.columns import numbers
@@ -112,7 +111,7 @@ class Population:
         if not len(found):
             return np.nan, np.nan
         middle = float(np.median(found))
-        return middle, MEDIAN_DEVIATION_AS_SIGMA * float(np.median(np.abs(found - middle)))
+        return middle, NORMAL_SIGMA_BY_MAD * float(np.median(np.abs(found - middle)))
 
     def _apart(self, values: np.ndarray, sigma: np.ndarray) -> np.ndarray:
         middle, deviation = self.spread(values)

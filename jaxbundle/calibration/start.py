@@ -20,6 +20,7 @@ from jaxbundle.calibration.pixels import images_of_board
 from jaxbundle.cameras import CameraModel
 from jaxbundle.cameras.pixel_frame import in_model_units
 from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.leastsquares.quality.distributions import NORMAL_SIGMA_BY_MAD
 from jaxbundle.measure.views import BoardViews
 from jaxbundle.network.columns import count
 
@@ -111,7 +112,7 @@ def _gross_views(views: BoardViews, solved: FirstCamera) -> Bool[np.ndarray, " v
     )
     # lengths of the residuals, pixels; NaN for missing points
     v = np.linalg.norm(computed - in_model_units(views.xy, model, views.image_size), axis=2)
-    typical = 1.4826 * np.nanmedian(v)
+    typical = NORMAL_SIGMA_BY_MAD * np.nanmedian(v)
     # Gross: above 12 times the typical size and 3 pixels. (Of lengths 1.4826·median is not σ of a
     # coordinate, but 1.75 times as much.) The camera of the start may have fewer coefficients than
     # its model, and what they leave grows towards the corners to several times its median; a wrong

@@ -34,7 +34,7 @@ from jaxbundle.arguments import number, positive, show
 from jaxbundle.certificates.lengths import RULES
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import read_toml
-from jaxbundle.network.columns import did_you_mean
+from jaxbundle.network.columns import refuse_unknown
 from jaxbundle.network.kinds.base import ANGLES
 from jaxbundle.network.units import ANGLE_UNITS
 
@@ -156,8 +156,7 @@ def _section(given: Mapping[str, Any], name: str, where: str) -> Mapping[str, An
 
 def _check_keys(given: Mapping[str, Any], known: Any, where: str) -> None:
     for key in given:
-        if key not in known:
-            raise InputError(f"{where}: unknown key {key!r}{did_you_mean(key, list(known))}")
+        refuse_unknown(key, known, f"{where}: ")
 
 
 def _evaluation(given: Mapping[str, Any], where: str) -> dict[str, Any]:

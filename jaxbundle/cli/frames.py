@@ -19,7 +19,7 @@ def frames(
         int | None,
         typer.Option(
             min=1,
-            help="instead, every so many-th frame, for calibrate-rig --synchronize: the videos "
+            help="instead, every Nth frame, for calibrate-rig --synchronize: the videos "
             "need not be simultaneous",
         ),
     ] = None,

@@ -8,7 +8,8 @@ from jaxbundle.io.scanner.refinement import SECTIONS
 from jaxbundle.io.scanner.refinement_images import read_images
 from jaxbundle.io.scanner.rpc_images import find_raster
 from jaxbundle.io.text.csv_tables import read_toml
-from jaxbundle.io.text.sections import TomlFile, refuse_unknown
+from jaxbundle.io.text.sections import TomlFile
+from jaxbundle.network.columns import refuse_unknown
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.refinement import ScannerImage
 from jaxbundle.surfaces.reconstruct import ground_bounds

@@ -108,7 +108,7 @@ def frames(
     - `videos`: files. Several: of cameras that run at one rate.
     - `out`: folder; in it a folder for each video, of its name, and a table `frames.csv`.
     - `number`: of frames at most, fewer if the pictures do not differ.
-    - `every`: instead, every so many-th frame, sharp or not, of videos that need not be
+    - `every`: instead, every `every`-th frame, sharp or not, of videos that need not be
       simultaneous or run at one rate: to find offsets of time (`calibrate_rig(…, synchronize=…)`).
     - `first`: for each video the frame at which all begin, if they were not started together.
     - `force`: replace a folder of other content.

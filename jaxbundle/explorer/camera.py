@@ -32,7 +32,7 @@ from jaxbundle.network.tables import Camera
 from jaxbundle.photographs.opencv import need_opencv
 from jaxbundle.plotting.distortion import distortion_at
 from jaxbundle.plotting.style import micrometres
-from jaxbundle.report.equations import equations
+from jaxbundle.report.camera_equations import camera_equations
 from jaxbundle.report.layout import clean, digits_of, significant
 from jaxbundle.report.page import UNKNOWN, Origin, Page, Section
 from jaxbundle.report.page.charts import Curve, draw_curves, draw_plan
@@ -177,7 +177,7 @@ class CameraView:
                             f"Camera {clean(self.camera.id)}, model {self.model.name}, "
                             f"{self.size[0]} × {self.size[1]} pixels."
                         ),
-                        items(equations(self.model)),
+                        items(camera_equations(self.model)),
                         draw_controls(controls, live),
                         draw_tools(live, {"Camera file": "camera.toml"}),
                         place("numbers"),

@@ -20,6 +20,7 @@ from jaxtyping import Float
 from jaxbundle.adjustment.problem import coordinates
 from jaxbundle.adjustment.quality.precision import Precision, precision
 from jaxbundle.adjustment.result import Adjustment
+from jaxbundle.arguments import show
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.convert_fit import images_of
 from jaxbundle.errors import InputError
@@ -34,7 +35,7 @@ from jaxbundle.geometry import (
 )
 from jaxbundle.leastsquares.indexing.rows import Data, Values
 from jaxbundle.leastsquares.spaces import PoseValue
-from jaxbundle.network.columns import count, did_you_mean, show
+from jaxbundle.network.columns import count, did_you_mean
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.plotting.frame import image_frame
 from jaxbundle.report.layout import clean, significant

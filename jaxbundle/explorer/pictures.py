@@ -148,7 +148,7 @@ def take_pictures(
 
 
 def pattern(frame: GroundFrame, cells: int = 8, fineness: int = 4) -> Float[np.ndarray, "1 r c"]:
-    """A scene without a file: a chessboard of so many cells along the longer side, brighter towards
+    """A scene without a file: a chessboard of `cells` cells along the longer side, brighter towards
     the east, with a disc in the north-west by which pictures are told from their mirror images.
     Every pixel is the mean of `fineness`² samples."""
     rows, columns = frame.rows, frame.columns

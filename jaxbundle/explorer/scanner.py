@@ -694,7 +694,7 @@ def _attitude_with(attitude: AttitudeTable, method: str) -> AttitudeTable:
 
 
 def _outline(image: PushbroomImage, places: int = 9) -> tuple[np.ndarray, np.ndarray]:
-    """Lines and pixels around the image, closed, at so many places of each side."""
+    """Lines and pixels around the image, closed, at `places` places of each side."""
     s, zero, one = np.linspace(0, 1, places), np.zeros(places), np.ones(places)
     down = np.concatenate([zero, s, one, s[::-1]])
     across = np.concatenate([s, one, s[::-1], zero])

@@ -4,8 +4,9 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple, Protocol
 
+from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
-from jaxbundle.network.columns import did_you_mean, show
+from jaxbundle.network.columns import did_you_mean
 from jaxbundle.report.page import Page
 
 # Values of the controls, by their keys.

@@ -28,7 +28,7 @@ from jaxbundle.leastsquares.iterations.search import SEARCHES
 from jaxbundle.leastsquares.iterations.solver import Minimum
 from jaxbundle.leastsquares.iterations.stopping import SINGULAR, TERMINATIONS, converged
 from jaxbundle.leastsquares.problem import Problem, SystemCounts, make_problem, with_factor
-from jaxbundle.leastsquares.quality.names import undetermined
+from jaxbundle.leastsquares.quality.null_space import undetermined_unknowns
 from jaxbundle.leastsquares.quality.reliability import external_reliability, minimal_detectable
 from jaxbundle.leastsquares.quality.robust import SuspectRow, reweight
 from jaxbundle.leastsquares.quality.snooping import RemovedRow, check_test, snoop
@@ -104,7 +104,11 @@ class Result:
     @functools.cached_property
     def undetermined(self) -> tuple[str, ...]:
         """Undetermined unknowns, most affected first; empty for a solved problem."""
-        return () if self.converged else tuple(undetermined(self.problem, self.minimum.values))
+        return (
+            ()
+            if self.converged
+            else tuple(undetermined_unknowns(self.problem, self.minimum.values))
+        )
 
     @functools.cached_property
     def _solution(self) -> Solution:
@@ -278,7 +282,7 @@ def adjust(  # noqa: PLR0913 - the options of an adjustment
         # The first solution may fail: the result says so. Later ones start at a solution; if they
         # fail, the weights left unknowns undetermined, and no result would be true.
         if len(minima) > 1 and not (converged(int(minima[-1].termination)) and found.determined):
-            names = undetermined(problem, minima[-1].values)
+            names = undetermined_unknowns(problem, minima[-1].values)
             what = ", ".join(names[:8])
             raise NotSolvedError(f"not solved after a change of weights: {what}", names)
         return found

@@ -27,8 +27,8 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxbundle.leastsquares.datum.conditions import zeros_of_tables
 from jaxbundle.leastsquares.equations.elimination import NormalFactor, damp, factorise, solve
-from jaxbundle.leastsquares.equations.normal import Normal, Tangent, normal_equations, zero_tangent
-from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.equations.normal import Normal, normal_equations, zero_tangent
+from jaxbundle.leastsquares.indexing.plan import Plan, Tangent
 from jaxbundle.leastsquares.indexing.rows import (
     Data,
     Declared,

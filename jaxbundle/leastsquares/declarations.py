@@ -253,7 +253,7 @@ class ObservationSet:
         return f"{self.kind.name} of {' and '.join(touched)}"
 
     def weight(self, residuals: int) -> Float[np.ndarray, "n ..."]:
-        """The weights for so many residuals of an observation."""
+        """The weights, of observations of this number of `residuals` each."""
         if self.covariance is not None:
             return _whitening(self.kind.name, self.covariance, self.number, residuals)
         shape, sigma = np.shape(self.sigma), 1.0 if self.sigma is None else self.sigma

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxbundle.leastsquares.equations.normal import Tangent, normal_equations
-from jaxbundle.leastsquares.indexing.plan import Incidences, Plan
+from jaxbundle.leastsquares.equations.normal import normal_equations
+from jaxbundle.leastsquares.indexing.plan import Incidences, Plan, Tangent
 from jaxbundle.leastsquares.indexing.rows import Data, Declared, Values, lay_out_data
 from jaxbundle.leastsquares.iterations.retraction import changes_of_tables
 from jaxbundle.leastsquares.problem import Problem, pad_data, pad_values, without_filling
@@ -30,15 +30,15 @@ class DeterminedRows(NamedTuple):
     inverse: Float[np.ndarray, "rows width width"]
     functions: tuple[dict[str, Float[np.ndarray, "width rows width"]], ...]
 
-    def cofactors(self, found: Solution) -> Float[np.ndarray, "rows width width"]:
+    def cofactors(self, solution: Solution) -> Float[np.ndarray, "rows width width"]:
         """V⁻¹ is the intersection with images given; V⁻¹WᵀQWV⁻¹ what their own uncertainty adds,
         in the datum of the adjustment, by propagation of three linear functions for each point."""
         return np.array(
-            [V + found.propagate_rows(rows) for V, rows in zip(self.inverse, self.functions)]
+            [V + solution.propagate_rows(rows) for V, rows in zip(self.inverse, self.functions)]
         )
 
 
-def determine(found: Solution, problem: Problem) -> DeterminedRows:
+def determine_excluded(solution: Solution, problem: Problem) -> DeterminedRows:
     """The eliminated rows of a problem whose other tables are those of a solution.
 
     **Arguments:** `problem`: with the kept tables of the solution's problem, at their adjusted
@@ -48,7 +48,7 @@ def determine(found: Solution, problem: Problem) -> DeterminedRows:
     data = pad_data(problem, problem.data)
     values, inverse, spread = _intersect(problem.declared, plan, data)
     number, every = problem.table(e).rows, []
-    blank = {t.name: np.zeros((t.rows, t.space.width)) for t in found.problem.tables}
+    blank = {t.name: np.zeros((t.rows, t.space.width)) for t in solution.problem.tables}
     by_row = {g: _by_row(at, W) for (g, W), at in zip(spread.items(), plan.incidences.values())}
     start = pad_values(problem, problem.data.start)
     for row in range(number):
@@ -89,12 +89,12 @@ def _intersect(
     held = (1.0 - group.free)[:, :, None] * jnp.eye(group.width)
     space = declared.spaces[e]
 
-    def further(values: Values, _: None) -> tuple[Values, None]:
+    def one_step(values: Values, _: None) -> tuple[Values, None]:
         _, gradient, N = normal_equations(declared, plan, values, laid)
         step = -jnp.linalg.solve(N.eliminated + held, gradient[e][..., None])[..., 0]
         return values | {e: jax.vmap(space.retract)(values[e], step)}, None
 
-    values, _ = jax.lax.scan(further, data.start, None, steps)
+    values, _ = jax.lax.scan(one_step, data.start, None, steps)
     *_, N = normal_equations(declared, plan, values, laid)
     inverse = jnp.linalg.inv(N.eliminated + held)
     of = lambda g: inverse[plan.incidences[g].eliminated]

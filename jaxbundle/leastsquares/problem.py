@@ -19,9 +19,8 @@ from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.leastsquares.datum.defect import find_open_motions, make_datum, survey_motions
 from jaxbundle.leastsquares.declarations import Kind, Motions, ObservationSet, Table
-from jaxbundle.leastsquares.equations.normal import Tangent
 from jaxbundle.leastsquares.indexing.indices import Sizes, common, finish, round_up
-from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.indexing.plan import Plan, Tangent
 from jaxbundle.leastsquares.indexing.planner import make_plan
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
 from jaxbundle.leastsquares.indexing.rows import (
@@ -159,7 +158,7 @@ def make_problem(
         (retraction or Retraction)(declared),
     )
     problem = problem if motions is None else _with_datum(problem, datum)
-    # Sorting so many observations leaves megabytes in the allocator.
+    # Sorting more observations than this leaves megabytes in the allocator.
     if sum(o.number for o in observations) > 10_000:
         return_freed_memory()
     return problem

@@ -22,8 +22,8 @@ from jaxbundle.leastsquares.datum.conditions import (
 )
 from jaxbundle.leastsquares.equations.elimination import PIVOT, NormalFactor, factorise, solve
 from jaxbundle.leastsquares.equations.linearise import differentiate
-from jaxbundle.leastsquares.equations.normal import Normal, Tangent, normal_equations
-from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.equations.normal import Normal, normal_equations
+from jaxbundle.leastsquares.indexing.plan import Plan, Tangent
 from jaxbundle.leastsquares.indexing.rows import (
     Data,
     Declared,
@@ -34,7 +34,7 @@ from jaxbundle.leastsquares.indexing.rows import (
     restore_order,
 )
 from jaxbundle.leastsquares.iterations.retraction import changes_of_tables
-from jaxbundle.leastsquares.iterations.solver import LeastSquares, Minimum, find
+from jaxbundle.leastsquares.iterations.solver import LeastSquares, Minimum, minimise_compiled
 from jaxbundle.leastsquares.iterations.stopping import converged
 from jaxbundle.leastsquares.problem import (
     Problem,
@@ -59,8 +59,8 @@ from jaxbundle.types import AnyArray, present
 # Placeholder of the plan in a factor returned by a compiled function.
 PLAN_PLACEHOLDER = "the plan"
 
-# Problems with at least so many observations are distributed over several devices; of smaller ones
-# (5 ms an iteration) the devices would wait for each other longer than they compute.
+# Problems with at least this many observations are distributed over several devices; of smaller
+# ones (5 ms an iteration) the devices would wait for each other longer than they compute.
 MIN_SHARED_OBSERVATIONS = 10_000
 
 # By the name of the set, rows in the given order.
@@ -91,10 +91,10 @@ def find_minimum(
     first = minimum = minimise_from(start)
     # After ten returns the two do not agree: the last minimum is as good as the next.
     for _ in range(10):
-        there = with_motions_at(problem, without_filling(problem, minimum.values))
-        values = _move_to_datum(there, minimum.values, given)
+        moved = with_motions_at(problem, without_filling(problem, minimum.values))
+        values = _move_to_datum(moved, minimum.values, given)
         # No weighted points: motions change no observation at all, and the minimum stays one.
-        if there is problem or not bool(converged(minimum.termination)):
+        if moved is problem or not bool(converged(minimum.termination)):
             break
         # Open combinations need not form a group (one open height of a point, say): the motion to
         # the datum may have left the minimum. 1e-12: of the digits that vᵀPv has after rounding.
@@ -123,7 +123,7 @@ def _report_after(minimise_from: Callable, progress: Callable) -> Callable:
 
 def _on_one_device(problem: Problem, solver: LeastSquares) -> Callable[[Values], Minimum[Values]]:
     data = pad_data(problem, problem.data)
-    return lambda start: find(solver, data, start)
+    return lambda start: minimise_compiled(solver, data, start)
 
 
 def _on_all_devices(problem: Problem, solver: LeastSquares) -> Callable[[Values], Minimum[Values]]:
@@ -150,8 +150,8 @@ def _move_to_datum(problem: Problem, values: Values, start: Values) -> Values:
         return values
     # By programs per table, compiled once for all problems; the rare deformation that needs Newton
     # steps compiles a program for its own.
-    moved, there = move_into_datum(problem.declared, problem.plan, values, start)
-    if not there:
+    moved, reached = move_into_datum(problem.declared, problem.plan, values, start)
+    if not reached:
         moved, _ = _move_by_newton(problem.declared, problem.plan, values, start)
     return moved
 
@@ -246,7 +246,7 @@ class Solution:
     def _own(self) -> dict[str, Float[np.ndarray, "rows width width"]]:
         """The cofactor blocks of all tables."""
         declared, plan, values = self.arguments[:3]
-        found = _of_tables(declared, plan, self.cofactors.own, values)
+        found = _of_tables(declared, plan, self.cofactors.diagonal_blocks, values)
         return jax.tree.map(np.asarray, without_filling(self.problem, found))
 
     @functools.cached_property
@@ -267,19 +267,19 @@ class Solution:
         return {o: v[o] / np.sqrt(1 + h[o]) for o in v}
 
     @functools.cached_property
-    def by_eliminated(self) -> Rows:
-        """The derivatives [n, r, w] of all observations by the eliminated rows they touch, divided
-        by their σ; without those that touch none."""
-        return self._rows(_by_eliminated(*self.arguments))
+    def jacobian_eliminated(self) -> Rows:
+        """The derivatives [n, r, w] of all observations with respect to the eliminated rows they
+        touch, divided by their σ; without those that touch none."""
+        return self._rows(_jacobian_eliminated(*self.arguments))
 
     def propagate(self, function: Callable[[Values], Array]) -> Float[np.ndarray, "n n"]:
         """The cofactors of any differentiable function (`Values` → [n]) of the unknowns, compiled
         once per function."""
-        return self.propagate_rows(self.slopes(function))
+        return self.propagate_rows(self.jacobian_of(function))
 
-    def slopes(self, function: Callable[[Values], Array]) -> dict[str, Array]:
-        """The derivatives of a function of the unknowns by the changes of tables, [n, rows, width]
-        each."""
+    def jacobian_of(self, function: Callable[[Values], Array]) -> dict[str, Array]:
+        """The derivatives of a function of the unknowns with respect to the changes of tables,
+        [n, rows, width] each."""
         still = {t.name: np.zeros((t.rows, t.space.width)) for t in self.problem.tables}
         return _rows_of(function, self.problem.declared, self.values, still)
 
@@ -349,7 +349,7 @@ _of_tables = compile_once(blocks_of_tables)
 
 
 @compile_once
-def _by_eliminated(
+def _jacobian_eliminated(
     declared: Declared, plan: Plan, values: Values, data: Data
 ) -> dict[str, Float[Array, "n r w"]]:
     laid, prepared, found = lay_out_data(plan, data), prepare(declared, values), []
@@ -364,7 +364,8 @@ def _by_eliminated(
 def _rows_of(
     function: Callable[[Values], Array], declared: Declared, values: Values, still: Values
 ) -> dict[str, Float[Array, "n rows width"]]:
-    """The derivatives of a function of the tables by their changes, [n, rows, width] each."""
+    """The derivatives of a function of the tables with respect to their changes, [n, rows, width]
+    each."""
 
     def of_change(change: Values) -> Float[Array, " n"]:
         moved = dict(values)

@@ -16,6 +16,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float, Real
 
+from jaxbundle.leastsquares.quality.distributions import NORMAL_SIGMA_BY_MAD
 from jaxbundle.measure.corner_quality import MAX_SIGMA, NO_EDGE, TOO_SMALL
 from jaxbundle.measure.straight_edges import EdgeFits, EdgeSettings, StraightEdges, fit_edges, take
 
@@ -268,11 +269,11 @@ def _robust_mean(
     good: Bool[np.ndarray, " edges"],
 ) -> tuple[float, float]:
     """The mean of shifts without outliers, and its σ from their scatter."""
-    # outliers beyond 3.5 σ of the median, σ from the median deviation (1.4826 = 1/Φ⁻¹(¾)); 0.01 and
+    # outliers beyond 3.5 σ of the median, σ from the median deviation; 0.01 and
     # 0.02 τ: what no photograph does better
     for _ in range(3):
         middle = np.median(shift[good])
-        spread = 1.4826 * np.median(np.abs(shift[good] - middle)) + 0.01
+        spread = NORMAL_SIGMA_BY_MAD * np.median(np.abs(shift[good] - middle)) + 0.01
         good = good & (np.abs(shift - middle) < 3.5 * spread)
     weight = 1 / (sigma[good] ** 2 + 0.02**2)
     mean = weight @ shift[good] / weight.sum()

@@ -27,6 +27,7 @@ import numpy as np
 import scipy  # its parts are loaded on use
 from jaxtyping import Bool, Float, Int, Real
 
+from jaxbundle.leastsquares.quality.distributions import NORMAL_SIGMA_BY_MAD
 from jaxbundle.measure.grey_value_fit import noise_of_residuals, normal_equations
 
 # The unknowns of edges, in the order of `UNKNOWNS`.
@@ -361,8 +362,7 @@ def _consistent_parts(
     # the median over the known parts: unknown ones come last
     order = np.sort(np.where(known, np.abs(z), np.inf), axis=1)
     middle = np.maximum(known.sum(1) - 1, 0) // 2
-    # as σ: the median of |z| of a normal z is Φ⁻¹(¾) = 1/1.4826
-    spread = 1.4826 * np.take_along_axis(order, middle[:, None], 1)
+    spread = NORMAL_SIGMA_BY_MAD * np.take_along_axis(order, middle[:, None], 1)
     good = known & (np.abs(z) < settings.max_part_shift * np.maximum(spread, 1.0))
     redundancy = good.sum(1) - 3  # a, b, c
     chi2 = np.where(good, z, 0.0) ** 2

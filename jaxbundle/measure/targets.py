@@ -26,6 +26,7 @@ from jaxtyping import Bool, Float, Int, Real
 
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.quality.distributions import NORMAL_SIGMA_BY_MAD
 from jaxbundle.measure.spots import MARGIN, Spot, find_spot
 
 # x, y, the three elements of M, G, C, ln τ, and the two of m.
@@ -304,7 +305,7 @@ def _consistent_sectors(
     shift = np.bincount(sector, normal * r * np.sign(J[6]), settings.sectors)
     z = shift / np.sqrt(np.maximum(information, 1e-12))
     noise = np.sqrt(max(r @ r / max(weight.sum() - UNKNOWNS, 1), 1 / 12))
-    spread = max(1.4826 * np.median(np.abs(z)), noise)  # 1/Φ⁻¹(¾): a median of |z| as σ
+    spread = max(NORMAL_SIGMA_BY_MAD * np.median(np.abs(z)), noise)
     return (np.abs(z) < settings.max_sector_shift * spread)[sector].astype(float)
 
 

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from jaxbundle.arguments import text
+from jaxbundle.arguments import show, text
 from jaxbundle.cameras import CameraModel, is_known
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import (
@@ -34,9 +34,8 @@ from jaxbundle.network.columns import (
     RepeatedIds,
     as_columns,
     count,
-    did_you_mean,
     is_missing,
-    show,
+    refuse_unknown,
 )
 from jaxbundle.network.kinds import KINDS, SECTIONS, Further
 from jaxbundle.network.rules import (
@@ -208,8 +207,7 @@ def make_further(given: Mapping[str, Any], radians: float, where: str = "") -> t
     **Raises:** `InputError`, also for an unknown name, and for settings without a table."""
     known = (*KINDS, *SECTIONS)
     for name in given:
-        if name not in known:
-            raise InputError(f"{where}unknown table {name!r}{did_you_mean(name, known)}")
+        refuse_unknown(name, known, where, "table")
     made = []
     for name, kind in KINDS.items():
         settings = given.get(kind.SECTION, {})
@@ -266,10 +264,7 @@ def _camera(
     if isinstance(model, CameraModel) or is_known(model):
         known = model_of(model, where).parameters
         for key in parameters:
-            if key not in known:
-                raise InputError(
-                    f"{where}unknown key {key!r}{did_you_mean(key, (*CAMERA_FIELDS, *known))}"
-                )
+            refuse_unknown(key, (*CAMERA_FIELDS, *known), where)
     sigma, observed = row.get("sigma", {}), row.get("observed", {})
     for key, given in (("sigma", sigma), ("observed", observed)):
         if not isinstance(given, Mapping):
@@ -351,7 +346,7 @@ def _make_images(table: Columns, cameras: Sequence[Camera], radians: float) -> I
 
 
 def _make_points(table: Columns) -> Points:
-    # all columns of coordinates, and of colours, or none
+    # All columns of coordinates, and of colours, or none.
     needed = [n for group in (AXES, POINT_COLOURS) if {*group} & {*table.values} for n in group]
     table.check_names(
         ("id", *needed), ("role", *AXES, *POINT_SIGMAS, *POINT_COLOURS, *POINT_ERRORS)
@@ -388,7 +383,7 @@ def _make_observations(
 ) -> Observations:
     table.check_names(OBSERVATION_COLUMNS, OBSERVATION_SIGMAS)
     if table.values.keys().isdisjoint(OBSERVATION_SIGMAS):
-        # millions of rows of other programs have none
+        # Millions of rows of other programs have none.
         sigma, missing = np.full((len(table), 2), sigma_image or 1.0), len(table) > 0
     else:
         stated = _matrix(table, OBSERVATION_SIGMAS)

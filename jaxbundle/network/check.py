@@ -1,6 +1,6 @@
 """Checks of a network before the adjustment; errors are reported with their location.
 
-`check_network` checks every value of every table, then (`jaxbundle.network.undetermined`)
+`check_network` checks every value of every table, then (`jaxbundle.network.equation_counts`)
 determinability: rays per point, points per image, connected parts, redundancy.
 """
 
@@ -14,6 +14,11 @@ from jaxtyping import Bool, Float
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import count, did_you_mean, list_some
+from jaxbundle.network.equation_counts import (
+    check_parts,
+    check_redundancy,
+    leave_out_with_too_few_rays,
+)
 from jaxbundle.network.number_range import check_coordinates
 from jaxbundle.network.repetitions import warn_of_repetitions
 from jaxbundle.network.rules import (
@@ -25,6 +30,7 @@ from jaxbundle.network.rules import (
     check_unique,
 )
 from jaxbundle.network.single_strip import check_single_strip
+from jaxbundle.network.subsets import keep_distances, with_roles
 from jaxbundle.network.tables import (
     EXTERIOR,
     ROLES,
@@ -35,14 +41,6 @@ from jaxbundle.network.tables import (
     Source,
     require_network,
 )
-from jaxbundle.network.undetermined import (
-    check_parts,
-    check_redundancy,
-    leave_out_undetermined,
-    with_roles,
-    without_distances,
-)
-from jaxbundle.network.undetermined import split_check_points as split_check_points
 from jaxbundle.network.unit_mistakes import check_units
 from jaxbundle.network.units import ANGLE_UNITS
 
@@ -52,13 +50,13 @@ def check_network(network: Network) -> Network:
 
     Control points without σ become fixed; unused cameras, points with too few rays, images with too
     few points and distances between fixed points are removed, each with a note on the network.
-    Check points are kept but not counted: remove them with `split_check_points`.
+    Check points are kept but not counted: remove them with `subsets.split_check_points`.
 
     **Raises:** `InputError`, one line with file, row, cause and remedy.
     """
     # Values first (a message about a row), then what they determine (a message about the network):
     # a missing number would otherwise be reported as a missing point.
-    network = leave_out_undetermined(check_tables(network))
+    network = leave_out_with_too_few_rays(check_tables(network))
     _check_start_values(network)
     check_parts(network)
     check_redundancy(network)
@@ -172,7 +170,7 @@ def _check_images(network: Network) -> None:
     hint = "are these degrees?" if unit == "rad" else f"is {unit!r} right?"
     _refuse(
         images,
-        # a turn, and a little for rounding: degrees read as radians are nearly always more
+        # A turn, and a little for rounding: degrees read as radians are nearly always more.
         np.abs(images.angles) > 2 * math.pi * 1.01,
         "image",
         lambda row, k: (
@@ -323,7 +321,7 @@ def _check_distances(network: Network) -> Network:
         )
     idle = np.all(points.has_role("fixed")[distances.points], axis=1)
     if idle.any():
-        network = without_distances(network, idle).note(
+        network = keep_distances(network, ~idle).note(
             f"left out {count(idle.sum(), 'distance')} between fixed points: "
             f"{names[idle.argmax()]}{' …' if idle.sum() > 1 else ''}"
         )

@@ -13,8 +13,7 @@ from typing import Any, SupportsIndex
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxbundle.arguments import refuse_traced
-from jaxbundle.arguments import show as show
+from jaxbundle.arguments import refuse_traced, show
 from jaxbundle.cameras.names import closest_name
 from jaxbundle.errors import InputError
 from jaxbundle.network.tables import Source
@@ -244,6 +243,20 @@ def did_you_mean(name: str, known: Iterable[str], *, listing: bool = True) -> st
     if close is not None:
         return f"; did you mean {close!r}?"
     return f"; known: {', '.join(known)}" if listing and known else ""
+
+
+def refuse_unknown(name: str, known: Iterable[str], where: str, noun: str = "key") -> None:
+    """Refuse a name other than the `known` ones, as a probable typing error: a setting that is
+    silently ignored would give another result than the user expects.
+
+    **Arguments:** `where` begins the message; `noun`: what the name is of, `section` in brackets.
+
+    **Raises:** `InputError`.
+    """
+    known = tuple(known)
+    if name not in known:
+        shown = f"[{name}]" if noun == "section" else repr(name)
+        raise InputError(f"{where}unknown {noun} {shown}{did_you_mean(name, known)}")
 
 
 def quote(name: Any) -> str:

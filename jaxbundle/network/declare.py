@@ -46,7 +46,7 @@ from jaxbundle.network.user_observations import place, split
 from jaxbundle.system.programs import compile_once
 
 # Smallest batch of rotations, so that networks of fewer images share one compiled program:
-# compiling takes a second, converting 64 rotations no time. Not critical.
+# compiling takes a second, converting 64 rotations no time.
 LEAST_IMAGES = 64
 
 

@@ -59,7 +59,7 @@ def _project(
     images, rays = network.images, network.observations
     found = np.zeros((len(rows), 2))
     # Portions of one size, padded: all networks share one program per camera model. Larger: small
-    # networks project padding; smaller: large ones make more calls. Not critical.
+    # networks project padding; smaller: large ones make more calls.
     portion = 4096
     with local_x64():
         for first in range(0, len(rows), portion):

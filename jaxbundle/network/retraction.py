@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbundle.geometry import matrix_from_quaternion
-from jaxbundle.leastsquares.equations.normal import Tangent, total
-from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.equations.normal import total
+from jaxbundle.leastsquares.indexing.plan import Plan, Tangent
 from jaxbundle.leastsquares.indexing.rows import Declared, Values
 from jaxbundle.leastsquares.iterations.retraction import changes_of_tables, retract
 from jaxbundle.leastsquares.spaces import PoseValue

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxbundle.arguments import one_of, text
+from jaxbundle.arguments import one_of, show, text
 from jaxbundle.cameras import (
     FAMILIES,
     MODEL_NAMES,
@@ -19,7 +19,7 @@ from jaxbundle.cameras import (
     is_own,
 )
 from jaxbundle.errors import InputError
-from jaxbundle.network.columns import did_you_mean, show
+from jaxbundle.network.columns import did_you_mean
 from jaxbundle.network.tables import DATUMS, RESIDUAL_DOMAINS, Camera, Source
 from jaxbundle.network.units import ANGLE_UNITS, IMAGE_UNITS
 

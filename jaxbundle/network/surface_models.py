@@ -18,7 +18,7 @@ from jaxbundle.system.rasters import read_heights
 # Triangles near the start value of a point, of which the nearest counts: one and the 12 that share
 # a corner with it in a regular mesh, rounded up.
 CANDIDATES = 16
-# Of so many with the smallest bound of the distance the exact one is computed; long thin triangles
+# The exact distance is computed of this many triangles with the smallest bounds: long thin ones
 # have small bounds and large distances.
 BOUNDED = 128
 # Nodes of a grid on either side of the start value of a point.
@@ -83,7 +83,7 @@ def _obj(content: bytes) -> Mesh:
             vertices.append([float(word) for word in words[:3]])
         elif key == "f":
             found = [int(word.split("/")[0]) for word in words]
-            # counted from 1, or backwards from the last
+            # Counted from 1, or backwards from the last.
             faces.append([k - 1 if k > 0 else len(vertices) + k for k in found])
     return Mesh(np.array(vertices, float).reshape(-1, 3), _fans(faces))
 
@@ -183,7 +183,7 @@ def triangles_near(
         bound = np.linalg.norm(middle - P, axis=1) - reach
         some = np.argpartition(bound, min(BOUNDED, len(bound)) - 1)[:BOUNDED]
         near = some[np.argsort(distances_to_triangles(P, corners[some]))[:CANDIDATES]]
-        # a small mesh: the last one again
+        # A small mesh: the last one again.
         chosen.append(np.resize(near, CANDIDATES) if len(near) < CANDIDATES else near)
     return corners[np.array(chosen, int)]
 

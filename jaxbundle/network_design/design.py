@@ -23,8 +23,8 @@ from jaxbundle.float64 import require_x64
 from jaxbundle.io.formats import as_network, recognise_format
 from jaxbundle.io.networks.project import project_file
 from jaxbundle.io.text.csv_tables import read_toml
+from jaxbundle.network.subsets import split_check_points
 from jaxbundle.network.tables import Network, units_of
-from jaxbundle.network.undetermined import split_check_points
 from jaxbundle.network_design.aims import Aim
 from jaxbundle.network_design.conditions import Conditions
 from jaxbundle.network_design.configuration import design_configuration

@@ -11,8 +11,8 @@ from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.geometry import matrix_from_quaternion, omega_phi_kappa_from_matrix
 from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.network.check import check_network
+from jaxbundle.network.subsets import keep_images
 from jaxbundle.network.tables import Distances, Network, Source
-from jaxbundle.network.undetermined import keep_images
 from jaxbundle.network_design.pairs import MIN_TARGETS, StationTargetPairs
 
 _angles = jax.jit(jax.vmap(lambda q: omega_phi_kappa_from_matrix(matrix_from_quaternion(q))))

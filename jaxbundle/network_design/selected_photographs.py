@@ -4,8 +4,8 @@ import numpy as np
 
 from jaxbundle.arguments import integer
 from jaxbundle.errors import InputError
+from jaxbundle.network.subsets import keep_images
 from jaxbundle.network.tables import Network
-from jaxbundle.network.undetermined import keep_images
 from jaxbundle.network_design.aims import Aim
 from jaxbundle.network_design.conditions import Conditions
 from jaxbundle.network_design.feasible import (

@@ -6,6 +6,7 @@ import itertools
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.leastsquares.quality.distributions import NORMAL_SIGMA_BY_MAD
 from jaxbundle.network.tables import Network
 from jaxbundle.orientation import batched
 from jaxbundle.orientation.incremental import Model, are_controlled
@@ -226,5 +227,5 @@ def similarity_of_most(
                 best, least = off, middle
     if best is None:
         return None
-    limit = max(OUTLIER_LIMIT * 1.4826 * least, np.sort(best)[2])
+    limit = max(OUTLIER_LIMIT * NORMAL_SIGMA_BY_MAD * least, np.sort(best)[2])
     return batched.similarity(source, target, (best <= limit).astype(float))

@@ -57,10 +57,10 @@ def resect(
 ) -> tuple[
     Float[np.ndarray, "images 3"], Float[np.ndarray, "images 3 3"], Float[np.ndarray, " images"]
 ]:
-    """X0, M of images, and the part of their points that agree within `tolerance` (c = 1); 0: no
+    """X0, M of images, and the share of their points that agree within `tolerance` (c = 1); 0: no
     pose."""
     rows = [spread(len(a)) for a in xy]
-    X0, M, part = run_in_lanes(
+    X0, M, share = run_in_lanes(
         _resect,
         LANES,
         _gather_slots(xy, rows),
@@ -68,7 +68,7 @@ def resect(
         _weights(rows),
         tolerance,
     )
-    return X0, M, part
+    return X0, M, share
 
 
 def refine(
@@ -98,10 +98,10 @@ def orient_pairs(
     Float[np.ndarray, " pairs"],
     Float[np.ndarray, " pairs"],
 ]:
-    """M, b of pairs of images, the part of the points that agree within `tolerance`, and the
+    """M, b of pairs of images, the share of the points that agree within `tolerance`, and the
     median angle of intersection (radians)."""
     rows = [spread(len(a)) for a in xy1]
-    M, b, part, angle = run_in_lanes(
+    M, b, share, angle = run_in_lanes(
         _orient_pair,
         LANES,
         _gather_slots(xy1, rows),
@@ -109,7 +109,7 @@ def orient_pairs(
         _weights(rows),
         tolerance,
     )
-    return M, b, part, angle
+    return M, b, share, angle
 
 
 def orient_planes(
@@ -219,8 +219,8 @@ def _resect(
     key = jax.random.key(0)
     found, good = robust_resection(key, xy, X, weights, threshold=tolerance)
     sound = (found.status == int(Status.SOUND)) & jnp.all(jnp.isfinite(found.pose.X0))
-    part = jnp.sum(good) / jnp.sum(weights > 0)
-    return found.pose.X0, found.pose.M, jnp.where(sound, part, 0.0)
+    share = jnp.sum(good) / jnp.sum(weights > 0)
+    return found.pose.X0, found.pose.M, jnp.where(sound, share, 0.0)
 
 
 @quick_jit
@@ -252,8 +252,8 @@ def _orient_pair(
     angle = jnp.arctan2(jnp.linalg.norm(jnp.cross(one, two), axis=1), jnp.sum(one * two, 1))
     number = jnp.sum(good)
     ordered = jnp.sort(jnp.where(good, angle, jnp.inf))
-    part = jnp.where(found.status == int(Status.SOUND), number / jnp.sum(weights > 0), 0.0)
-    return found.M, found.b, part, jnp.where(number > 0, ordered[number // 2], 0.0)
+    share = jnp.where(found.status == int(Status.SOUND), number / jnp.sum(weights > 0), 0.0)
+    return found.M, found.b, share, jnp.where(number > 0, ordered[number // 2], 0.0)
 
 
 @partial(compile_once, static=())

@@ -25,7 +25,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxbundle.leastsquares.quality.distributions import chi2_tail, f_tail, level_of_one
+from jaxbundle.leastsquares.quality.distributions import (
+    NORMAL_SIGMA_BY_MAD,
+    chi2_tail,
+    f_tail,
+    level_of_one,
+)
 
 # With at most this many points two are also tested together: two errors of one size, as of
 # exchanged names, hide each other in the estimated σ of a few points. Of 20 points there are 190
@@ -136,7 +141,7 @@ def _most_improbable(
     chance explains all."""
     rows = np.flatnonzero(used).tolist()
     few = len(rows) <= MAX_POINTS_FOR_PAIRS
-    # of many points one changes the estimated σ by too little to matter
+    # Of many points one changes the estimated σ by too little to matter.
     common = None if few else _linearise(found, used, used, assumed)
     for tests in ([[i] for i in rows], [list(p) for p in itertools.combinations(rows, 2)] * few):
         if tests and len(tests[0]) <= most:
@@ -256,7 +261,7 @@ def _resolve(
         return sigma, (0.0, 0.0), (bool(groups[0].any()), bool(groups[1].any()))
     start = np.abs(found.difference - np.median(found.difference[used], axis=0))
     for group in here:
-        sigma[group] = max(1.4826 * np.median(start[group & used[:, None]]), assumed)
+        sigma[group] = max(NORMAL_SIGMA_BY_MAD * np.median(start[group & used[:, None]]), assumed)
     # The fixed point converges linearly, slowly where C dominates; a σ to 0.1 % is far more than
     # its own σ of 10 to 40 % deserves, and after 200 rounds the last one is good enough.
     for number in range(200):
@@ -269,7 +274,7 @@ def _resolve(
                 s = sigma[group][0] * np.sqrt((Wd[mine] ** 2).sum() / trace)
                 sigma[group] = max(s, assumed)
             if number == 0:
-                # with a σ that dominates C; where the estimate is small, its share is hardly any
+                # With a σ that dominates C; where the estimate is small, its share is hardly any.
                 redundancy[0 if group[:, :2].any() else 1] = float(before[group][0] ** 2 * trace)
         if np.abs(sigma[unknown] / before[unknown] - 1).max() < 1e-3:
             break

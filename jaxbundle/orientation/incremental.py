@@ -4,8 +4,8 @@
 
 An image is resected from at least `min_points` known points, enough of which must agree; images
 with the most known points come first. A point is intersected from at least two consistent rays with
-an angle above `Demands.angle`. All tests use the tolerance of start values; the subsequent
-adjustment refines the result. The numbers are those of `StartValueSettings`.
+an angle above `IntersectionLimits.min_angle`. All tests use the tolerance of start values; the
+subsequent adjustment refines the result. The numbers are those of `StartValueSettings`.
 """
 
 import dataclasses
@@ -23,20 +23,20 @@ from jaxbundle.types import Index
 
 
 @dataclasses.dataclass(frozen=True)
-class Demands:
-    """On an intersected point: its least angle of intersection (radians), and how far its rays may
+class IntersectionLimits:
+    """Of an intersected point: its least angle of intersection (radians), and how far its rays may
     miss it, in tolerances."""
 
-    angle: float
-    miss: float
+    min_angle: float
+    max_miss: float
 
 
 # A point known well enough for resection: an angle of 0.02 (1.1°) makes an error of a direction 50
 # times as large along the ray, which an image from the side sees in full.
-RESECTION_DEMANDS = Demands(0.02, 1.0)
+RESECTION_LIMITS = IntersectionLimits(0.02, 1.0)
 # A point that needs a start value: the adjustment decides about it. Its rays may miss it by more
 # than `gross_ratio`, so that one bad ray of two is excluded and named, not the point lost.
-START_VALUE_DEMANDS = Demands(1e-3, 4.0)
+START_VALUE_LIMITS = IntersectionLimits(1e-3, 4.0)
 
 
 @dataclasses.dataclass
@@ -131,7 +131,7 @@ def grow(
     # Known points at the last try: an image is tried again only when it has more.
     tried = np.zeros(sights.images, int)
     due = max(settings.first_improvement, settings.improvement_growth * model.placed.sum())
-    intersect(sights, model, RESECTION_DEMANDS)
+    intersect(sights, model, RESECTION_LIMITS)
     while True:
         known = np.bincount(sights.image, model.known[sights.point], minlength=sights.images)
         waiting = candidates & ~model.placed & (known >= settings.min_points) & (known > tried)
@@ -144,7 +144,7 @@ def grow(
         chosen = np.flatnonzero(waiting & (known >= enough))
         tried[chosen] = known[chosen]
         if _place_images(sights, model, chosen, settings):
-            intersect(sights, model, RESECTION_DEMANDS)
+            intersect(sights, model, RESECTION_LIMITS)
         if improve is not None and model.placed.sum() >= due:
             improve(sights, model)
             due = settings.improvement_growth * model.placed.sum()
@@ -155,9 +155,9 @@ def finish(sights: Sights, model: Model, settings: StartValueSettings = DEFAULTS
     # Twice: the second time images are refined by points that already come from refined images.
     # More passes would approach what the adjustment computes anyway.
     for _ in range(2):
-        intersect(sights, model, START_VALUE_DEMANDS, again=True)
+        intersect(sights, model, START_VALUE_LIMITS, again=True)
         _refine(sights, model, settings)
-    intersect(sights, model, START_VALUE_DEMANDS, again=True)
+    intersect(sights, model, START_VALUE_LIMITS, again=True)
 
 
 def place_far_points(sights: Sights, model: Model, settings: StartValueSettings = DEFAULTS) -> None:
@@ -191,11 +191,11 @@ def _place_images(
     images, rows, R, xy = _in_planes(sights, model, images, settings)
     if not len(images):
         return 0
-    X0, M, part = batched.resect(
+    X0, M, share = batched.resect(
         xy, [model.X[sights.point[r]] for r in rows], sights.tolerance[images]
     )
     number = np.minimum([len(r) for r in rows], batched.SLOTS)
-    good = (part >= settings.agreeing_share) & (part * number >= settings.min_points)
+    good = (share >= settings.agreeing_share) & (share * number >= settings.min_points)
     for i, image in enumerate(images):
         if good[i]:
             model.place(image, X0[i], R[i].T @ M[i])
@@ -259,7 +259,9 @@ def misclosures(sights: Sights, model: Model) -> Float[np.ndarray, " n"]:
     return np.where(along <= 0, np.inf, error)
 
 
-def intersect(sights: Sights, model: Model, demands: Demands, again: bool = False) -> None:
+def intersect(
+    sights: Sights, model: Model, limits: IntersectionLimits, again: bool = False
+) -> None:
     """Intersect the points that are not known yet, or all that are not held `again`.
 
     If the rays of a point disagree, the worst ray is dropped, as long as two remain.
@@ -278,7 +280,7 @@ def intersect(sights: Sights, model: Model, demands: Demands, again: bool = Fals
     weights = (np.arange(batched.RAYS) < number[wanted, None]).astype(float)
     X0 = model.X0[sights.image[row]]
     rays = np.einsum("nkij,nki->nkj", model.M[sights.image[row]], sights.ray[row])
-    tolerance = demands.miss * sights.tolerance[sights.image[row]]
+    tolerance = limits.max_miss * sights.tolerance[sights.image[row]]
 
     X, good = np.full((len(wanted), 3), np.nan), np.zeros(len(wanted), bool)
     todo = np.arange(len(wanted))
@@ -287,7 +289,7 @@ def intersect(sights: Sights, model: Model, demands: Demands, again: bool = Fals
         off = _across(found[:, None] - X0[todo], rays[todo]) / tolerance[todo] * weights[todo]
         sound = status == int(Status.SOUND)
         agree = sound & (off.max(1) < 1)
-        X[todo], good[todo] = found, agree & (angle > demands.angle)
+        X[todo], good[todo] = found, agree & (angle > limits.min_angle)
         # One ray a round: the worst one draws the point to itself, so that good rays miss it as
         # well. Of two contradicting rays either may be wrong.
         more = ~agree & (weights[todo].sum(1) > 2) & np.isfinite(off).all(1)

@@ -27,8 +27,8 @@ from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.network.check import check_tables
 from jaxbundle.network.columns import count, list_some
+from jaxbundle.network.subsets import keep_images, keep_points, record_left_out
 from jaxbundle.network.tables import Network
-from jaxbundle.network.undetermined import keep_images, keep_points, leave_out
 from jaxbundle.network.unit_mistakes import name_pixels
 from jaxbundle.orientation import batched
 from jaxbundle.orientation.alignment import describe_mirror, join, move_to_given_frame, to_scale
@@ -396,7 +396,7 @@ def _result(
     for thing, found in zip(("image", "point"), reasons):
         network = note_missing(network, thing, found, "for which no start values were found")
     names = tuple(f"{points.id[rays.point[k]]} in {images.id[rays.image[k]]}" for k in wrong)
-    network = leave_out(network, "image point", names, CONTRADICTION)
+    network = record_left_out(network, "image point", names, CONTRADICTION)
     return Oriented(network, frame, *reasons, names)
 
 

@@ -74,7 +74,7 @@ def planar_orientations(
         n = n * jnp.where(jnp.sum(p * (a1 @ n)) < 0, -1.0, 1.0)
         b = -M.T @ (G - M) @ n
         length = jnp.linalg.norm(b)
-        # depth of the points in both cameras, in units of the plane's distance
+        # Depth of the points in both cameras, in units of the plane's distance.
         near = 1 / (a1 @ n)
         other = (near[:, None] * a1 - b) @ M.T
         front = (near > 0) & (other[:, 2] < 0)

@@ -103,7 +103,7 @@ def rays_of(
     given = {**default_parameters(model), **camera.parameters}
     p = np.array([given[name] for name in model.parameters])
     # In batches of one size, so that one program serves all networks. Larger ones make small
-    # networks wait for rays they do not have, smaller ones cost calls; not critical.
+    # networks wait for rays they do not have, smaller ones cost calls.
     batch = 4096
     batches = -(-len(xy) // batch)
     fill = lambda a: np.resize(a, (batches * batch, 2)).reshape(batches, batch, 2)

@@ -88,7 +88,7 @@ def relative_orientation(
     E = eight_points(*points)[0][None]
     if method == "five":
         points = _after(E, points)
-        # with noise, a solution that is not quite real is a good start
+        # With noise, a solution that is not quite real is a good start.
         E = jnp.concatenate([E, five_solutions(*points)[0]])
     M, b = (a.reshape(-1, *a.shape[2:]) for a in jax.vmap(orientations)(E))
     data = (xy1, xy2, jnp.sqrt(p))

@@ -51,7 +51,7 @@ def resection(
     """
     p = ones_unless(weights, xy)
     chosen = wide_triangle(xy, p)
-    # with noise, the pose nearest to a solution may be all there is, and a good start
+    # With noise, the pose nearest to a solution may be all there is, and a good start.
     starts, _ = three_points(jax.vmap(ray_of)(stop_gradient(xy[chosen])), stop_gradient(X[chosen]))
     data = (xy, X, jnp.sqrt(p))
     refine = lambda start: minimise(_misclosures, retract_pose, start, data, 6)

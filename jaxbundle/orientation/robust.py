@@ -22,6 +22,7 @@ from jax import Array
 from jaxtyping import Bool, Float, PyTree
 
 from jaxbundle.geometry import transform_point
+from jaxbundle.leastsquares.quality.distributions import NORMAL_SIGMA_BY_MAD
 from jaxbundle.orientation.absolute import AbsoluteOrientation, absolute_orientation
 from jaxbundle.orientation.dlt import direct_linear_transformation
 from jaxbundle.orientation.essential import five_solutions, orientations
@@ -114,11 +115,10 @@ def robust_limit(
     """OUTLIER_LIMIT·σ with σ = 1.4826·(1 + 5/(n − size))·median e (Rousseeuw and Leroy, 1987, p.
     202)."""
     redundancy = jnp.maximum(jnp.sum(present) - size, 1)
-    # 1.4826 = 1/Φ⁻¹(3/4) makes the median a σ of normal errors; the bracket corrects for the median
-    # being too small in a sample chosen to minimise it. At least 1e-11, a hundred thousand
-    # roundings of coordinates of size 1: of exact data the median is rounding, and half would be
-    # gross errors.
-    sigma = jnp.maximum(1.4826 * (1 + 5 / redundancy) * _median(e, present), 1e-11)
+    # The bracket corrects for the median being too small in a sample chosen to minimise it. At
+    # least 1e-11, a hundred thousand roundings of coordinates of size 1: of exact data the median
+    # is rounding, and half would be gross errors.
+    sigma = jnp.maximum(NORMAL_SIGMA_BY_MAD * (1 + 5 / redundancy) * _median(e, present), 1e-11)
     return OUTLIER_LIMIT * sigma
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxbundle.orientation import batched
 from jaxbundle.orientation.incremental import (
-    RESECTION_DEMANDS,
+    RESECTION_LIMITS,
 )
 from jaxbundle.orientation.rays import Sights, in_plane
 from jaxbundle.orientation.settings import StartValueSettings
@@ -42,11 +42,11 @@ def good_pairs(
         return
     R, Q, xy, other_xy = zip(*turned)
     tolerance = seen.tolerance[pairs].mean(1)
-    M, b, part, angle = batched.orient_pairs(xy, other_xy, tolerance)
+    M, b, share, angle = batched.orient_pairs(xy, other_xy, tolerance)
     # 1/σ of the depth of a pair: with the root of the number of points and with the angle. Beyond
     # `good_angle` images differ so much that many points are seen in one only.
-    worth = np.sqrt(common) * part * np.minimum(angle, settings.good_angle)
-    usable = (part >= settings.agreeing_share) & (angle > RESECTION_DEMANDS.angle)
+    worth = np.sqrt(common) * share * np.minimum(angle, settings.good_angle)
+    usable = (share >= settings.agreeing_share) & (angle > RESECTION_LIMITS.min_angle)
     for k in [k for k in np.argsort(-worth) if usable[k]][: settings.max_seeds]:
         yield *pairs[k], R[k].T, Q[k].T @ M[k], b[k]
 

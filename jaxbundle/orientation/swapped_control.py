@@ -16,7 +16,7 @@ from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Network
 from jaxbundle.orientation import batched
 from jaxbundle.orientation.control_consistency import MIN_AGREEING
-from jaxbundle.orientation.incremental import START_VALUE_DEMANDS, Model, are_controlled, intersect
+from jaxbundle.orientation.incremental import START_VALUE_LIMITS, Model, are_controlled, intersect
 from jaxbundle.orientation.rays import Sights, sights
 from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
 
@@ -47,7 +47,7 @@ def name_contradiction(
         there = np.all(np.isfinite(np.concatenate([images.position, images.angles], 1)), axis=1)
         if there.any():
             alone.place(there, images.position[there], batched.matrices(images.angles[there]))
-    intersect(seen, alone, START_VALUE_DEMANDS)
+    intersect(seen, alone, START_VALUE_LIMITS)
     control = np.flatnonzero(are_controlled(points) & alone.known)
     found = contradiction(
         alone.X[control], points.position[control], points.sigma[control], settings

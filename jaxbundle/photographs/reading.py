@@ -168,7 +168,7 @@ def _open_any_size(file: str | Path | io.BytesIO) -> Any:
 
 
 def _refuse_hollow(path: str | Path, size: int, harmless: int = 2**26, ratio: int = 2000) -> None:
-    """Refuse a header of more pixels than so many bytes hold; `harmless`: pixels that are always
+    """Refuse a header of more pixels than `size` bytes hold; `harmless`: pixels that are always
     decoded; `ratio`: for a byte, beyond them. DEFLATE packs 1032 bytes into one at most, JPEG 512
     pixels of one colour."""
     try:

@@ -28,7 +28,7 @@ ROLE_STYLE = {
     "fixed": {"color": INK, "marker": "s", "s": 26},
     "check": {"color": GREEN, "marker": "D", "s": 26},
 }
-# Maximum number of points of a plan with ids, half of them images: so many lines of 7 points fit
+# Maximum number of points of a plan with ids, half of them images: their lines of 7 points fit
 # along an axis of 6 inches with half a line between them.
 MAX_LABELS = 40
 

@@ -22,7 +22,7 @@ def cloud_perspective(
 ) -> Axes3D:
     """The points in perspective, coloured by σ of one axis, up to its 95th percentile.
 
-    Of more than `max_points` points, every so many-th is drawn.
+    Of more than `max_points` points, every nth is drawn, so that at most `max_points` remain.
 
     **Returns:** matplotlib `Axes3D`, in the object unit.
     """

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
 from jaxbundle.errors import InputError
-from jaxbundle.network.columns import did_you_mean
+from jaxbundle.network.columns import did_you_mean, refuse_unknown
 
 Times = Float[np.ndarray, " n"]
 
@@ -47,8 +47,7 @@ def signal(
     if kind not in KINDS:
         raise InputError(f"unknown signal {kind!r}{did_you_mean(str(kind), KINDS)}")
     for key in description:
-        if key not in ("kind", *KEYS[kind]):
-            raise InputError(f"signal {kind!r}: unknown key {key!r}{did_you_mean(key, KEYS[kind])}")
+        refuse_unknown(key, ("kind", *KEYS[kind]), f"signal {kind!r}: ")
     get = lambda key, default=0.0: float(description.get(key, default))
     for key in ("period", "step"):
         if not get(key, 1.0) > 0:

@@ -1,8 +1,8 @@
 """The adjustment of a reconstruction: estimated weights, gross errors removed.
 
 1. All measurements with the σ of their matching.
-2. The σ of measurements of a kind (least squares matching by level of the pyramid, positions of
-   features) are multiplied by the root of the variance component of this kind (Förstner 1979),
+2. The σ of measurements of a class (least squares matching by level of the pyramid, positions of
+   features) are multiplied by the root of the variance component of this class (Förstner 1979),
 
        f² = Σ(v/σ)²/Σr,        r = 1 − 3/(2n) for a point with n rays,
 
@@ -22,8 +22,9 @@ from jaxtyping import Bool, Float, Int
 from jaxbundle.adjustment.adjust import adjust
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.leastsquares.quality.distributions import NORMAL_SIGMA_BY_MAD
+from jaxbundle.network.subsets import keep_points
 from jaxbundle.network.tables import Network
-from jaxbundle.network.undetermined import keep_points
 from jaxbundle.orientation.network import find_start_values
 from jaxbundle.reconstruction.datum import choose_datum_points
 
@@ -38,27 +39,27 @@ class WeightingSettings:
     """Settings of the weighting of measurements and the removal of gross errors."""
 
     gross_residual: float = 4.0
-    """Normalised residuals above it, in factors of their kind, take no part in its factor. Normally
-    distributed ones are cut off with a probability of 6e-5, which reduces the factor by 0.05 %; at
-    3 it would be 1.3 %, and larger limits let small gross errors in."""
+    """Normalised residuals above it, in factors of their class, take no part in its factor.
+    Normally distributed ones are cut off with a probability of 6e-5, which reduces the factor by
+    0.05 %; at 3 it would be 1.3 %, and larger limits let small gross errors in."""
     suspect_residual: float = 5.0
-    """Normalised residual, in factors of its kind, above which an image point is excluded when data
-    snooping begins, with a probability of 6e-7; snooping restores it if it agrees. Smaller: more to
-    restore; larger: more rounds until all gross errors are found."""
+    """Normalised residual, in factors of its class, above which an image point is excluded when
+    data snooping begins, with a probability of 6e-7; snooping restores it if it agrees. Smaller:
+    more to restore; larger: more rounds until all gross errors are found."""
     last_change: float = 0.004
     """Relative change of a factor that ends the rounds: less than its own σ, 1/√(2·Σr), unless a
-    kind has more than 30 000 measurements."""
+    class has more than 30 000 measurements."""
     max_rounds: int = 4
     """Maximum rounds of data snooping and new factors. What has not converged then changes by
     single measurements."""
     min_measurements: int = 60
-    """Minimum measurements of a kind with a separate factor: with Σr of about 60 its σ is
+    """Minimum measurements of a class with a separate factor: with Σr of about 60 its σ is
     1/√(2·60) = 9 %. Fewer would only copy their own errors into the weights."""
     min_factor: float = 0.3
     """Smallest factor of one round. σ of matching are right to 15 % or too small; a much smaller
     factor comes from measurements that agree because they are hardly checked."""
-    max_factor: float = 8.0
-    """Largest factor of one round: `WRONG_MISFIT`. Beyond it the model is wrong, not σ."""
+    max_factor: float = WRONG_MISFIT
+    """Largest factor of one round: beyond it the model is wrong, not σ."""
     many_errors: float = 0.25
     """Share of gross errors above which points of two rays are not used: most of their gross errors
     cannot be detected, since one along the epipolar line moves the point and leaves no residual."""
@@ -83,9 +84,9 @@ class WeightingSettings:
 
 @dataclasses.dataclass(frozen=True)
 class WeightedAdjustment:
-    """The adjustment, and the factor of σ of each kind of measurement, which the adjustment has as
-    its `sigma_factors`; the number of measurements that agree with it, and `unused_points` of two
-    rays."""
+    """The adjustment, and the factor of σ of each class of measurements, which the adjustment has
+    as its `sigma_factors`; the number of measurements that agree with it, and `unused_points` of
+    two rays."""
 
     adjustment: Adjustment
     factors: dict[str, float]
@@ -135,27 +136,29 @@ def leave_out_features(
 
 def adjust_weighted(
     network: Network,
-    kinds: Int[np.ndarray, " rays"],
-    names: dict[int, str],
+    measurement_class: Int[np.ndarray, " rays"],
+    class_names: dict[int, str],
     significance: float,
     tell: Callable[[str], None],
     settings: WeightingSettings = WeightingSettings(),
 ) -> WeightedAdjustment:
-    """Adjust with variance components of the kinds and data snooping. Without a solution, or with
+    """Adjust with variance components of the classes and data snooping. Without a solution, or with
     a doubtful one, adjust again without points of two rays, whose gross errors can hardly be
     detected: where an object repeats itself, some agree with its photographs by chance.
 
-    **Arguments:** `kinds`: of every observation of the network, with their `names`;
+    **Arguments:** `measurement_class`: of every observation of the network; `class_names`;
     `significance`: of data snooping; `tell(stage)`.
 
     **Raises:** as `jaxbundle.adjust`; `NotSolvedError` if, with very many gross errors, points of
     three rays do not confirm the result.
     """
     every, failed, many = None, None, settings.many_errors
-    weight = lambda network, kinds: _weight(network, kinds, names, significance, tell, settings)
+    weight = lambda network, measurement_class: _weight(
+        network, measurement_class, class_names, significance, tell, settings
+    )
     try:
-        every = weight(network, kinds)
-        # two photographs have no points of three rays to compare with
+        every = weight(network, measurement_class)
+        # Two photographs have no points of three rays to compare with.
         few = len(network.images) < 3
         if every.adjustment.converged and (few or not _is_doubtful(every, settings)):
             return every
@@ -163,14 +166,14 @@ def adjust_weighted(
         failed = error
     solved = every is not None and every.adjustment.converged
     rays = network.observations
-    # points of another role than tie are checked by their coordinates
+    # Points of another role than tie are checked by their coordinates.
     number = np.bincount(rays.point, minlength=len(network.points))
     several = (number > 2) | ~network.points.has_role("tie")
-    clear, kinds = keep_points(network, several), kinds[several[rays.point]]
+    clear, measurement_class = keep_points(network, several), measurement_class[several[rays.point]]
     try:
-        clearer = weight(clear, kinds)
+        clearer = weight(clear, measurement_class)
     except (InputError, NotSolvedError):
-        # a photograph has hardly any of these points, or they do not determine it
+        # A photograph has hardly any of these points, or they do not determine it.
         if failed is not None:
             raise failed from None
     else:
@@ -216,7 +219,7 @@ def _count_agreeing(network: Network, clearer: WeightedAdjustment, tolerance: fl
     )
     values, points = result.image_values, network.points
     tie = points.has_role("tie")[:, None]
-    # images are placed, tie points intersected anew: start values count the rays that agree
+    # Images are placed, tie points intersected anew: start values count the rays that agree.
     images = dataclasses.replace(network.images, position=values[:, :3], angles=values[:, 3:])
     points = dataclasses.replace(points, position=np.where(tie, np.nan, points.position))
     placed = network.replace(cameras=cameras, images=images, points=points)
@@ -233,7 +236,7 @@ def adjust_determined(
     those given."""
     rows = np.arange(len(network.observations))
     adjust_again = lambda: adjust(network, max_iterations=limit_iterations(network), **options)
-    # each round may leave further points with one ray; what six do not end is reported as it is
+    # Each round may leave further points with one ray; what six do not end is reported as it is.
     for _ in range(6):
         try:
             result = adjust_again()
@@ -260,7 +263,7 @@ def limit_iterations(network: Network) -> int:
 
 def _are_determined(network: Network, undetermined: Iterable[str]) -> Bool[np.ndarray, " points"]:
     """False for tie points named among the undetermined."""
-    # as `leastsquares.quality.names` writes them: "X of point 17"
+    # As `leastsquares.quality.names` writes them: "X of point 17".
     lost = {name.partition(" of point ")[2] for name in undetermined}
     tie = network.points.has_role("tie")
     return ~(tie & np.isin(np.array(network.points.id, object), [*lost]))
@@ -268,8 +271,8 @@ def _are_determined(network: Network, undetermined: Iterable[str]) -> Bool[np.nd
 
 def _weight(
     network: Network,
-    kinds: Int[np.ndarray, " rays"],
-    names: dict[int, str],
+    measurement_class: Int[np.ndarray, " rays"],
+    class_names: dict[int, str],
     significance: float,
     tell: Callable[[str], None],
     settings: WeightingSettings,
@@ -277,17 +280,19 @@ def _weight(
     """The steps of the module, for the points of a network."""
     tell("adjustment")
     result, network, kept = adjust_determined(network)
-    kinds, sigma = kinds[kept], network.observations.sigma
+    measurement_class, sigma = measurement_class[kept], network.observations.sigma
     factor_so_far, suspects = np.ones(len(kept)), []
     if result.converged:
         (v, r), rows = _approximate_redundancy(result), _rows(result, network)
-        factor_so_far[rows] = _factors(v, r, kinds[rows], settings, settings.gross_residual)
+        factor_so_far[rows] = _factors(
+            v, r, measurement_class[rows], settings, settings.gross_residual
+        )
         # r ≥ 1/4 for two rays; one ray, r < 0, is judged like those that are hardly checked
         beyond = np.abs(v) / np.sqrt(np.maximum(r, 0.1)) > (
             settings.suspect_residual * factor_so_far[rows, None]
         )
         suspects = _pairs_of_ids(result, np.any(beyond, axis=1))
-        # once: a datum that changes with each round would change all σ, too
+        # Once: a datum that changes with each round would change all σ, too.
         network = network.replace(datum_points=choose_datum_points(result))
     for _ in range(settings.max_rounds):
         tell("data snooping")
@@ -298,20 +303,24 @@ def _weight(
             significance=significance,
             doubtful=suspects,
         )
-        kinds, sigma, factor_so_far = kinds[kept], sigma[kept], factor_so_far[kept]
+        measurement_class, sigma, factor_so_far = (
+            measurement_class[kept],
+            sigma[kept],
+            factor_so_far[kept],
+        )
         if not result.converged:
             break
         rows = _rows(result, network)
-        # gross errors are removed by now: no limit
-        factor = _factors(*_redundancy(result), kinds[rows], settings, np.inf)
+        # Gross errors are removed by now: no limit.
+        factor = _factors(*_redundancy(result), measurement_class[rows], settings, np.inf)
         if np.all(np.abs(factor - 1) < settings.last_change):
             break
         factor_so_far[rows] *= factor
         suspects = _pairs_of_ids(result, ~result.problem.used)
     factors = {
-        name: float(np.median(factor_so_far[kinds == k]))
-        for k, name in names.items()
-        if (kinds == k).any()
+        name: float(np.median(factor_so_far[measurement_class == k]))
+        for k, name in class_names.items()
+        if (measurement_class == k).any()
     }
     return WeightedAdjustment(result, factors, int(result.problem.used.sum()))
 
@@ -361,25 +370,24 @@ def _redundancy(
 def _factors(
     v: Float[np.ndarray, "rays 2"],
     r: Float[np.ndarray, "rays 2"],
-    kinds: Int[np.ndarray, " rays"],
+    measurement_class: Int[np.ndarray, " rays"],
     settings: WeightingSettings,
     gross: float,
 ) -> Float[np.ndarray, " rays"]:
     """Factors of the σ of every ray, from v/σ, of normalised residuals below `gross` factors."""
-    # of rows that are not judged (below): no division by 0
+    # Of rows that are not judged (below): no division by 0.
     r = np.maximum(r, 1e-3)
     factor = np.ones(len(v))
-    for kind in np.unique(kinds):
-        rows = kinds == kind
+    for number in np.unique(measurement_class):
+        rows = measurement_class == number
         normalised_residual, redundancy = np.abs(v[rows]) / np.sqrt(r[rows]), r[rows]
-        # with r below 0.05 less than a twentieth of an error appears in the residual, as much as
-        # rounding and neglected terms
+        # With r below 0.05 less than a twentieth of an error appears in the residual, as much as
+        # rounding and neglected terms.
         checked = np.isfinite(normalised_residual) & (redundancy > 0.05)
         if checked.sum() < 2 * settings.min_measurements:
             continue
-        # 1.4826 = 1/Φ⁻¹(3/4): the median of |v| of a normal distribution as its σ
-        scale = 1.4826 * np.median(normalised_residual[checked])
-        # the choice of good ones and the factor depend on each other; five rounds settle both
+        scale = NORMAL_SIGMA_BY_MAD * np.median(normalised_residual[checked])
+        # The choice of good ones and the factor depend on each other; five rounds settle both.
         for _ in range(5):
             good = checked & (normalised_residual < gross * max(scale, 1e-9))
             scale = np.sqrt(np.sum(v[rows][good] ** 2) / np.sum(redundancy[good]))

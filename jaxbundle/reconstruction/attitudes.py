@@ -54,17 +54,17 @@ def with_attitudes(
         return network, ""
     M, sigma = attitudes.M[rows[known]], attitudes.sigma[rows[known]]
     oriented = np.asarray(batched.matrices(network.images.angles[known]))
-    # the angle of M·M'ᵀ: 2·cos α + 1 = tr(M·M'ᵀ)
+    # The angle of M·M'ᵀ: 2·cos α + 1 = tr(M·M'ᵀ).
     cosine = (np.einsum("nij,nij->n", M, oriented) - 1) / 2
     off = np.arccos(np.clip(cosine, -1, 1))
-    # angles of right attitudes with σ about three axes have the median 1.54 σ; one constant
-    # rotation, as of a mounting, makes all of them large
+    # Angles of right attitudes with σ about three axes have the median 1.54 σ; one constant
+    # rotation, as of a mounting, makes all of them large.
     if np.median(off / sigma) > 3:
         return network, (
             f"attitudes in the files are off by {np.degrees(np.median(off)):.0f} degrees (median) "
             "from those of the photographs and their positions: not used"
         )
-    # one σ about all axes: the largest that the file states
+    # One σ about all axes: the largest that the file states.
     angles = np.asarray(batched.angles(M))
     columns = {"image": [network.images.id[k] for k in np.flatnonzero(known)]}
     columns |= {axis: angles[:, k] for k, axis in enumerate(("omega", "phi", "kappa"))}

@@ -170,14 +170,14 @@ def describe_block(result: Adjustment, exif: Mapping[str, Exif], system: str) ->
     known = np.isfinite(X[point]).all(1)
     image, point = image[known], point[known]
     depth = -np.einsum("nj,nj->n", M[image, 2], X[point] - X0[image])
-    # by photograph first: one with many points does not decide for all
+    # By photograph first: one with many points does not decide for all.
     of_image = np.array(
         [np.median(depth[image == k]) if (image == k).any() else np.nan for k in range(len(X0))]
     )
     c = np.array([central_distance(camera) for camera in network.cameras])
     pixel = 1 / c[network.images.camera]
-    # within 45 degrees of the vertical: in an oblique block the middle of a photograph is not below
-    # the camera, and footprints reach to the horizon
+    # Within 45 degrees of the vertical: in an oblique block the middle of a photograph is not below
+    # the camera, and footprints reach to the horizon.
     down = bool(system) and float(np.median(M[:, 2, 2])) > 0.7
     height = area = places = None
     tie = network.points.has_role("tie")
@@ -189,7 +189,7 @@ def describe_block(result: Adjustment, exif: Mapping[str, Exif], system: str) ->
             if (image == k).any()
         ]
         height, area = float(np.median(above)), _hull_area(_inner(ground[:, :2]))
-        # as much ground as the photographs cover, by how much there is
+        # As much ground as the photographs cover, by how much there is.
         footprints = [_hull_area(_inner(X[point[image == k], :2])) for k in range(len(X0))]
         places = sum(footprints) / area if area else None
     times = [exif[id].time for id in network.images.id if id in exif]
@@ -254,7 +254,7 @@ def camera_positions(result: Adjustment) -> CameraPositions | None:
     nothing = np.full(3, np.nan)
     antennas = next((one for one in network.further if isinstance(one, Antennas)), None)
     if antennas is not None:
-        # the shift of the one strip is the offset of the system; not estimated axes have none
+        # The shift of the one strip is the offset of the system; not estimated axes have none.
         row = {id: k for k, id in enumerate(network.images.id)}
         (strip,) = result.further_unknowns.get("GNSS strip", {"": {}}).values()
         found = [strip.get(f"shift {axis}", {}) for axis in "XYZ"]

@@ -53,7 +53,7 @@ def with_camera_priors(
     for k, (camera, file) in enumerate(zip(network.cameras, stated)):
         side = max(camera.image_size or (1, 1))
         for name, relative in PRIORS.items():
-            # equal parameters are one unknown: a second observation would count its prior twice
+            # Equal parameters are one unknown: a second observation would count its prior twice.
             if name in of_lens and lens[k] in lens[:k]:
                 continue
             if name == "fx" and file is not None:

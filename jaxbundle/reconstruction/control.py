@@ -78,7 +78,7 @@ def read_control_measurements(path: str | Path) -> Control:
     ]
     if not rows:
         raise InputError(f"{path}: the file is empty")
-    # three formats, told apart by the first line: column names, a coordinate system, anything else
+    # Three formats, told apart by the first line: column names, a coordinate system, anything else.
     head = [cell.strip().lower() for cell in rows[0][1].split(",")]
     if {"image", "u", "v", "x", "y", "z", "id"} <= set(head):
         return _read_table(path, head, rows[1:])
@@ -104,7 +104,7 @@ def _read_gcp_list(path: Path, system: str, rows: Sequence[tuple[int, str]]) -> 
             raise InputError(
                 f"{path}, line {number}: X Y Z u v photograph [name] are expected, not {line!r}"
             ) from None
-        # without a name rows of one point are known by their equal coordinates, as text
+        # Without a name rows of one point are known by their equal coordinates, as text.
         name = cells[6] if len(cells) > 6 else f"{cells[0]},{cells[1]}"
         records.append((name, (X, Y, Z), image, (u, v), MANUAL_SIGMA, number))
     return _collect(path, records, system, {})
@@ -158,13 +158,13 @@ def _collect(
     for name, X, _, place, sigma, number in records:
         if not np.isfinite([*X, *place, sigma]).all() or sigma <= 0:
             raise InputError(f"{path}, line {number}: coordinates and pixels must be finite")
-        # the table repeats the coordinates in each row of a point
+        # The table repeats the coordinates in each row of a point.
         if name in position and position[name] != X:
             raise InputError(f"{path}, line {number}: point {name} has other coordinates above")
         position[name] = X
         numbers.setdefault(name, number)
     X, said = to_map(np.array(list(position.values())), system, str(path))
-    # control without a σ, NaN, gets one from --control-sigma or from its residuals
+    # Control without a σ, NaN, gets one from --control-sigma or from its residuals.
     sigma = np.array([sigmas.get(n, ([math.nan] * 3, ""))[0] for n in position])
     roles = tuple(sigmas.get(n, ((), "control"))[1] for n in position)
     source = Source(str(path), np.array(list(numbers.values())), "line")

@@ -97,7 +97,7 @@ def assess_control(
     for part, axes in enumerate(([0, 1], [2])):
         estimated = _is_estimated(control, axes)
         total = sum(
-            # one σ for all of them in a group
+            # One σ for all of them in a group.
             of_group.redundancy[part] * of_group.sigma[:, axes][estimated[group]][0] ** 2
             for group, of_group in zip(groups, of_groups)
             if of_group.redundancy[part]
@@ -124,7 +124,7 @@ def with_heights_as_in_plane(control: Points, assessed: Assessment) -> Points:
     a block that bends to a plane of zeros leaves no residuals that would show their errors."""
     sigma = control.sigma.copy()
     estimated = _is_estimated(control, [2])[:, 0]
-    # one σ for all estimated ones
+    # One σ for all estimated ones.
     plane = float(assessed.sigma[:, 0].max())
     if not estimated.any() or assessed.sigma[:, 2].max() >= plane:
         return control
@@ -152,11 +152,11 @@ def choose_control(
         unknown = np.isnan(sigma[:, k])
         estimated = _is_estimated(control, [k])[list(usable), 0]
         sigma[unknown, k] = assessed.sigma[estimated, k][0] if estimated.any() else assumed
-    # stated σ that most points contradict are multiplied by one factor, estimated ones fit already
+    # Stated σ that most points contradict are multiplied by one factor, estimated ones fit already.
     sigma[np.isfinite(control.sigma)] *= assessed.factor
     choice = ControlChoice(dict(measured), np.zeros(len(control), bool), sigma, {}, {}, assessed)
     row = {k: n for n, k in enumerate(usable)}
-    # the offset of satellite positions against control, by the points that agree
+    # The offset of satellite positions against control, by the points that agree.
     shift = np.zeros(3)
     agreed = [k for k, n in row.items() if assessed.used[n]]
     if agreed:
@@ -203,7 +203,7 @@ def _settle_by_coordinates(
     coordinates."""
     id, point = control.id[k], choice.points[control.id[k]]
     X = control.position[k] + shift
-    # without a height, that of the points around
+    # Without a height, that of the points around.
     if np.isinf(control.sigma[k, 2]):
         heights = [block.X[row, 2] for row in block.row_of_determined.values()]
         X[2] = np.median(heights) if heights else X[2]
@@ -212,7 +212,7 @@ def _settle_by_coordinates(
     # σ of the measurement and, in pixels, of the coordinates
     sigma = np.hypot(point.sigma, spread / block.pixel_length(point, X))
     agree = off < block.settings.wrong_ray * sigma
-    # if exactly one of several rays that do not meet passes the coordinates, that one is right
+    # If exactly one of several rays that do not meet passes the coordinates, that one is right.
     if control.role[k] == "check" or (len(point.rows) > 1 and agree.sum() != 1):
         number = count(len(point.rows), "ray")
         choice.reasons[id] = (
@@ -258,13 +258,13 @@ def _name_exchanged(
     **Arguments:** `bad`: rows of the contradictory points, and in the assessment."""
     assessed, fitting = choice.assessment, block.settings.wrong_ray
     for i, n in bad.items():
-        # from the others: the offset of satellite positions is that of the points that agree
+        # From the others: the offset of satellite positions is that of the points that agree.
         predicted = control.position[i] + assessed.error[n]
         # σ² of the prediction without that of the coordinates of this point
         of_prediction = np.maximum(assessed.error_sigma[n] ** 2 - choice.sigma[i] ** 2, 0.0)
         for j in bad:
             off, sigma = predicted - control.position[j], choice.sigma[j]
-            # axes that are not controlled at both points tell nothing
+            # Axes that are not controlled at both points tell nothing.
             told = np.isfinite(off) & np.isfinite(sigma)
             within = np.abs(off) < fitting * np.sqrt(of_prediction + sigma**2)
             if i != j and told.any() and within[told].all():

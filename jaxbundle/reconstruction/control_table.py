@@ -50,7 +50,7 @@ class ControlPoint:
     @property
     def wrong_measurements(self) -> list[str]:
         """The photographs whose measurement of it contradicts the others."""
-        # the verdict decides: measurements of a point that takes no part are not wrong by that
+        # The verdict decides: measurements of a point that takes no part are not wrong by that.
         if "wrong measurement" not in self.verdict:
             return []
         return [one.image for one in self.measurements if f"{one.image} is a wrong" in self.verdict]
@@ -102,7 +102,7 @@ class ControlTable:
         if role == "check":
             chosen = [p.residual for p in self.points if p.role == "check"]
         else:
-            # without those left out: the fit of what the result rests on
+            # Without those left out: the fit of what the result rests on.
             chosen = [p.residual for p in self.points if p.used]
         there = np.array(chosen).reshape(-1, 3)
         number = np.isfinite(there).sum(0)
@@ -111,7 +111,7 @@ class ControlTable:
 
     def rows(self) -> list[tuple[str, ...]]:
         """The table as text, the RMS last."""
-        # decimals by σ: two significant digits of it, for all lengths alike
+        # Decimals by σ: two significant digits of it, for all lengths alike.
         places = column_decimals(np.concatenate([point.sigma for point in self.points]), 2, 4)
         rows = [point.cells(places) for point in self.points]
         for role, words in (("control", "RMS, used control"), ("check", "RMS, check points")):
@@ -162,7 +162,7 @@ def describe_sigma(
                 "each other by more than the stated σ"
             )
         words.append(said)
-    # one σ for X and Y: the residuals of few points do not determine two
+    # One σ for X and Y: the residuals of few points do not determine two.
     for k, name in ((0, "in the plane"), (2, "in height")):
         part = unknown[:, [0, 1]] if k == 0 else unknown[:, [2]]
         if not part.any():

@@ -10,8 +10,8 @@ from jaxtyping import Float, Int, UInt8
 
 from jaxbundle.io.results.result_project import readjustable_network
 from jaxbundle.network.kinds import Antennas, ExteriorPriors
+from jaxbundle.network.subsets import keep_points
 from jaxbundle.network.tables import GREY, Distances, LeftOut, Network, Points, Source
-from jaxbundle.network.undetermined import keep_points
 from jaxbundle.network.units import from_image_unit
 from jaxbundle.reconstruction.control_choice import ControlChoice
 from jaxbundle.reconstruction.oriented_block import MeasuredPoint, OrientedBlock
@@ -37,7 +37,7 @@ def network_with_control(block: OrientedBlock, control: Points, choice: ControlC
     ends = [(ids[a], ids[b]) for a, b in distances.points]
     network = keep_points(network, np.array([id not in named for id in network.points.id]))
     row = {id: k for k, id in enumerate(network.points.id)}
-    # the rows of the points in the new network, −1: named ones, which are added anew
+    # The rows of the points in the new network, −1: named ones, which are added anew.
     new_row = np.array([row.get(id, -1) for id in whole.points.id])
     rays = whole.observations.take(new_row[whole.observations.point] >= 0)
     added = _gather_points(block, control, choice, len(row))
@@ -45,7 +45,7 @@ def network_with_control(block: OrientedBlock, control: Points, choice: ControlC
         block.cameras, whole.images.camera[added.image], added.xy, added.spread, "px"
     )
     images, moved = network.images, [block.row_of_point[id] for id in network.points.id]
-    # check points are no points of the network, and distances to them are left out
+    # Check points are no points of the network, and distances to them are left out.
     row |= {id: len(row) + k for k, id in enumerate(added.id) if added.role[k] != "check"}
     here = np.array([a in row and b in row for a, b in ends], bool)
     return network.replace(
@@ -66,7 +66,7 @@ def network_with_control(block: OrientedBlock, control: Points, choice: ControlC
             source=Source("observations"),
         ),
         further=(
-            # the positions come back as observations of antennas, with an offset
+            # The positions come back as observations of antennas, with an offset.
             *(kind for kind in network.further if not isinstance(kind, ExteriorPriors)),
             *_observe_positions(block, choice),
         ),
@@ -118,10 +118,10 @@ def _gather_points(
     image, spread = [], []
     for k, id in enumerate(control.id):
         measured = choice.points[id]
-        # a point with wrong coordinates is a good tie point: its rays agree
+        # A point with wrong coordinates is a good tie point: its rays agree.
         role = "check" if control.role[k] == "check" else "tie"
         role = control.role[k] if choice.used[k] else role
-        # known coordinates and one ray leave a residual, a tie point with one ray leaves none
+        # Known coordinates and one ray leave a residual, a tie point with one ray leaves none.
         if measured.good.sum() < (1 if choice.used[k] else 2):
             continue
         there = np.isfinite(measured.position).all()
@@ -167,7 +167,7 @@ def _observe_positions(block: OrientedBlock, choice: ControlChoice) -> list[Ante
     there = np.flatnonzero(np.isfinite(X).all(1) & np.isfinite(sigma).all(1))
     if not len(there):
         return []
-    # on an axis without control the offset and the block itself could not be separated
+    # On an axis without control the offset and the block itself could not be separated.
     axes = [a for k, a in enumerate("XYZ") if np.isfinite(choice.sigma[choice.used, k]).any()]
     prior = dict(zip("XYZ", block.settings.offset_sigma))
     settings = {

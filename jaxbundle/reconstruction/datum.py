@@ -41,7 +41,7 @@ def choose_datum_points(
     otherwise, or all tie points are to define it."""
     problem = result.problem
     network = problem.network
-    # control or positions define the datum, or somebody chose it
+    # Control or positions define the datum, or somebody chose it.
     if network.datum != "inner" or network.datum_points:
         return ()
     if network.points.has_role("control", "fixed").any():
@@ -58,7 +58,7 @@ def choose_datum_points(
     rows = np.flatnonzero(good[point])
     image, point = image[rows], point[rows]
     cell = _cells(problem.image_coordinates()[used][rows], image, settings.cells)
-    # the first of each cell: with the most rays, and the widest angle
+    # The first of each cell: with the most rays, and the widest angle.
     order = np.lexsort((-angle[point], -rays[point], cell, image))
     first = np.unique(np.stack([image[order], cell[order]]), axis=1, return_index=True)[1]
     chosen = np.unique(point[order][first])

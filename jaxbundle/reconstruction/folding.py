@@ -21,7 +21,7 @@ from jaxbundle.network.tables import Camera, Network
 from jaxbundle.orientation import batched
 from jaxbundle.reconstruction.adjusting import WeightedAdjustment
 from jaxbundle.tiepoints.track_measurement import Measurements
-from jaxbundle.tiepoints.verified_pairs import ideal_features, present_size
+from jaxbundle.tiepoints.verified_pairs import ideal_features, required_image_size
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,7 +100,7 @@ def refuse_superimposed(
     for i, j in np.argwhere(np.triu(clear, 1)).tolist():
         if (min(place[i], place[j]), max(place[i], place[j])) in matched_pairs:
             compared += 1
-            # in one direction only: a blurred photograph, which lacks the points of the other
+            # In one direction only: a blurred photograph, which lacks the points of the other.
             if few[i, j] and few[j, i]:
                 contradictory.append((i, j))
     contradictory.sort(key=lambda pair: -number[pair])
@@ -143,10 +143,10 @@ def count_shared_points(
     ]
     expected, shared = np.zeros((2, n, n), int)
     for j in range(n):
-        # measured counts, even if it was removed as a gross error: what is missing was not found
+        # Measured counts, even if it was removed as a gross error: what is missing was not found.
         there = np.zeros(len(X), bool)
         there[agreeing[j]] = there[seen[j]] = True
-        # within both limits the base is shorter than the rays: others have no expected points
+        # Within both limits the base is shorter than the rays: others have no expected points.
         near = np.linalg.norm(X0 - X0[j], axis=1) < farthest
         for i in np.flatnonzero(near & (np.arange(n) != j)):
             d = X[agreeing[i]] - X0[j]
@@ -183,7 +183,7 @@ def _measured_rays(
 def _field_of_view(camera: Camera) -> Float[np.ndarray, "2 2"]:
     """Limits of x and y, c = 1, of the middle of each side: the corners of a lens with distortion
     reach farther, which costs a few points."""
-    columns, rows = present_size(camera)
+    columns, rows = required_image_size(camera)
     u, v = (columns - 1) / 2, (rows - 1) / 2
     ideal = ideal_features(camera, np.array([[0, v], [2 * u, v], [u, 0], [u, 2 * v]]))
     return np.stack([ideal.min(0), ideal.max(0)])

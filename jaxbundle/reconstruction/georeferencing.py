@@ -69,11 +69,11 @@ def georeference(
         for k, id in enumerate(control.id)
         if control.role[k] != "check" and block.is_determined(id, measured[id])
     ]
-    # rays and intersections again, in the frame of control
+    # Rays and intersections again, in the frame of control.
     if not block.has_positions:
         block.move(usable, control)
         measured = block.resolve()
-    # in object units: a pixel is larger on the ground the higher the camera
+    # In object units: a pixel is larger on the ground the higher the camera.
     assumed = block.settings.assumed_pixels * block.ground_sample_distance
     usable, assessed = assess_control(block, control, usable, assumed)
     given = control.sigma
@@ -87,7 +87,7 @@ def georeference(
             f"{choice.used.sum()}: "
             + list_some((f"{id}: {why}" for id, why in choice.reasons.items()), 5, str)
         )
-    # snooping begins without what was removed before; control is judged anew
+    # Snooping begins without what was removed before; control is judged anew.
     doubtful = [pair for pair in block.removed_image_points() if pair[1] not in control.id]
     result, _, _ = adjust_determined(
         network_with_control(block, control, choice),
@@ -174,7 +174,7 @@ def _predict(
     used = result.control_prediction
     if used is not None:
         found |= {id: (e, s) for id, e, s in zip(used.id, used.error, used.sigma)}
-    # exact coordinates take part and are not predicted
+    # Exact coordinates take part and are not predicted.
     fixed = {id for id, role in zip(result.points["id"], result.points["role"]) if role == "fixed"}
     return {id: both for id, both in found.items() if id not in fixed}
 

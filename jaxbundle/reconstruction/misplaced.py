@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxbundle.network.tables import Network
 from jaxbundle.orientation import batched
+from jaxbundle.tiepoints.pair_consistency import LoopSettings
 from jaxbundle.tiepoints.verification import Pair, rotation_angle
 
 
@@ -21,15 +22,14 @@ class MisplacedSettings:
     """Settings of the comparison of start values with pairs. Both are coarse, and what remains
     undetected is seen in the residuals: only gross contradictions count."""
 
-    max_rotation: float = np.radians(10.0)
-    """Maximum difference of rotations that agree, radians: twice that of a closed loop
-    (`LoopSettings.max_rotation`)."""
-    max_base_angle: float = np.radians(30.0)
+    max_rotation: float = 2 * LoopSettings.max_rotation
+    """Maximum difference of rotations that agree, radians: twice that of a closed loop."""
+    max_base_angle: float = float(np.arcsin(LoopSettings.max_aside))
     """Maximum difference of base directions that agree, radians, as in loops without common
-    features (`LoopSettings.max_aside`)."""
-    sure_base: float = 0.03
-    """Angle of intersection, radians, above which the direction of a base is known
-    (`LoopSettings.narrow_angle`)."""
+    features: 30 degrees."""
+    sure_base: float = LoopSettings.narrow_angle
+    """Angle of intersection, radians, above which the direction of a base is known, as in
+    loops."""
     min_pairs: int = 3
     """Minimum number of pairs for a photograph to be judged by them: with fewer, the
     photograph at the other end may be the wrong one."""
@@ -47,7 +47,7 @@ def find_misplaced(
     it is not known which of them are right."""
     contradicted = _compare(network, pairs, settings)
     misplaced: dict[str, str] = {}
-    # one at a time: the pairs of a misplaced photograph make its neighbours look wrong, too
+    # One at a time: the pairs of a misplaced photograph make its neighbours look wrong, too.
     while True:
         number = Counter(id for pair in contradicted for id in pair)
         bad = Counter(id for pair, wrong in contradicted.items() if wrong for id in pair)
@@ -74,7 +74,7 @@ def _compare(
         if ids[0] in row and ids[1] in row:
             i, j = (row[id] for id in ids)
             turned = rotation_angle(pair.M @ (M[j] @ M[i].T).T) > settings.max_rotation
-            # in the system of the first camera, as the base of the pair
+            # In the system of the first camera, as the base of the pair.
             base = M[i] @ (X0[j] - X0[i])
             angle = np.arctan2(np.linalg.norm(np.cross(base, pair.b)), base @ pair.b)
             clear = pair.kind != "rotation" and pair.angle > settings.sure_base

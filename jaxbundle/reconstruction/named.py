@@ -103,7 +103,7 @@ def find_named(
     if control is not None and control.sightings:
         index = {p.name: k for k, p in enumerate(photographs)}
         unknown = sorted({file for file, _ in control.sightings if file not in index})
-        # all: another folder was given; some: photographs that were left out of it
+        # All: another folder was given; some: photographs that were left out of it.
         if len(unknown) == len({file for file, _ in control.sightings}):
             raise InputError(
                 f"{control.points.source.name}: measured in none of the photographs, but in "
@@ -141,7 +141,7 @@ def named_as_features(named: NamedMeasurements, photographs: int) -> list[Featur
 
 
 def match_named(named: NamedMeasurements, photographs: int, least: int) -> list[FeatureMatches]:
-    """Pairs of photographs with at least so many common names, as matches of
+    """Pairs of photographs with at least `least` common names, as matches of
     `named_as_features`."""
     names = np.array(named.name, object)
     row = [
@@ -152,7 +152,7 @@ def match_named(named: NamedMeasurements, photographs: int, least: int) -> list[
     for i, j in itertools.combinations(range(photographs), 2):
         rows = np.array([(a, row[j][name]) for name, a in row[i].items() if name in row[j]])
         if len(rows) >= least:
-            # by their names they are certain
+            # By their names they are certain.
             sure = np.zeros(len(rows)), np.ones(len(rows), bool)
             matches.append(FeatureMatches((i, j), rows, *sure))
     return matches
@@ -172,7 +172,7 @@ def name_unused(
         name: len(set(named.image[np.array(named.name) == name].tolist()))
         for name in set(named.name)
     }
-    # an end in one photograph has no position, and a distance to it says nothing
+    # An end in one photograph has no position, and a distance to it says nothing.
     ends = lambda d: min(photographs.get(d["from"], 0), photographs.get(d["to"], 0))
     lost = [f"{d['from']} to {d['to']}" for d in distances if ends(d) < 2]
     if distances and len(lost) == len(distances):

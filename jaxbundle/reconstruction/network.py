@@ -45,7 +45,7 @@ def photograph_network(
 
     **Arguments:** `aspect_sigma`: of fy/fx about 1; infinite: not observed; `angle_unit` of the
     results."""
-    # without tie points of features the named ones connect the photographs
+    # Without tie points of features the named ones connect the photographs.
     rows = np.unique(measured.image if len(measured) else extra.named.image).tolist()
     of = [cameras.camera_of[k] for k in rows]
     used = sorted(set(of))
@@ -81,19 +81,19 @@ def photograph_network(
         angle_unit=angle_unit,
         name=name,
         sigma_origin=ESTIMATED,
-        # positions give frame and scale; without them inner constraints define the frame, and scale
-        # bars the scale
+        # Positions give frame and scale; without them inner constraints define the frame, and scale
+        # bars the scale.
         datum="inner" if extra.positions is None else "control",
         object_unit="m" if distances or extra.positions is not None else "unit",
     )
-    # of the photograph whose window is matched in the others
+    # Of the photograph whose window is matched in the others.
     tracks, colours = measured.track[measured.is_template], measured.colour[measured.is_template]
     colour_of = dict(zip(map(track_name, tracks.tolist()), colours.tolist()))
     network = network.replace(points=network.points.with_colours(colour_of))
     if not cameras.calibrated:
         stated = [cameras.stated_distances[c] for c in used]
         lens = [cameras.lens[c] for c in used]
-        # with pixels that may not be square, fx of portrait format is fy of landscape format
+        # With pixels that may not be square, fx of portrait format is fy of landscape format.
         of_lens = LENS_PARAMETERS if np.isfinite(aspect_sigma) else LENS_PARAMETERS[1:]
         network = with_common_lens_parameters(
             with_camera_priors(network, stated, lens, of_lens, aspect_sigma), lens, of_lens

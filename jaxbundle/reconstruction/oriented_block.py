@@ -126,13 +126,13 @@ class OrientedBlock:
         rows = np.array(rows, int)
         image = np.array([self.row[names[named.image[k]]] for k in rows], int)
         camera = self.network.images.camera[image]
-        # the measurements, and half a pixel to each side, for a central difference quotient
+        # The measurements, and half a pixel to each side, for a central difference quotient.
         shifts = np.array([[0, 0], [0.5, 0], [-0.5, 0], [0, 0.5], [0, -0.5]])
         xy = named.xy[rows] + shifts[:, None]
         d = self._camera_rays(np.tile(camera, len(shifts)), xy.reshape(-1, 2))
         d = np.einsum("nij,sni->snj", self.M[image], d.reshape(len(shifts), -1, 3))
-        # the ideal image of other cameras is not flat: the plane across the ray fits it best, and
-        # there is one beyond 90° from the axis, too
+        # The ideal image of other cameras is not flat: the plane across the ray fits it best, and
+        # there is one beyond 90° from the axis, too.
         flat = np.array([get_model(c.model).image == "perspective" for c in self.cameras], bool)
         axis = -self.M[image, 2]
         before = np.einsum("ni,ni->n", axis, d[0]) > MIN_COSINE
@@ -178,7 +178,7 @@ class OrientedBlock:
     ) -> Float[np.ndarray, " n"]:
         """The length of a pixel at X, parallel to the planes of its measurements."""
         depth = np.einsum("ni,ni->n", X - self.X0[point.image], point.normal)
-        # the side of a square as large as the pixel: |∂u × ∂v| pixels cover an area of 1
+        # The side of a square as large as the pixel: |∂u × ∂v| pixels cover an area of 1.
         cover = np.linalg.norm(np.cross(point.pixels[:, 0], point.pixels[:, 1]), axis=1)
         return depth / np.sqrt(cover)
 
@@ -189,7 +189,7 @@ class OrientedBlock:
         is larger than 1: a point is identified worse than it is measured."""
         measured = {id: self.measure(id) for id in self.frame.points.id}
         first = {id: self._find_consistent(point) for id, point in measured.items()}
-        # normalised by the redundancy number 1 − 3/(2n) of a point with n rays
+        # Normalised by the redundancy number 1 − 3/(2n) of a point with n rays.
         off = [
             self.misses(point, point.position)[point.good]
             / point.sigma[point.good]
@@ -237,7 +237,7 @@ class OrientedBlock:
         X = X0[0]
         for _ in range(3):
             N = (P * weight[:, None, None]).sum(0)
-            # parallel rays: σ along them would be a million times that across
+            # Parallel rays: σ along them would be a million times that across.
             if np.linalg.cond(N) > 1e12:
                 return np.full(3, np.nan)
             X = np.linalg.solve(N, np.einsum("n,nij,nj->i", weight, P, X0))
@@ -289,11 +289,11 @@ class OrientedBlock:
             C = C + np.diag(self.offset_sigma**2)[None, :, None, :]
             G = np.zeros((n, 3, 0))
         else:
-            # the generators of a similarity about the middle: shift, rotation, scale
+            # The generators of a similarity about the middle: shift, rotation, scale.
             x = (X - X.mean(0)) / max(np.ptp(X, axis=0).max(), 1e-12)
             turn = np.cross(np.eye(3)[None], x[:, None]).transpose(0, 2, 1)
             G = np.concatenate([np.tile(np.eye(3), (n, 1, 1)), turn, x[:, :, None]], 2)
-        # exact coordinates: σ 0, while NaN is to be estimated and infinity no observation
+        # Exact coordinates: σ 0, while NaN is to be estimated and infinity no observation.
         fixed = np.array([points.role[k] == "fixed" for k in places])
         sigma[fixed] = 0.0
         return Discrepancies(X - given, C, sigma, G)
@@ -302,7 +302,7 @@ class OrientedBlock:
         """The covariance of the coordinates of some points among each other."""
         problem, n = self.result.problem, len(rows)
         D, lengths = np.tile(np.eye(3), (n, 1, 1)), problem.lengths
-        # far points are unknowns by direction and inverse distance: D of X by them
+        # Far points are unknowns by direction and inverse distance: D of X by them.
         if lengths is not None:
             table = np.asarray(coordinates(self.result.values))
             for k, row in enumerate(rows):

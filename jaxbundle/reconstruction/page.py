@@ -69,7 +69,7 @@ def describe_part(whole: Reconstruction, part: ReconstructedPart) -> str:
     if part.control is not None:
         unit = part.control.unit
         lines += heading(f"Control and check points: adjusted − given, in {unit}")
-        # the reasons of verdicts are in the notes
+        # The reasons of verdicts are in the notes.
         rows = [(*row[:-1], row[-1].partition(":")[0]) for row in part.control.rows()]
         lines += table(HEADER, rows, "lrrrrrrrrl")
         lines += ["", *text_paragraph(f"{part.control.sigma}.")]
@@ -131,7 +131,7 @@ def _judge_photographs(whole: Reconstruction, part: ReconstructedPart) -> Findin
         words += f", {len(whole.parts)} unconnected parts"
     if whole.left_out:
         words += f", {len(whole.left_out)} left out"
-    # a verdict is about the photographs that somebody took, not about those that were used
+    # A verdict is about the photographs that somebody took, not about those that were used.
     complete = len(whole.parts) == 1 and not whole.left_out
     brief = f"{total - used} of {count(total, 'photograph')} not in this result"
     return Finding("Photographs", GOOD if complete else DOUBTFUL, words, brief)

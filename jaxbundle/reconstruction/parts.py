@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from jaxbundle.tiepoints.matching import FeatureMatches
+from jaxbundle.tiepoints.pair_graph import label_connected
 from jaxbundle.tiepoints.verification import Pair
 
 # Minimum photographs of a part; two if there are only two in all. Between two alone no loop and no
@@ -12,20 +13,9 @@ SMALLEST_PART = 3
 
 def group_connected(number: int, pairs: Sequence[Pair]) -> list[list[int]]:
     """Groups of photographs connected by verified pairs, the largest first."""
-    root = list(range(number))
-
-    def find_root(k: int) -> int:
-        while root[k] != k:
-            root[k] = root[root[k]]
-            k = root[k]
-        return k
-
-    for pair in pairs:
-        a, b = (find_root(k) for k in pair.images)
-        root[max(a, b)] = min(a, b)  # by the smallest: groups do not depend on the order of pairs
     groups: dict[int, list[int]] = {}
-    for k in range(number):
-        groups.setdefault(find_root(k), []).append(k)
+    for k, label in enumerate(label_connected(number, [pair.images for pair in pairs]).tolist()):
+        groups.setdefault(label, []).append(k)
     return sorted(groups.values(), key=lambda g: (-len(g), g[0]))
 
 

@@ -44,7 +44,7 @@ def find_photographs(
         try:
             check_plain(path)
             columns, rows = photograph_size(path)
-            # icons and previews: a window of least squares matching is a quarter of the side
+            # Icons and previews: a window of least squares matching is a quarter of the side.
             if min(columns, rows) < 64:
                 raise InputError(f"{path}: {columns} × {rows} pixels are too few")
             content = read_content(path, text=False)
@@ -130,7 +130,7 @@ def assign_cameras(
     if given is not None:
         fitted = _fit_size(given, photographs)
         return Cameras((fitted,), (0,) * len(photographs), (None,), True, notes)
-    # a zoom lens at another focal length is another camera, to the tenth of a millimetre
+    # A zoom lens at another focal length is another camera, to the tenth of a millimetre.
     groups: dict[tuple, list[int]] = {}
     for k, photograph in enumerate(photographs):
         exif = photograph.exif
@@ -138,13 +138,13 @@ def assign_cameras(
         own = photograph.path.parent.resolve() if per_folder else ""
         groups.setdefault((exif.camera, exif.serial, own, *focal, exif.size), []).append(k)
     cameras, stated, of = [], [], [0] * len(photographs)
-    # the key of a lens is that of a camera with the sides in order
+    # The key of a lens is that of a camera with the sides in order.
     lenses: dict[tuple, int] = {}
     lens = [lenses.setdefault((*key[:-1], *sorted(key[-1])), len(lenses)) for key in groups]
     for number, rows in enumerate(groups.values()):
         exif = photographs[rows[0]].exif
         told = exif.principal_distance()
-        # without a statement a start value: 45° of view, between telephones and normal lenses
+        # Without a statement a start value: 45° of view, between telephones and normal lenses.
         columns, rows_of_image = exif.size
         f = told.value if told else 1.2 * max(exif.size)
         id = (exif.camera or "camera") + (f" {number + 1}" if len(groups) > 1 else "")

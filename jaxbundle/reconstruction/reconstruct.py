@@ -70,7 +70,7 @@ from jaxbundle.tiepoints.camera_starts import start_cameras
 from jaxbundle.tiepoints.duplicates import find_duplicates
 from jaxbundle.tiepoints.features import Features, memory_of_features
 from jaxbundle.tiepoints.matching import FeatureMatches
-from jaxbundle.tiepoints.still import without_marks
+from jaxbundle.tiepoints.static_marks import without_marks
 from jaxbundle.tiepoints.store import Store
 from jaxbundle.tiepoints.track_measurement import Measurements, measure_tracks, no_measurements
 from jaxbundle.tiepoints.tracks import choose_tracks, make_tracks
@@ -115,11 +115,11 @@ def reconstruct(
         photographs, settings.targets, control, settings.workers, settings.uncoded
     )
     notes += name_other_files(given)
-    positions, said = find_positions(photographs, control)
-    notes += said
+    positions, messages = find_positions(photographs, control)
+    notes += messages
     framed = positions is not None and positions.define_frame
     notes += name_unused(named, control, distances, 1 if framed else MIN_CONTROL)
-    # attitudes are those of the map: without positions in it the frame has another orientation
+    # Attitudes are those of the map: without positions in it the frame has another orientation.
     attitudes = None
     if positions is not None and framed:
         attitudes = map_attitudes([p.exif.attitude for p in photographs], positions.convergence)
@@ -128,8 +128,8 @@ def reconstruct(
     if control is not None:
         points = control.points.take(~control.points.has_role("tie"))
         frame = FrameData(points, named, names, control.system, positions and positions[:2])
-        # measurements of check points take no part, in the first adjustment either: a wrong one
-        # would be judged by what it has changed
+        # Measurements of check points take no part, in the first adjustment either: a wrong one
+        # would be judged by what it has changed.
         checks = {id for id, role in zip(points.id, points.role) if role == "check"}
         named = named.take(np.array([id not in checks for id in named.name], bool))
     further = FurtherData(
@@ -174,7 +174,7 @@ class _ReconstructionRun:
 
     def run(self) -> Reconstruction:
         with ThreadPoolExecutor(1) as ahead:
-            # compiled during the search and matching of features, and the verification of pairs
+            # Compiled during the search and matching of features, and the verification of pairs.
             windows = lambda: track_measurement.prepare(self.settings.track_matching)
             programs = (prepare, windows, batched.prepare) if can_run_two_programs() else ()
             prepared = [ahead.submit(program) for program in programs]
@@ -186,18 +186,20 @@ class _ReconstructionRun:
             for program in prepared:
                 program.result()
         parts = self._make_parts(features, matches, pairs)
-        said = tuple(
+        verified = tuple(
             (self.names[p.images[0]], self.names[p.images[1]], p.match_count, len(p), p.kind)
             for p in pairs
         )
         files = {p.name: p.path for p in self.photographs}
-        warnings = [said for _, said in sorted(self.warnings, key=lambda warning: -warning[0])]
-        # the only part needs no name
+        warnings = [text for _, text in sorted(self.warnings, key=lambda warning: -warning[0])]
+        # The only part needs no name.
         only = f"{parts[0].name}: " if len(parts) == 1 else ""
         notes, warned = (
             tuple(text.removeprefix(only) for text in texts) for texts in (self.notes, warnings)
         )
-        return Reconstruction(tuple(parts), self.left_out, notes, said, files, warned, self.title)
+        return Reconstruction(
+            tuple(parts), self.left_out, notes, verified, files, warned, self.title
+        )
 
     def _match(self) -> tuple[list[Features], list[FeatureMatches]]:
         """Features and matches, without those of duplicates and marks; or the named points."""
@@ -219,7 +221,7 @@ class _ReconstructionRun:
             settings.candidates,
         )
         self.store.drop_unused()
-        # before marks: all matches of a duplicate are at the same pixels, too
+        # Before marks: all matches of a duplicate are at the same pixels, too.
         sizes = [p.size for p in self.photographs]
         duplicates = find_duplicates(matches, features, sizes, settings.duplicates)
         for k, (other, still, number) in duplicates.items():
@@ -271,7 +273,7 @@ class _ReconstructionRun:
             self.tell,
         )
         for name, of_photograph in zip(self.names, features):
-            # fewer than the matches that must agree in a pair
+            # Fewer than the matches that must agree in a pair.
             if (number := len(of_photograph)) < self.settings.verification.min_matches:
                 self.left_out.setdefault(name, f"no texture: {count(number, 'feature')}")
         self._require_two()
@@ -294,7 +296,7 @@ class _ReconstructionRun:
             except InputError as error:
                 why = str(error).removeprefix(f"{photograph.path}: ")
                 self.left_out[photograph.name] = why
-                # a header may be sound and the pixels not; the others go on without features of it
+                # A header may be sound and the pixels not; the others go on without features of it.
                 return np.zeros((8, 8), np.uint8)
 
         return read
@@ -344,7 +346,7 @@ class _ReconstructionRun:
     ) -> list[ReconstructedPart]:
         """The adjusted parts, the largest first. What is left of a part is tried as another one:
         two scenes may be connected by a few wrong pairs."""
-        # two photographs in all are a part, two of many are not
+        # Two photographs in all are a part, two of many are not.
         least = min(SMALLEST_PART, sum(name not in self.left_out for name in self.names))
         waiting = group_connected(len(self.photographs), pairs)
         parts: list[ReconstructedPart] = []
@@ -373,7 +375,7 @@ class _ReconstructionRun:
             ]
             for rows in group_connected(len(rest), renumbered):
                 again = [rest[k] for k in rows]
-                # a smaller group than before: the loop ends
+                # A smaller group than before: the loop ends.
                 if len(again) >= SMALLEST_PART and len(again) < len(group):
                     waiting.append(again)
                 else:
@@ -397,7 +399,7 @@ class _ReconstructionRun:
     def _explain_failure(self, pairs: Sequence[Pair], failed: Sequence[str]) -> str:
         """Why no part could be oriented, with a remedy."""
         kinds = {p.kind for p in pairs}
-        # the remedy depends on what the verified pairs show
+        # The remedy depends on what the verified pairs show.
         if kinds == {"rotation"} or kinds == {"rotation", "plane"}:
             return (
                 "not solved: a rotation or a plane explains every pair: the photographs were taken "
@@ -435,15 +437,7 @@ class _ReconstructionRun:
         settings = self.settings
         inside = [p for p in pairs if set(p.images) <= set(group)]
         measured = self._measure(features, inside)
-        network = photograph_network(
-            self.photographs,
-            self.cameras,
-            measured,
-            self.further,
-            self._title_of(name),
-            settings.aspect_sigma,
-            settings.angle_unit,
-        )
+        network = self._make_network(name, measured, self.further)
         self._begin("start values")
         named = {(self.names[p.images[0]], self.names[p.images[1]]): p for p in inside}
         oriented, weighted, note = self._adjust_first(network, measured, named)
@@ -451,7 +445,7 @@ class _ReconstructionRun:
             oriented, weighted, note = self._complete(name, weighted, measured, named)
         weighted, note = self._check_ratios(oriented, weighted, measured, note)
         self._begin("")
-        # before control, which fits a folded part as well as it can
+        # Before control, which fits a folded part as well as it can.
         refuse_folded(weighted, measured, self.names, settings.superposition)
         doubts = refuse_superimposed(
             weighted.adjustment, network, self.matched_pairs, self.names, settings.superposition
@@ -462,9 +456,17 @@ class _ReconstructionRun:
                 f"{name}: {count(weighted.unused_points, 'point')} of two rays not used: with "
                 "them the measurements contradict each other, as on an object that repeats itself"
             )
-        control, no_control = None, ""
+        part = self._finish_part(name, weighted)
+        for doubt in (*self._compare_with_files(part.adjustment), *doubts):
+            self._warn(f"{name}: {doubt}")
+        return part, dict(oriented.images_not_placed)
+
+    def _finish_part(self, name: str, weighted: WeightedAdjustment) -> ReconstructedPart:
+        """An adjusted part in the system of its control, if there is any, with errors that image
+        points share, and notes on what is arbitrary or doubtful."""
+        settings, control, no_control = self.settings, None, ""
         if self.frame is not None:
-            # wrong control costs the frame, not the reconstruction
+            # Wrong control costs the frame, not the reconstruction.
             try:
                 weighted, control = georeference(
                     weighted, self.frame, settings.significance, self._begin, settings.control
@@ -477,7 +479,7 @@ class _ReconstructionRun:
         if settings.correlated:
             result = result.with_correlated_errors()
         exif = {photograph.name: photograph.exif for photograph in self.photographs}
-        # without control and positions the frame is an arbitrary one
+        # Without control and positions the frame is an arbitrary one.
         absolute = control is not None or self.further.positions is not None
         block = describe_block(result, exif, self.system if absolute else "")
         part = ReconstructedPart(name, result, weighted.factors, block, control, no_control)
@@ -489,15 +491,21 @@ class _ReconstructionRun:
             )
         if part.misfit >= DOUBTFUL_MISFIT:
             self._warn(f"{name}: {misfit_in_words(part)}", part.misfit)
-        for said in (*self._compare_with_files(result), *doubts):
-            self._warn(f"{name}: {said}")
-        return part, dict(oriented.images_not_placed)
+        return part
 
-    def _title_of(self, part: str) -> str:
-        """The name of the network of a part: that of the job, from the second part on with the
-        part's own."""
-        first = part in ("", "part 1")
-        return self.title if first and self.title else ", ".join(filter(None, (self.title, part)))
+    def _make_network(self, part: str, measured: Measurements, further: FurtherData) -> Network:
+        """The network of a part, without start values. Its name is that of the job, from the second
+        part on with the part's own."""
+        first = part in ("", "part 1") and self.title
+        return photograph_network(
+            self.photographs,
+            self.cameras,
+            measured,
+            further,
+            self.title if first else ", ".join(filter(None, (self.title, part))),
+            self.settings.aspect_sigma,
+            self.settings.angle_unit,
+        )
 
     def _complete(
         self,
@@ -517,15 +525,7 @@ class _ReconstructionRun:
             f"{len(plain)} of {len(discs)} discs"
         )
         extra = dataclasses.replace(self.further, named=join_named(self.further.named, plain))
-        network = photograph_network(
-            self.photographs,
-            self.cameras,
-            measured,
-            extra,
-            self._title_of(name),
-            settings.aspect_sigma,
-            settings.angle_unit,
-        )
+        network = self._make_network(name, measured, extra)
         return self._adjust_first(network, measured, pairs)
 
     def _compare_with_files(self, result: Adjustment) -> list[str]:
@@ -537,8 +537,8 @@ class _ReconstructionRun:
             own = stated_sigma_of(adjusted)
             if file is None or not own:
                 continue
-            # the file's value is also an observation of the adjustment, which draws the result
-            # towards it: a contradiction is larger than it looks, and the test is cautious
+            # The file's value is also an observation of the adjustment, which draws the result
+            # towards it: a contradiction is larger than it looks, and the test is cautious.
             sigma = np.hypot(file.sigma, own)
             off = abs(adjusted["value"] - file.value)
             if off > square_pixels.CRITICAL_DEVIATION * sigma:
@@ -571,7 +571,7 @@ class _ReconstructionRun:
             if not is_plausible(result, guessed, settings):
                 failed = failed or _not_solved(result)
                 continue
-            # once more with the adjusted camera, if that orients more photographs
+            # Once more with the adjusted camera, if that orients more photographs.
             again = start_again(network, oriented, result, pairs, settings)
             if again is not None:
                 try:
@@ -612,17 +612,19 @@ class _ReconstructionRun:
                 )
         if not released:
             return weighted, note
-        # from the start values: the result's gross errors were judged with square pixels
+        # From the start values: the result's gross errors were judged with square pixels.
         network = square_pixels.release(oriented.network, released)
         return self._adjust(dataclasses.replace(oriented, network=network), measured)
 
     def _adjust(self, oriented: Oriented, measured: Measurements) -> tuple[WeightedAdjustment, str]:
         """The adjustment from start values, and a note on attitudes."""
         placed, note = with_attitudes(oriented.network, self.names, self.further.attitudes)
-        kinds, names = _kinds_of_measurements(placed, measured, self.names)
+        classes, class_names = _classify_measurements(placed, measured, self.names)
         significance, weighting = self.settings.significance, self.settings.weighting
-        placed, kept = leave_out_features(placed, kinds == -1, weighting)
-        weighted = adjust_weighted(placed, kinds[kept], names, significance, self._begin, weighting)
+        placed, kept = leave_out_features(placed, classes == -1, weighting)
+        weighted = adjust_weighted(
+            placed, classes[kept], class_names, significance, self._begin, weighting
+        )
         return weighted, note
 
 
@@ -643,17 +645,17 @@ def _not_solved(result: Adjustment) -> NotSolvedError:
     )
 
 
-def _kinds_of_measurements(
+def _classify_measurements(
     network: Network, measured: Measurements, names: Sequence[str]
 ) -> tuple[Int[np.ndarray, " rays"], dict[int, str]]:
-    """The kind of every observation, and the names of kinds, each of which has its own factor of
-    σ."""
+    """The class of every observation, and the names of classes, each of which has its own factor
+    of σ."""
     columns = (measured.image, measured.track, measured.level)
     level = {(names[i], track_name(t)): l for i, t, l in zip(*(c.tolist() for c in columns))}
     rays, images, points = network.observations, network.images.id, network.points.id
     ids = [(images[i], points[p]) for i, p in zip(rays.image.tolist(), rays.point.tolist())]
-    # the coarser the level, the fewer its matches: from the second on they share a factor
-    kinds = np.array([min(level[ray], 2) if ray in level else 3 for ray in ids], int)
+    # The coarser the level, the fewer its matches: from the second on they share a factor.
+    classes = np.array([min(level[ray], 2) if ray in level else 3 for ray in ids], int)
     words = {
         -1: "features not matched",
         0: "matched in the original",
@@ -661,4 +663,4 @@ def _kinds_of_measurements(
         2: "matched at a quarter or smaller",
         3: "named points",
     }
-    return kinds, words
+    return classes, words

@@ -152,7 +152,7 @@ def distances_found(result: Adjustment) -> str:
 
 def misfit_in_words(part: ReconstructedPart) -> str:
     """Measurements that contradict each other by far more than their σ."""
-    # without a χ² test, which estimated factors would always pass, they are themselves the verdict
+    # Without a χ² test, which estimated factors would always pass, they are themselves the verdict.
     wrong = part.misfit >= WRONG_MISFIT
     return (
         f"{'most likely wrong' if wrong else 'doubtful'}: measurements fit {part.misfit:.1f} times "

@@ -46,7 +46,7 @@ def find_positions(
     if not control.system:
         away = np.nanmedian(positions.X, 0) - np.median(control.points.position, axis=0)
         distance = float(np.hypot(*away[:2]))
-        # metres in their UTM zone: a block from the air is smaller, another system is farther
+        # Metres in their UTM zone: a block from the air is smaller, another system is farther.
         if distance > 10_000:
             return None, [
                 *notes,

@@ -14,10 +14,10 @@ from jaxbundle.reconstruction.uncoded_targets import UncodedSettings
 from jaxbundle.tiepoints.camera_starts import CameraStartSettings
 from jaxbundle.tiepoints.duplicates import DuplicateSettings
 from jaxbundle.tiepoints.features import FeatureSettings
-from jaxbundle.tiepoints.loops import LoopSettings
 from jaxbundle.tiepoints.matching import FeatureMatchingSettings
+from jaxbundle.tiepoints.pair_consistency import LoopSettings
 from jaxbundle.tiepoints.pairs import CandidateSettings
-from jaxbundle.tiepoints.still import MarkSettings
+from jaxbundle.tiepoints.static_marks import MarkSettings
 from jaxbundle.tiepoints.track_measurement import TrackMatchingSettings
 from jaxbundle.tiepoints.tracks import TrackSettings
 from jaxbundle.tiepoints.verification import VerificationSettings

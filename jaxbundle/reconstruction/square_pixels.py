@@ -20,8 +20,8 @@ from jaxbundle.adjustment.adjust import adjust
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.kinds import Ties
+from jaxbundle.network.subsets import keep_images, keep_points
 from jaxbundle.network.tables import Images, Network
-from jaxbundle.network.undetermined import keep_images, keep_points
 from jaxbundle.reconstruction.camera_priors import ASPECT, observed_parameters, with_observed
 
 # Normalised deviation, 3.29, beyond which chance (one in a thousand, either sign) does not explain
@@ -63,16 +63,16 @@ def replicated_ratios(result: Adjustment) -> dict[str, tuple[Ratio, Ratio]]:
     network = release(network, [camera.id for camera in network.cameras])
     number = np.arange(len(network.images))
     of_halves = []
-    # every second photograph, so that both halves see the whole object
+    # Every second photograph, so that both halves see the whole object.
     for parity in (0, 1):
         half = keep_images(network, number % 2 == parity)
         rays = np.bincount(half.observations.point, minlength=len(half.points))
         half = keep_points(half, (rays > 1) | ~half.points.has_role("tie"))
         half = half.replace(datum_points=())
-        # three photographs leave the principal point of an unknown camera to its prior
+        # Three photographs leave the principal point of an unknown camera to its prior.
         if len(half.images) < 4:
             return {}
-        # a half that does not determine its cameras confirms nothing
+        # A half that does not determine its cameras confirms nothing.
         try:
             alone = adjust(half)
         except (InputError, NotSolvedError):
@@ -91,7 +91,7 @@ def replicated_ratios(result: Adjustment) -> dict[str, tuple[Ratio, Ratio]]:
 
 def is_replicated(one: Ratio, other: Ratio) -> bool:
     """Whether two halves confirm each other that a ratio is not 1."""
-    # the difference of the halves shows the correlated errors that their σ does not contain
+    # The difference of the halves shows the correlated errors that their σ does not contain.
     apart = abs(one.deviation - other.deviation)
     clear = all(abs(r.deviation) > max(CRITICAL_DEVIATION * r.sigma, apart) for r in (one, other))
     return clear and one.deviation * other.deviation > 0
@@ -106,7 +106,7 @@ def release(network: Network, cameras: Collection[str]) -> Network:
     keep = [
         name != ASPECT or id not in cameras for id, name in zip(observed.camera, observed.parameter)
     ]
-    # of a lens in portrait format fy lies along the other axis: fx of both are then two unknowns
+    # Of a lens in portrait format fy lies along the other axis: fx of both are then two unknowns.
     network = with_observed(network, observed.take(np.array(keep)))
     return network.replace(
         further=tuple(

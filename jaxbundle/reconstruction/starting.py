@@ -18,13 +18,13 @@ from jaxtyping import Bool
 from jaxbundle.adjustment.orient import orient
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.errors import NotSolvedError
+from jaxbundle.network.subsets import keep_images, keep_points
 from jaxbundle.network.tables import Camera, Network
-from jaxbundle.network.undetermined import keep_images, keep_points
 from jaxbundle.orientation.network import Oriented
 from jaxbundle.orientation.rays import TOLERANCE
 from jaxbundle.reconstruction.camera_priors import observed_parameters, with_observed
 from jaxbundle.reconstruction.misplaced import MisplacedSettings, NamedPairs, find_misplaced
-from jaxbundle.tiepoints.verified_pairs import present_size
+from jaxbundle.tiepoints.verified_pairs import required_image_size
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,15 +88,15 @@ def start_values(
         except NotSolvedError as error:
             failed = error
         else:
-            # a wide tolerance lets wrong points in: only if the narrow one loses photographs
+            # A wide tolerance lets wrong points in: only if the narrow one loses photographs.
             if not candidates[-1].images_not_placed:
                 break
-    # those that leave out the fewest photographs first
+    # Those that leave out the fewest photographs first.
     yield from sorted(candidates, key=lambda oriented: len(oriented.images_not_placed))
     others = []
     for changed in _try_other_distances(network, guessed, settings):
         try:
-            # without pairs: their orientations were found with the other distance
+            # Without pairs: their orientations were found with the other distance.
             others.append(_orient(changed, settings.tolerance, {}, settings))
         except NotSolvedError:
             continue
@@ -119,7 +119,7 @@ def _orient(
         others = _without(network, np.isin(np.array(network.images.id), [*misplaced]))
         oriented = orient(others, tolerance=tolerance)
     network, images = oriented.network, {**oriented.images_not_placed, **misplaced}
-    # leaving out one photograph takes rays from the points of others: until none has too few
+    # Leaving out one photograph takes rays from the points of others: until none has too few.
     while True:
         rays = np.bincount(network.observations.point, minlength=len(network.points))
         tied = (rays > 1)[network.observations.point]
@@ -147,7 +147,7 @@ def _try_other_distances(
 ) -> Iterator[Network]:
     cameras = {c.id: c for c in network.cameras if c.id in guessed and c.image_size is not None}
     for factor in settings.other_distances if cameras else ():
-        distances = {id: factor * max(present_size(c)) for id, c in cameras.items()}
+        distances = {id: factor * max(required_image_size(c)) for id, c in cameras.items()}
         ratios = [cameras[id].parameters["fx"] / f for id, f in distances.items()]
         if any(max(r, 1 / r) > settings.distinct_ratio for r in ratios):
             yield _with_distances(network, distances)
@@ -165,7 +165,7 @@ def _with_distances(network: Network, distances: Mapping[str, float]) -> Network
         return network
     value, sigma = observed.value.copy(), observed.sigma.copy()
     for row, (id, name) in enumerate(zip(observed.camera, observed.parameter)):
-        # the prior moves with the start value, with the same relative σ: else it would pull back
+        # The prior moves with the start value, with the same relative σ: else it would pull back.
         if id in distances and name == "fx":
             value[row], sigma[row] = distances[id], distances[id] * sigma[row] / value[row]
     return with_observed(network, dataclasses.replace(observed, value=value, sigma=sigma))

@@ -100,7 +100,7 @@ class _Search:
         return d / np.linalg.norm(d, axis=1, keepdims=True)
 
     def accept(self, least: int) -> None:
-        """Accept the points with at least so many rays, pair by pair."""
+        """Accept the points with at least `least` rays, pair by pair."""
         n = len(self.rows)
         for i in range(n):
             for j in range(i + 1, n):
@@ -109,7 +109,7 @@ class _Search:
                     continue
                 hits, misfit = self._confirm(X)
                 rays = (hits >= 0).sum(1)
-                # of two that share a disc the one with more rays, of as many the closer one
+                # Of two that share a disc the one with more rays, of as many the closer one.
                 for row in np.lexsort((misfit, -rays)):
                     if rays[row] < least:
                         break
@@ -123,7 +123,7 @@ class _Search:
         base = self.X0[j] - self.X0[i]
         if not np.linalg.norm(base) > 0:
             return np.zeros((0, 3))
-        # the angle of a ray with the epipolar plane of the other, in pixels of the photograph
+        # The angle of a ray with the epipolar plane of the other, in pixels of the photograph.
         planes = np.cross(self.ray[i][a], base)
         planes /= np.maximum(np.linalg.norm(planes, axis=1, keepdims=True), np.finfo(float).tiny)
         off = np.abs(planes @ self.ray[j][b].T) / self.pixel[j]
@@ -131,7 +131,7 @@ class _Search:
         near = (off < self.settings.tolerance) & (cosine < np.cos(self.settings.min_angle))
         p, q = np.nonzero(near)
         u, v = self.ray[i][a[p]], self.ray[j][b[q]]
-        # the point midway between two rays: from the normal equations of both distances
+        # The point midway between two rays: from the normal equations of both distances.
         c = (u * v).sum(1)
         s = ((u - c[:, None] * v) @ base) / (1 - c**2)
         t = ((c[:, None] * u - v) @ base) / (1 - c**2)

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbundle.display import print_in_one_screen
-from jaxbundle.leastsquares.excluded_rows import determine
+from jaxbundle.leastsquares.excluded_rows import determine_excluded
 from jaxbundle.leastsquares.indexing.plan import Plan
 from jaxbundle.leastsquares.indexing.rows import (
     Data,
@@ -63,7 +63,7 @@ def intersect(found: RefinementInspection, rays: Rays) -> RefinementCheckPoints:
     inputs, adjusted = found.declared.inputs, found.solution.values
     checks = declare(inputs, rays, inputs.points.X[rays.points], adjusted)
     problem, start = checks.problem, checks.problem.data.start
-    determined = determine(found.solution, problem)
+    determined = determine_excluded(found.solution, problem)
     values, Q = determined.values, determined.cofactors(found.solution)
     known, axes = problem.table("point").free > 0, start["point"].axes
     change = np.asarray(values["point"].position - start["point"].position)

@@ -96,7 +96,7 @@ class RefinementInspection:
     @functools.cached_property
     def cofactor(self) -> Float[np.ndarray, "m m"]:
         """Cofactors of the shared unknowns."""
-        slopes, problem = self.solution.slopes(self.shared_unknowns), self.solution.problem
+        slopes, problem = self.solution.jacobian_of(self.shared_unknowns), self.solution.problem
         if not problem.kept_rows.any():
             # They are no functions of the points, whose zeros would take most of the time and
             # memory; only points with distances are in the system that remains.

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from jaxbundle.types import AnyArray, Scalar
 
 # Smallest number of intervals between knots. Three have six coefficients, less two for constant and
-# line; one or two are little more than a single cubic polynomial. Not critical.
+# line; one or two are little more than a single cubic polynomial.
 MIN_INTERVALS = 3
 
 

@@ -41,7 +41,7 @@ class HeightModel(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class TerrainHeight:
-    """v of the height of a point; the grid is that of a `Terrain` with so many columns."""
+    """v of the height of a point; the grid is that of a `Terrain`."""
 
     earth: Ellipsoid | None
     origin: tuple[float, float]

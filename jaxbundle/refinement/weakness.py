@@ -13,12 +13,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.leastsquares.problem import with_data
-from jaxbundle.leastsquares.quality.names import (
-    kept_unknowns,
-    place_of,
-    scaled_system,
-    undetermined,
-)
+from jaxbundle.leastsquares.quality.names import kept_unknowns, place_of
+from jaxbundle.leastsquares.quality.null_space import scaled_system, undetermined_unknowns
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.refinement.declare import DeclaredRefinement
 from jaxbundle.refinement.freedom import UnknownName
@@ -60,7 +56,7 @@ def weaknesses(
     S, names = _observe(declared, found)
     if not np.isfinite(S).all():
         # a point that its own observations leave open, so that it could not be eliminated
-        vague = undetermined(found.problem, found.values)
+        vague = undetermined_unknowns(found.problem, found.values)
         sentence = f"the points do not determine {', '.join(vague[: settings.most_named])}"
         return [WeakDirection(0.0, tuple(vague), sentence)]
     values, vectors = np.linalg.eigh(S)

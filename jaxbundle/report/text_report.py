@@ -53,7 +53,7 @@ def text(
     lines += unknowns.images(adjustment, max_rows)
     lines += unknowns.points(adjustment, max_rows, accuracy_unit)
     lines += unknowns.far_points(adjustment, max_rows)
-    lines += unknowns.further(adjustment, max_rows)
+    lines += unknowns.further_unknowns(adjustment, max_rows)
     lines += observations.check_points(adjustment, max_rows)
     lines += observations.predicted_control(adjustment, max_rows)
     lines += observations.distances(adjustment, max_rows)

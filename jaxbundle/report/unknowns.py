@@ -9,8 +9,8 @@ from jaxtyping import Float, Int
 from jaxbundle.cameras import CameraModel, get_model
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import EXTERIOR
+from jaxbundle.report.camera_equations import camera_equations
 from jaxbundle.report.correlated import stated_sigma, stated_sigma_of
-from jaxbundle.report.equations import equations
 from jaxbundle.report.layout import (
     WITHOUT_SIGMA,
     bar,
@@ -89,7 +89,7 @@ def _one_camera(entry: Mapping[str, Any], model: CameraModel) -> list[str]:
 
 
 def _equations(model: CameraModel) -> list[str]:
-    first, *others = map(clean, equations(model))
+    first, *others = map(clean, camera_equations(model))
     rows = [(f"Model {clean(model.name)}", first), *(("", line) for line in others)]
     return facts(rows)
 
@@ -326,7 +326,7 @@ def far_points(adjustment: "Adjustment", most: int) -> list[str]:
 # --- further kinds of observations ----------------------------------------------------------
 
 
-def further(adjustment: "Adjustment", most: int) -> list[str]:
+def further_unknowns(adjustment: "Adjustment", most: int) -> list[str]:
     """The unknowns of further kinds of observations, a line each."""
     lines = []
     for name, found in adjustment.further_unknowns.items():

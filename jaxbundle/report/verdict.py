@@ -140,7 +140,7 @@ def _tested(
     adjustment: "Adjustment", rows: Bool[np.ndarray, " n"] | slice
 ) -> tuple[float, float, str]:
     """The largest |τ| of some observations, NaN if none of them is controlled; its critical value
-    among so many; both in words."""
+    for the largest of their number; both in words."""
     tau = np.abs(adjustment.residuals["tau"][rows])
     tau = tau[np.isfinite(tau)]
     largest = float(np.fmax.reduce(tau, initial=np.nan))

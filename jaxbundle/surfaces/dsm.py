@@ -26,8 +26,8 @@ from jaxbundle.display import data_set, print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.io.rasters.vertical import horizontal_system
 from jaxbundle.io.rasters.writing import write_raster
+from jaxbundle.leastsquares.quality.distributions import NORMAL_SIGMA_BY_MAD
 from jaxbundle.surfaces.cloud import Cloud
-from jaxbundle.surfaces.scatter import NORMAL_SIGMA_BY_MAD
 
 if TYPE_CHECKING:
     import xarray

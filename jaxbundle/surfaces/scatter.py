@@ -12,11 +12,11 @@ from jaxtyping import Float
 from scipy import stats
 from scipy.optimize import brentq
 
+from jaxbundle.leastsquares.quality.distributions import NORMAL_SIGMA_BY_MAD
+
 # Minimum values for a variance factor: the median of n values of χ²₁ has the standard deviation
 # 1/(2·f·√n), with the density f = 0.47 at the median 0.455; for 100 values 23 % of it.
 MIN_VALUES = 100
-# σ of a normal distribution by its median absolute deviation: 1/Φ⁻¹(¾) to five digits.
-NORMAL_SIGMA_BY_MAD = 1.4826
 # Median of χ² of one degree of freedom, 0.455.
 CHI2_MEDIAN = float(stats.chi2.median(1))
 

@@ -13,18 +13,18 @@ from jaxtyping import Float
 
 from jaxbundle.network.tables import Camera
 from jaxbundle.orientation import batched
-from jaxbundle.tiepoints.closure import (
+from jaxbundle.tiepoints.coplanarity import CoplanaritySettings, estimate_interior
+from jaxbundle.tiepoints.features import Features
+from jaxbundle.tiepoints.interior_from_loops import (
     ClosureSettings,
     Interior,
     OrientedPairs,
     close_rotations,
     find_loops,
 )
-from jaxbundle.tiepoints.coplanarity import CoplanaritySettings, estimate_interior
-from jaxbundle.tiepoints.features import Features
 from jaxbundle.tiepoints.matching import FeatureMatches
 from jaxbundle.tiepoints.verification import MATCH_SLOTS, Pair, VerificationSettings
-from jaxbundle.tiepoints.verified_pairs import ideal_features, present_size, verify
+from jaxbundle.tiepoints.verified_pairs import ideal_features, required_image_size, verify
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,6 +66,9 @@ def start_cameras(
     """
     verification = verification or VerificationSettings()
     better, notes, sufficient = list(cameras), [], verification.sufficient_matches
+    # Relative to the image centres, which are taken as principal points.
+    size = lambda k: np.array(required_image_size(cameras[camera_of[k]]))
+    centred = lambda k: features[k].xy - (size(k) - 1) / 2
     for number in dict.fromkeys(lens):
         own = [c for c in range(len(cameras)) if lens[c] == number]
         pairs = [
@@ -74,8 +77,6 @@ def start_cameras(
             if {camera_of[k] for k in m.images} <= {*own}
         ]
         first, name, told = cameras[own[0]], cameras[own[0]].id, known[own[0]]
-        # relative to the image centres, which are taken as principal points
-        centred = lambda k: features[k].xy - (np.array(present_size(cameras[camera_of[k]])) - 1) / 2
         xy = [
             tuple(centred(k)[rows] for k, rows in zip(m.images, m.rows.T))
             for m in _choose_pairs(pairs, settings, sufficient)
@@ -138,7 +139,7 @@ def _close(
     def orient(x: Interior) -> OrientedPairs:
         quiet = lambda *_: None
         pairs = verify(with_interior(x), camera_of, features, matches, quiet, verification)
-        # only the matches that refine a rotation in every evaluation of the search
+        # Only the matches that refine a rotation in every evaluation of the search.
         pairs = [
             dataclasses.replace(pair, matches=pair.matches[batched.spread(len(pair), MATCH_SLOTS)])
             for pair in pairs
@@ -165,15 +166,15 @@ def _ideal_matches(
     camera = np.concatenate([np.full(len(rows), camera_of[k]) for k, rows in sides])
     ends = np.cumsum([len(rows) for _, rows in sides])[:-1]
 
-    # one call for each camera instead of two for each pair
-    def ideal(x: Interior) -> list[tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]]:
+    # One call for each camera instead of two for each pair.
+    def ideal_with(x: Interior) -> list[tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]]:
         xy, cameras = np.empty_like(uv), with_interior(x)
         for c in own:
             xy[camera == c] = ideal_features(cameras[c], uv[camera == c])
         each = np.split(xy, ends)
         return list(zip(each[::2], each[1::2]))
 
-    return ideal
+    return ideal_with
 
 
 def _prefer_unique(matches: FeatureMatches, sufficient: int) -> FeatureMatches:
@@ -208,7 +209,7 @@ def _choose_loops(
     loops = loops[np.argsort(-weakest, kind="stable")]
     pairs = np.array(list(number)).reshape(-1, 2)
     new, chosen = np.ones(len(loops), bool), np.zeros(len(pairs), bool)
-    # each loop has at least a photograph in common with chosen ones, so that they can share pairs:
+    # Each loop has at least a photograph in common with chosen ones, so that they can share pairs:
     # k loops of k + 2 photographs with 2k + 1 pairs are independent, those apart need 3k pairs. To
     # demand a common pair chose the same 60 pairs of three rendered sets of 24 photographs.
     while chosen.sum() < most:

@@ -110,7 +110,7 @@ def estimate_interior(
     xy1, xy2 = ([pair[i][r] for pair, r in zip(pairs, clear)] for i in (0, 1))
     tried = [camera.parameters["fx"]] if known else [size * factor for factor in settings.factors]
     if len(pairs) > PAIRS:
-        # every third distance suffices to see which pairs agree at all, and at which angle
+        # Every third distance suffices to see which pairs agree at all, and at which angle.
         first = tried if known else tried[1::3]
         _, _, part, _, angle = _orient([_with(camera, f) for f in first], xy1, xy2, limit)
         # σ of c falls with the angle; matches that agree count more than it does
@@ -120,14 +120,14 @@ def estimate_interior(
     M, b, part, costs, _ = _orient([_with(camera, f) for f in tried], xy1, xy2, limit)
     unusual = np.abs(np.log(np.array(tried) / (settings.usual * size)))
     doubt = 1 + settings.doubt * unusual * (1 + unusual) / 2
-    # of all pairs together: one pair alone often has a minimum at the end of the range
+    # Of all pairs together: one pair alone often has a minimum at the end of the range.
     best = int(np.argmin(costs.sum(1) * (1 if known else doubt)))
     f, M, b, part = tried[best], M[best], b[best], part[best]
     use = np.flatnonzero(part > settings.min_agreeing)
     if not len(use):
         return CoplanarityResult(_with(camera, f), 0, np.nan)
     f, k1, e = _adjust(_with(camera, f), [(xy1[k], xy2[k]) for k in use], M[use], b[use], limit)
-    # relative to what was known or tried: the files know lenses of any length
+    # Relative to what was known or tried: the files know lenses of any length.
     sane = 1 / settings.max_ratio < f / tried[best] < settings.max_ratio
     sane &= abs(k1) < settings.max_k1
     better = _with(camera, f, k1) if sane else _with(camera, tried[best])
@@ -160,7 +160,7 @@ def _orient(
     M, b, part, angle = batched.orient_pairs(one, two, limit / f)
     filled = (np.stack([_fill(a) for a in side]) for side in (one, two))
     e = np.asarray(batched.run_in_lanes(_sampson, batched.LANES, M, b, *filled)[0])
-    # in pixels, so that the distances do not shrink with the scale of a larger c
+    # In pixels, so that the distances do not shrink with the scale of a larger c.
     e = np.nan_to_num(f[:, None] * e, nan=1e3)
     # Cauchy's ρ = ln(1 + (e/limit)²); a pair that cannot be oriented counts as with 10 limits
     costs = np.where(part > 0, np.log1p((e / limit) ** 2).mean(1), np.log1p(100.0))
@@ -244,12 +244,12 @@ def _self_calibrate(
 
     def adjust_once(_: Int[Array, ""], state: State) -> State:
         e = misclosures(state, xy1, xy2, jnp.ones(xy1.shape[:2])).reshape(xy1.shape[:2])
-        # the root of Cauchy's weight 1/(1 + (e/limit)²)
+        # The root of Cauchy's weight 1/(1 + (e/limit)²).
         root = weight[:, None] / jnp.sqrt(1 + (jnp.nan_to_num(e, nan=1e6) / limit) ** 2)
         state, _ = minimise(misclosures, move, state, (xy1, xy2, root), 2 + 5 * len(M), 8)
         return state
 
-    # four times with at most eight steps: start values, which need not converge
+    # Four times with at most eight steps: start values, which need not converge.
     state = jax.lax.fori_loop(0, 4, adjust_once, (jnp.zeros(2), M, b))
     e = misclosures(state, xy1, xy2, jnp.ones(xy1.shape[:2])).reshape(xy1.shape[:2])
     q = camera(state[0])

@@ -66,7 +66,7 @@ def _choose_left_out(
 ) -> dict[int, tuple[int, int, int]]:
     """Every photograph that shows the same as a better one that stays."""
     left_out: dict[int, tuple[int, int, int]] = {}
-    # the best first: whether it stays is known before those that it replaces are judged
+    # The best first: whether it stays is known before those that it replaces are judged.
     for k in sorted(range(len(number)), key=lambda k: (-number[k], k)):
         for pair, counted in same.items():
             if k in pair:
@@ -90,7 +90,7 @@ def _count_still(
     if len(m.rows) < needed:
         return 0
     i, j = m.images
-    # positions in a photograph, 0 to 1 in both directions
+    # Positions in a photograph, 0 to 1 in both directions.
     one, other = ((features[k].xy + 0.5) / np.array(sizes[k]) for k in (i, j))
     a, b = one[m.rows[:, 0]], other[m.rows[:, 1]]
     blur = [
@@ -98,7 +98,7 @@ def _count_still(
         for k, rows in zip((i, j), m.rows.T)
     ]
     limit = settings.max_motion + np.maximum(*blur)
-    # one of them may have been saved upright, in either direction, or upside down
+    # One of them may have been saved upright, in either direction, or upside down.
     for turns in range(4):
         still = _are_still(a, b, sizes[i], limit, turns, sizes[j])
         number = int(still.sum())

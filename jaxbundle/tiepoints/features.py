@@ -89,10 +89,10 @@ def find_features(
     factor = min(1.0, settings.side / max(rows, columns)) if settings.side else 1.0
     if factor < 1:
         size = max(round(columns * factor), 1), max(round(rows * factor), 1)
-        # the mean over the area of a pixel: the other interpolations alias when they reduce
+        # The mean over the area of a pixel: the other interpolations alias when they reduce.
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     points, descriptors = _search(cv2, grey, settings, settings.contrast)
-    # a low threshold for all would fill sharp photographs with features of noise
+    # A low threshold for all would fill sharp photographs with features of noise.
     if settings.kind == "sift" and len(points) < settings.faint_share * settings.number:
         points, descriptors = _search(cv2, grey, settings, settings.faint_contrast)
     if not points or not descriptors:
@@ -134,7 +134,7 @@ def _search(
 def _make_detector(cv2: ModuleType, settings: FeatureSettings, contrast: float) -> Any:
     ample = int(settings.search_factor * settings.number)
     if settings.kind == "sift":
-        # without precise upscaling, features are a quarter of a pixel too far right and down
+        # Without precise upscaling, features are a quarter of a pixel too far right and down.
         return cv2.SIFT_create(
             nfeatures=ample, contrastThreshold=contrast, enable_precise_upscale=True
         )
@@ -145,7 +145,7 @@ def _make_detector(cv2: ModuleType, settings: FeatureSettings, contrast: float) 
             f"OpenCV {cv2.__version__} is built without AKAZE: take features sift, or install "
             "opencv-contrib-python-headless"
         )
-    # half of OpenCV's default threshold, as for the contrast of SIFT
+    # Half of OpenCV's default threshold, as for the contrast of SIFT.
     return cv2.AKAZE_create(threshold=0.0005)
 
 
@@ -198,7 +198,7 @@ def _choose_evenly(
     cell = row * (settings.cells + 1) + column
     order = np.lexsort((-response, cell))
     first = np.searchsorted(cell[order], cell[order])
-    # the rank of each feature within its cell: all first ones are taken, then all second ones, …
+    # The rank of each feature within its cell: all first ones are taken, then all second ones, …
     rank = np.empty(len(xy), int)
     rank[order] = np.arange(len(xy)) - first
     chosen = np.lexsort((-response, rank))[: settings.number]

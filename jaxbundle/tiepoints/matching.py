@@ -78,19 +78,19 @@ def match_features(
     best, distance, second = nearest(a, b)
     if within is not None:
         second = np.minimum(second, np.minimum(within[0], within[1][best]))
-    # most features are dropped here, and need no search in the other direction
+    # Most features are dropped here, and need no search in the other direction.
     rows = np.flatnonzero(distance < settings.max_ratio * second)
     if not len(rows):
         return np.zeros((0, 2), int), np.zeros(0)
     back, _, second_back = nearest(b[best[rows]], a)
-    # descriptors closer than 1e-3 are equal: three times √ε of float32, the rounding of √(1 − a·b)
-    # also the matched ones: two features equal to one of the other photograph have the ratio 1
+    # Descriptors closer than 1e-3 are equal: three times √ε of float32, the rounding of √(1 − a·b)
+    # also the matched ones: two features equal to one of the other photograph have the ratio 1.
     equal = 1e-3
     distance_ratio = np.maximum(distance[rows], equal) / np.maximum(
         np.minimum(second[rows], second_back), equal
     )
     mutual = np.flatnonzero((back == rows) & (distance_ratio < settings.max_ratio))
-    # stable: equal ratios keep their order on every machine
+    # Stable: equal ratios keep their order on every machine.
     mutual = mutual[np.argsort(distance_ratio[mutual], kind="stable")]
     rows = rows[mutual]
     return np.stack([rows, best[rows]], 1), distance_ratio[mutual]
@@ -109,7 +109,7 @@ def are_unique(
 def count_matches_of_largest(one: Features, other: Features, most: int) -> int:
     """The number of matches of the largest features, at most `most` of each photograph: a quick
     check whether two overlap (Wu, 2013, preemptive matching)."""
-    # features are in order of their size; the largest survive the largest changes of scale
+    # Features are in order of their size; the largest survive the largest changes of scale.
     largest = slice(most)
     return len(match_features(one.take(largest), other.take(largest))[0])
 
@@ -131,8 +131,8 @@ def distances_within(features: Features) -> Float[np.ndarray, " n"]:
     for first in range(0, n, ROWS_AT_ONCE):
         rows = slice(first, first + ROWS_AT_ONCE)
         s = a[rows] @ a.T
-        # not itself, nor the other directions and scales that SIFT gives one place: those are no
-        # repetition
+        # Not itself, nor the other directions and scales that SIFT gives one place: those are no
+        # repetition.
         away = (xy[rows, None, 0] - xy[:, 0]) ** 2 + (xy[rows, None, 1] - xy[:, 1]) ** 2
         s[away <= squared_size[rows, None]] = -1
         nearest[rows] = _distance(s.max(1))

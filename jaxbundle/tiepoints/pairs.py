@@ -13,7 +13,8 @@ from jaxbundle.tiepoints.matching import count_matches_of_largest
 
 @dataclasses.dataclass(frozen=True)
 class CandidateSettings:
-    """Settings of the selection of pairs: one in vain costs a matching, one missed a connection."""
+    """Settings of the selection of pairs: a needless pair costs one matching run; a missed pair
+    loses a connection."""
 
     all_pairs_up_to: int = 60
     """Maximum number of photographs with all pairs matched: 1770 pairs, each a product of two
@@ -66,7 +67,7 @@ def _nearest_by_position(
 ) -> list[tuple[int, int]]:
     from scipy.spatial import cKDTree
 
-    # one more: the nearest of each photograph is the photograph itself
+    # One more: the nearest of each photograph is the photograph itself.
     _, rows = cKDTree(place).query(place, k=min(neighbours + 1, len(place)))
     pairs = {(min(i, j), max(i, j)) for i, row in enumerate(rows) for j in row.tolist() if i != j}
     return sorted(pairs)

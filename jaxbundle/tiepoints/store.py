@@ -86,8 +86,8 @@ class Store:
                 if path.stem not in self.used:
                     path.unlink(missing_ok=True)
             for path in self.folder.glob("*.part*"):
-                # from a killed run, unless so new that another run may be writing it; a file of a
-                # few megabytes takes no ten minutes, even on a slow disk
+                # From a killed run, unless so new that another run may be writing it; a file of a
+                # few megabytes takes no ten minutes, even on a slow disk.
                 with suppress(OSError):
                     if time.time() - path.stat().st_mtime > 600:
                         path.unlink()
@@ -108,7 +108,7 @@ class Store:
     def _save(self, name: str, **arrays: np.ndarray) -> None:
         if self.folder is None:
             return
-        # renamed when it is complete, which is atomic; by process, as two may run in one folder
+        # Renamed when it is complete, which is atomic; by process, as two may run in one folder.
         path = self.folder / f"{name}.npz"
         with temporary(self.folder / f"{name}.part{os.getpid()}") as part:
             try:

@@ -168,7 +168,7 @@ def measure_tracks(
     track_features = _place_windows(tracks, features, settings)
     cutouts = _cut_out(track_features, len(features), read, advance, settings)
     inside = cutouts.inside
-    # the window inside its own photograph, and a place for it in the other
+    # The window inside its own photograph, and a place for it in the other.
     others = np.flatnonzero(~track_features.is_template & inside & inside[track_features.template])
     half = settings.window // 2
     bend = (
@@ -259,7 +259,7 @@ def _predict_affine(
     c, s = grown * np.cos(turn), grown * np.sin(turn)
     start = np.zeros((len(xy), 2, 3))
     start[:, 0, 0], start[:, 0, 1], start[:, 1, 0], start[:, 1, 1] = c, -s, s, c
-    # the point is the centre pixel of the window, a fraction of a pixel from the feature
+    # The point is the centre pixel of the window, a fraction of a pixel from the feature.
     offset = centre[w] - xy[w] / scale[w, None]
     start[:, :, 2] = xy / scale[:, None] + np.einsum("nij,nj->ni", start[:, :, :2], offset)
     return start
@@ -276,7 +276,7 @@ def _cut_out(
     cv2 = need_opencv()
     n, is_template = len(track_features.image), track_features.is_template
     window, side = settings.window, settings.search_window
-    # one pixel for interpolation and one for the last step, beyond the window that moves within
+    # One pixel for interpolation and one for the last step, beyond the window that moves within.
     margins = {window: window // 2, side: window // 2 + 2}
     windows = np.zeros((int(is_template.sum()), window, window), np.uint8)
     row_of_window = np.cumsum(is_template) - 1
@@ -388,7 +388,7 @@ def _collect(
     track, scale, corner = track_features.track, track_features.scale, track_features.corner
     place = affine[:, :, 2] + corner[others]
     away = np.linalg.norm(place - track_features.xy[others] / scale[others, None], axis=1)
-    # half of the variance of a match belongs to each of its two windows
+    # Half of the variance of a match belongs to each of its two windows.
     sigma = np.sqrt(np.maximum(covariance[:, [0, 1], [0, 1]], 0) / 2)
     good = (status == int(MatchingStatus.CONVERGED)) & (rho > settings.min_correlation)
     good &= (away < settings.max_shift) & (sigma < settings.max_sigma).all(1)
@@ -400,11 +400,11 @@ def _collect(
     matched[rows] = True
     templates = np.flatnonzero(track_features.is_template)
     number = np.bincount(track[rows], minlength=len(templates))
-    # the point is the centre of the window, if that is matched, else the feature
+    # The point is the centre of the window, if that is matched, else the feature.
     from_window = (track_features.start[:, :, 2] + corner) * scale[:, None]
     xy = np.where(number[track, None] > 0, from_window, track_features.xy)
     xy[rows] = place[good] * scale[rows, None]
-    # the share of the window, from each of its matches, and their mean
+    # The share of the window, from each of its matches, and their mean.
     sums = [np.bincount(track[rows], sigma[good, i] ** 2, len(templates)) for i in (0, 1)]
     square = np.stack(sums, 1)
     use = number > 0

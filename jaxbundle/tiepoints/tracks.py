@@ -31,7 +31,7 @@ class TrackSettings:
 
 def make_tracks(features: Sequence[Features], pairs: Sequence[Pair]) -> list[list[tuple[int, int]]]:
     """Tracks as lists of (photograph, feature), two photographs at least."""
-    # every feature of all photographs has a number; `first` is that of the first of a photograph
+    # Every feature of all photographs has a number; `first` is that of the first of a photograph.
     first = np.concatenate([[0], np.cumsum([len(f) for f in features])]).astype(int)
     same = np.concatenate([_merge_directions(f.xy) + k for f, k in zip(features, first)] or [[]])
     rows = [first[list(pair.images)] + pair.matches for pair in pairs if len(pair)]
@@ -49,7 +49,7 @@ def make_tracks(features: Sequence[Features], pairs: Sequence[Pair]) -> list[lis
 
 def _merge_directions(xy: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, " n"]:
     """For every feature the first one at its position: SIFT may give several directions."""
-    # to a hundredth of a pixel, since it interpolates the position for each of them
+    # To a hundredth of a pixel, since it interpolates the position for each of them.
     _, first, back = np.unique(np.round(xy, 2), axis=0, return_index=True, return_inverse=True)
     return first[back.ravel()]
 
@@ -63,7 +63,7 @@ def _join(
 
     def root(node: int) -> int:
         while parent[node] != node:
-            # path halving (van Leeuwen and van der Weide 1977): nearly constant time a query
+            # Path halving (van Leeuwen and van der Weide 1977): nearly constant time a query.
             parent[node] = parent[parent[node]]
             node = parent[node]
         return node
@@ -102,8 +102,8 @@ def choose_tracks(
         track = tracks[k]
         wanted = sum(filled[i][cell[i][f]] < quota[i] for i, f in track)
         double = sum(near[i][f] in taken[i] for i, f in track)
-        # a track that fills a quota in one photograph only adds no connection; one that lies on a
-        # chosen one in one photograph only is another point behind or in front of it
+        # A track that fills a quota in one photograph only adds no connection; one that lies on a
+        # chosen one in one photograph only is another point behind or in front of it.
         if wanted < 2 or double >= 2:
             continue
         chosen[k] = True
@@ -127,7 +127,7 @@ def _cells(
         cell.append(row * nx + column)
         shape.append((nx, ny))
         fine = np.floor(places / (settings.merging_distance * max(columns, rows))).astype(int)
-        # row and column as one number: there are fewer than 100 000 columns
+        # Row and column as one number: there are fewer than 100 000 columns.
         near.append((fine[:, 1] * 100_000 + fine[:, 0]).tolist())
     return cell, near, shape
 

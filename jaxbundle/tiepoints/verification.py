@@ -147,8 +147,8 @@ def verify_pairs(
         good, M, b = agreed[k]
         if (good & unique[k]).sum() >= settings.sufficient_matches:
             agreed[k] = good & unique[k], M, b
-    # without a base the coplanarity condition is empty, and the robust orientation may fail; a
-    # rotation alone has fewer unknowns and is sought for itself
+    # Without a base the coplanarity condition is empty, and the robust orientation may fail; a
+    # rotation alone has fewer unknowns and is sought for itself.
     turned = {
         k: turn
         for k in usable
@@ -182,7 +182,7 @@ def _find_agreeing(
     these agree. Otherwise only the most distinct ones are tried: for photographs far apart most
     matches may be wrong."""
     rows = {k: r for k, r in rows.items() if len(r) >= settings.min_matches}
-    # the most distinct ones, but all of a few
+    # The most distinct ones, but all of a few.
     distinct = lambda n: batched.spread(
         max(int(settings.distinct_share * n), min(n, batched.SLOTS))
     )
@@ -211,13 +211,13 @@ def _orient_by_rows(
         return {}
     keys = np.array(list(rows))
     few = [rows[k][choose(len(rows[k]))] for k in rows]
-    M, b, part, _ = batched.orient_pairs(
+    M, b, share, _ = batched.orient_pairs(
         [xy1[k][r] for k, r in zip(rows, few)],
         [xy2[k][r] for k, r in zip(rows, few)],
         settings.first_factor * tolerance[keys],
     )
-    poses = {k: (M[i], b[i]) for i, k in enumerate(rows) if part[i] > 0}
-    # matches and orientation by turns, the second time with those of the final tolerance
+    poses = {k: (M[i], b[i]) for i, k in enumerate(rows) if share[i] > 0}
+    # Matches and orientation alternately, the second time with those of the final tolerance.
     for factor in (settings.first_factor, 1.0):
         poses = _improve(poses, rows, xy1, xy2, factor * tolerance, settings.min_matches)
     agreed = {}
@@ -225,7 +225,7 @@ def _orient_by_rows(
         good = _agree(M, b, xy1[k], xy2[k], tolerance[k])
         use = rows[k][good[rows[k]]]
         enough = len(use) >= max(settings.min_matches, settings.min_share * len(rows[k]))
-        # the smaller eigenvalue of the covariance is the variance across a line
+        # The smaller eigenvalue of the covariance is the variance across a line.
         if enough and all(
             np.linalg.eigvalsh(np.cov(xy[k][use].T))[0] > (settings.min_extent * xy[k].std()) ** 2
             for xy in (xy1, xy2)
@@ -260,8 +260,8 @@ def _find_rotation(
         if first is None or second is None:
             continue
         M = second.T @ first
-        # twice the tolerance: Sampson's distance is 1/√2 of the distance from an epipolar line, and
-        # that is one of the two components of the distance of two rays
+        # Twice the tolerance: Sampson's distance is 1/√2 of the distance from an epipolar line, and
+        # that is one of the two components of the distance of two rays.
         good = np.linalg.norm(one @ M.T - two, axis=1) < 2 * tolerance
         if good.sum() > most:
             most, best = good.sum(), (good, M)
@@ -293,11 +293,20 @@ def _agree(
     line2, line1 = np.cross(b, a1) @ M.T, np.cross(back, b)
     square = (line2[:, :2] ** 2).sum(1) + (line1[:, :2] ** 2).sum(1)
     e = np.abs((a2 * line2).sum(1)) / np.sqrt(np.maximum(square, 1e-300))
-    # the signs of both depths s, s₁·a₁ − s₂·Mᵀ·a₂ = b, by normal equations whose determinant is > 0
-    aa, cc, dot = (a1**2).sum(1), (back**2).sum(1), (a1 * back).sum(1)
-    first, second = a1 @ b, back @ b
-    front = (cc * first - dot * second > 0) & (dot * first - aa * second > 0)
-    return (e < tolerance) & front
+    # The determinant is positive: the signs of both depths are those of the numerators.
+    first, second, _ = depths_of_rays(a1, back, b)
+    return (e < tolerance) & (first > 0) & (second > 0)
+
+
+def depths_of_rays(
+    a: Float[np.ndarray, "n 3"], c: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "3"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """The depths s and t of the nearest points s·a and b + t·c of rays in one system, times their
+    determinant (0 for parallel rays), and this: the normal equations of s·a − t·c = b. In NumPy, of
+    many numbers of matches; `orientation.relative.distances_along_rays` is the same for JAX."""
+    aa, cc, dot = (a**2).sum(1), (c**2).sum(1), (a * c).sum(1)
+    first, second = a @ b, c @ b
+    return cc * first - dot * second, dot * first - aa * second, aa * cc - dot * dot
 
 
 def _improve(
@@ -334,7 +343,7 @@ def refine_rotations(
     rows = [batched.spread(len(pair), MATCH_SLOTS) for pair in pairs]
     weights = _used_slots(rows)
     xy1, xy2 = (np.stack([_fill(xy[i][r]) for xy, r in zip(ideal, rows)]) for i in (0, 1))
-    # with a strong K1 rays of the border have no image: without weight
+    # With a strong K1 rays of the border have no image: without weight.
     weights *= np.isfinite(xy1 + xy2).all(-1)
     xy1, xy2 = np.nan_to_num(xy1), np.nan_to_num(xy2)
     start = [np.stack([getattr(pair, name) for pair in pairs]) for name in ("M", "b")]
@@ -343,10 +352,19 @@ def refine_rotations(
 
 def rotation_angle(M: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n"]:
     """The angle of rotations, radians."""
-    # sin ω from M − Mᵀ, cos ω from the trace: each alone loses half of the digits near 0 or π
+    # sin ω from M − Mᵀ, cos ω from the trace: each alone loses half of the digits near 0 or π.
     across = M - np.swapaxes(M, -1, -2)
     sine = np.sqrt((across**2).sum((-2, -1)) / 8)
     return np.arctan2(sine, (np.trace(M, axis1=-2, axis2=-1) - 1) / 2)
+
+
+def loop_misclosure(
+    ij: Float[np.ndarray, "*n 3 3"],
+    jk: Float[np.ndarray, "*n 3 3"],
+    ik: Float[np.ndarray, "*n 3 3"],
+) -> Float[np.ndarray, "*n"]:
+    """The angle of M_jk·M_ij·M_ikᵀ around three photographs, radians; 0 if the rotations close."""
+    return rotation_angle(jk @ ij @ np.swapaxes(ik, -1, -2))
 
 
 def _used_slots(rows: Sequence[Int[np.ndarray, " _"]]) -> Float[np.ndarray, "pairs slots"]:
@@ -377,8 +395,8 @@ def _refine(
         M, b = pair
         return root * jax.vmap(sampson_distance, (None, None, 0, 0))(M, b, xy1, xy2)
 
-    # five unknowns; eight steps, since from an orientation by five matches few are needed, and the
-    # choice of matches, not the last digit, limits the result
+    # Five unknowns; eight steps, since from an orientation by five matches few are needed, and the
+    # choice of matches, not the last digit, limits the result.
     (M, b), _ = minimise(misclosures, retract, (M, b), (xy1, xy2, weights), 5, 8)
     return M, b
 

@@ -14,7 +14,6 @@ from jaxbundle.photographs.reading import image_errors
 from jaxbundle.system.threads import map_in_threads
 from jaxbundle.tiepoints import coplanarity, verification
 from jaxbundle.tiepoints.features import Features, FeatureSettings, find_features
-from jaxbundle.tiepoints.loops import LoopSettings, split_contradicted
 from jaxbundle.tiepoints.matching import (
     FeatureMatches,
     FeatureMatchingSettings,
@@ -22,6 +21,7 @@ from jaxbundle.tiepoints.matching import (
     distances_within,
     match_features,
 )
+from jaxbundle.tiepoints.pair_consistency import LoopSettings, split_contradicted
 from jaxbundle.tiepoints.pairs import CandidateSettings, candidate_pairs
 from jaxbundle.tiepoints.store import Store
 from jaxbundle.tiepoints.verification import Pair, VerificationSettings, verify_pairs
@@ -76,7 +76,7 @@ def match(
     names = lambda pair: (fingerprints[pair[0]], fingerprints[pair[1]])
     stored = {pair: store.load_matches(*names(pair)) for pair in pairs}
     needed = sorted({k for pair, columns in stored.items() if columns is None for k in pair})
-    # once for each photograph, not for each of its pairs: as much work as a pair
+    # Once for each photograph, not for each of its pairs: as much work as a pair.
     with ThreadPoolExecutor(workers) as pool:
         within = dict(zip(needed, pool.map(distances_within, (features[k] for k in needed))))
 
@@ -106,9 +106,9 @@ def verify(
     **Arguments:** `camera_of`: the camera of every photograph.
     """
     ideal = [ideal_features(cameras[c], f.xy) for c, f in zip(camera_of, features)]
-    # the longer side in units of c
+    # The longer side in units of c.
     size = np.array(
-        [max(present_size(cameras[c])) / central_distance(cameras[c]) for c in camera_of]
+        [max(required_image_size(cameras[c])) / central_distance(cameras[c]) for c in camera_of]
     )
     matches = [m for m in matches if len(m.rows)]
     # 64 pairs at once fill eight runs of eight lanes; in between the progress is shown
@@ -147,15 +147,15 @@ def ideal_features(camera: Camera, uv: Float[np.ndarray, "n 2"]) -> Float[np.nda
     return ideal_points(camera, xy) if len(xy) else xy
 
 
-def present_size(camera: Camera) -> tuple[int, int]:
-    """The image size of a camera."""
+def required_image_size(camera: Camera) -> tuple[int, int]:
+    """The image size of a camera, which cameras of photographs have."""
     assert camera.image_size is not None
     return camera.image_size
 
 
 def central_distance(camera: Camera) -> float:
     """The principal distance in pixels, from the images of two points near the centre."""
-    columns, rows = present_size(camera)
+    columns, rows = required_image_size(camera)
     middle = np.array([[columns / 2 - 0.5, rows / 2 - 0.5], [columns / 2 + 0.5, rows / 2 - 0.5]])
     return 1 / float(np.linalg.norm(np.diff(ideal_features(camera, middle), axis=0)))
 
@@ -165,5 +165,5 @@ def _with_ideal(
 ) -> FeatureMatches:
     """The matches whose rays point forward in both photographs."""
     xy = [ideal[k][rows] for k, rows in zip(matches.images, matches.rows.T)]
-    there = [np.all(np.isfinite(a), axis=1) for a in xy]
-    return matches.take(there[0] & there[1])
+    finite = [np.all(np.isfinite(a), axis=1) for a in xy]
+    return matches.take(finite[0] & finite[1])

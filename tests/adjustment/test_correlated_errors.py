@@ -16,7 +16,7 @@ from jaxbundle.adjustment.quality.weakness import Weakness
 from jaxbundle.leastsquares.quality import error_components
 from jaxbundle.leastsquares.quality.error_effects import stack_rows
 from jaxbundle.leastsquares.solution import Solution
-from jaxbundle.network.undetermined import keep_images
+from jaxbundle.network.subsets import keep_images
 from jaxbundle.planning import grid_of_targets, ring_of_stations
 from jaxbundle.report import correlated
 from jaxbundle.report.layout import significant

@@ -14,8 +14,8 @@ from jaxbundle.leastsquares.iterations.stopping import (
     SETTLED,
     SINGULAR,
     STOPPING,
-    Approach,
     Tolerance,
+    UndampedStepState,
 )
 
 ANGLE = ls.Kind("angle", lambda x, measured: jnp.arctan(x) - measured, of=("x",))
@@ -45,13 +45,13 @@ def test_the_damping_is_dropped_where_steps_converge_quadratically(other):
     """Gain ratio near 1, and a predicted decrease below a tenth of the cost and half of the one
     before: 0.1 in the first case and all others but that of 0.15, which is below half of 1."""
     before = jnp.asarray(1.0 if other.get("predicted") == 0.15 else 0.1)
-    approach = dataclasses.replace(Approach.begin(STOPPING), predicted=before)
+    state = dataclasses.replace(UndampedStepState.begin(STOPPING), predicted=before)
     step = {name: jnp.asarray(value) for name, value in (STEP | other).items()}
-    size, after = approach.choose_step(jnp.asarray(3.0), cost=jnp.asarray(1.0), **step)
+    size, after = state.choose_step(jnp.asarray(3.0), cost=jnp.asarray(1.0), **step)
     assert size == (3.0 if other else jnp.inf)
     assert after.predicted == (step["predicted"] if step["accept"] else before)
     # equations that could not be solved without damping are damped to the end
-    singular = dataclasses.replace(approach, singular=jnp.asarray(True))
+    singular = dataclasses.replace(state, singular=jnp.asarray(True))
     assert singular.choose_step(jnp.asarray(3.0), cost=jnp.asarray(1.0), **step)[0] == 3.0
 
 
@@ -59,13 +59,13 @@ def test_the_damping_is_dropped_where_steps_converge_quadratically(other):
 def test_a_rejected_undamped_step_was_tried_too_early(last_size, again):
     """After it, a decrease ten times smaller counts as near the minimum; a rejected damped step
     changes nothing."""
-    approach = dataclasses.replace(Approach.begin(STOPPING), predicted=jnp.asarray(0.1))
+    state = dataclasses.replace(UndampedStepState.begin(STOPPING), predicted=jnp.asarray(0.1))
     step = {name: jnp.asarray(value) for name, value in STEP.items()}
     sizes = {"step_size": jnp.asarray(3.0), "cost": jnp.asarray(1.0)}
     rejected = {"last_size": jnp.asarray(last_size), "accept": jnp.asarray(False)}
-    _, approach = approach.choose_step(**sizes, **(step | rejected))
-    assert approach.choose_step(**sizes, **step)[0] == again
-    assert approach.choose_step(**sizes, **(step | {"predicted": jnp.asarray(0.009)}))[0] == jnp.inf
+    _, state = state.choose_step(**sizes, **(step | rejected))
+    assert state.choose_step(**sizes, **step)[0] == again
+    assert state.choose_step(**sizes, **(step | {"predicted": jnp.asarray(0.009)}))[0] == jnp.inf
 
 
 def test_the_trust_region_follows_nielsen():
@@ -95,20 +95,20 @@ def test_a_factorisation_that_failed_far_from_the_minimum_is_tried_again_there()
     """A small damped step is repeated without damping, and that one decides, also after an earlier
     failure; equations that send it away twice are singular."""
     tolerance = Tolerance(*(jnp.asarray(x) for x in (10.0, 1e4, 1e-3, 0.0)))
-    far = dataclasses.replace(Approach.begin(STOPPING), singular=jnp.asarray(True))
+    far = dataclasses.replace(UndampedStepState.begin(STOPPING), singular=jnp.asarray(True))
 
-    def judge(approach, step_size, decrement, finite=True):
+    def judge(state, step_size, decrement, finite=True):
         given = (jnp.asarray(x) for x in (step_size, finite, decrement, False, True, 5.1, 5.0, 5.0))
-        termination, approach = approach.judge(tolerance, *given)
-        return int(termination), approach
+        termination, state = state.judge(tolerance, *given)
+        return int(termination), state
 
     small, inf = 1e-12, np.inf
-    termination, approach = judge(far, 1e4, small)
-    assert termination == LIMIT and approach.repeat_undamped
-    again = dataclasses.replace(approach, repeated=jnp.asarray(True))
+    termination, state = judge(far, 1e4, small)
+    assert termination == LIMIT and state.repeat_undamped
+    again = dataclasses.replace(state, repeated=jnp.asarray(True))
     assert judge(again, inf, small)[0] == SETTLED
     assert judge(again, inf, small, finite=False)[0] == SINGULAR
-    begun = dataclasses.replace(Approach.begin(STOPPING), repeated=jnp.asarray(True))
+    begun = dataclasses.replace(UndampedStepState.begin(STOPPING), repeated=jnp.asarray(True))
     assert judge(begun, inf, small, finite=False)[0] == SINGULAR
     twice = dataclasses.replace(far, rejected=jnp.asarray(2))
     assert judge(twice, 1e4, small)[0] == SINGULAR

@@ -7,7 +7,7 @@ import numpy as np
 from jaxbundle import leastsquares as ls
 from jaxbundle.leastsquares.problem import make_problem
 from jaxbundle.leastsquares.quality.names import eliminated_rows
-from jaxbundle.leastsquares.quality.snooping import _Touched
+from jaxbundle.leastsquares.quality.snooping import _TouchedRows
 
 VIEW = ls.Kind("view", lambda p, s, t, y: p + s + t - y, of=("point", "shift", "tilt"))
 RANGE = ls.Kind("range", lambda a, b, d: jnp.sum((a - b) ** 2) - d, of=("point", "point"))
@@ -26,11 +26,11 @@ def test_observations_are_grouped_by_eliminated_row_and_first_kept_row():
         eliminate="point",
     )  # fmt: skip
     assert problem.plan.eliminated == "point"
-    touched = _Touched(problem)
+    touched = _TouchedRows(problem)
     alone = np.isin(point, [0, 2])
-    np.testing.assert_array_equal(touched.own["view"], np.where(alone, point, -1))
-    np.testing.assert_array_equal(touched.shared["view"], n + shift)
-    assert touched.own["range"] == [-1]
+    np.testing.assert_array_equal(touched.eliminated_row["view"], np.where(alone, point, -1))
+    np.testing.assert_array_equal(touched.first_kept_row["view"], n + shift)
+    assert touched.eliminated_row["range"] == [-1]
     # Unknowns that nothing determines belong to their eliminated row; others to none.
     names = ["1 of point 3", "2 of point 3", "1 of point 2", "1 of shift 3", "1 of point"]
     assert eliminated_rows(problem, names) == [2]

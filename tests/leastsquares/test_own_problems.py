@@ -11,7 +11,7 @@ import pytest
 from jaxbundle import InputError, NotSolvedError
 from jaxbundle import leastsquares as ls
 from jaxbundle.geometry import quaternion_from_rotation_vector
-from jaxbundle.leastsquares.quality.names import undetermined_rows
+from jaxbundle.leastsquares.quality.null_space import undetermined_eliminated_unknowns
 
 SIGMA = 0.002
 RANGE = ls.Kind("distance", lambda a, b, d: jnp.linalg.norm(a - b) - d, of=("point", "point"))
@@ -103,7 +103,7 @@ def test_a_row_that_loses_its_only_view_is_excluded():
         )  # fmt: skip
 
     unseen = adjusted(np.arange(len(point)) != 3 * lost + 2)
-    named = undetermined_rows(unseen.problem, unseen.minimum.values)
+    named = undetermined_eliminated_unknowns(unseen.problem, unseen.minimum.values)
     assert named == ["1, 2, 3 of point 5"] and named == [*unseen.undetermined]
     result = adjusted(np.ones(len(point), bool), snooping="pope")
     assert result.converged and [r.row for r in result.removed] == [3 * lost + 2]

@@ -98,11 +98,11 @@ CASES = {
 
 
 @eqx.filter_jit
-def step(declared, plan, data, values, damping, regular):
+def step(declared, plan, data, values, damping, pin_datum):
     """The gradient, N⁻¹ of it, the factor, and N times the solution, which knows no datum."""
     _, gradient, blocks = normal_equations(declared, plan, values, lay_out_data(plan, data))
     normal = damp(Normal(plan, blocks), damping)
-    factor = factorise(normal, regular)
+    factor = factorise(normal, pin_datum)
     change = solve(factor, gradient)
     return gradient, change, factor, normal.mv(change)
 
@@ -153,15 +153,16 @@ def test_cofactors_of_the_band_are_those_of_the_dense_system(ways):
         g: np.sqrt(np.abs(np.diagonal(B, axis1=1, axis2=2))) for g, B in own.items()
     }
     near = lambda a, b, s, t: (np.abs(a - b) <= 1e-7 * s[:, :, None] * t[:, None, :]).all()
-    for g, s in sigma(dense.own).items():
-        assert near(banded.own[g], dense.own[g], s, s)
-    kept = sigma(dense.kept.own)
-    assert len(dense.kept.off) == len(problem.plan.blocks) == len(banded.kept.off)
-    for (a, b), B in dense.kept.off.items():
+    for g, s in sigma(dense.diagonal_blocks).items():
+        assert near(banded.diagonal_blocks[g], dense.diagonal_blocks[g], s, s)
+    kept = sigma(dense.kept.diagonal_blocks)
+    off, banded_off = dense.kept.off_diagonal_blocks, banded.kept.off_diagonal_blocks
+    assert len(off) == len(problem.plan.blocks) == len(banded_off)
+    for (a, b), B in off.items():
         at = problem.plan.blocks[a, b]
         real = slice(0, -1)  # The last block is empty.
         s, t = kept[a][at.row][real], kept[b][at.column][real]
-        assert near(banded.kept.off[a, b][real], B[real], s, t) and np.abs(B[real]).max() > 0
+        assert near(banded_off[a, b][real], B[real], s, t) and np.abs(B[real]).max() > 0
     for o, r in tested.redundancy.items():
         np.testing.assert_allclose(other.redundancy[o], r, atol=1e-7)
     total = sum(float(r.sum()) for r in other.redundancy.values())
@@ -216,7 +217,7 @@ def test_a_line_too_long_for_a_dense_factor_is_banded():
     factor = step(*given, jnp.array(0.0), jnp.array(True))[2]
     Q = eqx.filter_jit(cofactors)(problem.declared, data.start, factor)
     # The variance of a height grows with the number of differences on the way to it.
-    variance = np.asarray(Q.own["height"])[order, 0, 0]
+    variance = np.asarray(Q.diagonal_blocks["height"])[order, 0, 0]
     np.testing.assert_allclose(variance, np.arange(number), rtol=1e-6)
 
 

@@ -12,9 +12,10 @@ from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.network import Camera, Network
 from jaxbundle.network.build import make_network
-from jaxbundle.network.check import _note_points_behind, check_network, split_check_points
+from jaxbundle.network.check import _note_points_behind, check_network
+from jaxbundle.network.equation_counts import label_connected_parts
 from jaxbundle.network.rules import check_camera
-from jaxbundle.network.undetermined import label_connected_parts
+from jaxbundle.network.subsets import split_check_points
 from jaxbundle.planning.simulate import simulate
 from jaxbundle.planning.stations import aerial_block, cloud_of_targets
 

@@ -10,7 +10,7 @@ import pytest
 from network.further_checks import sample
 
 import jaxbundle
-from jaxbundle.adjustment.far_points import at_infinity, minimise_with_infinity
+from jaxbundle.adjustment.far_points import at_infinity, minimise_holding_infinite_points
 from jaxbundle.adjustment.minimum import inspect_solution
 from jaxbundle.adjustment.problem import coordinates
 from jaxbundle.adjustment.quality.inspection import Inspection
@@ -62,7 +62,8 @@ def moderate():
     found = []
     for lengths in (None, LENGTHS):
         problem = prepared(network, lengths)
-        problem, minimum = minimise_with_infinity(problem, problem.data.start, max_steps=50)
+        start = problem.data.start
+        problem, minimum = minimise_holding_infinite_points(problem, start, max_steps=50)
         found.append(inspect_solution(problem, minimum))
     return found
 
@@ -211,7 +212,7 @@ def test_a_minimum_does_not_depend_on_what_was_held_at_infinity_before(horizon):
     u = point[NEAR:, :3] / np.linalg.norm(point[NEAR:, :3], axis=1)[:, None]
     point[NEAR:, :3] = LARGEST_DISTANCE * LENGTHS[NEAR:, None] * u
     for start in (problem.data.start, values | {"point": jnp.asarray(point)}):
-        again, minimum = minimise_with_infinity(problem, start, max_steps=100)
+        again, minimum = minimise_holding_infinite_points(problem, start, max_steps=100)
         np.testing.assert_array_equal(
             at_infinity(again, minimum.values), at_infinity(problem, values)
         )

@@ -14,7 +14,7 @@ from jaxbundle.cameras import get_model, project
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.network.build import make_further
-from jaxbundle.network.undetermined import equations_of
+from jaxbundle.network.equation_counts import equations_of
 
 LINE = 3e-5
 CAMERA = jaxbundle.Camera(

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 import jaxbundle
 from jaxbundle.choices import DESIGNED
 from jaxbundle.errors import InputError
-from jaxbundle.network.undetermined import keep_images
+from jaxbundle.network.subsets import keep_images
 from jaxbundle.network_design.aims import Aim, measure, smallest_redundancy, task_of
 from jaxbundle.network_design.feasible import start_at
 from jaxbundle.network_design.pairs import make_pairs

@@ -15,7 +15,7 @@ from jaxbundle.adjustment.problem import make_problem
 from jaxbundle.leastsquares.iterations.stopping import converged
 from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.network.check import check_network
-from jaxbundle.network.undetermined import keep_images
+from jaxbundle.network.subsets import keep_images
 from jaxbundle.orientation.network import find_start_values, lacks_start_values
 from jaxbundle.planning.stations import Stations
 

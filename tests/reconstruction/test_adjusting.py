@@ -31,8 +31,8 @@ def test_without_points_of_three_rays_the_first_attempt_counts(monkeypatch, firs
         return unfinished
 
     monkeypatch.setattr(adjusting, "_weight", weight)
-    kinds = np.zeros(len(network.observations), int)
-    call = lambda: adjusting.adjust_weighted(network, kinds, {0: "all"}, 0.001, print)
+    classes = np.zeros(len(network.observations), int)
+    call = lambda: adjusting.adjust_weighted(network, classes, {0: "all"}, 0.001, print)
     if first == "fails":
         with pytest.raises(NotSolvedError, match="the first reason"):
             call()
@@ -73,8 +73,8 @@ def test_points_of_three_rays_confirm_a_result_with_many_gross_errors(
     attempts = iter(results)
     monkeypatch.setattr(adjusting, "_weight", lambda *_: next(attempts))
     monkeypatch.setattr(adjusting, "_count_agreeing", lambda *_: 64)
-    kinds = np.zeros(len(network.observations), int)
-    call = lambda: adjusting.adjust_weighted(network, kinds, {0: "all"}, 0.001, print)
+    classes = np.zeros(len(network.observations), int)
+    call = lambda: adjusting.adjust_weighted(network, classes, {0: "all"}, 0.001, print)
     if confirmed:
         assert call().adjustment is results[removed > 16].adjustment
     else:
@@ -97,8 +97,8 @@ def test_of_two_results_the_one_that_fits_better_counts(monkeypatch, worst):
     attempts = iter(results)
     monkeypatch.setattr(adjusting, "_weight", lambda *_: next(attempts))
     monkeypatch.setattr(adjusting, "_count_agreeing", lambda *_: 64)
-    kinds = np.zeros(len(network.observations), int)
-    found = adjusting.adjust_weighted(network, kinds, {0: "all"}, 0.001, print)
+    classes = np.zeros(len(network.observations), int)
+    found = adjusting.adjust_weighted(network, classes, {0: "all"}, 0.001, print)
     assert found.factors == {"all": min(3.0, worst)}
 
 
@@ -126,8 +126,8 @@ def test_sigma_are_multiplied_until_they_fit(monkeypatch, last, changes, expecte
     for name in ("_approximate_redundancy", "_redundancy"):
         monkeypatch.setattr(adjusting, name, lambda _: (np.ones((len(every), 2)),) * 2)
     monkeypatch.setattr(adjusting, "_factors", lambda *_: np.full(len(every), next(changes)))
-    kinds, settings = np.zeros(len(every), int), adjusting.WeightingSettings()
-    done = adjusting._weight(network, kinds, {0: "all"}, 0.001, lambda _: None, settings)
+    classes, settings = np.zeros(len(every), int), adjusting.WeightingSettings()
+    done = adjusting._weight(network, classes, {0: "all"}, 0.001, lambda _: None, settings)
     assert done.factors["all"] == pytest.approx(expected)
     # the last result is that with the last σ
     assert sigma[-1] == pytest.approx(expected * sigma[0])
@@ -273,8 +273,8 @@ def test_points_without_rays_are_no_points_of_three(monkeypatch):
 
     monkeypatch.setattr(adjusting, "_weight", weight)
     monkeypatch.setattr(adjusting, "_count_agreeing", lambda *_: 9)
-    kinds = np.zeros(len(network.observations), int)
-    adjusting.adjust_weighted(network, kinds, {0: "all"}, 0.001, print)
+    classes = np.zeros(len(network.observations), int)
+    adjusting.adjust_weighted(network, classes, {0: "all"}, 0.001, print)
     assert given == [network.points.id, network.points.id[1:14]]
 
 

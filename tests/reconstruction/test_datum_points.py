@@ -9,7 +9,7 @@ import pytest
 
 import jaxbundle
 from jaxbundle import Camera, grid_of_targets, ring_of_stations, simulate
-from jaxbundle.network.undetermined import keep_points
+from jaxbundle.network.subsets import keep_points
 from jaxbundle.reconstruction.datum import choose_datum_points
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxbundle
-from jaxbundle.network.undetermined import keep_images
+from jaxbundle.network.subsets import keep_images
 from jaxbundle.orientation import batched
 from jaxbundle.reconstruction.misplaced import find_misplaced
 from jaxbundle.tiepoints.verification import Pair

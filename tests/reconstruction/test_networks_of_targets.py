@@ -8,7 +8,7 @@ import pytest
 
 import jaxbundle
 from jaxbundle.errors import InputError
-from jaxbundle.network.undetermined import keep_points
+from jaxbundle.network.subsets import keep_points
 from jaxbundle.orientation import absolute_orientation
 from jaxbundle.reconstruction.named import (
     NamedMeasurements,

@@ -13,13 +13,6 @@ from jaxbundle.errors import InputError
 from jaxbundle.orientation import batched
 from jaxbundle.tiepoints import camera_starts, verification
 from jaxbundle.tiepoints.camera_starts import start_cameras
-from jaxbundle.tiepoints.closure import (
-    ClosureMinimum,
-    ClosureSettings,
-    close_rotations,
-    count_independent,
-    find_loops,
-)
 from jaxbundle.tiepoints.coplanarity import CoplanaritySettings, estimate_interior
 from jaxbundle.tiepoints.features import (
     Features,
@@ -28,15 +21,22 @@ from jaxbundle.tiepoints.features import (
     find_features,
     memory_of_features,
 )
-from jaxbundle.tiepoints.loops import split_contradicted
+from jaxbundle.tiepoints.interior_from_loops import (
+    ClosureMinimum,
+    ClosureSettings,
+    close_rotations,
+    count_independent,
+    find_loops,
+)
 from jaxbundle.tiepoints.matching import (
     FeatureMatches,
     count_matches_of_largest,
     distances_within,
     match_features,
 )
+from jaxbundle.tiepoints.pair_consistency import split_contradicted
 from jaxbundle.tiepoints.pairs import CandidateSettings, candidate_pairs
-from jaxbundle.tiepoints.still import MarkSettings, without_marks
+from jaxbundle.tiepoints.static_marks import MarkSettings, without_marks
 from jaxbundle.tiepoints.store import Store
 from jaxbundle.tiepoints.track_measurement import TrackMatchingSettings
 from jaxbundle.tiepoints.tracks import choose_tracks, make_tracks
@@ -182,7 +182,7 @@ def test_a_first_principal_distance_without_loops_is_passed_over(monkeypatch):
         factor = min(answers, key=lambda f: abs(np.log(f) - first[0] + middle))
         return answers[factor]
 
-    monkeypatch.setattr("jaxbundle.tiepoints.closure._search", search)
+    monkeypatch.setattr("jaxbundle.tiepoints.interior_from_loops._search", search)
     np.testing.assert_allclose(close_rotations(lambda x: None, start), start + 0.01)
     answers.update(dict.fromkeys(answers))
     np.testing.assert_array_equal(close_rotations(lambda x: None, start), start)

@@ -21,7 +21,7 @@ from jaxbundle.adjustment.quality.correlated_errors import CorrelationSettings, 
 from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.adjustment.quality.variance_groups import groups
 from jaxbundle.display import print_in_one_screen
-from jaxbundle.leastsquares.excluded_rows import DeterminedRows, determine
+from jaxbundle.leastsquares.excluded_rows import DeterminedRows, determine_excluded
 from jaxbundle.leastsquares.quality.error_components import ErrorModel, Errors, IndependentErrors
 from jaxbundle.leastsquares.quality.error_effects import effects, first_rows
 from jaxbundle.leastsquares.quality.variance_components import rescale
@@ -73,7 +73,7 @@ def intersect_check_points(
     # With estimated variance components the rays of check points have the estimated σ as well.
     data = rescale(checks, groups(checks), factors).data
     system = dataclasses.replace(checks, data=data)
-    determined = determine(inspection.solution, system)
+    determined = determine_excluded(inspection.solution, system)
     position = np.asarray(determined.values["point"]) + problem.origin
     if isinstance(errors, IndependentErrors):
         covariance = errors.variance * determined.cofactors(inspection.solution)
@@ -105,7 +105,7 @@ def _modelled_covariance(
     size = sum(np.asarray(v).size for v in own.residuals.values())
     number = len(determined.inverse)
     D = np.zeros((number, 3, size))
-    for name, E in own.by_eliminated.items():
+    for name, E in own.jacobian_eliminated.items():
         point = checks.point[checks.image_rows[name]]
         for axis in range(E.shape[1]):
             rows = starts[name] + E.shape[1] * np.arange(len(E)) + axis

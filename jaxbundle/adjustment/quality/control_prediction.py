@@ -163,7 +163,7 @@ def _delete(
         sigma[used[known]] = (unit * np.sqrt(np.einsum("ik,kl,il->i", E, C, E)))[known]
         if not known.any():
             return error, sigma, np.nan
-        # the sizes of the components are those of all observations: this group hardly changes them
+        # The sizes of the components are those of all observations: this group hardly changes them.
         return error, sigma, chi2_tail(float(along @ np.linalg.solve(C, along)), int(seen.sum()))
     cofactor = (E**2 / remains[seen]).sum(1)
     sigma[used[known]] = (sigma0 * unit * np.sqrt(cofactor))[known]

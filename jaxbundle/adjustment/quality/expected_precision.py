@@ -60,7 +60,7 @@ def expected_precision(
         raise InputError("the planned network is not fully determined; plan more overlap")
     operator: Errors = IndependentErrors(found.solution, 1.0)
     if errors:
-        # of image coordinates as they are expected: components refer to places on the sensor
+        # Of image coordinates as they are expected: components refer to places on the sensor.
         given = with_data(problem, predict(problem, problem.data))
         operator = stated_errors(Solution(given, given.data.start), given, errors)
     sigma = lambda C: np.sqrt(np.clip(np.diagonal(np.asarray(C), axis1=1, axis2=2), 0, None))

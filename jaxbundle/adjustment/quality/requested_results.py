@@ -168,7 +168,7 @@ def _of_points(inspection: Inspection, errors: Errors) -> _Part | None:
     rows = np.flatnonzero((problem.table("point").free > 0).any(1))
     if not len(rows):
         return None
-    # of far points those of the engine are of direction and inverse distance
+    # Of far points those of the engine are of direction and inverse distance.
     C = problem.cofactors_of_coordinates(inspection.adjusted["point"], errors.covariance("point"))
     variance = np.diagonal(np.asarray(C)[rows], axis1=1, axis2=2)
     names = [(f"points:{axis}", f"{axis} of points, RMS", False) for axis in "XYZ"]

@@ -42,13 +42,14 @@ FURTHER = (
 class Weakness:
     """`unknowns`: names of image and camera unknowns with a σ above 1/`VAGUE_RATIO` of their
     reference, the weakest first; `worst`: the largest ratio. `points`: ids of points with a σ above
-    1/`NONLINEAR_RATIO` of their distance; `of`: the number of points. `georeference`: how uncertain
-    the common position of all is, in words, if that alone makes image unknowns look weak."""
+    1/`NONLINEAR_RATIO` of their distance; `judged`: the number of points. `georeference`: how
+    uncertain the common position of all is, in words, if that alone makes image unknowns look
+    weak."""
 
     unknowns: tuple[str, ...] = ()
     worst: float = 0.0
     points: tuple[str, ...] = ()
-    of: int = 0
+    judged: int = 0
     georeference: str = ""
 
     @property
@@ -56,7 +57,7 @@ class Weakness:
         """Whether so few points are weak that the others are what the network is about."""
         # The summary of a network has the σ that 95 % of its points do not exceed: it does not
         # show a twentieth.
-        return len(self.points) <= 0.05 * self.of
+        return len(self.points) <= 0.05 * self.judged
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -83,10 +84,11 @@ class Weakness:
 
     def _of_points(self) -> tuple[str, ...]:
         if self.points:
-            most = 2 * len(self.points) > self.of
+            most = 2 * len(self.points) > self.judged
             where = "images taken from one place, or nearly" if most else "rays almost parallel"
+            number = count(self.judged, "point")
             return (
-                f"poorly determined: X, Y, Z of {len(self.points)} of {count(self.of, 'point')} "
+                f"poorly determined: X, Y, Z of {len(self.points)} of {number} "
                 f"({list_some(self.points)}), with a σ above {1 / NONLINEAR_RATIO:g} of their "
                 f"distance: {where}. Depth needs images from places farther apart.",
             )

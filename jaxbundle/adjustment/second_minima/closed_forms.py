@@ -84,7 +84,7 @@ def rays_of(problem: NetworkProblem) -> ImageRays:
 
 
 def sample(rays: ImageRays, images: int, most: int) -> ImageRays:
-    """At most so many rays of every image, evenly, with the weight of all of them: sums over an
+    """At most `most` rays of every image, evenly, with the weight of all of them: sums over an
     image stay about the same, in a time that does not grow with its points."""
     order = np.argsort(rays.image, kind="stable")
     number = np.bincount(rays.image, minlength=images)

@@ -111,7 +111,7 @@ class SecondMinimumSettings:
     - `early_limit`: an order of magnitude, since vᵀPv still falls.
     - `max_images`: of images alone, this many of the least evidence are adjusted again, and this
       many of the worst resected in closed form.
-    - `max_legs`: a second minimum of two images may lie in the valley of their bas-relief, along
+    - `max_runs`: a second minimum of two images may lie in the valley of their bas-relief, along
       which iterations are slow: they are continued up to this many times, each time up to the limit
       of iterations.
     - `max_rounds`: how often a better minimum may take the place of the result.
@@ -126,7 +126,7 @@ class SecondMinimumSettings:
     max_misfit: float = 5.0
     evaluations_before_rejection: int = 6
     max_images: int = 8
-    max_legs: int = 5
+    max_runs: int = 5
     max_rounds: int = 3
 
     @property

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxbundle.adjustment.far_points import join_legs, noise_of_rays
+from jaxbundle.adjustment.far_points import concatenate_runs, noise_of_rays
 from jaxbundle.adjustment.minimum import adjusted_cameras, inspect_solution
 from jaxbundle.adjustment.problem import NetworkProblem, with_coordinates
 from jaxbundle.adjustment.quality.inspection import Inspection
@@ -54,7 +54,7 @@ from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import UNIT
 from jaxbundle.orientation import batched
-from jaxbundle.orientation.incremental import START_VALUE_DEMANDS, Model, grow, intersect
+from jaxbundle.orientation.incremental import START_VALUE_LIMITS, Model, grow, intersect
 from jaxbundle.orientation.rays import MIN_COSINE, Sights, sights
 
 # `minimise(problem, start)` iterates from given values, `max_steps` at most if given; returns the
@@ -98,7 +98,7 @@ def find_second_minima(
         best = min(better, key=lambda one: one.inspection.vtpv)
         superseded.append((best, first.vtpv))
         problem, first = best.problem, best.inspection
-        minimum = join_legs([minimum, best.minimum])
+        minimum = concatenate_runs([minimum, best.minimum])
     records = [state.record_superseded(*one) for one in superseded]
     said = [
         dataclasses.replace(one, taken=is_said(one, records))
@@ -259,7 +259,7 @@ class _State:
         model.place(first, np.zeros(3), np.eye(3))
         model.place(second, b, M)
         grow(seen, model)
-        intersect(seen, model, START_VALUE_DEMANDS)
+        intersect(seen, model, START_VALUE_LIMITS)
         used = np.unique(self.all_rays.point)
         if not model.placed.all() or not model.known[used].all():
             return None
@@ -300,13 +300,13 @@ class _State:
             # `not … <`: NaN is rejected, too.
             if not _cost(minimum) - self.first.vtpv < settings.early_limit * limit:
                 return None
-            legs = [minimum]
-            while int(legs[-1].termination) == LIMIT and len(legs) <= settings.max_legs:
-                problem, rest = self.minimise(problem, legs[-1].values)
-                legs.append(rest)
+            runs = [minimum]
+            while int(runs[-1].termination) == LIMIT and len(runs) <= settings.max_runs:
+                problem, rest = self.minimise(problem, runs[-1].values)
+                runs.append(rest)
                 if not _cost(rest) - self.first.vtpv < limit:
                     return None
-            minimum = join_legs(legs)
+            minimum = concatenate_runs(runs)
         if not _cost(minimum) - self.first.vtpv < limit:
             return None
         found = inspect_solution(problem, minimum)

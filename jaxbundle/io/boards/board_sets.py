@@ -19,12 +19,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
 from jaxbundle.io.boards.targets import read_target
 from jaxbundle.io.text.csv_tables import read_toml
-from jaxbundle.io.text.sections import refuse_unknown
 from jaxbundle.measure.boards import Board
-from jaxbundle.network.columns import show
+from jaxbundle.network.columns import refuse_unknown
 from jaxbundle.system.file_content import naming_file
 
 OF_BOARD = tuple(field.name for field in dataclasses.fields(Board))

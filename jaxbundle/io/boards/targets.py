@@ -12,13 +12,13 @@ Source: Kalibr's wiki, "Calibration targets".
 
 from pathlib import Path
 
+from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.json_fields import JsonFields
-from jaxbundle.io.text.sections import refuse_unknown
 from jaxbundle.io.text.yaml_text import parse_yaml
 from jaxbundle.measure.boards import Board
-from jaxbundle.network.columns import show
+from jaxbundle.network.columns import refuse_unknown
 from jaxbundle.system.file_content import naming_file
 
 TYPES = ("checkerboard", "circlegrid", "aprilgrid")

@@ -44,6 +44,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
+from jaxbundle.arguments import show
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.model import project
 from jaxbundle.cameras.scalars import Scalar
@@ -68,7 +69,6 @@ from jaxbundle.io.networks.kalibr import is_kalibr
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.io.text.known_keys import Keys, UnknownKeys
 from jaxbundle.io.text.yaml_text import parse_document
-from jaxbundle.network.columns import show
 from jaxbundle.network.rules import check_camera
 from jaxbundle.network.tables import Camera
 from jaxbundle.system.file_content import beginning, parse_json

@@ -17,9 +17,9 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Any, TypeGuard
 
+from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.known_keys import Keys, UnknownKeys
-from jaxbundle.network.columns import show
 
 # The entries of a camera by meaning: the spelling in the file, and the value.
 Found = dict[str, tuple[str, Any]]

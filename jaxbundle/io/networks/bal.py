@@ -24,6 +24,7 @@ from typing import BinaryIO
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.arguments import show
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import bundler_pose, exterior_from_bundler
@@ -40,7 +41,7 @@ from jaxbundle.io.text.archives import largest_unpacked_size
 from jaxbundle.io.text.csv_tables import write_bytes
 from jaxbundle.io.text.rows import parse_numbers
 from jaxbundle.network.build import make_cameras, make_network
-from jaxbundle.network.columns import Columns, show
+from jaxbundle.network.columns import Columns
 from jaxbundle.network.tables import EXTERIOR, Network, Source
 
 OPENERS = {".gz": gzip.open, ".bz2": bz2.open}

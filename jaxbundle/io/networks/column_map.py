@@ -47,14 +47,14 @@ from pathlib import Path
 import numpy as np
 
 from jaxbundle import geometry
+from jaxbundle.arguments import show
 from jaxbundle.cameras import CameraModel
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.poses import angles_of, apply_in_batches, are_rotations
 from jaxbundle.io.networks.settings import SETTINGS, TABLES, apply_overrides, network_of
 from jaxbundle.io.text.csv_tables import read_toml
 from jaxbundle.io.text.rows import TextRows
-from jaxbundle.io.text.sections import refuse_unknown
-from jaxbundle.network.columns import Columns, did_you_mean, show
+from jaxbundle.network.columns import Columns, did_you_mean, refuse_unknown
 from jaxbundle.network.tables import Network, Source
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.system.file_content import read_content

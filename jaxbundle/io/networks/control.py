@@ -21,11 +21,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxbundle.arguments import show
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.networks.poses import angles_of, matrices_of
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.network.build import POINT_ERRORS, POINT_SIGMAS
-from jaxbundle.network.columns import Columns, count, did_you_mean, list_some, show
+from jaxbundle.network.columns import Columns, count, did_you_mean, list_some
 from jaxbundle.network.rules import AXES, check_choice, check_unique
 from jaxbundle.network.tables import ROLES, Images, Network, Points, Source
 from jaxbundle.network.unit_mistakes import name_degrees

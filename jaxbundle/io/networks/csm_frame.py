@@ -38,13 +38,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.nearest_camera import Foreign, Formula, fit_camera, fit_messages
 from jaxbundle.io.networks.assemble import assemble, entry_of, foreign_document, image_columns
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.io.text.json_fields import JsonFields, read_object
 from jaxbundle.io.text.known_keys import Keys, UnknownKeys
-from jaxbundle.network.columns import show
 from jaxbundle.network.tables import Camera, Network, Source
 from jaxbundle.system.file_content import beginning
 from jaxbundle.types import Scalar

@@ -35,13 +35,13 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
+from jaxbundle.arguments import show
 from jaxbundle.cameras.scalars import Scalar
 from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.nearest_camera import Foreign, NoPlaceError, nearest_camera, root
 from jaxbundle.io.networks.assemble import PIXEL_CENTRE
 from jaxbundle.io.text.known_keys import Keys, UnknownKeys
 from jaxbundle.io.text.xml_fields import number_in
-from jaxbundle.network.columns import show
 
 COEFFICIENTS = ("f", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2")
 OLD_COEFFICIENTS = ("fx", "fy", "skew")

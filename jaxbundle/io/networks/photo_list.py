@@ -18,10 +18,11 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.settings import apply_overrides, network_of
 from jaxbundle.io.text.csv_tables import read_text
-from jaxbundle.network.columns import Columns, count, show
+from jaxbundle.network.columns import Columns, count
 from jaxbundle.network.tables import UNIT, Network, Source
 
 PHOTO = ("omega", "phi", "kappa", "X0", "Y0", "Z0")

@@ -92,7 +92,7 @@ def apply_in_batches(
     """A function of one image's array applied to all, in batches of one shape.
 
     **Arguments:** `rows` [images, *shape]; `batch_size`: larger wastes work on the zeros that fill
-    up the last batch (a dozen images are common), smaller makes more calls; not critical.
+    up the last batch (a dozen images are common), smaller makes more calls.
 
     **Returns:** [images, *result_shape].
     """

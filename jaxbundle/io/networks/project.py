@@ -53,7 +53,6 @@ from jaxbundle.io.networks.settings import (
     network_of,
 )
 from jaxbundle.io.text.csv_tables import read_csv, read_toml, write_csv, write_text
-from jaxbundle.io.text.sections import refuse_unknown
 from jaxbundle.io.text.toml_text import assignments
 from jaxbundle.io.writing.folders import replace_folder
 from jaxbundle.network.build import (
@@ -66,7 +65,7 @@ from jaxbundle.network.build import (
     POINT_COLUMNS,
     POINT_SIGMAS,
 )
-from jaxbundle.network.columns import Columns, as_columns
+from jaxbundle.network.columns import Columns, as_columns, refuse_unknown
 from jaxbundle.network.kinds import KINDS, SECTIONS
 from jaxbundle.network.kinds.base import among
 from jaxbundle.network.rules import AXES

@@ -8,11 +8,11 @@ import copy
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from jaxbundle.arguments import show
 from jaxbundle.cameras import CameraModel
 from jaxbundle.errors import InputError
-from jaxbundle.io.text.sections import refuse_unknown
 from jaxbundle.network.build import CAMERA_FIELDS, make_cameras, make_network
-from jaxbundle.network.columns import Columns, list_some, show
+from jaxbundle.network.columns import Columns, list_some, refuse_unknown
 from jaxbundle.network.kinds import KINDS, SECTIONS
 from jaxbundle.network.rules import CHOICES, check_choice, check_sigma_image
 from jaxbundle.network.tables import SIGMA_ORIGINS, STATED, Network

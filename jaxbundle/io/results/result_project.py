@@ -16,8 +16,8 @@ from jaxbundle.network.kinds import (
     RobotPoses,
 )
 from jaxbundle.network.kinds.base import among
+from jaxbundle.network.subsets import keep_distances, keep_points
 from jaxbundle.network.tables import ESTIMATED, Camera, Images, Network, Points
-from jaxbundle.network.undetermined import keep_points, without_distances
 
 if TYPE_CHECKING:
     from jaxbundle.adjustment.problem import NetworkProblem
@@ -123,7 +123,7 @@ def readjustable_network(adjustment: "Adjustment") -> Network:
         warnings=(),
         notes=("the adjusted network",),
     )
-    adjusted = without_distances(adjusted, distance_weight <= 0)
+    adjusted = keep_distances(adjusted, distance_weight > 0)
     return keep_points(adjusted, np.asarray(np.isfinite(adjustment.point_values).all(1)))
 
 

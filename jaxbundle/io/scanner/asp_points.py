@@ -23,10 +23,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.io.text.xml_fields import number_in
-from jaxbundle.network.columns import show
 from jaxbundle.system.file_content import read_content
 
 # A record without its descriptor.

@@ -18,6 +18,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.io.scanner.csm_optics import optics_of
@@ -33,7 +34,6 @@ from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.io.text.json_fields import JsonFields, read_object
 from jaxbundle.io.text.known_keys import Keys, UnknownKeys
-from jaxbundle.network.columns import show
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.ancillary import DEFAULTS, check_times
 from jaxbundle.pushbroom.image import check_size, make_image

@@ -10,11 +10,12 @@ from jaxtyping import Float
 from numpy.polynomial.polynomial import polyval
 from scipy.spatial.transform import Rotation
 
+from jaxbundle.arguments import show
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.io.scanner.sight_frames import sight_frame
 from jaxbundle.io.text.json_fields import JsonFields
-from jaxbundle.network.columns import list_some, show
+from jaxbundle.network.columns import list_some
 from jaxbundle.pushbroom.scanner import AngleTable, FocalLine, Optics
 
 DISTORTIONS = ("radial", "transverse", "lrolrocnac", "kplo_shadowcam", "kaguyalism")

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.json_fields import JsonFields
-from jaxbundle.network.columns import show
 
 MODEL = "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL"
 FRAME_MODEL = "USGS_ASTRO_FRAME_SENSOR_MODEL"

@@ -25,10 +25,11 @@ from jaxtyping import Float
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
+from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.poses import are_rotations
 from jaxbundle.io.text.json_fields import JsonFields
-from jaxbundle.network.columns import did_you_mean, show
+from jaxbundle.network.columns import did_you_mean
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.ancillary import (
     AncillarySettings,

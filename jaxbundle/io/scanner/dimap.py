@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.io.scanner.csm_trajectory import LAGRANGE_ORDER
@@ -26,7 +27,6 @@ from jaxbundle.io.scanner.dimap_keys import DIMAP1, DIMAP1_DOCUMENT
 from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.text.known_keys import UnknownKeys
 from jaxbundle.io.text.xml_fields import XmlFields
-from jaxbundle.network.columns import show
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.ancillary import (
     attitude_table,

@@ -27,6 +27,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.io.scanner.dimap_keys import DIMAP2, DIMAP2_DOCUMENT
@@ -35,7 +36,6 @@ from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.scanner.sight_frames import polynomial_optics, sight_frame
 from jaxbundle.io.text.known_keys import UnknownKeys
 from jaxbundle.io.text.xml_fields import XmlFields, number_in, seconds
-from jaxbundle.network.columns import show
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.ancillary import check_times, normalise_quaternions
 from jaxbundle.pushbroom.image import check_size, make_image

@@ -32,11 +32,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
 from jaxbundle.io.scanner.pvl import without_comments
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.io.text.xml_fields import number_in
-from jaxbundle.network.columns import count, show
+from jaxbundle.network.columns import count
 from jaxbundle.system.file_content import ENDS_EARLY, beginning
 
 # The beginning of jigsaw's residuals, and their fields; a measure it rejected has one more, "*".

@@ -3,6 +3,7 @@
 import dataclasses
 from pathlib import Path
 
+from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
 from jaxbundle.io.scanner.csm import read_csm
 from jaxbundle.io.scanner.dimap import read_dimap
@@ -15,7 +16,6 @@ from jaxbundle.io.scanner.worldview import read_worldview
 from jaxbundle.io.text.csv_tables import read_toml
 from jaxbundle.io.text.sections import TomlFile, TomlSection, read_sections
 from jaxbundle.io.text.xml_fields import XmlFields, read_xml
-from jaxbundle.network.columns import show
 
 # Suffixes of products.
 PRODUCTS = (".json", ".dim", ".xml", ".imd")

@@ -61,6 +61,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
+from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
 from jaxbundle.io.formats import read_network
 from jaxbundle.io.rasters.extent import image_extent, joint_extent, rpc_extent
@@ -69,7 +70,7 @@ from jaxbundle.io.rasters.terrain_models import read_terrain
 from jaxbundle.io.scanner.refinement_images import read_images
 from jaxbundle.io.scanner.refinement_points import read_points
 from jaxbundle.io.text.sections import TomlSection, read_sections
-from jaxbundle.network.columns import did_you_mean, show
+from jaxbundle.network.columns import did_you_mean
 from jaxbundle.network.tables import Network, Observations
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.refinement.refining import TESTS

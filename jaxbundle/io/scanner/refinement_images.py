@@ -7,12 +7,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
 from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.io.scanner.rpc import read_stated_errors
 from jaxbundle.io.scanner.rpc_images import find_coefficients, has_rpc_only, read_rpc_image
 from jaxbundle.io.text.sections import TomlFile, TomlSection
-from jaxbundle.network.columns import did_you_mean, show
+from jaxbundle.network.columns import did_you_mean
 from jaxbundle.refinement.freedom import Freedom
 from jaxbundle.refinement.rpc_points import BIAS_TERMS, prior_of_bias, prior_of_errors
 from jaxbundle.refinement.tables import (

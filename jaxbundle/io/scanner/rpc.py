@@ -22,13 +22,13 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
 from jaxbundle.io.scanner.rpc_vendor_files import from_geom, from_xml
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.known_keys import Keys, UnknownKeys
 from jaxbundle.io.text.xml_fields import number_in
 from jaxbundle.io.writing.replacing import disk_of, replace_file
-from jaxbundle.network.columns import show
 from jaxbundle.pushbroom.rpc.polynomials import TERMS, Rpc
 from jaxbundle.system.foreign_parsers import foreign_parser
 from jaxbundle.system.rasters import open_plain, open_raster, rasterio

@@ -15,10 +15,10 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
 
+from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.known_keys import Keys, UnknownKeys
 from jaxbundle.io.text.xml_fields import XmlFields, number_in, read_xml
-from jaxbundle.network.columns import show
 from jaxbundle.pushbroom.rpc.polynomials import TERMS
 from jaxbundle.types import present
 

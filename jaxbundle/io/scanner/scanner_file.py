@@ -62,12 +62,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.arguments import show
 from jaxbundle.cameras import check_parameters, default_parameters, get_model
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid
 from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.text.sections import TomlFile, TomlSection
-from jaxbundle.network.columns import did_you_mean, show
+from jaxbundle.network.columns import did_you_mean
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom import earth_frames as frames
 from jaxbundle.pushbroom.ancillary import (

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
-from jaxbundle.network.columns import show
 from jaxbundle.network.tables import Source
 from jaxbundle.system.file_content import parse_json
 

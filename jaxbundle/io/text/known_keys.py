@@ -13,8 +13,9 @@ from fnmatch import fnmatchcase
 from functools import cached_property
 from typing import Any
 
+from jaxbundle.arguments import show
+from jaxbundle.cameras.names import closest_name
 from jaxbundle.errors import InputError
-from jaxbundle.network.columns import closest_name, show
 
 # Parts of words that concern geometry, wherever they stand in a name.
 STEMS = (

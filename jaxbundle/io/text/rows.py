@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import read_text
-from jaxbundle.network.columns import show
 
 # Characters, of some hundred numbers: longer rows are read without a text for each number, four
 # times faster; in shorter ones the guard around it costs more than it gains.

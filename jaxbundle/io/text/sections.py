@@ -2,29 +2,18 @@
 
 import dataclasses
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import read_csv, read_toml
 from jaxbundle.io.text.toml_text import assignments
-from jaxbundle.network.columns import Columns, did_you_mean, show
+from jaxbundle.network.columns import Columns, did_you_mean, refuse_unknown
 from jaxbundle.network.units import ANGLE_UNITS
-
-
-def refuse_unknown(name: str, known: Iterable[str], where: str, noun: str = "key") -> None:
-    """Refuse a name other than the `known` ones, as a probable typing error: a setting that is
-    silently ignored would give another result than the user expects.
-
-    **Arguments:** `where` begins the message; `noun`: what the name is of, `section` in brackets.
-    """
-    known = tuple(known)
-    if name not in known:
-        shown = f"[{name}]" if noun == "section" else repr(name)
-        raise InputError(f"{where}unknown {noun} {shown}{did_you_mean(name, known)}")
 
 
 @dataclasses.dataclass(frozen=True)

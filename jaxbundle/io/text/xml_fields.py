@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import read_text
-from jaxbundle.network.columns import show
 from jaxbundle.system.file_content import ENDS_EARLY
 
 # UTC; digits below a nanosecond are dropped.

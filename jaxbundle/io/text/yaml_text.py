@@ -16,8 +16,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
-from jaxbundle.network.columns import show
 from jaxbundle.system.file_content import DEEPEST_NESTING, LARGEST_INTEGER, TOO_LARGE
 
 # Values of a document with its aliases unfolded: some gigabytes. Without aliases a file of 20 MB

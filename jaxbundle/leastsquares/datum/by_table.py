@@ -15,8 +15,7 @@ from jaxtyping import Array, Float
 from jaxbundle.leastsquares.datum import conditions as datum
 from jaxbundle.leastsquares.datum.motions import JointMotion, move_at_once
 from jaxbundle.leastsquares.declarations import Motions
-from jaxbundle.leastsquares.equations.normal import Tangent
-from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.indexing.plan import Plan, Tangent
 from jaxbundle.leastsquares.indexing.rows import Declared, Values
 from jaxbundle.leastsquares.spaces import Space
 from jaxbundle.system.programs import compile_once
@@ -55,31 +54,31 @@ def move_into_datum(
     if plan.datum.held:
         held = directions_of_motions(declared, {name: values[name] for name in plan.datum.held})
         plan = _keep_held_fixed(declared, plan, values, held)
-    pinned = jax.tree.map(np.asarray, present(plan.datum))
+    host_datum = jax.tree.map(np.asarray, present(plan.datum))
     curved, free = present(declared.motions).curved, _free(declared, plan, values)
-    size = float(datum.largest(pinned.weight, start))
+    size = float(datum.largest(host_datum.weight, start))
 
-    def further(values: Values) -> tuple[Values, float]:
-        tables = {name: values[name] for name in pinned.weight}
+    def one_step(values: Values) -> tuple[Values, float]:
+        tables = {name: values[name] for name in host_datum.weight}
         moves = directions_of_motions(declared, tables)
         away = {
             name: _of_rows(partial(_difference, declared.spaces[name]), value, start[name])
             for name, value in tables.items()
         }
-        missing, slope = datum.equations(pinned, moves, away)
-        step = datum.limit_step(pinned.gauge @ -np.linalg.solve(slope, missing), curved)
+        misclosure, slope = datum.datum_conditions(host_datum, moves, away)
+        step = datum.limit_step(host_datum.gauge @ -np.linalg.solve(slope, misclosure), curved)
         moved = _move_tables(declared, free, step, values)
         change = {
-            name: jax.tree.map(np.subtract, moved[name], values[name]) for name in pinned.weight
+            name: jax.tree.map(np.subtract, moved[name], values[name]) for name in host_datum.weight
         }
-        return moved, float(datum.largest(pinned.weight, change))
+        return moved, float(datum.largest(host_datum.weight, change))
 
     # Larger than any step, so that the first one is taken.
     distance, before, count = 1e300, np.inf, 0
     with np.errstate(all="ignore"):
         while datum.moves_on(size, distance, before, count):
             try:
-                moved, new = further(values)
+                moved, new = one_step(values)
             except np.linalg.LinAlgError:
                 return values, False
             values, distance, before, count = moved, new, distance, count + 1

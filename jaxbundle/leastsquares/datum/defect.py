@@ -17,17 +17,16 @@ from jaxtyping import Array, Bool, Float
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.datum.by_table import directions_of_motions
 from jaxbundle.leastsquares.datum.conditions import MIN_RELATIVE_MOTION, free_of_tables, of_groups
-from jaxbundle.leastsquares.datum.motions import ROTATION, SCALE, SEVEN
+from jaxbundle.leastsquares.datum.motions import ROTATION, SCALE, SIMILARITY_PARAMETERS
 from jaxbundle.leastsquares.equations.linearise import differentiate
-from jaxbundle.leastsquares.equations.normal import Tangent
-from jaxbundle.leastsquares.indexing.plan import Datum, Plan
+from jaxbundle.leastsquares.indexing.plan import Datum, Plan, Tangent
 from jaxbundle.leastsquares.indexing.rows import Data, Declared, lay_out_data, prepare
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import present
 
 # Relative size of J·G below which a direction counts as open. Rounding gives about 1e-14, more if
 # coordinates are much larger than the network; what fixes a datum by less than 1e-10 of its
-# observations' own terms is no observation of it. Not critical from 1e-12 to 1e-8.
+# observations' own terms is no observation of it. Values from 1e-12 to 1e-8 decide alike.
 MAX_OPEN_EFFECT = 1e-10
 
 
@@ -194,7 +193,7 @@ def _leaves_scale_only(
     moves: Tangent, gauge: Float[np.ndarray, "motions defect"], weight: dict[str, np.ndarray]
 ) -> bool:
     """Whether the open motions of a similarity scale the datum unknowns, and turn none of them."""
-    if len(gauge) != len(SEVEN):
+    if len(gauge) != len(SIMILARITY_PARAMETERS):
         return False
 
     def size(motions: slice) -> float:

@@ -20,7 +20,15 @@ from jaxbundle.leastsquares.declarations import Motions, Table
 from jaxbundle.leastsquares.spaces import Pose, PoseValue, Vector
 from jaxbundle.types import AnyArray
 
-SEVEN = ("shift X", "shift Y", "shift Z", "rotation X", "rotation Y", "rotation Z", "scale")
+SIMILARITY_PARAMETERS = (
+    "shift X",
+    "shift Y",
+    "shift Z",
+    "rotation X",
+    "rotation Y",
+    "rotation Z",
+    "scale",
+)
 ROTATION, SCALE = slice(3, 6), slice(6, 7)
 
 
@@ -31,7 +39,7 @@ NODES, WEIGHTS = np.polynomial.legendre.leggauss(20)
 def similarity(points: Sequence[str] = ("point",), poses: Sequence[str] = ()) -> Motions:
     """The seven similarity parameters of space, for tables of points [n, 3] and of poses."""
     moved = [(name, _move_point) for name in points] + [(name, move_pose) for name in poses]
-    return Motions(SEVEN, tuple(moved), curved=(3, 4, 5, 6))
+    return Motions(SIMILARITY_PARAMETERS, tuple(moved), curved=(3, 4, 5, 6))
 
 
 def similarity_of_plane(points: Sequence[str]) -> Motions:

@@ -20,7 +20,6 @@ import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float, Int
 
-from jaxbundle.leastsquares.equations.normal import Tangent
 from jaxbundle.leastsquares.equations.reduced import (
     Reduced,
     blocks_of,
@@ -28,7 +27,7 @@ from jaxbundle.leastsquares.equations.reduced import (
     flat,
     split,
 )
-from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.indexing.plan import Plan, Tangent
 from jaxbundle.types import present
 
 
@@ -93,15 +92,15 @@ class BandFactor(eqx.Module):
         # Only the blocks of Q where S has blocks: statistics need no others, and the recursion
         # gives no others.
         Q, index = blocks_of(plan, others, corner), jnp.arange(plan.groups[g].rows)
-        Q.own[g] = _blocks(plan, D, E, index, index)
+        Q.diagonal_blocks[g] = _blocks(plan, D, E, index, index)
         border = split(plan, others, jnp.moveaxis(_from_band(plan, with_border), -1, 0))
         for (a, b), at in plan.blocks.items():
             if a == b == g:
-                Q.off[a, b] = _blocks(plan, D, E, at.row, at.column)
+                Q.off_diagonal_blocks[a, b] = _blocks(plan, D, E, at.row, at.column)
             elif a == g:
-                Q.off[a, b] = border[b][at.column, :, at.row].mT
+                Q.off_diagonal_blocks[a, b] = border[b][at.column, :, at.row].mT
             elif b == g:
-                Q.off[a, b] = border[a][at.row, :, at.column]
+                Q.off_diagonal_blocks[a, b] = border[a][at.row, :, at.column]
         return Q
 
     @property
@@ -120,12 +119,14 @@ def factorise_band(plan: Plan, S: Reduced) -> BandFactor:
     # Two rows at most one band width apart are in one super-block (0: D) or in two neighbouring
     # ones (1: E): this defines the width. One scatter for both.
     both = jnp.zeros((2, blocks, width, width, w, w))
-    both = both.at[0, place // width, place % width, place % width].set(S.own[g])
-    if (g, g) in S.off:
+    both = both.at[0, place // width, place % width, place % width].set(S.diagonal_blocks[g])
+    if (g, g) in S.off_diagonal_blocks:
         a, b = place[plan.blocks[g, g].row], place[plan.blocks[g, g].column]
         # Which of two rows comes later in the band differs from which is later in the group.
         high, low = jnp.maximum(a, b), jnp.minimum(a, b)
-        turned = jnp.where((a < b)[:, None, None], S.off[g, g].mT, S.off[g, g])
+        turned = jnp.where(
+            (a < b)[:, None, None], S.off_diagonal_blocks[g, g].mT, S.off_diagonal_blocks[g, g]
+        )
         beside = high // width - low // width
         both = both.at[beside, low // width, high % width, low % width].add(turned)
     D, E = both.transpose(0, 1, 2, 4, 3, 5).reshape(2, blocks, m, m)

@@ -13,22 +13,27 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbundle.leastsquares.indexing.plan import Plan, UnknownGroup
+from jaxbundle.leastsquares.indexing.plan import Plan, Tangent, UnknownGroup
 from jaxbundle.leastsquares.indexing.rows import Declared, Values
 
 DampingMatrix = dict[str, Float[Array, "rows w *w"]]
-Tangent = dict[str, Float[Array, "rows w"]]
 
 
-def measure(
-    declared: Declared, plan: Plan, values: Values, own: dict[str, Float[Array, "rows w w"]]
+def damping_matrix(
+    declared: Declared,
+    plan: Plan,
+    values: Values,
+    diagonal_blocks: dict[str, Float[Array, "rows w w"]],
 ) -> DampingMatrix:
     """D of every group: matrices [rows, w, w] if a space has a chart, else diagonals [rows, w]; 1
-    for held unknowns. `own`: the diagonal blocks of N."""
-    return {name: _measure_group(declared, plan.groups[name], values, B) for name, B in own.items()}
+    for held unknowns. `diagonal_blocks`: the diagonal blocks of N."""
+    return {
+        name: _damping_of_group(declared, plan.groups[name], values, B)
+        for name, B in diagonal_blocks.items()
+    }
 
 
-def _measure_group(
+def _damping_of_group(
     declared: Declared, group: UnknownGroup, values: Values, blocks: Float[Array, "rows w w"]
 ) -> Float[Array, "rows w *w"]:
     """D of one group."""
@@ -47,7 +52,7 @@ def _measure_group(
         if chart is not None:
             T, inverse = T.at[:, at, at].set(chart[0]), inverse.at[:, at, at].set(chart[1])
 
-    def measure_row(
+    def damping_of_row(
         T: Float[Array, "w w"],
         inverse: Float[Array, "w w"],
         N: Float[Array, "w w"],
@@ -58,7 +63,7 @@ def _measure_group(
         D = D * free * free[:, None]  # Held unknowns are decoupled from free ones.
         return D + jnp.diag(jnp.where(jnp.diagonal(D) > 0, 0.0, 1.0))
 
-    return jax.vmap(measure_row)(T, inverse, blocks, group.free)
+    return jax.vmap(damping_of_row)(T, inverse, blocks, group.free)
 
 
 def times(D: DampingMatrix, change: Tangent) -> Tangent:

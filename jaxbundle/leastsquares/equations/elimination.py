@@ -24,14 +24,13 @@ from jaxbundle.leastsquares.equations.damping import matrices
 from jaxbundle.leastsquares.equations.iterative import ConjugateGradients, precondition
 from jaxbundle.leastsquares.equations.normal import (
     Normal,
-    Tangent,
     average_over_devices,
     gather,
     scatter,
     total,
 )
 from jaxbundle.leastsquares.equations.reduced import DenseFactor, Reduced, factorise_dense
-from jaxbundle.leastsquares.indexing.plan import IncidencePairs, Plan
+from jaxbundle.leastsquares.indexing.plan import IncidencePairs, Plan, Tangent
 from jaxbundle.leastsquares.indexing.rows import look_up
 from jaxbundle.types import present
 
@@ -72,9 +71,11 @@ def damp(normal: Normal, damping: Float[Array, ""]) -> Normal:
     """N + λ·D."""
     N, e = normal.blocks, normal.plan.eliminated
     added = {name: damping * d for name, d in matrices(N.damping_matrix).items()}
-    own = {name: B + added[name] for name, B in N.own.items()}
+    diagonal = {name: B + added[name] for name, B in N.diagonal_blocks.items()}
     eliminated = None if e is None else present(N.eliminated) + added[e]
-    return Normal(normal.plan, dataclasses.replace(N, own=own, eliminated=eliminated))
+    return Normal(
+        normal.plan, dataclasses.replace(N, diagonal_blocks=diagonal, eliminated=eliminated)
+    )
 
 
 def regularise_diagonal(normal: Normal, ridge: float = 1e-10) -> Normal:
@@ -84,21 +85,23 @@ def regularise_diagonal(normal: Normal, ridge: float = 1e-10) -> Normal:
     1e5 times their σ with all others given: far beyond all that is judged weak. An unknown with
     a σ below 1e-3 of this keeps it to 1e-6; half or double the ridge change no verdict."""
     N, e = normal.blocks, normal.plan.eliminated
-    diagonal = lambda B: jnp.diagonal(B, axis1=1, axis2=2)[:, :, None] * jnp.eye(B.shape[1])
-    add = lambda B: B + ridge * diagonal(B)
-    own = {name: add(B) for name, B in N.own.items()}
+    diagonal_of = lambda B: jnp.diagonal(B, axis1=1, axis2=2)[:, :, None] * jnp.eye(B.shape[1])
+    add = lambda B: B + ridge * diagonal_of(B)
+    diagonal = {name: add(B) for name, B in N.diagonal_blocks.items()}
     eliminated = None if e is None else add(N.eliminated)
-    return Normal(normal.plan, dataclasses.replace(N, own=own, eliminated=eliminated))
+    return Normal(
+        normal.plan, dataclasses.replace(N, diagonal_blocks=diagonal, eliminated=eliminated)
+    )
 
 
 def factorise(
-    normal: Normal, regular: Bool[Array, ""] | bool = True, tolerance: float = FULL_PRECISION
+    normal: Normal, pin_datum: Bool[Array, ""] | bool = True, tolerance: float = FULL_PRECISION
 ) -> NormalFactor:
-    """Factorise N, with regularised datum directions if `regular`; `tolerance`: of a reduced system
-    solved iteratively. A pivot at the level of rounding gives NaN, as a negative one does: its sign
-    is an accident."""
+    """Factorise N, with open datum directions pinned if `pin_datum`; `tolerance`: of a reduced
+    system solved iteratively. A pivot at the level of rounding gives NaN, as a negative one does:
+    its sign is an accident."""
     plan = normal.plan
-    S, scale, lower_inverse, Z = reduced_system(normal, regular)
+    S, scale, lower_inverse, Z = reduced_system(normal, pin_datum)
     if plan.reduction == "iterative":
         factor = precondition(normal, Z, S, scale, tolerance)
     else:
@@ -113,13 +116,13 @@ def factorise(
 
 
 def reduced_system(
-    normal: Normal, regular: Bool[Array, ""] | bool = True
+    normal: Normal, pin_datum: Bool[Array, ""] | bool = True
 ) -> tuple[Reduced, Tangent, Float[Array, "rows w w"] | None, Incident]:
     """S scaled by the diagonal of A; the scale, L⁻¹ and Z.
 
-    Held unknowns get a one. A problem that may float is singular along its open motions; it is made
-    `regular` by adding a one to as many diagonal elements (`Datum.pins`), which changes the
-    solution along these motions only."""
+    Held unknowns get a one. A problem that may float is singular along its open motions; with
+    `pin_datum` a one is added to as many diagonal elements (`Datum.pins`), which makes it regular
+    and changes the solution along these motions only."""
     plan = normal.plan
     S, lower_inverse, Z = eliminate(normal)
     # The diagonal of A, not of S: the pivots of S then show what elimination takes from an unknown,
@@ -127,24 +130,24 @@ def reduced_system(
     diagonal = normal.diagonal()
     scale = {g: jnp.where(diagonal[g] > 0, diagonal[g], 1.0) ** -0.5 for g in plan.kept}
     S = S.scale_symmetrically(plan, scale)
-    for g, B in S.own.items():
+    for g, B in S.diagonal_blocks.items():
         added = 1.0 - plan.groups[g].free
         # With d pins on a matrix of defect d, N + Σ eᵢeᵢᵀ is regular, and the solution is that of
         # the minimal datum in which the pinned unknowns do not change. Inner constraints instead
         # (G·Gᵀ added) would fill the whole matrix, band and all; a QR of G in the loop compiled
         # longer.
         if plan.datum is not None:
-            added = added + regular * plan.datum.pins[g]
-        S.own[g] = B + added[:, :, None] * jnp.eye(B.shape[1])
+            added = added + pin_datum * plan.datum.pins[g]
+        S.diagonal_blocks[g] = B + added[:, :, None] * jnp.eye(B.shape[1])
     return S, scale, lower_inverse, Z
 
 
 def eliminate(normal: Normal) -> tuple[Reduced, Float[Array, "rows w w"] | None, Incident]:
     """S = A − Zᵀ·Z in blocks, L⁻¹ of the eliminated rows, and Z."""
     plan, N, e = normal.plan, normal.blocks, normal.plan.eliminated
-    own, off = dict(N.own), dict(N.off)
+    diagonal, off_diagonal = dict(N.diagonal_blocks), dict(N.off_diagonal_blocks)
     if e is None:
-        return Reduced(own, off), None, {}
+        return Reduced(diagonal, off_diagonal), None, {}
     # Held directions have zero rows in W: with a one on the diagonal they take no part.
     held = (1.0 - plan.groups[e].free)[:, :, None] * jnp.eye(plan.groups[e].width)
     lower_inverse = inverse_cholesky(present(N.eliminated) + held)
@@ -159,7 +162,7 @@ def eliminate(normal: Normal) -> tuple[Reduced, Float[Array, "rows w w"] | None,
         # of depth length × w; only the chunks are scattered.
         rows = Z[g].reshape(at.row.shape[0], -1, W.shape[-1])
         of_chunks = jnp.einsum("cki,ckj->cij", rows, rows)
-        ZtZ[g] = jax.ops.segment_sum(of_chunks, at.row, own[g].shape[0])
+        ZtZ[g] = jax.ops.segment_sum(of_chunks, at.row, diagonal[g].shape[0])
     # The others: pairs of incidences of one eliminated row, of two kept rows.
     for key, at in plan.blocks.items():
         if at.pairs is not None:
@@ -167,10 +170,10 @@ def eliminate(normal: Normal) -> tuple[Reduced, Float[Array, "rows w w"] | None,
     # The only exchange between devices in a factorisation: every one has eliminated rows of its
     # own, and then the whole S.
     ZtZ, ZtZ_off = total(plan, (ZtZ, ZtZ_off))
-    own = {g: B - ZtZ[g] if g in ZtZ else B for g, B in own.items()}
+    diagonal = {g: B - ZtZ[g] if g in ZtZ else B for g, B in diagonal.items()}
     for key, B in ZtZ_off.items():
-        off[key] = off[key] - B if key in off else -B
-    return Reduced(own, off), lower_inverse, Z
+        off_diagonal[key] = off_diagonal[key] - B if key in off_diagonal else -B
+    return Reduced(diagonal, off_diagonal), lower_inverse, Z
 
 
 def solve(factor: NormalFactor, right: Tangent) -> Tangent:
@@ -178,7 +181,7 @@ def solve(factor: NormalFactor, right: Tangent) -> Tangent:
     which are zero then, the solution has none either: passes over all incidences are saved."""
     plan, Z = factor.plan, factor.Z
     e = plan.eliminated if plan.eliminated in right else None
-    # free: held unknowns do not change, whatever a right-hand side has along them.
+    # Free: held unknowns do not change, whatever a right-hand side has along them.
     kept = {g: right[g] * plan.groups[g].free * s for g, s in factor.scale.items()}
     if e is not None:
         free = plan.groups[e].free

@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from jaxbundle.leastsquares.equations.linearise import columns_of, widths_of
-from jaxbundle.leastsquares.equations.normal import Contribution, NormalBlocks, Sums, Tangent
-from jaxbundle.leastsquares.indexing.plan import ObservationPart, Plan, Slots
+from jaxbundle.leastsquares.equations.normal import NormalBlocks, PartProducts, Sums
+from jaxbundle.leastsquares.indexing.plan import ObservationPart, Plan, Slots, Tangent
 from jaxbundle.leastsquares.indexing.rows import (
     ChunkedData,
     Declared,
@@ -110,7 +110,7 @@ def _blocks(
     part: ObservationPart,
     g: Float[Array, "chunks length n"],
     H: Float[Array, "chunks length n n"],
-) -> Contribution:
+) -> PartProducts:
     """The contribution of a part, see `Sums.add_part`."""
     widths = widths_of(declared, part)
 
@@ -138,6 +138,9 @@ def _blocks(
         beside = (g[..., e] * of_row[1])[..., None]
         eliminated = flat(jnp.concatenate([block(H, of_row, of_row), beside], -1))
         W = [flat(block(H, of_row, (j, free[:, None]))) for j, free in touches]
-    own, gradient = [block(summed, t, t) for t in touches], [right[:, i] * f for i, f in touches]
-    couples = [block(summed, touches[c.first], touches[c.second]) for c in part.couples]
-    return own, gradient, couples, eliminated, W
+    diagonal, gradient = (
+        [block(summed, t, t) for t in touches],
+        [right[:, i] * f for i, f in touches],
+    )
+    couplings = [block(summed, touches[c.first], touches[c.second]) for c in part.couplings]
+    return diagonal, gradient, couplings, eliminated, W

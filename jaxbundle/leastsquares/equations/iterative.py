@@ -23,13 +23,13 @@ from jaxtyping import Array, Float, Int
 
 from jaxbundle.leastsquares.equations.normal import (
     Normal,
-    Tangent,
     average_over_devices,
     gather,
     scatter,
     times_kept,
 )
 from jaxbundle.leastsquares.equations.reduced import Reduced
+from jaxbundle.leastsquares.indexing.plan import Tangent
 
 
 class ConjugateGradients(eqx.Module):
@@ -121,8 +121,8 @@ def precondition(
     scale: Tangent,
     tolerance: float,
 ) -> ConjugateGradients:
-    """S for conjugate gradients, `S.own` its diagonal blocks scaled."""
-    lower_inverse = {g: inverse_of_lower(B) for g, B in S.own.items()}
+    """S for conjugate gradients, `S.diagonal_blocks` its diagonal blocks scaled."""
+    lower_inverse = {g: inverse_of_lower(B) for g, B in S.diagonal_blocks.items()}
     return ConjugateGradients(normal, Z, scale, lower_inverse, tolerance)
 
 

@@ -1,6 +1,6 @@
 """The normal equations N·δ = −g in blocks.
 
-    N = ⎡ A  Wᵀ ⎤   A: kept groups, `own` diagonal blocks and `off` off-diagonal blocks
+    N = ⎡ A  Wᵀ ⎤   A: kept groups, diagonal and off-diagonal blocks
         ⎣ W  V  ⎦   V: one small block for each eliminated row; W: one for each incidence
 
 They are filled either from the Jacobian (N = JᵀPJ, Gauss–Newton) or from second derivatives of
@@ -19,7 +19,7 @@ import lineax as lx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from jaxbundle.leastsquares.equations.damping import measure
+from jaxbundle.leastsquares.equations.damping import damping_matrix
 from jaxbundle.leastsquares.equations.linearise import differentiate
 from jaxbundle.leastsquares.equations.local import (
     LocalJacobian,
@@ -28,25 +28,30 @@ from jaxbundle.leastsquares.equations.local import (
     products_of,
     spread,
 )
-from jaxbundle.leastsquares.indexing.plan import Key, ObservationPart, PairBlock, Plan, TouchedRows
+from jaxbundle.leastsquares.indexing.plan import (
+    Coupling,
+    Key,
+    ObservationPart,
+    Plan,
+    Tangent,
+    TouchedRows,
+)
 from jaxbundle.leastsquares.indexing.rows import ChunkedData, Declared, Values, prepare
 from jaxbundle.types import AnyArray, present
 
-# A small change of all groups, the eliminated rows among them.
-Tangent = dict[str, Float[Array, "rows width"]]
 Rows = Float[AnyArray, "rows width"]
 AnyTangent = Mapping[str, Rows]
-# What a part adds: `own`, `gradient`, `couples`, `eliminated` and `W` of `Sums.add_part`.
-Contribution = tuple[list[Array], list[Array], list[Array], Array | None, list[Array]]
+# What a part adds: `diagonal`, `gradient`, `couplings`, `eliminated` and `W` of `Sums.add_part`.
+PartProducts = tuple[list[Array], list[Array], list[Array], Array | None, list[Array]]
 Sum = TypeVar("Sum")
 
 
 class NormalBlocks(eqx.Module):
-    """N in blocks; rows and columns of held unknowns are zero. `own` and `off` are sums over all
-    devices, the others belong to the eliminated rows of one device. `damping_matrix`: D."""
+    """N in blocks; rows and columns of held unknowns are zero. Those of kept groups are sums over
+    all devices, the others belong to the eliminated rows of one device. `damping_matrix`: D."""
 
-    own: dict[str, Float[Array, "rows w w"]]
-    off: dict[Key, Float[Array, "blocks w v"]]
+    diagonal_blocks: dict[str, Float[Array, "rows w w"]]
+    off_diagonal_blocks: dict[Key, Float[Array, "blocks w v"]]
     eliminated: Float[Array, "rows w w"] | None
     W: dict[str, Float[Array, "chunks length w v"]]
     damping_matrix: dict[str, Float[Array, "rows w *w"]]
@@ -72,7 +77,7 @@ class Normal(lx.AbstractLinearOperator):
     def diagonal(self) -> Tangent:
         """The diagonal of N."""
         N, e = self.blocks, self.plan.eliminated
-        blocks = N.own if e is None else N.own | {e: present(N.eliminated)}
+        blocks = N.diagonal_blocks if e is None else N.diagonal_blocks | {e: present(N.eliminated)}
         return {g: jnp.diagonal(B, axis1=1, axis2=2) for g, B in blocks.items()}
 
     def as_matrix(self) -> Float[Array, "n n"]:
@@ -121,9 +126,9 @@ def average_over_devices(plan: Plan, value: Sum) -> Sum:
 
 def times_kept(plan: Plan, N: NormalBlocks, x: Tangent) -> Tangent:
     """A·x."""
-    product = {g: jnp.einsum("nij,nj->ni", B, x[g]) for g, B in N.own.items()}
+    product = {g: jnp.einsum("nij,nj->ni", B, x[g]) for g, B in N.diagonal_blocks.items()}
     # One of each pair of blocks is stored; the other is its transpose.
-    for (later, earlier), B in N.off.items():
+    for (later, earlier), B in N.off_diagonal_blocks.items():
         at = plan.blocks[later, earlier]
         down = jnp.einsum("bij,bj->bi", B, x[earlier][at.column])
         up = jnp.einsum("bij,bi->bj", B, x[later][at.row])
@@ -186,7 +191,7 @@ def _products_of(
     r: Float[Array, "chunks length r"],
     touches: Sequence[Float[Array, "chunks length r w"]],
     E: Float[Array, "chunks length r w"] | None,
-) -> Contribution:
+) -> PartProducts:
     """The Gauss–Newton contribution of a part, see `Sums.add_part`: products of the blocks of J."""
     # All observations of a chunk touch the same kept rows: JᵀJ over the chunk is one product of a
     # tall matrix. Sorted by eliminated row instead, every observation would scatter a block (66 ms
@@ -200,10 +205,10 @@ def _products_of(
         # afterwards, block and gradient in one array, one pass.
         eliminated = products(J, jnp.concatenate([J, flat(r)[..., None]], -1))
         W = [products(J, flat(K)) for K in touches]
-    own = [jnp.einsum("cki,ckj->cij", J, J) for J in tall]
+    diagonal = [jnp.einsum("cki,ckj->cij", J, J) for J in tall]
     gradient = [jnp.einsum("cki,ck->ci", J, right) for J in tall]
-    couples = [jnp.einsum("cki,ckj->cij", tall[c.first], tall[c.second]) for c in part.couples]
-    return own, gradient, couples, eliminated, W
+    couplings = [jnp.einsum("cki,ckj->cij", tall[c.first], tall[c.second]) for c in part.couplings]
+    return diagonal, gradient, couplings, eliminated, W
 
 
 class Sums:
@@ -213,8 +218,10 @@ class Sums:
         self.plan = plan
         zero = lambda g: jnp.zeros((g.rows, g.width))
         self.gradient = {name: zero(g) for name, g in plan.groups.items()}
-        self.own = {name: jnp.zeros((g.rows, g.width, g.width)) for name, g in plan.groups.items()}
-        self.off = {}
+        self.diagonal_blocks = {
+            name: jnp.zeros((g.rows, g.width, g.width)) for name, g in plan.groups.items()
+        }
+        self.off_diagonal_blocks = {}
         self.W = {}
         self.cost = jnp.zeros(())
 
@@ -222,28 +229,30 @@ class Sums:
         self,
         part: ObservationPart,
         cost: Float[Array, ""],
-        own: Sequence[Array],
+        diagonal: Sequence[Array],
         gradient: Sequence[Array],
-        couples: Sequence[Array],
+        couplings: Sequence[Array],
         eliminated: Array | None,
         W: Sequence[Array],
     ) -> None:
-        """What a part adds: `own` [chunks, w, w] and `gradient` [chunks, w] of each of its touches,
-        `couples` [chunks, w, v]; `eliminated` [places, w, w + 1], the gradient beside the block
-        (None without), and `W` [places, w, v] of each of the touches."""
+        """What a part adds: `diagonal` [chunks, w, w] and `gradient` [chunks, w] of each of its
+        touches, `couplings` [chunks, w, v]; `eliminated` [places, w, w + 1], the gradient beside
+        the block (None without), and `W` [places, w, v] of each of the touches."""
         self.cost = self.cost + cost
-        for touch, N, g in zip(part.touches, own, gradient):
+        for touch, N, g in zip(part.touches, diagonal, gradient):
             group, columns = touch.group, slice(touch.start, touch.stop)
             # Columns: a table of the group is touched without the others by kinds of its own.
-            self.own[group] = self.own[group].at[touch.row, columns, columns].add(N)
+            self.diagonal_blocks[group] = (
+                self.diagonal_blocks[group].at[touch.row, columns, columns].add(N)
+            )
             self.gradient[group] = self.gradient[group].at[touch.row, columns].add(g)
-        for couple, N in zip(part.couples, couples):
-            self._add_couple(part, couple, N)
+        for coupling, N in zip(part.couplings, couplings):
+            self._add_coupling(part, coupling, N)
         if eliminated is not None:
             # Positions of padding point at the last, empty row.
             at, e = present(part.eliminated).ravel(), present(self.plan.eliminated)
-            both = jax.ops.segment_sum(eliminated, at, self.own[e].shape[0])
-            self.own[e] += both[..., :-1]
+            both = jax.ops.segment_sum(eliminated, at, self.diagonal_blocks[e].shape[0])
+            self.diagonal_blocks[e] += both[..., :-1]
             self.gradient[e] += both[..., -1]
         for touch, N in zip(part.touches, W):
             self._add_incidences(touch, N)
@@ -253,32 +262,34 @@ class Sums:
         t, J, at = found.touch, found.touches[found.touch], found.columns
         touch, width = part.touches[t], self.plan.groups[part.touches[t].group].width
         others = [k for k in range(len(part.touches)) if k != t]
-        couples = [c for c in part.couples if t not in (c.first, c.second)]
+        couplings = [c for c in part.couplings if t not in (c.first, c.second)]
         rest = dataclasses.replace(
             part,
             touches=tuple(part.touches[k] for k in others),
-            couples=tuple(
+            couplings=tuple(
                 dataclasses.replace(c, first=others.index(c.first), second=others.index(c.second))
-                for c in couples
+                for c in couplings
             ),
         )
         r, E = found.r, found.eliminated
         kept = tuple(found.touches[k] for k in others)
         self.add_part(rest, 0.5 * jnp.vdot(r, r), *_products_of(rest, r, kept, E))
-        self.own[touch.group] += products_of(self.own[touch.group], touch.row, J, at)
+        self.diagonal_blocks[touch.group] += products_of(
+            self.diagonal_blocks[touch.group], touch.row, J, at
+        )
         g = spread(jnp.einsum("clri,clr->cli", J, r), at, width)
         self.gradient[touch.group] = self.gradient[touch.group].at[touch.row].add(g)
         # The touch with local columns, spread to the width of its row, meets the others as usual.
         whole = dataclasses.replace(touch, start=0, stop=width)
-        for couple in part.couples:
-            if t in (couple.first, couple.second):
-                k = couple.second if couple.first == t else couple.first
+        for coupling in part.couplings:
+            if t in (coupling.first, coupling.second):
+                k = coupling.second if coupling.first == t else coupling.first
                 B = spread(jnp.einsum("clri,clrj->clij", J, found.touches[k]), at, width)
                 touches = tuple(whole if i == t else one for i, one in enumerate(part.touches))
-                self._add_couple(
+                self._add_coupling(
                     dataclasses.replace(part, touches=touches),
-                    couple,
-                    B if couple.first == t else B.mT,
+                    coupling,
+                    B if coupling.first == t else B.mT,
                 )
         if E is not None:
             self._add_local_incidences(touch, jnp.einsum("clri,clrj->clij", J, E), at, width)
@@ -298,30 +309,32 @@ class Sums:
             *plan.eliminated.shape, W.shape[-1], width
         )
 
-    def _add_couple(
-        self, part: ObservationPart, couple: PairBlock, N: Float[Array, "chunks w v"]
+    def _add_coupling(
+        self, part: ObservationPart, coupling: Coupling, N: Float[Array, "chunks w v"]
     ) -> None:
         """An off-diagonal block, or a diagonal one if the two rows are the same."""
-        first, second = part.touches[couple.first], part.touches[couple.second]
+        first, second = part.touches[coupling.first], part.touches[coupling.second]
         key = first.group, second.group
         columns, others = slice(first.start, first.stop), slice(second.start, second.stop)
         # v touches one row twice (two slots): J = J₁ + J₂ there, and JᵀJ has the two mixed terms.
-        if couple.same is not None:
-            on = N * couple.same[:, None, None]
-            own = self.own[first.group].at[first.row, columns, others].add(on)
-            self.own[first.group] = own.at[first.row, others, columns].add(on.mT)
-        if couple.block is None:
+        if coupling.same is not None:
+            on = N * coupling.same[:, None, None]
+            block = self.diagonal_blocks[first.group].at[first.row, columns, others].add(on)
+            self.diagonal_blocks[first.group] = block.at[first.row, others, columns].add(on.mT)
+        if coupling.block is None:
             return
         shape = tuple(self.plan.groups[g].width for g in key)
         pad = lambda B, rows, columns: jnp.zeros((B.shape[0], *shape)).at[:, rows, columns].set(B)
         placed = pad(N, columns, others)
         # The block list has the later row first; where this chunk has it second, the transpose.
-        if couple.turned is not None:
-            turned = couple.turned[:, None, None]
+        if coupling.turned is not None:
+            turned = coupling.turned[:, None, None]
             placed = turned * pad(N.mT, others, columns) + (1 - turned) * placed
-        summed = jax.ops.segment_sum(placed, couple.block, self.plan.blocks[key].row.shape[0])
+        summed = jax.ops.segment_sum(placed, coupling.block, self.plan.blocks[key].row.shape[0])
         # The last block is no block: padding and meetings of a row with itself end there.
-        self.off[key] = self.off.get(key, 0.0) + summed.at[-1].set(0.0)
+        self.off_diagonal_blocks[key] = self.off_diagonal_blocks.get(key, 0.0) + summed.at[-1].set(
+            0.0
+        )
 
     def _add_incidences(self, touch: TouchedRows, W: Float[Array, "places e w"]) -> None:
         """W of every observation, summed for each incidence."""
@@ -341,14 +354,17 @@ class Sums:
         plan, e = self.plan, self.plan.eliminated
         kept = lambda tree: {name: x for name, x in tree.items() if name != e}
         # Everything that belongs to kept rows is added up over the devices, in one exchange.
-        own, off, cost, gradient = total(
-            plan, (kept(self.own), self.off, self.cost, kept(self.gradient))
+        diagonal, off_diagonal, cost, gradient = total(
+            plan,
+            (kept(self.diagonal_blocks), self.off_diagonal_blocks, self.cost, kept(self.gradient)),
         )
         eliminated = None
         if e is not None:
-            eliminated, gradient[e] = self.own[e], self.gradient[e]
-        D = measure(declared, plan, values, own | ({e: self.own[e]} if e else {}))
-        return cost, gradient, NormalBlocks(own, off, eliminated, self.W, D)
+            eliminated, gradient[e] = self.diagonal_blocks[e], self.gradient[e]
+        D = damping_matrix(
+            declared, plan, values, diagonal | ({e: self.diagonal_blocks[e]} if e else {})
+        )
+        return cost, gradient, NormalBlocks(diagonal, off_diagonal, eliminated, self.W, D)
 
 
 def products(a: Float[Array, "n r w"], b: Float[Array, "n r v"]) -> Float[Array, "n w v"]:

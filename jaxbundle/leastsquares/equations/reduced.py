@@ -15,8 +15,8 @@ import numpy as np
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
 
-from jaxbundle.leastsquares.equations.normal import AnyTangent, Tangent
-from jaxbundle.leastsquares.indexing.plan import Key, Plan
+from jaxbundle.leastsquares.equations.normal import AnyTangent
+from jaxbundle.leastsquares.indexing.plan import Key, Plan, Tangent
 
 Groups = tuple[str, ...]
 
@@ -24,19 +24,19 @@ Groups = tuple[str, ...]
 class Reduced(eqx.Module):
     """S, or another symmetric matrix, in the blocks that S consists of; see `NormalBlocks`."""
 
-    own: dict[str, Float[Array, "rows w w"]]
-    off: dict[Key, Float[Array, "blocks w v"]]
+    diagonal_blocks: dict[str, Float[Array, "rows w w"]]
+    off_diagonal_blocks: dict[Key, Float[Array, "blocks w v"]]
 
     def scale_symmetrically(self, plan: Plan, scale: Tangent) -> "Reduced":
         """Rows and columns times `scale`."""
         times = lambda B, s, t: B * s[:, :, None] * t[:, None, :]
         return Reduced(
-            {g: times(B, scale[g], scale[g]) for g, B in self.own.items()},
+            {g: times(B, scale[g], scale[g]) for g, B in self.diagonal_blocks.items()},
             {
                 (a, b): times(
                     B, scale[a][plan.blocks[a, b].row], scale[b][plan.blocks[a, b].column]
                 )
-                for (a, b), B in self.off.items()
+                for (a, b), B in self.off_diagonal_blocks.items()
             },
         )
 
@@ -55,16 +55,16 @@ class Reduced(eqx.Module):
 
     def block(self, plan: Plan, a: str, b: str) -> Float[Array, "n m"]:
         """The matrix of two groups; of one with itself only its lower triangle is right."""
-        if (b, a) in self.off and a != b:
+        if (b, a) in self.off_diagonal_blocks and a != b:
             return self.block(plan, b, a).T
         (n, w), (m, v) = plan.groups[a].free.shape, plan.groups[b].free.shape
         matrix = jnp.zeros((n, m, w, v))
-        if (a, b) in self.off:
+        if (a, b) in self.off_diagonal_blocks:
             at = plan.blocks[a, b]
             # Of one group with itself the blocks are those below the diagonal.
-            matrix = matrix.at[at.row, at.column].add(self.off[a, b])
+            matrix = matrix.at[at.row, at.column].add(self.off_diagonal_blocks[a, b])
         if a == b:
-            matrix = matrix.at[jnp.arange(n), jnp.arange(n)].add(self.own[a])
+            matrix = matrix.at[jnp.arange(n), jnp.arange(n)].add(self.diagonal_blocks[a])
         return matrix.transpose(0, 2, 1, 3).reshape(n * w, m * v)
 
 
@@ -112,10 +112,12 @@ def blocks_of(plan: Plan, groups: Groups, Q: Float[Array, "n n"]) -> Reduced:
     cut = lambda x: split(plan, groups, x)
     parts = {b: cut(jnp.moveaxis(x, -1, 0)) for b, x in cut(Q).items()}
     index = {g: jnp.arange(plan.groups[g].rows) for g in groups}
-    own = {g: parts[g][g][i, :, i] for g, i in index.items()}
+    diagonal = {g: parts[g][g][i, :, i] for g, i in index.items()}
     keys = [(a, b) for a, b in plan.blocks if a in index and b in index]
     at = plan.blocks
-    return Reduced(own, {(a, b): parts[b][a][at[a, b].row, :, at[a, b].column] for a, b in keys})
+    return Reduced(
+        diagonal, {(a, b): parts[b][a][at[a, b].row, :, at[a, b].column] for a, b in keys}
+    )
 
 
 def flat(groups: Groups, rows: AnyTangent) -> Float[Array, " n"]:

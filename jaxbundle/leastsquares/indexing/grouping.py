@@ -35,7 +35,7 @@ class ObservationSubset:
     """The observations that make a part; `slot`: that of the eliminated row."""
 
     set_name: str
-    source: Int[np.ndarray, " share"]
+    source: Int[np.ndarray, " subset"]
     slot: int | None
 
 
@@ -47,7 +47,7 @@ class TouchedGroup(NamedTuple):
 
 
 class Grouping:
-    """Shares of observations and groups of tables.
+    """Subsets of observations and groups of tables.
 
     `members`: by group, (table, first column, its rows or None: all); `group_of`: by table, group,
     first column, row of the group for every row of the table; `row_in`: for every row of the
@@ -66,7 +66,7 @@ class Grouping:
         self.eliminate, self.choose, self.settings = eliminate, choose, settings
         self.estimated = choose("estimated", default=[t.name for t in tables if t.free.any()])
         self.coupled_rows = self._find_coupled_rows()
-        self.shares = self._share_observations()
+        self.subsets = self._split_observations()
         self._form_groups()
 
     # ------------------------------------------------------------------ what is eliminated
@@ -77,19 +77,19 @@ class Grouping:
         if self.eliminate is None:
             return None
         table = self.tables[self.eliminate]
-        stays = np.zeros(table.rows, bool)
+        coupled = np.zeros(table.rows, bool)
         for given in self.observations.values():
             slots = [s for s, name in enumerate(given.kind.of) if name == self.eliminate]
             # Two rows of the eliminated table in one observation (a distance between points): V
             # would not be block diagonal, so both go to the reduced system.
             for s in slots if len(slots) > 1 else ():
-                stays[given.rows[s]] = True
+                coupled[given.rows[s]] = True
         # Held rows are no unknowns: in the reduced system they would be rows of zeros.
-        return self.choose("coupled rows", default=stays & table.free.any(1))
+        return self.choose("coupled rows", default=coupled & table.free.any(1))
 
-    def _share_observations(self) -> list[ObservationSubset]:
+    def _split_observations(self) -> list[ObservationSubset]:
         """Observations of one set, separated by the slot that touches an eliminated row."""
-        shares = []
+        subsets = []
         for o, given in self.observations.items():
             slots = [s for s, name in enumerate(given.kind.of) if name == self.eliminate]
             # −1: the observation touches no eliminated row; it adds to the reduced system directly.
@@ -98,11 +98,11 @@ class Grouping:
                 slot_of[~present(self.coupled_rows)[given.rows[s]]] = s
             # An observation may touch two held rows of the table: the last one counts as
             # eliminated.
-            # A set without observations is an empty share.
+            # A set without observations is an empty subset.
             for slot in self.choose("slots", o, default=np.unique(slot_of).tolist() or [-1]):
                 rows = np.flatnonzero(slot_of == slot)
-                shares.append(ObservationSubset(o, rows, None if slot < 0 else slot))
-        return shares
+                subsets.append(ObservationSubset(o, rows, None if slot < 0 else slot))
+        return subsets
 
     # ------------------------------------------------------------------ groups
 
@@ -126,16 +126,16 @@ class Grouping:
                 self.group_of[name] = host, start, np.arange(table.rows)
         self.row_in, name = {}, self.eliminate
         if name is not None:
-            stays = present(self.coupled_rows)
+            coupled = present(self.coupled_rows)
             # Kept rows and eliminated ones are numbered separately.
             place = lambda mask: np.where(mask, np.cumsum(mask) - 1, -1)
-            if stays.any():
+            if coupled.any():
                 kept = f"{name} (kept)"
-                self.members[kept] = [(name, 0, np.flatnonzero(stays))]
-                self.group_of[name] = kept, 0, place(stays)
-            rows = np.flatnonzero(~stays) if stays.any() else None
+                self.members[kept] = [(name, 0, np.flatnonzero(coupled))]
+                self.group_of[name] = kept, 0, place(coupled)
+            rows = np.flatnonzero(~coupled) if coupled.any() else None
             self.members[name] = [(name, 0, rows)]
-            self.row_in = place(~stays)
+            self.row_in = place(~coupled)
         # In the order of JAX's pytrees.
         self.kept = sorted(g for g in self.members if g != name)
 
@@ -146,10 +146,10 @@ class Grouping:
         if self.tables[first].rows != self.tables[name].rows:
             return False
         met = False
-        for share in self.shares:
-            given = self.observations[share.set_name]
+        for subset in self.subsets:
+            given = self.observations[subset.set_name]
             of, rows = given.kind.of, given.rows
-            if share.slot is None:
+            if subset.slot is None:
                 continue
             a = [s for s, t in enumerate(of) if t == first]
             b = [s for s, t in enumerate(of) if t == name]
@@ -159,7 +159,7 @@ class Grouping:
                 return False
             if a:
                 met = True
-                if not np.array_equal(rows[a[0]][share.source], rows[b[0]][share.source]):
+                if not np.array_equal(rows[a[0]][subset.source], rows[b[0]][subset.source]):
                     return False
         return met
 
@@ -180,18 +180,18 @@ class Grouping:
         all_free = self.choose("all free", name, default=all_free)
         return UnknownGroup(tuple(members), as_column(free, ("group", name)), all_free)
 
-    def touched_groups(self, number: int, share: ObservationSubset) -> list[TouchedGroup]:
-        """The kept groups touched by share `number`, in order.
+    def touched_groups(self, number: int, subset: ObservationSubset) -> list[TouchedGroup]:
+        """The kept groups touched by subset `number`, in order.
 
         Slots of one group are one touch if they have the same row in every observation of the
-        share. This is decided for each share: tables that always meet where rows are eliminated
+        subset. This is decided for each subset: tables that always meet where rows are eliminated
         may cross elsewhere, as the velocity of one image and the pose of the next."""
-        given, found = self.observations[share.set_name], []
+        given, found = self.observations[subset.set_name], []
         for s, name in enumerate(given.kind.of):
-            if s == share.slot or name not in self.group_of:
+            if s == subset.slot or name not in self.group_of:
                 continue
             group, start, place = self.group_of[name]
-            row = place[given.rows[s][share.source]]
+            row = place[given.rows[s][subset.source]]
             same = (t for t, at in found if t.group == group and np.array_equal(at, row))
             tables = lambda t: [given.kind.of[q] for q, _ in t.slots]
             # Two slots of one table need columns of their own.

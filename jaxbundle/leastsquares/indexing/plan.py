@@ -17,6 +17,8 @@ and forms the reduced system.
   together, with one block W, regardless of the number of observations.
 - Two incidences of the same eliminated row are a **pair**: the product of their blocks is added to
   the block of the reduced matrix of the two groups' rows.
+- Two kept rows that observations of a part touch together are a **coupling**: their block is added
+  to the reduced matrix directly.
 """
 
 import equinox as eqx
@@ -24,6 +26,8 @@ from jaxtyping import Array, Float, Int
 
 from jaxbundle.leastsquares.indexing.reduction import Band
 
+# A small change of all groups, the eliminated rows among them.
+Tangent = dict[str, Float[Array, "rows width"]]
 Key = tuple[str, str]
 # Slots of a kind, and the first column of each in its group.
 Slots = tuple[tuple[int, int], ...]
@@ -68,9 +72,9 @@ class TouchedRows(eqx.Module):
     incidence: Int[Array, "chunks length"] | None
 
 
-class PairBlock(eqx.Module):
-    """Two touches of a part and the block of the reduced matrix where their rows meet: in every
-    chunk the block's number, and whether the first row stands in its row (0) or its column (1).
+class Coupling(eqx.Module):
+    """Two touches of a part and the block of the reduced matrix of their rows: in every chunk the
+    block's number, and whether the first row stands in its row (0) or its column (1).
     `same`: 1 if both are the same row, None if never."""
 
     first: int = eqx.field(static=True)
@@ -94,7 +98,7 @@ class ObservationPart(eqx.Module):
     source: Int[Array, "chunks length"]
     place: Int[Array, " observations"]
     touches: tuple[TouchedRows, ...]
-    couples: tuple[PairBlock, ...]
+    couplings: tuple[Coupling, ...]
 
 
 class Incidences(eqx.Module):

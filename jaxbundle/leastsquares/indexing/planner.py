@@ -1,7 +1,7 @@
 """Plans a problem on the host: see `plan.py`."""
 
 import dataclasses
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,10 +20,10 @@ from jaxbundle.leastsquares.indexing.layout import (
 )
 from jaxbundle.leastsquares.indexing.plan import (
     Blocks,
+    Coupling,
     Incidences,
     Key,
     ObservationPart,
-    PairBlock,
     Plan,
     TouchedRows,
 )
@@ -64,7 +64,7 @@ class _PartInChunks:
     along: Hashable
 
     def set(self, field: str, number: int, **changed: Any) -> None:
-        """Replaces an item in one of the touches or couples."""
+        """Replaces an item in one of the touches or couplings."""
         items = list(getattr(self.part, field))
         items[number] = dataclasses.replace(items[number], **changed)
         self.part = dataclasses.replace(self.part, **{field: tuple(items)})
@@ -82,7 +82,7 @@ class _IncidencesInChunks:
     length: int
 
 
-# By groups (later, earlier): for each entry the part, the index of the couple in it, and the rows
+# By groups (later, earlier): for each entry the part, the index of the coupling in it, and the rows
 # and columns of the blocks.
 DirectBlocks = dict[Key, list[tuple[int, int, np.ndarray, np.ndarray]]]
 
@@ -106,7 +106,7 @@ class _Planner:
         self.solvers = self.choose("solvers", default=tuple(solvers))
 
     def plan(self) -> Plan:
-        parts = [self.lay_out(k, share) for k, share in enumerate(self.grouping.shares)]
+        parts = [self.plan_part(k, subset) for k, subset in enumerate(self.grouping.subsets)]
         incidences = {g: self.incidences_of(g, parts) for g in self.grouping.kept}
         incidences = {g: found for g, found in incidences.items() if found is not None}
         groups = {
@@ -144,55 +144,46 @@ class _Planner:
         # Without a factor nothing reads the lists of pairs, which are the largest of all.
         return blocks if solver in FACTORS else self.find_blocks(parts, {}), solver, band
 
-    def lay_out(self, k: int, share: ObservationSubset) -> _PartInChunks:
-        """Part k in chunks, with its touches (couples and incidences are added later)."""
-        given = self.grouping.observations[share.set_name]
-        of = given.kind.of
-        rows = [np.asarray(r)[share.source] for r in given.rows]
-        slots = self.grouping.touched_groups(k, share)
-        # One number for every combination of kept rows that occurs; `unique` keeps it small.
-        major = np.zeros(len(share.source), np.int64)
+    def plan_part(self, k: int, subset: ObservationSubset) -> _PartInChunks:
+        """Part k in chunks, with its touches (couplings and incidences are added later)."""
+        given = self.grouping.observations[subset.set_name]
+        rows = [np.asarray(r)[subset.source] for r in given.rows]
+        slots = self.grouping.touched_groups(k, subset)
+        # Of every touch the row of its group, for every observation.
+        kept_rows = []
         for _, touched in slots:
             slot = touched[0][0]
-            row = self.grouping.group_of[of[slot]][2][rows[slot]]
+            kept_rows.append(self.grouping.group_of[given.kind.of[slot]][2][rows[slot]])
+        # One number for every combination of kept rows that occurs; `unique` keeps it small.
+        major = np.zeros(len(subset.source), np.int64)
+        for row in kept_rows:
             # Rows begin at −1, none: row + 1 is one of max + 2 numbers from 0 on.
             major = np.unique(major * (row.max(initial=0) + 2) + row + 1, return_inverse=True)[1]
-        minor = rows[share.slot] if share.slot is not None else np.arange(len(major))
+        minor = rows[subset.slot] if subset.slot is not None else np.arange(len(major))
         along = ("part", k)
         length = self.choose("length", along, default=chunk_length(major, self.settings))
         large = self.choose("large", k, default=len(major) >= self.settings.small_part)
         order, used = lay_out(major, minor, length)
         chunk = lambda x: x[order].reshape(-1, length)
-        lookup, by_row, first = [], [], np.zeros(major.max(initial=0) + 1, np.int64)
-        first[major] = np.arange(len(major))  # An observation of every major.
-        for s, name in enumerate(of):
-            at = chunk(rows[s])
-            # A slot whose row is the same in a chunk is looked up once for it, the others for each
-            # observation.
-            one = length == 1 or bool((rows[s] == rows[s][first[major]]).all())
-            # The eliminated row is looked up for each observation in any case.
-            one = self.choose("by chunk", k, s, default=one and s != share.slot)
-            by_row.append(not one)
-            lookup.append(as_index(at[:, 0] if one else at, along, ("table", name)))
+        lookup, by_row = self._plan_lookups(k, subset, rows, major, chunk)
         touches = []
-        for group, touched in slots:
-            slot = touched[0][0]
-            row = chunk(self.grouping.group_of[of[slot]][2][rows[slot]])[:, 0]
-            stop = max(start + self.grouping.tables[of[s]].space.width for s, start in touched)
+        for (group, touched), row in zip(slots, kept_rows):
+            width = lambda slot: self.grouping.tables[given.kind.of[slot]].space.width
+            stop = max(start + width(slot) for slot, start in touched)
             start = min(start for _, start in touched)
-            index = as_index(row, along, ("group", group))
+            index = as_index(chunk(row)[:, 0], along, ("group", group))
             touches.append(TouchedRows(group, tuple(touched), start, stop, index, None))
-        source = np.where(used, share.source[order], -1).reshape(-1, length)
+        source = np.where(used, subset.source[order], -1).reshape(-1, length)
         place = np.full(given.number, -1)
-        place[share.source[order][used]] = np.flatnonzero(used)
+        place[subset.source[order][used]] = np.flatnonzero(used)
         eliminated = None
-        if share.slot is not None:
-            at = self.grouping.row_in[chunk(rows[share.slot])]
+        if subset.slot is not None:
+            at = self.grouping.row_in[chunk(rows[subset.slot])]
             eliminated = as_index(at, along, ("group", self.grouping.eliminate))
-        number = ("observations", share.set_name)
+        number = ("observations", subset.set_name)
         made = ObservationPart(
-            set_name=share.set_name,
-            slot=share.slot,
+            set_name=subset.set_name,
+            slot=subset.slot,
             by_row=tuple(by_row),
             large=large,
             lookup=tuple(lookup),
@@ -200,9 +191,34 @@ class _Planner:
             source=as_index(source, along, number),
             place=as_index(place, number, along, length),
             touches=tuple(touches),
-            couples=(),
+            couplings=(),
         )
         return _PartInChunks(made, used, length, along)
+
+    def _plan_lookups(
+        self,
+        k: int,
+        subset: ObservationSubset,
+        rows: Sequence[np.ndarray],
+        major: Int[np.ndarray, " subset"],
+        chunk: Callable[[np.ndarray], np.ndarray],
+    ) -> tuple[list, list[bool]]:
+        """Of every slot of part k the rows of its table, one for a chunk or one for each
+        observation; and which of both."""
+        of = self.grouping.observations[subset.set_name].kind.of
+        along, lookup, by_row = ("part", k), [], []
+        first = np.zeros(major.max(initial=0) + 1, np.int64)
+        first[major] = np.arange(len(major))  # An observation of every major.
+        for s, name in enumerate(of):
+            at = chunk(rows[s])
+            # A slot whose row is the same in a chunk is looked up once for it, the others for each
+            # observation.
+            same = at.shape[1] == 1 or bool((rows[s] == rows[s][first[major]]).all())
+            # The eliminated row is looked up for each observation in any case.
+            once = self.choose("by chunk", k, s, default=same and s != subset.slot)
+            by_row.append(not once)
+            lookup.append(as_index(at[:, 0] if once else at, along, ("table", name)))
+        return lookup, by_row
 
     def incidences_of(self, group: str, parts: list[_PartInChunks]) -> _IncidencesInChunks | None:
         """The incidences of a group; sets the incidence of the observations of the parts."""
@@ -215,7 +231,6 @@ class _Planner:
         ]
         if not at:
             return None
-        number = len(self.grouping.row_in)
         eliminated, row, used = [], [], []
         for k, t in at:
             p = parts[k]
@@ -225,28 +240,23 @@ class _Planner:
         eliminated, row, used = (np.concatenate(x) for x in (eliminated, row, used))
         # An incidence is a combination of both rows; several observations may share it (an image
         # point and a distance to the same camera).
+        number = len(self.grouping.row_in)
         keys = row[used].astype(np.int64) * number + eliminated[used]
-        keys, of = np.unique(keys, return_inverse=True)
-        # Observations that are incidences themselves, the usual case: W needs no sum by incidence.
-        apart = len(at) == 1 and len(keys) == used.sum()
-        if self.choose("incidences apart", group, default=apart):
+        keys, incidence = np.unique(keys, return_inverse=True)
+        # The usual case: every observation is an incidence of its own, and W needs no sum.
+        one_each = len(at) == 1 and len(keys) == used.sum()
+        if self.choose("one incidence an observation", group, default=one_each):
             p = parts[at[0][0]]
             along, length = p.along, p.length
         else:
-            r, q = keys // number, keys % number
+            row, eliminated = keys // number, keys % number
             along = ("incidences", group)
-            length = self.choose("length", along, default=chunk_length(r, self.settings))
-            order, filled = lay_out(r, q, length)
+            length = self.choose("length", along, default=chunk_length(row, self.settings))
+            order, filled = lay_out(row, eliminated, length)
             place = np.empty(len(keys), np.int64)
             place[order[filled]] = np.flatnonzero(filled)
-            whole = np.full(len(used), -1)
-            whole[used] = place[of]
-            cuts = np.cumsum([len(parts[k].used) for k, _ in at])[:-1]
-            for (k, t), where in zip(at, np.split(whole, cuts)):
-                p = parts[k]
-                index = as_index(where.reshape(-1, p.length), p.along, along, length)
-                p.set("touches", t, incidence=index)
-            eliminated, row, used = q[order], r[order], filled
+            self._set_incidences(parts, at, used, place[incidence], along, length)
+            eliminated, row, used = eliminated[order], row[order], filled
         plan = Incidences(
             as_index(eliminated.reshape(-1, length), along, ("group", self.grouping.eliminate)),
             as_index(row[::length], along, ("group", group)),
@@ -255,6 +265,25 @@ class _Planner:
         eliminated, row = eliminated[places], row[places]
         return _IncidencesInChunks(plan, places, eliminated, row, along, length)
 
+    @staticmethod
+    def _set_incidences(
+        parts: list[_PartInChunks],
+        touches: Sequence[tuple[int, int]],
+        used: Bool[np.ndarray, " places"],
+        place: Int[np.ndarray, " used"],
+        along: Hashable,
+        length: int,
+    ) -> None:
+        """Sets the place of the incidence of every used observation of these touches (part, number
+        of its touch), one after the other."""
+        of_all = np.full(len(used), -1)
+        of_all[used] = place
+        cuts = np.cumsum([len(parts[k].used) for k, _ in touches])[:-1]
+        for (k, t), of_part in zip(touches, np.split(of_all, cuts)):
+            p = parts[k]
+            index = as_index(of_part.reshape(-1, p.length), p.along, along, length)
+            p.set("touches", t, incidence=index)
+
     def find_blocks(
         self, parts: list[_PartInChunks], incidences: dict[str, _IncidencesInChunks]
     ) -> dict[Key, Blocks]:
@@ -262,7 +291,7 @@ class _Planner:
         observations that touch two kept rows."""
         direct: DirectBlocks = {}
         for k, p in enumerate(parts):
-            self._couples(k, p, direct)
+            self._couplings(k, p, direct)
         blocks = {}
         # Blocks below the diagonal of the reduced matrix, groups in the order of JAX's pytrees.
         for place, later in enumerate(self.grouping.kept):
@@ -274,10 +303,10 @@ class _Planner:
                     blocks[key] = made
         return blocks
 
-    def _couples(self, k: int, p: _PartInChunks, direct: DirectBlocks) -> None:
+    def _couplings(self, k: int, p: _PartInChunks, direct: DirectBlocks) -> None:
         """Adds the pairs of touches of part k, and their rows and columns to `direct`."""
         touches = p.part.touches
-        couples = []
+        couplings = []
         for j in range(len(touches)):
             for i in range(j):
                 a, b = touches[j], touches[i]  # the later group first
@@ -292,9 +321,9 @@ class _Planner:
                     turned = as_column(less.astype(float), p.along)
                     none |= equal
                 row = np.where(none, -1, row)
-                direct.setdefault((a.group, b.group), []).append((k, len(couples), row, column))
-                couples.append(PairBlock(j, i, None, turned, same))
-        p.part = dataclasses.replace(p.part, couples=tuple(couples))
+                direct.setdefault((a.group, b.group), []).append((k, len(couplings), row, column))
+                couplings.append(Coupling(j, i, None, turned, same))
+        p.part = dataclasses.replace(p.part, couplings=tuple(couplings))
 
     def _pairs(
         self, later: _IncidencesInChunks | None, earlier: _IncidencesInChunks | None, within: bool
@@ -305,10 +334,10 @@ class _Planner:
             return _PairList(empty, empty, empty, empty, ())
         i, j = pairs_between(later.eliminated, earlier.eliminated)
         # Touched rows may be held, or eliminated themselves: no block.
-        there = (later.row[i] >= 0) & (earlier.row[j] >= 0)
+        has_block = (later.row[i] >= 0) & (earlier.row[j] >= 0)
         if within:  # below the diagonal; an incidence paired with itself is summed by chunks
-            there &= later.row[i] > earlier.row[j]
-        i, j = i[there], j[there]
+            has_block &= later.row[i] > earlier.row[j]
+        i, j = i[has_block], j[has_block]
         into = (later.along, later.length), (earlier.along, earlier.length)
         return _PairList(later.place[i], earlier.place[j], later.row[i], earlier.row[j], into)
 
@@ -326,9 +355,9 @@ class _Planner:
         if not len(keys):
             return None
         along = ("blocks", *key)
-        for k, couple, r, c in direct:
+        for k, coupling, r, c in direct:
             block = np.where(r >= 0, np.searchsorted(keys, number(r, c)), -1)
-            parts[k].set("couples", couple, block=as_index(block, parts[k].along, along))
+            parts[k].set("couplings", coupling, block=as_index(block, parts[k].along, along))
         found = None
         lengths = self.choose(
             "pair chunks", *key, default=pair_chunk_lengths(len(i), self.settings)

@@ -68,7 +68,7 @@ def find_band(
     w: int,
     settings: PlanningSettings = PLANNING,
 ) -> Band:
-    """A narrow band of the blocks (row, column) of a group of so many rows of `w` unknowns."""
+    """A narrow band of the blocks (row, column) of a group of `rows` rows of `w` unknowns each."""
     from scipy import sparse  # imported here: a tenth of a second
     from scipy.sparse.csgraph import reverse_cuthill_mckee
 

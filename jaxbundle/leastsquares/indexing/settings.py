@@ -53,7 +53,7 @@ class PlanningSettings:
     # chunks do.
     small_part: int = 2000
     # Compiling takes seconds; the mask of 22 106 points costs nothing that can be measured (BAL 16:
-    # 100 ms an evaluation with and without, alternating). Not critical.
+    # 100 ms an evaluation with and without, alternating).
     masked_below: int = 100_000
     # Rounding pads by up to an eighth: less than the compilation that it saves a small problem; of
     # a large one an eighth of every iteration.
@@ -67,7 +67,7 @@ class PlanningSettings:
     max_factor_elements: float = 2e9 / 8
     max_pairs: float = 3e8
     # Some tens of steps reach a hundredth of the right-hand side. Half or double of either moves
-    # the change from one way to the other, where their times differ little: not critical.
+    # the change from one way to the other, where their times differ little.
     conjugate_gradient_steps: int = 40
     conjugate_gradient_work: float = 600.0
     # With fewer unknowns the overhead of the loop over super-blocks dominates.

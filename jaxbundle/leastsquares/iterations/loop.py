@@ -21,9 +21,9 @@ from jaxbundle.leastsquares.iterations.search import (
 from jaxbundle.leastsquares.iterations.stopping import (
     LIMIT,
     STOPPING,
-    Approach,
     StoppingSettings,
     Tolerance,
+    UndampedStepState,
 )
 
 
@@ -39,7 +39,7 @@ class Loop(eqx.Module):
     predicted: Float[Array, ""]
     step_size: Float[Array, ""]
     region: RegionState
-    approach: Approach
+    undamped_state: UndampedStepState
     termination: Int[Array, ""]
     steps: Int[Array, ""]
 
@@ -77,7 +77,7 @@ def iterate(
             (loop.trial, trial_equations, trial_cost),
             (loop.at, loop.equations, loop.cost),
         )
-        step_size, approach = loop.approach.choose_step(
+        step_size, undamped_state = loop.undamped_state.choose_step(
             region.radius, loop.step_size, first, accept, loop.predicted, ratio, cost
         )
         damping = 1 / step_size
@@ -86,7 +86,7 @@ def iterate(
         finite = jnp.isfinite(decrement)
         change = jax.tree.map(lambda x: jnp.where(finite, x, 0.0), change)
         costs = loop.cost, cost, trial_cost
-        termination, approach = approach.judge(
+        termination, undamped_state = undamped_state.judge(
             tolerance(equations), step_size, finite, decrement, first, accept, *costs
         )
         return Loop(
@@ -97,7 +97,7 @@ def iterate(
             predicted=jnp.where(finite, 0.5 * (decrement + damping * damped), 0.0),
             step_size=step_size,
             region=region,
-            approach=approach,
+            undamped_state=undamped_state,
             termination=termination,
             steps=loop.steps + 1,
         )
@@ -119,7 +119,7 @@ def _begin(linearise: Callable, start: PyTree, stopping: StoppingSettings) -> Lo
         predicted=zero,
         step_size=jnp.full_like(zero, jnp.inf),
         region=RegionState.begin(TRUST_REGION),
-        approach=Approach.begin(stopping),
+        undamped_state=UndampedStepState.begin(stopping),
         termination=jnp.asarray(LIMIT),
         steps=jnp.asarray(0),
     )

@@ -3,8 +3,8 @@
 import jax
 import jax.numpy as jnp
 
-from jaxbundle.leastsquares.equations.normal import AnyTangent, Rows, Tangent
-from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.equations.normal import AnyTangent, Rows
+from jaxbundle.leastsquares.indexing.plan import Plan, Tangent
 from jaxbundle.leastsquares.indexing.rows import Declared, Values
 from jaxbundle.leastsquares.spaces import Frame
 
@@ -35,7 +35,7 @@ def changes_of_tables(plan: Plan, values: Values, change: AnyTangent) -> dict[st
 
 def representatives(declared: Declared, values: Values, start: Values) -> Values:
     """The tables with what does not change them (a plane moved in itself) as near to `start` as
-    possible: a function of the figures and `start` alone, not of the way of the iterations."""
+    possible: a function of the figures and `start` alone, not of the path of the iterations."""
     frames = {n: space for n, space in declared.named_spaces if isinstance(space, Frame)}
     nearest = {n: jax.vmap(s.representative)(values[n], start[n]) for n, s in frames.items()}
     return values | nearest

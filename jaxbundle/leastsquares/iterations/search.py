@@ -28,15 +28,16 @@ from jaxbundle.leastsquares.equations.elimination import (
     factorise,
     solve,
 )
-from jaxbundle.leastsquares.equations.normal import Normal, Tangent, dot
+from jaxbundle.leastsquares.equations.normal import Normal, dot
+from jaxbundle.leastsquares.indexing.plan import Tangent
 
 # `optimistix.FunctionInfo.Eval` of the point tried, which is no class to a type checker.
 Evaluation = Any
 
 
 class Info(optx.FunctionInfo.EvalGradHessian):
-    """Quantities at an accepted point: ½vᵀPv, its gradient and N; `damping`: λ of the step under
-    test; `noise`: rounding error of a change of ½vᵀPv."""
+    """Quantities at an accepted point: ½vᵀPv, its gradient and N; `damping`: λ of the step from
+    there that is tried; `noise`: rounding error of a change of ½vᵀPv."""
 
     hessian: Normal
     damping: Float[Array, ""]
@@ -46,16 +47,16 @@ class Info(optx.FunctionInfo.EvalGradHessian):
 class Elimination(lx.AbstractLinearSolver):
     """Solves with N by elimination, for any descent that takes a linear solver.
 
-    `regular`: with regularised datum directions; `tolerance`: relative residual of a reduced system
-    solved iteratively."""
+    `pin_datum`: with unknowns of open datum directions pinned (`elimination.reduced_system`);
+    `tolerance`: relative residual of a reduced system solved iteratively."""
 
-    regular: bool | Bool[Array, ""] = True
+    pin_datum: bool | Bool[Array, ""] = True
     tolerance: float = eqx.field(static=True, default=FULL_PRECISION)
 
     def init(self, operator: Normal, options: dict[str, Any]) -> NormalFactor:
         if not isinstance(operator, Normal):
             raise ValueError("Elimination solves with the normal equations of a plan only")
-        return factorise(operator, self.regular, self.tolerance)
+        return factorise(operator, self.pin_datum, self.tolerance)
 
     def compute(
         self, state: NormalFactor, vector: Tangent, options: dict[str, Any]
@@ -183,9 +184,8 @@ class NielsenTrustRegion(optx.AbstractSearch):
         state: RegionState,
     ) -> tuple[Float[Array, ""], Bool[Array, ""], Any, RegionState]:
         change = jax.tree.map(jnp.subtract, y_eval, y)
-        predicted = predicted_decrease(f_info, change)
-        decrease = f_info.as_min() - f_eval_info.as_min()
-        accept, state = state.after(first_step, gain_ratio(predicted, decrease, f_info.noise))
+        _, ratio = compare_with_prediction(f_info, change, f_eval_info.as_min())
+        accept, state = state.after(first_step, ratio)
         return state.radius, accept, optx.RESULTS.successful, state
 
 
@@ -210,6 +210,15 @@ class FullStep(optx.AbstractSearch):
 SEARCHES: dict[str, NielsenTrustRegion | FullStep] = dict(
     zip(METHODS, (NielsenTrustRegion(), FullStep()), strict=True)
 )
+
+
+def compare_with_prediction(
+    info: Info, change: Tangent, trial_cost: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """The predicted decrease of ½vᵀPv, and the gain ratio, of a step from an accepted point to one
+    with ½vᵀPv = `trial_cost`."""
+    predicted = predicted_decrease(info, change)
+    return predicted, gain_ratio(predicted, info.as_min() - trial_cost, info.noise)
 
 
 def predicted_decrease(info: Info, change: Tangent) -> Float[Array, ""]:

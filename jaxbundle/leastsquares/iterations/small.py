@@ -120,7 +120,7 @@ def finish(
     N = jnp.where(determined, N, jnp.eye(unknowns, dtype=N.dtype))
     step = jnp.where(determined, -_solve(N, g), 0)
     square = lambda x, data: jnp.sum(residuals(x, *data) ** 2)
-    # at the minimum, rounding may let vᵀv rise; far from it, an undamped step may be wrong
+    # At the minimum, rounding may let vᵀv rise; far from it, an undamped step may be wrong.
     rounding = 1e-22 * jnp.sum(diagonal)
     good = square(retract(x, step), held) <= 1.001 * square(x, held) + rounding
     x = retract(x, jnp.where(good, step, 0))

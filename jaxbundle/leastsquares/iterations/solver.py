@@ -21,13 +21,12 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from jaxbundle.leastsquares.equations.normal import (
     Normal,
     NormalBlocks,
-    Tangent,
     dot,
     normal_equations,
     total,
     zero_tangent,
 )
-from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.indexing.plan import Plan, Tangent
 from jaxbundle.leastsquares.indexing.rows import (
     ChunkedData,
     Data,
@@ -41,17 +40,16 @@ from jaxbundle.leastsquares.iterations.search import (
     Info,
     MarquardtDescent,
     NielsenTrustRegion,
-    gain_ratio,
-    predicted_decrease,
+    compare_with_prediction,
 )
 from jaxbundle.leastsquares.iterations.stopping import (
     LIMIT,
     NOT_FINITE,
     SETTLED,
     STOPPING,
-    Approach,
     StoppingSettings,
     Tolerance,
+    UndampedStepState,
 )
 from jaxbundle.system.programs import compile_once
 
@@ -78,7 +76,8 @@ class History(eqx.Module):
 
 
 class Linearisation(eqx.Module):
-    """Quantities at an accepted point: ½vᵀPv, its gradient, N. `damping`: λ of the next step."""
+    """Quantities at an accepted point: ½vᵀPv, its gradient, N. `damping`: λ of the step from there
+    that is tried."""
 
     cost: Float[Array, ""]
     gradient: Tangent
@@ -96,7 +95,7 @@ class SolverState(eqx.Module):
     step_size: Float[Array, ""]
     descent: Any
     search: Any
-    approach: Approach
+    undamped_state: UndampedStepState
     termination: Int[Array, ""]
     steps: Int[Array, ""]
     history: History
@@ -106,9 +105,10 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
     """The solver of a planned problem; see the module.
 
     **Arguments:** `descent` and `search`: ours or optimistix's (those without memory of earlier
-    points); `retract(plan, values, change)`: applies a change; `max_steps`: maximum evaluations,
-    and `rows` of the history, which are compiled in; `progress(step, cost, λ)` is called on the
-    host after every evaluation; `stopping`: when the damping is dropped.
+    points); `retract(plan, values, change)`: applies a change; `max_steps`: maximum number of
+    evaluations; `rows`: of the history, a size of the compiled program (further evaluations are not
+    recorded); `progress(step, cost, λ)` is called on the host after every evaluation; `stopping`:
+    when the damping is dropped.
     """
 
     declared: Declared
@@ -148,7 +148,7 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
             step_size=jnp.asarray(jnp.inf),
             descent=self.descent.init(zero, info),
             search=self.search.init(zero, info),
-            approach=Approach.begin(self.stopping),
+            undamped_state=UndampedStepState.begin(self.stopping),
             termination=jnp.asarray(LIMIT),
             steps=jnp.asarray(0),
             history=History(nothing, nothing, jnp.zeros(rows, bool)),
@@ -170,22 +170,22 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
         step_size, accept, _, search = self.search.step(
             state.first, zero, state.change, before, trial, state.search
         )
-        predicted = predicted_decrease(before, state.change)
-        ratio = gain_ratio(predicted, before.f - trial.f, before.noise)
+        # Here as well as in our search: those of optimistix do not return them.
+        predicted, ratio = compare_with_prediction(before, state.change, trial.f)
         # N is formed again at accepted points only: a rejected step costs residuals and a solution.
         y, known = jax.lax.cond(
             accept,
             lambda: (state.trial, self._linearise(state.trial, args)),
             lambda: (y, state.known),
         )
-        step_size, approach = state.approach.choose_step(
+        step_size, undamped_state = state.undamped_state.choose_step(
             step_size, state.step_size, state.first, accept, predicted, ratio, known.cost
         )
         change, finite = self._next_change(known, step_size, state.descent)
         # d² = −gᵀδ; for an undamped step δᵀNδ.
         costs = before.f, known.cost, trial.f
         decrement = -dot(self.plan, known.gradient, change)
-        termination, approach = approach.judge(
+        termination, undamped_state = undamped_state.judge(
             self.tolerance, step_size, finite, decrement, state.first, accept, *costs
         )
         following = self.retract(self.plan, y, change)
@@ -203,7 +203,7 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
                 step_size=step_size,
                 descent=state.descent,
                 search=search,
-                approach=approach,
+                undamped_state=undamped_state,
                 termination=termination,
                 steps=state.steps + 1,
                 history=state.history.with_row(state.steps, trial.f, 1 / state.step_size, accept),
@@ -300,8 +300,8 @@ def minimise(solver: LeastSquares, data: Data, start: Values) -> Minimum[Values]
     return Minimum(values, stats["termination"], stats["iterations"], stats["history"])
 
 
-# `minimise`, compiled once for all callers.
-find = compile_once(minimise)
+# Compiled once for all callers.
+minimise_compiled = compile_once(minimise)
 
 
 def half_square(plan: Plan, residual: Iterable[Float[Array, "..."]]) -> Float[Array, ""]:

@@ -41,14 +41,15 @@ class StoppingSettings:
       before.
     - `narrowing`: a rejected undamped step was tried too early: `near_solution` of this problem is
       multiplied by this.
-    - `max_rejected_undamped`: after so many rejected undamped steps at points where the damped
+    - `max_rejected_undamped`: after this many rejected undamped steps at points where the damped
       steps have settled, the problem is (nearly) singular.
     - `shortest_step`: step sizes 1/λ below this are not tried; the problem is stuck.
     """
 
     # Measured (`benchmarks/constants.py`) on BAL 16 and BAL 49: 9 and 189 or 190 evaluations, and
     # the same vᵀPv to 3e-14, with 0.01 to 1 for the first, 0.9 to 0.975 for the second, and 0.25 to
-    # 1 for the third. They matter far from a minimum (`Approach.choose_step`), not near it.
+    # 1 for the third. They matter far from a minimum (`UndampedStepState.choose_step`), not near
+    # it.
     near_solution: float = 0.1
     quadratic_gain: float = 0.95
     quadratic_decrease: float = 0.5
@@ -112,16 +113,16 @@ class Tolerance(eqx.Module):
         return self.cost_rounding * jnp.sqrt(self.squares * 2 * cost)
 
 
-class Approach(eqx.Module):
-    """State near convergence.
+class UndampedStepState(eqx.Module):
+    """What decides whether the next step is undamped, and whether the equations are singular.
 
-    `near`: the largest relative decrease that counts as near the solution; `predicted`: the
+    `near_limit`: the largest relative decrease that counts as near the solution; `predicted`: the
     decrease predicted for the last accepted step; `singular`: the undamped equations could not be
     solved; `repeat_undamped`: a settled damped step is to be repeated without damping; `repeated`:
     the last one was; `rejected`: how many of those were rejected.
     """
 
-    near: Float[Array, ""]
+    near_limit: Float[Array, ""]
     predicted: Float[Array, ""]
     singular: Bool[Array, ""]
     repeat_undamped: Bool[Array, ""]
@@ -130,10 +131,10 @@ class Approach(eqx.Module):
     settings: StoppingSettings = eqx.field(static=True, default=STOPPING)
 
     @classmethod
-    def begin(cls, settings: StoppingSettings) -> "Approach":
+    def begin(cls, settings: StoppingSettings) -> "UndampedStepState":
         """Before the first step."""
-        no, near = jnp.asarray(False), jnp.asarray(settings.near_solution)
-        return cls(near, jnp.asarray(0.0), no, no, no, jnp.asarray(0), settings)
+        no, near_limit = jnp.asarray(False), jnp.asarray(settings.near_solution)
+        return cls(near_limit, jnp.asarray(0.0), no, no, no, jnp.asarray(0), settings)
 
     def choose_step(
         self,
@@ -144,34 +145,35 @@ class Approach(eqx.Module):
         predicted: Float[Array, ""],
         gain_ratio: Float[Array, ""],
         cost: Float[Array, ""],
-    ) -> tuple[Float[Array, ""], "Approach"]:
-        """The step size, infinite for an undamped step; and the approach after it."""
+    ) -> tuple[Float[Array, ""], "UndampedStepState"]:
+        """The step size, infinite for an undamped step; and the next state."""
         # Undamped steps are the faster ones where the problem is nearly quadratic, and wasted
         # elsewhere. The rule, with ρ the gain ratio of the last step and q its predicted decrease:
         #
-        #     try undamped  if  ρ > 0.95, q < near·½vᵀPv and q < 0.5·(q of the step before)
-        #     if rejected   near ← 0.1·near
+        #     try undamped  if  ρ > 0.95, q < near_limit·½vᵀPv and q < 0.5·(q of the step before)
+        #     if rejected   near_limit ← 0.1·near_limit
         #
         # Alternatives on BAL 49: with an undamped step after every good one, every second
-        # evaluation was wasted; with the tenfold narrowing after a rejection as well, 5 of 60; with
-        # the condition on q as well (measured with 0.1 instead of 0.5) none, and a street of 200
-        # images converges after 31 evaluations instead of 36.
+        # evaluation was wasted; with the tenfold narrowing after a rejection as well, 5 of the
+        # first 60; with the condition on q as well (measured with 0.1 instead of 0.5) none, and a
+        # street of 200 images converges after 31 evaluations instead of 36.
         rules = self.settings
         # A rejected undamped step was tried too early.
-        near = jnp.where(jnp.isinf(last_size) & ~accept, rules.narrowing * self.near, self.near)
+        rejected = jnp.isinf(last_size) & ~accept
+        near_limit = jnp.where(rejected, rules.narrowing * self.near_limit, self.near_limit)
         quadratic = accept & (gain_ratio > rules.quadratic_gain) & ~self.singular & ~first
         decrease = rules.quadratic_decrease
-        quadratic &= (predicted < near * cost) & (predicted < decrease * self.predicted)
-        approach = dataclasses.replace(
+        quadratic &= (predicted < near_limit * cost) & (predicted < decrease * self.predicted)
+        state = dataclasses.replace(
             self,
-            near=near,
+            near_limit=near_limit,
             predicted=jnp.where(accept, predicted, self.predicted),
             repeated=self.repeat_undamped,
             # Only steps after a damped one that settled count: one tried too early says nothing
             # about the equations, and problems far from the minimum have many of them.
             rejected=self.rejected + (self.repeated & ~accept),
         )
-        return jnp.where(quadratic | self.repeat_undamped, jnp.inf, step_size), approach
+        return jnp.where(quadratic | self.repeat_undamped, jnp.inf, step_size), state
 
     def judge(
         self,
@@ -184,8 +186,8 @@ class Approach(eqx.Module):
         before: Float[Array, ""],
         cost: Float[Array, ""],
         trial_cost: Float[Array, ""],
-    ) -> tuple[Int[Array, ""], "Approach"]:
-        """The termination code after a step was computed, and the approach.
+    ) -> tuple[Int[Array, ""], "UndampedStepState"]:
+        """The termination code after a step was computed, and the next state.
 
         `cost`: at the accepted point; `before`: at the one before; `trial_cost`: at the one tried.
         """
@@ -200,8 +202,8 @@ class Approach(eqx.Module):
         failed = undamped & ~finite & (self.singular | self.repeated)
         # Equations that can only just be factorised send undamped steps anywhere: each is rejected
         # although the damped ones have settled. Twice, since once may be an accident of rounding.
-        sent_away = self.rejected >= rules.max_rejected_undamped
-        singular = self.singular | (undamped & ~finite) | sent_away
+        undamped_rejected_too_often = self.rejected >= rules.max_rejected_undamped
+        singular = self.singular | (undamped & ~finite) | undamped_rejected_too_often
         # `first`: the start values were evaluated, no step was taken.
         stalled = accept & ~first & (before - trial_cost < tolerance.rtol * before)
         # Gauss–Newton accepts every step: a sum of squares that grows has not stalled, it diverges.
@@ -210,7 +212,7 @@ class Approach(eqx.Module):
             (~jnp.isfinite(cost), NOT_FINITE),
             (settled, SETTLED),
             (stalled & ~singular, RELATIVE_COST),
-            ((small & sent_away) | (stalled & singular), SINGULAR),
+            ((small & undamped_rejected_too_often) | (stalled & singular), SINGULAR),
             (failed, SINGULAR),
             ((step_size < rules.shortest_step) & ~small, STUCK),
         )
@@ -219,5 +221,5 @@ class Approach(eqx.Module):
         for happened, reason in reversed(reasons):
             termination = jnp.where(happened, reason, termination)
         # A small damped step says nothing: λ may have made it small.
-        repeat = small & ~sent_away & ~settled
+        repeat = small & ~undamped_rejected_too_often & ~settled
         return termination, dataclasses.replace(self, singular=singular, repeat_undamped=repeat)

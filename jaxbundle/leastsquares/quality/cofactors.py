@@ -27,9 +27,8 @@ from jaxbundle.leastsquares.equations.elimination import (
     solve,
     sum_over_pairs,
 )
-from jaxbundle.leastsquares.equations.normal import Tangent
 from jaxbundle.leastsquares.equations.reduced import Reduced
-from jaxbundle.leastsquares.indexing.plan import IncidencePairs, Plan
+from jaxbundle.leastsquares.indexing.plan import IncidencePairs, Plan, Tangent
 from jaxbundle.leastsquares.indexing.rows import Declared, Values
 from jaxbundle.types import present
 
@@ -37,13 +36,14 @@ from jaxbundle.types import present
 class Cofactors(eqx.Module):
     """Blocks of Q = N⁻¹.
 
-    `own`: of every row of every group, in the datum of the problem. The others are for residuals,
-    in the regularised datum of the factor (use them for estimable quantities only): `kept`, the
-    blocks of the reduced system; `eliminated`; `coupled`, every eliminated row with the kept row of
-    its incidences; `lower_inverse`, L⁻¹ of the eliminated rows. Held unknowns have zeros.
+    `diagonal_blocks`: of every row of every group, in the datum of the problem. The others are for
+    residuals, in the regularised datum of the factor (use them for estimable quantities only):
+    `kept`, the blocks of the reduced system; `eliminated`; `coupled`, every eliminated row with the
+    kept row of its incidences; `lower_inverse`, L⁻¹ of the eliminated rows. Held unknowns have
+    zeros.
     """
 
-    own: dict[str, Float[Array, "rows w w"]]
+    diagonal_blocks: dict[str, Float[Array, "rows w w"]]
     kept: Reduced
     eliminated: Float[Array, "rows w w"] | None
     coupled: dict[str, Float[Array, "chunks length w v"]]
@@ -60,9 +60,9 @@ def cofactors(
     Q = factor.inverse()
     # Held unknowns had ones in S.
     mask = lambda B, g: B * plan.groups[g].free[:, :, None] * plan.groups[g].free[:, None, :]
-    Q = Reduced({g: mask(B, g) for g, B in Q.own.items()}, Q.off)
+    Q = Reduced({g: mask(B, g) for g, B in Q.diagonal_blocks.items()}, Q.off_diagonal_blocks)
     eliminated, coupled = None, {}
-    own = dict(Q.own)
+    diagonal = dict(Q.diagonal_blocks)
     if plan.eliminated is not None:
         K, L = _couplings(factor, Q), present(factor.lower_inverse)
         # L⁻ᵀ·(1 + K·Zᵀ)·L⁻¹: V⁻¹, and what the uncertainty of the kept rows adds.
@@ -75,15 +75,18 @@ def cofactors(
         free = plan.groups[plan.eliminated].free
         eliminated = jnp.einsum("nji,njk,nkl->nil", L, inner, L)
         eliminated = eliminated * free[:, :, None] * free[:, None, :]
-        own[plan.eliminated] = eliminated
-    own = _in_datum(declared, values, factor, own, moves)
-    return Cofactors(own, Q, eliminated, coupled, factor.lower_inverse)
+        diagonal[plan.eliminated] = eliminated
+    diagonal = _in_datum(declared, values, factor, diagonal, moves)
+    return Cofactors(diagonal, Q, eliminated, coupled, factor.lower_inverse)
 
 
 def _couplings(factor: NormalFactor, Q: Reduced) -> Incident:
     """K of every incidence."""
     plan, Z = factor.plan, factor.Z
-    K = {g: jnp.einsum("clij,cjk->clik", z, Q.own[g][plan.incidences[g].row]) for g, z in Z.items()}
+    K = {
+        g: jnp.einsum("clij,cjk->clik", z, Q.diagonal_blocks[g][plan.incidences[g].row])
+        for g, z in Z.items()
+    }
     flat = {g: k.reshape(-1, *k.shape[2:]) for g, k in K.items()}
     rows = {g: z.reshape(-1, *z.shape[2:]) for g, z in Z.items()}
     for (later, earlier), at in plan.blocks.items():
@@ -93,7 +96,7 @@ def _couplings(factor: NormalFactor, Q: Reduced) -> Incident:
             at.pairs,
             rows[later],
             rows[earlier],
-            Q.off[later, earlier],
+            Q.off_diagonal_blocks[later, earlier],
             flat[later],
             flat[earlier],
             later == earlier,
@@ -133,12 +136,16 @@ def _spread(
 
 
 def _in_datum(
-    declared: Declared, values: Values, factor: NormalFactor, own: Tangent, moves: Tangent | None
+    declared: Declared,
+    values: Values,
+    factor: NormalFactor,
+    diagonal: Tangent,
+    moves: Tangent | None,
 ) -> Tangent:
     """The diagonal blocks in the datum of the problem: S·Q·Sᵀ."""
     plan = factor.plan
     if plan.datum is None:
-        return own
+        return diagonal
     # S·Q·Sᵀ = Q − G·(M·BᵀQ) − (Q·B·Mᵀ)·Gᵀ + G·M·BᵀQB·Mᵀ·Gᵀ, M = (BᵀG)⁻¹: d solutions with the
     # factor instead of the whole Q.
     G, B = datum_directions(declared, plan, values, moves)
@@ -155,19 +162,19 @@ def _in_datum(
         cross = jnp.einsum("nik,njk->nij", g, a)
         return Q - cross - cross.transpose(0, 2, 1) + jnp.einsum("nik,kl,njl->nij", g, C, g)
 
-    return {name: moved(Q, G[name], A[name]) for name, Q in own.items()}
+    return {name: moved(Q, G[name], A[name]) for name, Q in diagonal.items()}
 
 
 def blocks_of_tables(
-    declared: Declared, plan: Plan, own: Tangent, values: Values
+    declared: Declared, plan: Plan, diagonal: Tangent, values: Values
 ) -> dict[str, Float[Array, "rows width width"]]:
-    """`Cofactors.own` by table rows; zero for held unknowns."""
+    """`Cofactors.diagonal_blocks` by table rows; zero for held unknowns."""
     empty = zeros_of_tables(declared, values)
     found = {name: jnp.zeros((*zero.shape, zero.shape[1])) for name, zero in empty.items()}
     for name, group in plan.groups.items():
         for m in group.members:
             at, rows = slice(m.start, m.start + m.width), slice(None) if m.rows is None else m.rows
-            found[m.table] = found[m.table].at[rows].add(own[name][:, at, at])
+            found[m.table] = found[m.table].at[rows].add(diagonal[name][:, at, at])
     return found
 
 

@@ -34,8 +34,8 @@ from jaxbundle.implicit import derivative_along, differentiable_once, implicit_r
 from jaxbundle.leastsquares.datum import conditions as datum
 from jaxbundle.leastsquares.equations import elimination
 from jaxbundle.leastsquares.equations.hessian import SecondOrder, count_terms, equations_and_terms
-from jaxbundle.leastsquares.equations.normal import Normal, Tangent, normal_equations, zero_tangent
-from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.equations.normal import Normal, normal_equations, zero_tangent
+from jaxbundle.leastsquares.indexing.plan import Plan, Tangent
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
 from jaxbundle.leastsquares.indexing.rows import (
     Data,
@@ -46,7 +46,7 @@ from jaxbundle.leastsquares.indexing.rows import (
     residuals,
 )
 from jaxbundle.leastsquares.iterations.retraction import representatives, retract
-from jaxbundle.leastsquares.iterations.solver import find, half_square
+from jaxbundle.leastsquares.iterations.solver import half_square, minimise_compiled
 from jaxbundle.leastsquares.iterations.stopping import converged
 from jaxbundle.leastsquares.problem import Problem, complete_data, make_solver, without_filling
 from jaxbundle.leastsquares.quality.hessian_products import multiply
@@ -98,7 +98,7 @@ def solve(
     data = complete_data(problem, data)
     solver = make_solver(problem, atol=atol, max_steps=steps, **options)
     fixed = jax.lax.stop_gradient(data)
-    minimum = find(solver, fixed, fixed.start)
+    minimum = minimise_compiled(solver, fixed, fixed.start)
     good = converged(minimum.termination)
     values = attach_derivatives(problem.declared, problem.plan, minimum.values, data, sensitivity)
     # A factor, not `where`: derivatives of a failed solution are NaN as well, not 0.

@@ -5,6 +5,9 @@ import importlib
 import math
 from types import ModuleType
 
+# σ of a normal distribution by its median absolute deviation: 1/Φ⁻¹(¾) to five digits.
+NORMAL_SIGMA_BY_MAD = 1.4826
+
 
 @functools.cache
 def _special() -> ModuleType:

@@ -134,7 +134,7 @@ class IndependentErrors:
     def propagate_rows(
         self, rows: Mapping[str, Float[np.ndarray, "n rows width"]]
     ) -> Float[np.ndarray, "n n"]:
-        """The covariance of linear functions of the changes of tables (`Solution.slopes`)."""
+        """The covariance of linear functions of the changes of tables (`Solution.jacobian_of`)."""
         return self.variance * self.found.propagate_rows(rows)
 
     def propagate(self, function: Callable[[Values], Array]) -> Float[np.ndarray, "n n"]:
@@ -225,12 +225,12 @@ class ErrorModel:
     def propagate_rows(
         self, rows: Mapping[str, Float[np.ndarray, "n rows width"]]
     ) -> Float[np.ndarray, "n n"]:
-        """The covariance of linear functions of the changes of tables (`Solution.slopes`)."""
+        """The covariance of linear functions of the changes of tables (`Solution.jacobian_of`)."""
         return self.of_effects(effects(self.found, rows))
 
     def propagate(self, function: Callable[[Values], Array]) -> Float[np.ndarray, "n n"]:
         """The covariance of a differentiable function (`Values` → [n]) of the unknowns."""
-        slopes = self.found.slopes(function)
+        slopes = self.found.jacobian_of(function)
         return self.propagate_rows({table: np.asarray(x) for table, x in slopes.items()})
 
     def joint_covariance(

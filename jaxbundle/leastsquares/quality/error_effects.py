@@ -24,8 +24,8 @@ from jaxbundle.leastsquares.datum.conditions import (
 )
 from jaxbundle.leastsquares.equations.elimination import NormalFactor, solve
 from jaxbundle.leastsquares.equations.linearise import differentiate
-from jaxbundle.leastsquares.equations.normal import Tangent, zero_tangent
-from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.equations.normal import zero_tangent
+from jaxbundle.leastsquares.indexing.plan import Plan, Tangent
 from jaxbundle.leastsquares.indexing.rows import (
     Data,
     Declared,

@@ -8,8 +8,8 @@ from jaxtyping import Array, Float
 
 from jaxbundle.leastsquares.equations.hessian import SecondOrder
 from jaxbundle.leastsquares.equations.linearise import widths_of
-from jaxbundle.leastsquares.equations.normal import Rows, Tangent
-from jaxbundle.leastsquares.indexing.plan import ObservationPart, Plan
+from jaxbundle.leastsquares.equations.normal import Rows
+from jaxbundle.leastsquares.indexing.plan import ObservationPart, Plan, Tangent
 from jaxbundle.leastsquares.indexing.rows import Declared, Values
 from jaxbundle.leastsquares.iterations.retraction import changes_of_tables
 

@@ -18,8 +18,8 @@ from jaxtyping import Array, Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.equations.elimination import factorise
-from jaxbundle.leastsquares.equations.normal import Normal, Tangent, normal_equations, zero_tangent
-from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.equations.normal import Normal, normal_equations, zero_tangent
+from jaxbundle.leastsquares.indexing.plan import Plan, Tangent
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
 from jaxbundle.leastsquares.indexing.rows import Data, Declared, Values, fill_places, lay_out_data
 from jaxbundle.leastsquares.iterations.retraction import retract
@@ -84,7 +84,9 @@ def covariances(
     filled, laid = fill_places(plan, lay_out_data(plan, data))
     normal = normal_equations(declared, filled, data.start, laid)[-1]
     factor = factorise(Normal(plan, normal))
-    own = blocks_of_tables(declared, plan, cofactors(declared, data.start, factor).own, data.start)
+    own = blocks_of_tables(
+        declared, plan, cofactors(declared, data.start, factor).diagonal_blocks, data.start
+    )
     return own, propagate(declared, data.start, factor, rows)
 
 

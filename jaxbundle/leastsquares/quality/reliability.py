@@ -50,9 +50,10 @@ MIN_REDUNDANCY = 1e-8
 class Reliability(eqx.Module):
     """By set of observations, [n, r], 0 for residuals without weight: `residual`, v/σ; `standard`,
     nᵀu (v/σ if uncorrelated); `gain`, σ·√Pᵢᵢ ≥ 1 (1 if uncorrelated), by which the other residuals
-    of its row sharpen it; the redundancy number; Baarda's w (NaN if uncontrolled); `hat`, h; and
-    `own`, its part due to the eliminated row of the observation alone. `joint` [n, 1], of two
-    uncorrelated residuals: B between them, which deletes both together; else [n, 0]."""
+    of its row sharpen it; the redundancy number; Baarda's w (NaN if uncontrolled); the leverage
+    `hat`, h; and `eliminated_leverage`, its part due to the eliminated row of the observation
+    alone. `joint` [n, 1], of two uncorrelated residuals: B between them, which deletes both
+    together; else [n, 0]."""
 
     residual: Mapping[str, Float[AnyArray, "n r"]]
     standard: Mapping[str, Float[AnyArray, "n r"]]
@@ -60,7 +61,7 @@ class Reliability(eqx.Module):
     redundancy: Mapping[str, Float[AnyArray, "n r"]]
     w: Mapping[str, Float[AnyArray, "n r"]]
     hat: Mapping[str, Float[AnyArray, "n r"]]
-    own: Mapping[str, Float[AnyArray, "n r"]]
+    eliminated_leverage: Mapping[str, Float[AnyArray, "n r"]]
     joint: Mapping[str, Float[AnyArray, "n c"]]
 
 
@@ -71,11 +72,11 @@ def reliability(
     """Redundancy numbers and test statistics of all observations."""
     laid = lay_out_data(plan, data)
     found = hat_blocks(declared, plan, values, laid, Q)
-    whitened, hats, owns = (restore_order(plan, rows) for rows in found)
+    whitened, hats, eliminated_leverages = (restore_order(plan, rows) for rows in found)
     by_set = {
-        o: _correlated(data.weight[o], u, hats[o], owns[o])
+        o: _correlated(data.weight[o], u, hats[o], eliminated_leverages[o])
         if data.weight[o].ndim == 3
-        else _uncorrelated(data.weight[o], u, hats[o], owns[o])
+        else _uncorrelated(data.weight[o], u, hats[o], eliminated_leverages[o])
         for o, u in whitened.items()
     }
     columns = {f.name: {o: x[f.name] for o, x in by_set.items()} for f in fields(Reliability)}
@@ -86,10 +87,10 @@ def _uncorrelated(
     weight: Float[AnyArray, "n r"],
     v: Float[Array, "n r"],
     hat: Float[Array, "n rc"],
-    own: Float[Array, "n rc"],
+    eliminated_leverage: Float[Array, "n rc"],
 ) -> dict[str, Float[AnyArray, "n r"]]:
     used, r = weight > 0, v.shape[-1]
-    hat, joint, own = hat[:, :r], hat[:, r:], own[:, :r]
+    hat, joint, eliminated_leverage = hat[:, :r], hat[:, r:], eliminated_leverage[:, :r]
     return {
         "residual": v,
         "standard": v,
@@ -97,7 +98,7 @@ def _uncorrelated(
         "redundancy": jnp.where(used, jnp.clip(1 - hat, 0.0, 1.0), 0.0),
         "w": _test(v, hat, used),
         "hat": hat,
-        "own": own,
+        "eliminated_leverage": eliminated_leverage,
         "joint": joint,
     }
 
@@ -106,7 +107,7 @@ def _correlated(
     weight: Float[AnyArray, "n r r"],
     u: Float[Array, "n r"],
     hat: Float[Array, "n r r"],
-    own: Float[Array, "n r r"],
+    eliminated_leverage: Float[Array, "n r r"],
 ) -> dict[str, Float[AnyArray, "n r"]]:
     """Of whitening matrices L⁻¹ [n, r, r] and blocks B of the same shape."""
     used = diagonal_of(weight) > 0
@@ -124,7 +125,7 @@ def _correlated(
         "redundancy": jnp.where(used, r, 0.0),
         "w": _test(standard, h, used),
         "hat": h,
-        "own": along(own),
+        "eliminated_leverage": along(eliminated_leverage),
         "joint": jnp.zeros((len(u), 0)),
     }
 
@@ -176,7 +177,7 @@ def _hat_of_chunk(
     form = block if correlated else _diagonal_and_joint
     rows = r.shape[-1]
     inner = (rows, rows) if correlated else (rows + (rows == 2),)
-    hat = own = jnp.zeros((*r.shape[:-1], *inner))
+    hat = eliminated_leverage = jnp.zeros((*r.shape[:-1], *inner))
     if touches:
         J = jnp.concatenate(touches, -1)
         # h = J·Q·Jᵀ from the blocks of Q that the observation touches, 9 × 9 and 3 × 3: kept,
@@ -185,14 +186,14 @@ def _hat_of_chunk(
     if E is not None:
         # E·V⁻¹·Eᵀ: h if everything else were known.
         root = jnp.einsum("lri,lji->lrj", E, present(Q.lower_inverse)[part.eliminated])
-        own = form(root, root)
+        eliminated_leverage = form(root, root)
         hat = hat + form(E @ present(Q.eliminated)[part.eliminated], E)
         for touch, J in zip(part.touches, touches):
             coupled = Q.coupled[touch.group]
             of_row = coupled.reshape(-1, *coupled.shape[2:])[touch.incidence]
             cross = form(E @ of_row[..., touch.start : touch.stop], J)
             hat = hat + cross + (cross.mT if correlated else cross)
-    return r, hat, own
+    return r, hat, eliminated_leverage
 
 
 def _diagonal_and_joint(
@@ -212,21 +213,21 @@ def _kept_cofactors(part: ObservationPart, Q: Cofactors) -> Float[Array, "n n"]:
     cut = lambda B, rows, columns: B[rows.start : rows.stop, columns.start : columns.stop]
     blocks: list[list[Any]] = [[None] * len(touches) for _ in touches]
     for t, touch in enumerate(touches):
-        blocks[t][t] = cut(Q.kept.own[touch.group][touch.row], touch, touch)
-    for couple in part.couples:
-        first, second = touches[couple.first], touches[couple.second]
+        blocks[t][t] = cut(Q.kept.diagonal_blocks[touch.group][touch.row], touch, touch)
+    for coupling in part.couplings:
+        first, second = touches[coupling.first], touches[coupling.second]
         found: Any = 0.0
-        if couple.block is not None:
+        if coupling.block is not None:
             # Stored below the diagonal; `turned` where this chunk has the later row second.
-            B = Q.kept.off[first.group, second.group][couple.block]
+            B = Q.kept.off_diagonal_blocks[first.group, second.group][coupling.block]
             found = cut(B, first, second)
-            if couple.turned is not None:
-                found = jnp.where(couple.turned > 0, cut(B, second, first).T, found)
-        if couple.same is not None:
-            on = cut(Q.kept.own[first.group][first.row], first, second)
-            found = jnp.where(couple.same > 0, on, found)
-        blocks[couple.first][couple.second] = found
-        blocks[couple.second][couple.first] = found.T
+            if coupling.turned is not None:
+                found = jnp.where(coupling.turned > 0, cut(B, second, first).T, found)
+        if coupling.same is not None:
+            on = cut(Q.kept.diagonal_blocks[first.group][first.row], first, second)
+            found = jnp.where(coupling.same > 0, on, found)
+        blocks[coupling.first][coupling.second] = found
+        blocks[coupling.second][coupling.first] = found.T
     return jnp.block(blocks)
 
 

@@ -24,8 +24,8 @@ from jaxtyping import Array, Bool, Float, PyTree
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.leastsquares.datum.conditions import attach_motion
 from jaxbundle.leastsquares.equations.elimination import NormalFactor, solve
-from jaxbundle.leastsquares.equations.normal import Tangent, dot, zero_tangent
-from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.equations.normal import dot, zero_tangent
+from jaxbundle.leastsquares.indexing.plan import Plan, Tangent
 from jaxbundle.leastsquares.indexing.rows import Data, Declared, Values, restore_order
 from jaxbundle.leastsquares.iterations.solver import half_square
 from jaxbundle.leastsquares.quality.derivatives import LinearisedSolution, gradient_after
@@ -193,7 +193,7 @@ def _solve(
         open_ = (size > tolerance**2 * begin) & (count <= max_steps)
         return (count == 0) | open_
 
-    def further(state: tuple) -> tuple:
+    def one_step(state: tuple) -> tuple:
         x, left, direction, size, begin, count = state
         # Pass 0 has x = 0 and direction 0: its product is (∂g/∂θ)·held, the right-hand side.
         first = count == 0
@@ -210,6 +210,6 @@ def _solve(
 
     nothing: Any = jnp.zeros(())
     x, *_, size, begin, _ = jax.lax.while_loop(
-        going, further, (still, right, still, nothing, nothing, jnp.asarray(0))
+        going, one_step, (still, right, still, nothing, nothing, jnp.asarray(0))
     )
     return x, jnp.sqrt(jnp.where(begin == 0, 0.0, size / jnp.where(begin == 0, 1.0, begin)))

@@ -3,11 +3,13 @@
     |w|  > z(1 − α/2)                        Baarda (1968): each residual separately
     |τ|  > τ(1 − α'/2, redundancy)           Pope (1976): the largest of n, α' = 1 − (1 − α)^(1/n)
 
-One blunder affects the residuals of its neighbours. So only observations that cannot mask each
-other are removed together (`separation.py`): of every eliminated row only the worst, of a kept row
-only those that stay significant whatever the influence of the worse ones, and only those at least
-half as bad as the worst of all. Observations without an eliminated row, or with residuals tested
-individually, are removed alone. An eliminated row left with too few residuals is excluded too, as
+One blunder affects the residuals of its neighbours. Observations are removed together only if they
+hardly affect each other (`separability.py`): of every eliminated row the worst; of a kept row (of
+an image, say) those that stay significant whatever the influence of the worse ones; and of these
+those at least half as bad as the worst of all. A row counts with the first kept row it touches, and
+influence through other unknowns is neglected: what was removed wrongly passes the last test, and is
+restored. Observations without an eliminated row, or with residuals tested individually, are removed
+alone. An eliminated row left with too few residuals is excluded too, as
 is one that its remaining observations do not determine, such as a point with two parallel rays.
 
 If observations of a row are inseparable, as the two of a two-ray point, nothing decides which is
@@ -19,7 +21,7 @@ with weight zero, so nothing is compiled again.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -27,11 +29,11 @@ from jaxtyping import Float, Int
 from jaxbundle.arguments import number, one_of
 from jaxbundle.choices import TESTS
 from jaxbundle.errors import NotSolvedError
-from jaxbundle.leastsquares.equations.separation import choose_together, find_alternatives
 from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.problem import Problem, hold, with_data
 from jaxbundle.leastsquares.quality.distributions import critical_w, normal_quantile
 from jaxbundle.leastsquares.quality.names import eliminated_rows
+from jaxbundle.leastsquares.quality.separability import choose_together, find_alternatives
 from jaxbundle.leastsquares.solution import Solution, take_step
 from jaxbundle.leastsquares.whitening import used, without_residual
 from jaxbundle.types import AnyArray, present
@@ -88,7 +90,7 @@ def readjust(problem: Problem, values: Values, adjust_from: Adjust) -> Solution:
 
 
 def snoop(
-    found: Solution,
+    solution: Solution,
     adjust_from: Adjust,
     *,
     test: str = "pope",
@@ -100,7 +102,7 @@ def snoop(
 
     **Arguments:**
 
-    - `found`: the solution with all observations.
+    - `solution`: the one with all observations.
     - `adjust_from(problem, start)`: the solution of a changed problem.
     - `test`: `"pope"` (σ a posteriori, the largest of all) or `"baarda"` (σ a priori, each).
     - `significance`: α, two-sided: for `"pope"` the probability of removing anything from data
@@ -115,19 +117,22 @@ def snoop(
     **Raises:** `InputError` for an unknown test, or a level that is not a probability.
     """
     check_test(test, significance)
-    whole, removed, returned = found.problem, [*doubtful], set()
-    touched, excluded = _Touched(whole), set()
+    full_problem = solution.problem
+    touched = _TouchedRows(full_problem)
+    removed, restored = [*doubtful], set()
+    excluded: set[int] = set()
     if removed:
-        found = _solve(whole, removed, excluded, found.values, adjust_from)
+        solution = _solve(full_problem, removed, excluded, solution.values, adjust_from)
     # τ has f − 1 degrees of freedom.
-    while found.problem.counts.redundancy >= 2:
+    while solution.problem.counts.redundancy >= 2:
         # Exact data have σ0 = 0, and residuals of rounding that no test may be scaled by.
-        unit = found.sigma0 if test == "pope" and found.sigma0 > 0 else 1.0
-        counts = found.problem.counts
+        unit = solution.sigma0 if test == "pope" and solution.sigma0 > 0 else 1.0
+        counts = solution.problem.counts
         critical = critical_w(
-            test, significance, touched.tested(found.problem), counts.redundancy, found.sigma0
+            test, significance, touched.tested(solution.problem), counts.redundancy, solution.sigma0
         )
-        worst = _worst(found, touched, unit, critical / unit, normal_quantile(1 - significance / 2))
+        critical_alone = normal_quantile(1 - significance / 2)
+        worst = _worst(solution, touched, unit, critical / unit, critical_alone)
         if worst and limit is not None:
             worst = worst[: max(limit - len(removed), 0)]
         if worst:
@@ -135,24 +140,24 @@ def snoop(
         else:
             # What was restored once is not again: two that exclude each other would alternate
             # forever.
-            passing = _passing(whole, found, touched, removed, critical) - returned
+            passing = _passing(full_problem, solution, touched, removed, critical) - restored
             kept = list(_without_passing(removed, passing))
             if kept == removed:
                 break
-            returned |= passing
+            restored |= passing
             removed = kept
         again = lambda problem, values: readjust(problem, values, adjust_from)
-        found = _solve(whole, removed, excluded, found.values, again)
+        solution = _solve(full_problem, removed, excluded, solution.values, again)
     if doubtful:
-        unit = found.sigma0 if test == "pope" and found.sigma0 > 0 else 1.0
-        removed = list(_with_tests(whole, found, touched, removed, unit))
+        unit = solution.sigma0 if test == "pope" and solution.sigma0 > 0 else 1.0
+        removed = list(_with_tests(full_problem, solution, touched, removed, unit))
     if removed:
-        found = _solve(whole, removed, excluded, found.values, adjust_from)
-    return found, removed
+        solution = _solve(full_problem, removed, excluded, solution.values, adjust_from)
+    return solution, removed
 
 
 def _solve(
-    whole: Problem,
+    full_problem: Problem,
     removed: Sequence[RemovedRow],
     excluded: set[int],
     values: Values,
@@ -162,143 +167,171 @@ def _solve(
     added that the remaining observations do not determine."""
     while True:
         try:
-            return adjust_from(without(whole, removed, excluded), values)
+            return adjust_from(without(full_problem, removed, excluded), values)
         except NotSolvedError as error:
-            more = {*eliminated_rows(whole, error.undetermined)} - excluded
+            more = {*eliminated_rows(full_problem, error.undetermined)} - excluded
             if not more:
                 raise
             excluded |= more
 
 
-class _Touched:
+class _TouchedRows:
     """The rows touched by tested observations: by set the eliminated row of each (−1: none) and an
-    index of its first kept row; `whole`: sets whose observations are removed as a whole."""
+    index of its first kept row; and the sets whose rows, or single residuals, are removed."""
 
     def __init__(self, problem: Problem):
         self.eliminated = problem.plan.eliminated
-        self.own: dict[str, Int[np.ndarray, " n"]] = {}
-        self.shared: dict[str, Int[np.ndarray, " n"]] = {}
+        self.eliminated_row: dict[str, Int[np.ndarray, " n"]] = {}
+        self.first_kept_row: dict[str, Int[np.ndarray, " n"]] = {}
         first = np.cumsum([0, *(t.rows for t in problem.tables)])
         start = {t.name: n for t, n in zip(problem.tables, first)}
-        moves = {t.name: t.free.any(1) for t in problem.tables}
-        stays = problem.kept_rows
+        is_free = {t.name: t.free.any(1) for t in problem.tables}
         for given in problem.observations:
-            own, shared = np.full(given.number, -1), np.full(given.number, -1)
+            eliminated, kept = np.full(given.number, -1), np.full(given.number, -1)
             for name, rows in zip(given.kind.of, given.rows):
                 if name == self.eliminated:
-                    own = np.where(moves[name][rows] & ~stays[rows], rows, own)
-                elif moves[name].any():
-                    shared = np.where(shared < 0, start[name] + rows, shared)
-            self.own[given.name], self.shared[given.name] = own, shared
+                    is_eliminated = is_free[name][rows] & ~problem.kept_rows[rows]
+                    eliminated = np.where(is_eliminated, rows, eliminated)
+                elif is_free[name].any():
+                    kept = np.where(kept < 0, start[name] + rows, kept)
+            self.eliminated_row[given.name], self.first_kept_row[given.name] = eliminated, kept
         chosen = lambda policy: [
             given.name for given in problem.observations if given.kind.snooped == policy
         ]
-        self.whole, self.single = chosen("whole"), chosen("single")
+        self.sets_removed_by_row = chosen("whole")
+        self.sets_removed_by_residual = chosen("single")
 
     def tested(self, problem: Problem) -> int:
         """The number of tested residuals."""
-        weight = [problem.weights(o) for o in (*self.whole, *self.single)]
+        sets = (*self.sets_removed_by_row, *self.sets_removed_by_residual)
+        weight = [problem.weights(o) for o in sets]
         return sum(int((w > 0).sum()) for w in weight)
 
 
+@dataclasses.dataclass(frozen=True)
+class _Candidates:
+    """Rows of observations that may be removed: the set and row of each, and its largest test."""
+
+    set: list[str]
+    row: Int[np.ndarray, " n"]
+    test: Float[np.ndarray, " n"]
+
+    def of(self, by_set: Mapping[str, np.ndarray], positions: Iterable[int]) -> np.ndarray:
+        """Values by set and row, of the candidates at these positions."""
+        return np.array([by_set[self.set[k]][self.row[k]] for k in positions])
+
+
 def _worst(
-    found: Solution, touched: _Touched, unit: float, critical: float, apart: float
+    solution: Solution, touched: _TouchedRows, unit: float, critical: float, critical_alone: float
 ) -> list[RemovedRow]:
     """The observations to remove now, the worst first; tests in `unit`.
 
-    Observations of a row are separable if the test of the suspect exceeds `apart` without the
-    other."""
-    tests = {o: _finite(w) / unit for o, w in found.reliability.w.items()}
-    alone = [
-        RemovedRow(o, *divmod(int(t.argmax()), t.shape[1]), float(t.max()))
-        for o, t in ((o, tests[o]) for o in touched.single)
-        if t.size
-    ]
-    together, of, row = [], [], []
-    for o in filter(lambda o: len(tests[o]), touched.whole):
-        of_one = tests[o].max(1, initial=0.0)
-        lonely = np.where(touched.own[o] < 0, of_one, 0.0)
-        alone.append(RemovedRow(o, int(lonely.argmax()), None, float(lonely.max(initial=0.0))))
-        together.append(np.where(touched.own[o] < 0, 0.0, of_one))
-        of.append(np.full(len(of_one), o, dtype=object))
-        row.append(np.arange(len(of_one)))
-    together, of, row = (np.concatenate([*x, []]) for x in (together, of, row))
-    row = row.astype(int)
-    worst = max(alone, key=lambda r: r.test, default=None)
-    other, largest = worst.test if worst else 0.0, together.max(initial=0.0)
+    Observations of a row are separable if the test of the suspect exceeds `critical_alone` without
+    the other."""
+    tests = {o: _finite(w) / unit for o, w in solution.reliability.w.items()}
+    single, joint = _find_candidates(tests, touched)
+    worst = max(single, key=lambda r: r.test, default=None)
+    largest_single, largest_test = worst.test if worst else 0.0, joint.test.max(initial=0.0)
     # Observations without an eliminated row (control, distances) influence everything: alone.
-    if worst and other > max(critical, largest):
+    if worst and largest_single > max(critical, largest_test):
         return [worst]
-    at = np.flatnonzero(together > max(critical, other, REMOVED_TOGETHER * largest))
-    if not len(at):
+    limit = max(critical, largest_single, REMOVED_TOGETHER * largest_test)
+    positions = np.flatnonzero(joint.test > limit)
+    if not len(positions):
         return []
-    pick = lambda by_set: np.array([by_set[o][k] for o, k in zip(of[at], row[at])])
-    chosen = at[
+    chosen = positions[
         choose_together(
-            together[at],
-            pick(touched.own),
-            pick(touched.shared),
-            pick(_leverage(found)),
+            joint.test[positions],
+            joint.of(touched.eliminated_row, positions),
+            joint.of(touched.first_kept_row, positions),
+            joint.of(_leverage(solution), positions),
             critical,
         )
     ]
-    neighbours = _Neighbours(found, touched, unit)
+    neighbours = _Neighbours(solution, touched, unit)
     others = {
-        k: neighbours.alternatives(str(of[k]), int(row[k]), critical, apart)
+        k: neighbours.alternatives(joint.set[k], int(joint.row[k]), critical, critical_alone)
         for k in chosen.tolist()
     }
     # Those beyond doubt first: without them, some of the others may become separable.
     certain = [k for k in others if not others[k]]
     return [
-        RemovedRow(str(of[k]), int(row[k]), None, float(together[k]), others[k])
+        RemovedRow(joint.set[k], int(joint.row[k]), None, float(joint.test[k]), others[k])
         for k in certain or others
     ]
 
 
-def _leverage(found: Solution) -> dict[str, Float[np.ndarray, " n"]]:
+def _find_candidates(
+    tests: Mapping[str, Float[np.ndarray, "n r"]], touched: _TouchedRows
+) -> tuple[list[RemovedRow], _Candidates]:
+    """Of every set the worst of those that are removed alone; and all rows with an eliminated row,
+    which may be removed with others."""
+    single_candidates = [
+        RemovedRow(o, *divmod(int(t.argmax()), t.shape[1]), float(t.max()))
+        for o, t in ((o, tests[o]) for o in touched.sets_removed_by_residual)
+        if t.size
+    ]
+    sets, rows, joint_tests = [], [np.zeros(0, int)], [np.zeros(0)]
+    for o in (o for o in touched.sets_removed_by_row if len(tests[o])):
+        largest_test = tests[o].max(1, initial=0.0)
+        alone = touched.eliminated_row[o] < 0
+        without_eliminated_row = np.where(alone, largest_test, 0.0)
+        worst, test = without_eliminated_row.argmax(), without_eliminated_row.max(initial=0.0)
+        single_candidates.append(RemovedRow(o, int(worst), None, float(test)))
+        sets += [o] * len(largest_test)
+        rows.append(np.arange(len(largest_test)))
+        joint_tests.append(np.where(alone, 0.0, largest_test))
+    return single_candidates, _Candidates(sets, np.concatenate(rows), np.concatenate(joint_tests))
+
+
+def _leverage(solution: Solution) -> dict[str, Float[np.ndarray, " n"]]:
     """(h − h_e)/(1 − h) of every observation, the largest of its residuals: its leverage h without
     the part h_e of its eliminated row, over its redundancy number."""
-    tested, tiny = found.reliability, np.finfo(float).tiny
-    return {
-        o: (np.clip(h - tested.own[o], 0.0, None) / np.maximum(1 - h, tiny)).max(1, initial=0.0)
-        for o, h in tested.hat.items()
-    }
+    tested, tiny = solution.reliability, np.finfo(float).tiny
+    rest = {o: np.clip(h - tested.eliminated_leverage[o], 0, None) for o, h in tested.hat.items()}
+    redundancy = {o: np.maximum(1 - h, tiny) for o, h in tested.hat.items()}
+    return {o: (rest[o] / redundancy[o]).max(1, initial=0.0) for o in rest}
 
 
 class _Neighbours:
     """The observations of every eliminated row, to test their separability."""
 
-    def __init__(self, found: Solution, touched: _Touched, unit: float):
-        self.found, self.unit, self.sets = found, unit, touched.own
+    def __init__(self, solution: Solution, touched: _TouchedRows, unit: float):
+        self.solution, self.unit = solution, unit
+        self.eliminated_row = touched.eliminated_row
+        # By set: the rows with weight in the order of their eliminated rows, and these.
         self.order, self.sorted = {}, {}
-        for o, own in touched.own.items():
-            weighted = used(np.asarray(found.problem.data.weight[o])).any(1)
-            rows = np.flatnonzero(weighted & (own >= 0))
-            self.order[o] = rows[np.argsort(own[rows], kind="stable")]
-            self.sorted[o] = own[self.order[o]]
+        for o, eliminated in touched.eliminated_row.items():
+            weighted = used(np.asarray(solution.problem.data.weight[o])).any(1)
+            rows = np.flatnonzero(weighted & (eliminated >= 0))
+            self.order[o] = rows[np.argsort(eliminated[rows], kind="stable")]
+            self.sorted[o] = eliminated[self.order[o]]
 
-    def alternatives(self, o: str, row: int, critical: float, apart: float) -> tuple[int, ...]:
+    def alternatives(
+        self, o: str, row: int, critical: float, critical_alone: float
+    ) -> tuple[int, ...]:
         """Inseparable rows of the same set and eliminated row."""
-        own = self.sets[o][row]
+        eliminated = self.eliminated_row[o][row]
+        between = [eliminated, eliminated + 1]
         rows = {
-            s: self.order[s][slice(*np.searchsorted(self.sorted[s], [own, own + 1]))]
-            for s in (o, *(s for s in self.sets if s != o))
+            s: self.order[s][slice(*np.searchsorted(self.sorted[s], between))]
+            for s in (o, *(s for s in self.order if s != o))
         }
-        E, v = self.found.by_eliminated, self.found.residuals
+        E, v = self.solution.jacobian_eliminated, self.solution.residuals
         width = next(iter(E.values())).shape[2]
         design = np.concatenate([E[s][k].reshape(-1, width) for s, k in rows.items()])
         residual = np.concatenate([v[s][k].ravel() for s, k in rows.items()]) / self.unit
         size = v[o].shape[1]
         where = [np.arange(size) + size * i for i in range(len(rows[o]))]
         suspect = int(np.flatnonzero(rows[o] == row)[0])
-        alternatives = find_alternatives(design, residual, where, suspect, critical, apart)
+        alternatives = find_alternatives(design, residual, where, suspect, critical, critical_alone)
         return tuple(rows[o][alternatives].tolist())
 
 
 def _passing(
-    whole: Problem,
-    found: Solution,
-    touched: _Touched,
+    full_problem: Problem,
+    solution: Solution,
+    touched: _TouchedRows,
     removed: Sequence[RemovedRow],
     critical: float,
 ) -> set[tuple[str, int, int | None]]:
@@ -306,52 +339,64 @@ def _passing(
     them."""
     return {
         (r.set, row, r.residual)
-        for r, tests in _test_removed(whole, found, touched, removed)
+        for r, tests in _test_removed(full_problem, solution, touched, removed)
         for row, test in zip(r.rows, tests)
         if test < critical
     }
 
 
 def _with_tests(
-    whole: Problem,
-    found: Solution,
-    touched: _Touched,
+    full_problem: Problem,
+    solution: Solution,
+    touched: _TouchedRows,
     removed: Sequence[RemovedRow],
     unit: float,
 ) -> Iterable[RemovedRow]:
     """What was removed, with the tests of initially doubtful observations, in `unit`."""
-    for r, tests in _test_removed(whole, found, touched, removed):
+    for r, tests in _test_removed(full_problem, solution, touched, removed):
         yield r if np.isfinite(r.test) else dataclasses.replace(r, test=max(tests) / unit)
 
 
 def _test_removed(
-    whole: Problem, found: Solution, touched: _Touched, removed: Sequence[RemovedRow]
+    full_problem: Problem, solution: Solution, touched: _TouchedRows, removed: Sequence[RemovedRow]
 ) -> Iterable[tuple[RemovedRow, list[float]]]:
     """Each of the removed with the test of its rows against what remains; NaN in rows of an
     excluded eliminated row, which agrees with anything.
 
     Two residuals removed from one correlated observation are tested in separate passes, each
     without the other, which would predict it."""
-    correlated = lambda r: r.residual is not None and whole.data.weight[r.set].ndim == 3
-    together: dict[tuple[str, int], list[RemovedRow]] = {}
-    for r in filter(correlated, removed):
-        together.setdefault((r.set, r.row), []).append(r)
-    others = lambda r: [x for x in together[r.set, r.row] if x is not r] if correlated(r) else []
-    place = lambda r: together[r.set, r.row].index(r) if correlated(r) else 0
-    aside = np.zeros(0, bool)
+    # Correlated observations of which single residuals were removed: [those of one row].
+    of_one_row: dict[tuple[str, int], list[RemovedRow]] = {}
+
+    def is_correlated(r: RemovedRow) -> bool:
+        return r.residual is not None and full_problem.data.weight[r.set].ndim == 3
+
+    for r in filter(is_correlated, removed):
+        of_one_row.setdefault((r.set, r.row), []).append(r)
+
+    def pass_of(r: RemovedRow) -> int:
+        return of_one_row[r.set, r.row].index(r) if is_correlated(r) else 0
+
+    held = np.zeros(0, bool)
     if touched.eliminated is not None:
         free = lambda problem: problem.table(touched.eliminated).free.any(1)
-        aside = free(whole) & ~free(found.problem)
-    excluded = lambda r, row: touched.own[r.set][row] >= 0 and aside[touched.own[r.set][row]]
-    for turn in sorted({place(r) for r in removed}):
-        of = [r for r in removed if place(r) == turn]
-        rest = [x for r in of for x in others(r)]
-        data = without(whole, rest).data if rest else whole.data
-        tests = {o: _finite(t) for o, t in found.predicted_tests(data).items()}
-        for r in of:
+        held = free(full_problem) & ~free(solution.problem)
+
+    def is_excluded(r: RemovedRow, row: int) -> bool:
+        eliminated = touched.eliminated_row[r.set][row]
+        return bool(eliminated >= 0 and held[eliminated])
+
+    for this_pass in sorted({pass_of(r) for r in removed}):
+        tested = [r for r in removed if pass_of(r) == this_pass]
+        same_rows = (of_one_row[r.set, r.row] for r in tested if is_correlated(r))
+        others = [x for rows in same_rows for x in rows if pass_of(x) != this_pass]
+        data = without(full_problem, others).data if others else full_problem.data
+        tests = {o: _finite(t) for o, t in solution.predicted_tests(data).items()}
+        for r in tested:
             residual = r.residual if r.residual is not None else slice(None)
             of_rows = np.max(tests[r.set][list(r.rows)][:, residual].reshape(len(r.rows), -1), 1)
-            yield r, np.where([excluded(r, row) for row in r.rows], np.nan, of_rows).tolist()
+            excluded = [is_excluded(r, row) for row in r.rows]
+            yield r, np.where(excluded, np.nan, of_rows).tolist()
 
 
 def _remove(weight: Float[np.ndarray, "n ..."], removed: RemovedRow) -> None:
@@ -392,18 +437,20 @@ def without(
     weight = {o: np.array(w) for o, w in problem.data.weight.items()}
     for r in removed:
         _remove(weight[r.set], r)
-    e, lone = problem.plan.eliminated, []
+    e = problem.plan.eliminated
+    undetermined: list[int] = []
     if e is not None and (removed or excluded):
-        touched, width = _Touched(problem), problem.table(e).space.width
+        touched, width = _TouchedRows(problem), problem.table(e).space.width
         left = np.zeros(problem.table(e).rows)
-        for o, own in touched.own.items():
+        for o, eliminated in touched.eliminated_row.items():
             rows = used(weight[o]).sum(1)
-            np.add.at(left, own[own >= 0], rows[own >= 0])
+            np.add.at(left, eliminated[eliminated >= 0], rows[eliminated >= 0])
         # −1: no eliminated row.
-        changed = {int(touched.own[r.set][row]) for r in removed for row in r.rows} - {-1}
-        lone = sorted({*excluded} | {row for row in changed if left[row] < width})
-        for o, own in touched.own.items():
-            weight[o][np.isin(own, lone)] = 0.0
+        of_removed = ((touched.eliminated_row[r.set], row) for r in removed for row in r.rows)
+        changed = {int(eliminated[row]) for eliminated, row in of_removed} - {-1}
+        undetermined = sorted({*excluded} | {row for row in changed if left[row] < width})
+        for o, eliminated in touched.eliminated_row.items():
+            weight[o][np.isin(eliminated, undetermined)] = 0.0
     data = dataclasses.replace(problem.data, weight=weight)
     problem = with_data(problem, data)
-    return hold(problem, present(e), lone) if lone else problem
+    return hold(problem, present(e), undetermined) if undetermined else problem

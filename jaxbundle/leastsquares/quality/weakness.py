@@ -1,4 +1,4 @@
-"""What observations determine in name only: the weakest directions, by the names of unknowns.
+"""What observations hardly determine: the weakest directions, by the names of unknowns.
 
 The σ of an unknown means little by itself; it is compared with an *extent* e: that of a position
 with a distance, that of an angle with a radian. With E = diag(e), the datum S and Q = N⁻¹, the
@@ -7,7 +7,7 @@ largest eigenvalues μ of
     A = E⁻¹·S·Q·Sᵀ·E⁻¹
 
 belong to the weakest directions, and no σ is larger than σ0·√μ₁ extents. They are found by subspace
-iteration (Golub and Van Loan, Matrix Computations, section 8.2.4): a few solutions with the
+iteration (Golub and Van Loan, Matrix Computations, section 8.2.4): a few solves with the
 existing factor, never an inverse; if the cofactors are available, the σ are taken from them.
 Unknowns without an extent are not judged. Eliminated rows are judged by their σ with everything
 else given.
@@ -27,9 +27,9 @@ from jaxbundle.leastsquares.equations.elimination import (
     regularise_diagonal,
     solve,
 )
-from jaxbundle.leastsquares.equations.normal import Normal, Tangent, normal_equations
+from jaxbundle.leastsquares.equations.normal import Normal, normal_equations
 from jaxbundle.leastsquares.equations.reduced import flat, split
-from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.indexing.plan import Plan, Tangent
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
 from jaxbundle.leastsquares.indexing.rows import Data, Declared, Values, lay_out_data
 from jaxbundle.leastsquares.problem import Problem
@@ -37,9 +37,9 @@ from jaxbundle.leastsquares.quality.names import kept_unknowns, name_of
 from jaxbundle.leastsquares.solution import Solution, with_plan, without_plan
 from jaxbundle.system.programs import compile_once
 
-# An unknown whose σ is above a fiftieth of its extent (1.1° of a rotation, 2 cm a metre away) is
-# determined in name only. A choice, not a measurement: what is meant to be determined is hundreds
-# of times better.
+# An unknown is poorly determined if its σ is above a fiftieth of its extent (1.1° of a rotation,
+# 2 cm a metre away). A choice, not a measurement: what is meant to be determined is hundreds of
+# times better.
 VAGUE_RATIO = 50.0
 # A row whose σ is above a tenth of its extent: at 3 σ, errors of the second order in it, (3/10)²/2,
 # are no longer small beside those that least squares propagate.
@@ -56,7 +56,7 @@ Extents = dict[str, Float[np.ndarray, "rows *width"]]
 class Weak:
     """`names` of kept unknowns with a σ above 1/`VAGUE_RATIO` of their extent, the weakest first;
     `worst`: the largest of these ratios. `rows`: eliminated ones with a σ above 1/`NONLINEAR_RATIO`
-    of theirs, of so many `judged`."""
+    of theirs; `judged`: number of rows compared."""
 
     names: tuple[str, ...] = ()
     worst: float = 0.0
@@ -107,8 +107,8 @@ def _weak(
         return Weak()
     per_extent = _of_columns(problem, extents)
     if at_hand:
-        own = found.cofactors.own
-        variance = {g: np.diagonal(np.asarray(own[g]), axis1=1, axis2=2) for g in plan.kept}
+        blocks = found.cofactors.diagonal_blocks
+        variance = {g: np.diagonal(np.asarray(blocks[g]), axis1=1, axis2=2) for g in plan.kept}
         sigma = np.sqrt(np.asarray(flat(plan.kept, variance))) * per_extent
     else:
         sigma = _sigma_of_weakest(found, factor, per_extent)

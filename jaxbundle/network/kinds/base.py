@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from jaxbundle.arguments import positive, show
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.declarations import Kind, ObservationSet, Table
-from jaxbundle.network.columns import Columns, did_you_mean
+from jaxbundle.network.columns import Columns, did_you_mean, refuse_unknown
 from jaxbundle.network.tables import Images, Network, Points, Rows, Source, row_indices
 
 # Unknowns of further tables that are lengths, in the object unit.
@@ -155,7 +155,7 @@ class Further(abc.ABC):
         return 1
 
 
-# "from" is a word of Python: the field of this column has another name.
+# "from" is a reserved word of Python: the field of this column has another name.
 COLUMNS_OF_FIELDS = {"start": "from"}
 
 
@@ -241,8 +241,7 @@ def check_settings(section: str, given: Mapping[str, Any], known: Sequence[str])
     if not isinstance(given, Mapping):
         raise InputError(f"[{section}]: a section of settings is expected, not {show(given)}")
     for key in given:
-        if key not in known:
-            raise InputError(f"[{section}]: unknown key {key!r}{did_you_mean(key, known)}")
+        refuse_unknown(key, known, f"[{section}]: ")
 
 
 def numbers(section: str, key: str, value: Any, length: int) -> Float[np.ndarray, " length"]:

@@ -10,7 +10,7 @@ from jaxbundle.plotting.cameras import curve_reach
 from jaxbundle.plotting.distortion import distortion_profile
 from jaxbundle.plotting.style import micrometres
 from jaxbundle.report import correlated, head, observations
-from jaxbundle.report.equations import equations
+from jaxbundle.report.camera_equations import camera_equations
 from jaxbundle.report.layout import clean, fixed, significant
 from jaxbundle.report.observations import count_by_class
 from jaxbundle.report.page.charts import Curve, draw_curves, draw_histogram
@@ -84,7 +84,7 @@ def cameras(adjustment: "Adjustment", max_cameras: int = 20) -> Iterator[Section
     for number, camera in enumerate(chosen):
         entry = adjustment.cameras[camera]
         model = get_model(entry["model"])
-        parts = [items(equations(model)), _distortion(adjustment, camera)]
+        parts = [items(camera_equations(model)), _distortion(adjustment, camera)]
         parts.append(paragraph(validity(adjustment, camera)))
         if len(entry["free"]) > 1:
             parts += [

@@ -27,10 +27,11 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.tiepoints.verification import Pair, rotation_angle
+from jaxbundle.tiepoints.pair_graph import label_connected
+from jaxbundle.tiepoints.verification import Pair, depths_of_rays, loop_misclosure
 
 # The photographs of a pair, the smaller number first.
-Ids = tuple[int, int]
+PhotographPair = tuple[int, int]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +75,7 @@ def split_contradicted(
     **Arguments:** `ideal`: coordinates of the features of every photograph, c = 1.
     """
     loops = _Loops(pairs, ideal, settings)
-    # first with all pairs, wrong ones included, which only orders them
+    # First with all pairs, wrong ones included, which only orders them.
     votes = {ids: [loops.closes(ids, k) for k in loops.thirds(ids)] for ids in loops.pairs}
 
     def strength(pair: Pair) -> tuple[bool, float]:
@@ -84,9 +85,9 @@ def split_contradicted(
         good, bad = closed.count(True), closed.count(False)
         return pair.sure, len(pair) * (1 + good) / (1 + good + bad)
 
-    # greedy, the strongest first, like Kruskal's spanning tree: a wrong pair is then judged by
-    # right ones, and wrong ones that agree with it do not count
-    accepted: set[Ids] = set()
+    # Greedy, the strongest first, like Kruskal's spanning tree: a wrong pair is then judged by
+    # right ones, and wrong ones that agree with it do not count.
+    accepted: set[PhotographPair] = set()
     group = {k: k for pair in pairs for k in pair.images}
     for pair in sorted(pairs, key=strength, reverse=True):
         i, j = pair.images
@@ -95,7 +96,7 @@ def split_contradicted(
             for k in loops.thirds((i, j))
             if {_pair(i, k), _pair(j, k)} <= accepted
         ]
-        # a pair by repeated features must be confirmed, unless nothing else connects its sides
+        # A pair by repeated features must be confirmed, unless nothing else connects its sides.
         needs_no_loop = pair.sure or group[i] != group[j]
         if closed.count(False) <= closed.count(True) and (needs_no_loop or any(closed)):
             accepted.add((i, j))
@@ -107,7 +108,9 @@ def split_contradicted(
     )
 
 
-def _without_weak(pairs: Sequence[Pair], accepted: set[Ids], min_share: float) -> set[Ids]:
+def _without_weak(
+    pairs: Sequence[Pair], accepted: set[PhotographPair], min_share: float
+) -> set[PhotographPair]:
     """The accepted pairs without the weaker ones of photographs most of whose pairs contradict
     others; a pair that alone connects photographs stays."""
     weak = []
@@ -117,23 +120,16 @@ def _without_weak(pairs: Sequence[Pair], accepted: set[Ids], min_share: float) -
         if len(left) < min_share * len(every):
             most = max(map(len, left), default=0)
             weak += [p for p in left if 2 * len(p) < most]
+    number = max((k for pair in pairs for k in pair.images), default=0) + 1
     for pair in sorted(weak, key=len):
-        others = accepted - {pair.images}
-        if _are_connected(others, *pair.images):
+        others, (i, j) = accepted - {pair.images}, pair.images
+        label = label_connected(number, others)
+        if label[i] == label[j]:
             accepted = others
     return accepted
 
 
-def _are_connected(pairs: set[Ids], i: int, j: int) -> bool:
-    """Whether a chain of pairs leads from a photograph to another."""
-    reached, before = {i}, set()
-    while reached != before and j not in reached:
-        before = reached
-        reached = before | {k for pair in pairs if before & {*pair} for k in pair}
-    return j in reached
-
-
-def _pair(i: int, j: int) -> Ids:
+def _pair(i: int, j: int) -> PhotographPair:
     return min(i, j), max(i, j)
 
 
@@ -155,7 +151,7 @@ class _Loops:
             self.neighbours.setdefault(j, set()).add(i)
         self.closed: dict[tuple[int, ...], bool | None] = {}
 
-    def thirds(self, ids: Ids) -> list[int]:
+    def thirds(self, ids: PhotographPair) -> list[int]:
         """Photographs that form a pair with both, those with the most matches first."""
         if ids not in self.pairs:
             return []
@@ -164,7 +160,7 @@ class _Loops:
         common = sorted(self.neighbours[i] & self.neighbours[j], key=lambda k: (-fewest(k), k))
         return common[: self.settings.max_loops]
 
-    def closes(self, ids: Ids, k: int) -> bool | None:
+    def closes(self, ids: PhotographPair, k: int) -> bool | None:
         """Whether a loop closes; None if the bases are unknown."""
         loop = tuple(sorted((*ids, k)))
         if loop not in self.closed:
@@ -173,16 +169,15 @@ class _Loops:
 
     def _closes(self, i: int, j: int, k: int) -> bool | None:
         ij, jk, ik = (self.pairs[ids] for ids in ((i, j), (j, k), (i, k)))
-        turn = jk.M @ ij.M @ ik.M.T
-        if rotation_angle(turn) > self.settings.max_rotation:
+        if loop_misclosure(ij.M, jk.M, ik.M) > self.settings.max_rotation:
             return False
         # ln β of jk and ik, β of ij is 1: each from the features that two pairs share in the
         # photograph that they share; two of the three ratios suffice
         at_j, at_i = self._ratio((i, j), (j, k), 1, 0), self._ratio((i, j), (i, k), 0, 0)
         at_k = self._ratio((j, k), (i, k), 1, 1)
-        # without two of them the bases can have any lengths: of the second equation only β > 0 is
+        # Without two of them the bases can have any lengths: of the second equation only β > 0 is
         # left. If ik is narrow, its base may be the small difference of two opposite ones, of any
-        # direction; if ij or jk is narrow, its base is short, and ik nearly has that of the other
+        # direction; if ij or jk is narrow, its base is short, and ik nearly has that of the other.
         if np.isnan([at_j, at_i, at_k]).sum() > 1:
             between = _is_between(ij.b, ij.M.T @ jk.b, ik.b, self.settings.max_aside)
             return None if between or ik.angle < self.settings.narrow_angle else False
@@ -193,7 +188,9 @@ class _Loops:
         longest = max(1.0, np.exp(of_jk), np.exp(of_ik))
         return bool(gap < self.settings.max_gap * longest)
 
-    def _ratio(self, one: Ids, other: Ids, of_one: int, of_other: int) -> float:
+    def _ratio(
+        self, one: PhotographPair, other: PhotographPair, of_one: int, of_other: int
+    ) -> float:
         """ln of the ratio of the base of `other` to that of `one`, by the depths in their common
         photograph: the first or second (0, 1) of each; NaN: unknown."""
         a, depth = self.pairs[one].matches[:, of_one], self.depth[one][of_one]
@@ -226,12 +223,6 @@ def _depths(
         np.pad(ideal[k][rows], ((0, 0), (0, 1)), constant_values=-1.0)
         for k, rows in zip(pair.images, pair.matches.T)
     )
-    c = c @ pair.M
-    # normal equations of s·a − t·c = b for the nearest points of two rays
-    aa, cc, dot = (a**2).sum(1), (c**2).sum(1), (a * c).sum(1)
-    determinant = aa * cc - dot * dot
+    first, second, determinant = depths_of_rays(a, c @ pair.M, pair.b)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return (
-            (cc * (a @ pair.b) - dot * (c @ pair.b)) / determinant,
-            (dot * (a @ pair.b) - aa * (c @ pair.b)) / determinant,
-        )
+        return first / determinant, second / determinant

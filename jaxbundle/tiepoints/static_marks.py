@@ -75,7 +75,7 @@ def without_marks(
     }
     if not marks:
         return list(matches), 0
-    # a mark at the border of a cell falls into its neighbour in another photograph
+    # A mark at the border of a cell falls into its neighbour in another photograph.
     near = {(size, i + a, j + b) for size, i, j in marks for a in (-1, 0, 1) for b in (-1, 0, 1)}
     remaining, marked = [], set()
     for m, (rows, _) in zip(matches, still):
@@ -101,7 +101,7 @@ def _find_still(
     a, b = features[i].take(m.rows[:, 0]), features[j].take(m.rows[:, 1])
     motion = np.linalg.norm(a.xy - b.xy, axis=1) / (settings.max_motion * max(sizes[i]))
     same = np.abs(np.log(a.size / b.size)) < np.log(settings.max_size_ratio)
-    # the difference of two directions, in (−π, π]
+    # The difference of two directions, in (−π, π].
     same &= np.abs(np.angle(np.exp(1j * (a.angle - b.angle)))) < settings.max_turn
     return same & (motion < 1), motion
 

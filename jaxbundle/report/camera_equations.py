@@ -139,7 +139,7 @@ EQUATIONS: dict[str, tuple[str, ...]] = {
 }
 
 
-def equations(model: CameraModel) -> tuple[str, ...]:
+def camera_equations(model: CameraModel) -> tuple[str, ...]:
     """The lines that state a model's equations."""
     name = model.name if is_own(model) else re.sub(r"-\d.*", "", model.name)
     if name in EQUATIONS:

@@ -27,7 +27,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxbundle.tiepoints.verification import Pair, refine_rotations, rotation_angle
+from jaxbundle.tiepoints.pair_graph import label_connected
+from jaxbundle.tiepoints.verification import Pair, loop_misclosure, refine_rotations
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +73,7 @@ class OrientedPairs:
     """Pairs oriented with a camera, and the coordinates, c = 1, of their matches with another."""
 
     pairs: Sequence[Pair]
-    ideal: Callable[[Interior], Sequence[tuple[np.ndarray, np.ndarray]]]
+    ideal_with: Callable[[Interior], Sequence[tuple[np.ndarray, np.ndarray]]]
 
 
 def close_rotations(
@@ -97,8 +98,8 @@ def close_rotations(
             minima.append(minimum)
     if not minima:
         return start
-    # with a wrong camera few pairs are oriented, and a few loops may close by chance: only minima
-    # with more than half of the largest number of loops are compared
+    # With a wrong camera few pairs are oriented, and a few loops may close by chance: only minima
+    # with more than half of the largest number of loops are compared.
     most = max(minimum.independent for minimum in minima)
     many = [minimum for minimum in minima if 2 * minimum.independent > most]
     best = min(many, key=lambda minimum: minimum.per_loop).interior
@@ -127,16 +128,16 @@ def _search(
         return None
 
     def total(x: Interior) -> float:
-        M = refine_rotations(pairs, oriented.ideal(x))
+        M = refine_rotations(pairs, oriented.ideal_with(x))
         ij, jk, ik = (M[column] for column in loops.T)
-        # a pair that cannot be refined with this camera counts as a half turn
-        angle = np.nan_to_num(rotation_angle(jk @ ij @ np.swapaxes(ik, 1, 2)), nan=np.pi)
+        # A pair that cannot be refined with this camera counts as a half turn.
+        angle = np.nan_to_num(loop_misclosure(ij, jk, ik), nan=np.pi)
         misclosure = independent * np.log1p((angle / settings.sigma_rotation) ** 2).mean()
         off = (x[0] - middle) / settings.sigma_log_distance, x[1] / settings.sigma_k1
         return misclosure + off[0] ** 2 + off[1] ** 2
 
-    # without derivatives: each evaluation refines every pair anew (and may lose rays at the
-    # border), and the sum has kinks where wrong loops close
+    # Without derivatives: each evaluation refines every pair anew (and may lose rays at the
+    # border), and the sum has kinks where wrong loops close.
     simplex = first + np.array([[0, 0], [settings.step_log_distance, 0], [0, settings.step_k1]])
     minimum = minimize(
         total,
@@ -155,16 +156,12 @@ def _search(
 def count_independent(pairs: Sequence[tuple[int, int]]) -> int:
     """The number of independent loops of pairs: edges − nodes + connected components, the
     dimension of the cycle space of a graph."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    photographs, ends = np.unique(np.reshape(pairs, (-1, 2)), return_inverse=True)
-    shape = (len(photographs), len(photographs))
     if not len(pairs):
         return 0
-    i, j = ends.reshape(-1, 2).T
-    groups, _ = connected_components(coo_array((np.ones(len(i)), (i, j)), shape), directed=False)
-    return len(pairs) - len(photographs) + groups
+    photographs, ends = np.unique(np.reshape(pairs, (-1, 2)), return_inverse=True)
+    i, j = ends.reshape(-1, 2).T.tolist()
+    groups = label_connected(len(photographs), list(zip(i, j))).max() + 1
+    return int(len(pairs) - len(photographs) + groups)
 
 
 def find_loops(pairs: Sequence[tuple[int, int]]) -> Int[np.ndarray, "loops 3"]:

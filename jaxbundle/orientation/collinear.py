@@ -30,7 +30,7 @@ from jaxbundle.orientation.incremental import Model
 from jaxbundle.orientation.rays import Sights
 
 
-def have_one_line(
+def rays_coincide(
     seen: Sights,
     model: Model,
     points: Bool[np.ndarray, " points"],
@@ -72,13 +72,13 @@ def have_one_line(
     return one_line, one_line & (misses(away / usual) < limit)
 
 
-def see_a_line(
+def see_collinear_points(
     seen: Sights, model: Model, factor: float = 1.0, significance: float = 0.001
 ) -> Bool[np.ndarray, " images"]:
     """Which images see known points on a line only, or fewer than three. Images that are not placed
     count as at the usual distance.
 
-    **Arguments:** as of `have_one_line`."""
+    **Arguments:** as of `rays_coincide`."""
     rows = np.flatnonzero(model.known[seen.point] & (seen.sigma > 0))
     image = seen.image[rows]
     number = np.bincount(image, minlength=seen.images)

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from jaxbundle.leastsquares.equations.separation import choose_together, find_alternatives
 from jaxbundle.leastsquares.quality.correlation import correlation_matrix, total_correlation
+from jaxbundle.leastsquares.quality.separability import choose_together, find_alternatives
 
 CRITICAL, APART = 4.0, 3.29
 

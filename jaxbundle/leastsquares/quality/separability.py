@@ -4,17 +4,19 @@ A blunder ∇_b (in σ) of observation b moves the test of observation a by
 
     Δw_a = −h_ab·∇_b/√r_a,    ∇_b ≈ w_b/√r_b                       Baarda (1968); Förstner (1985)
 
-If a and b share no eliminated unknown, h_ab = ã·S⁻¹·b̃ᵀ with the rows reduced by elimination. So
+If a and b share no eliminated row, h_ab = ã·S⁻¹·b̃ᵀ with the rows reduced by elimination. So
 h_ab² ≤ h̃_a·h̃_b (Cauchy and Schwarz), where h̃ is h less the part of the eliminated unknown of the
 observation. With the leverage l = h̃/r
 
     |Δw_a| ≤ √(l_a·l_b)·|w_b|
 
 and a can be removed together with worse ones b if its test exceeds the critical value even
-without their largest possible influence. Only one observation per eliminated unknown is removed at
-a time. These are compared by another test: T_A = v_Aᵀ·(R_AA)⁺·v_A is the decrease of vᵀv without
-the observations A. If T_b is significant like T_a, but T_ab − T_b is not, b explains everything
-that a does: one of them is wrong, and they cannot be separated (separability: Förstner, 1983).
+without their largest possible influence. That of b is considered only if both touch the same kept
+row first (the same image, say); what passes through other unknowns is neglected. Only one
+observation of an eliminated row is removed at a time. These are compared by another test:
+T_A = v_Aᵀ·(R_AA)⁺·v_A is the decrease of vᵀv without the observations A. If T_b is significant like
+T_a, but T_ab − T_b is not, b explains everything that a does: one of them is wrong, and they cannot
+be separated (separability: Förstner, 1983).
 
 This module works on rows, groups and numbers only, not on particular observations.
 """
@@ -27,31 +29,33 @@ from jaxtyping import Float, Int
 
 def choose_together(
     tests: Float[np.ndarray, " n"],
-    own: Int[np.ndarray, " n"],
-    shared: Int[np.ndarray, " n"],
+    eliminated_row: Int[np.ndarray, " n"],
+    first_kept_row: Int[np.ndarray, " n"],
     leverage: Float[np.ndarray, " n"],
     critical: float,
 ) -> list[int]:
-    """Positions of observations that cannot mask each other, the worst first.
+    """Positions of observations that cannot mask each other through the first kept row they touch,
+    the worst first.
 
     **Arguments:**
 
     - `tests`: |w| > `critical` of the candidates.
-    - `own`: the eliminated unknown of each: at most one observation of it is chosen.
-    - `shared`: its block of unknowns that are not eliminated: observations of the same block are
-      taken as correlated as `leverage` (h̃/r) allows.
+    - `eliminated_row` of each: at most one of its observations is chosen.
+    - `first_kept_row`: observations that touch the same one are taken as correlated as `leverage`
+      (h̃/r) allows, others as uncorrelated.
     """
     chosen: list[int] = []
     taken: set[int] = set()
     influence: dict[int, float] = {}
     root = np.sqrt(leverage)
     for a in np.argsort(-tests, kind="stable").tolist():
-        block, before = int(shared[a]), influence.get(int(shared[a]), 0.0)
-        if int(own[a]) in taken or not tests[a] - root[a] * before > critical:
+        kept, eliminated = int(first_kept_row[a]), int(eliminated_row[a])
+        before = influence.get(kept, 0.0)
+        if eliminated in taken or not tests[a] - root[a] * before > critical:
             continue
         chosen.append(a)
-        taken.add(int(own[a]))
-        influence[block] = float(before + root[a] * tests[a])
+        taken.add(eliminated)
+        influence[kept] = float(before + root[a] * tests[a])
     return chosen
 
 
@@ -61,17 +65,17 @@ def find_alternatives(
     observations: Sequence[Int[np.ndarray, " k"]],
     suspect: int,
     critical: float,
-    apart: float,
+    critical_alone: float,
     min_redundancy: float = 1e-2,
 ) -> list[int]:
     """Observations that explain the same error as the suspect, so that either may be wrong.
 
     **Arguments:**
 
-    - `design`, `residual`: the rows of one eliminated unknown, divided by their σ.
+    - `design`, `residual`: the rows of one eliminated row, divided by their σ.
     - `observations`: the rows of each observation; `suspect` one of them.
     - `critical`: others with a test below this are not suspected.
-    - `apart`: the suspect is certainly wrong if its test exceeds this without the other one.
+    - `critical_alone`: the suspect is certainly wrong if its test exceeds this without the other.
     - `min_redundancy`: directions of the residuals with a smaller redundancy number carry no
       information: a hundredth of an error appears in them.
     """
@@ -94,5 +98,5 @@ def find_alternatives(
         for other in range(len(observations))
         if other != suspect
         and explained(other) > critical**2
-        and explained(suspect, other) - explained(other) < apart**2
+        and explained(suspect, other) - explained(other) < critical_alone**2
     ]

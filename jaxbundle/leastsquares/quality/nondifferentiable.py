@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbundle.leastsquares.equations.normal import Tangent
+from jaxbundle.leastsquares.indexing.plan import Tangent
 from jaxbundle.leastsquares.indexing.rows import (
     Values,
     fill_places,
