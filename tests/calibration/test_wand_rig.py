@@ -78,8 +78,8 @@ def test_what_is_refused(tmp_path):
 
 @pytest.mark.further
 def test_boards_and_a_wand(tmp_path):
-    """Two cameras see a board, two only the wand: truth within σ, one scale; also of a single camera
-    with a board. What is known of the length adds to that of the boards."""
+    """Two cameras see a board, two only the wand: truth within σ, one scale; also of a single
+    camera with a board. What is known of the length adds to that of the boards."""
     found = rig_of(("c0", "c1"))
     assert found.converged and 0.85 < found.sigma0 < 1.15
     assert found.names == list(room.NAMES) and set(found.cameras) == {"c0", "c1"}

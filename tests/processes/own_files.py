@@ -208,7 +208,8 @@ def write_waved(path: Path, camera: str) -> None:
         lines += [f"{f},{marker},{x},{y}" for f, (x, y) in enumerate(xy)]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     names = get_model("opencv").parameters
-    lens = Camera("far", "opencv", dict(zip(names, render.LENS.parameters)), (), image_size=(480, 360))
+    values = dict(zip(names, render.LENS.parameters))
+    lens = Camera("far", "opencv", values, (), image_size=render.LENS.size)
     write_cameras([lens], path.parent / "far.toml")
 
 

@@ -219,7 +219,7 @@ def calibrate_wand(
             )
     images = {name: given for name, given in markers.items() if are_images(given)}
     tables = {name: _marks(name, given) for name, given in markers.items() if name not in images}
-    frames = {name: dict.fromkeys(mark.frame for mark in own) for name, own in tables.items()}
+    frames = {name: [*dict.fromkeys(m.frame for m in own)] for name, own in tables.items()}
     pairs, notes, measured = _pairs(lengths, tables), [], {}
     if images:
         found = measure_wand(images, cameras, frames, blobs or BlobSettings(), progress)

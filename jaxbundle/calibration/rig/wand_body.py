@@ -191,7 +191,7 @@ def add_wand(
     rows = [(len(rig.epochs) + e, *row) for e, frame in enumerate(frames) for row in seen[frame]]
     epoch, camera, point, marks = zip(*rows)
     xy, sigma = _in_units(rig, np.array(camera), marks, wand, calibrations)
-    pose = pose_values(poses)
+    pose = pose_values([*poses])
     join = lambda a, b: PoseValue(*(np.concatenate(parts) for parts in zip(a, b)))
     place = rig.place
     if place is not None:

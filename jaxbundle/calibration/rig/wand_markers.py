@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import count
@@ -276,7 +276,7 @@ def _turns_of_pair(
     M, base, _, _ = batched.orient_pairs([xy1], [xy2], np.array([tolerance]))
     distances = jax.vmap(sampson_distance, (None, None, 0, 0))
     off = np.abs(distances(M[0], base[0], first.reshape(-1, 2), second.reshape(-1, 2)))
-    fits: Bool[np.ndarray, "2 n"] = (np.asarray(off).reshape(2, -1, 2) < tolerance).all(2)
+    fits = np.asarray((off.reshape(2, -1, 2) < tolerance).all(2))
     clear = fits[0] != fits[1]
     if clear.mean() < settings.min_agreeing:
         return {}
