@@ -86,6 +86,7 @@ def find_still_scene(frames: Iterable[Grey], settings: BlobSettings) -> StillSce
     # of an even number the lower of the middle two: a marker in half of the frames is none of it
     row = (len(stack) - 1) // 2
     background = np.partition(stack, row, axis=0)[row]
+    # Signed: darker than the background is less than 0, not 255.
     strongest = max(int((one.astype(np.int16) - background).max()) for one in stack)
     least = SpotSettings().min_contrast
     if strongest < least:
@@ -97,7 +98,9 @@ def find_moving_blobs(grey: Grey, scene: StillScene, settings: BlobSettings) -> 
     """The measured centres of the blobs of a frame that are not in the scene and stand free of each
     other; none if there are more than `max_blobs`."""
     signal = _brighten(grey, settings).astype(np.float32) - scene.background
+    # Eight neighbours: the pixels of a small blob may touch at their corners only.
     labels, number = scipy.ndimage.label(signal > scene.level, np.ones((3, 3)))
+    # So many are noise or another light, and measuring each would take long.
     if number > 10 * settings.max_blobs:
         return []
     found: list[Target] = []
@@ -116,6 +119,7 @@ def find_moving_blobs(grey: Grey, scene: StillScene, settings: BlobSettings) -> 
         except InputError:
             # cut by the edge of the image, or within the noise
             continue
+        # A centre outside of the blob is that of something else.
         if target.bright and np.linalg.norm(target.xy - near) < max(inside.shape):
             found.append(target)
     return found if len(found) <= settings.max_blobs else []

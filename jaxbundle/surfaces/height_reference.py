@@ -48,6 +48,7 @@ class HeightReference:
             return np.zeros(len(x))
         longitude, latitude = to_degrees(x, y, self.horizontal)
         N = undulations_at(self.geoid, longitude, latitude)
+        # Never 0: heights that are tens of metres off would look like an answer.
         if (missing := np.isnan(N)).any():
             k = int(missing.argmax())
             raise InputError(
@@ -69,6 +70,7 @@ class HeightReference:
     ) -> tuple[float, float]:
         """The range of computed heights that contains a range of wanted ones at all of some
         places."""
+        # computed = wanted − added, and added differs over the area.
         added = self.correction(x, y)
         low, high = heights
         return float(low - added.max(initial=-np.inf)), float(high - added.min(initial=np.inf))
@@ -197,12 +199,15 @@ def _above_geoid(crs: str, geoid: str | Path | None, before: str) -> HeightRefer
     if parts.vertical is None:
         system = with_heights_above(parts.horizontal, geoid)
     else:
+        # Depths, and heights in feet, would need a conversion that nobody has asked for.
         (axis,) = parts.vertical.axis_info
         if axis.direction != "up" or axis.unit_conversion_factor != 1:
             raise InputError(
                 f"--crs {crs}: its heights, {parts.vertical.name}, are in {axis.unit_name}, "
                 f"{axis.direction}; expected metres upwards"
             )
+        # A known grid of another system is a mistake; an unknown file may be a copy of the right
+        # one.
         known, grid = GRIDS.get(code or 0), Path(geoid).name
         if known is not None and grid in GRIDS.values() and grid != known:
             raise InputError(

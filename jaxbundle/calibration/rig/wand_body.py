@@ -92,6 +92,7 @@ class WandBody:
 
     def _poses(self) -> dict[str, Float[np.ndarray, "4 4"]]:
         """From the frame of the wand's network to each camera."""
+        # Its cameras have one image each, which has their name.
         images = self.found.adjustment.values["image"]
         poses = {}
         for k, name in enumerate(self.found.adjustment.problem.network.images.id):
@@ -102,6 +103,7 @@ class WandBody:
     def points(self, mountings: Mapping[str, Float[np.ndarray, "4 4"]]) -> dict[str, np.ndarray]:
         """By frame, both ends in the frame of the rig [2, 3]; `mountings`: rig to camera."""
         name, pose = next(iter(self._poses().items()))
+        # Any camera of both ties the frames; what is left is a matter of the adjustment.
         to_rig = np.linalg.inv(mountings[name]) @ pose
         adjustment = self.found.adjustment
         at = dict(zip(adjustment.problem.network.points.id, np.asarray(adjustment.values["point"])))
@@ -138,6 +140,7 @@ def start_wand(
             f"wand: camera {missing[0]!r} sees no board; expected its interior orientation in "
             "cameras (--cameras)"
         )
+    # Their interior orientation is that of the boards; the wand alone would weaken it.
     hold = lambda camera: dataclasses.replace(camera, free=(), sigma={}, observed={})
     known = {name: hold(known[name]) for name in wand.markers}
     found = calibrate_wand(
@@ -186,6 +189,7 @@ def add_wand(
             if mark.frame in seen and mark.marker in wand.ends:
                 point = len(rig.ids) + wand.ends.index(mark.marker)
                 seen[mark.frame].append((names.index(name), point, mark))
+    # Two markers in two cameras: with fewer rays a pose of five unknowns is not checked.
     frames = [frame for frame, rows in seen.items() if len(rows) >= 4]
     poses = np.array([_stick_to_rig(*ends[frame]) for frame in frames])
     rows = [(len(rig.epochs) + e, *row) for e, frame in enumerate(frames) for row in seen[frame]]
@@ -195,6 +199,7 @@ def add_wand(
     join = lambda a, b: PoseValue(*(np.concatenate(parts) for parts in zip(a, b)))
     place = rig.place
     if place is not None:
+        # The wand has no place of its own beside its body's: the identity.
         place = join(place, PoseValue(np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]])))
     half = wand.length / 2
     labels = [f"{BODY} {frame}" for frame in frames]
@@ -236,6 +241,7 @@ def _sigma0(calibrations: Mapping[str, Calibration]) -> float:
 def _stick_to_rig(a: np.ndarray, b: np.ndarray) -> Float[np.ndarray, "4 4"]:
     """Body to rig: the origin midway, e_x towards the second end."""
     x = (b - a) / np.linalg.norm(b - a)
+    # A rotation about itself has no effect: any axis across it, not nearly along it.
     y = np.cross(np.eye(3)[np.abs(x).argmin()], x)
     y /= np.linalg.norm(y)
     return transformation(np.stack([x, y, np.cross(x, y)], 1), (a + b) / 2)

@@ -127,9 +127,11 @@ def name_three(
     for seen in _by_frame(marks).values():
         uv = np.array([(mark.x, mark.y) for mark in seen])
         straight = _straight_triples(uv, interior, settings)
+        # Perspective changes the ratio by that of the depths of both ends, to either side.
         possible = [rows for rows, observed in straight if 1 / depth < observed / ratio < depth]
         without += not possible
         ambiguous += len(possible) > 1
+        # For the message where none fits: a wrong length in the table shows in this ratio.
         seen_ratios += [observed for _, observed in straight]
         if len(possible) == 1:
             by = zip((near, names[middle], far), possible[0])
@@ -161,10 +163,12 @@ def _straight_triples(
         apart = {pair: np.linalg.norm(uv[pair[0]] - uv[pair[1]]) for pair in combinations(rows, 2)}
         if min(apart.values()) < settings.min_distance or not np.isfinite(xy[[*rows]]).all():
             continue
+        # The ends are farthest from each other.
         near, far = max(apart, key=lambda pair: apart[pair])
         (middle,) = {*rows} - {near, far}
         line, a, b = xy[far] - xy[near], xy[middle] - xy[near], xy[middle] - xy[far]
         bend = abs(line[0] * a[1] - line[1] * a[0]) / (line @ line)
+        # The near end is that beside the middle marker.
         if np.linalg.norm(a) > np.linalg.norm(b):
             near, far, a, b = far, near, b, a
         if bend < settings.max_bend:
@@ -206,6 +210,7 @@ def _name_two(
         }
         for camera, own in frames.items()
     }
+    # Rays have c = 1, the tolerance is in pixels.
     tolerance = {camera: settings.tolerance * _pixel(cameras[camera]) for camera in marks}
     turns: dict[tuple[str, str], Turns] = {}
     for one, other in combinations(marks, 2):
@@ -216,6 +221,7 @@ def _name_two(
             turns[one, other] = dict.fromkeys(frames[one].keys() & frames[other].keys(), False)
     found: dict[str, Marks] = {camera: [] for camera in marks}
     left = contradicting = 0
+    # Named cameras first: the others follow their names.
     order = [*(c for c in marks if c not in nameless), *nameless]
     for frame in dict.fromkeys(frame for own in frames.values() for frame in own):
         seeing = [camera for camera in order if frame in frames[camera]]
@@ -271,12 +277,14 @@ def _turns_of_pair(
     b = np.array([other[frame] for frame in common])
     # straight pairings, and crossed ones
     first, second = np.concatenate([a, a]), np.concatenate([b, b[:, ::-1]])
+    # Mixed, since a search with gross errors may take the first ones for good.
     mixed = np.random.default_rng(0).permutation(4 * len(common))
     xy1, xy2 = first.reshape(-1, 2)[mixed], second.reshape(-1, 2)[mixed]
     M, base, _, _ = batched.orient_pairs([xy1], [xy2], np.array([tolerance]))
     distances = jax.vmap(sampson_distance, (None, None, 0, 0))
     off = np.abs(distances(M[0], base[0], first.reshape(-1, 2), second.reshape(-1, 2)))
     fits = np.asarray((off.reshape(2, -1, 2) < tolerance).all(2))
+    # Both fit where the wand lies in the epipolar plane: nothing tells them apart there.
     clear = fits[0] != fits[1]
     if clear.mean() < settings.min_agreeing:
         return {}
@@ -305,8 +313,10 @@ def _turns_of_frame(
                 if other not in found:
                     found[other] = turn
                     reached.append(other)
+                # A loop of cameras that does not close: one of its pairs is wrong.
                 elif found[other] != turn:
                     return None
+        # The largest group stands for the frame; others have no order in common with it.
         if len(found) > len(best):
             best = found
     return best if len(best) > 1 else {}
