@@ -185,6 +185,7 @@ def _write_foreign(network: Network, folder: Path, name: str, limits: Sequence[s
         except InputError as error:
             return [f"not written for OpenCV and COLMAP: {error}"]
         remark = [f"{name}.yaml and {COLMAP}: {conversion}" for conversion in cost.values()]
+    # Whoever undistorts whole images with this file meets the radius at which it ends.
     comments = "".join(f"# {limit}\n" for limit in limits)
     write_text(folder / f"{name}.yaml", opencv_text(network.cameras[0]) + comments)
     fill_colmap(network, folder / COLMAP)
