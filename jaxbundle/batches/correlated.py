@@ -14,6 +14,10 @@ and with the triangular factors L of a view and R of the camera the effects of t
 so that covariances need only W·V·Wᵀ, W·V·Zᵀ and Z·V·Zᵀ of every V = F·Fᵀ: no row of all
 observations is solved for. T of errors along tracks and of given points, of which a camera has
 thousands of columns, is from random combinations of them (`SumSettings`).
+
+Three programs, for each only the cameras and components that need it: q of all cameras, without any
+span or root (0.45 ms for 20 views of 88 points); T, of some of a batch with sizes in common (6 ms);
+the covariances that components of θ > 0 give (0.55 ms).
 """
 
 import dataclasses

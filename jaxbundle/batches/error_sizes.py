@@ -95,7 +95,7 @@ def _shown(
     shown[:, FIELD:TRACKS] = (views >= settings.min_images)[:, None]
     shown[:, FIELD] &= points >= settings.min_points_of_field
     shown[:, TRACKS] = views > 1
-    shown[:, GIVEN:] = sums.forms.given >= settings.min_given_points
+    shown[:, GIVEN:] = (sums.forms.given >= settings.min_given_points)[:, None]
     sound = np.isfinite(sums.forms.q).all(1) & np.isfinite(sums.traces.T).all((1, 2))
     return shown & np.asarray(sound)[:, None]
 
