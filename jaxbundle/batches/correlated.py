@@ -252,7 +252,8 @@ def traces_of_portion(
 ) -> ComponentTraces:
     """The traces of the cameras of a portion for which they are wanted."""
     number = len(COMPONENTS)
-    none = lambda _: ComponentTraces(*(jnp.zeros((number,) * n) for n in (2, 3)))
+    zero: list[Any] = [jnp.zeros((number,) * n) for n in (2, 3)]
+    none = lambda _: ComponentTraces(*zero)
     signs = _signs(settings, *seen.weight.shape[1:])
 
     def traced(given: tuple[Sightings, CameraUnknowns]) -> ComponentTraces:
@@ -276,7 +277,8 @@ def parts_of_portion(
     the classical covariance, and left at zero."""
     number, k, views = len(COMPONENTS), len(key.free), seen.weight.shape[1]
     shapes = (number,), (number, k, k), (number, views, POSE)
-    none = lambda *_: ComponentParts(*map(jnp.zeros, shapes))
+    zero: list[Any] = [jnp.zeros(shape) for shape in shapes]
+    none = lambda *_: ComponentParts(*zero)
     found = partial(_parts, key.model, key.free, settings)
     of_camera = lambda given: jax.lax.cond(jnp.any(given[-1][1:]), found, none, *given)
     return key.for_every(of_camera)((seen, at, axes, middle, wanted))
