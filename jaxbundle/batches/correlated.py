@@ -14,6 +14,10 @@ and with the triangular factors L of a view and R of the camera the effects of t
 so that covariances need only W·V·Wᵀ, W·V·Zᵀ and Z·V·Zᵀ of every V = F·Fᵀ: no row of all
 observations is solved for. T of errors along tracks and of given points, of which a camera has
 thousands of columns, is from random combinations of them (`SumSettings`).
+
+Three programs, for each only the cameras and components that need it: q of all cameras, without any
+span or root (0.45 ms for 20 views of 88 points); T, of some of a batch with sizes in common (6 ms);
+the covariances that components of θ > 0 give (0.55 ms).
 """
 
 import dataclasses
@@ -248,7 +252,8 @@ def traces_of_portion(
 ) -> ComponentTraces:
     """The traces of the cameras of a portion for which they are wanted."""
     number = len(COMPONENTS)
-    none = lambda _: ComponentTraces(*(jnp.zeros((number,) * n) for n in (2, 3)))
+    zero: list[Any] = [jnp.zeros((number,) * n) for n in (2, 3)]
+    none = lambda _: ComponentTraces(*zero)
     signs = _signs(settings, *seen.weight.shape[1:])
 
     def traced(given: tuple[Sightings, CameraUnknowns]) -> ComponentTraces:
@@ -272,7 +277,8 @@ def parts_of_portion(
     the classical covariance, and left at zero."""
     number, k, views = len(COMPONENTS), len(key.free), seen.weight.shape[1]
     shapes = (number,), (number, k, k), (number, views, POSE)
-    none = lambda *_: ComponentParts(*map(jnp.zeros, shapes))
+    zero: list[Any] = [jnp.zeros(shape) for shape in shapes]
+    none = lambda *_: ComponentParts(*zero)
     found = partial(_parts, key.model, key.free, settings)
     of_camera = lambda given: jax.lax.cond(jnp.any(given[-1][1:]), found, none, *given)
     return key.for_every(of_camera)((seen, at, axes, middle, wanted))

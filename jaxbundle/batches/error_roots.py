@@ -189,7 +189,7 @@ def correlation_of_views(
     X = jnp.asarray(seen.point)
     away = jnp.linalg.norm(X[None] - station[:, None], axis=2)
     apart = jnp.linalg.norm(station[:, None] - station, axis=2)
-    return wendland(apart / (reach * _median(away, used > 0)))
+    return jnp.asarray(wendland(apart / (reach * _median(away, used > 0))))
 
 
 def _median(x: Float[Array, "*axes"], among: Bool[Array, "*axes"]) -> Float[Array, ""]:

@@ -81,7 +81,8 @@ def batch_errors(
     find = _common_sizes if together else _sizes_of_each
     theta, parts = find(sums, shown, critical, programs)
     # a camera without sizes has no σ: zero would read as without any error
-    used = np.where(np.isnan(theta).all(1)[:, None], np.nan, np.nan_to_num(theta))
+    none = np.isnan(theta).all(1, keepdims=True)
+    used = np.where(none, np.nan, np.nan_to_num(theta))
     covariance = np.einsum("nk,nkij->nij", parts.factor * used, parts.interior)
     variance = np.einsum("nk,nkvi->nvi", parts.factor * used, parts.pose)
     return BatchErrors(np.sqrt(theta), covariance, variance)
@@ -95,7 +96,7 @@ def _shown(
     shown[:, FIELD:TRACKS] = (views >= settings.min_images)[:, None]
     shown[:, FIELD] &= points >= settings.min_points_of_field
     shown[:, TRACKS] = views > 1
-    shown[:, GIVEN:] = sums.forms.given >= settings.min_given_points
+    shown[:, GIVEN:] = (sums.forms.given >= settings.min_given_points)[:, None]
     sound = np.isfinite(sums.forms.q).all(1) & np.isfinite(sums.traces.T).all((1, 2))
     return shown & np.asarray(sound)[:, None]
 
@@ -113,14 +114,12 @@ class SizedParts(NamedTuple):
         """Without any widening; None: independent errors alone."""
         factor = np.ones(sums.forms.q.shape)
         if parts is None:
-            own = sums.interior[:, None], sums.pose[:, None]
             interior, pose = (
-                np.concatenate([x, np.zeros((len(x), factor.shape[1] - 1, *x.shape[2:]))], 1)
-                for x in own
+                np.zeros((*factor.shape, *x.shape[1:])) for x in (sums.interior, sums.pose)
             )
         else:
             interior, pose = np.array(parts.interior), np.array(parts.pose)
-            interior[:, 0], pose[:, 0] = sums.interior, sums.pose
+        interior[:, 0], pose[:, 0] = sums.interior, sums.pose
         return SizedParts(factor, interior, pose)
 
     def tables(
@@ -145,8 +144,8 @@ def _sizes_of_each(
         block = np.ix_(of, of), np.ix_(of, of, of)
         equations = SizeEquations(T[n][block[0]], False, critical, cubes[n][block[1]])
         theta[n, of] = equations.solve(q[n][of])[0]
-    used = np.nan_to_num(theta) > 0
-    shared = used[:, 1:].any(1)
+    used: np.ndarray = np.nan_to_num(theta) > 0
+    shared = np.asarray(used[:, 1:].any(1))
     if not shared.any():
         return theta, SizedParts.of(sums, None)
     parts = SizedParts.of(sums, programs.parts(used & shared[:, None]))

@@ -126,10 +126,10 @@ def effects_of_object_points(
     X = [jnp.where(weight > 0, seen.point[:, i], 0.0) for i in range(3)]
 
     def weighted_residual(X: Sequence[ByPoint]) -> tuple[ByPoint, ByPoint]:
-        ray = tuple(
+        r, s, q = (
             sum(M[:, i, j, None] * X[j] for j in range(3)) + at.shift[:, i, None] for i in range(3)
         )
-        vx, vy = cameras.residual(model, "measured", tuple(at.interior), ray, xy)
+        vx, vy = cameras.residual(model, "measured", tuple(at.interior), (r, s, q), xy)
         return weight * vx, weight * vy
 
     one, none = jnp.ones_like(weight), jnp.zeros_like(weight)

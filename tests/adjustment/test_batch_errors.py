@@ -106,7 +106,7 @@ def test_sizes_of_a_batch_are_those_of_all_cameras_together(network):
     alone, together = (of_batch(network, correlated=how) for how in ("camera", "batch"))
     np.testing.assert_allclose(together.sigma_correlated, alone.sigma_correlated, rtol=0.05)
     rays = network.observations
-    xy = np.full((2, VIEWS, len(network.points), 2), np.nan)
+    xy = np.full((3, VIEWS, len(network.points), 2), np.nan)
     xy[:, rays.image, rays.point] = rays.xy
     xy[1, DEFAULTS.min_images - 2 :] = np.nan
     both = jaxbundle.calibrate_batch(

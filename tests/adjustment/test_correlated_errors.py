@@ -333,6 +333,19 @@ def test_errors_across_a_board_are_told_from_those_in_its_plane(clean):
 
 
 @pytest.mark.further
+def test_too_few_photographs_for_halves():
+    """The remedy that is named can be followed."""
+    targets = grid_of_targets(9, 7, 0.6, relief=0.6)
+    first = lambda number: jaxbundle.simulate(
+        ring_of_stations(number, 5.0, 6.0, roll_every=2), targets, CAMERA, noise=SIGMA, seed=1
+    )
+    with pytest.raises(jaxbundle.InputError, match="4 photographs: .* 6 or more; .* points need 3"):
+        jaxbundle.replicate(first(4), by="photographs")
+    with pytest.raises(jaxbundle.InputError, match="2 photographs: halves by points need 3"):
+        jaxbundle.replicate(first(2), by="points")
+
+
+@pytest.mark.further
 def test_check_points_share_the_errors_of_the_network():
     """One by one, the errors of a component displace network and check points: the sum of squares
     is the covariance of a model with this component alone. Without distortion, by which errors of

@@ -13,7 +13,7 @@ errors and those of every octave have the same variance.
 Errors in the plane that fits the points best and errors across it are two components: a print is
 stretched or displaced in its plane, paper bends and lifts across it. Of the board of four cameras,
 estimated as free points, these errors were 0.09 and 0.19 mm; taken as one component, differences of
-halves of its points over their covariance were 1.76, as two 1.5.
+halves of its points over their covariance were d²/n = 1.76, as two 1.59.
 """
 
 from typing import Any
