@@ -12,7 +12,7 @@ errors and those of every octave have the same variance.
 """
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from jaxbundle.leastsquares.quality.error_components import IMAGE, ErrorComponent
 from jaxbundle.leastsquares.quality.error_effects import residual_change
@@ -39,7 +39,8 @@ def given_points_component(
     import scipy.sparse as sp
 
     X = np.asarray(found.values["point"])
-    given = _held(found) & (np.bincount(point, minlength=len(X)) > 1)
+    held = ~np.asarray(found.problem.table("point").free, bool).any(axis=1)
+    given = held & (np.bincount(point, minlength=len(X)) > 1)
     chosen = np.flatnonzero(given)
     if X.shape[1] != 3 or len(chosen) < min_points:
         return None
@@ -60,11 +61,6 @@ def given_points_component(
     # √θ is then the RMS of the effect on an image coordinate
     effect = np.asarray(root.power(2).sum(1)).ravel()[rows] * sigma[own].T.ravel() ** 2
     return ErrorComponent(GIVEN_POINTS, IMAGE, root / np.sqrt(effect.mean()))
-
-
-def _held(found: Solution) -> Bool[np.ndarray, " points"]:
-    """Which points have no free coordinate."""
-    return np.logical_not(np.asarray(found.problem.table("point").free, bool).any(axis=1))
 
 
 def correlation_of_points(
