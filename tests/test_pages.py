@@ -128,7 +128,7 @@ def test_estimated_sigma_are_not_confirmed_after_control_either(convergent4):
 
 
 @pytest.mark.parametrize("factor, state, words", [
-    (3.0, "met", ""), (5.0, "doubtful", "doubtful: "), (19.7, "not met", "most likely wrong: ")
+    (3.0, "noted", ""), (5.0, "doubtful", "doubtful: "), (19.7, "not met", "most likely wrong: ")
 ])  # fmt: skip
 def test_a_reconstruction_that_fits_badly_says_so_first(convergent4, factor, state, words):
     part = ReconstructedPart("part 1", convergent4, {"sift": factor, "other": 1.0}, BLOCK)
