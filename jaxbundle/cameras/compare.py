@@ -112,7 +112,10 @@ def compare_cameras(
     """
     (source, values), (other, others) = (
         (model, {**default_parameters(model), **given})
-        for model, given in ((get_model(model), given) for model, given in (a, b))
+        for model, given in (
+            (get_model(model) if isinstance(model, str) else model, given)
+            for model, given in (a, b)
+        )
     )
     low, high = area or image_area(source, image_size, pixel_size)
     xy = image_grid(low, high)

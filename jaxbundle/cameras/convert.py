@@ -98,7 +98,9 @@ def convert_camera(
 
     **Raises:** `ValueError` naming a missing argument, or the reason why a fit is impossible.
     """
-    source, target = get_model(source), get_model(target)
+    # Parts of built-in models, as start values have them, share a name: objects stay as they are.
+    source = get_model(source) if isinstance(source, str) else source
+    target = get_model(target) if isinstance(target, str) else target
     values = {**default_parameters(source), **parameters}
     sizes = (image_size, pixel_size)
     shift, step = between_frames(source, target, *sizes)
