@@ -1,6 +1,7 @@
 """1000 cameras, calibrated independently, against OpenCV in two processes in the same run.
 
-    python benchmarks/calibration.py [--cameras N] [--repeat N] [--json FILE]
+    python benchmarks/calibration.py [--cameras N] [--repeat N] [--correlated batch|camera]
+                                     [--json FILE]
 
 Every camera: 20 views of a board of 11 × 8 corners, 1920 × 1080 pixels, σ = 0.3 pixels, OpenCV's
 model of 5 coefficients. `jaxbundle.calibrate_batch` gives parameters, poses and all their standard
@@ -98,6 +99,8 @@ def main() -> int:
     parser = machine.parser_of(__doc__)
     parser.add_argument("--cameras", type=machine.positive, default=1000)
     parser.add_argument("--repeat", type=machine.positive, default=3)
+    parser.add_argument("--correlated", choices=("batch", "camera"),
+                        help="also σ under errors that image points share, beside those without")
     parser.add_argument("--json", type=machine.target, help="file for the figures; - for stdout")
     options = parser.parse_args()
     n = options.cameras
@@ -130,6 +133,13 @@ def main() -> int:
     if pool:
         pool.close()
         pool.join()
+    shared = []
+    if options.correlated:
+        under_errors = lambda: jaxbundle.calibrate_batch(
+            X, images, SIZE, correlated=options.correlated
+        )
+        under_errors()
+        shared = [clock(under_errors)[2] for _ in range(options.repeat)]
 
     wall, cpu = (1e3 * min(column) / n for column in zip(*turns))
     error = (batch.values - truth) / batch.sigma
@@ -144,6 +154,9 @@ def main() -> int:
         "error_over_sigma": [round(float(s), 3) for s in error.std(0)],
         "median_rms": float(np.median(batch.rms)),
     }
+    if shared:
+        figures["correlated_processor_ms_per_camera"] = round(1e3 * min(shared) / n, 3)
+        figures["correlated_ratio"] = round(1e3 * min(shared) / n / cpu, 2)
     wrong = [] if batch.converged.all() else ["not every camera has converged"]
     if not (np.abs(error.std(0) - 1) < 5 / np.sqrt(2 * n)).all():
         wrong.append("errors of the parameters do not agree with their σ")

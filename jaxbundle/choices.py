@@ -12,6 +12,8 @@ METHODS = ("levenberg-marquardt", "gauss-newton")
 REDUCTIONS = ("dense", "banded", "iterative")
 # Robust estimators.
 ESTIMATORS = ("huber", "cauchy", "tukey")
+# What the markers of a wand are in an image.
+MARKERS_OF_A_WAND = ("bright", "dark")
 # Tests of data snooping.
 TESTS = ("pope", "baarda")
 # Where a priori σ come from: somebody stated them; nobody did, so that they are units of weight;
@@ -125,6 +127,8 @@ MATCHED_PAIRS = ("auto", "all", "sequence", "place", "alike")
 
 # Points matched for a surface.
 SURFACE_POINTS = ("grid", "edges", "corners")
+# What the heights of a surface are above.
+ELLIPSOID, GEOID = HEIGHTS = ("ellipsoid", "geoid")
 CLOUD_FILES = (".csv", ".ply", ".las", ".laz", ".dxf")
 # The point that replaces those of a cube.
 CUBE_POINTS = ("mean", "corner", "best")

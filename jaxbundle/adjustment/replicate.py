@@ -26,6 +26,7 @@ from jaxbundle.arguments import integer, one_of
 from jaxbundle.choices import REPLICATION
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.formats import as_network
+from jaxbundle.network.columns import count
 from jaxbundle.network.tables import Network
 from jaxbundle.types import Progress
 
@@ -81,10 +82,12 @@ def _compare_halves(
 ) -> Replication:
     """`repeat` splits of one network."""
     network = given.problem.network
-    if len(network.images) < 2 * MIN_IMAGES and by != "points":
+    photographs = len(network.images)
+    needed = MIN_IMAGES if by == "points" else 2 * MIN_IMAGES
+    if photographs < needed:
+        also = f"; halves by points need {MIN_IMAGES}" if photographs >= MIN_IMAGES else ""
         raise InputError(
-            f"{len(network.images)} photographs: halves of them need {2 * MIN_IMAGES} or more; "
-            'halves by "points" can be made'
+            f"{count(photographs, 'photograph')}: halves by {by} need {needed} or more{also}"
         )
     if not any(given.camera_covariance(camera.id)[0] for camera in network.cameras):
         raise InputError("no camera has a free parameter: there is nothing to compare")

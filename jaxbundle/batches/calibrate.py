@@ -19,7 +19,6 @@ from functools import partial
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxbundle.adjustment.quality.correlated_errors import DEFAULTS
 from jaxbundle.arguments import integer, one_of
 from jaxbundle.batches.camera import (
     CONVERGED,
@@ -31,18 +30,13 @@ from jaxbundle.batches.camera import (
     WEAK,
 )
 from jaxbundle.batches.compiled import ProgramKey, Rows, in_double, solve_portion, tests_of_points
-from jaxbundle.batches.correlated import (
-    SUMS,
-    ComponentSums,
-    scatter_of_portion,
-    sums_of_portion,
-)
-from jaxbundle.batches.error_sizes import Scatter, batch_errors
+from jaxbundle.batches.error_sizes import BatchPrograms, BatchSums, batch_errors
 from jaxbundle.batches.input import Batch, Portion
 from jaxbundle.batches.misfit import far_outside, misfits, remarks
-from jaxbundle.batches.normal import CameraUnknowns, Sightings
+from jaxbundle.batches.normal import POSE, CameraUnknowns
 from jaxbundle.batches.result import BatchCalibration as BatchCalibration
 from jaxbundle.batches.snooping import MAX_ROUNDS, TESTS, Snooping
+from jaxbundle.batches.solved_portions import SolvedPortions
 from jaxbundle.batches.weakness import is_vague, vanishing, weak_geometry
 from jaxbundle.cameras import CameraModel, get_model, key_of
 from jaxbundle.float64 import require_x64
@@ -59,7 +53,6 @@ OF_A_VIEW = (
     "sigma_position",
     "sigma_angles",
     "rotation",
-    "sums_pose",
     "sigma_position_correlated",
     "sigma_angles_correlated",
 )
@@ -150,12 +143,7 @@ def calibrate_batch(  # noqa: PLR0913 keyword arguments of a public function
             done += len(portion.cameras)
             if progress is not None:
                 progress("calibrating", done, len(batch))
-    if correlated is not None:
-        # one after the other: large products use all cores, and two programs that wait for the
-        # same threads never end
-        traced = _traced(portions, parts, correlated == "batch")
-        parts = [rows | _sums(key, portion, rows, traced) for portion, rows in zip(portions, parts)]
-    scatter = partial(_scatter, key, portions, parts, len(batch))
+    solved = SolvedPortions(key, portions, parts, *batch.xy.shape[:2])
     shape = batch.xy.shape[1:3]
     parts = [_without_padding(portion, shape, rows) for portion, rows in zip(portions, parts)]
     order = np.argsort(np.concatenate([portion.cameras for portion in portions]))
@@ -163,69 +151,8 @@ def calibrate_batch(  # noqa: PLR0913 keyword arguments of a public function
     if snooping is not None:
         rows["removed"] |= far
     if correlated is not None:
-        rows |= _under_errors(batch, rows, scatter, correlated == "batch")
+        rows |= _under_errors(batch, rows, solved, correlated == "batch")
     return _result(camera_model, batch, rows)
-
-
-def _traced(
-    portions: Sequence[Portion], parts: Sequence[Rows], together: bool
-) -> Bool[np.ndarray, " cameras"]:
-    """Whose traces are needed: of every solved camera, or for one set of sizes of some of them, as
-    far as there are with views enough for components by view."""
-    of = lambda rows, portion: np.stack([rows["status"] == CONVERGED, rows["views"].sum(1)])[
-        :, : len(portion.cameras)
-    ]
-    cameras = np.concatenate([portion.cameras for portion in portions])
-    solved, views = np.zeros((2, len(cameras)), int)
-    solved[cameras], views[cameras] = np.concatenate(list(map(of, parts, portions)), 1)
-    found = solved > 0
-    if together:
-        many = found & (views >= DEFAULTS.min_images)
-        chosen = np.flatnonzero(many if many.any() else found)
-        step = max(len(chosen) / SUMS.traced, 1)
-        found = np.zeros(len(cameras), bool)
-        found[chosen[np.arange(0, len(chosen), step).astype(int)]] = True
-    return found
-
-
-def _sums(
-    key: ProgramKey, portion: Portion, rows: Rows, traced: Bool[np.ndarray, " cameras"]
-) -> Rows:
-    """What the error components of the cameras of a portion are estimated from."""
-    wide = np.zeros(len(portion.axes), bool)
-    wide[: len(portion.cameras)] = traced[portion.cameras]
-    placed = portion.axes, portion.middle, wide
-    found = sums_of_portion(key, DEFAULTS, *_adjusted(portion, rows), *placed)
-    rows = {f"sums_{name}": np.array(x) for name, x in found._asdict().items()}
-    return rows | {"sums_pose": rows["sums_pose"].swapaxes(1, 2)}
-
-
-def _adjusted(portion: Portion, rows: Rows) -> tuple[Sightings, CameraUnknowns]:
-    """What was adjusted of a portion, with its weights, and the unknowns found."""
-    weight = np.asarray(portion.seen.weight) * rows["views"][:, :, None]
-    if "removed" in rows:
-        weight = weight * ~rows["removed"]
-    seen = in_double(dataclasses.replace(portion.seen, weight=weight))
-    return seen, CameraUnknowns(rows["interior"], rows["quaternion"], rows["shift"])
-
-
-def _scatter(
-    key: ProgramKey,
-    portions: Sequence[Portion],
-    parts: Sequence[Rows],
-    cameras: int,
-    theta: Float[np.ndarray, "cameras k"],
-) -> Float[np.ndarray, "cameras k k"]:
-    """The covariances of the forms of all cameras under errors of these sizes."""
-    found = np.zeros((cameras, theta.shape[1], theta.shape[1]))
-    for portion, rows in zip(portions, parts):
-        own = theta[portion.cameras]
-        if own.any():
-            missing = len(portion.axes) - len(own)
-            wide = np.pad(own, [(0, missing), (0, 0)])
-            forms = scatter_of_portion(key, DEFAULTS, *_adjusted(portion, rows), wide)
-            found[portion.cameras] = np.asarray(forms)[: len(own)]
-    return found
 
 
 def _without_padding(portion: Portion, shape: tuple[int, int], solved: Rows) -> Rows:
@@ -277,15 +204,23 @@ def _result(model: CameraModel, batch: Batch, rows: Rows) -> BatchCalibration:
     return BatchCalibration(model=key_of(model), parameters=free, **rows)
 
 
-def _under_errors(batch: Batch, rows: Rows, scatter: Scatter, together: bool) -> Rows:
+def _under_errors(batch: Batch, rows: Rows, solved: SolvedPortions, together: bool) -> Rows:
     """σ under errors that image points share; `together`: of the same size in all cameras."""
-    sums = ComponentSums(*(rows.pop(f"sums_{name}") for name in ComponentSums._fields))
-    solved = np.where(batch.finite, rows["status"], NOT_FINITE) == CONVERGED
-    sums.q[~solved] = np.nan
-    sums = sums._replace(pose=sums.pose.swapaxes(1, 2))
+    ended = np.where(batch.finite, rows["status"], NOT_FINITE)
+    forms, traced = solved.forms(), solved.traced(together)
+    forms.q[ended != CONVERGED] = np.nan
+    # without residuals everything is zero, as it is classically
+    variance = rows["sigma0"] ** 2
+    factor = np.divide(1.0, variance, out=np.zeros_like(variance), where=variance > 0)
+    interior = factor[:, None, None] * rows["covariance"]
+    sigma = np.concatenate([rows["sigma_position"], rows["sigma_angles"]], -1)
+    pose = factor[:, None, None] * sigma**2
+    traces = solved.traces(traced)
+    sums = BatchSums(forms, traces, traced, rows["redundancy"], interior, pose)
     views = rows["views"].sum(1)
-    points = (rows["redundancy"] + len(batch.free) + 6 * views) // 2
-    found = batch_errors(sums, views, points, together, scatter)
+    points = (rows["redundancy"] + len(batch.free) + POSE * views) // 2
+    programs = BatchPrograms(solved.scatter, solved.parts)
+    found = batch_errors(sums, views, points, together, programs)
     diagonal = np.diagonal(found.covariance, axis1=1, axis2=2)
     return {
         "covariance_correlated": found.covariance,

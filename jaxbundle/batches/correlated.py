@@ -14,6 +14,10 @@ and with the triangular factors L of a view and R of the camera the effects of t
 so that covariances need only W·V·Wᵀ, W·V·Zᵀ and Z·V·Zᵀ of every V = F·Fᵀ: no row of all
 observations is solved for. T of errors along tracks and of given points, of which a camera has
 thousands of columns, is from random combinations of them (`SumSettings`).
+
+Three programs, for each only the cameras and components that need it: q of all cameras, without any
+span or root (0.45 ms for 20 views of 88 points); T, of some of a batch with sizes in common (6 ms);
+the covariances that components of θ > 0 give (0.55 ms).
 """
 
 import dataclasses
@@ -27,9 +31,28 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxbundle.adjustment.quality.correlated_errors import CorrelationSettings
+from jaxbundle.adjustment.quality.given_points import GIVEN_POINTS
 from jaxbundle.batches.compiled import ProgramKey, exterior_slopes
-from jaxbundle.batches.error_roots import effects_of_points, fields_of_camera, root_of_views
-from jaxbundle.batches.normal import POSE, CameraUnknowns, Sightings, design
+from jaxbundle.batches.error_roots import (
+    GIVEN_AXES,
+    correlation_of_given,
+    correlation_of_views,
+    displacements_by_view,
+    effects_of_given,
+    field_form,
+    fields_of_camera,
+    given_points,
+    mean_squares_of_given,
+    places_on_sensor,
+    root_of_views,
+)
+from jaxbundle.batches.normal import (
+    POSE,
+    CameraUnknowns,
+    Sightings,
+    design,
+    effects_of_object_points,
+)
 from jaxbundle.cameras import CameraModel
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.system.programs import compile_once
@@ -42,10 +65,10 @@ COMPONENTS = (
     "principal distance by view",
     "affine by view",
     "along tracks",
-    "given points",
+    *GIVEN_POINTS,
 )
 FIELD, TRACKS, GIVEN = map(
-    COMPONENTS.index, ("field on the sensor", "along tracks", "given points")
+    COMPONENTS.index, ("field on the sensor", "along tracks", GIVEN_POINTS[0])
 )
 # Columns of the components by view among five: displacements of x and y.
 BY_VIEW = (slice(0, 2), slice(2, 3), slice(3, 5))
@@ -73,24 +96,35 @@ class SumSettings:
 SUMS = SumSettings()
 
 
-class ComponentSums(NamedTuple):
-    """Of a camera: T [k, k] of the components, the traces of three of them
-    (`leastsquares.quality.size_traces`), and q [k]; by component the covariance of the
-    interior orientation, and the variances of X0, Y0, Z0, ω, φ, κ, for θ = 1; how many points are
-    seen in two views or more; whether it has traces."""
+class ComponentForms(NamedTuple):
+    """The quadratic forms q [k] of the residuals of a camera, and how many points are seen in two
+    views or more."""
+
+    q: Float[np.ndarray, "*cameras k"]
+    given: Float[np.ndarray, "*cameras"]
+
+
+class ComponentTraces(NamedTuple):
+    """T [k, k] of the components of a camera, and the traces of three of them
+    (`leastsquares.quality.size_traces`); zero where they are not wanted."""
 
     T: Float[np.ndarray, "*cameras k k"]
     cubes: Float[np.ndarray, "*cameras k k k"]
-    q: Float[np.ndarray, "*cameras k"]
+
+
+class ComponentParts(NamedTuple):
+    """What components of θ = 1 give a camera: `remaining`, their tr(M·V) in its vᵀv; the covariance
+    of the interior orientation, and the variances of X0, Y0, Z0, ω, φ, κ; zero where they are not
+    wanted."""
+
+    remaining: Float[np.ndarray, "*cameras k"]
     interior: Float[np.ndarray, "*cameras k n n"]
     pose: Float[np.ndarray, "*cameras k views 6"]
-    given: Float[np.ndarray, "*cameras"]
-    traced: Bool[np.ndarray, "*cameras"]
 
 
 class Spans(eqx.Module):
-    """Orthonormal rows W of the views and Z of the camera (`component_sums`), their triangular
-    factors L and R, W·Jᵢ, and ∂v/∂X of every image point."""
+    """Orthonormal rows W of the views and Z of the camera, their triangular factors L and R, W·Jᵢ,
+    and ∂v/∂X of every image point."""
 
     W: Float[Array, "views 6 2 points"]
     Z: Float[Array, "views k 2 points"]
@@ -142,10 +176,17 @@ class Roots(eqx.Module):
 
     def forms(self, u: Float[Array, "r views 2 points"]) -> Float[Array, "r components"]:
         """‖F_kᵀ·u‖² of residuals u."""
-        field, of_view, track, point = self.products(u)
+        return self.forms_of(u, self.products(u))
+
+    def forms_of(
+        self, u: Float[Array, "r views 2 points"], products: Products
+    ) -> Float[Array, "r components"]:
+        """The same from their products."""
+        field, of_view, track, point = products
         square = lambda a: jnp.sum(a**2, range(1, a.ndim))
         parts = [square(u), square(field), *(square(of_view[..., of]) for of in BY_VIEW)]
-        return jnp.stack([*parts, square(track), square(point)], 1)
+        of_points = [square(point[:, of]) for of in GIVEN_AXES]
+        return jnp.stack([*parts, square(track), *of_points], 1)
 
     def along_tracks(self, z: Float[Array, "r views 2 points"]) -> Array:
         """F·z of errors along tracks."""
@@ -169,7 +210,8 @@ class Roots(eqx.Module):
         of_view = jnp.repeat(size[2:TRACKS], jnp.array([2, 1, 2]), total_repeat_length=5)
         e += jnp.einsum("vapc,rvc->rvap", self.by_view, of_view * normal(2, views, 5))
         e += size[TRACKS] * self.along_tracks(normal(3, views, 2, points))
-        return e + size[GIVEN] * self.of_points(normal(4, 3, points))
+        of_axes = jnp.repeat(size[GIVEN:], jnp.array([2, 1]), total_repeat_length=3)
+        return e + self.of_points(of_axes[:, None] * normal(4, 3, points))
 
 
 def _single(tree: Any) -> Any:
@@ -193,22 +235,53 @@ class Covariances(NamedTuple):
 
 
 @partial(compile_once, static=(0, 1))
-def sums_of_portion(
+def forms_of_portion(
+    key: ProgramKey, settings: CorrelationSettings, seen: Sightings, at: CameraUnknowns
+) -> ComponentForms:
+    """The forms of every camera of a portion; `seen`: with the weights of the adjustment."""
+    return key.for_every(lambda given: _forms(key.model, settings, *given))((seen, at))
+
+
+@partial(compile_once, static=(0, 1))
+def traces_of_portion(
+    key: ProgramKey,
+    settings: CorrelationSettings,
+    seen: Sightings,
+    at: CameraUnknowns,
+    wanted: Bool[AnyArray, " cameras"],
+) -> ComponentTraces:
+    """The traces of the cameras of a portion for which they are wanted."""
+    number = len(COMPONENTS)
+    zero: list[Any] = [jnp.zeros((number,) * n) for n in (2, 3)]
+    none = lambda _: ComponentTraces(*zero)
+    signs = _signs(settings, *seen.weight.shape[1:])
+
+    def traced(given: tuple[Sightings, CameraUnknowns]) -> ComponentTraces:
+        return _traces(*_spans_and_roots(key.model, key.free, settings, *given), signs)
+
+    of_camera = lambda given: jax.lax.cond(given[2], traced, none, given[:2])
+    return key.for_every(of_camera)((seen, at, wanted))
+
+
+@partial(compile_once, static=(0, 1))
+def parts_of_portion(
     key: ProgramKey,
     settings: CorrelationSettings,
     seen: Sightings,
     at: CameraUnknowns,
     axes: Float[AnyArray, "cameras 3 3"],
     middle: Float[AnyArray, "cameras 3"],
-    traced: Bool[AnyArray, " cameras"],
-) -> ComponentSums:
-    """The sums of every camera of a portion; `seen`: with the weights of the adjustment; `traced`:
-    those whose traces are wanted; the others have the first row and column of T alone."""
-
-    def of_camera(given: tuple[Sightings, CameraUnknowns, Array, Array, Array]) -> ComponentSums:
-        return component_sums(key.model, key.free, settings, *given)
-
-    return key.for_every(of_camera)((seen, at, axes, middle, traced))
+    wanted: Bool[AnyArray, "cameras k"],
+) -> ComponentParts:
+    """What the wanted components give every camera of a portion; that of the independent part is
+    the classical covariance, and left at zero."""
+    number, k, views = len(COMPONENTS), len(key.free), seen.weight.shape[1]
+    shapes = (number,), (number, k, k), (number, views, POSE)
+    zero: list[Any] = [jnp.zeros(shape) for shape in shapes]
+    none = lambda *_: ComponentParts(*zero)
+    found = partial(_parts, key.model, key.free, settings)
+    of_camera = lambda given: jax.lax.cond(jnp.any(given[-1][1:]), found, none, *given)
+    return key.for_every(of_camera)((seen, at, axes, middle, wanted))
 
 
 @partial(compile_once, static=(0, 1))
@@ -237,7 +310,38 @@ def scatter_of_portion(
     return key.for_every(of_camera)((seen, at, theta))
 
 
-def component_sums(
+def _forms(
+    model: CameraModel, settings: CorrelationSettings, seen: Sightings, at: CameraUnknowns
+) -> ComponentForms:
+    """vᵀV_k·v of one camera, with the correlations V of errors along tracks and of given points,
+    without their roots."""
+    used = jnp.asarray(seen.weight)
+    by_axis, by_point = effects_of_object_points(model, seen, at)
+    v = by_axis.swapaxes(0, 1)
+    on_sensor, place = places_on_sensor(_computed(seen, v), used)
+    of_view = jnp.einsum("vapc,vap->vc", displacements_by_view(on_sensor, used), v)
+    by_view = [jnp.sum(of_view[:, of] ** 2) for of in BY_VIEW]
+    K = correlation_of_views(at, used, settings.reach, seen)
+    along_tracks = jnp.sum(jnp.einsum("vw,wap->vap", K, v) * v)
+    # sums over leading axes, which are vectorised
+    given, squares = given_points(used), jnp.sum(by_point**2, 1)
+    K = correlation_of_given(jnp.asarray(seen.point), used, settings)
+    point = jnp.sum(by_point * by_axis, (1, 2)) * given
+    of_axes = jnp.sum((point @ K) * point, 1) / mean_squares_of_given(used, squares)
+    of_points = [jnp.sum(of_axes[of]) for of in GIVEN_AXES]
+    field = field_form(place, used, v, settings)
+    q = jnp.stack([jnp.sum(v**2), field, *by_view, along_tracks, *of_points])
+    parts: list[Any] = [q, jnp.sum(given).astype(float)]
+    return ComponentForms(*parts)
+
+
+def _computed(seen: Sightings, v: Float[Array, "views 2 points"]) -> Float[Array, "views points 2"]:
+    """Computed image coordinates, in which effects are given: they have no share of the residuals
+    (`correlated_errors.image_rows`)."""
+    return jnp.asarray(seen.xy) + v.swapaxes(1, 2)
+
+
+def _parts(
     model: CameraModel,
     free: tuple[int, ...],
     settings: CorrelationSettings,
@@ -245,23 +349,42 @@ def component_sums(
     at: CameraUnknowns,
     axes: Float[Array, "3 3"],
     middle: Float[Array, "3"],
-    traced: Bool[Array, ""],
-) -> ComponentSums:
-    """The sums of one camera from all its image points with weight."""
-    spans, roots = _spans_and_roots(model, free, settings, seen, at)
-    projected = _project(spans, roots)
-    none = lambda *_: (jnp.zeros((len(COMPONENTS),) * 2), jnp.zeros((len(COMPONENTS),) * 3))
-    T, cubes = jax.lax.cond(traced, partial(_traces, settings), none, spans, roots, projected)
-    covariances = _covariances(spans, roots, projected)
-    of_white = jnp.stack([c.remaining for c in covariances])
-    T = T.at[0].set(of_white).at[:, 0].set(of_white)
-    q = roots.forms(spans.v[None])[0]
-    interior = jnp.stack([_of_interior(spans, c) for c in covariances])
+    wanted: Bool[Array, " k"],
+) -> ComponentParts:
+    """`parts_of_portion` of one camera."""
+    spans = _spans(model, free, seen, at)
+    used = jnp.asarray(seen.weight)
+    on_sensor, place = places_on_sensor(_computed(seen, spans.v), used)
+
+    def of_field() -> Covariances:
+        splines, octaves, _ = fields_of_camera(place, used, settings)
+        return _of_columns(*_onto_field(spans, splines, octaves), 2 * used.sum())
+
+    def of_given(axes: slice) -> Covariances:
+        K = correlation_of_given(jnp.asarray(seen.point), used, settings)
+        by_point = effects_of_given(used, spans.by_point)[..., axes]
+        return _of_given(spans, by_point, jnp.linalg.cholesky(K))
+
+    def along_tracks() -> Covariances:
+        K = correlation_of_views(at, used, settings.reach, seen)
+        return _along_tracks(spans, used, K)
+
+    views, k = spans.W.shape[0], spans.Z.shape[1]
+    zero = (views, POSE, POSE), (views, POSE, k), (k, k), ()
+    none = lambda: Covariances(*map(jnp.zeros, zero))
+    if_wanted = lambda c, function: jax.lax.cond(wanted[c], function, none)
+    found = [
+        none(),
+        if_wanted(FIELD, of_field),
+        *_by_view(spans, displacements_by_view(on_sensor, used)),
+        if_wanted(TRACKS, along_tracks),
+        *(if_wanted(GIVEN + n, partial(of_given, of)) for n, of in enumerate(GIVEN_AXES)),
+    ]
+    interior = jnp.stack([_of_interior(spans, c) for c in found])
     slopes = jax.vmap(exterior_slopes, (0, 0, None, None))(at.rotation, at.shift, axes, middle)
-    pose = jnp.stack([_of_poses(spans, slopes, c) for c in covariances])
-    given = jnp.sum(roots.used.sum(0) > 1)
-    parts: list[Any] = [T, cubes, q, interior, pose, given.astype(float), traced]
-    return ComponentSums(*parts)
+    pose = jnp.stack([_of_poses(spans, slopes, c) for c in found])
+    parts: list[Any] = [jnp.stack([c.remaining for c in found]), interior, pose]
+    return ComponentParts(*parts)
 
 
 class OntoSpans(NamedTuple):
@@ -273,6 +396,27 @@ class OntoSpans(NamedTuple):
     ZF: Float[Array, "views k 5"]
 
 
+def _spans(model: CameraModel, free: tuple[int, ...], seen: Sightings, at: CameraUnknowns) -> Spans:
+    columns = [jnp.stack(axis, 1) for axis in design(model, free, seen, at)]
+    rows = jnp.stack(columns, 2)  # [views, 6 + k + 1, 2, points]
+    E, J, v = rows[:, :POSE], rows[:, POSE:-1], rows[:, -1]
+    W, L = _orthonormal(E, jnp.asarray(seen.weight))
+    WJ = _products(W, J)
+    Z, R = _orthonormal_of_all(J - jnp.einsum("vek,veap->vkap", WJ, W))
+    # ray = M·X + t: of a point as of the shift, turned
+    turns = jax.vmap(matrix_from_quaternion)(at.rotation)
+    by_point = [sum(turns[:, i, j, None, None] * E[:, i] for i in range(3)) for j in range(3)]
+    return Spans(W, Z, L, R, WJ, v, jnp.stack(by_point, -1))
+
+
+def _products(
+    a: Float[Array, "views m 2 points"], b: Float[Array, "views n 2 points"]
+) -> Float[Array, "views m n"]:
+    """Of all rows of the views."""
+    flat = lambda x: x.reshape(*x.shape[:2], -1)
+    return flat(a) @ flat(b).swapaxes(1, 2)
+
+
 def _spans_and_roots(
     model: CameraModel,
     free: tuple[int, ...],
@@ -281,33 +425,33 @@ def _spans_and_roots(
     at: CameraUnknowns,
 ) -> tuple[Spans, Roots]:
     used = jnp.asarray(seen.weight)
-    x, y = (jnp.stack(columns, -1) for columns in design(model, free, seen, at))
-    rows = jnp.stack([x, y], 1)  # [views, 2, points, 6 + k + 1]
-    E, J, v = rows[..., :POSE], rows[..., POSE:-1], rows[..., -1]
-    W, L = _orthonormal(E, used)
-    WJ = jnp.einsum("veap,vapk->vek", W, J)
-    Z, R = _orthonormal_of_all(J - jnp.einsum("veap,vek->vapk", W, WJ))
-    # ray = M·X + t: of a point as of the shift, turned
-    turns = jax.vmap(matrix_from_quaternion)(at.rotation)
-    by_point = jnp.einsum("vapi,vij->vapj", E[..., :3], turns)
-    spans = Spans(W, Z, L, R, WJ, v, by_point)
-    # at computed coordinates, which have no share of the residuals (`correlated_errors.image_rows`)
-    computed = jnp.asarray(seen.xy) + v.swapaxes(1, 2)
-    splines, octaves, gram, by_view = fields_of_camera(computed, used, settings)
-    by_point, points = effects_of_points(jnp.asarray(seen.point), used, by_point, settings)
-    views = root_of_views(at, used, settings.reach, seen)
+    spans = _spans(model, free, seen, at)
+    on_sensor, place = places_on_sensor(_computed(seen, spans.v), used)
+    splines, octaves, gram = fields_of_camera(place, used, settings)
+    by_view = displacements_by_view(on_sensor, used)
+    by_point = effects_of_given(used, spans.by_point)
+    points = jnp.linalg.cholesky(correlation_of_given(jnp.asarray(seen.point), used, settings))
+    K = correlation_of_views(at, used, settings.reach, seen)
+    views = root_of_views(K)
     return spans, Roots(used, splines, octaves, gram, by_view, views, by_point, points)
 
 
-def _project(spans: Spans, roots: Roots) -> OntoSpans:
-    W, Z = spans.W, spans.Z
-    project = lambda A: jnp.einsum("veap,vps->veas", _single(A), roots.splines) @ roots.octaves
+def _onto_field(
+    spans: Spans,
+    splines: Float[Array, "views points splines"],
+    octaves: Float[Array, "splines splines"],
+) -> tuple[Float[Array, "views 6 n"], Float[Array, "k n"]]:
+    """W·F and Z·F of the field."""
+    project = lambda A: jnp.einsum("veap,vps->veas", _single(A), splines) @ octaves
     flat = lambda A: A.reshape(*A.shape[:-2], -1)
+    return flat(project(spans.W)), flat(project(spans.Z).sum(0))
+
+
+def _project(spans: Spans, roots: Roots) -> OntoSpans:
     return OntoSpans(
-        flat(project(W)),
-        flat(project(Z).sum(0)),
-        jnp.einsum("veap,vapc->vec", W, roots.by_view),
-        jnp.einsum("vkap,vapc->vkc", Z, roots.by_view),
+        *_onto_field(spans, roots.splines, roots.octaves),
+        jnp.einsum("veap,vapc->vec", spans.W, roots.by_view),
+        jnp.einsum("vkap,vapc->vkc", spans.Z, roots.by_view),
     )
 
 
@@ -347,78 +491,116 @@ class FewColumns(NamedTuple):
         return found.at[FIELD, FIELD].add(jnp.sum(self.field * other.field))
 
 
-def _traces(
-    settings: CorrelationSettings, spans: Spans, roots: Roots, projected: OntoSpans
-) -> tuple[Array, Array]:
-    """T and tr(M·V_i·M·V_j·M·V_l), but for the independent part."""
+def _signs(settings: CorrelationSettings, views: int, points: int) -> tuple[Array, Array]:
+    """Random combinations of the columns of errors along tracks and of given points, the same of
+    every camera."""
+    keys = jax.random.split(jax.random.key(settings.estimation.seed))
+    signs = lambda key, *shape: jax.random.rademacher(key, (SUMS.probes, *shape), dtype=float)
+    return signs(keys[0], views, 2, points), signs(keys[1], 3, points)
+
+
+def _traces(spans: Spans, roots: Roots, signs: tuple[Array, Array]) -> ComponentTraces:
+    projected = _project(spans, roots)
     S, count = _single(FewColumns.of(roots, projected)), len(COMPONENTS)
     T, cubes = S.sums(S), jnp.zeros((count,) * 3)
     # S_ij·S_jk of every j
     through = FewColumns(S.field @ S.field, S.mixed @ S.field, S.mixed @ S.mixed.T)
     cubes = cubes.at[FIELD].set(S.sums(through))
+    of_columns = np.arange(len(S.by_view)) % 5
     for k, columns in enumerate(BY_VIEW, FIELD + 1):
-        some = (jnp.arange(len(S.by_view)) % 5)[:, None]
-        some = ((some >= columns.start) & (some < columns.stop)).astype(S.by_view.dtype)
-        field, by_view = some * S.mixed, some * S.by_view
-        through = FewColumns(field.T @ S.mixed, by_view.T @ S.mixed, by_view.T @ S.by_view)
+        some = np.flatnonzero((of_columns >= columns.start) & (of_columns < columns.stop))
+        field, by_view = S.mixed[some], S.by_view[some]
+        through = FewColumns(field.T @ field, by_view.T @ field, by_view.T @ by_view)
         cubes = cubes.at[k].set(S.sums(through))
     # of random combinations of the columns of the others
-    keys = jax.random.split(jax.random.key(settings.estimation.seed))
-    signs = lambda key, *shape: jax.random.rademacher(key, (SUMS.probes, *shape), dtype=float)
-    errors = [
-        roots.along_tracks(signs(keys[0], *spans.v.shape)),
-        roots.of_points(signs(keys[1], 3, len(roots.points))),
-    ]
+    masks = [jnp.zeros((3, 1)).at[axes].set(1.0) for axes in GIVEN_AXES]
+    errors = [roots.along_tracks(signs[0]), *(roots.of_points(signs[1] * one) for one in masks)]
+    remaining = jnp.stack([c.remaining for c in _covariances(spans, roots, projected)])
     spans, roots = _single((spans, roots))
-    for k, e in zip((TRACKS, GIVEN), _single(errors)):
+    for k, e in zip(range(TRACKS, count), _single(errors)):
         u = spans.residuals(e)
         products = roots.products(u)
-        found = roots.forms(u).mean(0)
+        found = roots.forms_of(u, products).mean(0)
         T = T.at[k].set(found)
         flat = [x.reshape(SUMS.probes, -1) / jnp.sqrt(SUMS.probes) for x in products[:2]]
         pairs = FewColumns(flat[0].T @ flat[0], flat[1].T @ flat[0], flat[1].T @ flat[1])
         cubes = cubes.at[k].set(S.sums(pairs))
         # half of them again: M·F·(Fᵀ·M·F·ξ)
         half = [x[: SUMS.probes // 2] for x in products]
-        e = roots.along_tracks(half[2]) if k == TRACKS else roots.of_points(half[3])
+        e = (
+            roots.along_tracks(half[2])
+            if k == TRACKS
+            else roots.of_points(half[3] * _single(masks[k - GIVEN]))
+        )
         z = spans.residuals(e)
         more = [x * y for x, y in zip(roots.products(z), half)]
         own = jnp.zeros(count).at[k].set(jnp.sum(z**2)).at[FIELD].set(jnp.sum(more[0]))
         for j, columns in enumerate(BY_VIEW, FIELD + 1):
             own = own.at[j].set(jnp.sum(more[1][..., columns]))
         cubes = cubes.at[k, k].set(own / (SUMS.probes // 2))
-    T = T.at[:, TRACKS].set(T[TRACKS]).at[:, GIVEN].set(T[GIVEN])
-    both = (T[TRACKS, GIVEN] + T[GIVEN, TRACKS]) / 2
-    T = T.at[TRACKS, GIVEN].set(both).at[GIVEN, TRACKS].set(both)
-    return T.astype(float), cubes.astype(float)
+    # of two of them from the combinations of both
+    both = (T[TRACKS:, TRACKS:] + T[TRACKS:, TRACKS:].T) / 2
+    T = T.at[:, TRACKS:].set(T[TRACKS:].T).at[TRACKS:, TRACKS:].set(both)
+    T = T.astype(float).at[0].set(remaining).at[:, 0].set(remaining)
+    parts: list[Any] = [T, cubes.astype(float)]
+    return ComponentTraces(*parts)
 
 
 def _covariances(spans: Spans, roots: Roots, of: OntoSpans) -> list[Covariances]:
     """Of all components."""
-    W, Z = spans.W, spans.Z
-    WB, ZB, WF, ZF = of
+    W, k = spans.W, spans.Z.shape[1]
     rows = 2 * roots.used.sum()
     own = jnp.einsum("veap,vfap->vef", W, W)
-    k = Z.shape[1]
-    found = [
+    return [
         Covariances(own, jnp.zeros((*W.shape[:2], k)), jnp.eye(k), rows),
-        Covariances(WB @ WB.swapaxes(1, 2), WB @ ZB.T, ZB @ ZB.T, rows),
+        _of_columns(of.WB, of.ZB, rows),
+        *_by_view(spans, roots.by_view),
+        _along_tracks(spans, roots.used, roots.views @ roots.views.T),
+        *(_of_given(spans, roots.by_point[..., axes], roots.points) for axes in GIVEN_AXES),
     ]
+
+
+def _of_columns(
+    WF: Float[Array, "views 6 n"], ZF: Float[Array, "k n"], trace: Float[Array, ""]
+) -> Covariances:
+    """Of columns F that all views share."""
+    return Covariances(WF @ WF.swapaxes(1, 2), WF @ ZF.T, ZF @ ZF.T, trace)
+
+
+def _by_view(spans: Spans, by_view: Float[Array, "views 2 points 5"]) -> list[Covariances]:
+    """Of the components by view."""
+    WF = jnp.einsum("veap,vapc->vec", spans.W, by_view)
+    ZF = jnp.einsum("vkap,vapc->vkc", spans.Z, by_view)
+    found = []
     for one in BY_VIEW:
         w, z = WF[..., one], ZF[..., one]
         wz = jnp.einsum("vec,vkc->vek", w, z)
-        trace = jnp.sum(roots.by_view[..., one] ** 2)
+        trace = jnp.sum(by_view[..., one] ** 2)
         zz = jnp.einsum("vkc,vlc->kl", z, z)
         found.append(Covariances(w @ w.swapaxes(1, 2), wz, zz, trace))
-    # Z·V of errors along tracks: V is 1 in a view
-    near = jnp.einsum("vw,wkap->vkap", roots.views @ roots.views.T, Z)
+    return found
+
+
+def _along_tracks(
+    spans: Spans, used: Float[Array, "views points"], K: Float[Array, "views views"]
+) -> Covariances:
+    """Of errors along tracks, of the correlation K of the views, which is 1 in a view."""
+    W, Z = spans.W, spans.Z
+    own = jnp.einsum("veap,vfap->vef", W, W)
+    near = jnp.einsum("vw,wkap->vkap", K, Z)
     wz, zz = jnp.einsum("veap,vkap->vek", W, near), jnp.einsum("vkap,vlap->kl", Z, near)
-    found.append(Covariances(own, wz, zz, rows))
-    WG = jnp.einsum("veap,vapd->vedp", W, roots.by_point) @ roots.points
-    ZG = jnp.einsum("vkap,vapd->kdp", Z, roots.by_point) @ roots.points
-    WG, ZG = WG.reshape(*W.shape[:2], -1), ZG.reshape(k, -1)
-    trace = jnp.sum(roots.by_point**2)
-    return [*found, Covariances(WG @ WG.swapaxes(1, 2), WG @ ZG.T, ZG @ ZG.T, trace)]
+    return Covariances(own, wz, zz, 2 * used.sum())
+
+
+def _of_given(
+    spans: Spans, by_point: Float[Array, "views 2 points axes"], root: Float[Array, "points points"]
+) -> Covariances:
+    """Of errors of given points along some axes with a root of their correlation."""
+    W, Z = spans.W, spans.Z
+    WG = jnp.einsum("veap,vapd->vedp", W, by_point) @ root
+    ZG = jnp.einsum("vkap,vapd->kdp", Z, by_point) @ root
+    WG, ZG = WG.reshape(*W.shape[:2], -1), ZG.reshape(Z.shape[1], -1)
+    return _of_columns(WG, ZG, jnp.sum(by_point**2))
 
 
 def _of_interior(spans: Spans, c: Covariances) -> Float[Array, "k k"]:
@@ -442,29 +624,26 @@ def _of_poses(
 
 
 def _orthonormal(
-    E: Float[Array, "views 2 points 6"], used: Float[Array, "views points"]
+    E: Float[Array, "views 6 2 points"], used: Float[Array, "views points"]
 ) -> tuple[Float[Array, "views 6 2 points"], Float[Array, "views 6 6"]]:
-    """Rows W that span the columns of every view, and L of EᵀE = L·Lᵀ; of views without points W is
+    """Rows W that span those of every view, and L of EEᵀ = L·Lᵀ; of views without points W is
     zero."""
-    N = jnp.einsum("vape,vapf->vef", E, E)
+    N = _products(E, E)
     none = ~(used.sum(1) > 0)
     scale = jax.lax.rsqrt(jnp.where(none[:, None], 1.0, jnp.diagonal(N, axis1=1, axis2=2)))
     N = N * scale[:, :, None] * scale[:, None, :] + none[:, None, None] * jnp.eye(POSE)
     L = jnp.linalg.cholesky(N)
-    solve = jax.vmap(lambda l, b: jax.scipy.linalg.solve_triangular(l, b, lower=True))
-    views, _, points, _ = E.shape
-    flat = (E * scale[:, None, None, :]).reshape(views, 2 * points, POSE).swapaxes(1, 2)
-    return solve(L, flat).reshape(views, POSE, 2, points), L / scale[:, :, None]
+    eye = jnp.broadcast_to(jnp.eye(POSE), N.shape)
+    inverse = jax.scipy.linalg.solve_triangular(L, eye, lower=True) * scale[:, None, :]
+    return jnp.einsum("vef,vfap->veap", inverse, E), L / scale[:, :, None]
 
 
 def _orthonormal_of_all(
-    J: Float[Array, "views 2 points k"],
+    J: Float[Array, "views k 2 points"],
 ) -> tuple[Float[Array, "views k 2 points"], Float[Array, "k k"]]:
-    """Rows Z that span the columns of all views together, and R of JᵀJ = R·Rᵀ."""
-    N = jnp.einsum("vapk,vapl->kl", J, J)
+    """Rows Z that span those of all views together, and R of JJᵀ = R·Rᵀ."""
+    N = jnp.sum(_products(J, J), 0)
     scale = jax.lax.rsqrt(jnp.diagonal(N))
     R = jnp.linalg.cholesky(N * scale[:, None] * scale)
-    flat = (J * scale).reshape(-1, len(scale)).T
-    views, _, points, k = J.shape
-    Z = jax.scipy.linalg.solve_triangular(R, flat, lower=True)
-    return Z.reshape(k, views, 2, points).swapaxes(0, 1), R / scale[:, None]
+    inverse = jax.scipy.linalg.solve_triangular(R, jnp.eye(len(R)), lower=True) * scale
+    return jnp.einsum("kl,vlap->vkap", inverse, J), R / scale[:, None]

@@ -7,49 +7,95 @@ indices: arrays are [views, points], masked.
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxbundle.adjustment.quality.correlated_errors import CorrelationSettings, cubic_splines
 from jaxbundle.adjustment.quality.given_points import correlation_of_points, wendland
 from jaxbundle.batches.normal import CameraUnknowns, Sightings
 from jaxbundle.geometry import matrix_from_quaternion
 
+# Principal axes of the object in each component of given points: the normal of the plane that fits
+# them is the last.
+GIVEN_AXES = (slice(0, 2), slice(2, 3))
 
-def fields_of_camera(
-    xy: Float[Array, "views points 2"],
-    used: Float[Array, "views points"],
-    settings: CorrelationSettings,
-) -> tuple[
-    Float[Array, "views points splines"],
-    Float[Array, "splines splines"],
-    Float[Array, "splines splines"],
-    Float[Array, "views 2 points 5"],
-]:
-    """The finest splines B on the sensor and the root R of all octaves in them, of a mean square of
-    one, with (BR)ᵀBR; displacements by view: of the principal point, of the distance and affine
-    ones, of size 1 at the edge of the measured area."""
+
+def places_on_sensor(
+    xy: Float[Array, "views points 2"], used: Float[Array, "views points"]
+) -> tuple[Float[Array, "views points 2"], Float[Array, "views points 2"]]:
+    """Where image points are in the measured area: from its middle, in half its longer side (0 if
+    invisible); and from 0 to 1 over each side."""
     there = used[..., None] > 0
     low = jnp.min(jnp.where(there, xy, jnp.inf), (0, 1))
     high = jnp.max(jnp.where(there, xy, -jnp.inf), (0, 1))
     size = (high - low) / 2
     at = (xy - (low + high) / 2) / jnp.max(size)
     at = jnp.where(there, at, 0.0)
-    place = (at / (size / jnp.max(size)) + 1) / 2
+    return at, (at / (size / jnp.max(size)) + 1) / 2
+
+
+def mean_square_of_octaves(
+    place: Float[Array, "views points 2"],
+    used: Float[Array, "views points"],
+    settings: CorrelationSettings,
+) -> Float[Array, ""]:
+    """That of the sum of all octaves of splines, Σ_i Σ_j (x_i·y_j)² = Σ_i x_i²·Σ_j y_j². Of one
+    side four splines are not zero, whose squares follow from the place between two knots."""
+    total = jnp.zeros(())
+    for octave in settings.octaves_of_knots:
+        intervals = place * (np.asarray(octave) - 3)
+        # sums of four arrays: a sum over an axis of four is not vectorised
+        four = cubic_splines(intervals - jnp.floor(intervals), 4) ** 2
+        square = four[..., 0] + four[..., 1] + four[..., 2] + four[..., 3]
+        total += jnp.sum(used * square[..., 0] * square[..., 1])
+    return total / jnp.sum(used)
+
+
+def fields_of_camera(
+    place: Float[Array, "views points 2"],
+    used: Float[Array, "views points"],
+    settings: CorrelationSettings,
+) -> tuple[
+    Float[Array, "views points splines"],
+    Float[Array, "splines splines"],
+    Float[Array, "splines splines"],
+]:
+    """The finest splines B on the sensor and the root R of all octaves in them, of a mean square of
+    one, with (BR)ᵀBR."""
     x, y = (cubic_splines(place[..., k], settings.knots[k]) for k in (0, 1))
     # not computed again for every product
     x, y = jax.lax.optimization_barrier((x, y * used[..., None]))
     B = y[..., :, None].astype(jnp.float32) * x[..., None, :].astype(jnp.float32)
     B = B.reshape(*used.shape, -1)
+    square = mean_square_of_octaves(place, used, settings)
+    octaves = jnp.asarray(root_of_octaves(settings)) / jnp.sqrt(square)
     gram = _gram_of_products(x.reshape(-1, x.shape[-1]), y.reshape(-1, y.shape[-1]))
-    octaves = jnp.asarray(root_of_octaves(settings))
-    gram = octaves.T @ gram @ octaves
-    square = jnp.trace(gram) / jnp.sum(used)
-    gram, octaves = gram / square, octaves / jnp.sqrt(square)
+    return B, octaves, octaves.T @ gram @ octaves
+
+
+def field_form(
+    place: Float[Array, "views points 2"],
+    used: Float[Array, "views points"],
+    v: Float[Array, "views 2 points"],
+    settings: CorrelationSettings,
+) -> Float[Array, ""]:
+    """‖(BR)ᵀv‖² of the splines and octaves of `fields_of_camera`, as products of x and of y."""
+    x, y = (cubic_splines(place[..., k], n).reshape(-1, n) for k, n in enumerate(settings.knots))
+    residual = v.swapaxes(0, 1).reshape(2, -1)
+    products = [(y * of[:, None]).T @ x for of in residual]
+    of_octaves = jnp.stack(products).reshape(2, -1) @ root_of_octaves(settings)
+    return jnp.sum(of_octaves**2) / mean_square_of_octaves(place, used, settings)
+
+
+def displacements_by_view(
+    at: Float[Array, "views points 2"], used: Float[Array, "views points"]
+) -> Float[Array, "views 2 points 5"]:
+    """Displacements by view: of the principal point, of the distance and affine ones, of size 1 at
+    the edge of the measured area."""
     x, y = at[..., 0] * used, at[..., 1] * used
     none = jnp.zeros_like(used)
     of_x = jnp.stack([used, none, x, x, y], -1)
     of_y = jnp.stack([none, used, y, -y, x], -1)
-    return B, octaves, gram, jnp.stack([of_x, of_y], 1)
+    return jnp.stack([of_x, of_y], 1)
 
 
 def _gram_of_products(
@@ -92,36 +138,82 @@ def root_of_octaves(settings: CorrelationSettings) -> Float[np.ndarray, "splines
     return np.linalg.cholesky(total)
 
 
-def effects_of_points(
+def given_points(used: Float[Array, "views points"]) -> Bool[Array, " points"]:
+    """The points seen twice or more, whose errors views share."""
+    return used.sum(0) > 1
+
+
+def correlation_of_given(
     X: Float[Array, "points 3"],
     used: Float[Array, "views points"],
-    by_point: Float[Array, "views 2 points 3"],
     settings: CorrelationSettings,
-) -> tuple[Float[Array, "views 2 points 3"], Float[Array, "points points"]]:
-    """The effects of errors of points seen twice or more, of a mean square of one in an image
-    coordinate, and a root of the correlation of the points (`given_points`)."""
-    given = used.sum(0) > 1
+) -> Float[Array, "points points"]:
+    """The correlation of the given points by their distances (`given_points`); 1 of others."""
+    given = given_points(used)
     X = jnp.where(given[:, None], X, 0.0)
     pairs = given[:, None] & given
     apart = jnp.where(pairs, jnp.linalg.norm(X[:, None] - X, axis=2), 0.0)
     extent = jnp.maximum(apart.max(), jnp.finfo(float).tiny)
     K = correlation_of_points(apart, extent, jnp.eye(len(X)), settings.octaves)
-    K = jnp.where(pairs, K, jnp.eye(len(X)))
-    by_point = by_point * given[:, None]
+    return jnp.where(pairs, K, jnp.eye(len(X)))
+
+
+def effects_of_given(
+    used: Float[Array, "views points"], by_point: Float[Array, "views 2 points 3"]
+) -> Float[Array, "views 2 points 3"]:
+    """The effects of errors of given points along the principal axes, those in the plane of the
+    points and those across it each of a mean square of one in an image coordinate."""
+    by_point = by_point * given_points(used)[:, None]
+    squares = jnp.moveaxis(jnp.sum(by_point**2, 1), -1, 0)
+    return by_point / jnp.sqrt(mean_squares_of_given(used, squares))
+
+
+def mean_squares_of_given(
+    used: Float[Array, "views points"], squares: Float[Array, "3 views points"]
+) -> Float[Array, "3"]:
+    """The mean squares of the effects of given points in an image coordinate that belong to each
+    axis, from their `squares` in both coordinates: in the plane of both axes together."""
+    given = given_points(used)
     rows = 2 * jnp.maximum(jnp.sum(used * given), 1)
-    scale = jnp.sqrt(jnp.maximum(jnp.sum(by_point**2), jnp.finfo(float).tiny) / rows)
-    return by_point / scale, jnp.linalg.cholesky(K)
+    total = jnp.sum(squares * given, (1, 2))
+    of_components = [jnp.broadcast_to(jnp.sum(total[of]), total[of].shape) for of in GIVEN_AXES]
+    return jnp.maximum(jnp.concatenate(of_components), jnp.finfo(float).tiny) / rows
 
 
-def root_of_views(
+def correlation_of_views(
     at: CameraUnknowns, used: Float[Array, "views points"], reach: float, seen: Sightings
 ) -> Float[Array, "views views"]:
-    """A root of the correlation of the views by the distance of their stations."""
+    """The correlation of the views by the distance of their stations."""
     M = jax.vmap(matrix_from_quaternion)(at.rotation)
     station = -jnp.einsum("vji,vj->vi", M, at.shift)
     X = jnp.asarray(seen.point)
     away = jnp.linalg.norm(X[None] - station[:, None], axis=2)
-    depth = jnp.nanmedian(jnp.where(used > 0, away, jnp.nan))
-    apart = jnp.linalg.norm(station[:, None] - station, axis=2) / (reach * depth)
-    w, U = jnp.linalg.eigh(wendland(apart))
+    apart = jnp.linalg.norm(station[:, None] - station, axis=2)
+    return jnp.asarray(wendland(apart / (reach * _median(away, used > 0))))
+
+
+def _median(x: Float[Array, "*axes"], among: Bool[Array, "*axes"]) -> Float[Array, ""]:
+    """The median of some of nonnegative numbers, without sorting: bits of such numbers are ordered
+    as the numbers are, and the k-th is found by halving. 0.04 ms for 1760; sorted 0.17 ms."""
+    bits = jax.lax.bitcast_convert_type(jnp.where(among, x, jnp.inf), jnp.int64)
+    highest = jax.lax.bitcast_convert_type(jnp.inf, jnp.int64)
+    number = jnp.sum(among)
+
+    def halve(_: int, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = bounds
+        middle = low + (high - low) // 2
+        below = jnp.sum(bits <= middle) > (number - 1) // 2
+        return jnp.where(below, low, middle + 1), jnp.where(below, middle, high)
+
+    first = jax.lax.fori_loop(0, 63, halve, (jnp.zeros_like(highest), highest))[1]
+    # of an even number the mean of the two in the middle
+    last = jnp.where(bits > first, bits, highest).min()
+    last = jnp.where(jnp.sum(bits <= first) > number // 2, first, last)
+    numbers = jax.lax.bitcast_convert_type(jnp.stack([first, last]), float)
+    return jnp.mean(numbers)
+
+
+def root_of_views(K: Float[Array, "views views"]) -> Float[Array, "views views"]:
+    """A root of the correlation of the views, of which two may be of one station."""
+    w, U = jnp.linalg.eigh(K)
     return U * jnp.sqrt(jnp.clip(w, 0, None))

@@ -115,6 +115,29 @@ def residual_lengths(model: CameraModel, seen: Sightings, at: CameraUnknowns) ->
     return jnp.asarray(seen.weight) * jnp.sqrt(vx * vx + vy * vy)
 
 
+def effects_of_object_points(
+    model: CameraModel, seen: Sightings, at: CameraUnknowns
+) -> tuple[Float[Array, "2 views points"], Float[Array, "3 2 views points"]]:
+    """v of all points and ∂v/∂X by their object points, 0 if invisible: forward, 0.05 ms (backward,
+    as in `design`, 0.09 ms)."""
+    M = jax.vmap(matrix_from_quaternion)(at.rotation)
+    xy = (seen.xy[..., 0], seen.xy[..., 1])
+    weight = jnp.asarray(seen.weight)
+    X = [jnp.where(weight > 0, seen.point[:, i], 0.0) for i in range(3)]
+
+    def weighted_residual(X: Sequence[ByPoint]) -> tuple[ByPoint, ByPoint]:
+        r, s, q = (
+            sum(M[:, i, j, None] * X[j] for j in range(3)) + at.shift[:, i, None] for i in range(3)
+        )
+        vx, vy = cameras.residual(model, "measured", tuple(at.interior), (r, s, q), xy)
+        return weight * vx, weight * vy
+
+    one, none = jnp.ones_like(weight), jnp.zeros_like(weight)
+    along = lambda axis: [one if i == axis else none for i in range(3)]
+    pushed = [jax.jvp(weighted_residual, (X,), (along(axis),)) for axis in range(3)]
+    return jnp.stack(pushed[0][0]), jnp.stack([jnp.stack(change) for _, change in pushed])
+
+
 def gram(x: list[ByPoint], y: list[ByPoint]) -> Float[Array, "views n n"]:
     """AᵀA by view, of the n columns of A, with a row in x and one in y per point."""
     square = lambda A: jnp.einsum("vip,vjp->vij", A, A)

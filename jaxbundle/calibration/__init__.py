@@ -8,6 +8,8 @@ from jaxbundle.calibration.result import Calibration
 from jaxbundle.calibration.rig.calibrate import calibrate_rig
 from jaxbundle.calibration.rig.result import RigCalibration
 from jaxbundle.calibration.rig.wand import WandCalibration, calibrate_wand
+from jaxbundle.calibration.rig.wand_body import Wand
+from jaxbundle.calibration.rig.wand_markers import WandSettings
 from jaxbundle.calibration.several import Calibrations, calibrate_cameras
 from jaxbundle.calibration.simulate import simulate_views
 from jaxbundle.calibration.stability import Stability, stability
@@ -22,7 +24,9 @@ __all__ = [
     "ModelComparison",
     "RigCalibration",
     "Stability",
+    "Wand",
     "WandCalibration",
+    "WandSettings",
     "calibrate",
     "calibrate_cameras",
     "calibrate_rig",

@@ -110,19 +110,25 @@ def files_of(names: Sequence[str]) -> list[str]:
                 *(f"{COLMAP}/{file}" for file in COLMAP_FILES),
             )
         ]
-        found += [f"rig_{name}.toml", f"rig_{name}_*.png"] if place else []
     if len(names) > 1:
-        found += [
-            f"{RIG}/{file}"
-            for file in (
-                CONVERSIONS,
-                STEREO_PAIRS,
-                *(name for name, _ in RIG_FILES.values()),
-                *(f"{name}/{file}" for name, files in RIG_FILES.values() for file in files),
-            )
-        ]
+        # names of a rig may be of cameras that see no board
+        found += ["rig_*.toml", "rig_*.png"]
+        found += rig_files()
         found += [f"{ADJUSTED}/{file}" for file in NETWORK_FILES]
     return found
+
+
+def rig_files() -> list[str]:
+    """Files that `fill_rig` may write into the folder `RIG`, pairs of cameras as patterns."""
+    return [
+        f"{RIG}/{file}"
+        for file in (
+            CONVERSIONS,
+            STEREO_PAIRS,
+            *(name for name, files in RIG_FILES.values() if not files),
+            *(f"{name}/{file}" for name, files in RIG_FILES.values() for file in files),
+        )
+    ]
 
 
 def write_calibration(
@@ -179,6 +185,7 @@ def _write_foreign(network: Network, folder: Path, name: str, limits: Sequence[s
         except InputError as error:
             return [f"not written for OpenCV and COLMAP: {error}"]
         remark = [f"{name}.yaml and {COLMAP}: {conversion}" for conversion in cost.values()]
+    # Whoever undistorts whole images with this file meets the radius at which it ends.
     comments = "".join(f"# {limit}\n" for limit in limits)
     write_text(folder / f"{name}.yaml", opencv_text(network.cameras[0]) + comments)
     fill_colmap(network, folder / COLMAP)
@@ -210,7 +217,7 @@ def fill_calibrations(
 ) -> None:
     """Write a calibration into an existing folder; `origin` is for report and page, `choice` for
     the page."""
-    if len(found.cameras) == 1:
+    if len(found.cameras) == 1 and found.rig is None:
         one = next(iter(found.cameras.values()))
         return _fill(one, folder, plots, origin, choice, progress)
     for name, one in found.cameras.items():

@@ -70,7 +70,7 @@ def compose_calibrations(
     **Arguments:** `found`: `Calibrations`; `choice`: the underlying comparison of models; `also`:
     further findings and sections.
     """
-    if len(found.cameras) == 1:
+    if len(found.cameras) == 1 and found.rig is None:
         return compose_calibration(next(iter(found.cameras.values())), origin, choice, also)
     return write(_describe_several(found, origin, also))
 

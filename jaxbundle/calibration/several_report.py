@@ -21,7 +21,7 @@ def several_text(found: "Calibrations") -> str:
 
 def calibrations_dict(found: "Calibrations", brief: bool = False) -> dict:
     """The JSON of one calibration, or of several under their names, with the rig."""
-    if len(found.cameras) == 1:
+    if len(found.cameras) == 1 and found.rig is None:
         return next(iter(found.cameras.values())).to_dict(brief)
     parts = {name: one.to_dict(brief) for name, one in found.cameras.items()}
     verdict = verdict_dict(conclude_calibrations(found))

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxbundle.cameras.catalogue import get_model
 from jaxbundle.cameras.convert import Area, image_area
 from jaxbundle.cameras.convert_fit import GRID, come_back, image_grid, images_of, rays_of
 from jaxbundle.cameras.model import CameraModel, project
@@ -86,8 +87,8 @@ class Comparison:
 
 
 def compare_cameras(
-    a: tuple[CameraModel, Mapping[str, float]],
-    b: tuple[CameraModel, Mapping[str, float]],
+    a: tuple[str | CameraModel, Mapping[str, float]],
+    b: tuple[str | CameraModel, Mapping[str, float]],
     *,
     image_size: Numbers | None = None,
     pixel_size: Numbers | None = None,
@@ -99,7 +100,7 @@ def compare_cameras(
 
     **Arguments:**
 
-    - `a`, `b`: model and parameters by name (those left out have their defaults).
+    - `a`, `b`: model, or its name, and parameters by name (those left out have their defaults).
     - `image_size` (pixels), `pixel_size` (mm): required if the models differ in unit or axes, or
       to determine the area.
     - `area`: corners (low, high) of the part of the image to compare, in a's coordinates.
@@ -110,7 +111,8 @@ def compare_cameras(
     **Raises:** `ValueError` naming a missing size, or if nothing can be compared.
     """
     (source, values), (other, others) = (
-        (model, {**default_parameters(model), **given}) for model, given in (a, b)
+        (model, {**default_parameters(model), **given})
+        for model, given in ((get_model(model), given) for model, given in (a, b))
     )
     low, high = area or image_area(source, image_size, pixel_size)
     xy = image_grid(low, high)

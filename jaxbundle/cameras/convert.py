@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.cameras.catalogue import get_model
 from jaxbundle.cameras.convert_exact import (
     CORRECTIONS,
     DISTORTIONS,
@@ -71,9 +72,9 @@ class Conversion:
 
 
 def convert_camera(
-    source: CameraModel,
+    source: str | CameraModel,
     parameters: Mapping[str, float],
-    target: CameraModel,
+    target: str | CameraModel,
     *,
     image_size: Numbers | None = None,
     pixel_size: Numbers | None = None,
@@ -85,7 +86,8 @@ def convert_camera(
 
     **Arguments:**
 
-    - `parameters`: of the source, by name; those left out have their defaults.
+    - `source`, `target`: models, or their names; `parameters`: of the source, by name; those left
+      out have their defaults.
     - `image_size` (pixels), `pixel_size` (mm): required between pixels and millimetres or image
       centres.
     - `area`: the corners of the image (low, high) in the source's coordinates; by default the whole
@@ -96,6 +98,7 @@ def convert_camera(
 
     **Raises:** `ValueError` naming a missing argument, or the reason why a fit is impossible.
     """
+    source, target = get_model(source), get_model(target)
     values = {**default_parameters(source), **parameters}
     sizes = (image_size, pixel_size)
     shift, step = between_frames(source, target, *sizes)

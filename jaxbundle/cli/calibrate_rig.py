@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -16,6 +16,9 @@ from jaxbundle.cli.certificate_options import (
     Lengths,
 )
 from jaxbundle.errors import InputError
+
+if TYPE_CHECKING:
+    from jaxbundle.calibration import Wand
 
 COMMAND = "calibrate-rig"
 
@@ -48,6 +51,27 @@ def calibrate_rig(  # noqa: PLR0913 - the options of the command
             help="FILE.toml with a section [rig], as of a project: what is known of the mountings"
         ),
     ] = "",
+    wand: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="NAME=VIDEO, NAME=FOLDER or NAME=FILE.csv of each camera before which a wand was "
+            "waved, as for calibrate-wand; repeatable"
+        ),
+    ] = None,
+    wand_length: Annotated[
+        list[str] | None,
+        typer.Option(help="of the wand, in --unit; of more markers A,B=LENGTH, each"),
+    ] = None,
+    wand_sigma: Annotated[
+        float | None, typer.Option(help="σ of a length of the wand; default: 0.1 mm")
+    ] = None,
+    wand_camera: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="file of cameras, or NAME=FILE for one: interior orientations of those that see "
+            "the wand, but no board; repeatable"
+        ),
+    ] = None,
     synchronize: Annotated[
         str,
         typer.Option(
@@ -99,8 +123,9 @@ def calibrate_rig(  # noqa: PLR0913 - the options of the command
 
     Photographs of equal names, or equal last numbers in them, are simultaneous. Cameras are tied by
     boards that they see at the same time, through other cameras, or by the motion of the rig
-    between boards that are fixed to each other. With --synchronize nothing is simultaneous: offsets
-    and rates of the clocks follow from frames of videos in which the targets move.
+    between boards that are fixed to each other, or by a wand (--wand). With --synchronize nothing
+    is simultaneous: offsets and rates of the clocks follow from frames of videos in which the
+    targets move.
     """
     from jaxbundle.calibration import Calibrations
     from jaxbundle.calibration import calibrate_rig as calibrate_together
@@ -117,7 +142,8 @@ def calibrate_rig(  # noqa: PLR0913 - the options of the command
         _check_alone(square, diameter, marker, first_marker, board)
     else:
         known = board_given(board, square, kind, diameter, marker, dictionary, first_marker)
-    cameras = name_cameras(folders)
+    cameras = name_cameras(folders, alone=bool(wand))
+    waved = wand_given(wand, wand_length, wand_sigma, wand_camera, cameras, unit, sigma_image)
     when = times_given(times, cameras) if times or synchronize else None
     need_opencv()
     files = [path for folder in cameras.values() for path in photographs([folder])]
@@ -127,6 +153,10 @@ def calibrate_rig(  # noqa: PLR0913 - the options of the command
         "--kind": kind,
         "--fixed": fixed,
         "--mountings": mountings,
+        "--wand": ", ".join(wand or ()),
+        "--wand-length": ", ".join(wand_length or ()),
+        "--wand-sigma": wand_sigma,
+        "--wand-camera": ", ".join(wand_camera or ()),
         "--synchronize": synchronize,
         "--times": times,
         "--model": model,
@@ -147,6 +177,7 @@ def calibrate_rig(  # noqa: PLR0913 - the options of the command
             known,
             fixed=fixed,
             mountings=mountings or None,
+            wand=waved,
             synchronize=synchronize,
             times=when,
             model=model,
@@ -166,15 +197,62 @@ def calibrate_rig(  # noqa: PLR0913 - the options of the command
         )
         return Calibrations(rig.cameras, rig), None
 
+    others = [] if waved is None else [name for name in waved.markers if name not in cameras]
     CalibrationOutputs(
-        COMMAND, [*cameras], files, settings, json, out, html, force, brief, quiet, plots,
+        COMMAND, [*cameras, *others], files, settings, json, out, html, force, brief, quiet, plots,
         judged=CertificateOptions(accept, certificate, details, lengths), models=[model],
     ).compute(compute)  # fmt: skip
 
 
-def name_cameras(folders: Sequence[str]) -> dict[str, str]:
+def wand_given(
+    sources: Sequence[str] | None,
+    lengths: Sequence[str] | None,
+    sigma: float | None,
+    files: Sequence[str] | None,
+    cameras: Mapping[str, str],
+    unit: str,
+    sigma_image: float | None,
+) -> "Wand | None":
+    """The wand of the options, None without one.
+
+    **Raises:** `InputError` for options that miss each other."""
+    from jaxbundle.calibration import Wand
+    from jaxbundle.cli.calibrate_wand import (
+        cameras_by_name,
+        lengths_given,
+        sigma_of_length,
+        split_named,
+    )
+
+    if not sources:
+        given = {"--wand-length": lengths, "--wand-sigma": sigma, "--wand-camera": files}
+        for option, value in given.items():
+            if value:
+                raise InputError(f"{option}: is of a wand; give --wand NAME=VIDEO, too")
+        return None
+    if not lengths:
+        raise InputError("--wand-length: the length of the wand is missing")
+    markers = dict(split_named(one, "NAME=VIDEO, NAME=FOLDER or NAME=FILE.csv") for one in sources)
+    if len(markers) < len(sources):
+        raise InputError("--wand: two sources are given of one camera; expected one for each")
+    others = [name for name in markers if name not in cameras]
+    if others and not files:
+        raise InputError(
+            f"--wand-camera: there is no folder of camera {others[0]!r}, so that it sees no board; "
+            "expected its interior orientation, NAME=FILE"
+        )
+    return Wand(
+        markers,
+        lengths_given(lengths),
+        sigma_of_length(sigma, unit, "--wand-sigma"),
+        cameras_by_name(files or (), others, "--wand-camera"),
+        sigma_image,
+    )
+
+
+def name_cameras(folders: Sequence[str], alone: bool = False) -> dict[str, str]:
     """Folders by the name of the camera: that given, or that of the folder, with as many of the
-    folders above it as make the names unique."""
+    folders above it as make the names unique; `alone`: one camera is enough."""
     given: list[tuple[str, str]] = []
     for item in folders:
         name, equals, folder = item.partition("=")
@@ -185,7 +263,7 @@ def name_cameras(folders: Sequence[str]) -> dict[str, str]:
             raise InputError(
                 f"{folder}: no such folder; expected a folder of photographs for each camera"
             )
-    if len(given) < 2:
+    if len(given) < 2 and not alone:
         raise InputError(
             "a rig has at least two cameras: give a folder of photographs for each; for one camera "
             "use jaxbundle calibrate"

@@ -1,26 +1,28 @@
 """`jaxbundle calibrate-wand`: cameras around a room, from a wand of known length."""
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from jaxbundle.choices import MARKERS_OF_A_WAND
 from jaxbundle.cli import calibration_options as options
-from jaxbundle.cli.app import Force, Json, Quiet, app
+from jaxbundle.cli.app import Force, Json, Quiet, app, choice
 from jaxbundle.errors import InputError
 
 COMMAND = "calibrate-wand"
-REPORT, RESULT, RIG = "report.txt", "result.json", "rig"
+REPORT, RESULT, MARKERS = "report.txt", "result.json", "markers"
 
 
-@app.command(COMMAND, example="left=left.csv right=right.csv --cameras cameras.toml --length 0.5")
+@app.command(COMMAND, example="left=left.mp4 right=right.mp4 --cameras cameras.toml --length 0.5")
 def calibrate_wand(  # noqa: PLR0913 - the options of the command
     markers: Annotated[
         list[str],
         typer.Argument(
-            help="NAME=FILE.csv of each camera: frame, marker, x, y of the markers; the first "
-            "camera is the reference"
+            help="NAME=VIDEO or NAME=FOLDER of photographs of each camera, or NAME=FILE.csv: "
+            "frame, marker, x, y of the markers; the first camera is the reference"
         ),
     ],
     cameras: Annotated[
@@ -33,8 +35,15 @@ def calibrate_wand(  # noqa: PLR0913 - the options of the command
     length: Annotated[
         list[str], typer.Option(help="of the wand, in --unit; of more markers A,B=LENGTH, each")
     ],
-    sigma_length: Annotated[float, typer.Option(help="σ of a length")] = 1e-4,
+    sigma_length: Annotated[
+        float | None,
+        typer.Option(help="σ of a length, the same error in all frames; default: 0.1 mm"),
+    ] = None,
     sigma_image: options.SigmaImage = None,
+    marker_kind: Annotated[
+        str, choice(MARKERS_OF_A_WAND, "than what is behind them", "--markers")
+    ] = "bright",
+    snooping: options.Snooping = "pope",
     free: Annotated[
         str, typer.Option(help="parameters of the cameras to estimate: fx,fy,…; default: none")
     ] = "",
@@ -48,16 +57,23 @@ def calibrate_wand(  # noqa: PLR0913 - the options of the command
     import dataclasses
 
     import jaxbundle
-    from jaxbundle.calibration.files import fill_rig, json_text
+    from jaxbundle.calibration.files import RIG, file_name, fill_rig, json_text, rig_files
+    from jaxbundle.calibration.rig.wand_markers import Mark
     from jaxbundle.cli.calibration_outputs import words
     from jaxbundle.cli.outputs import check_json_target, print_result
+    from jaxbundle.cli.progress import staging
+    from jaxbundle.io.text.csv_tables import write_csv
     from jaxbundle.io.writing.folders import replace_folder
+    from jaxbundle.measure import BlobSettings
 
-    tables = dict(split_named(one, "NAME=FILE.csv") for one in markers)
-    if len(tables) < len(markers):
-        raise InputError("two tables are given of one camera; expected one for each")
-    check_json_target(json, [*tables.values(), *cameras])
-    known = cameras_by_name(cameras, list(tables))
+    # a video that is no video is reported by an error, not by messages of a codec
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    sources = dict(split_named(one, "NAME=VIDEO, NAME=FOLDER or NAME=FILE.csv") for one in markers)
+    if len(sources) < len(markers):
+        raise InputError("two sources are given of one camera; expected one for each")
+    check_json_target(json, [*sources.values(), *cameras])
+    known = cameras_by_name(cameras, list(sources))
     # what the files say is free was so in another adjustment: here it is given, unless asked for
     own = tuple(words(free))
     for name, camera in known.items():
@@ -68,20 +84,40 @@ def calibrate_wand(  # noqa: PLR0913 - the options of the command
             if parameter in camera.observed
         }
         known[name] = dataclasses.replace(camera, free=own, sigma=sigma, observed=observed)
-    result = jaxbundle.calibrate_wand(
-        tables,
-        known,
-        lengths_given(length),
-        sigma_length=sigma_length,
-        sigma_image=sigma_image,
-        object_unit=unit,
-    )
+    with staging(quiet or json == "-") as tell:
+        result = jaxbundle.calibrate_wand(
+            sources,
+            known,
+            lengths_given(length),
+            sigma_length=sigma_of_length(sigma_length, unit),
+            sigma_image=sigma_image,
+            object_unit=unit,
+            blobs=BlobSettings(dark=marker_kind == "dark"),
+            snooping=None if snooping == "none" else snooping,
+            progress=tell,
+        )
     if out is not None:
-        with replace_folder(out, COMMAND, (REPORT, RESULT, RIG), force) as folder:
+        tables = {name: f"{MARKERS}/{file_name(name)}.csv" for name in sources}
+        files = (REPORT, RESULT, *rig_files(), *tables.values())
+        with replace_folder(out, COMMAND, files, force) as folder:
             (folder / REPORT).write_text(result.report(), encoding="utf-8")
             (folder / RESULT).write_text(json_text(result.to_dict()), encoding="utf-8")
             fill_rig(result.network(), folder / RIG)
-    print_result(result, json, quiet)
+            (folder / MARKERS).mkdir()
+            for name, marks in result.markers.items():
+                write_csv(folder / tables[name], Mark._fields, marks)
+    if json or out is None or not quiet:
+        print_result(result, json, quiet)
+
+
+def sigma_of_length(given: float | None, unit: str, option: str = "--sigma-length") -> float:
+    """σ of the lengths in their unit, 0.1 mm if not given.
+
+    **Raises:** `InputError` if that is not known in this unit."""
+    in_unit = {"m": 1e-4, "cm": 1e-2, "mm": 0.1}
+    if given is None and unit not in in_unit:
+        raise InputError(f"{option}: expected the σ of the lengths in {unit}")
+    return in_unit[unit] if given is None else given
 
 
 def split_named(given: str, expected: str) -> tuple[str, str]:
@@ -92,7 +128,7 @@ def split_named(given: str, expected: str) -> tuple[str, str]:
     return name, rest
 
 
-def cameras_by_name(files: Sequence[str], names: Sequence[str]) -> dict:
+def cameras_by_name(files: Sequence[str], names: Sequence[str], option: str = "--cameras") -> dict:
     """Interior orientations by the name of the camera."""
     from jaxbundle.io import read_cameras
     from jaxbundle.network.columns import list_some
@@ -112,8 +148,8 @@ def cameras_by_name(files: Sequence[str], names: Sequence[str]) -> dict:
     missing = [name for name in names if name not in found]
     if missing:
         raise InputError(
-            f"--cameras: no camera {missing[0]!r}; the files have "
-            f"{list_some(list(found)) or 'none'}; expected a camera of each name, or --cameras "
+            f"{option}: no camera {missing[0]!r}; the files have "
+            f"{list_some(list(found)) or 'none'}; expected a camera of each name, or {option} "
             f"{missing[0]}=FILE"
         )
     return {name: found[name] for name in names}

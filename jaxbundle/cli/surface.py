@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from jaxbundle.choices import SURFACE_POINTS
+from jaxbundle.choices import HEIGHTS, SURFACE_POINTS
 from jaxbundle.cli.app import Force, Quiet, app, choice
 from jaxbundle.cli.certificate_options import Accept
 
@@ -69,6 +69,16 @@ def surface(  # noqa: PLR0913 - the options of the command
             "the default is the UTM zone"
         ),
     ] = None,
+    geoid: Annotated[
+        Path | None,
+        typer.Option(help="geoid heights: a raster, or the name of a PROJ grid"),
+    ] = None,
+    heights: Annotated[
+        str | None,
+        choice(
+            HEIGHTS, "what heights are above; default: the geoid with --geoid, else as computed"
+        ),
+    ] = None,
     csv: Annotated[
         bool,
         typer.Option(
@@ -114,6 +124,8 @@ def surface(  # noqa: PLR0913 - the options of the command
             orthophoto_of=orthophoto_of,
             check=check,
             crs=crs,
+            geoid=geoid,
+            heights=heights,
             progress=show,
             tell=lambda message: typer.echo(f"jaxbundle: {message}", err=True),
         )

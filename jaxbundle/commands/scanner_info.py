@@ -113,6 +113,11 @@ def info(
         np.array([pixel, pixel, pixel + 1, 0.0, last[1], last[1], 0.0]),
     )
     middle, along, across = X[:, :3].T
+    if not np.isfinite(middle).all():
+        what = "height, and the heights of the coefficients"
+        if not isinstance(image, RpcImage):
+            what = "attitude, mounting, positions and height"
+        tell(f"{scanner}: the ray of the middle of the image misses the ground; check {what}")
     figures["ground_sampling_along"] = float(np.linalg.norm(along - middle))
     figures["ground_sampling_across"] = float(np.linalg.norm(across - middle))
     figures["incidence"], figures["azimuth"] = _view(image, surface, middle, line, pixel)

@@ -4,10 +4,11 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxbundle.arguments import numeric_array
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.io.rasters.maps import describe_distance
@@ -17,6 +18,13 @@ from jaxbundle.results import TableMethods
 from jaxbundle.surfaces.cloud import Cloud
 from jaxbundle.surfaces.dsm import Dsm, make_dsm
 from jaxbundle.surfaces.files import report_of, text_of
+from jaxbundle.surfaces.height_reference import (
+    HeightReference,
+    check_cells,
+    heights_of_ground_images,
+    heights_of_photographs,
+    no_height_reference,
+)
 from jaxbundle.surfaces.inputs import check_points, read_views, tie_points
 from jaxbundle.surfaces.orthophoto import ToViews, mosaic
 from jaxbundle.surfaces.pairs import parse_partners
@@ -32,10 +40,12 @@ from jaxbundle.surfaces.relative import align_all
 from jaxbundle.surfaces.scanner_inputs import (
     from_map,
     is_ground_image,
+    map_coordinates,
     read_ground_views,
     system_of,
     to_map,
 )
+from jaxbundle.surfaces.scanner_views import GroundView, Neighbourhood, RpcView
 from jaxbundle.surfaces.views import OrientedImage
 from jaxbundle.types import Progress
 
@@ -44,17 +54,27 @@ DEFAULT = SurfaceSettings()
 Heights = tuple[float, float]
 
 
+class _Wanted(NamedTuple):
+    """The options --crs, --geoid and --heights; whether a model is made."""
+
+    crs: str | None
+    geoid: str | Path | None
+    heights: str | None
+    model: bool
+
+
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Surface(TableMethods):
     """A surface from oriented images: `cloud`, `messages`; `matching`: the cloud's statistics by
     base image; the `dsm` and the `orthophoto` on it [rows, columns], None if not asked for; `check`
-    points [n, 3]."""
+    points [n, 3]; `heights`: what they are above, empty if it is not known."""
 
     matching: SurfaceResult
     dsm: Dsm | None
     orthophoto: np.ndarray | None
     check: np.ndarray
+    heights: str = ""
 
     @property
     def cloud(self) -> Cloud:
@@ -69,7 +89,7 @@ class Surface(TableMethods):
     @cached_property
     def accuracy(self) -> dict[str, Any]:
         """Counts and accuracy; RMS at check points, if there are any."""
-        return report_of(self.matching, check=self.check)
+        return report_of(self.matching, check=self.check, heights=self.heights)
 
     def to_dict(self) -> dict[str, Any]:
         """Counts and accuracy as plain dicts and numbers, as in JSON."""
@@ -99,6 +119,8 @@ def surface(  # noqa: PLR0913 (public: the options of the command, all but one b
     orthophoto_of: Sequence[str] | None = None,
     check: np.ndarray | str | Path | None = None,
     crs: str | None = None,
+    geoid: str | Path | None = None,
+    heights: str | None = None,
     settings: SurfaceSettings = DEFAULT,
     progress: Progress | None = None,
     tell: Callable[[str], object] | None = None,
@@ -119,20 +141,27 @@ def surface(  # noqa: PLR0913 (public: the options of the command, all but one b
       in `orthophoto_of`.
     - `check`: points [n, 3], or their file, whose heights are compared; default: check and control
       points of the input.
-    - `crs`: coordinate system of cloud and DSM; of scanner and RPC images by default the UTM zone.
+    - `crs`: coordinate system of cloud and DSM; of scanner and RPC images by default the UTM zone;
+      of photographs that of their block. With a vertical part, its heights.
+    - `geoid`: raster of geoid heights, or name of a grid of PROJ; `heights`: what cloud, DSM,
+      `check`, `zmin` and `zmax` are above, `"ellipsoid"` or `"geoid"`. Default: the geoid if one
+      is given, else what is computed: above the ellipsoid from scanner and RPC images, the heights
+      of their block from photographs.
     - `progress(stage, done, total)`; `tell`: called with every message when it arises.
 
     **Raises:** `InputError`; `NotSolvedError` if no images overlap, or nothing matches.
     """
     inputs = [Path(input)] if isinstance(input, str | Path) else [Path(path) for path in input]
     folder = None if photos is None else Path(photos)
-    heights = _heights(zmin, zmax)
+    between = _heights(zmin, zmax)
     if dsm is not None and not dsm > 0:
         raise InputError(f"--dsm {dsm}: a positive size is expected")
     if (orthophoto or orthophoto_of) and dsm is None:
         raise InputError("--orthophoto: needs --dsm, the size of its pixels")
     # read before matching, which takes minutes: its errors come at once
     given = read_cloud(check).X if isinstance(check, str | Path) else check
+    if given is not None:
+        given = numeric_array("check", given, "coordinates X, Y, Z [n, 3]")
     options = {"points": points, "step": step, "dense": dense, "settings": settings}
     say = tell or (lambda _: None)
     # photographs come in one folder, scanner and RPC images one by one
@@ -140,23 +169,25 @@ def surface(  # noqa: PLR0913 (public: the options of the command, all but one b
         match = _match_ground_images
     else:
         match = _match_photographs
-    made = match(inputs, folder, heights, pairs, crs, {**options, "progress": progress}, say)
+    wanted = _Wanted(crs, geoid, heights, dsm is not None)
+    made = match(inputs, folder, between, pairs, wanted, {**options, "progress": progress}, say)
     views = choose_views(made.views, orthophoto_of) if orthophoto or orthophoto_of else []
     model = None if dsm is None else make_dsm(made.surface.cloud, dsm)
     picture = mosaic(views, model, made.to_views) if views and model is not None else None
     known = made.check if given is None else np.asarray(given, float)
-    return Surface(made.surface, model, picture, known)
+    return Surface(made.surface, model, picture, known, made.heights)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Matched:
-    """The matched surface, its images, the transformation from cloud to image coordinates, and
-    check points."""
+    """The matched surface, its images, the transformation from cloud to image coordinates,
+    check points, and what the heights are above."""
 
     surface: SurfaceResult
     views: Sequence[OrientedImage]
     to_views: ToViews
     check: np.ndarray
+    heights: str = ""
 
 
 def _match_photographs(
@@ -164,21 +195,34 @@ def _match_photographs(
     photos: Path | None,
     heights: Heights | None,
     pairs: Sequence[str] | None,
-    crs: str | None,
+    wanted: _Wanted,
     options: Mapping[str, Any],
     say: Callable[[str], object],
 ) -> _Matched:
     if photos is None:
         raise InputError("--photos is missing: the folder of the photographs")
+    reference = heights_of_photographs(wanted.crs, wanted.geoid, wanted.heights)
+    if wanted.model:
+        check_cells(reference, metres=False)
     views, network, messages = read_views(inputs[0], photos)
+    if reference.geoid is not None:
+        if network.object_unit != "m":
+            raise InputError(f"--geoid: the unit of the block is {network.object_unit}; expected m")
+        # also without heights: a grid that does not cover the block is refused before matching
+        x, y = np.stack([view.X0[:2] for view in views], 1)
+        inside = reference.as_computed(heights or (0.0, 0.0), x, y)
+        heights = heights and inside
     bounds, more = find_bounds(views, tie_points(network), heights)
     _say_all(messages + more, say)
     found = reconstruct_surface(views, bounds, _partners(pairs, views), **options)
-    cloud = dataclasses.replace(found.cloud, system=crs)
+    cloud = reference.apply(found.cloud)
     _say_all(found.messages, say)
     every = (*messages, *more, *found.messages)
     found = dataclasses.replace(found, cloud=cloud, messages=every)
-    return _Matched(found, views, lambda X: X, check_points(network))
+    to_views = lambda X: _with_height(X, -reference.correction(X[:, 0], X[:, 1]))
+    check = check_points(network)
+    check = _with_height(check, reference.correction(check[:, 0], check[:, 1]))
+    return _Matched(found, views, to_views, check, reference.words)
 
 
 def _match_ground_images(
@@ -186,7 +230,7 @@ def _match_ground_images(
     photos: Path | None,
     heights: Heights | None,
     pairs: Sequence[str] | None,
-    crs: str | None,
+    wanted: _Wanted,
     options: Mapping[str, Any],
     say: Callable[[str], object],
 ) -> _Matched:
@@ -194,6 +238,18 @@ def _match_ground_images(
     views, around = read_ground_views(inputs, photos)
     if len(views) < 2:
         raise InputError(f"{inputs[0]}: one image; a surface needs at least two")
+    crs, geoid, above, model = wanted
+    if around is None:
+        no_height_reference(geoid, above)
+        reference = HeightReference()
+    else:
+        reference = heights_of_ground_images(system_of(around, crs), geoid, above)
+        if model:
+            check_cells(reference, metres=True)
+    if reference.geoid is not None and around is not None and reference.horizontal is not None:
+        x, y = _corners(views, around, reference.horizontal)
+        inside = reference.as_computed(heights or (0.0, 0.0), x, y)
+        heights = heights and inside
     bounds, messages = ground_bounds(views, heights)
     messages = (*messages, *align_all(views, bounds))
     if around is not None and crs is not None:
@@ -203,12 +259,37 @@ def _match_ground_images(
     found = reconstruct_surface(views, bounds, _partners(pairs, views), **options)
     _say_all(found.messages, say)
     found = dataclasses.replace(found, messages=(*messages, *found.messages))
-    if around is None:
+    if around is None or reference.horizontal is None:
         return _Matched(found, views, lambda X: X, np.zeros((0, 3)))
-    system = system_of(around, crs)
-    in_map = dataclasses.replace(found, cloud=to_map(found.cloud, around, system))
-    to_views = lambda X: from_map(X[:, 0], X[:, 1], X[:, 2], around, system)
-    return _Matched(in_map, views, to_views, np.zeros((0, 3)))
+    horizontal = reference.horizontal
+    cloud = reference.apply(to_map(found.cloud, around, horizontal))
+    in_map = dataclasses.replace(found, cloud=cloud)
+
+    def to_views(X: np.ndarray) -> np.ndarray:
+        h = X[:, 2] - reference.correction(X[:, 0], X[:, 1])
+        return from_map(X[:, 0], X[:, 1], h, around, horizontal)
+
+    return _Matched(in_map, views, to_views, np.zeros((0, 3)), reference.words)
+
+
+def _with_height(X: np.ndarray, added: np.ndarray) -> np.ndarray:
+    """Points [n, 3] with something added to their heights."""
+    return np.column_stack([X[:, :2], X[:, 2] + added])
+
+
+def _corners(
+    views: Sequence[GroundView], around: Neighbourhood, crs: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """x and y of the corners of images on the ellipsoid, or at the middle of their heights."""
+    found = []
+    for view in views:
+        columns, rows = view.size
+        uv = np.array([[u, v] for u in (0.0, columns - 1.0) for v in (0.0, rows - 1.0)])
+        h = sum(view.range()) / 2 if isinstance(view, RpcView) else 0.0
+        found.append(view.points(uv, np.full(len(uv), h)))
+    X = np.concatenate(found)
+    x, y = map_coordinates(X[np.isfinite(X).all(1)], around, crs)
+    return x, y
 
 
 def choose_views(

@@ -12,6 +12,7 @@ from jaxtyping import Int
 from jaxbundle.choices import CLOUD_FILES, SURFACE_ERRORS
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
+from jaxbundle.io.rasters.vertical import horizontal_system, split_system
 from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.network.columns import count, did_you_mean
 from jaxbundle.results import TableMethods
@@ -132,6 +133,7 @@ def change(  # noqa: PLR0913 (public: the options of the command, all but two by
         after, after_sigma, after_errors or {}, size, "after", after_orientation is not None
     )
     _check_systems(first, second)
+    _check_heights(first, second)
     first, second = align(first, second)
     if same_adjustment:
         if before_orientation is None or after_orientation is None:
@@ -258,16 +260,30 @@ def _read_mask(path: str | Path, cells: CellSource) -> Int[np.ndarray, "rows col
 
 
 def _check_systems(first: CellSource, second: CellSource) -> None:
-    """Refuse surfaces of different coordinate systems."""
+    """Refuse surfaces in different map systems."""
     if first.system is None or second.system is None:
         return
     import pyproj
 
-    one, other = (pyproj.CRS.from_user_input(grid.system) for grid in (first, second))
+    one, other = (
+        pyproj.CRS.from_user_input(horizontal_system(grid.system)) for grid in (first, second)
+    )
     if not one.equals(other, ignore_axis_order=True):
         raise InputError(
             f"two rasters are in different coordinate systems, {one.name} and {other.name}; "
             "transform one (gdalwarp -t_srs)"
+        )
+
+
+def _check_heights(first: CellSource, second: CellSource) -> None:
+    """Refuse heights above different surfaces, by the systems of the files."""
+    systems = [split_system(grid.system) for grid in (first, second) if grid.system is not None]
+    names = ["none" if one.vertical is None else one.vertical.name for one in systems]
+    if len({*names}) > 1:
+        raise InputError(
+            f"the heights of both surfaces are of different systems: before {names[0]}, after "
+            f"{names[1]}; none is the ellipsoid. Transform one (surface --geoid, gdalwarp), or, if "
+            "both have the same heights, name the same system in both (gdal_edit.py -a_srs)"
         )
 
 

@@ -18,6 +18,7 @@ from jaxbundle.measure.least_squares_matching import (
     match_least_squares,
 )
 from jaxbundle.measure.matching import Match, correlation, find_match
+from jaxbundle.measure.moving_blobs import BlobSettings
 from jaxbundle.measure.ring_targets import RingSettings, ring_codes
 from jaxbundle.measure.targets import Target, centre_by_ellipse, centre_by_grey_values
 from jaxbundle.measure.transfer import (
@@ -32,6 +33,7 @@ from jaxbundle.network.units import image_from_pixel, pixel_from_image
 from jaxbundle.photographs import read_photograph
 
 __all__ = [
+    "BlobSettings",
     "Board",
     "BoardPoints",
     "BoardSet",

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
 from jaxbundle.arguments import integer
 from jaxbundle.errors import InputError
@@ -73,8 +73,7 @@ def look_at_video(path: Path, settings: FrameSettings, progress: Progress) -> Vi
     with _opened(path) as video:
         rate = float(video.get(cv2.CAP_PROP_FPS))
         stated = max(int(video.get(cv2.CAP_PROP_FRAME_COUNT)), 1)
-        for frame in _frames(video):
-            grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY) if frame.ndim == 3 else frame
+        for grey in _grey_frames(video):
             small = _reduce(grey, settings.side).astype(np.float32)
             # of the same view at another exposure it is the same; blur does not change the mean
             sharpness.append(cv2.Laplacian(small, cv2.CV_32F).var() / max(small.mean(), 1.0) ** 2)
@@ -121,6 +120,19 @@ def choose_frames(
     return np.sort(candidates[chosen])
 
 
+def frames_of_video(path: Path) -> Iterator[UInt8[np.ndarray, "rows columns"]]:
+    """The grey values of all frames of a video.
+
+    **Raises:** `InputError` if it is not a video, or has no frames."""
+    empty = True
+    with _opened(path) as video:
+        for grey in _grey_frames(video):
+            empty = False
+            yield grey
+    if empty:
+        raise InputError(f"{path}: a video without frames")
+
+
 def file_of_frame(number: int) -> str:
     """The name of the file of a frame."""
     return f"frame_{number:06d}.png"
@@ -164,12 +176,13 @@ def _opened(path: Path) -> Iterator[Any]:
         video.release()
 
 
-def _frames(video: Any) -> Iterator[np.ndarray]:
+def _grey_frames(video: Any) -> Iterator[UInt8[np.ndarray, "rows columns"]]:
+    cv2 = need_opencv()
     while True:
         there, frame = video.read()
         if not there:
             return
-        yield frame
+        yield cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY) if frame.ndim == 3 else frame
 
 
 def _reduce(grey: np.ndarray, side: int) -> np.ndarray:

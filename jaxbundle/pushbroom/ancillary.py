@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.arguments import numeric_array
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.network.tables import Source
@@ -302,13 +303,15 @@ def _table(
     what: str,
     source: Source,
 ) -> TimeTable:
-    times, values = np.asarray(times, float), np.asarray(values, float)
+    # masked values are NaN, and refused with their row
+    plain = lambda array: numeric_array(source.name, array, "numbers").astype(float)
+    times, values = plain(times), plain(values)
     if values.ndim != 2 or times.shape != values.shape[:1]:
         raise InputError(
             f"{source.name}: {times.shape} times and {what}s of shape {values.shape}; one row of "
             "values a time is expected"
         )
-    rates = None if rates is None else np.asarray(rates, float)
+    rates = None if rates is None else plain(rates)
     for name, array in ((what, values), ("velocity", rates)):
         if array is not None and (bad := ~np.isfinite(array).all(1)).any():
             raise InputError(f"{source(int(bad.argmax()))}: the {name} is not a finite number")

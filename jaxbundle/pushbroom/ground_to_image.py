@@ -24,6 +24,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from jaxbundle.arguments import without_masks
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, normal
 from jaxbundle.geometry.vectors import Vector, difference, dot, rotate_back
 from jaxbundle.implicit import implicit_root, solve_dense
@@ -101,6 +102,7 @@ def make_search(
     return Search(pieces, footprint, samples, line, earth, settings)
 
 
+@without_masks
 def project_points(
     image: PushbroomImage,
     search: Search,

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxbundle.arguments import without_masks
 from jaxbundle.geometry.vectors import Triple, along, difference, length, rotate
 from jaxbundle.pushbroom.corrections import Corrections, earlier_earth, inertial_velocity, refract
 from jaxbundle.pushbroom.corrections import true_direction as without_aberration
@@ -52,6 +53,7 @@ def ground_point(
     return X
 
 
+@without_masks
 def locate_lines(
     image: PushbroomImage,
     surface: GroundSurface,
@@ -72,6 +74,7 @@ def locate_lines(
     return jnp.stack(jax.vmap(locate_line)(lines))
 
 
+@without_masks
 def locate_points(
     image: PushbroomImage,
     surface: GroundSurface,

@@ -30,6 +30,7 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
+from jaxbundle.arguments import numeric_array
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, at_height, geodetic, ray_to_ellipsoid
 from jaxbundle.geometry.vectors import Scalar, Triple, Vector, along
@@ -126,9 +127,11 @@ def make_terrain(
     **Arguments:** `over_voids`: rays pass over cells without a height, and come from beyond the
     edges.
 
+    Masked heights are none.
+
     **Raises:** `InputError` for fewer than 2 × 2 heights, or without any valid height.
     """
-    heights = np.asarray(heights, float)
+    heights = numeric_array("heights", heights, "heights [rows, columns]").astype(float, copy=False)
     if heights.ndim != 2 or min(heights.shape) < 2:
         raise InputError(f"terrain: heights of shape {heights.shape}; a grid of 2 × 2 at least")
     if not np.isfinite(heights).any():

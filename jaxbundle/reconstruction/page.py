@@ -114,6 +114,7 @@ def _judge_fit(part: ReconstructedPart) -> Finding:
     words = ", ".join(f"{significant(f, 3)} ({kind})" for kind, f in part.factors.items())
     worst = part.misfit
     state = BAD if worst >= WRONG_MISFIT else DOUBTFUL if worst >= DOUBTFUL_MISFIT else NOTED
+    # A fit to σ estimated from the same residuals is no test: noted, never met.
     times = f"residuals {significant(worst)} times their σ from matching"
     return Finding(
         "Fit",

@@ -48,7 +48,10 @@ REMARKS = {
     "edge of the image: a moving shutter, or film that is not flat",
     "along tracks": "errors of {} along the tracks of points, alike from stations near to each "
     "other: measured against one image",
-    "given points": "points held, as those of a board, are not where they are given, by {} in "
+    "given points in plane": "points held, as those of a board, are not where they are given in "
+    "its plane, by {} in images: a stretched or inexact print; measure its squares, or estimate "
+    "its points (--board-free)",
+    "given points out of plane": "points held, as those of a board, are not in its plane, by {} in "
     "images: use a flat board, or estimate its points (--board-free)",
 }
 # σ under correlated errors over classical ones from which the difference is a finding: five in a

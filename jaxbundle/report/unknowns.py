@@ -264,6 +264,7 @@ def _list_of_points(adjustment: "Adjustment", most: int) -> list[str]:
     total = len(found["id"])
     unit = clean(adjustment.network.object_unit)
     lines = heading(f"Points: coordinates in {unit}")
+    # A table of what was given, without σ, says nothing of the result.
     if not (adjustment.problem.table("point").free > 0).any():
         return [*lines, f"All {count(total, 'point')} are held where they are given (points.csv)."]
     shown = np.arange(min(total, most))

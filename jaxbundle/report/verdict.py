@@ -60,13 +60,7 @@ class Verdict(NamedTuple):
 def judge(adjustment: "Adjustment") -> list[Finding]:
     """The findings of a solved adjustment."""
     return [
-        judge_fit(
-            adjustment.global_test(),
-            chi_squared(adjustment),
-            adjustment.sigma0,
-            adjustment.weights_matter,
-            adjustment.redundancy,
-        ),
+        _fit(adjustment),
         _control(adjustment),
         *_checks(adjustment),
         *_second_minima(adjustment),
@@ -103,6 +97,16 @@ def conclude(
     # those of the command first: they are about its own question
     found = [*findings, *(f for f in judge(adjustment) if f.about not in without)]
     return Verdict(*in_words(found, warnings + len(adjustment.warnings)), tuple(found))
+
+
+def _fit(adjustment: "Adjustment") -> Finding:
+    return judge_fit(
+        adjustment.global_test(),
+        chi_squared(adjustment),
+        adjustment.sigma0,
+        adjustment.weights_matter,
+        adjustment.redundancy,
+    )
 
 
 def judge_fit(
@@ -167,6 +171,7 @@ def judge_replication(adjustment: "Adjustment") -> Finding | None:
         return None
     if not halves.splits:
         return Finding("Replication", NOTED, halves.sentence, "halves not compared")
+    # The root of d²/n: differences are compared with σ, not with variances.
     limit = np.sqrt(chi2_quantile(1 - LEVEL, halves.dof) / halves.dof)
     words = f"{halves.sentence}; in one of 1000 cases by more than {limit:.2f} by chance"
     state = DOUBTFUL if halves.probability < LEVEL else GOOD

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxbundle.io.rasters.vertical import horizontal_system
 from jaxbundle.io.rasters.writing import write_raster
 from jaxbundle.surfaces.change import SurfaceChange
 from jaxbundle.surfaces.dsm import NO_DATA
@@ -19,7 +20,7 @@ def write_change(change: SurfaceChange, difference: str | Path, significant: str
 
     profile = {
         "transform": Affine(change.size, 0, change.x, 0, -change.size, change.y),
-        "crs": change.system,
+        "crs": horizontal_system(change.system),
         "compress": "deflate",
     }
     rows, columns = change.difference.shape

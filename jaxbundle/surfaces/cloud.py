@@ -31,6 +31,8 @@ class Cloud:
     shared: Float[np.ndarray, " n"] | None = None
 
     def __post_init__(self) -> None:
+        if np.ma.is_masked(self.X) or np.ma.is_masked(self.covariance):
+            raise InputError("cloud: masked coordinates or covariances; leave these points out")
         n = len(self.X)
         shapes = {"X": (n, 3), "covariance": (n, 3, 3), "rays": (n,), "image": (n,), "uv": (n, 2)}
         for name, shape in shapes.items():

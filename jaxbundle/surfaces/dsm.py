@@ -24,6 +24,7 @@ from scipy import ndimage
 from jaxbundle.arguments import positive
 from jaxbundle.display import data_set, print_in_one_screen
 from jaxbundle.errors import InputError
+from jaxbundle.io.rasters.vertical import horizontal_system
 from jaxbundle.io.rasters.writing import write_raster
 from jaxbundle.leastsquares.quality.distributions import NORMAL_SIGMA_BY_MAD
 from jaxbundle.surfaces.cloud import Cloud
@@ -164,23 +165,29 @@ def _add_shared(dsm: Dsm, cell: Int[np.ndarray, " n"], shared: Float[np.ndarray,
 
 def write_dsm(dsm: Dsm, path: str | Path, sigma_path: str | Path | None = None) -> None:
     """GeoTIFFs of heights and of their σ, float32, no-data `NO_DATA`. Where the σ without the
-    errors of the orientations is known, it is the second band of the file of σ."""
+    errors of the orientations is known, it is the second band of the file of σ. The system of
+    heights is that of the file of heights alone."""
     from rasterio.transform import Affine
 
     profile = {
         "transform": Affine(dsm.size, 0, dsm.x, 0, -dsm.size, dsm.y),
         "nodata": NO_DATA,
-        "crs": dsm.system,
         "compress": "deflate",
     }
     rows, columns = dsm.height.shape
     sigmas = {"sigma of height": dsm.sigma}
     if dsm.own_sigma is not None:
         sigmas[OWN_SIGMA] = dsm.own_sigma
-    for target, bands in ((path, {"height": dsm.height}), (sigma_path, sigmas)):
+    # σ are no heights: with a vertical system gdalwarp would add geoid heights to them
+    horizontal = horizontal_system(dsm.system)
+    files = (
+        (path, {"height": dsm.height}, dsm.system),
+        (sigma_path, sigmas, horizontal),
+    )
+    for target, bands, crs in files:
         if target is not None:
-            count = len(bands)
-            with write_raster(target, columns, rows, count, "float32", **profile) as raster:
+            form = {**profile, "crs": crs}
+            with write_raster(target, columns, rows, len(bands), "float32", **form) as raster:
                 values = np.stack([*bands.values()])
                 raster.write(np.nan_to_num(values, nan=NO_DATA).astype(np.float32))
                 raster.describe([*bands])

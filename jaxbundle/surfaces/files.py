@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxbundle.errors import InputError
+from jaxbundle.io.rasters.vertical import name_system
 from jaxbundle.io.text.csv_tables import read_csv, write_text
 from jaxbundle.network.tables import Source
 from jaxbundle.surfaces.accuracy import accuracy_of, at_check_points
@@ -124,8 +125,10 @@ def report_of(
     surface: SurfaceResult,
     warnings: Sequence[str] = (),
     check: Float[np.ndarray, "n 3"] | None = None,
+    heights: str = "",
 ) -> dict[str, Any]:
-    """Counts and accuracy, for JSON; RMS at check points, if there are any."""
+    """Counts and accuracy, for JSON; RMS at check points, if there are any; `heights`: what they
+    are above, empty if it is not known."""
     cloud = surface.cloud
     number = np.bincount(cloud.rays) if len(cloud) else np.zeros(0, int)
     return {
@@ -133,6 +136,7 @@ def report_of(
         "rays": {str(k): int(n) for k, n in enumerate(number) if n},
         "images": [dict(row) for row in surface.bases],
         "system": cloud.system,
+        "heights": heights or None,
         "sigma_includes": ["matching", *(["orientation"] if surface.orientation else [])],
         "accuracy": accuracy_of(cloud),
         **(
@@ -151,6 +155,9 @@ def text_of(report: Mapping[str, Any]) -> str:
         f"{report['points']} points, by rays: "
         + ", ".join(f"{k}: {n}" for k, n in report["rays"].items())
     ]
+    if report.get("system"):
+        above = f", heights {report['heights']}" if report.get("heights") else ""
+        lines.append(f"coordinates in {name_system(report['system'])}{above}")
     for row in report["images"]:
         factor = row["variance_factor"]
         said = "" if factor is None else f", variance factor {factor:.3g}"

@@ -7,6 +7,7 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.arguments import numeric_array
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 
@@ -27,6 +28,12 @@ class HeightGrid:
     size: float
     system: str | None = None
     shared: Modes | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("height", "sigma"):
+            if isinstance(values := getattr(self, name), np.ma.MaskedArray):
+                # a masked cell has no height
+                object.__setattr__(self, name, numeric_array(name, values, "numbers"))
 
     @property
     def shape(self) -> tuple[int, int]:

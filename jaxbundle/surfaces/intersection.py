@@ -45,7 +45,8 @@ def intersect(
     X = start.copy()
     weight = np.zeros((n, m, 2, 2))
     weight[used] = np.linalg.inv(covariance[used])
-    J, v, sights = np.zeros((n, m, 2, 3)), np.zeros((n, m, 2)), np.zeros((n, m, 3))
+    J, PJ = np.zeros((n, m, 2, 3)), np.zeros((n, m, 2, 3))
+    v, sights = np.zeros((n, m, 2)), np.zeros((n, m, 3))
     Q = np.full((n, 3, 3), np.nan)
     # Points start within a few pixels of their rays, where the projection is nearly linear: on
     # rendered photographs one Gauss-Newton step is as good as six; three are safe. A fourth pass
@@ -53,15 +54,17 @@ def intersect(
     steps = 3
     for step in range(steps + 1):
         N, g = np.zeros((n, 3, 3)), np.zeros((n, 3))
+        renewed = step in (0, steps)  # J, and N with it, hardly change in between
         for k, view in enumerate(views):
             rows = np.flatnonzero(used[:, k])
-            if step in (0, steps):  # they hardly change in between
+            if renewed:
                 J[rows, k] = view.derivative(X[rows])
+                PJ[rows, k] = weight[rows, k] @ J[rows, k]
+                N[rows] += np.swapaxes(J[rows, k], 1, 2) @ PJ[rows, k]
             v[rows, k] = view.project(X[rows]) - uv[rows, k]
-            PJ = weight[rows, k] @ J[rows, k]
-            N[rows] += np.swapaxes(J[rows, k], 1, 2) @ PJ
-            g[rows] += np.einsum("nji,nj->ni", PJ, v[rows, k])
-        Q = _inverse(N)
+            g[rows] += np.einsum("nji,nj->ni", PJ[rows, k], v[rows, k])
+        if renewed:
+            Q = _inverse(N)
         if step < steps:
             X = X - np.einsum("nij,nj->ni", Q, g)
     for k in range(m):

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbundle.errors import InputError
+from jaxbundle.io.rasters.vertical import horizontal_system
 from jaxbundle.network.columns import list_some
 from jaxbundle.surfaces.height_cells import CellSource, HeightGrid, Modes
 from jaxbundle.surfaces.inputs import read_orientations
@@ -161,4 +162,5 @@ def oriented_errors(chosen: ChosenImages, others: Set[str], system: str | None) 
             "scanners and RPC: pushbroom refine --out) and give the folder"
         )
     uses = tuple(view.name in chosen.names for view in kept)
-    return OrientedErrors(errors, uses, chosen.around, system)
+    # heights above a geoid are taken as they are: 100 m at 500 km change the effects by 2e-4
+    return OrientedErrors(errors, uses, chosen.around, horizontal_system(system))

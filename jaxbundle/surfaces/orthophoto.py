@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
+from jaxbundle.io.rasters.vertical import horizontal_system
 from jaxbundle.io.rasters.writing import write_raster
 from jaxbundle.surfaces.dsm import Dsm
 from jaxbundle.surfaces.views import OrientedImage, is_inside, line_of_sight
@@ -75,7 +76,7 @@ def write_orthophoto(values: Float[np.ndarray, "rows columns"], dsm: Dsm, path: 
         dtype,
         transform=transform,
         nodata=0,
-        crs=dsm.system,
+        crs=horizontal_system(dsm.system),
         compress="deflate",
     ) as raster:
         raster.write(stored[None])

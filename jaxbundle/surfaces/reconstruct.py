@@ -109,7 +109,9 @@ def ground_bounds(
             raise InputError("line scanner images need --zmin and --zmax, heights of the surface")
         heights = max(low for low, _ in ranges), min(high for _, high in ranges)
         messages = (
-            f"heights from {heights[0]:.6g} to {heights[1]:.6g} are searched, the range of the "
+            # millimetres, and not −1e-9 for 0
+            f"heights from {round(heights[0], 3) + 0.0:.6g} to {round(heights[1], 3) + 0.0:.6g} "
+            "are searched, the range of the "
             "coefficients; give --zmin and --zmax",
         )
     return tuple(Bounds(view, heights) for view in views), messages

@@ -67,6 +67,8 @@ def align(
     if len(uv) < settings.min_matches:
         return None
     shape = windows(base, other, base.points(uv, q.mean(1)))
+    if not shape.usable.any():
+        return None
     along = np.median(shape.other_axis[shape.usable], axis=0)
     across = np.array([-along[1], along[0]]) / np.linalg.norm(along)
     both, guide_settings = (pyramids[0], [pyramids[1]]), GuideSettings()

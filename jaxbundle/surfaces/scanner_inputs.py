@@ -74,6 +74,13 @@ def read_ground_views(
         for path, one in zip(files, refined)
     ]
     around = _common_neighbourhood(files, [orientation for orientation, _ in found])
+    rasters = [raster.resolve() for _, raster in found]
+    for k, raster in enumerate(rasters):
+        if raster in rasters[:k]:
+            raise InputError(
+                f"{files[k]}: its raster {raster.name} is also that of "
+                f"{files[rasters.index(raster)]}; a surface needs different images"
+            )
     names = [raster.name for _, raster in found]
     if len({*names}) < len(names):
         names = [str(raster) for _, raster in found]
@@ -302,9 +309,16 @@ def from_map(
     crs: str,
 ) -> Float[np.ndarray, "n 3"]:
     """Points of map coordinates."""
-    degrees = _transformer(crs).transform(x, y, direction="INVERSE")
-    east, north = np.radians(degrees)
+    east, north = np.radians(to_degrees(x, y, crs))
     return np.asarray(around.local(east, north, np.asarray(h, float))).T
+
+
+def to_degrees(
+    x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], crs: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Longitude and latitude of map coordinates."""
+    longitude, latitude = _transformer(crs).transform(x, y, direction="INVERSE")
+    return np.asarray(longitude), np.asarray(latitude)
 
 
 def _transformer(crs: str) -> "pyproj.Transformer":

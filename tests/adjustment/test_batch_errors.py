@@ -85,17 +85,19 @@ def test_traces_are_those_of_an_adjustment(network, monkeypatch):
 
     monkeypatch.setattr(jaxbundle.batches.calibrate, "batch_errors", watched)
     of_batch(network, correlated="camera")
-    T, equations = seen[0].T[0], result.error_model.equations
-    cubes = with_traces(seen[0].cubes[0], T)
-    # 16 random combinations of the columns of the last two; rest: exact to single precision
+    T, equations = seen[0].traces.T[0], result.error_model.equations
+    cubes = with_traces(seen[0].traces.cubes[0], T)
+    # 16 random combinations of the columns of the last three, right to √(2/(16·r)) of matrices of
+    # the effective rank r, of which smooth errors across a board have ten; rest: exact to single
+    # precision
     few = np.ix_(range(5), range(5))
     np.testing.assert_allclose(T[few], equations.T[few], rtol=1e-3)
     scale = np.sqrt(np.diag(T))
     np.testing.assert_allclose(T / scale / scale[:, None], equations.T / scale / scale[:, None],
-                               atol=0.1)  # fmt: skip
+                               atol=0.2)  # fmt: skip
     few = np.ix_(range(5), range(5), range(5))
     np.testing.assert_allclose(cubes[few], equations.cubes[few], rtol=3e-3)
-    for k in range(7):
+    for k in range(8):
         assert cubes[k, k, k] == pytest.approx(equations.cubes[k, k, k], rel=0.5), k
 
 
@@ -104,7 +106,7 @@ def test_sizes_of_a_batch_are_those_of_all_cameras_together(network):
     alone, together = (of_batch(network, correlated=how) for how in ("camera", "batch"))
     np.testing.assert_allclose(together.sigma_correlated, alone.sigma_correlated, rtol=0.05)
     rays = network.observations
-    xy = np.full((2, VIEWS, len(network.points), 2), np.nan)
+    xy = np.full((3, VIEWS, len(network.points), 2), np.nan)
     xy[:, rays.image, rays.point] = rays.xy
     xy[1, DEFAULTS.min_images - 2 :] = np.nan
     both = jaxbundle.calibrate_batch(

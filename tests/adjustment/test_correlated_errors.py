@@ -10,7 +10,7 @@ import pytest
 import jaxbundle
 from jaxbundle.adjustment.problem import make_problem
 from jaxbundle.adjustment.quality.correlated_errors import splines
-from jaxbundle.adjustment.quality.given_points import given_points_component, wendland
+from jaxbundle.adjustment.quality.given_points import given_points_components, wendland
 from jaxbundle.adjustment.quality.replication import compared_parameters
 from jaxbundle.adjustment.quality.weakness import Weakness
 from jaxbundle.leastsquares.quality import error_components
@@ -284,22 +284,65 @@ def test_errors_of_given_points_are_found(clean):
     solution, rays = found.cofactors.solution, found.problem
     row = 2 * np.arange(len(clean.observations))
     sigma = clean.observations.sigma
-    columns = given_points_component(solution, row, rays.point, sigma, 0, 8).root.toarray()
-    X, step = np.asarray(solution.values["point"]), np.zeros((len(points), 3))
-    step[7, 2] = 1e-5
+    of_plane, across = given_points_components(solution, row, rays.point, sigma, 0, 8)
+    X = np.asarray(solution.values["point"])
+    # the normal of the plane that fits best: of the smallest second moment
+    centred = X - X.mean(0)
+    normal = np.linalg.eigh(centred.T @ centred)[1][:, 0]
+    step = np.zeros((len(points), 3))
+    step[7] = 1e-5 * normal
     moved = Solution(solution.problem, solution.values | {"point": X + step})
     change = stack_rows(moved, moved.residuals) - stack_rows(solution, solution.residuals)
-    column = columns[:, 2 * len(points) + 7]
+    column = across.root.toarray()[:, 7]
     scale = column @ change / (column @ column)
     np.testing.assert_allclose(change, scale * column, atol=1e-4 * np.abs(change).max())
-    none = given_points_component(solution, row, rays.point, sigma, 0, len(points) + 1)
-    assert none is None and found.error_model.sizes[-1].size < 0.1
+    assert of_plane.root.shape[1] == 2 * len(points)
+    assert not given_points_components(solution, row, rays.point, sigma, 0, len(points) + 1)
+    assert max(size.size for size in found.error_model.sizes[-2:]) < 0.1
     rng = np.random.default_rng(2)
     off = points.position + 0.003 * rng.normal(size=X.shape)
     wrong = given.replace(points=dataclasses.replace(points, position=off))
-    size = jaxbundle.adjust(wrong, correlated=True).error_model.sizes[-1]
-    # 3 mm at 6 m are 0.75 pixels across the line of sight, 0.61 in the mean of all directions
-    assert size.name == "given points" and 0.5 < size.size < 0.75 and size.score > 20
+    sizes = jaxbundle.adjust(wrong, correlated=True).error_model.sizes[-2:]
+    assert [size.name for size in sizes] == ["given points in plane", "given points out of plane"]
+    # 3 mm at 6 m are 0.75 pixels across the line of sight; of the three axes two thirds of that
+    # square, 0.61 pixels, in both components together
+    total = np.sqrt(sum(size.size**2 for size in sizes))
+    assert 0.5 < total < 0.75 and max(size.score for size in sizes) > 20
+
+
+@pytest.mark.further
+def test_errors_across_a_board_are_told_from_those_in_its_plane(clean):
+    """A board that is bent, or one whose print is displaced: the component of the other is
+    small."""
+    rng = np.random.default_rng(5)
+    stations = ring_of_stations(IMAGES, 5.0, 6.0, roll_every=2)
+    targets = grid_of_targets(9, 7, 0.6)
+    exact = jaxbundle.simulate(stations, targets, CAMERA, noise=SIGMA, seed=1)
+    flat = exact.points.position * np.array([1.0, 1.0, 0.0])
+    points = dataclasses.replace(exact.points, position=flat, role=("fixed",) * len(flat))
+    given = exact.replace(points=points, datum="control")
+    # 3 mm at 7.8 m are 0.58 pixels; of an error across the plane, seen at 40°, sin 40° of that in
+    # both coordinates together; in the plane of two errors of 1 and cos 40°
+    across, within = 0.58 * 0.64 / np.sqrt(2), 0.58 * np.sqrt((1 + 0.77**2) / 2)
+    for axes, large, small, size in (([0, 0, 1], -1, -2, across), ([1, 1, 0], -2, -1, within)):
+        off = flat + 0.003 * rng.normal(size=flat.shape) * np.array(axes)
+        wrong = given.replace(points=dataclasses.replace(given.points, position=off))
+        sizes = jaxbundle.adjust(wrong, correlated=True).error_model.sizes
+        assert sizes[large].size == pytest.approx(size, rel=0.3), axes
+        assert sizes[small].size < 0.3 * sizes[large].size, axes
+
+
+@pytest.mark.further
+def test_too_few_photographs_for_halves():
+    """The remedy that is named can be followed."""
+    targets = grid_of_targets(9, 7, 0.6, relief=0.6)
+    first = lambda number: jaxbundle.simulate(
+        ring_of_stations(number, 5.0, 6.0, roll_every=2), targets, CAMERA, noise=SIGMA, seed=1
+    )
+    with pytest.raises(jaxbundle.InputError, match="4 photographs: .* 6 or more; .* points need 3"):
+        jaxbundle.replicate(first(4), by="photographs")
+    with pytest.raises(jaxbundle.InputError, match="2 photographs: halves by points need 3"):
+        jaxbundle.replicate(first(2), by="points")
 
 
 @pytest.mark.further

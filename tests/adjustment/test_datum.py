@@ -316,3 +316,27 @@ def test_derivatives_by_turned_start_values(attitudes_without_a_scale):
         slopes = [jax.grad(size)(here + e), jax.grad(size)(here - e)]
         difference = (slopes[0] - slopes[1]) / (2 * step)
         np.testing.assert_allclose(curvature[k], difference, rtol=1e-4, atol=1e-8)
+
+
+def test_open_directions_are_orthonormal_on_the_datum_unknowns():
+    """Also where one open motion, as the height of horizontal angles, has no effect on anything:
+    with nearly parallel directions the S-transformation loses its digits."""
+    network = jaxbundle.read_network("examples/convergent4/project.toml").replace(datum="inner")
+    azimuth = lambda at, to: jnp.arctan2(*(to - at)[:2])
+    kind = jaxbundle.leastsquares.Kind(
+        "horizontal angles", lambda at, a, b, m: azimuth(at, b) - azimuth(at, a) - m,
+        of=("point", "point", "point"),
+    )  # fmt: skip
+    ids = network.points.id
+    rows = [[ids[k] for k in ks] for ks in ((0, 4, 8, 2), (5, 1, 3, 7), (9, 8, 6, 5))]
+    angles = kind(rows=tuple(rows), measured=np.zeros(4), sigma=1e-4)
+    problem = jaxbundle.make_problem(network, also=[angles])
+    datum = problem.plan.datum
+    assert datum.gauge.shape[1] == 5
+    moves = generators(problem.declared, problem.data.start)
+    G = [np.asarray(moves[t]) @ datum.gauge for t in datum.weight]
+    gram = sum(
+        np.einsum("nwi,nw,nwj->ij", g, np.asarray(w)[: len(g)], g)
+        for g, w in zip(G, datum.weight.values())
+    )
+    np.testing.assert_allclose(gram, np.eye(5), atol=1e-10)

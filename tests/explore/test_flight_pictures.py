@@ -201,6 +201,7 @@ def test_a_flight_file_has_start_and_end(tmp_path):
         assert abs(height - 9000.0) < 1e-3
     for wrong, words in (
         ("start = [10.0, 95.0, 9000.0]\nend = [10.0, 50.0, 9000.0]", "latitude of 95"),
+        ("start = [nan, 50.0, 9000.0]\nend = [10.0, 50.0, 9000.0]", "start is .*finite numbers"),
         ("start = [10.0, 50.0, 9000.0]", "end"),
         ("start = [10.0, 50.0, 9000.0]\nend = [10.0, 50.0, 9000.0]", "same place"),
         (f"{track}\nheight = 5e5", "height"),

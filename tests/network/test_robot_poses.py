@@ -18,6 +18,8 @@ from jaxbundle.io.results.result_project import adjusted_network, readjustable_n
 from jaxbundle.leastsquares.problem import with_data
 from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.network.kinds.fit_hand_eye import Rigid, motions, solve
+from jaxbundle.network.tables import EXTERIOR
+from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.planning.stations import Stations, stations_looking_at
 
 N, SIGMA_P, SIGMA_R = 12, 2e-4, 3e-4
@@ -198,7 +200,7 @@ def test_noisy_data_are_better_than_closed_forms(seen):
 @pytest.mark.further
 @pytest.mark.parametrize("type", ["eye-in-hand", "eye-to-hand"])
 def test_sigma_is_that_of_a_sample(seen, type):
-    """200 draws of all image points and robot poses."""
+    """200 draws of all image points and robot poses: positions, and the angles ω, φ, κ."""
     problem = jaxbundle.make_problem(robot(seen.truth, hands(seen, type), type=type))
     names, random, data = problem.further_tables, np.random.default_rng(8), problem.data
     found = {name: [] for name in names}
@@ -215,12 +217,15 @@ def test_sigma_is_that_of_a_sample(seen, type):
         changed = with_data(problem, dataclasses.replace(data, measured=measured))
         values = find_minimum(changed, data.start).values
         for name in names:
-            found[name].append(np.asarray(values[name].position))
+            M = np.asarray(matrix_from_quaternion(values[name].rotation[0]))
+            angles = np.asarray(omega_phi_kappa_from_matrix(M))
+            found[name].append([*np.asarray(values[name].position[0]), *angles])
     result = jaxbundle.adjust(robot(seen.network, hands(seen, type, noise=1.0), type=type))
     for name in names:
         one = next(iter(result.further_unknowns[name].values()))
-        sigma = np.array([one[f"{a}0"]["sigma"] for a in "XYZ"]) / result.sigma0
-        ratio = np.array(found[name])[:, 0].std(0, ddof=1) / sigma
+        sigma = np.array([one[parameter]["sigma"] for parameter in EXTERIOR]) / result.sigma0
+        sigma[3:] *= ANGLE_UNITS[seen.network.angle_unit]  # radians
+        ratio = np.unwrap(np.array(found[name]), axis=0).std(0, ddof=1) / sigma
         assert (ratio > 0.88).all() and (ratio < 1.12).all(), (name, ratio)
 
 

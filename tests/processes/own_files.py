@@ -182,6 +182,37 @@ def write_view_of_rig(path: Path, side: int, seed: int = 0) -> None:
         cv2.imwrite(str(path / f"{'lr'[side]}_{k:03}.png"), grey)
 
 
+def write_waved(path: Path, camera: str) -> None:
+    """What a camera of the rig, or one far from it, saw of a wand of 0.2 m; beside it the file of
+    the far one."""
+    import render
+    from scipy.spatial.transform import Rotation
+
+    from jaxbundle.cameras import get_model
+    from jaxbundle.io import write_cameras
+    from jaxbundle.network.tables import Camera
+
+    turn = lambda degrees: Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+    poses = {
+        "left": (np.eye(3), np.zeros(3)),
+        "right": (turn(3), np.array([0.04, 0, 0])),
+        "far": (turn(-50), np.array([0.9, 0.05, -0.2])),
+    }
+    shape, rng = np.random.default_rng(1), np.random.default_rng(list(poses).index(camera))
+    middle = shape.uniform([-0.1, -0.1, -1.1], [0.1, 0.1, -0.8], (40, 3))
+    along = shape.normal(size=(40, 3))
+    along *= 0.1 / np.linalg.norm(along, axis=1)[:, None]
+    lines = ["frame,marker,x,y"]
+    for marker, X in (("A", middle - along), ("B", middle + along)):
+        xy = render.LENS.image_of(*poses[camera], X) + 0.05 * rng.normal(size=(40, 2))
+        lines += [f"{f},{marker},{x},{y}" for f, (x, y) in enumerate(xy)]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    names = get_model("opencv").parameters
+    values = dict(zip(names, render.LENS.parameters))
+    lens = Camera("far", "opencv", values, (), image_size=render.LENS.size)
+    write_cameras([lens], path.parent / "far.toml")
+
+
 def write_video(path: Path, side: int) -> None:
     """A camera of the rig, moved by hand from place to place before a board: eight of them, with
     rests."""
@@ -209,6 +240,34 @@ def write_video(path: Path, side: int) -> None:
             grey = render.photograph(render.LENS, M, X0, PATTERN, noise=0.5)
             video.write(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR))
     video.release()
+
+
+def write_wand_video(path: Path, camera: str) -> None:
+    """A wand of three markers before a camera; beside it the file of both cameras."""
+    import cv2
+    import wand_scenes as scenes
+    from test_wand import CAMERAS, PLACES, ROTATIONS
+
+    from jaxbundle.io import write_cameras
+
+    size, names = (640, 480), {"left": "c0", "right": "c1"}
+    half = {"fx": 500.0, "fy": 500.0, "cx": 319.5, "cy": 239.5}
+    known = {
+        name: dataclasses.replace(
+            CAMERAS[own], id=name, parameters={**CAMERAS[own].parameters, **half}, image_size=size
+        )
+        for name, own in names.items()
+    }
+    k = int(names[camera][1])
+    seen = scenes.markers_in_images(
+        known[camera], ROTATIONS[k], PLACES[k], scenes.wave(40), [0, 0.3, 1]
+    )
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 30, size)
+    for uv in seen:
+        grey = scenes.render_frame(uv, size, np.random.default_rng(k))
+        video.write(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR))
+    video.release()
+    write_cameras([*known.values()], path.parent / "wand.toml")
 
 
 def write_wand(path: Path, camera: str) -> None:
@@ -458,6 +517,11 @@ OWN: dict[str, Callable[[Path], None]] = {
     "scene": write_sparse_model,
     "left.mp4": lambda path: write_video(path, 0),
     "right.mp4": lambda path: write_video(path, 1),
+    "wand_left.mp4": lambda path: write_wand_video(path, "left"),
+    "wand_right.mp4": lambda path: write_wand_video(path, "right"),
+    "wand_left.csv": lambda path: write_waved(path, "left"),
+    "wand_right.csv": lambda path: write_waved(path, "right"),
+    "wand_far.csv": lambda path: write_waved(path, "far"),
     "left.csv": lambda path: write_wand(path, "left"),
     "right.csv": lambda path: write_wand(path, "right"),
     "spring_2024": lambda path: write_heights(path, 0),

@@ -11,6 +11,7 @@ from test_rpc_products import digitalglobe
 from test_rpc_products import dimap as dimap_rpc
 from test_xml_products import dimap, worldview
 
+from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, geodetic
 from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.io.scanner.rpc import read_rpc, write_rpc
@@ -76,7 +77,30 @@ def test_corrections_that_are_given_are_kept_and_the_difference_is_said(tmp_path
     (said,) = found.warnings
     assert "differ by more than their accuracy explains" in said and "[corrections]" in said
     assert 12 < float(said.partition("explains: ")[2].split()[0]) < 18
+    assert "With no correction they agree" in said
     assert read_scanner(with_rpc(tmp_path, uncorrected, 20.0)).warnings == ()
+
+
+def test_corrections_that_the_rpc_choose_are_asked_for(tmp_path, uncorrected):
+    """`corrections = "auto"` is the default, and says so where there are no RPC; none explain RPC
+    that are moved along the line."""
+    with_rpc(tmp_path, uncorrected)
+    path = tmp_path / "auto.toml"
+    path.write_text('[scanner]\nsource = "image.xml"\ncorrections = "auto"\n')
+    assert read_scanner(path).image.corrections == Corrections()
+    away = eqx.tree_at(lambda r: r.sample_offset, uncorrected, uncorrected.sample_offset + 40)
+    with_rpc(tmp_path, away)
+    (said,) = read_scanner(path).warnings
+    assert "No corrections explain it" in said and "m at most): check the origin" in said
+    (tmp_path / "image.xml").write_text(scene())
+    (said,) = read_scanner(path).warnings
+    assert "has no RPC" in said and "light time, aberration and refraction applied" in said
+    path.write_text(path.read_text() + "[corrections]\nrefraction = true\n")
+    with pytest.raises(InputError, match="give one of them"):
+        read_scanner(path)
+    path.write_text('[scanner]\nsource = "image.xml"\ncorrections = "none"\n')
+    with pytest.raises(InputError, match='"auto" is expected'):
+        read_scanner(path)
 
 
 @pytest.mark.parametrize("shift, expected", [(0.0, None), (1.0, "origin of lines and pixels")])

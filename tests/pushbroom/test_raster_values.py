@@ -46,6 +46,24 @@ def test_scale_offset_and_no_data_of_a_terrain_model(tmp_path, projected):
         assert np.isnan(plain.heights[2, 3]) and plain.heights[0, 1] == 10
 
 
+@pytest.mark.parametrize("projected", [False, True])
+@pytest.mark.parametrize("mark", [-9999, -32768, 32767])
+def test_a_mark_of_no_data_that_is_not_declared(tmp_path, projected, mark):
+    """Its value is named, not that of neighbours mixed with it; a sea as deep is one."""
+    values = STORED.copy()
+    values[2:4, 3:5] = mark
+    system = {"crs": "EPSG:32633", "transform": rasterio.transform.Affine(
+        900, 0, 330_000, 0, -900, 4_540_000)} if projected else {}  # fmt: skip
+    with pytest.raises(InputError, match=f"height {mark}, the others 0 to 290; .*-a_nodata {mark}"):
+        read_terrain(write(tmp_path / "a.tif", values, nodata=None, **system), WGS84)
+    scaled = write(tmp_path / "b.tif", values, nodata=None, scale=0.5, offset=10, **system)
+    with pytest.raises(InputError, match=f"height {0.5 * mark + 10:g}, .*-a_nodata {mark} FILE"):
+        read_terrain(scaled, WGS84)
+    sea = np.linspace(0, -10_000, 30).reshape(5, 6).astype(np.float64)
+    found = read_terrain(write(tmp_path / "c.tif", sea, nodata=None, **system), WGS84)
+    assert np.nanmin(found.heights) < -9000
+
+
 def test_scale_and_no_data_of_a_scene(tmp_path):
     values = STORED.copy()
     values[2, 3] = -9999

@@ -8,7 +8,14 @@ from rpc_scenes import made_up, places
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, earth_fixed
-from jaxbundle.pushbroom.rpc.bias import RpcBias, apply_bias, fit_bias, project_compensated
+from jaxbundle.pushbroom.rpc.bias import (
+    RpcBias,
+    apply_bias,
+    bias_terms,
+    fit_bias,
+    images_and_slopes,
+    project_compensated,
+)
 from jaxbundle.pushbroom.rpc.fitting import RpcTable
 from jaxbundle.pushbroom.rpc.polynomials import project_points
 
@@ -68,6 +75,36 @@ def test_covariance_redundancy_and_tests_by_drawing():
     assert np.mean(np.square(tests)) == pytest.approx(1.0, abs=0.05)
     assert np.mean(np.square(sigma0)) == pytest.approx(1.0, abs=0.05)
     assert fit.redundancy_numbers.sum() == pytest.approx(fit.redundancy, rel=1e-9) == 18
+
+
+def test_every_point_by_its_own_block_as_of_the_dense_matrices():
+    """All of P, Qv and A at once (Baarda, 1968), for a few points; 20 000 points are as cheap."""
+    rng, ground = np.random.default_rng(3), np.array([2.0, 1.0, 5.0])
+    table = control(BIAS, 0.4, rng)
+    sigma = rng.uniform(0.3, 0.6, (12, 2))
+    given = {"model": "affine", "ground_sigma": np.tile(ground, (12, 1))}
+    fit = fit_bias(RPC, table, sigma=sigma, **given)
+    computed, G = map(np.asarray, images_and_slopes(RPC, WGS84, *table[:3]))
+    C = np.zeros((12, 2, 12, 2))
+    for i in range(12):
+        C[i, :, i] = G[i] @ np.diag(ground**2) @ G[i].T + np.diag(sigma[i] ** 2)
+    C = C.reshape(24, 24)
+    terms = np.stack(bias_terms(RPC, *computed.T), 1)[:, :3]
+    A = np.kron(terms, np.eye(2)).reshape(24, 3, 2).swapaxes(1, 2).reshape(24, 6)
+    P = np.linalg.inv(C)
+    Q = np.linalg.inv(A.T @ P @ A)
+    v = A @ (Q @ A.T @ P @ (np.stack(table[3:], 1) - computed).ravel())
+    v -= (np.stack(table[3:], 1) - computed).ravel()
+    Qv = C - A @ Q @ A.T
+    np.testing.assert_allclose(fit.cofactor, Q, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(fit.residuals.ravel(), v, atol=1e-9)
+    np.testing.assert_allclose(fit.redundancy_numbers.ravel(), np.diag(Qv @ P), atol=1e-10)
+    w = (P @ v) / np.sqrt(np.diag(P @ Qv @ P))
+    np.testing.assert_allclose(fit.w.ravel(), w, rtol=1e-8)
+    assert fit.sigma0 == pytest.approx(np.sqrt(v @ P @ v / 18))
+    many = RpcTable(*(np.resize(column, 20_000) for column in table))
+    fit = fit_bias(RPC, many, **given | {"ground_sigma": np.tile(ground, (20_000, 1))})
+    assert fit.redundancy_numbers.sum() == pytest.approx(39_994) == fit.redundancy
 
 
 def test_a_blunder_has_the_largest_w_and_moves_its_residual_by_r():

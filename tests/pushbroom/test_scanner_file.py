@@ -6,6 +6,7 @@ import json
 import sys
 from collections import Counter
 
+import cv2
 import numpy as np
 import pytest
 import rasterio
@@ -148,6 +149,22 @@ def test_what_is_wrong_in_a_table(tmp_path, column, value, words):
         assert word in str(refused.value)
 
 
+def test_positions_in_kilometres(tmp_path):
+    t = np.arange(-6.0, 11.0)
+    P, V = orbit(t)
+    path = write_scanner(tmp_path, positions=(P / 1000, V / 1000))
+    with pytest.raises(InputError, match="positions.csv, line 2: .* from the centre .*kilometres"):
+        read_scanner(path)
+
+
+def test_a_camera_that_looks_up(tmp_path, command):
+    """What the middle ray misses is said; figures of it are not known."""
+    text = TEXT.replace(f"roll = {float(np.degrees(-0.02))!r}", "roll = 180")
+    told = command("pushbroom", "info", write_scanner(tmp_path, text), "--json", "-")
+    assert told.status == 0 and "the middle of the image misses the ground; check att" in told.err
+    assert json.loads(told.out)["incidence"] is None
+
+
 def run(monkeypatch, capsys, *arguments):
     """Exit status, standard output and error of a command, in this process."""
     monkeypatch.setattr(sys, "argv", ["jaxbundle", "pushbroom", *map(str, arguments)])
@@ -194,6 +211,8 @@ def test_what_the_commands_refuse(tmp_path, monkeypatch, capsys):
     north.write_text("longitude,latitude,height\n1,2,3\n1,95,3\n")
     lon.write_text("lon,lat,height\n1,2,3\n")
     gone.write_text("X,Y,Z\n6378137,0,0\n6378137,0,1\n")  # as many as there and back
+    scene = tmp_path / "image.tif"
+    cv2.imwrite(str(scene), np.zeros((LINES, PIXELS), np.uint8))
     cases = [
         (["locate", scanner, "--points", off], ["off.csv, line 2", "pixel 400", "399.5"]),
         (["locate", scanner, "--grid", "few"], ["--grid 'few'", "11x11"]),
@@ -203,6 +222,8 @@ def test_what_the_commands_refuse(tmp_path, monkeypatch, capsys):
         (["project", scanner, "--points", north], ["north.csv, line 3", "latitude 95", "90°"]),
         (["project", scanner, "--points", lon], ["lon.csv", "X, Y, Z", "longitude"]),
         (["locate", scanner, "--height", "nan"], ["--height nan", "finite"]),
+        (["correct", scanner, scene, "--out", tmp_path / "m.tif", "--spacing", 30],
+         ["--spacing 30", "larger than the whole image", "degrees"]),
     ]
     for arguments, words in cases:
         status, out, err = run(monkeypatch, capsys, *arguments)

@@ -104,6 +104,29 @@ def test_a_network_gives_the_refinement_of_its_points(scene, folder):
     np.testing.assert_allclose(found.inspection.sigma, direct.inspection.sigma, rtol=1e-5)
 
 
+def test_comments_and_null(tmp_path):
+    """What a network does not have is as missing; line numbers stay those of the file."""
+    more = """
+      LineSigma      = Null   # of no use
+      SampleSigma    = NULL <pixels>
+      /* two lines,
+         Line = 99 */
+      ChooserName    = "text with # and /* in it"
+"""
+    text = HEAD + point("P", "Free", [1e6, 2e6, 3e6], None, [measure("s", 4.0, 7.0, more)])
+    text = text.replace("AprioriX = 1000000.0 <meters>", "AprioriX = Null /* unknown */")
+    path = tmp_path / "one.net"
+    path.write_text(text + "End_Object\nEnd\n")
+    found = read_control_network(path)
+    np.testing.assert_allclose(found.xy, [[4.0, 7.0]])
+    assert np.isnan(found.xy_sigma).all() and np.isnan(found.X).any()
+    row = text.splitlines().index("      SerialNumber   = s") + 1
+    assert found.ray_row.tolist() == [row]
+    path.write_text(text.replace("Line           = 5.0", "Line = Null") + "End_Object\nEnd\n")
+    with pytest.raises(InputError, match="a measure without LINE"):
+        read_control_network(path)
+
+
 def test_a_covariance_becomes_sigma_along_its_axes(tmp_path):
     R = Rotation.from_rotvec([0.4, -0.3, 0.8]).as_matrix()
     C = R @ np.diag([4.0, 9.0, 0.01]) @ R.T

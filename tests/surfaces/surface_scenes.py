@@ -1,6 +1,7 @@
 """Rendered stereo pairs of a hilly ground with a roof above it."""
 
 import numpy as np
+import rasterio
 
 import jaxbundle
 from jaxbundle.planning.rendering import Scene, Sensor, render
@@ -34,3 +35,21 @@ def photographs(scene, positions, noise=2.0):
         views.append(FrameView(f"photo_{k}.png", shot.grey, CAMERA, np.array(X0, float), np.eye(3)))
         truth.append(shot.point)
     return views, truth
+
+
+def undulation(longitude, latitude):
+    """A geoid without curvature, so that no interpolation errs."""
+    return 47 + 4.0 * (longitude - 10) - 3.0 * (latitude - 45)
+
+
+def write_geoid(path):
+    """The geoid as a grid from 5° to 15° E, 40° to 50° N."""
+    step, west, north, n = 0.25, 5.0, 50.0, 41
+    x, y = np.meshgrid(west + step * np.arange(n), north - step * np.arange(n))
+    transform = rasterio.transform.Affine(step, 0, west - step / 2, 0, -step, north + step / 2)
+    with rasterio.open(
+        path, "w", driver="GTiff", width=n, height=n, count=1, dtype="float64", crs="EPSG:4326",
+        transform=transform,
+    ) as raster:  # fmt: skip
+        raster.write(undulation(x, y)[None])
+    return path

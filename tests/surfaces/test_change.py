@@ -366,6 +366,9 @@ def test_surfaces_that_cannot_be_compared(files):
         jaxbundle.change(files / "before.tif", files / "after.tif")
     write(files / "zone.tif", hills(), crs="EPSG:32634")
     given = {"after_errors": {"cell": 0.3}}
+    write(files / "sea.tif", hills(), crs="EPSG:32633+5773")
+    with pytest.raises(InputError, match="before none, after EGM96 height; none is the ellipsoid"):
+        jaxbundle.change(files / "before.tif", files / "sea.tif", **given)
     with pytest.raises(InputError, match="different coordinate systems.*32N|33N"):
         jaxbundle.change(files / "before.tif", files / "zone.tif", **given)
     write(files / "degrees.tif", hills(), crs="EPSG:4326", x=10.0)

@@ -7,11 +7,17 @@ from types import SimpleNamespace
 import cv2
 import jax.numpy as jnp
 import numpy as np
+import pyproj
 import pytest
 import rasterio
-from surface_scenes import CAMERA, SIZE, hills, photographs, two_shapes
+from surface_scenes import CAMERA, SIZE, hills, photographs, two_shapes, undulation, write_geoid
 
 import jaxbundle
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.ellipsoid import WGS84
+from jaxbundle.io.rasters.geoid import add_geoid
+from jaxbundle.io.rasters.terrain_models import read_terrain
+from jaxbundle.io.rasters.vertical import split_system, with_heights_above
 from jaxbundle.io.scanner.rpc import write_rpc
 from jaxbundle.planning.rendering import Scene, Sensor, render_rays
 from jaxbundle.planning.shapes import HeightField
@@ -132,6 +138,38 @@ def test_photographs_of_another_size_or_missing_are_named(project, tmp_path, com
     assert told.status == 2 and "20 × 10" in told.err
 
 
+def test_a_block_of_photographs_above_the_other_surface(project, tmp_path, command):
+    """From the ellipsoid to the geoid, and back; heights searched are above the same."""
+    folder, _ = project
+    geoid = write_geoid(tmp_path / "own.tif")
+    plain = "+proj=tmerc +lat_0=45 +lon_0=10 +datum=WGS84 +units=m"
+    given = {
+        "plain": ["--zmin", -1.5, "--zmax", 3],
+        "geoid": ["--zmin", -48.5, "--zmax", -44, "--crs", plain, "--geoid", geoid],
+        "ellipsoid": ["--zmin", 45.5, "--zmax", 50, "--crs", with_heights_above(plain, "x.gtx"),
+                      "--geoid", geoid, "--heights", "ellipsoid"],
+    }  # fmt: skip
+    told, clouds = {}, {}
+    for name, options in given.items():
+        said = command(
+            "surface", folder, "--photos", folder / "photos", "--out", tmp_path / name, "--pairs",
+            "photo_0.png,photo_1.png", "--step", 8, "--json", "-", *options,
+        )  # fmt: skip
+        assert said.status == 0, said.err
+        told[name] = json.loads(said.out)["heights"]
+        rows = np.genfromtxt(tmp_path / name / "cloud.csv", delimiter=",", names=True)
+        clouds[name] = {(r["u"], r["v"]): r["Z"] for r in rows}
+    assert told["plain"] is None
+    one = clouds["plain"]
+    for name, sign in (("geoid", -1), ("ellipsoid", 1)):
+        assert f"above the {name}" in told[name] and str(geoid) in told[name]
+        both = one.keys() & clouds[name].keys()
+        assert len(both) > 0.9 * len(one) > 100
+        moved = np.median([clouds[name][k] - one[k] for k in both])
+        # where N begins, the range of heights is another one by millimetres: σ is 10 mm
+        assert moved == pytest.approx(sign * 47.0, abs=2e-3)
+
+
 LINES, SAMPLES = 150, 180
 
 
@@ -192,6 +230,48 @@ def test_rpc_images_become_a_cloud_in_a_map_system(satellite, tmp_path, command,
     w = e / cloud.sigma[:, 2]
     assert (np.abs(w) > 5).mean() < 0.02
     assert 0.55 < np.sqrt(np.mean(w[np.abs(w) < 5] ** 2)) < 1.3
+
+
+def test_one_image_twice(satellite, tmp_path, command):
+    folder, _ = satellite
+    told = command("surface", folder / "a.tif", folder / "a.tif", "--out", tmp_path / "out")
+    assert told.status == 2 and "its raster a.tif is also that of" in told.err
+
+
+def test_a_satellite_surface_above_the_geoid(satellite, tmp_path, command):
+    """The heights of the cloud are those of the scene minus N; --zmin and --zmax are above the
+    geoid, too; the DSM says so, and is read back as the ellipsoidal one."""
+    folder, around = satellite
+    out, geoid = tmp_path / "out", write_geoid(tmp_path / "own.tif")
+    told = command(
+        "surface", folder / "a.tif", folder / "b.tif", "--out", out, "--zmin", 123, "--zmax", 183,
+        "--pairs", "a.tif,b.tif", "--step", 3, "--dsm", 6, "--orthophoto", "--geoid", geoid,
+        "--json", "-",
+    )  # fmt: skip
+    assert told.status == 0, told.err
+    report = json.loads(told.out)
+    assert report["heights"] == f"above the geoid {geoid}"
+    assert f"heights above the geoid {geoid}" in (out / "report.txt").read_text()
+    with rasterio.open(out / "dsm.tif") as raster:
+        system = split_system(raster.crs.to_wkt())
+        x, y = np.meshgrid(*(np.arange(n) + 0.5 for n in raster.shape[::-1]))
+        x, y = raster.bounds.left + 6 * x, raster.bounds.top - 6 * y
+        H = raster.read(1, masked=True)
+    assert system.horizontal == "EPSG:32632" and "geoid own.tif" in system.vertical.name
+    for name in ("dsm_sigma.tif", "orthophoto.tif"):
+        with rasterio.open(out / name) as raster:
+            assert raster.crs.to_epsg() == 32632
+            if name == "orthophoto.tif":
+                assert (raster.read(1)[~H.mask] > 0).mean() > 0.9
+    back = pyproj.Transformer.from_crs("EPSG:32632", "EPSG:4326", always_xy=True)
+    longitude, latitude = back.transform(x, y)
+    X = np.asarray(around.local(np.radians(longitude), np.radians(latitude), 0.0 * x))
+    error = (H + undulation(longitude, latitude) - ground(X[0], X[1])).compressed()
+    assert np.abs(np.median(error)) < 0.05 and np.percentile(np.abs(error), 90) < 0.5
+    with pytest.raises(InputError, match="'height above the geoid own.tif', not above the ellips"):
+        read_terrain(out / "dsm.tif", WGS84)
+    terrain = add_geoid(read_terrain(out / "dsm.tif", WGS84, above_geoid=True), geoid)
+    assert abs(np.nanmean(terrain.heights) - (H + undulation(longitude, latitude)).mean()) < 0.2
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,8 @@ Components of real photographs (`leastsquares.quality.error_components` estimate
 | principal distance | the same, at the edge of the image | image unit |
 | affine | shear and ratio of scales, the same | image unit |
 | along tracks | of images of one point, alike from stations near to each other | a priori σ |
-| given points | held points, as those of a board, not where they are given | image unit |
+| given points in plane | held points, as those of a board, not where they are given | image unit |
+| given points out of plane | the same across the plane that fits them | image unit |
 
 Fields are sums of cubic B-splines on the sensor, in octaves of the same variance. Along a track the
 errors of two images are correlated by Wendland's function (1995) of the distance of their stations.
@@ -23,7 +24,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbundle.adjustment.problem import NetworkProblem
-from jaxbundle.adjustment.quality.given_points import given_points_component, wendland
+from jaxbundle.adjustment.quality.given_points import given_points_components, wendland
 from jaxbundle.arguments import number as require_number
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.quality.error_components import (
@@ -177,8 +178,8 @@ def with_given_points_and_others(
     import scipy.sparse as sp
 
     chosen = settings.octaves, settings.min_given_points
-    given = given_points_component(found, rays.row, rays.point, rays.sigma, *chosen)
-    components = [*components, *([] if given is None else [given])]
+    given = given_points_components(found, rays.row, rays.point, rays.sigma, *chosen)
+    components = [*components, *given]
 
     others = np.setdiff1d(np.arange(rays.number), np.concatenate([rays.row, rays.row + 1]))
     others = others[_have_weight(found)[others]]

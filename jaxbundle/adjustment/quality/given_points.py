@@ -9,29 +9,36 @@ residuals of all its images share its error:
 d are the distances of the points, D is the extent of the object, w is Wendland's function. The bend
 of a board is smooth and of no known scale, a displaced corner is an error of its own: independent
 errors and those of every octave have the same variance.
+
+Errors in the plane that fits the points best and errors across it are two components: a print is
+stretched or displaced in its plane, paper bends and lifts across it. Of the board of four cameras,
+estimated as free points, these errors were 0.09 and 0.19 mm; taken as one component, differences of
+halves of its points over their covariance were d²/n = 1.76, as two 1.59.
 """
 
+from typing import Any
+
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxbundle.leastsquares.quality.error_components import IMAGE, ErrorComponent
 from jaxbundle.leastsquares.quality.error_effects import residual_change
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.types import AnyArray, Scalar
 
-GIVEN_POINTS = "given points"
+GIVEN_POINTS = ("given points in plane", "given points out of plane")
 
 
-def given_points_component(
+def given_points_components(
     found: Solution,
     rows: Int[np.ndarray, " rays"],
     point: Int[np.ndarray, " rays"],
     sigma: Float[np.ndarray, "rays 2"],
     octaves: int,
     min_points: int,
-) -> ErrorComponent | None:
-    """The errors of points that are held and seen in two images or more; None with fewer than
-    `min_points` of them.
+) -> list[ErrorComponent]:
+    """The errors of points that are held and seen in two images or more, in and across the plane
+    that fits them best; none with fewer than `min_points` of them.
 
     **Arguments:** of every image point the `rows` of x (y is the next), the object point and σ;
     `octaves` of smooth errors.
@@ -39,11 +46,10 @@ def given_points_component(
     import scipy.sparse as sp
 
     X = np.asarray(found.values["point"])
-    held = ~np.asarray(found.problem.table("point").free, bool).any(axis=1)
-    given = held & (np.bincount(point, minlength=len(X)) > 1)
+    given = _held(found) & (np.bincount(point, minlength=len(X)) > 1)
     chosen = np.flatnonzero(given)
     if X.shape[1] != 3 or len(chosen) < min_points:
-        return None
+        return []
     apart = np.linalg.norm(X[chosen][:, None] - X[chosen], axis=2)
     K = correlation_of_points(apart, apart.max(), np.eye(len(chosen)), octaves)
     L = np.linalg.cholesky(K)
@@ -51,16 +57,31 @@ def given_points_component(
     column = np.searchsorted(chosen, point[own])
     rows = np.concatenate([rows[own], rows[own] + 1])
     number = sum(np.asarray(v).size for v in found.residuals.values())
+    # the normal of the plane is the last
+    axes = np.linalg.svd(X[chosen] - X[chosen].mean(0), full_matrices=True)[2]
     parts = []
-    for axis in range(3):
-        change = residual_change(found, "point", given[:, None] * np.eye(3)[axis])
+    for axis in axes:
+        change = residual_change(found, "point", given[:, None] * axis)
         shape = (number, len(chosen))
         J = sp.csr_matrix((change[rows], (rows, np.tile(column, 2))), shape=shape)
         parts.append(J @ sp.csr_matrix(L))
-    root = sp.hstack(parts).tocsr()
-    # √θ is then the RMS of the effect on an image coordinate
-    effect = np.asarray(root.power(2).sum(1)).ravel()[rows] * sigma[own].T.ravel() ** 2
-    return ErrorComponent(GIVEN_POINTS, IMAGE, root / np.sqrt(effect.mean()))
+    return [
+        _scaled(name, sp.hstack(some).tocsr(), rows, sigma[own].T.ravel())
+        for name, some in zip(GIVEN_POINTS, (parts[:2], parts[2:]))
+    ]
+
+
+def _scaled(
+    name: str, root: Any, rows: Int[np.ndarray, " n"], sigma: Float[np.ndarray, " n"]
+) -> ErrorComponent:
+    """A component whose √θ is the RMS of the effect on an image coordinate."""
+    effect = np.asarray(root.power(2).sum(1)).ravel()[rows] * sigma**2
+    return ErrorComponent(name, IMAGE, root / np.sqrt(effect.mean()))
+
+
+def _held(found: Solution) -> Bool[np.ndarray, " points"]:
+    """Which points have no free coordinate."""
+    return np.logical_not(np.asarray(found.problem.table("point").free, bool).any(axis=1))
 
 
 def correlation_of_points(

@@ -153,6 +153,7 @@ class Replication(TableMethods):
         said = f"{what} differ by {np.sqrt(self.ratio):.2f} times their classical σ"
         if self.model is not None:
             said += f", {np.sqrt(self.ratio_correlated):.2f} times σ under correlated errors"
+        # As times of σ, the root of d²/n; the quantiles of a root are the roots of the quantiles.
         low, high = (1.0, 1.0) if self.band is None else np.sqrt(self.band)
         expected = f"{low:.2f} to {high:.2f}" if low < high else "1"
         return f"{said} (RMS of {count(self.dof, 'parameter')}; {expected} expected)"

@@ -39,6 +39,7 @@ from jaxbundle.calibration.rig.synchronize import (
     without_run,
 )
 from jaxbundle.calibration.rig.times import HOW, times_of_photographs
+from jaxbundle.calibration.rig.wand_body import Wand, add_wand, start_wand
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.leastsquares import Result
@@ -53,7 +54,7 @@ from jaxbundle.types import Progress
 SHARED = ("board_sigma", "board_free", "snooping", "significance", "max_iterations")
 
 
-def calibrate_rig(
+def calibrate_rig(  # noqa: PLR0913 - what a rig may be given by
     photographs: Mapping[str, RigPhotographs],
     board: Board | Mapping[str, Board] | str | Path | None = None,
     *,
@@ -62,6 +63,7 @@ def calibrate_rig(
     seen_by: Mapping[str, Sequence[str]] | None = None,
     mountings: Mapping[str, Any] | str | Path | None = None,
     bases: Sequence[Mapping[str, Any]] = (),
+    wand: Wand | None = None,
     synchronize: str | Sequence[str] = (),
     times: Any = None,
     progress: Progress | None = None,
@@ -87,6 +89,8 @@ def calibrate_rig(
     - `mountings`, `bases`: what is known of the mountings, held or with σ, as in the section
       `[rig]` of a project (degrees), such as `{"b": {"position": [0, 0, 0.1], "sigma_position":
       0.01}}`; or a file with that section.
+    - `wand`: a wand waved before the cameras while they stood still, a `calibration.Wand`: it ties
+      cameras, those that see no board, too, and its length gives the scale beside the boards.
     - `synchronize`: unknowns of the clocks of cameras that run by themselves, of "offset", "rate"
       and "read-out" (of a rolling shutter): nothing is simultaneous then, targets move along
       splines in time, and `clocks` of the result has the unknowns. Photographs must follow each
@@ -104,8 +108,9 @@ def calibrate_rig(
     rig does not determine a mounting that nothing else does.
     """
     check_test(options.get("snooping", "pope"), options.get("significance", 0.001))
-    _check(photographs)
-    known = known_mountings(mountings, bases, list(photographs))
+    wanded = [] if wand is None else [name for name in wand.markers if name not in photographs]
+    _check(photographs, wanded)
+    known = known_mountings(mountings, bases, [*photographs, *wanded])
     unknowns = _unknowns_of_clocks(synchronize, times, bool(options.get("board_free")))
     if bodies is not None:
         bodies = require_lists("bodies", bodies, "{'room': ['front', 'rear']}")
@@ -113,6 +118,8 @@ def calibrate_rig(
         raise InputError("fixed: all boards are one body; give either fixed or bodies")
     views, declared = views_of_camera(photographs, board, seen_by, progress)
 
+    if wand is not None and (unknowns or options.get("board_free")):
+        raise InputError("wand: expected cameras that are synchronised, and boards that are known")
     calibrations = _calibrate_cameras(views, options, progress)
     given = {name: options[name] for name in SHARED if name in options}
     if options.get("robust") and not given.get("snooping"):
@@ -125,7 +132,13 @@ def calibrate_rig(
             calibrations, bodies, fixed, known, seconds, unknowns
         )
     else:
-        rig, connections = start_rig(calibrations, bodies, fixed, known)
+        body = None
+        if wand is not None:
+            unit = next(iter(calibrations.values())).adjustment.network.object_unit
+            body = start_wand(wand, calibrations, unit, progress)
+        rig, connections = start_rig(calibrations, bodies, fixed, known, wand=body)
+        if body is not None:
+            rig = add_wand(rig, body, connections, calibrations)
     return _adjust_together(calibrations, rig, connections, **given)
 
 
@@ -202,8 +215,7 @@ def _adjust_together(
             "its own; give the σ of their coordinates instead (--board-sigma)"
         )
     rig = dataclasses.replace(rig, point_sigma=board_sigma, points_free=board_free)
-    cameras = [one.camera for one in calibrations.values()]
-    size = np.array([unit_size(get_model(one.model), one.pixel_size) for one in cameras])
+    size = np.array([unit_size(get_model(one.model), one.pixel_size) for one in rig.cameras])
     left_out, held = [], {}
     if rig.trajectory is None:
         found = adjust_rig(rig, max_iterations)
@@ -227,13 +239,14 @@ def _adjust_together(
     return RigCalibration(dict(calibrations), rig, found, left_out, tolerated, connections, held)
 
 
-def _check(photographs: Any) -> None:
+def _check(photographs: Any, others: Sequence[str]) -> None:
+    """Refuse photographs of one camera without `others`."""
     if not isinstance(photographs, Mapping):
         raise InputError(
             "photographs must be by the name of the camera, such as {'left': ['left/*.jpg']}, but "
             f"is {show(photographs)}"
         )
-    if len(photographs) < 2:
+    if len(photographs) < (1 if others else 2):
         raise InputError("a rig has at least two cameras: give the photographs of each")
 
 

@@ -37,7 +37,7 @@ from jaxbundle.leastsquares.declarations import Kind, Motions, ObservationSet, T
 from jaxbundle.leastsquares.problem import Problem
 from jaxbundle.leastsquares.quality.snooping import RemovedRow, snoop, without
 from jaxbundle.leastsquares.solution import Solution, find_minimum
-from jaxbundle.leastsquares.spaces import PoseValue
+from jaxbundle.leastsquares.spaces import Posed, PoseValue
 from jaxbundle.network.declare import CameraTable, camera_tables
 from jaxbundle.network.kinds.continuous_time import (
     CLOCK,
@@ -46,6 +46,7 @@ from jaxbundle.network.kinds.continuous_time import (
     timed_image_points,
 )
 from jaxbundle.network.kinds.control_points import CONTROL_POINTS
+from jaxbundle.network.kinds.distances import DISTANCES
 from jaxbundle.network.kinds.image_points import image_points
 from jaxbundle.network.kinds.mountings import BASES, MOUNTING, observe_mountings
 from jaxbundle.network.tables import EXTERIOR, Camera
@@ -73,6 +74,30 @@ CLOCK_PRIOR = Kind(
 FLOATING = Motions(_OF_OBJECT.names, (*_OF_OBJECT.actions, ("mounting", _scale)), _OF_OBJECT.curved)
 
 
+def roll_of_stick(stick: Posed, given: Float[Array, "3"]) -> Array:
+    """The axis e_y of a stick, given in the frame of the rig by its rotation, along a given one."""
+    return jnp.asarray(given) @ stick.rotation.matrix()[:, 1]
+
+
+# Of a stick, which has no rotation about itself: see `wand_body`.
+ROLLS = Kind("rolls", roll_of_stick, ("epoch",), ("roll",), "", snooped="")
+# The known length of a wand.
+WAND_LENGTH = "wand length"
+
+
+@dataclasses.dataclass(frozen=True)
+class RigWand:
+    """A wand as the last body of a rig, whose two points are its last.
+
+    **Fields:** `length` of it and `sigma`; `first`: the row of the pose of its first frame, all
+    later ones are its own; `across`: z₀ by frame."""
+
+    length: float
+    sigma: float
+    first: int
+    across: Float[np.ndarray, "frames 3"]
+
+
 @dataclasses.dataclass(frozen=True)
 class Rig:
     """The input of the rig adjustment, with start values.
@@ -91,6 +116,7 @@ class Rig:
       body of its own; `body`: of every board the index of the first board of its body.
     - `known`: what is given of the mountings.
     - `trajectory`: of cameras that are not synchronised; every photograph is then an epoch.
+    - `wand`: the last of the boards, if there is one.
     """
 
     cameras: tuple[Camera, ...]
@@ -114,6 +140,12 @@ class Rig:
     body: tuple[int, ...] = (0,)
     known: KnownMountings = NOTHING_KNOWN
     trajectory: TargetMotion | None = None
+    wand: RigWand | None = None
+
+    @property
+    def number_of_board_points(self) -> int:
+        """The number of points of boards, which come before those of a wand."""
+        return len(self.points) - (0 if self.wand is None else 2)
 
     @property
     def lines(self) -> Float[np.ndarray, " n"]:
@@ -157,7 +189,8 @@ class Rig:
         """The engine's results by set of image points, in the order of the rig."""
         found = np.zeros(self.xy.shape)
         for table, rows in self.sets:
-            found[rows] = by_set[table.image_set]
+            if len(rows):
+                found[rows] = by_set[table.image_set]
         return found
 
 
@@ -166,6 +199,10 @@ def declare_rig(rig: Rig) -> tuple[list[Table], list[ObservationSet]]:
     # Free points that no camera sees keep their coordinates.
     seen = np.isin(np.arange(len(rig.points)), rig.point)
     free = seen if rig.points_free else np.full(len(rig.points), rig.point_sigma is not None)
+    free = np.repeat(free[:, None], 3, axis=1)
+    if rig.wand is not None:
+        # the pose has the other coordinates
+        free[-2:] = [[False, False, False], [True, False, False]]
     names = [camera.id for camera in rig.cameras]
     tables = [
         *_tables_of_poses(rig),
@@ -193,10 +230,23 @@ def declare_rig(rig: Rig) -> tuple[list[Table], list[ObservationSet]]:
     observations = _image_points(rig)
     observations += _given_mountings(rig)
     if rig.point_sigma is not None:
-        every = np.arange(len(rig.points))
-        control = CONTROL_POINTS((every,), rig.points, sigma=rig.point_sigma, name="control")
-        observations.append(control)
+        every = np.arange(rig.number_of_board_points)
+        given = rig.points[every]
+        observations.append(CONTROL_POINTS((every,), given, sigma=rig.point_sigma, name="control"))
+    if rig.wand is not None:
+        observations += _wand(rig, rig.wand)
     return tables, observations
+
+
+def _wand(rig: Rig, wand: RigWand) -> list[ObservationSet]:
+    """The known length of a wand, and its rolls."""
+    one, other = np.array([[len(rig.points) - 2], [len(rig.points) - 1]])
+    length, sigma = np.array([wand.length]), np.array([wand.sigma])
+    frames = wand.first + np.arange(len(wand.across))
+    return [
+        DISTANCES((one, other), length, sigma=sigma, name=WAND_LENGTH),
+        ROLLS((frames,), wand.across, sigma=np.ones(len(frames))),
+    ]
 
 
 def _tables_of_poses(rig: Rig) -> list[Table]:
@@ -216,6 +266,8 @@ def _image_points(rig: Rig) -> list[ObservationSet]:
         return _timed_image_points(rig, rig.trajectory)
     observations = []
     for table, rows in rig.sets:
+        if not len(rows):
+            continue
         k = rig.camera[rows]
         touched = rig.epoch[rows], k, np.searchsorted(table.cameras, k), rig.point[rows]
         if rig.place is not None:

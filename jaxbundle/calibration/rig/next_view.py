@@ -105,6 +105,8 @@ def next_view(
     are not synchronised."""
     given = rig.rig
     alone = [b for b, first in enumerate(given.body) if given.body.count(first) == 1]
+    if given.wand is not None:
+        alone = alone[:-1]
     if given.trajectory is not None or not alone or camera not in rig.mountings:
         return None
     seen = np.bincount(given.board_of_points[given.point], minlength=len(given.boards))

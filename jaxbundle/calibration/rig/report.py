@@ -3,6 +3,8 @@
 import dataclasses
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from jaxbundle.calibration.report import coverage_dict, map_rows, maps_dict
 from jaxbundle.calibration.verdict import (
     coverage_in_words,
@@ -35,7 +37,7 @@ MOUNTED = ("bx", "by", "bz", "ω", "φ", "κ")
 def rig_text(rig: "RigCalibration") -> str:
     """The mountings of a rig and its cameras in the common adjustment."""
     unit = clean(rig.object_unit)
-    lines = [f"Rig of {len(rig.cameras)} cameras, reference {clean(rig.names[0])}", "=" * 100]
+    lines = [f"Rig of {len(rig.names)} cameras, reference {clean(rig.names[0])}", "=" * 100]
     lines += facts(rig_facts(rig, unit))
     for title, m in mounting_titles(rig).items():
         lines += heading(title)
@@ -80,9 +82,25 @@ def rig_facts(rig: "RigCalibration", unit: str) -> list[tuple[str, str]]:
             if rig.rig.point_sigma is None
             else f"known with σ {rig.rig.point_sigma:g} {unit}",
         ),
+        *_wand_facts(rig, unit),
         *_tied_facts(rig),
         *((clean(epoch), clean(why)) for epoch, why in odd),
     ]
+
+
+def _wand_facts(rig: "RigCalibration", unit: str) -> list[tuple[str, str]]:
+    """The adjusted length of the wand, and what was given."""
+    if rig.rig.wand is None or rig.wand_length is None:
+        return []
+    value, sigma = estimate(*rig.wand_length)
+    gone = any(item.kind == "distance" for item in rig.removed)
+    given = f"{rig.rig.wand.length:g} was given" + ", which contradicts the boards" * gone
+    frames = count(len(rig.rig.wand.across), "frame")
+    of_boards = rig.rig.epoch < rig.rig.wand.first
+    views = np.unique(np.stack([rig.rig.epoch, rig.rig.camera], 1)[of_boards], axis=0)
+    together = np.bincount(views[:, 0]).max(initial=0) > 1
+    alone = "" if together else "; no board is seen by two cameras at the same time"
+    return [("Wand", f"{value} ± {sigma} {unit}, {given}; {frames}{alone}")]
 
 
 def _tied_facts(rig: "RigCalibration") -> list[tuple[str, str]]:

@@ -19,7 +19,7 @@ from jaxbundle.calibration.result import Calibration
 from jaxbundle.calibration.rig.advice import advise_rig
 from jaxbundle.calibration.rig.clocks import Clock
 from jaxbundle.calibration.rig.connections import Connections
-from jaxbundle.calibration.rig.declare import Rig, used_rays
+from jaxbundle.calibration.rig.declare import WAND_LENGTH, Rig, used_rays
 from jaxbundle.calibration.rig.errors import rig_errors
 from jaxbundle.calibration.rig.mounting import (
     POSE,
@@ -52,7 +52,8 @@ class RigCalibration(TableMethods):
 
     **Attributes:**
 
-    - `cameras`: their separate calibrations; `mountings`, `parameters`, `sigma` of the common
+    - `names` of the cameras; `cameras`: their separate calibrations, but of those that see only a
+      wand; `mountings`, `parameters`, `sigma` of the common
       adjustment, by camera;
     - `board`: its points [points, 3]; of several boards `bodies` and `placements`;
     - `ties`: cameras that only the motion of the rig ties (`MotionTie`); `separate`: boards of a
@@ -90,7 +91,7 @@ class RigCalibration(TableMethods):
 
     @property
     def names(self) -> list[str]:
-        return list(self.cameras)
+        return [camera.id for camera in self.rig.cameras]
 
     @property
     def epochs(self) -> tuple[str, ...]:
@@ -135,7 +136,7 @@ class RigCalibration(TableMethods):
         """√(Σ|v|²/points) in pixels, by camera."""
         v, found = self.rig.in_order(self.result.solution.residuals) * self.rig.sigma, {}
         for k, name in enumerate(self.names):
-            given = self.cameras[name].camera
+            given = self.rig.cameras[k]
             own = v[self.used & (self.rig.camera == k)]
             own = own / np.array(unit_size(get_model(given.model), given.pixel_size))
             found[name] = float(np.sqrt((own**2).sum(1).mean()))
@@ -161,12 +162,12 @@ class RigCalibration(TableMethods):
             )
         ]
         if rig.point_sigma is not None:
-            blank = np.full(len(ids), "", dtype=object)
+            blank = np.full(rig.number_of_board_points, "", dtype=object)
             parts.append(
                 result_tables.KindRows(
                     "control",
                     blank,
-                    ids,
+                    ids[: len(blank)],
                     tuple("XYZ"),
                     weight("control"),
                     tuple(getattr(found, name)["control"] for name in result_tables.TESTED),
@@ -195,6 +196,9 @@ class RigCalibration(TableMethods):
                 name = f"{'XYZ'[axis]} of point {rig.ids[item.row]}"
                 found.append(Removed("control", 3 * item.row + axis, name, item.test))
                 continue
+            if item.set == WAND_LENGTH:
+                found.append(Removed("distance", item.row, "the length of the wand", item.test))
+                continue
             rows = rows_of[item.set][list(item.rows)]
             seen = zip(rig.point[rows], rig.camera[rows], rig.epoch[rows])
             names = [f"point {rig.ids[p]} in image {self._photograph(k, e)}" for p, k, e in seen]
@@ -215,6 +219,15 @@ class RigCalibration(TableMethods):
             return {}
         covariance = self.errors.covariance(CLOCK)
         return clocks_of(self.rig, self.values(CLOCK), covariance, self._held_clocks)
+
+    @functools.cached_property
+    def wand_length(self) -> tuple[float, float] | None:
+        """The adjusted length of the wand and its σ; None without a wand."""
+        if self.rig.wand is None:
+            return None
+        (x, *_), (x2, *_) = self.values("point")[-2:]
+        C = self.errors.covariance("point")
+        return float(x2 - x), float(np.sqrt(C[-1, 0, 0]))
 
     def values(self, table: str) -> Any:
         """The adjusted rows of a table of unknowns; of "epoch" the poses of all epochs."""
@@ -362,7 +375,10 @@ class RigCalibration(TableMethods):
 
     def camera(self, name: str) -> Camera:
         """A camera with the parameters of the common adjustment, held."""
-        return dataclasses.replace(self.cameras[name].camera, parameters=self.parameters[name])
+        given = self.rig.cameras[self.names.index(name)]
+        if name in self.cameras:
+            given = self.cameras[name].camera
+        return dataclasses.replace(given, parameters=self.parameters[name])
 
     def network(self) -> Network:
         """The cameras on their mountings as a network of one image each, the reference at the
@@ -421,15 +437,16 @@ class RigCalibration(TableMethods):
 
     def plot_coverage(self, name: str, ax: "Axes | None" = None) -> "Axes":
         """Coverage of the image of a camera by points of the rig; matplotlib axes."""
-        size = self.cameras[name].views.image_size
+        size = present(self.camera(name).image_size)
         return plotting.coverage_map(self.coverage(name), rig_points(self, name), size, name, ax)
 
     def plot_uncertainty(
         self, name: str, distance: float = np.inf, frame: str = "rig", ax: "Axes | None" = None
     ) -> "Axes":
         """σ of a projected point over the image of a camera; matplotlib axes."""
-        found, size = self.uncertainty(name, distance, frame, DRAWN), self.cameras[name].views
-        return plotting.uncertainty_image(found, size.image_size, self.object_unit, name, ax)
+        found = self.uncertainty(name, distance, frame, DRAWN)
+        size = present(self.camera(name).image_size)
+        return plotting.uncertainty_image(found, size, self.object_unit, name, ax)
 
     def report(self) -> str:
         """The full report as text."""
@@ -450,7 +467,7 @@ class RigCalibration(TableMethods):
 
     def __str__(self) -> str:
         lines = [
-            f"Rig of {len(self.cameras)} cameras, {len(self.epochs)} epochs, σ0 "
+            f"Rig of {len(self.names)} cameras, {len(self.epochs)} epochs, σ0 "
             f"{self.sigma0:.3f}, reference {self.names[0]}"
         ]
         for name, m in self.mountings.items():

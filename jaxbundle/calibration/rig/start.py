@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import numpy as np
@@ -23,6 +23,9 @@ from jaxbundle.measure.boards import Board, BoardSet
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, present
+
+if TYPE_CHECKING:
+    from jaxbundle.calibration.rig.wand_body import WandBody
 
 
 @dataclasses.dataclass(frozen=True)
@@ -152,25 +155,35 @@ def start_rig(
     fixed: bool = False,
     known: KnownMountings = NOTHING_KNOWN,
     nearly: Keys | None = None,
+    wand: "WandBody | None" = None,
 ) -> tuple[Rig, Connections]:
     """The rig with start values, and the image points that the calibration of each camera kept.
 
     **Arguments:** `bodies`: by name, boards that are fixed to each other; `fixed`: all are;
     `known`: what is given of the mountings; `nearly`: the epochs of photographs that are nearly
     simultaneous. Start values are by these, and then every photograph is an epoch of its own.
+    `wand`: ties its cameras; its frames are not among the epochs (`wand_body.add_wand`), its
+    cameras that see no board come last.
 
     **Raises:** `InputError`, `NotSolvedError` if the cameras do not hang together
     (`connections.connect`).
     """
     boards = collect_boards(calibrations, bodies, fixed)
-    keys = nearly or keys_by_name(calibrations)
+    keys = nearly or _keys(calibrations, wand)
     cameras = sort_views(calibrations, boards, keys)
     epochs = epochs_of(cameras)
     names, views = list(boards.boards), board_views(cameras, boards, epochs)
     body = list(dict.fromkeys(boards.body.values()))
     numbers = [body.index(boards.body[name]) for name in names]
-    given = known.positions(list(calibrations))
-    found = connect(list(calibrations), names, numbers, views, given)
+    others = {} if wand is None else wand.cameras
+    of_rig = [*calibrations, *others]
+    given = known.positions(of_rig)
+    if wand is None:
+        found = connect(of_rig, names, numbers, views, given)
+    else:
+        ties = wand.views(of_rig, len(names), len(epochs))
+        all_numbers = [*numbers, len(body)]
+        found = connect(of_rig, [*names, "wand"], all_numbers, [*views, *ties], given)
     if nearly is not None:
         # relations are known now; of a motion each photograph has a time and so a pose of its own
         cameras = sort_views(calibrations, boards, keys_of_photographs(calibrations))
@@ -191,10 +204,11 @@ def start_rig(
         tuple(
             dataclasses.replace(one.camera, id=name, free=free[name])
             for name, one in calibrations.items()
-        ),
-        _hold(_pose_values(found.mountings), list(calibrations), known),
+        )
+        + tuple(others.values()),
+        _hold(pose_values(found.mountings), of_rig, known),
         tuple(labels),
-        _pose_values(poses),
+        pose_values(poses),
         boards.ids,
         boards.points,
         epoch,
@@ -206,11 +220,24 @@ def start_rig(
         boards=tuple(names),
         board=np.repeat(np.arange(len(names)), [len(b.ids) for b in boards.boards.values()]),
         centroids=np.array([one.points.mean(0) for one in boards.boards.values()]),
-        place=None if len(found.bodies) == len(names) else _pose_values(found.places),
+        place=None
+        if len(found.bodies) == len(found.places)
+        else pose_values(found.places[: len(names)]),
         body=tuple(reference),
         known=known,
     )
     return rig, found
+
+
+def _keys(calibrations: Mapping[str, Calibration], wand: "WandBody | None") -> Keys:
+    """The epochs of photographs by their names; where a wand ties the cameras, they need not have
+    any in common."""
+    try:
+        return keys_by_name(calibrations)
+    except InputError:
+        if wand is None:
+            raise
+        return keys_of_photographs(calibrations)
 
 
 def _best_views(
@@ -254,7 +281,7 @@ def board_views(
     return found
 
 
-def _pose_values(matrices: Sequence[Float[np.ndarray, "4 4"]]) -> PoseValue:
+def pose_values(matrices: Sequence[Float[np.ndarray, "4 4"]]) -> PoseValue:
     """Centre and quaternion of poses: R·x + t = R·(x − X0)."""
     found = np.array(matrices)
     R, t = found[:, :3, :3], found[:, :3, 3]

@@ -4,15 +4,24 @@ Cameras stand still; every frame has the markers at other places, which are poin
 their known distances are observations of it. Interior orientations are given, held or free. The
 frame is that of the first camera, the scale that of the wand.
 
+The lengths l_i of the wand are the same in all frames, and so are their errors: however many frames
+there are, the scale is known as well as by each length once, and a base b with
+
+    C_b + σ_s²·b·bᵀ,        σ_s = σ_l/√(Σ l_i²)
+
+where C_b is its covariance from the adjustment, in which lengths of frames are independent.
+
 Sources: Borghese and Cerveri (2000), Calibrating a video camera pair with a rigid bar, Pattern
 Recognition 33; Mitchelson and Hilton (2003), Wand-based multiple camera studio calibration.
 """
 
 import dataclasses
-from collections.abc import Mapping
+import functools
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -21,6 +30,8 @@ from jaxbundle.adjustment.adjust import adjust
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.arguments import positive, show
 from jaxbundle.calibration.rig.mounting import Mounting, mounting_of, table_of_mountings
+from jaxbundle.calibration.rig.wand_images import are_images, measure_wand, replaced_sigma
+from jaxbundle.calibration.rig.wand_markers import Mark, Marks, WandSettings, name_markers
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import (
@@ -31,60 +42,47 @@ from jaxbundle.geometry import (
 from jaxbundle.io.networks.rig_result import network_of_rig
 from jaxbundle.io.text.csv_tables import read_csv
 from jaxbundle.leastsquares import PoseValue
+from jaxbundle.measure.moving_blobs import BlobSettings
 from jaxbundle.network.build import make_network
-from jaxbundle.network.columns import count, did_you_mean, list_some
+from jaxbundle.network.columns import count, did_you_mean, is_missing, list_some
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.results import TableMethods
+from jaxbundle.types import Progress
 
-# A marker in an image: frame, name of the marker, x, y (pixels).
-Marks = list[tuple[str, str, float, float]]
-COLUMNS = "frame, x, y and marker"
-
-
-@dataclasses.dataclass(frozen=True)
-class WandSettings:
-    """How markers of a wand without names are told apart.
-
-    **Fields:** `min_ratio`: of the longer to the shorter of the two distances from the middle
-    marker. Perspective changes a ratio in the image by the ratio of the depths of the ends: a wand
-    of a third of its distance, pointing at the camera, by 1.4.
-    """
-
-    min_ratio: float = 1.5
+COLUMNS = "frame, x, y, marker, sx and sy (σ)"
 
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class WandCalibration(TableMethods):
     """Cameras calibrated by a wand; **Fields:** `adjustment`: the result of all observations;
-    `names` of the cameras, the first is the reference; `notes`: what was not used."""
+    `names` of the cameras, the first is the reference; `scale_sigma`: relative σ of the scale, by
+    the lengths of the wand; `notes`: what was not used; `markers` by camera, with their names;
+    `lengths` between them."""
 
     adjustment: Adjustment
     names: tuple[str, ...]
+    scale_sigma: float = 0.0
     notes: tuple[str, ...] = ()
+    markers: Mapping[str, Marks] = dataclasses.field(default_factory=dict, repr=False)
+    lengths: Mapping[tuple[str, str], float] = dataclasses.field(default_factory=dict)
 
     @property
     def converged(self) -> bool:
         return self.adjustment.converged
 
-    @property
+    @functools.cached_property
     def mountings(self) -> dict[str, Mounting]:
         """The mounting of every camera but the first in the frame of that, with its covariance."""
         row = {name: k for k, name in enumerate(self.adjustment.problem.network.images.id)}
-        # poses of the network are in the datum of all points (inner constraints): only relative
-        # ones, and their σ, do not depend on it
-        first, found = row[self.names[0]], {}
-        for name in self.names[1:]:
-            at = _relative(self.adjustment.values["image"], first, row[name])
-            R = matrix_from_quaternion(at.rotation)
-
-            def change(values: Mapping[str, Any], k: int = row[name], R: Array = R) -> Array:
-                moved = _relative(values["image"], first, k)
-                turn = rotation_vector_from_matrix(matrix_from_quaternion(moved.rotation) @ R.T)
-                return jnp.concatenate([jnp.asarray(moved.position), turn])
-
-            C = self.adjustment.covariance_of(change)
-            found[name] = mounting_of(PoseValue(*map(np.asarray, at)), np.asarray(C))
+        first, *others = (row[name] for name in self.names)
+        C = np.asarray(self.adjustment.covariance_of(_Mountings(first, tuple(others))))
+        found = {}
+        for k, name in enumerate(self.names[1:]):
+            at = _relative(self.adjustment.values["image"], first, others[k])
+            own, base = C[6 * k : 6 * k + 6, 6 * k : 6 * k + 6].copy(), np.asarray(at.position)
+            own[:3, :3] += self.scale_sigma**2 * np.outer(base, base)
+            found[name] = mounting_of(PoseValue(*map(np.asarray, at)), own)
         return found
 
     def network(self) -> Network:
@@ -143,6 +141,27 @@ class WandCalibration(TableMethods):
         return "\n".join([*lines, *(f"note: {said}" for said in self.notes)])
 
 
+@dataclasses.dataclass(frozen=True)
+class _Mountings:
+    """Bases and small turns of cameras in the frame of the first, as a function of all unknowns;
+    equal ones share a program.
+
+    Poses of networks are in the datum of all points (inner constraints): only relative ones, and
+    their σ, do not depend on it."""
+
+    first: int
+    others: tuple[int, ...]
+
+    def __call__(self, values: Mapping[str, Any]) -> Array:
+        changes = []
+        for k in self.others:
+            at = _relative(values["image"], self.first, k)
+            R = matrix_from_quaternion(at.rotation)
+            turn = rotation_vector_from_matrix(R @ jax.lax.stop_gradient(R).T)
+            changes += [jnp.asarray(at.position), turn]
+        return jnp.concatenate(changes)
+
+
 def _relative(images: PoseValue, first: int, k: int) -> PoseValue:
     """The pose of an image in the frame of another one."""
     M = matrix_from_quaternion(images.rotation[first])
@@ -160,20 +179,27 @@ def calibrate_wand(
     sigma_image: float | None = None,
     object_unit: str = "m",
     settings: WandSettings | None = None,
+    blobs: BlobSettings | None = None,
+    progress: Progress | None = None,
     **options: Any,
 ) -> WandCalibration:
     """Calibrate cameras that stand still by a wand of known length, waved before them.
 
     **Arguments:**
 
-    - `markers` by the name of the camera, the first is the reference: a table, or the path of a
-      CSV, with the columns frame, x, y (pixels) and marker (its name). Frames of one name are
-      simultaneous. Without `marker`, of a wand of three markers in a line, unevenly spaced, they
-      are told apart by their distances.
+    - `markers` by the name of the camera, the first is the reference: a folder of photographs, a
+      list of them, or a video; or a table, or the path of a CSV, with the columns frame, x, y
+      (pixels), and optional ones: marker (its name), sx and sy (σ, pixels). Frames of one name, or
+      of images one number, are simultaneous.
     - `cameras`: interior orientation by name; what is `free` of it is estimated as well.
     - `lengths`: between two markers, by their names: `{("A", "B"): 0.5}`; or that of a wand of two.
-    - `sigma_length` of these, `sigma_image` in pixels (default: a unit of weight).
-    - `options`: of `jaxbundle.adjust`.
+    - `sigma_length` of these, the same error in all frames; `sigma_image` in pixels (default: a
+      unit of weight; of markers in images in proportion to the measured σ, times what their
+      residuals say: a variance component).
+    - `settings`: how markers without names (all in images) are told apart: three in a line,
+      unevenly spaced, by their distances; two that look alike by their rays. `blobs`: what a marker
+      is in an image, such as `BlobSettings(dark=True)`.
+    - `progress(stage, done, total)`: frames searched. `options`: of `jaxbundle.adjust`.
 
     Cameras are oriented one after the other: each needs frames that it shares with one before it.
 
@@ -181,6 +207,8 @@ def calibrate_wand(
     hang together.
     """
     positive("sigma_length", sigma_length)
+    if sigma_image is not None:
+        positive("sigma_image", sigma_image)
     if not isinstance(markers, Mapping) or len(markers) < 2:
         raise InputError("markers: those of two cameras at least are expected, by their names")
     for name in markers:
@@ -189,61 +217,113 @@ def calibrate_wand(
                 f"cameras: none {name!r}{did_you_mean(name, cameras)}; expected the interior "
                 "orientation of every camera"
             )
-    marks = {name: _marks(name, given) for name, given in markers.items()}
-    pairs, notes = _pairs(lengths, marks), []
-    for name, own in marks.items():
-        if own and not own[0][1]:
-            marks[name], said = _told_apart(name, own, pairs, settings or WandSettings())
-            notes += said
-    network, said = _network(marks, cameras, pairs, sigma_length, sigma_image, object_unit)
-    return WandCalibration(adjust(network, **options), tuple(markers), (*notes, *said))
+    images = {name: given for name, given in markers.items() if are_images(given)}
+    tables = {name: _marks(name, given) for name, given in markers.items() if name not in images}
+    frames = {name: [*dict.fromkeys(m.frame for m in own)] for name, own in tables.items()}
+    pairs, notes, measured = _pairs(lengths, tables), [], {}
+    if images:
+        found = measure_wand(images, cameras, frames, blobs or BlobSettings(), progress)
+        measured, notes = found
+    if sigma_image is not None:
+        measured = {name: replaced_sigma(own, sigma_image) for name, own in measured.items()}
+    marks = {name: (measured if name in images else tables)[name] for name in markers}
+    marks, said = name_markers(marks, cameras, pairs, settings or WandSettings())
+    notes += said
+    declare = lambda marks: _network(marks, cameras, pairs, sigma_length, sigma_image, object_unit)
+    network, said = declare(marks)
+    result = adjust(network, **options)
+    if images and sigma_image is None and result.converged:
+        # σ by the noise of the grey values: compression smooths it, and shifts centres by more.
+        # They are weights of the markers among each other; residuals give their size
+        factor = _residuals_over_sigma(result, images)
+        for name in images:
+            marks[name] = [m._replace(sx=factor * m.sx, sy=factor * m.sy) for m in marks[name]]
+        result = adjust(declare(marks)[0], **options)
+        said += [f"σ of markers in images: {factor:.2f} times what the noise says, by residuals"]
+    longest = max(pairs.values())
+    # nobody waves a wand of ten metres; in millimetres it would be one of a centimetre at least
+    if object_unit == "m" and longest > 10:
+        said += [f"the wand is {longest:g} m long: is this in mm? Lengths and σ are of one unit"]
+    scale = sigma_length / float(np.sqrt(np.sum(np.square([*pairs.values()]))))
+    return WandCalibration(result, tuple(markers), scale, (*notes, *said), marks, pairs)
+
+
+def _residuals_over_sigma(result: Adjustment, cameras: Collection[str]) -> float:
+    """√(Σ(v/σ)²/Σr) of the image points of some cameras: the size of their σ (a variance
+    component)."""
+    table = result.residuals
+    rows = (table["kind"] == "image") & np.isin(table["image"].astype(str), [*cameras])
+    ratio, r = (table["v"] / table["sigma"])[rows], table["r"][rows]
+    taken = np.isfinite(ratio) & (r > 0)
+    size = float(np.sqrt((ratio[taken] ** 2).sum() / max(r[taken].sum(), 1.0)))
+    # exact images leave nothing
+    return size if size > 0 else 1.0
 
 
 def _marks(camera: str, given: Any) -> Marks:
-    """The measurements of a camera."""
+    """The markers of a camera that are given in a table.
+
+    **Raises:** `InputError` naming file or camera, frame and column."""
+    of = str(given) if isinstance(given, str | Path) else f"markers of camera {camera!r}"
     table = read_csv(Path(given)).values if isinstance(given, str | Path) else given
     if not isinstance(table, Mapping):
         raise InputError(
-            f"markers of camera {camera!r}: got {show(given)}; expected a table with the columns "
-            f"{COLUMNS}, or its path"
+            f"{of}: got {show(given)}; expected a table with the columns {COLUMNS}, or its path, "
+            "or images"
         )
     for name in ("frame", "x", "y"):
         if name not in table:
-            where = given if isinstance(given, str | Path) else f"markers of camera {camera!r}"
-            raise InputError(f"{where}: column {name!r} is missing; expected columns: {COLUMNS}")
-    names = table.get("marker", [""] * len(table["frame"]))
+            raise InputError(f"{of}: column {name!r} is missing; expected columns: {COLUMNS}")
+    number = len(table["frame"])
+    if not number:
+        raise InputError(f"{of}: no markers; expected rows with {COLUMNS}")
+    columns = [table.get(name, [""] * number) for name in ("frame", "marker", "x", "y", "sx", "sy")]
     found, seen = [], set()
-    for frame, name, x, y in zip(table["frame"], names, table["x"], table["y"]):
-        try:
-            xy = float(x), float(y)
-        except (TypeError, ValueError):
-            xy = np.nan, np.nan
-        where = f"markers of camera {camera!r}, frame {frame}"
+    for frame, name, x, y, *sigma in zip(*columns):
+        where = f"{of}, frame {frame}"
+        xy = _numbers(x, y)
         if not np.isfinite(xy).all():
             raise InputError(f"{where}: got x {show(x)}, y {show(y)}; expected pixels")
-        if str(name) and (str(frame), str(name)) in seen:
-            raise InputError(f"{where}: marker {name!r} is there twice")
-        seen.add((str(frame), str(name)))
-        found.append((str(frame), str(name), *xy))
-    without = next((mark for mark in found if not mark[1]), None)
-    if without is not None and any(name for _, name, *_ in found):
+        own = _numbers(*(np.nan if is_missing(s) else s for s in sigma))
+        if not all(is_missing(s) or one > 0 for s, one in zip(sigma, own)):
+            raise InputError(
+                f"{where}: got sx {show(sigma[0])}, sy {show(sigma[1])}; expected a positive σ in "
+                "pixels, or nothing"
+            )
+        marker = "" if is_missing(name) else str(name)
+        if marker and (str(frame), marker) in seen:
+            raise InputError(f"{where}: marker {marker!r} is there twice")
+        seen.add((str(frame), marker))
+        found.append(Mark(str(frame), marker, *xy, *own))
+    without = next((mark for mark in found if not mark.marker), None)
+    if without is not None and any(mark.marker for mark in found):
         raise InputError(
-            f"markers of camera {camera!r}, frame {without[0]}: a marker has no name, others have; "
+            f"{of}, frame {without.frame}: a marker has no name, others have; "
             "expected a name for each, or for none"
         )
     return found
+
+
+def _numbers(x: Any, y: Any) -> tuple[float, float]:
+    """Two numbers, NaN if one of them is none."""
+    try:
+        return float(x), float(y)
+    except (TypeError, ValueError):
+        return np.nan, np.nan
 
 
 def _pairs(
     lengths: float | Mapping[tuple[str, str], float], marks: Mapping[str, Marks]
 ) -> dict[tuple[str, str], float]:
     """The known lengths by their markers."""
-    names = sorted({name for own in marks.values() for _, name, *_ in own} - {""})
+    names = sorted({mark.marker for own in marks.values() for mark in own} - {""})
     if not isinstance(lengths, Mapping):
+        # the markers of a wand of two need no names
+        names = names or ["A", "B"]
         if len(names) != 2:
             raise InputError(
                 "lengths: one is given, of two markers, but the markers are "
-                f"{list_some(names) or 'without names'}; "
+                f"{list_some(names)}; "
                 'expected the length of each pair, such as {("A", "B"): 0.5}'
             )
         lengths = {(names[0], names[1]): lengths}
@@ -260,51 +340,6 @@ def _pairs(
     return dict(lengths)
 
 
-def _told_apart(
-    camera: str,
-    marks: Marks,
-    pairs: Mapping[tuple[str, str], float],
-    settings: WandSettings,
-) -> tuple[Marks, list[str]]:
-    """Names of markers in a line by the ratio of their distances; frames with another number of
-    them are not used."""
-    names = sorted({name for pair in pairs for name in pair})
-    size = {frozenset(pair): length for pair, length in pairs.items()}
-    if len(names) != 3 or len(size) < 2:
-        raise InputError(
-            f"markers of camera {camera!r} have no names (marker): only three in a line, whose "
-            "distances are given, can be told apart"
-        )
-    # the pair that is not given, or the longest, are the ends
-    others = [frozenset(n for n in names if n != one) for one in names]
-    middle = max(range(3), key=lambda k: size.get(others[k], np.inf))
-    ends = [name for name in names if name != names[middle]]
-    away = [size[frozenset((names[middle], end))] for end in ends]
-    if max(away) < settings.min_ratio * min(away):
-        raise InputError(
-            f"markers of camera {camera!r} have no names (marker), and the middle one is nearly "
-            f"half way between the others ({away[0]:g}, {away[1]:g}): they cannot be told apart"
-        )
-    frames: dict[str, list[tuple[float, float]]] = {}
-    for frame, _, x, y in marks:
-        frames.setdefault(frame, []).append((x, y))
-    found, left = [], 0
-    for frame, seen in frames.items():
-        if len(seen) != 3:
-            left += 1
-            continue
-        xy = np.array(seen)
-        apart = np.linalg.norm(xy[:, None] - xy, axis=2)
-        # the middle one is opposite to the longest side
-        centre = int(np.argmin(apart.sum(1)))
-        near, far = sorted((k for k in range(3) if k != centre), key=lambda k: apart[centre, k])
-        order = ends if away[0] < away[1] else ends[::-1]
-        by = {centre: names[middle], near: order[0], far: order[1]}
-        found += [(frame, by[k], *seen[k]) for k in range(3)]
-    said = f"camera {camera!r}: {count(left, 'frame')} without exactly three markers not used"
-    return found, [said] * bool(left)
-
-
 def _network(
     marks: Mapping[str, Marks],
     cameras: Mapping[str, Camera],
@@ -316,18 +351,19 @@ def _network(
     """The network of all frames, of markers that two cameras see at least."""
     rays: dict[str, int] = {}
     for own in marks.values():
-        for frame, name, *_ in own:
-            rays[f"{frame}:{name}"] = rays.get(f"{frame}:{name}", 0) + 1
+        for mark in own:
+            point = f"{mark.frame}:{mark.marker}"
+            rays[point] = rays.get(point, 0) + 1
     # one ray and one known distance are as many observations as a point has unknowns: such a point
     # would be met exactly, and on either of two places along its ray
     seen = {point for point, number in rays.items() if number > 1}
     rows = [
-        (camera, f"{frame}:{name}", x, y)
+        (camera, f"{frame}:{name}", x, y, *(s if np.isfinite(s) else None for s in sigma))
         for camera, own in marks.items()
-        for frame, name, x, y in own
+        for frame, name, x, y, *sigma in own
         if f"{frame}:{name}" in seen
     ]
-    frames = dict.fromkeys(frame for own in marks.values() for frame, *_ in own)
+    frames = dict.fromkeys(mark.frame for own in marks.values() for mark in own)
     known = [
         (f"{frame}:{a}", f"{frame}:{b}", length)
         for frame in frames
@@ -344,7 +380,7 @@ def _network(
         [dataclasses.replace(cameras[name], id=name) for name in names],
         {"id": names, "camera": names},
         {"id": sorted(seen), "role": ["tie"] * len(seen)},
-        dict(zip(("image", "point", "x", "y"), map(list, zip(*rows)))),
+        dict(zip(("image", "point", "x", "y", "sx", "sy"), map(list, zip(*rows)))),
         {
             **dict(zip(("from", "to", "value"), map(list, zip(*known)))),
             "sigma": [sigma_length] * len(known),

@@ -100,6 +100,11 @@ def map_of(
         columns = np.hypot(np.diff(x, axis=1), np.diff(y, axis=1)) / np.diff(pixels)
         # two digits: a round size that a reader can repeat
         size = float(f"{min(np.nanmedian(rows), np.nanmedian(columns)):.2g}")
+    elif size > (extent := max(np.nanmax(v) - np.nanmin(v) for v in (x, y))):
+        raise InputError(
+            f"--spacing {size:g}: larger than the whole image, {extent:.3g} {system.unit}; give a "
+            "smaller one, in the unit of the map, or another --crs"
+        )
     grid = grid_around(x, y, size, max_pixels * image.lines * image.pixels)
     # a line beyond the outermost centres, outside the border
     return MapGrid(grid.x - size, grid.y + size, size, grid.columns + 2, grid.rows + 2)

@@ -6,6 +6,7 @@ The grid is a raster with georeference (GeoTIFF, GTX), or a grid of PROJ by its 
 `us_nga_egm96_15.tif`, which `projsync` fetches (through pyproj).
 """
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -32,13 +33,16 @@ def add_geoid(terrain: Terrain, geoid: Path) -> Terrain:
         for k in (0, 1)
     )
     N = undulations(geoid, longitude, latitude)
-    if (missing := np.isnan(N) & np.isfinite(heights)).any():
+    missing = np.isnan(N)
+    missing &= np.isfinite(heights)
+    if missing.any():
         row, column = np.argwhere(missing)[0]
         raise InputError(
             f"{geoid}: no height of the geoid at longitude {longitude[column]:.6g}°, latitude "
             f"{latitude[row]:.6g}°; give a geoid that covers the terrain model"
         )
-    return make_terrain(heights + N, terrain.origin, terrain.step, terrain.earth)
+    N += heights
+    return make_terrain(N, terrain.origin, terrain.step, terrain.earth)
 
 
 def undulations(
@@ -52,14 +56,40 @@ def undulations_at(
     geoid: Path, longitude: Float[np.ndarray, "*#shape"], latitude: Float[np.ndarray, "*#shape"]
 ) -> Float[np.ndarray, "*shape"]:
     """N in metres at points, degrees; NaN outside the grid."""
-    if not Path(geoid).exists():
-        return _undulations_by_proj(geoid, longitude, latitude)
+    geoid = Path(geoid)
+    if not geoid.exists():
+        return _in_parts(_grid_of_proj(geoid), longitude, latitude)
     extent = Extent(longitude.min(), latitude.min(), longitude.max(), latitude.max())
     grid = read_terrain(geoid, WGS84, extent)
     heights, (x0, y0), (dx, dy) = np.asarray(grid.heights), *np.degrees([grid.origin, grid.step])
     middle = x0 + dx * (heights.shape[1] - 1) / 2
     longitude = longitude - 360 * np.round((longitude - middle) / 360)
-    return _bilinear(heights, (latitude - y0) / dy, (longitude - x0) / dx)
+    function = lambda x, y: _bilinear(heights, (y - y0) / dy, (x - x0) / dx)
+    return _in_parts(function, longitude, latitude)
+
+
+def _in_parts(
+    function: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    longitude: Float[np.ndarray, "*#shape"],
+    latitude: Float[np.ndarray, "*#shape"],
+    together: int = 1 << 18,
+) -> Float[np.ndarray, "*shape"]:
+    """A function of points, about so many at once: interpolation has a dozen arrays of their
+    number, for 2¹⁸ points 25 MB."""
+    shape = np.broadcast_shapes(longitude.shape, latitude.shape)
+    out = np.empty(shape)
+    if out.size <= together:
+        out[...] = function(longitude, latitude)
+        return out
+    rows = max(1, together // (out.size // shape[0]))
+    for first in range(0, shape[0], rows):
+        part = slice(first, first + rows)
+        # an axis of one stands for all rows
+        x, y = (
+            a[part] if a.ndim == len(shape) and len(a) > 1 else a for a in (longitude, latitude)
+        )
+        out[part] = function(x, y)
+    return out
 
 
 def _bilinear(
@@ -85,12 +115,8 @@ def _bilinear(
     return between(u, in_row(i), in_row(i + 1))
 
 
-def _undulations_by_proj(
-    name: str | Path,
-    longitude: Float[np.ndarray, "*#shape"],
-    latitude: Float[np.ndarray, "*#shape"],
-) -> Float[np.ndarray, "*shape"]:
-    """N of a grid of PROJ."""
+def _grid_of_proj(name: Path) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """N of a grid of PROJ as a function of longitude and latitude."""
     try:
         import pyproj.datadir
         import pyproj.exceptions
@@ -109,6 +135,10 @@ def _undulations_by_proj(
             f"is {folder}); give a raster of the geoid, or fetch the "
             "grid with projsync"
         ) from None
-    x, y = (np.array(v) for v in np.broadcast_arrays(longitude, latitude))
-    N = transformer.transform(x, y, np.zeros_like(x))[2]
-    return np.where(np.isfinite(N), N, np.nan)
+
+    def function(longitude: np.ndarray, latitude: np.ndarray) -> np.ndarray:
+        x, y = (np.array(v) for v in np.broadcast_arrays(longitude, latitude))
+        N = transformer.transform(x, y, np.zeros_like(x))[2]
+        return np.where(np.isfinite(N), N, np.nan)
+
+    return function

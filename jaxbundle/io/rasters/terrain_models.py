@@ -25,6 +25,7 @@ from jaxbundle.system.rasters import (
 
 if TYPE_CHECKING:
     from rasterio.io import DatasetReader
+    from rasterio.vrt import WarpedVRT
 
 
 def read_terrain(
@@ -47,7 +48,7 @@ def read_terrain(
     for a vertical system of heights above a geoid that nobody adds.
     """
     package = rasterio()
-    from rasterio.vrt import WarpedVRT
+    from rasterio.vrt import WarpedVRT as Warped
 
     with as_one_raster(path) as file, open_raster(file) as source:
         check_georeference(path, source)
@@ -63,16 +64,19 @@ def read_terrain(
         if source.crs.is_geographic:
             return _terrain(source, earth, path, extent, height)
         degrees = _degrees_around(path, source)
-        with raster_parser(path):
-            warped = WarpedVRT(
-                source,
-                crs=degrees,
-                dtype="float64",
-                nodata=np.nan,
-                resampling=package.enums.Resampling.bilinear,
-            )
-        with warped:
-            return _terrain(warped, earth, path, extent, height)
+
+        def warp(kind: str) -> "WarpedVRT":
+            with raster_parser(path):
+                return Warped(
+                    source,
+                    crs=degrees,
+                    dtype="float64",
+                    nodata=np.nan,
+                    resampling=package.enums.Resampling[kind],
+                )
+
+        with warp("bilinear") as warped, warp("nearest") as exact:
+            return _terrain(warped, earth, path, extent, height, exact)
 
 
 def _degrees_around(path: str | Path, source: "DatasetReader") -> str:
@@ -96,17 +100,22 @@ def _terrain(
     path: str | Path,
     extent: Extent | None,
     height: HeightScale,
+    exact: "DatasetReader | WarpedVRT | None" = None,
 ) -> Terrain:
-    """The terrain model of a raster, whole or the `extent` of it."""
+    """The terrain model of a raster, whole or the `extent` of it; `exact`: with the same cells and
+    the values of the file, where those of the raster are interpolated."""
     transform = source.transform
     if transform.b or transform.d:
         raise InputError(f"{path}: the raster is rotated; make it north up with gdalwarp")
     step = transform.a, transform.e
-    first = (0, 0)
-    if earth is None or extent is None:
-        heights = _heights(path, source, None, height)
-    else:
-        heights, first = _cut(source, path, extent, height)
+    read = lambda source: (
+        (_heights(path, source, None, height), (0, 0))
+        if earth is None or extent is None
+        else _cut(source, path, extent, height)
+    )
+    heights, first = read(source)
+    if _has_strange_heights(heights):
+        _refuse_undeclared_no_data(path, heights if exact is None else read(exact)[0], height)
     unit = 1.0 if earth is None else np.pi / 180
     x, y = transform.c + (first[1] + 0.5) * step[0], transform.f + (first[0] + 0.5) * step[1]
     if not np.isfinite(heights).any():
@@ -114,6 +123,40 @@ def _terrain(
         raise InputError(f"{path}: no height{there}; give a model that covers the image")
     with naming_file(path):
         return make_terrain(heights, (unit * x, unit * y), (unit * step[0], unit * step[1]), earth)
+
+
+def _has_strange_heights(
+    heights: Float[np.ndarray, "rows columns"], lowest: float = -500.0, highest: float = 9000.0
+) -> bool:
+    """Whether there are heights below or above all land of the Earth (−430 m, 8849 m), metres."""
+    return bool((heights < lowest).any() or (heights > highest).any())
+
+
+def _refuse_undeclared_no_data(
+    path: str | Path,
+    heights: Float[np.ndarray, "rows columns"],
+    height: HeightScale,
+    gap: float = 1000.0,
+) -> None:
+    """Refuse a mark of cells without height, such as −9999, that a file does not declare: a height
+    that no land has, far from every other.
+
+    **Arguments:** `gap`: metres to the next height. Deep sea and high mountains of other bodies
+    have heights between.
+    """
+    known = heights[np.isfinite(heights)]
+    for end, sign in ((known.min(), 1.0), (known.max(), -1.0)):
+        others = known[known != end]
+        if not len(others):
+            return
+        nearest = others.min() if sign > 0 else others.max()
+        if sign * (nearest - end) > gap and _has_strange_heights(end[None, None]):
+            mark = (end - height.offset) / height.scale
+            raise InputError(
+                f"{path}: {len(known) - len(others)} of {len(known)} cells have the height "
+                f"{end:.10g}, the others {others.min():.6g} to {others.max():.6g}; if it "
+                f"marks cells without height, declare it: gdal_edit.py -a_nodata {mark:.10g} FILE"
+            )
 
 
 def _cut(

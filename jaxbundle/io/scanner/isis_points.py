@@ -34,6 +34,7 @@ from jaxtyping import Float, Int
 
 from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
+from jaxbundle.io.scanner.pvl import without_comments
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.io.text.xml_fields import number_in
 from jaxbundle.network.columns import count
@@ -220,6 +221,9 @@ def _points_of(path: Path) -> Iterator[tuple[Fields, list[Fields]]]:
                 raise InputError(f"{where}: {entry.name} without a beginning of this {kind}")
             if blocks.pop()[1] == "CONTROLPOINT":
                 yield fields, measures
+        elif entry.value.partition("<")[0].strip().upper() == "NULL":
+            # a value that the network does not have, as if its line were missing
+            continue
         elif blocks and blocks[-1][1] == "CONTROLPOINT":
             fields[entry.name] = entry
         elif blocks and blocks[-1][1] == "CONTROLMEASURE":
@@ -235,13 +239,14 @@ def _points_of(path: Path) -> Iterator[tuple[Fields, list[Fields]]]:
 def _statements(path: Path) -> Iterator[_Entry]:
     """Names and values; lists in brackets and texts in quotes may have several lines."""
     waiting: tuple[str, str, int] | None = None
-    for number, text in enumerate(read_text(path, fallback="latin-1").splitlines(), 1):
+    content = without_comments(read_text(path, fallback="latin-1"))
+    for number, text in enumerate(content.splitlines(), 1):
         line = text.strip()
         if waiting is not None:
             name, value, first = waiting
             value = f"{value} {line}"
         else:
-            if not line or line.startswith("#"):
+            if not line:
                 continue
             if line.upper() == "END":
                 return

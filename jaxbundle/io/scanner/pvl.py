@@ -16,6 +16,8 @@ from pathlib import Path
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import read_text
 
+# A text in quotes, or a comment: from /* to */, or from # to the end of its line.
+TEXT_OR_COMMENT = re.compile(r'"[^"]*"|/\*.*?\*/|(?:(?<=\s)|^)#[^\n]*', re.DOTALL | re.MULTILINE)
 GROUPS = ("IMD", "EPH", "ATT", "GEO")
 STATEMENT = re.compile(r"\s*([^=;]+?)\s*=\s*")
 ROW = re.compile(r"\(([^()]*)\)")
@@ -40,7 +42,7 @@ def read_support_data(path: Path) -> ET.Element:
 
 def _read(path: Path, root: ET.Element) -> None:
     """Add the groups and values of a file to an element."""
-    text, begin, groups = read_text(path, fallback="latin-1"), 0, [root]
+    text, begin, groups = without_comments(read_text(path, fallback="latin-1")), 0, [root]
     wrong = lambda what: InputError(f"{path}, line {text[:begin].count(chr(10)) + 1}: {what}")
     while (rest := text[begin:].strip()) and not rest.upper().startswith("END;"):
         begin = len(text) - len(text[begin:].lstrip())
@@ -68,6 +70,12 @@ def _read(path: Path, root: ET.Element) -> None:
         begin = end + 1
     if len(groups) > 1:
         raise InputError(f"{path}: the group {groups[-1].tag} does not end")
+
+
+def without_comments(text: str) -> str:
+    """PVL without its comments; every line keeps its number."""
+    blank = lambda found: found[0] if found[0][0] == '"' else "\n" * found[0].count("\n")
+    return TEXT_OR_COMMENT.sub(blank, text)
 
 
 def _put(group: ET.Element, name: str, value: str) -> None:

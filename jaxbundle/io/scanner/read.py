@@ -53,13 +53,24 @@ def read_scanner(path: str | Path) -> ScannerInput:
     for name in OF_SOURCES:
         if name in scanner:
             raise InputError(f"{scanner.where}{name}: give it in [position] and [attitude]")
+    if "corrections" in scanner:
+        raise InputError(
+            f"{scanner.where}corrections: chosen by the RPC of a source; here give the section "
+            "[corrections]"
+        )
     file.require(REQUIRED_FIELDS, f", or source in [scanner], the name of {EXPECTED_PRODUCTS}")
     return scanner_of(file)
 
 
 def _read_source(file: TomlFile, scanner: TomlSection) -> ScannerInput:
     """The image of the source, with the name, interpolation and corrections of the file."""
-    scanner.check_keys(("source", "name", *OF_SOURCES))
+    scanner.check_keys(("source", "name", *OF_SOURCES, "corrections"))
+    automatic = scanner.text("corrections", "") if "corrections" in scanner else None
+    if automatic not in (None, "auto"):
+        raise InputError(
+            f'{scanner.where}corrections = {show(automatic)}; "auto" is expected, or the section '
+            "[corrections] with light_time, aberration, refraction"
+        )
     for name in file.document:
         if name not in ("scanner", "corrections"):
             raise InputError(
@@ -79,6 +90,10 @@ def _read_source(file: TomlFile, scanner: TomlSection) -> ScannerInput:
     product = _read_product(source, choice, seconds)
     switches = file.section("corrections")
     switched = {name: switches.switch(name) for name in switches.values}
+    if automatic and switched:
+        raise InputError(
+            f'{scanner.where}corrections = "auto", and [corrections] are given; give one of them'
+        )
     corrections = product.image.corrections._replace(**switched)
     if corrections.any and product.backwards:
         raise InputError(
@@ -88,7 +103,7 @@ def _read_source(file: TomlFile, scanner: TomlSection) -> ScannerInput:
     image = dataclasses.replace(product.image, corrections=corrections)
     product = dataclasses.replace(product, image=image, name=scanner.text("name", product.name))
     # what the user switched is compared, but not replaced
-    return check_against_rpc(product, source, choose=not switched)
+    return check_against_rpc(product, source, not switched, automatic is not None)
 
 
 def _read_product(

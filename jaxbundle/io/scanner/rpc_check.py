@@ -35,12 +35,18 @@ from jaxbundle.pushbroom.rpc.agreement import (
 from jaxbundle.pushbroom.rpc.polynomials import Rpc
 
 
-def check_against_rpc(scanner: ScannerInput, path: Path, choose: bool = True) -> ScannerInput:
+def check_against_rpc(
+    scanner: ScannerInput, path: Path, choose: bool = True, expected: bool = False
+) -> ScannerInput:
     """The image of a product, compared with its RPC if there are any: with corrections that agree
-    and a warning if they are not the usual ones (`choose`), and a warning if none agree."""
+    and a warning if they are not the usual ones (`choose`), and a warning if none agree; also
+    without RPC if they are `expected`."""
     file = _find_rpc_file(path)
     if file is None:
-        return scanner
+        if not expected:
+            return scanner
+        usual = _names(scanner.image.corrections)
+        return _warn(scanner, f"{path}: has no RPC that could choose corrections: {usual} applied")
     try:
         unknown = UnknownKeys()
         rpc = read_rpc(file, unknown)
@@ -56,11 +62,11 @@ def check_against_rpc(scanner: ScannerInput, path: Path, choose: bool = True) ->
         return scanner
     if not np.isfinite(usual.rms):
         return _warn(scanner, f"{path}: no position could be compared with the RPC of {file.name}")
-    if choose:
-        found = _compare(image, rpc, CORRECTION_SETS)
-        best = min(range(len(found)), key=lambda k: np.nan_to_num(found[k].rms, nan=np.inf))
-        if _agree(found[best], random_error):
-            chosen = CORRECTION_SETS[best]
+    found = _compare(image, rpc, CORRECTION_SETS)
+    best = min(range(len(found)), key=lambda k: np.nan_to_num(found[k].rms, nan=np.inf))
+    chosen = CORRECTION_SETS[best]
+    if _agree(found[best], random_error):
+        if choose:
             message = (
                 f"{path}: {_names(chosen)} applied, with which the rigorous model agrees with the "
                 f"RPC of {file.name} ({_size(found[best])}); with those usual for this product, "
@@ -70,11 +76,17 @@ def check_against_rpc(scanner: ScannerInput, path: Path, choose: bool = True) ->
             image = dataclasses.replace(image, corrections=chosen)
             chosen_one = dataclasses.replace(scanner, image=image, agreement=found[best])
             return _warn(chosen_one, message)
+        remedy = f"With {_names(chosen)} they agree ({_size(found[best])}): set [corrections] so"
+    else:
+        remedy = (
+            f"No corrections explain it (the least is left with {_names(chosen)}: "
+            f"{_size(found[best])}): check the origin of lines and pixels, whether the RPC are of "
+            "this image, or use the RPC"
+        )
     return _warn(
         scanner,
         f"{path}: the rigorous model, with {_names(image.corrections)}, and the RPC of {file.name} "
-        f"differ by more than their accuracy explains: {_size(usual)}. Check [corrections] and the "
-        "origin of lines and pixels, or use the RPC",
+        f"differ by more than their accuracy explains: {_size(usual)}. {remedy}",
     )
 
 

@@ -48,8 +48,9 @@ Or the file of a product, with changes:
 source = "image.json"
 interpolation = "lagrange"          # CSM files: usgscsm | lagrange
 extrapolate = 2.0                   # CSM files: seconds by which tables may end before the image
+corrections = "auto"                # those that the RPC of the product confirms; the default
 
-[corrections]
+[corrections]                       # instead: the ones given, others as usual for the product
 refraction = true
 ```
 """
@@ -59,6 +60,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.arguments import show
 from jaxbundle.cameras import check_parameters, default_parameters, get_model
@@ -97,6 +99,7 @@ SECTIONS = {
         "source",
         "interpolation",
         "extrapolate",
+        "corrections",
     ),
     "times": ("first", "period", "table"),
     "position": (*KINDS, "at", "j2", "frame", "span", "step", *INTERPOLATION),
@@ -244,8 +247,24 @@ def _position(file: TomlFile, earth: Ellipsoid | None) -> tuple[TimeTable, Sourc
         check_times(t, columns.source)
         R = frames.to_earth(frame, _epoch(file), t, _orientation(file))
         P, V = frames.turn_positions(R, P, V, _orientation(file))
+    if earth is not None:
+        _check_outside(P, earth, columns.source)
     table = position_table(t, P, V, **_options(section, "lagrange"), source=columns.source)
     return table, columns.source
+
+
+def _check_outside(P: Float[np.ndarray, "n 3"], earth: Ellipsoid, source: Source) -> None:
+    """Refuse positions deep inside the Earth, such as in kilometres."""
+    distance = np.linalg.norm(P, axis=1)
+    # a hundredth of the axis, 64 km: no camera is so deep
+    least = 0.99 * min(float(earth.a), float(earth.b), float(earth.c))
+    if (bad := distance < least).any():
+        row = int(bad.argmax())
+        raise InputError(
+            f"{source(row)}: the position is {distance[row]:.6g} m from the centre of the Earth, "
+            f"whose axes are {least / 0.99:.7g} m and more; expected metres from the centre: is it "
+            "in kilometres, or in another frame?"
+        )
 
 
 def _orbit(

@@ -110,13 +110,16 @@ class TomlSection:
         return self._get(key, False, "true or false", (bool,))
 
     def numbers(self, key: str, count: int | None = None) -> np.ndarray:
-        """A list of numbers, of a given length."""
+        """A list of finite numbers, of a given length."""
         expected = f"a list of {count or 'some'} numbers"
         values = self._get(key, None, expected, (list,))
         good = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
         if not good or not values or count not in (None, len(values)):
             raise InputError(f"{self.where}{key} is {show(values)}; {expected} is expected")
-        return np.array(values, float)
+        found = np.array(values, float)
+        if not np.isfinite(found).all():
+            raise InputError(f"{self.where}{key} is {show(values)}; finite numbers are expected")
+        return found
 
     def path(self, key: str, expected: str, folder: bool = False) -> Path:
         """The file that a key names, beside the file of the section; also a folder, if it may be

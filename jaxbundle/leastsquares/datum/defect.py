@@ -116,7 +116,11 @@ def find_open_motions(survey: Survey) -> Float[np.ndarray, "motions defect"]:
     held = np.asarray(survey.held)
     held = held[np.isfinite(held).all(1)]
     scale = np.sqrt(np.asarray(survey.squares) + (held**2).sum(0))
-    scale = np.where(scale > 0, scale, 1.0)
+    # A motion without any effect gets the scale of the others by the size of its displacements:
+    # combinations of motions of very different sizes would be nearly parallel.
+    moved = np.sqrt(sum((np.asarray(x) ** 2).sum((0, 1)) for x in survey.moves.values()))
+    moved = np.where(moved > 0, moved, 1.0)
+    scale = np.where(scale > 0, scale, moved * ((scale / moved).max(initial=0.0) or 1.0))
     held = held / scale
     # A held unknown that moves at all holds: every row counts the same.
     size = np.linalg.norm(held, axis=1, keepdims=True)
@@ -168,6 +172,9 @@ def make_datum(
         singular = np.linalg.svd(R, compute_uv=False)
         if singular[-1] <= MIN_RELATIVE_MOTION * singular[0]:
             raise CannotHold(defect)
+        # The same directions, orthonormal on the datum unknowns: BᵀG is then the unit matrix.
+        orthonormal = np.linalg.inv(R) / size[:, None]
+        gauge, directions = gauge @ orthonormal, [rows @ orthonormal for rows in directions]
     if minimal:
         picked = _pick_rows(np.concatenate(directions), np.concatenate(candidates))
         cuts = np.cumsum([w.size for w in weight.values()])[:-1]

@@ -24,10 +24,10 @@ make σ of points larger for the uncertain size of a field that they do not depe
 """
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxbundle.leastsquares.quality.distributions import (
     normal_probability,
@@ -69,7 +69,8 @@ class SizeEquations:
         T, onto = self.reduced
         forms = onto @ q
         cubes = self.cubes
-        if cubes is not None:
+        # else the matrix is 1, and the product the largest part of the time
+        if cubes is not None and self.has_others:
             cubes = np.einsum("ia,jb,kc,abc->ijk", onto, onto, onto, cubes)
         theta = _significant(T, forms, self.critical, cubes)
         score = _scores(T, forms)
@@ -90,39 +91,65 @@ def widening(
     **Arguments:** `T` of the estimated sizes, the first m, and the covariance of their `forms` q;
     of every table the variances that each component of θ = 1 gives its unknowns.
     """
-    factor = np.ones(len(theta))
-    some = np.flatnonzero(theta[: len(T)] > 0)
-    if not (some > 0).any():
-        return factor  # independent errors alone
-    # of the θ that are not zero, in the system of these alone
-    inverse = np.linalg.pinv(T[np.ix_(some, some)], 1e-10, hermitian=True)
-    spread = inverse @ forms[np.ix_(some, some)] @ inverse
-    excesses = [_excess(theta[some], spread, parts[some]) for parts in tables]
-    sigma = np.sqrt(np.diag(spread))
-    factor[some] += max(excesses, default=0.0) * sigma / theta[some]
+    return widenings(theta[None], T, forms, [parts[None] for parts in tables])[0]
+
+
+def widenings(
+    theta: Float[np.ndarray, "n k"],
+    T: Float[np.ndarray, "m m"],
+    forms: Float[np.ndarray, "m m"],
+    tables: Sequence[Float[np.ndarray, "n k unknowns"]],
+) -> Float[np.ndarray, "n k"]:
+    """`widening` of n solutions whose sizes have the same equations."""
+    factor = np.ones(theta.shape)
+    positive = theta[:, : len(T)] > 0
+    for pattern in np.unique(positive, axis=0):
+        some = np.flatnonzero(pattern)
+        if not (some > 0).any():
+            continue  # independent errors alone
+        # of the θ that are not zero, in the system of these alone
+        inverse = np.linalg.pinv(T[np.ix_(some, some)], 1e-10, hermitian=True)
+        spread = inverse @ forms[np.ix_(some, some)] @ inverse
+        sigma = np.sqrt(np.diag(spread))
+        of = np.flatnonzero((positive == pattern).all(1))
+        block = np.ix_(of, some)
+        excess = np.zeros(len(of))
+        for parts in tables:
+            excess = np.maximum(excess, _excess(theta[block], spread, parts[block]))
+        factor[block] += excess[:, None] * sigma / theta[block]
     return factor
 
 
 def _excess(
-    theta: Float[np.ndarray, " s"],
+    theta: Float[np.ndarray, "n s"],
     spread: Float[np.ndarray, "s s"],
-    parts: Float[np.ndarray, "s unknowns"],
+    parts: Float[np.ndarray, "n s unknowns"],
     coverage: float = 0.95,
     min_degrees: float = 3.0,
-) -> float:
+) -> Float[np.ndarray, " n"]:
     """λ of a table, for intervals of a `coverage`; `min_degrees` of freedom, from which Student's
     distribution has a variance."""
     upper = 1 - (1 - coverage) / 2
-    variance = theta @ parts
+    variance = (theta[:, None] @ parts)[:, 0]
     free = variance > 0
-    if not free.any():
-        return 0.0
-    variance, parts = variance[free], parts[:, free]
-    of_variance = np.einsum("kn,kl,ln->n", parts, spread, parts)
-    degrees = float(np.median(2 * variance**2 / of_variance))
-    t = t_quantile(upper, max(degrees, min_degrees))
-    share = float(np.median(variance / (np.sqrt(np.diag(spread)) @ parts)))
-    return ((t / normal_quantile(upper)) ** 2 - 1) * share
+    of_variance = np.sum((spread @ parts) * parts, 1)
+    of_sigma = np.sqrt(np.diag(spread)) @ parts
+    degrees = _median(2 * variance**2, of_variance, free)
+    t = np.array([t_quantile(upper, d) for d in np.maximum(degrees, min_degrees)])
+    excess = ((t / normal_quantile(upper)) ** 2 - 1) * _median(variance, of_sigma, free)
+    return np.where(free.any(1), excess, 0.0)
+
+
+def _median(
+    x: Float[np.ndarray, "n unknowns"],
+    y: Float[np.ndarray, "n unknowns"],
+    some: Bool[np.ndarray, "n unknowns"],
+) -> Float[np.ndarray, " n"]:
+    """The medians of x/y of some unknowns, 1 where there are none."""
+    quotients = np.divide(x, y, out=np.full(x.shape, np.inf), where=y > 0)
+    quotients = np.where(some, quotients, np.nan)
+    quotients[~some.any(1)] = 1.0
+    return np.nanmedian(quotients, 1)
 
 
 def _nonnegative(

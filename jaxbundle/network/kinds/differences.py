@@ -39,7 +39,8 @@ def angle(
     a: Float[Array, "3"], at: Float[Array, "3"], b: Float[Array, "3"], measured: Float[Array, ""]
 ) -> Float[Array, ""]:
     """The angle at a point between two others minus the measured one, radians."""
-    # The tangent is exact at every angle; the arc cosine has no derivative at 0 and 180°.
+    # The tangent keeps its digits near 0 and 180°, where the arc cosine loses them. At these two
+    # angles the one in space has no derivative.
     u, v = a - at, b - at
     sine = jnp.sqrt(jnp.sum(jnp.cross(u, v) ** 2))
     return jnp.arctan2(sine, u @ v) - measured

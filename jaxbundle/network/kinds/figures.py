@@ -44,6 +44,8 @@ from jaxbundle.types import Scalar
 # square (points move by 1e-5 of their σ, by 1e-3 with 1e-2); the normal equations stay well
 # conditioned.
 EXACT_SIGMA = 1e-3
+# The set of observations of shapes.
+KNOWN_SHAPES = "known shapes"
 # The `DIRECTIONS` in which a figure changes; along the others it moves in itself: they would be
 # undetermined.
 MOVES = {
@@ -286,7 +288,7 @@ class Shapes(Further):
             parameters=DIRECTIONS,
         )
         sigma = np.where(self.sigma > 0, self.sigma, EXACT_SIGMA * across_rays(network))
-        kind = Kind("known shapes", in_shape, ("shape", "point"), ("x", "y", "z"), "length")
+        kind = Kind(KNOWN_SHAPES, in_shape, ("shape", "point"), ("x", "y", "z"), "length")
         seen = kind((shape, point), self.place, sigma=sigma)
         return Contribution((frame,), (seen,), (("shape", move_pose),))
 

@@ -27,8 +27,9 @@ from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, earth_fixed, geodetic
 from jaxbundle.geometry.vectors import Vector, along
+from jaxbundle.leastsquares.indexing.indices import round_up
 from jaxbundle.network.tables import Source
-from jaxbundle.pushbroom.rpc.fitting import RpcCheck, RpcTable, check_rpc, fit_rpc
+from jaxbundle.pushbroom.rpc.fitting import RpcCheck, RpcTable, check_rpc, fit_rpc, plain_table
 from jaxbundle.pushbroom.rpc.polynomials import DOMAIN_MARGIN, Rpc, Scalar, project, project_points
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
@@ -99,7 +100,7 @@ def fit_bias(
     require_x64()
     if model not in MODELS:
         raise InputError(f"unknown bias {model!r}; one of {', '.join(MODELS)} is expected")
-    control = RpcTable(*(np.asarray(column, float) for column in control))
+    control = plain_table(control)
     n, k = len(control.line), MODELS[model]
     for name, column in zip(control._fields, control):
         if (bad := ~np.isfinite(column)).any():
@@ -109,14 +110,18 @@ def fit_bias(
     sigma = np.broadcast_to(np.asarray(sigma, float), (n, 2))
     if (bad := ~(sigma > 0).all(1)).any():
         raise InputError(f"{source(int(bad.argmax()))}: σ must be positive, in pixels")
-    computed, G = (np.asarray(a) for a in images_and_slopes(rpc, earth, *control[:3]))
+    # snooping leaves out one point after the other: the next number of a program stays the same
+    more = round_up(n) - n
+    padded = (np.pad(column, (0, more), mode="edge") for column in control[:3])
+    computed, G = (np.asarray(a)[:n] for a in images_and_slopes(rpc, earth, *padded))
     if (bad := ~np.isfinite(computed).all(1)).any():
         raise InputError(
             f"{source(int(bad.argmax()))}: the coefficients have no image of this point; check "
             "longitude, latitude, height and their order"
         )
     check_domain(rpc, control, source)
-    terms = np.stack(bias_terms(rpc, computed[:, 0], computed[:, 1]), 1)[:, :k]
+    # with numbers of NumPy: JAX would compile every operation for each number of points
+    terms = np.stack(bias_terms(domain_of_bias(rpc), *computed.T), 1)[:, :k]
     singular = np.linalg.svd(terms, compute_uv=False)
     # 1e-6 of 10 000 pixels is a hundredth of a pixel: points so near a line do not fix its sides
     if singular[-1] < 1e-6 * singular[0]:
@@ -138,28 +143,25 @@ def _adjust(
 ) -> BiasFit:
     """Least squares of measured minus computed positions with P⁻¹ of each, `cofactors`.
 
-    Lines and samples of a point are correlated by its ground coordinates, so that all of it is
-    dense: a few control points.
+    Line and sample of a point are correlated by its ground coordinates: P has a block of 2 × 2 a
+    point, and of Qv only these blocks are needed.
     """
     n, k = terms.shape
-    # rows in the order line, sample of the first point, of the second, …
     A = np.zeros((n, 2, 2 * k))
     A[:, 0, :k] = A[:, 1, k:] = terms
-    A = A.reshape(2 * n, 2 * k)
-    inverse_weights = np.zeros((n, 2, n, 2))
-    inverse_weights[np.arange(n), :, np.arange(n), :] = cofactors
-    inverse_weights = inverse_weights.reshape(2 * n, 2 * n)
-    P = np.linalg.inv(inverse_weights)
-    Q = np.linalg.inv(A.T @ P @ A)
-    x = Q @ A.T @ P @ difference.ravel()
-    v = (A @ x).reshape(n, 2) - difference
-    Qv = inverse_weights - A @ Q @ A.T
-    r = np.clip(np.diag(Qv @ P), 0.0, 1.0)
-    test = np.diag(P @ Qv @ P)
+    P = np.linalg.inv(cofactors)
+    PA = P @ A
+    Q = np.linalg.inv(np.einsum("nia,nib->ab", A, PA))
+    x = Q @ np.einsum("nia,ni->a", PA, difference)
+    v = A @ x - difference
+    Qv = cofactors - A @ Q @ np.swapaxes(A, 1, 2)
+    r = np.clip(np.einsum("nij,nji->ni", Qv, P), 0.0, 1.0)
+    test = np.einsum("nij,njk,nki->ni", P, Qv, P)
     free = r > 1e-8  # r = 0 exactly, up to rounding: the point has no test
-    w = np.where(free, P @ v.ravel() / np.sqrt(np.where(free, test, 1.0)), np.nan)
+    Pv = np.einsum("nij,nj->ni", P, v)
+    w = np.where(free, Pv / np.sqrt(np.where(free, test, 1.0)), np.nan)
     redundancy = 2 * n - 2 * k
-    vtpv = float(v.ravel() @ P @ v.ravel())
+    vtpv = float(np.sum(v * Pv))
     sigma0 = float(np.sqrt(vtpv / redundancy)) if redundancy else np.nan
     full = lambda a: jnp.asarray(np.r_[a, np.zeros(max(3 - k, 0))])
     return BiasFit(
@@ -168,8 +170,8 @@ def _adjust(
         sigma0,
         redundancy,
         v,
-        r.reshape(n, 2),
-        w.reshape(n, 2),
+        r,
+        w,
     )
 
 

@@ -33,6 +33,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxbundle.arguments import numeric_array
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.geometry.ellipsoid import Ellipsoid, geodetic
@@ -131,6 +132,13 @@ class RpcFit(eqx.Module):
     converged: bool
 
 
+def plain_table(table: RpcTable) -> RpcTable:
+    """A table of floats; masked ones are NaN."""
+    return RpcTable(
+        *(numeric_array(name, c, "numbers").astype(float) for name, c in table._asdict().items())
+    )
+
+
 def fit_rpc(
     table: RpcTable,
     *,
@@ -148,7 +156,7 @@ def fit_rpc(
     of one longitude, latitude, line or sample.
     """
     require_x64()
-    table = RpcTable(*(np.asarray(column, float) for column in table))
+    table = plain_table(table)
     _check_table(table, source)
     offsets = _offsets(table)
     _check_ranges(offsets, source)

@@ -31,6 +31,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
+from jaxbundle.arguments import without_masks
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, earth_fixed
 from jaxbundle.geometry.vectors import Triple, Vector, along, difference, unit, unpack
 from jaxbundle.implicit import implicit_root
@@ -275,6 +276,7 @@ def sight(
     return unpack(top), unit(difference(bottom, top))
 
 
+@without_masks
 @partial(compile_once, static=())
 def project_points(
     rpc: Rpc,
@@ -287,6 +289,7 @@ def project_points(
     return jax.vmap(place)(longitude, latitude, height)
 
 
+@without_masks
 @partial(compile_once, static=())
 def locate_points(
     rpc: Rpc,
@@ -308,6 +311,7 @@ def locate_points(
     return jax.lax.cond(settled, lambda: first, lambda: every(MAX_STEPS))
 
 
+@without_masks
 @partial(compile_once, static=())
 def locate_points_on(
     rpc: Rpc, surface: GroundSurface, line: Float[AnyArray, " n"], sample: Float[AnyArray, " n"]

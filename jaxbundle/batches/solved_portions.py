@@ -1,0 +1,120 @@
+"""The programs of error components (`correlated`), run on the portions of a solved batch; their
+results in the order of the cameras and views of the user.
+
+Portions come one after the other: large products use all cores, and two programs that wait for the
+same threads never end."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Shaped
+
+from jaxbundle.adjustment.quality.correlated_errors import DEFAULTS
+from jaxbundle.batches.camera import CONVERGED
+from jaxbundle.batches.compiled import ProgramKey, Rows
+from jaxbundle.batches.correlated import (
+    COMPONENTS,
+    SUMS,
+    ComponentForms,
+    ComponentParts,
+    ComponentTraces,
+    forms_of_portion,
+    parts_of_portion,
+    scatter_of_portion,
+    traces_of_portion,
+)
+from jaxbundle.batches.input import Portion
+from jaxbundle.batches.normal import POSE, CameraUnknowns, Sightings
+
+
+class SolvedPortions(NamedTuple):
+    """The portions of a batch with their rows, padded as they were solved; how many `cameras` the
+    batch has, and how many views each."""
+
+    key: ProgramKey
+    portions: Sequence[Portion]
+    rows: Sequence[Rows]
+    cameras: int
+    views: int
+
+    def traced(self, together: bool) -> Bool[np.ndarray, " cameras"]:
+        """Whose traces are needed: of every solved camera, or for one set of sizes of some of them,
+        as far as there are with views enough for components by view."""
+        solved, views = np.zeros((2, self.cameras), int)
+        for portion, rows in zip(self.portions, self.rows):
+            number = len(portion.cameras)
+            solved[portion.cameras] = rows["status"][:number] == CONVERGED
+            views[portion.cameras] = rows["views"][:number].sum(1)
+        found = solved > 0
+        if together:
+            many = found & (views >= DEFAULTS.min_images)
+            chosen = np.flatnonzero(many if many.any() else found)
+            step = max(len(chosen) / SUMS.traced, 1)
+            found = np.zeros(self.cameras, bool)
+            found[chosen[np.arange(0, len(chosen), step).astype(int)]] = True
+        return found
+
+    def forms(self) -> ComponentForms:
+        """Those of all cameras."""
+        number = len(COMPONENTS)
+        q, given = np.zeros((self.cameras, number)), np.zeros(self.cameras)
+        for portion, rows in zip(self.portions, self.rows):
+            found = forms_of_portion(self.key, DEFAULTS, *_adjusted(portion, rows))
+            q[portion.cameras], given[portion.cameras] = _without_padding(portion, found)
+        return ComponentForms(q, given)
+
+    def traces(self, wanted: Bool[np.ndarray, " cameras"]) -> ComponentTraces:
+        """Those of some cameras."""
+        number = len(COMPONENTS)
+        T, cubes = (np.zeros((self.cameras, *(number,) * n)) for n in (2, 3))
+        for portion, rows, some in self._wanted(wanted):
+            found = traces_of_portion(self.key, DEFAULTS, *_adjusted(portion, rows), some)
+            T[portion.cameras], cubes[portion.cameras] = _without_padding(portion, found)
+        return ComponentTraces(T, cubes)
+
+    def parts(self, wanted: Bool[np.ndarray, "cameras k"]) -> ComponentParts:
+        """Those of some components of cameras."""
+        number, k = len(COMPONENTS), len(self.key.free)
+        remaining, interior = (np.zeros((self.cameras, number, *n)) for n in ((), (k, k)))
+        pose = np.zeros((self.cameras, number, self.views, POSE))
+        for portion, rows, some in self._wanted(wanted):
+            adjusted = *_adjusted(portion, rows), portion.axes, portion.middle
+            found = parts_of_portion(self.key, DEFAULTS, *adjusted, some)
+            remaining[portion.cameras], interior[portion.cameras], padded = _without_padding(
+                portion, found
+            )
+            of = portion.views.shape[1]
+            # indices on both sides of a slice put the cameras and views in front
+            pose[portion.cameras[:, None], :, portion.views] = padded.swapaxes(1, 2)[:, :of]
+        return ComponentParts(remaining, interior, pose)
+
+    def scatter(self, theta: Float[np.ndarray, "cameras k"]) -> Float[np.ndarray, "cameras k k"]:
+        """The covariances of the forms of all cameras under errors of these sizes."""
+        found = np.zeros((self.cameras, len(COMPONENTS), len(COMPONENTS)))
+        for portion, rows, own in self._wanted(theta):
+            forms = scatter_of_portion(self.key, DEFAULTS, *_adjusted(portion, rows), own)
+            (found[portion.cameras],) = _without_padding(portion, [forms])
+        return found
+
+    def _wanted(self, wanted: Shaped[np.ndarray, "cameras *axes"]) -> Any:
+        """The portions with rows in which something is wanted, and what, filled up with zeros."""
+        for portion, rows in zip(self.portions, self.rows):
+            own = wanted[portion.cameras]
+            if own.any():
+                missing = len(portion.axes) - len(own)
+                yield portion, rows, np.pad(own, [(0, missing), *[(0, 0)] * (own.ndim - 1)])
+
+
+def _adjusted(portion: Portion, rows: Rows) -> tuple[Sightings, CameraUnknowns]:
+    """What was adjusted of a portion, with its weights, and the unknowns found."""
+    weight = np.asarray(portion.seen.weight) * rows["views"][:, :, None]
+    if "removed" in rows:
+        weight = weight * ~rows["removed"]
+    numbers = portion.seen.point, portion.seen.xy, weight
+    seen = Sightings(*(np.asarray(x, float) for x in numbers))
+    return seen, CameraUnknowns(rows["interior"], rows["quaternion"], rows["shift"])
+
+
+def _without_padding(portion: Portion, found: Sequence[Any]) -> list[np.ndarray]:
+    return [np.asarray(x)[: len(portion.cameras)] for x in found]

@@ -1,0 +1,322 @@
+"""Which marker of a wand is which: by their spacing, or of two alike by their rays.
+
+Three markers in a line at the distances a < b from the middle one appear in an image, where the
+depths of the ends are z_a and z_b, at distances of the ratio
+
+    (b/a)·(z_a/z_b)
+
+so that an uneven spacing tells them apart in every image by itself. Two markers, or three at even
+distances, look alike in each image. Of two cameras one of both assignments fulfils coplanarity: all
+pairings are given to a relative orientation with gross errors, half of which are right.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.network.columns import count
+from jaxbundle.network.tables import Camera
+from jaxbundle.orientation import batched
+from jaxbundle.orientation.relative import sampson_distance
+from jaxbundle.tiepoints.verified_pairs import ideal_features
+
+
+class Mark(NamedTuple):
+    """A marker in an image: frame, name of the marker ("": not known), x, y and their σ (pixels;
+    NaN: none of its own)."""
+
+    frame: str
+    marker: str
+    x: float
+    y: float
+    sx: float = np.nan
+    sy: float = np.nan
+
+
+Marks = list[Mark]
+# By frame, its markers.
+ByFrame = dict[str, Marks]
+# Of two frames of one name the assignment: markers in the same order, or the other way round.
+Turns = dict[str, bool]
+
+
+@dataclasses.dataclass(frozen=True)
+class WandSettings:
+    """How markers of a wand without names are told apart.
+
+    **Fields:**
+
+    - `min_ratio`: of the longer to the shorter of the two distances from the middle marker: more
+      than `depth_ratio`, so that no image fits both orders.
+    - `depth_ratio`: of the ends of the wand, by which perspective changes a ratio in the image: a
+      wand of a third of its distance, pointing at the camera, has 1.4.
+    - `max_bend`: distance of the middle marker from the line of the others, relative to their
+      distance; a pixel in 20. Larger: other blobs are taken for markers; smaller: a wand seen from
+      its end is lost.
+    - `min_distance`: of two markers in an image, pixels: nearer ones blur into each other.
+    - `tolerance`: of coplanarity of two rays, pixels, of interior orientations that are somewhat
+      wrong, when two markers are told apart.
+    - `min_agreeing`: part of the frames of two cameras in which exactly one assignment is within
+      the tolerance. By chance, with a wrong relative orientation, few are.
+    """
+
+    min_ratio: float = 1.5
+    depth_ratio: float = 1.4
+    max_bend: float = 0.05
+    min_distance: float = 3.0
+    tolerance: float = 3.0
+    min_agreeing: float = 0.5
+
+
+def name_markers(
+    marks: Mapping[str, Marks],
+    cameras: Mapping[str, Camera],
+    pairs: Mapping[tuple[str, str], float],
+    settings: WandSettings,
+) -> tuple[dict[str, Marks], list[str]]:
+    """The markers of all cameras with names, and what was not used.
+
+    **Raises:** `InputError` if markers without names cannot be told apart."""
+    found, notes = dict(marks), []
+    nameless = [camera for camera, own in marks.items() if own and not own[0].marker]
+    if nameless and len({name for pair in pairs for name in pair}) == 2:
+        return _name_two(found, nameless, cameras, settings)
+    for camera in nameless:
+        found[camera], said = name_three(camera, marks[camera], cameras[camera], pairs, settings)
+        notes += said
+    return found, notes
+
+
+def name_three(
+    camera: str,
+    marks: Marks,
+    interior: Camera,
+    pairs: Mapping[tuple[str, str], float],
+    settings: WandSettings,
+) -> tuple[Marks, list[str]]:
+    """Names of three markers in a line by their distances, in every frame in which exactly three
+    blobs can be such."""
+    names = sorted({name for pair in pairs for name in pair})
+    size = {frozenset(pair): length for pair, length in pairs.items()}
+    if len(names) != 3 or len(size) < 2:
+        raise InputError(
+            f"markers of camera {camera!r} have no names (marker): only two, or three in a line, "
+            "whose distances are given, can be told apart"
+        )
+    # the pair that is not given, or the longest, are the ends
+    others = [frozenset(n for n in names if n != one) for one in names]
+    middle = max(range(3), key=lambda k: size.get(others[k], np.inf))
+    ends = [name for name in names if name != names[middle]]
+    away = [size[frozenset((names[middle], end))] for end in ends]
+    if max(away) < settings.min_ratio * min(away):
+        raise InputError(
+            f"markers of camera {camera!r} have no names (marker), and the middle one is nearly "
+            f"half way between the others ({away[0]:g}, {away[1]:g}): they cannot be told apart"
+        )
+    near, far = ends if away[0] < away[1] else ends[::-1]
+    found: Marks = []
+    seen_ratios: list[float] = []
+    without = ambiguous = 0
+    ratio, depth = max(away) / min(away), settings.depth_ratio
+    for seen in _by_frame(marks).values():
+        uv = np.array([(mark.x, mark.y) for mark in seen])
+        straight = _straight_triples(uv, interior, settings)
+        # Perspective changes the ratio by that of the depths of both ends, to either side.
+        possible = [rows for rows, observed in straight if 1 / depth < observed / ratio < depth]
+        without += not possible
+        ambiguous += len(possible) > 1
+        # For the message where none fits: a wrong length in the table shows in this ratio.
+        seen_ratios += [observed for _, observed in straight]
+        if len(possible) == 1:
+            by = zip((near, names[middle], far), possible[0])
+            found += [seen[k]._replace(marker=name) for name, k in by]
+    if not found:
+        usual = f"; those in a line are at 1 : {np.median(seen_ratios):.1f}" if seen_ratios else ""
+        raise InputError(
+            f"camera {camera!r}: no frame shows three markers in a line whose distances from the "
+            f"middle one are as 1 : {ratio:.2f}{usual}"
+        )
+    said = [
+        f"camera {camera!r}: {count(number, 'frame')} {why} not used"
+        for number, why in (
+            (without, "without three markers in a line at the ratio of the wand"),
+            (ambiguous, "in which several blobs could be the wand"),
+        )
+        if number
+    ]
+    return found, said
+
+
+def _straight_triples(
+    uv: Float[np.ndarray, "n 2"], interior: Camera, settings: WandSettings
+) -> list[tuple[tuple[int, int, int], float]]:
+    """Three blobs in a line, as rows of the near end, the middle and the far end, and the ratio of
+    the distances of far and near end from the middle."""
+    xy, found = ideal_features(interior, uv), []
+    for rows in combinations(range(len(uv)), 3):
+        apart = {pair: np.linalg.norm(uv[pair[0]] - uv[pair[1]]) for pair in combinations(rows, 2)}
+        if min(apart.values()) < settings.min_distance or not np.isfinite(xy[[*rows]]).all():
+            continue
+        # The ends are farthest from each other.
+        near, far = max(apart, key=lambda pair: apart[pair])
+        (middle,) = {*rows} - {near, far}
+        line, a, b = xy[far] - xy[near], xy[middle] - xy[near], xy[middle] - xy[far]
+        bend = abs(line[0] * a[1] - line[1] * a[0]) / (line @ line)
+        # The near end is that beside the middle marker.
+        if np.linalg.norm(a) > np.linalg.norm(b):
+            near, far, a, b = far, near, b, a
+        if bend < settings.max_bend:
+            found.append(((near, middle, far), float(np.linalg.norm(b) / np.linalg.norm(a))))
+    return found
+
+
+def _by_frame(marks: Marks) -> ByFrame:
+    found: ByFrame = {}
+    for mark in marks:
+        found.setdefault(mark.frame, []).append(mark)
+    return found
+
+
+def _name_two(
+    marks: dict[str, Marks],
+    nameless: Sequence[str],
+    cameras: Mapping[str, Camera],
+    settings: WandSettings,
+) -> tuple[dict[str, Marks], list[str]]:
+    """Names A and B of two markers that look alike, the same in all cameras of a frame.
+
+    Which end of the wand is A means nothing; that it is the same end in all cameras does."""
+    # "A", "B" of named cameras in alphabetical order: they come first and decide
+    frames = {
+        camera: {
+            frame: sorted(seen, key=lambda mark: mark.marker)
+            for frame, seen in _by_frame(own).items()
+            if len(seen) == 2
+        }
+        for camera, own in marks.items()
+    }
+    named = {mark.marker for own in marks.values() for mark in own} - {""}
+    names = sorted(named) if len(named) == 2 else ["A", "B"]
+    xy = {
+        camera: {
+            frame: ideal_features(cameras[camera], np.array([(m.x, m.y) for m in seen]))
+            for frame, seen in own.items()
+        }
+        for camera, own in frames.items()
+    }
+    # Rays have c = 1, the tolerance is in pixels.
+    tolerance = {camera: settings.tolerance * _pixel(cameras[camera]) for camera in marks}
+    turns: dict[tuple[str, str], Turns] = {}
+    for one, other in combinations(marks, 2):
+        if one in nameless or other in nameless:
+            limit = max(tolerance[one], tolerance[other])
+            turns[one, other] = _turns_of_pair(xy[one], xy[other], limit, settings)
+        else:
+            turns[one, other] = dict.fromkeys(frames[one].keys() & frames[other].keys(), False)
+    found: dict[str, Marks] = {camera: [] for camera in marks}
+    left = contradicting = 0
+    # Named cameras first: the others follow their names.
+    order = [*(c for c in marks if c not in nameless), *nameless]
+    for frame in dict.fromkeys(frame for own in frames.values() for frame in own):
+        seeing = [camera for camera in order if frame in frames[camera]]
+        turned = _turns_of_frame(frame, seeing, turns)
+        contradicting += turned is None
+        left += turned is not None and len(turned) < len(seeing)
+        for camera, turn in (turned or {}).items():
+            pair = frames[camera][frame][:: -1 if turn else 1]
+            found[camera] += [m._replace(marker=name) for m, name in zip(pair, names)]
+    said = [
+        f"{count(number, 'frame')} {why} not used"
+        for number, why in (
+            (left, "in which the rays of some cameras do not tell the two markers apart, there"),
+            (contradicting, "in which pairs of cameras tell the two markers apart differently"),
+        )
+        if number
+    ]
+    for camera, own in marks.items():
+        number = len(_by_frame(own)) - len(frames[camera])
+        said += [
+            f"camera {camera!r}: {count(number, 'frame')} without two markers not used"
+        ] * bool(number)
+    if not any(found.values()):
+        raise InputError(
+            "the two markers look alike, and the rays of no two cameras tell them apart: expected "
+            "15 or more frames in which two cameras see both, at different places and in different "
+            "directions; or names (marker), or a wand of three markers at uneven distances"
+        )
+    return found, said
+
+
+def _pixel(camera: Camera) -> float:
+    """The size of a pixel in the middle of the image, c = 1."""
+    middle = np.array([(np.array(camera.image_size or (1, 1)) - 1) / 2])
+    return float(np.linalg.norm(np.diff(ideal_features(camera, middle + [[0, 0], [1, 0]]), axis=0)))
+
+
+def _turns_of_pair(
+    one: Mapping[str, Float[np.ndarray, "2 2"]],
+    other: Mapping[str, Float[np.ndarray, "2 2"]],
+    tolerance: float,
+    settings: WandSettings,
+) -> Turns:
+    """Of the common frames of two cameras whose assignment is clear, which it is."""
+    common = [
+        frame for frame in one if frame in other and np.isfinite([one[frame], other[frame]]).all()
+    ]
+    # 5 points determine an orientation and 5 frames have 20 pairings, half of them wrong; with
+    # three times as many a wrong one does not agree by chance
+    if len(common) < 15:
+        return {}
+    a = np.array([one[frame] for frame in common])
+    b = np.array([other[frame] for frame in common])
+    # straight pairings, and crossed ones
+    first, second = np.concatenate([a, a]), np.concatenate([b, b[:, ::-1]])
+    # Mixed, since a search with gross errors may take the first ones for good.
+    mixed = np.random.default_rng(0).permutation(4 * len(common))
+    xy1, xy2 = first.reshape(-1, 2)[mixed], second.reshape(-1, 2)[mixed]
+    M, base, _, _ = batched.orient_pairs([xy1], [xy2], np.array([tolerance]))
+    distances = jax.vmap(sampson_distance, (None, None, 0, 0))
+    off = np.abs(distances(M[0], base[0], first.reshape(-1, 2), second.reshape(-1, 2)))
+    fits = np.asarray((off.reshape(2, -1, 2) < tolerance).all(2))
+    # Both fit where the wand lies in the epipolar plane: nothing tells them apart there.
+    clear = fits[0] != fits[1]
+    if clear.mean() < settings.min_agreeing:
+        return {}
+    return {frame: bool(fits[1, k]) for k, frame in enumerate(common) if clear[k]}
+
+
+def _turns_of_frame(
+    frame: str, cameras: Sequence[str], turns: Mapping[tuple[str, str], Turns]
+) -> dict[str, bool] | None:
+    """Of the cameras of a frame that hang together, which have the other order; None if pairs of
+    them contradict each other."""
+    known: dict[tuple[str, str], bool] = {}
+    for (one, other), of_pair in turns.items():
+        if frame in of_pair:
+            known[one, other] = known[other, one] = of_pair[frame]
+    best: dict[str, bool] = {}
+    for start in cameras:
+        if start in best:
+            continue
+        found, reached = {start: False}, [start]
+        for camera in reached:
+            for other in cameras:
+                if (camera, other) not in known:
+                    continue
+                turn = found[camera] ^ known[camera, other]
+                if other not in found:
+                    found[other] = turn
+                    reached.append(other)
+                # A loop of cameras that does not close: one of its pairs is wrong.
+                elif found[other] != turn:
+                    return None
+        # The largest group stands for the frame; others have no order in common with it.
+        if len(found) > len(best):
+            best = found
+    return best if len(best) > 1 else {}
