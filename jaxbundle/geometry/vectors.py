@@ -34,7 +34,7 @@ def dot(u: Vector, v: Vector) -> Scalar:
     return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
 
 
-def cross(u: Vector, v: Vector) -> Triple:
+def cross(u: Vector | tuple[Scalar, ...], v: Vector | tuple[Scalar, ...]) -> Triple:
     """u × v."""
     return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
 
