@@ -211,8 +211,7 @@ class FirstMinimum:
                 more = find_more(problem, minimum.values, factor)
                 begin = partial(transfer_start_values, before=problem, values=minimum.values)
                 if not more:
-                    check = points, observations
-                    return FoundMinimum(problem, minimum, check, excluded, current)
+                    return FoundMinimum(problem, minimum, (points, observations), excluded, current)
             excluded += more
 
     def _make_problem(self, make: Callable[[], NetworkProblem]) -> NetworkProblem:

@@ -59,7 +59,7 @@ from jaxbundle.leastsquares.quality.error_components import IndependentErrors
 from jaxbundle.leastsquares.quality.sensitivity import pull_back
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.report.layout import estimate, significant, table
-from jaxbundle.results import TableMethods, rows_of
+from jaxbundle.results import TableMethods
 
 
 @print_in_one_screen
@@ -247,10 +247,6 @@ class UncertaintyBudget(TableMethods):
                 "contribution": [float(u) for _, u in parts],
             }
         return {"coverage": self.coverage, "inputs": lines, "measurands": found}
-
-    def single_inputs(self) -> list[dict[str, Any]]:
-        """Every single measurement, one dict each."""
-        return rows_of(self.measurements())
 
     def __str__(self) -> str:
         percent = f"{100 * self.coverage:.4g} %"

@@ -27,7 +27,7 @@ from jaxbundle.batches.normal import ByPoint, CameraUnknowns, Sightings, gram
 from jaxbundle.batches.small_cholesky import backward, cholesky, forward, rows_of
 from jaxbundle.cameras import CameraModel
 from jaxbundle.geometry import quaternion_from_matrix
-from jaxbundle.leastsquares.spaces import cross
+from jaxbundle.geometry.vectors import cross
 
 ByView = Float[Array, " views"]
 # The three elements of a column of H or P, of all views.

@@ -15,7 +15,7 @@ from jaxbundle.certificates.lengths import LengthTest, length_errors, read_lengt
 from jaxbundle.certificates.quantities import find_quantity, offered
 from jaxbundle.certificates.quantities_of_batches import SOLVED
 from jaxbundle.certificates.quantities_of_others import unknown_quantity
-from jaxbundle.certificates.quantity import AXES, QuantityValues, require_parameter
+from jaxbundle.certificates.quantity import AXES, require_parameter
 from jaxbundle.certificates.units import convert, kind_of
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError, NotSolvedError
@@ -233,7 +233,8 @@ def length_test_of(result: Any, lengths: Any, **options: Any) -> LengthTest:
 def _judge(result: Any, test: LengthTest | None, one: Criterion) -> AcceptanceRow:
     try:
         found = find_quantity(result, test, one.name, one.argument)
-        values = _in_unit(found, one.unit)
+        in_unit_of_limit = lambda value: convert(value, found.unit, one.unit, found.pitch)
+        values = {name: in_unit_of_limit(value) for name, value in found.values.items()}
     except InputError as error:
         raise InputError(f"criterion {one.text!r}: {error}") from None
     except (LookupError, NotSolvedError) as error:
@@ -256,11 +257,6 @@ def _judge(result: Any, test: LengthTest | None, one: Criterion) -> AcceptanceRo
     )
 
 
-def _in_unit(found: QuantityValues, unit: str) -> dict[str, float]:
-    """Values in the unit of the limit."""
-    return {name: convert(v, found.unit, unit, found.pitch) for name, v in found.values.items()}
-
-
 def check_criteria(
     texts: Sequence[str] | None,
     command: str,
@@ -281,7 +277,8 @@ def check_criteria(
             if one.name not in known:
                 forms = [quantity.form for quantity in known.values()]
                 raise InputError(unknown_quantity(one.name, forms))
-            cameras = network.cameras if network is not None else _of_models(models)
+            cameras = [Camera("", model) for model in models]
+            cameras = cameras if network is None else network.cameras
             if one.name in OF_UNKNOWNS and command != "pushbroom refine":
                 _check_unknown(one, cameras, network, command)
             known[one.name].check_argument(one.argument)
@@ -289,10 +286,6 @@ def check_criteria(
         except InputError as error:
             raise InputError(f"--accept {one.text!r}: {error}") from None
     return criteria
-
-
-def _of_models(models: Sequence[str]) -> list[Camera]:
-    return [Camera("", model) for model in models]
 
 
 def _check_unknown(

@@ -14,7 +14,6 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from jaxbundle.arguments import show
-from jaxbundle.certificates.units import KINDS
 from jaxbundle.errors import InputError
 from jaxbundle.system.terminals import in_utf8
 
@@ -95,8 +94,3 @@ def read_criteria(texts: Iterable[str] | str) -> list[Criterion]:
         if texts_of.count(text) > 1:
             raise InputError(f"criterion {text!r}: is given twice")
     return found
-
-
-def known_units() -> str:
-    """All units, for messages."""
-    return ", ".join(u for known in KINDS.values() for u in known if u and u.isascii())

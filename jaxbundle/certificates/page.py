@@ -21,6 +21,7 @@ from jaxbundle.certificates.acceptance import HEADER as ACCEPTANCE_HEADER
 from jaxbundle.certificates.details import FIELDS, WANTED
 from jaxbundle.certificates.positional import SUMMARY_HEADER
 from jaxbundle.certificates.units import LENGTHS, convert
+from jaxbundle.io.results.gis import round_down
 from jaxbundle.network.columns import count
 from jaxbundle.report import head, observations
 from jaxbundle.report.correlated import INDEPENDENCE
@@ -69,11 +70,8 @@ def compose_certificate(certificate: "Certificate") -> Iterator[str]:
         *_survey(certificate),
         _statements(certificate),
     ]
-    return write(Page(title, sections, certificate.origin, style=_style()))
-
-
-def _style() -> str:
-    return files("jaxbundle.certificates").joinpath(STYLE).read_text(encoding="utf-8")
+    style = files("jaxbundle.certificates").joinpath(STYLE).read_text(encoding="utf-8")
+    return write(Page(title, sections, certificate.origin, style=style))
 
 
 # --- first screen ---------------------------------------------------------------------------
@@ -198,7 +196,7 @@ def draw_network(adjustment: "Adjustment") -> str:
     roots = [_ellipse_root(one) for one in C]
     largest = max((float(np.linalg.norm(root)) for root in roots), default=0.0)
     # the largest ellipse a twentieth of the network, times a round number
-    factor = _round_down(0.05 * extent / largest) if largest > 0 else 0.0
+    factor = round_down(0.05 * extent / largest) if largest > 0 else 0.0
     turn = np.linspace(0, 2 * np.pi, 33)
     circle = np.stack([np.cos(turn), np.sin(turn)])
     lines = []
@@ -219,12 +217,6 @@ def draw_network(adjustment: "Adjustment") -> str:
 def _ellipse_root(C: Float[np.ndarray, "2 2"]) -> Float[np.ndarray, "2 2"]:
     w, E = np.linalg.eigh(C)
     return E * np.sqrt(np.clip(w, 0, None))
-
-
-def _round_down(x: float) -> float:
-    """1, 2 or 5 times a power of ten, not larger than x."""
-    power = 10.0 ** np.floor(np.log10(x))
-    return float(max(step for step in (1, 2, 5) if step * power <= x * (1 + 1e-9)) * power)
 
 
 # --- results and budgets --------------------------------------------------------------------
@@ -497,13 +489,9 @@ def _statements(certificate: "Certificate") -> Section:
             "Calibrated lengths have no part in the adjustment. Their values are those of the "
             "reference temperature that their calibration states."
         )
+    name = certificate.details.fields.get("approved_by", "")
     signatures = (
         '<div class="signatures"><div>Place and date</div><div>Signature'
-        f"{text(_approved(certificate))}</div></div>\n"
+        f"{text(f', {name}' if name else '')}</div></div>\n"
     )
     return Section("statements", "Statements", items(lines) + signatures, "Statements")
-
-
-def _approved(certificate: "Certificate") -> str:
-    name = certificate.details.fields.get("approved_by", "")
-    return f", {name}" if name else ""

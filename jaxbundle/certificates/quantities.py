@@ -30,6 +30,7 @@ from jaxbundle.certificates.quantity import (
     Quantity,
     QuantityValues,
     Subject,
+    number_of_result,
     one_value,
     refuse_argument,
     require_parameter,
@@ -139,14 +140,6 @@ def _pitch(cameras: Any) -> PixelPitch:
     if len(sizes) == 1 and (size := next(iter(sizes))) is not None and size[0] == size[1]:
         return PixelPitch(float(size[0]))
     return NO_PITCH
-
-
-def _number(function: Callable[[Adjustment], float]) -> Callable[[Subject, str], QuantityValues]:
-    def find(subject: Subject, argument: str) -> QuantityValues:
-        refuse_argument(argument)
-        return one_value(function(subject.result))
-
-    return find
 
 
 def _split(argument: str) -> tuple[str, str, str]:
@@ -270,10 +263,6 @@ def _image_rms(subject: Subject, argument: str) -> QuantityValues:
     return QuantityValues({"": float(np.sqrt(np.mean(v**2)))}, unit, pitch)
 
 
-def _least_redundancy(adjustment: Adjustment) -> float:
-    return float(adjustment.residuals["r"].min())
-
-
 def _differences(subject: Subject) -> tuple[dict[str, np.ndarray], str]:
     adjustment: Adjustment = subject.result
     found = adjustment.table("checks")
@@ -305,10 +294,6 @@ def _check_max(subject: Subject, argument: str) -> QuantityValues:
         },
         unit,
     )
-
-
-def _check_number(adjustment: Adjustment) -> float:
-    return 0 if adjustment.check_points is None else len(adjustment.check_points.id)
 
 
 def _rms(x: np.ndarray) -> float:
@@ -359,17 +344,38 @@ def _chi_squared(adjustment: Adjustment) -> float:
 
 
 OF_ADJUSTMENT: tuple[Quantity, ...] = (
-    Quantity("sigma0", "", "σ0 of the adjustment", _number(lambda a: a.sigma0)),
-    Quantity("redundancy", "", "redundancy of the adjustment", _number(lambda a: a.redundancy)),
-    Quantity("chi2", "", "vᵀPv over the upper limit of its χ² test", _number(_chi_squared)),
+    Quantity("sigma0", "", "σ0 of the adjustment", number_of_result(lambda a: a.sigma0)),
     Quantity(
-        "observations", "", "number of observations", _number(lambda a: a.counts.observations)
+        "redundancy", "", "redundancy of the adjustment", number_of_result(lambda a: a.redundancy)
     ),
-    Quantity("images", "", "number of images", _number(lambda a: len(a.problem.network.images))),
-    Quantity("points", "", "number of points", _number(lambda a: int((~a.problem.excluded).sum()))),
-    Quantity("removed", "", "observations removed as blunders", _number(lambda a: len(a.removed))),
-    Quantity("warnings", "", "number of warnings", _number(lambda a: len(a.warnings))),
-    Quantity("r", "", "smallest redundancy number", _number(_least_redundancy)),
+    Quantity(
+        "chi2", "", "vᵀPv over the upper limit of its χ² test", number_of_result(_chi_squared)
+    ),
+    Quantity(
+        "observations",
+        "",
+        "number of observations",
+        number_of_result(lambda a: a.counts.observations),
+    ),
+    Quantity(
+        "images", "", "number of images", number_of_result(lambda a: len(a.problem.network.images))
+    ),
+    Quantity(
+        "points",
+        "",
+        "number of points",
+        number_of_result(lambda a: int((~a.problem.excluded).sum())),
+    ),
+    Quantity(
+        "removed",
+        "",
+        "observations removed as blunders",
+        number_of_result(lambda a: len(a.removed)),
+    ),
+    Quantity("warnings", "", "number of warnings", number_of_result(lambda a: len(a.warnings))),
+    Quantity(
+        "r", "", "smallest redundancy number", number_of_result(lambda a: a.residuals["r"].min())
+    ),
     Quantity("sigma(NAME)", "of NAME", "σ of an unknown, the largest of several", _sigma),
     Quantity(
         "sigma.rms(NAME)",
@@ -390,7 +396,12 @@ OF_ADJUSTMENT: tuple[Quantity, ...] = (
         _check_rms,
     ),
     Quantity("check.max[(X|Y|Z)]", "length", "largest difference at check points", _check_max),
-    Quantity("check.number", "", "number of check points", _number(_check_number)),
+    Quantity(
+        "check.number",
+        "",
+        "number of check points",
+        number_of_result(lambda a: 0 if a.check_points is None else len(a.check_points.id)),
+    ),
     Quantity("control.rms[(X|Y|Z)]", "length", "RMS residual of control", _control_rms),
     Quantity("LME", "length", "largest length measurement error (--lengths)", _lme),
     Quantity("LME.rms", "length", "RMS of length measurement errors", _lme_rms),
@@ -445,16 +456,6 @@ OF_CALIBRATION: tuple[Quantity, ...] = (
 # --- rigs -----------------------------------------------------------------------------------
 
 
-def _rig_number(
-    function: Callable[[RigCalibration], float],
-) -> Callable[[Subject, str], QuantityValues]:
-    def find(subject: Subject, argument: str) -> QuantityValues:
-        refuse_argument(argument)
-        return one_value(function(subject.result))
-
-    return find
-
-
 def _rig_rms(subject: Subject, argument: str) -> QuantityValues:
     rig: RigCalibration = subject.result
     if argument and argument not in rig.rms:
@@ -494,10 +495,10 @@ def _mountings(rig: RigCalibration, what: str) -> QuantityValues:
 
 
 OF_RIG: tuple[Quantity, ...] = (
-    Quantity("sigma0", "", "σ0 of the common adjustment", _rig_number(lambda r: r.sigma0)),
-    Quantity("redundancy", "", "redundancy of the rig", _rig_number(lambda r: r.redundancy)),
-    Quantity("epochs", "", "epochs used", _rig_number(lambda r: len(r.epochs))),
-    Quantity("left_out", "", "epochs left out", _rig_number(lambda r: len(r.left_out))),
+    Quantity("sigma0", "", "σ0 of the common adjustment", number_of_result(lambda r: r.sigma0)),
+    Quantity("redundancy", "", "redundancy of the rig", number_of_result(lambda r: r.redundancy)),
+    Quantity("epochs", "", "epochs used", number_of_result(lambda r: len(r.epochs))),
+    Quantity("left_out", "", "epochs left out", number_of_result(lambda r: len(r.left_out))),
     Quantity("rms[(CAMERA)]", "px", "RMS of an image point by camera", _rig_rms),
     Quantity(
         "sigma(NAME|CAMERA:NAME|base|rotation)",
@@ -511,23 +512,13 @@ OF_RIG: tuple[Quantity, ...] = (
 # --- reconstruction -------------------------------------------------------------------------
 
 
-def _reconstructed(
-    function: Callable[[Reconstruction], float],
-) -> Callable[[Subject, str], QuantityValues]:
-    def find(subject: Subject, argument: str) -> QuantityValues:
-        refuse_argument(argument)
-        return one_value(function(subject.result))
-
-    return find
-
-
 OF_RECONSTRUCTION: tuple[Quantity, ...] = (
-    Quantity("parts", "", "parts of the reconstruction", _reconstructed(lambda r: len(r.parts))),
-    Quantity("left_out", "", "photographs left out", _reconstructed(lambda r: len(r.left_out))),
+    Quantity("parts", "", "parts of the reconstruction", number_of_result(lambda r: len(r.parts))),
+    Quantity("left_out", "", "photographs left out", number_of_result(lambda r: len(r.left_out))),
     Quantity(
         "misfit",
         "",
         "how many times worse than their σ measurements fit",
-        _reconstructed(lambda r: max((p.misfit for p in r.parts), default=math.nan)),
+        number_of_result(lambda r: max((p.misfit for p in r.parts), default=math.nan)),
     ),
 )

@@ -2,7 +2,7 @@
 its JSON."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from jaxbundle.certificates.quantity import (
     Quantity,
     QuantityValues,
     Subject,
+    number_of_result,
     one_value,
     refuse_argument,
 )
@@ -116,14 +117,6 @@ OF_HAND_EYE: tuple[Quantity, ...] = (
 # --- scanner images -------------------------------------------------------------------------
 
 
-def _refined(function: Callable[[Refinement], float]) -> Callable[[Subject, str], QuantityValues]:
-    def find(subject: Subject, argument: str) -> QuantityValues:
-        refuse_argument(argument)
-        return one_value(function(subject.result))
-
-    return find
-
-
 def _differences(result: Refinement) -> np.ndarray:
     if result.check is None:
         raise LookupError("the result has no check points")
@@ -172,15 +165,16 @@ def _point_sigma(subject: Subject, argument: str) -> QuantityValues:
     return QuantityValues(chosen, METRES)
 
 
-def _check_number(result: Refinement) -> int:
-    return 0 if result.check is None else len(result.check.id)
-
-
 OF_REFINEMENT: tuple[Quantity, ...] = (
-    Quantity("sigma0", "", "σ0 of the adjustment", _refined(lambda r: r.sigma0)),
-    Quantity("redundancy", "", "its redundancy", _refined(lambda r: r.redundancy)),
-    Quantity("removed", "", "observations removed as blunders", _refined(lambda r: len(r.removed))),
-    Quantity("warnings", "", "number of warnings", _refined(lambda r: len(r.warnings))),
+    Quantity("sigma0", "", "σ0 of the adjustment", number_of_result(lambda r: r.sigma0)),
+    Quantity("redundancy", "", "its redundancy", number_of_result(lambda r: r.redundancy)),
+    Quantity(
+        "removed",
+        "",
+        "observations removed as blunders",
+        number_of_result(lambda r: len(r.removed)),
+    ),
+    Quantity("warnings", "", "number of warnings", number_of_result(lambda r: len(r.warnings))),
     Quantity("sigma(X|Y|Z)", "length", "σ of the points, the largest", _point_sigma),
     Quantity(
         "check.rms[(X|Y|Z|H|V)]",
@@ -189,5 +183,10 @@ OF_REFINEMENT: tuple[Quantity, ...] = (
         _check_rms,
     ),
     Quantity("check.max[(X|Y|Z)]", "length", "largest difference at check points", _check_max),
-    Quantity("check.number", "", "number of check points", _refined(_check_number)),
+    Quantity(
+        "check.number",
+        "",
+        "number of check points",
+        number_of_result(lambda r: 0 if r.check is None else len(r.check.id)),
+    ),
 )

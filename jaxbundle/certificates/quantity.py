@@ -77,6 +77,16 @@ def refuse_argument(argument: str) -> None:
         raise InputError(f"it has no argument, but ({argument}) is given")
 
 
+def number_of_result(function: Callable[[Any], float]) -> Callable[[Subject, str], QuantityValues]:
+    """How to find a quantity without an argument: one number, a function of the result."""
+
+    def find(subject: Subject, argument: str) -> QuantityValues:
+        refuse_argument(argument)
+        return one_value(function(subject.result))
+
+    return find
+
+
 def require_parameter(cameras: Any, name: str) -> None:
     """Refuse a name that is no parameter of any of these cameras.
 

@@ -59,7 +59,8 @@ def write_outputs(
         if is_parquet(table):
             write_parquet(table, columns)
         else:
-            write_csv(table, list(columns), map(_plain, table_rows(columns)))
+            empty = lambda x: "" if isinstance(x, float) and np.isnan(x) else x
+            write_csv(table, list(columns), (tuple(map(empty, row)) for row in table_rows(columns)))
     if summary is not None:
         document = found.summary(against)
         if accepted is not None:
@@ -78,8 +79,3 @@ def addition_of(accepted: "Acceptance | None") -> Addition:
 
     finding = Finding("Acceptance", GOOD if accepted.met else BAD, accepted.sentence)
     return NO_ADDITION._replace(findings=(finding,), sections=(acceptance_section(accepted),))
-
-
-def _plain(row: tuple) -> tuple:
-    """Missing values are empty."""
-    return tuple("" if isinstance(x, float) and np.isnan(x) else x for x in row)

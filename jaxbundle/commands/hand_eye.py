@@ -12,6 +12,7 @@ from jaxtyping import Float
 from jaxbundle.adjustment.adjust import adjust
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.calibration import calibrate
+from jaxbundle.calibration.rig.motion import transformation
 from jaxbundle.choices import HAND_EYE
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
@@ -50,7 +51,7 @@ class HandEye(TableMethods):
             raise InputError(f"camera is {name!r}; expected one of {', '.join(labels)}")
         row = 0 if name is None else labels.index(name)
         M = np.asarray(matrix_from_quaternion(table.value.rotation[row]))
-        return _matrix(M.T, table.value.position[row])
+        return transformation(M.T, table.value.position[row])
 
     @property
     def cameras(self) -> list[str]:
@@ -62,7 +63,7 @@ class HandEye(TableMethods):
         """Object space → base (eye in hand: robot–world), or object → hand (eye to hand)."""
         table = self.adjustment.unknowns(TABLES[self.poses.type].frame)
         M = np.asarray(matrix_from_quaternion(table.value.rotation[0]))
-        return _matrix(M, -M @ (table.value.position[0] + self.adjustment.problem.origin))
+        return transformation(M, -M @ (table.value.position[0] + self.adjustment.problem.origin))
 
     def covariance(self, name: str | None = None) -> Float[np.ndarray, "6 6"]:
         """Of the position of the camera (object unit) and a small rotation about the axes of the
@@ -154,12 +155,6 @@ class HandEye(TableMethods):
             f"{other}), do poses and photographs belong together, and are the units and the order "
             "of the rotations those of the robot?"
         ]
-
-
-def _matrix(R: Float[np.ndarray, "3 3"], t: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, t
-    return T
 
 
 def hand_eye(

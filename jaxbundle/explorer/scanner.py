@@ -191,7 +191,7 @@ class FlightView:
                 Number(
                     "attitude_white",
                     "σ of every attitude row",
-                    _degrees(self.flight.noise.attitude_white),
+                    shorten_number(np.degrees(_largest(self.flight.noise.attitude_white))),
                     "°",
                 ),
                 Number(
@@ -274,7 +274,7 @@ class FlightView:
         noise = flight.noise
         for name, unit in (("attitude_white", np.pi / 180), ("position_white", 1.0)):
             # A σ for every axis stays as the file has it until it is changed.
-            if values[name] != _control(self.controls, name).value:
+            if values[name] != next(one.value for one in self.controls if one.key == name):
                 noise = noise._replace(**{name: unit * values[name]})
         names = (
             "position_interpolation",
@@ -712,17 +712,9 @@ def _kernel(values: Mapping[str, Any]) -> Resampling:
     return cast(Resampling, values["resampling"])
 
 
-def _control(controls: list[Control], key: str) -> Control:
-    return next(one for one in controls if one.key == key)
-
-
 def _largest(sigma: Sigma) -> float:
     """A σ of three axes as one number, the largest."""
     return float(np.max(sigma))
-
-
-def _degrees(sigma: Sigma) -> float:
-    return shorten_number(np.degrees(_largest(sigma)))
 
 
 _locate = jax.jit(locate_points)

@@ -22,6 +22,7 @@ CVPR.
 
 from collections.abc import Sequence
 
+from jaxbundle.geometry.vectors import cross
 from jaxbundle.types import Scalar
 
 # Three scalars, and the nine of a matrix by rows.
@@ -52,13 +53,13 @@ def gibbs_vector(A: Rows, B: Rows) -> Triple:
 def compose_gibbs(one: Triple, other: Triple) -> Triple:
     """The Gibbs vector of C(one)·C(other)."""
     over = 1 / (1 - sum(a * b for a, b in zip(one, other)))
-    return tuple((a + b + c) * over for a, b, c in zip(one, other, _cross(one, other)))
+    return tuple((a + b + c) * over for a, b, c in zip(one, other, cross(one, other)))
 
 
 def turn_by_gibbs(h: Triple, x: Triple) -> Triple:
     """C(h)·x = x + 2·(h × x + h × (h × x))/(1 + h·h)."""
-    first = _cross(h, x)
-    second = _cross(h, first)
+    first = cross(h, x)
+    second = cross(h, first)
     scale = 2 / (1 + h[0] * h[0] + h[1] * h[1] + h[2] * h[2])
     return tuple(a + scale * (b + c) for a, b, c in zip(x, first, second))
 
@@ -79,7 +80,3 @@ def turn_back_by_steps(steps: Sequence[Triple], u: Scalar, x: Triple) -> Triple:
         # the inverse of C(h) is C(−h)
         x = turn_by_gibbs(tuple(-weight * c for c in h), x)
     return x
-
-
-def _cross(a: Triple, b: Triple) -> Triple:
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])

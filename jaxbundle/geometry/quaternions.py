@@ -118,7 +118,7 @@ def rotation_vector_from_quaternion(q: Float[AnyArray, "4"]) -> Float[Array, "3"
     small = square < 0.01 * w * w
     w_small = jnp.where(small, w, 1)
     root = jnp.sqrt(jnp.where(small, 1, square))
-    series = _arctangent_series(jnp.where(small, square, 0) / w_small**2) / w_small
+    series = _horner(_ARCTANGENT_SERIES, jnp.where(small, square, 0) / w_small**2) / w_small
     return 2 * jnp.where(small, series, jnp.arctan2(root, w) / root) * u
 
 
@@ -187,8 +187,3 @@ def _sine_over_angle(square: AnyArray) -> Array:
     angle = jnp.sqrt(jnp.where(small, 1, square))
     series = _horner(_SINE_SERIES, jnp.where(small, square, 0))
     return jnp.where(small, series, jnp.sin(angle) / angle)
-
-
-def _arctangent_series(square: AnyArray) -> Array:
-    """(arctan t)/t as a function of t² ≤ 0.01."""
-    return _horner(_ARCTANGENT_SERIES, square)

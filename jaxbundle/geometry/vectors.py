@@ -5,6 +5,8 @@ that unpacks into three components, such as an array of shape [3, …]. XLA fuse
 a batch of products of 3×3 matrices costs several times more.
 """
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 from jaxtyping import Float
 
@@ -34,7 +36,7 @@ def dot(u: Vector, v: Vector) -> Scalar:
     return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
 
 
-def cross(u: Vector, v: Vector) -> Triple:
+def cross(u: Vector | Sequence[Scalar], v: Vector | Sequence[Scalar]) -> Triple:
     """u × v."""
     return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
 

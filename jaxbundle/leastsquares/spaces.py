@@ -26,6 +26,7 @@ from jaxbundle.geometry import (
     retract_quaternion,
 )
 from jaxbundle.geometry.quaternions import small_difference
+from jaxbundle.geometry.vectors import cross
 from jaxbundle.types import AnyArray, Scalar
 
 Change = tuple[Scalar, ...]
@@ -394,8 +395,3 @@ def turn_by(angle: Triple, x: Triple) -> Triple:
     first = cross(angle, x)
     second = cross(angle, first)
     return tuple(a + sine * b + cosine * c for a, b, c in zip(x, first, second))
-
-
-def cross(a: Triple, b: Triple) -> Triple:
-    """The vector product of two triples of scalars."""
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])

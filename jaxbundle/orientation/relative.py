@@ -93,7 +93,7 @@ def relative_orientation(
     M, b = (a.reshape(-1, *a.shape[2:]) for a in jax.vmap(orientations)(E))
     data = (xy1, xy2, jnp.sqrt(p))
     chosen, score = _refine_best(M, b, stop_gradient(data), p)
-    fit = finish(_misclosures, retract, chosen, data, 5)
+    fit = finish(coplanarity_misclosures, retract, chosen, data, 5)
     M, b = fit.estimate
     front = _in_front((M, b), xy1, xy2, p)
     vtpv = stop_gradient(fit.vtpv)
@@ -163,12 +163,12 @@ def _refine_best(
         value = (square / jnp.sum(p) + ROUNDING_VARIANCE) * (1 + 100 * behind)
         return jnp.where(jnp.isfinite(value), value, jnp.inf)
 
-    first = lambda M, b: score((M, b), jnp.sum(_misclosures((M, b), *data) ** 2))
+    first = lambda M, b: score((M, b), jnp.sum(coplanarity_misclosures((M, b), *data) ** 2))
     # Of up to 44 candidates. Of 400 pairs of images with eight points and noise of 1e-3, 3 % ended
     # above the best vᵀPv by more than 1 % with two, 2 % with four, 0.7 % with eight, which cost
     # twice the time; of a nearly flat object 6, 1.5 and 0.5 %.
     _, best = jax.lax.top_k(-jax.vmap(first)(M, b), 4)
-    refine = lambda M, b: minimise(_misclosures, retract, (M, b), data, 5)
+    refine = lambda M, b: minimise(coplanarity_misclosures, retract, (M, b), data, 5)
     refined, squares = jax.vmap(refine)(M[best], b[best])
     scores = jax.vmap(score)(refined, squares)
     k = jnp.argmin(scores)
@@ -182,12 +182,13 @@ def _after(done: Float[AnyArray, "..."], arrays: PyTree) -> PyTree:
     return jax.tree.map(lambda a: a + nothing, arrays)
 
 
-def _misclosures(
+def coplanarity_misclosures(
     pair: Motion,
     xy1: Float[AnyArray, "n 2"],
     xy2: Float[AnyArray, "n 2"],
     sqrt_weight: Float[AnyArray, " n"],
 ) -> Float[AnyArray, " n"]:
+    """Weighted Sampson distances of the points of M and b."""
     M, b = pair
     return sqrt_weight * jax.vmap(sampson_distance, (None, None, 0, 0))(M, b, xy1, xy2)
 

@@ -189,12 +189,22 @@ def simulate_with_truth(  # noqa: PLR0913 (public: a table of options, all but t
         Source("image points"),
         STATED if np.all(sigma_xy) else UNIT,
     )
+    length = np.linalg.norm(points.position[ends[:, 0]] - points.position[ends[:, 1]], axis=1)
     truth = Network(
         cameras=cameras,
-        images=_images(stations, of_station),
+        images=Images(
+            id=tuple(str(i + 1) for i in range(len(stations))),
+            camera=of_station,
+            position=stations.position,
+            angles=stations.angles,
+            sigma=np.full((len(stations), 6), np.nan),
+            source=Source("stations", None, "station"),
+        ),
         points=points,
         observations=observations,
-        distances=_distances(points.position, ends, distance_sigma),
+        distances=Distances(
+            ends, length, np.full(len(ends), float(distance_sigma)), Source("distances")
+        ),
         datum=datum,
         residuals=residuals,
         name=name,
@@ -222,17 +232,6 @@ def _select_imaged(
     return [x[chosen] for x in rays], used
 
 
-def _images(stations: Stations, of_station: Int[np.ndarray, " images"]) -> Images:
-    return Images(
-        id=tuple(str(i + 1) for i in range(len(stations))),
-        camera=of_station,
-        position=stations.position,
-        angles=stations.angles,
-        sigma=np.full((len(stations), 6), np.nan),
-        source=Source("stations", None, "station"),
-    )
-
-
 def _points(
     targets: Float[np.ndarray, "targets 3"],
     role: np.ndarray,
@@ -247,13 +246,6 @@ def _points(
     return Points(
         tuple(map(str, number.tolist())), tuple(role.tolist()), targets[used], sigma, source
     )
-
-
-def _distances(
-    position: Float[np.ndarray, "points 3"], ends: Int[np.ndarray, "n 2"], sigma: float
-) -> Distances:
-    length = np.linalg.norm(position[ends[:, 0]] - position[ends[:, 1]], axis=1)
-    return Distances(ends, length, np.full(len(ends), float(sigma)), Source("distances"))
 
 
 def _measure(

@@ -60,7 +60,13 @@ class Verdict(NamedTuple):
 def judge(adjustment: "Adjustment") -> list[Finding]:
     """The findings of a solved adjustment."""
     return [
-        _fit(adjustment),
+        judge_fit(
+            adjustment.global_test(),
+            chi_squared(adjustment),
+            adjustment.sigma0,
+            adjustment.weights_matter,
+            adjustment.redundancy,
+        ),
         _control(adjustment),
         *_checks(adjustment),
         *_second_minima(adjustment),
@@ -97,16 +103,6 @@ def conclude(
     # those of the command first: they are about its own question
     found = [*findings, *(f for f in judge(adjustment) if f.about not in without)]
     return Verdict(*in_words(found, warnings + len(adjustment.warnings)), tuple(found))
-
-
-def _fit(adjustment: "Adjustment") -> Finding:
-    return judge_fit(
-        adjustment.global_test(),
-        chi_squared(adjustment),
-        adjustment.sigma0,
-        adjustment.weights_matter,
-        adjustment.redundancy,
-    )
 
 
 def judge_fit(

@@ -71,8 +71,9 @@ def start_cameras(
     centred = lambda k: features[k].xy - (size(k) - 1) / 2
     for number in dict.fromkeys(lens):
         own = [c for c in range(len(cameras)) if lens[c] == number]
+        # The unique matches, if they are enough.
         pairs = [
-            _prefer_unique(m, sufficient)
+            m.take(m.unique) if m.unique.sum() >= sufficient else m
             for m in matches
             if {camera_of[k] for k in m.images} <= {*own}
         ]
@@ -175,12 +176,6 @@ def _ideal_matches(
         return list(zip(each[::2], each[1::2]))
 
     return ideal_with
-
-
-def _prefer_unique(matches: FeatureMatches, sufficient: int) -> FeatureMatches:
-    """The unique matches, if they are enough."""
-    use = matches.unique
-    return matches.take(use) if use.sum() >= sufficient else matches
 
 
 def _choose_pairs(

@@ -159,8 +159,7 @@ def count_independent(pairs: Sequence[tuple[int, int]]) -> int:
     if not len(pairs):
         return 0
     photographs, ends = np.unique(np.reshape(pairs, (-1, 2)), return_inverse=True)
-    i, j = ends.reshape(-1, 2).T.tolist()
-    groups = label_connected(len(photographs), list(zip(i, j))).max() + 1
+    groups = label_connected(len(photographs), ends.reshape(-1, 2).tolist()).max() + 1
     return int(len(pairs) - len(photographs) + groups)
 
 

@@ -1,13 +1,13 @@
 """The graph of pairs: which photographs they connect."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from jaxtyping import Int
 
 
 def label_connected(
-    number: int, pairs: Collection[tuple[int, int]]
+    number: int, pairs: Collection[Sequence[int]]
 ) -> Int[np.ndarray, " photographs"]:
     """A label for each of a number of photographs; those connected by pairs, directly or in a
     chain, have the same."""

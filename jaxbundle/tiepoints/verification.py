@@ -33,7 +33,7 @@ from jaxbundle.orientation import (
     ray_of,
 )
 from jaxbundle.orientation.absolute import rotation_between
-from jaxbundle.orientation.relative import retract, sampson_distance
+from jaxbundle.orientation.relative import coplanarity_misclosures, retract
 from jaxbundle.system.programs import quick_jit
 
 # Padded numbers of matches of a pair, and of pairs in one run of a compiled program. 192 matches
@@ -386,18 +386,9 @@ def _refine(
     xy2: Float[Array, "slots 2"],
     weights: Float[Array, " slots"],
 ) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
-    def misclosures(
-        pair: tuple[Float[Array, "3 3"], Float[Array, "3"]],
-        xy1: Float[Array, "slots 2"],
-        xy2: Float[Array, "slots 2"],
-        root: Float[Array, " slots"],
-    ) -> Float[Array, " slots"]:
-        M, b = pair
-        return root * jax.vmap(sampson_distance, (None, None, 0, 0))(M, b, xy1, xy2)
-
     # Five unknowns; eight steps, since from an orientation by five matches few are needed, and the
     # choice of matches, not the last digit, limits the result.
-    (M, b), _ = minimise(misclosures, retract, (M, b), (xy1, xy2, weights), 5, 8)
+    (M, b), _ = minimise(coplanarity_misclosures, retract, (M, b), (xy1, xy2, weights), 5, 8)
     return M, b
 
 

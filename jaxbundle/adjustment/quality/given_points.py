@@ -19,7 +19,7 @@ halves of its points over their covariance were d²/n = 1.76, as two 1.59.
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from jaxbundle.leastsquares.quality.error_components import IMAGE, ErrorComponent
 from jaxbundle.leastsquares.quality.error_effects import residual_change
@@ -46,7 +46,8 @@ def given_points_components(
     import scipy.sparse as sp
 
     X = np.asarray(found.values["point"])
-    given = _held(found) & (np.bincount(point, minlength=len(X)) > 1)
+    held = ~np.asarray(found.problem.table("point").free, bool).any(axis=1)
+    given = held & (np.bincount(point, minlength=len(X)) > 1)
     chosen = np.flatnonzero(given)
     if X.shape[1] != 3 or len(chosen) < min_points:
         return []
@@ -77,11 +78,6 @@ def _scaled(
     """A component whose √θ is the RMS of the effect on an image coordinate."""
     effect = np.asarray(root.power(2).sum(1)).ravel()[rows] * sigma**2
     return ErrorComponent(name, IMAGE, root / np.sqrt(effect.mean()))
-
-
-def _held(found: Solution) -> Bool[np.ndarray, " points"]:
-    """Which points have no free coordinate."""
-    return np.logical_not(np.asarray(found.problem.table("point").free, bool).any(axis=1))
 
 
 def correlation_of_points(

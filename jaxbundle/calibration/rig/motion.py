@@ -36,6 +36,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.network.kinds.fit_hand_eye import nearest_rotation
+
 # Fewest epochs: between three there are two motions, and a motion determines no position along its
 # own axis.
 MIN_MOTION_EPOCHS = 3
@@ -207,12 +209,6 @@ def transformation(R: Float[np.ndarray, "3 3"], t: Float[np.ndarray, "3"]) -> np
     found = np.eye(4)
     found[:3, :3], found[:3, 3] = R, t
     return found
-
-
-def nearest_rotation(M: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    """The rotation nearest to a matrix."""
-    U, _, V = np.linalg.svd(M)
-    return U @ np.diag([1.0, 1.0, np.linalg.det(U @ V)]) @ V
 
 
 def medoid(transformations: Sequence[Float[np.ndarray, "4 4"]]) -> Float[np.ndarray, "4 4"]:

@@ -32,7 +32,7 @@ from jaxbundle.io.cameras.nearest_camera import with_messages
 from jaxbundle.io.cameras.opencv_file import camera_of
 from jaxbundle.io.cameras.spellings import Found
 from jaxbundle.io.text.known_keys import Keys, UnknownKeys
-from jaxbundle.io.text.rows import TextRow, TextRows
+from jaxbundle.io.text.rows import TextRows
 from jaxbundle.network.tables import Camera
 from jaxbundle.system.file_content import beginning
 
@@ -118,10 +118,6 @@ def _sections(path: Path) -> Iterator[tuple[str, Section]]:
         elif not key:
             raise row.error(f"{text[:40]!r} without a key; expected width, camera matrix, …")
         else:
-            section[key] += _numbers(row)
+            section[key] += row.all_numbers("a value").tolist()
     if section:
         yield name, section
-
-
-def _numbers(row: TextRow) -> list[float]:
-    return row.all_numbers("a value").tolist()

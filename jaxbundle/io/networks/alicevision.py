@@ -147,7 +147,8 @@ def read_alicevision(path: str | Path, overrides: Sequence[str] = ()) -> Network
             f"{path}: a scene of AliceVision without poses and image points; expected the result "
             "of its structure from motion"
         )
-    labels = unique_labels([_name(_path(row, id)) for id, row in views.items()], list(views))
+    files = [re.split(r"[\\/]", _path(row, id))[-1] for id, row in views.items()]
+    labels = unique_labels(files, list(views))
     names = dict(zip(views, labels))
     R, X0 = np.full((len(views), 3, 3), np.nan), np.full((len(views), 3), np.nan)
     for k, (id, row) in enumerate(views.items()):
@@ -189,10 +190,6 @@ def read_alicevision(path: str | Path, overrides: Sequence[str] = ()) -> Network
         ),
         (*(told if left else ()), *unknown.messages()),
     )
-
-
-def _name(path: str) -> str:
-    return re.split(r"[\\/]", path)[-1]
 
 
 def _camera(row: JsonFields, id: str, version: tuple[int, ...]) -> dict[str, Any]:

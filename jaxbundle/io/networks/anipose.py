@@ -73,7 +73,11 @@ def read_anipose(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     """
     path = Path(path)
     unknown, document = UnknownKeys(), read_toml(path)
-    tables = {key: value for key, value in document.items() if _is_camera(value)}
+    tables = {
+        key: value
+        for key, value in document.items()
+        if isinstance(value, dict) and "matrix" in value
+    }
     unknown.check((key for key in document if key not in tables), FILE, path)
     if not tables:
         raise InputError(f"{path}: there is no camera; [cam_0] with matrix, … is expected")
@@ -87,10 +91,6 @@ def read_anipose(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     poses = [_pose(one) for one in fields]
     R, t = zip(*poses)
     return rig_network(path, cameras, R, t, overrides, unknown.messages())
-
-
-def _is_camera(value: Any) -> bool:
-    return isinstance(value, dict) and "matrix" in value
 
 
 def _camera(id: str, fields: JsonFields) -> Camera:

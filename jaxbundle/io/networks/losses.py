@@ -59,11 +59,6 @@ def _rows_of(table: str) -> Count:
     return count
 
 
-def _sharing(network: Network) -> int:
-    """Images beyond the first of each camera."""
-    return len(network.images) - len(np.unique(network.images.camera))
-
-
 def _stated_sigmas(network: Network) -> int:
     """Image points with a σ other than 1, which is that of a format without σ."""
     rays = network.observations
@@ -78,7 +73,8 @@ QUANTITIES: Losses = MappingProxyType(
     {
         "interior orientations": lambda n: len(n.cameras),
         "names of cameras": lambda n: len(n.cameras),
-        "that images share a camera": _sharing,
+        # Images beyond the first of each camera.
+        "that images share a camera": lambda n: len(n.images) - len(np.unique(n.images.camera)),
         "image sizes of cameras": lambda n: sum(c.image_size is not None for c in n.cameras),
         "pixel sizes of cameras": lambda n: sum(c.pixel_size is not None for c in n.cameras),
         "prior σ of camera parameters": lambda n: sum(len(c.sigma) for c in n.cameras),

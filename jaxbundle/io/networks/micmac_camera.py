@@ -47,6 +47,7 @@ from jaxbundle.io.networks.losses import check_others_zero, one_focal_length, si
 from jaxbundle.io.networks.micmac_unified import unified_camera
 from jaxbundle.io.text.csv_tables import write_text
 from jaxbundle.io.text.known_keys import Keys, UnknownKeys
+from jaxbundle.io.text.rows import is_number
 from jaxbundle.io.text.xml_fields import XmlFields, number_in, read_xml
 from jaxbundle.network.tables import Camera
 from jaxbundle.system.file_content import beginning
@@ -117,21 +118,13 @@ def calibration(path: Path, root: ET.Element, id: str, pixel_size: float = 0.005
 
 def _check_keys(unknown: UnknownKeys, path: Path, found: ET.Element) -> None:
     unknown.check_element(found, KEYS, f"{path}: {CALIBRATION}")
-    if any(float(e.text or 0) for e in found.iter("ParamAF") if _is_number(e.text)):
+    if any(float(e.text or 0) for e in found.iter("ParamAF") if is_number(e.text or "")):
         raise InputError(f"{path}: ParamAF, an afocal system, is not supported")
     for distortion in found.iter("CalibDistortion"):
         unknown.check_element(distortion, DISTORTION_KEYS, f"{path}: CalibDistortion")
         for tag, keys in KIND_KEYS.items():
             for part in distortion.iter(tag):
                 unknown.check_element(part, keys, f"{path}: {tag}")
-
-
-def _is_number(text: str | None) -> bool:
-    try:
-        float(text or "")
-    except ValueError:
-        return False
-    return True
 
 
 def _calibrated(path: Path, xml: XmlFields, id: str, pixel_size: float) -> Camera:

@@ -39,7 +39,7 @@ from jaxbundle.io.networks.assemble import (
     unique_labels,
 )
 from jaxbundle.io.networks.poses import matrices_of_quaternions
-from jaxbundle.io.text.rows import TextRow, TextRows
+from jaxbundle.io.text.rows import TextRow, TextRows, is_number
 from jaxbundle.network.columns import Columns, count
 from jaxbundle.network.tables import Network, Source
 from jaxbundle.system.file_content import beginning
@@ -77,7 +77,7 @@ def read_nvm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         raise head.error(f"{head.text.strip()[:40]!r}; expected {HEAD}, with quaternions")
     if "FixedK" in head.words:
         fixed = head.words[head.words.index("FixedK") + 1 :]
-        if len(fixed) < 4 or any(float(word) for word in (fixed[1], fixed[3]) if _is_number(word)):
+        if len(fixed) < 4 or any(float(word) for word in (fixed[1], fixed[3]) if is_number(word)):
             raise head.error(
                 "FixedK, a calibration with a principal point of its own, is not read; expected "
                 "a model without it"
@@ -93,14 +93,6 @@ def read_nvm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     model = max(models, key=lambda model: (len(model.points), len(model.cameras)))
     told = [f"the largest of {len(models)} models is read"] if len(models) > 1 else []
     return _network(path, model, overrides, told)
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def _network(path: Path, model: _Model, overrides: Sequence[str], told: Sequence[str]) -> Network:

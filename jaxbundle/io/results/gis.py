@@ -207,7 +207,7 @@ def _ellipses(
     axes = np.sqrt(np.clip(w, 0, None))
     if factor is None:
         extent = float(np.ptp(place[known][:, :2], axis=0).max()) or 1.0
-        factor = _round_down(0.02 * extent / float(axes.max()))
+        factor = round_down(0.02 * extent / float(axes.max()))
     factor = positive("factor", factor)
     turn = 2 * np.pi * np.arange(CORNERS) / CORNERS
     circle = np.stack([np.cos(turn), np.sin(turn)])
@@ -228,7 +228,8 @@ def _ellipses(
         )
 
 
-def _round_down(x: float) -> float:
+def round_down(x: float) -> float:
+    """1, 2 or 5 times a power of ten, not larger than x."""
     power = 10.0 ** np.floor(np.log10(x))
     return float(max(step for step in (1, 2, 5) if step * power <= x * (1 + 1e-9)) * power)
 

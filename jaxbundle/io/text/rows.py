@@ -24,6 +24,15 @@ END_OF_LINE = " nan\n"
 BLANKS = "; blanks separate columns, so that no name may have one"
 
 
+def is_number(word: str) -> bool:
+    """Whether a word is a number, also one that is not finite."""
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
 def join_numbers(values: Iterable[float], separator: str = " ") -> str:
     """Numbers as text that reads back to the last bit (`repr` is the shortest such text)."""
     return separator.join(repr(float(value)) for value in values)

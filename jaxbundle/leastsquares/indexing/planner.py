@@ -280,9 +280,8 @@ class _Planner:
         of_all[used] = place
         cuts = np.cumsum([len(parts[k].used) for k, _ in touches])[:-1]
         for (k, t), of_part in zip(touches, np.split(of_all, cuts)):
-            p = parts[k]
-            index = as_index(of_part.reshape(-1, p.length), p.along, along, length)
-            p.set("touches", t, incidence=index)
+            place = of_part.reshape(-1, parts[k].length)
+            parts[k].set("touches", t, incidence=as_index(place, parts[k].along, along, length))
 
     def find_blocks(
         self, parts: list[_PartInChunks], incidences: dict[str, _IncidencesInChunks]

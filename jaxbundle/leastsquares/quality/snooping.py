@@ -149,8 +149,11 @@ def snoop(
         again = lambda problem, values: readjust(problem, values, adjust_from)
         solution = _solve(full_problem, removed, excluded, solution.values, again)
     if doubtful:
+        # The tests of those that were doubtful from the beginning.
         unit = solution.sigma0 if test == "pope" and solution.sigma0 > 0 else 1.0
-        removed = list(_with_tests(full_problem, solution, touched, removed, unit))
+        tested = _test_removed(full_problem, solution, touched, removed)
+        of_unknown = lambda r, tests: r.test if np.isfinite(r.test) else max(tests) / unit
+        removed = [dataclasses.replace(r, test=of_unknown(r, tests)) for r, tests in tested]
     if removed:
         solution = _solve(full_problem, removed, excluded, solution.values, adjust_from)
     return solution, removed
@@ -343,18 +346,6 @@ def _passing(
         for row, test in zip(r.rows, tests)
         if test < critical
     }
-
-
-def _with_tests(
-    full_problem: Problem,
-    solution: Solution,
-    touched: _TouchedRows,
-    removed: Sequence[RemovedRow],
-    unit: float,
-) -> Iterable[RemovedRow]:
-    """What was removed, with the tests of initially doubtful observations, in `unit`."""
-    for r, tests in _test_removed(full_problem, solution, touched, removed):
-        yield r if np.isfinite(r.test) else dataclasses.replace(r, test=max(tests) / unit)
 
 
 def _test_removed(

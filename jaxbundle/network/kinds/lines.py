@@ -25,9 +25,10 @@ from jaxbundle import cameras
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import quaternion_from_matrix
 from jaxbundle.geometry.rotations import matrix_from_omega_phi_kappa
+from jaxbundle.geometry.vectors import cross
 from jaxbundle.leastsquares.datum.motions import move_pose
 from jaxbundle.leastsquares.declarations import Kind, Table
-from jaxbundle.leastsquares.spaces import Change, Frame, Posed, PoseValue, cross
+from jaxbundle.leastsquares.spaces import Change, Frame, Posed, PoseValue
 from jaxbundle.network.camera_tables import camera_tables, start_of
 from jaxbundle.network.columns import Columns
 from jaxbundle.network.kinds.base import Contribution, Further, positive_sigma, rows_of

@@ -70,7 +70,8 @@ def encode_values(values: np.ndarray, exact: bool = False) -> dict[str, Any]:
 def _pack(values: np.ndarray, exact: bool = False) -> dict[str, Any]:
     if values.dtype.kind in "iu":
         low, high = (int(of(initial=0)) for of in (values.min, values.max))
-        kind = next((k for k in INTEGERS if _holds(k, low, high)), "<f8")
+        ranges = ((k, np.iinfo(k)) for k in INTEGERS)
+        kind = next((k for k, of in ranges if of.min <= low and high <= of.max), "<f8")
     else:
         kind = "<f8" if exact else "<f4"
     # the page decodes little-endian bytes, whatever this machine has
@@ -78,10 +79,6 @@ def _pack(values: np.ndarray, exact: bool = False) -> dict[str, Any]:
     if len(packed) > 1 and np.isfinite(packed[0]) and (packed == packed[0]).all():
         return {"type": kind[1:], "same": packed[0].item()}
     return {"type": kind[1:], "data": base64.b64encode(packed.tobytes()).decode("ascii")}
-
-
-def _holds(kind: str, low: int, high: int) -> bool:
-    return np.iinfo(kind).min <= low and high <= np.iinfo(kind).max
 
 
 def script_text(value: Any) -> str:
