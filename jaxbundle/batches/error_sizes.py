@@ -12,16 +12,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbundle.adjustment.quality.correlated_errors import DEFAULTS, CorrelationSettings
-from jaxbundle.batches.correlated import (
-    COMPONENTS,
-    FIELD,
-    GIVEN,
-    SUMS,
-    TRACKS,
-    ComponentForms,
-    ComponentParts,
-    ComponentTraces,
-)
+from jaxbundle.batches.correlated import ComponentForms, ComponentParts
+from jaxbundle.batches.error_spans import COMPONENTS, FIELD, GIVEN, TRACKS
+from jaxbundle.batches.error_traces import SUMS, ComponentTraces
 from jaxbundle.leastsquares.quality.estimated_sizes import SizeEquations, widening, widenings
 from jaxbundle.leastsquares.quality.size_traces import with_traces
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 from jaxbundle.arguments import show as quoted
 from jaxbundle.batches.camera import CONVERGED, SOLVED, STATUS
-from jaxbundle.batches.correlated import COMPONENTS
+from jaxbundle.batches.error_spans import COMPONENTS
 from jaxbundle.batches.population import Population
 from jaxbundle.cameras import CameraModel
 from jaxbundle.display import print_in_one_screen

@@ -14,16 +14,15 @@ from jaxbundle.adjustment.quality.correlated_errors import DEFAULTS
 from jaxbundle.batches.camera import CONVERGED
 from jaxbundle.batches.compiled import ProgramKey, Rows
 from jaxbundle.batches.correlated import (
-    COMPONENTS,
-    SUMS,
     ComponentForms,
     ComponentParts,
-    ComponentTraces,
     forms_of_portion,
     parts_of_portion,
     scatter_of_portion,
     traces_of_portion,
 )
+from jaxbundle.batches.error_spans import COMPONENTS
+from jaxbundle.batches.error_traces import SUMS, ComponentTraces
 from jaxbundle.batches.input import Portion
 from jaxbundle.batches.normal import POSE, CameraUnknowns, Sightings
 
