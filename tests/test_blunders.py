@@ -116,6 +116,30 @@ def test_what_agrees_comes_back(network):
     assert len(back & set(wrong)) <= 0.05 * len(wrong)
 
 
+def test_what_nothing_is_left_to_test_has_no_test(network):
+    """Rays that were suspected from the beginning: a good one among bad ones comes back, a bad one
+    keeps the test that removes it, all of a point stay out, untested."""
+    rays, ids = network.observations, (network.images.id, network.points.id)
+    of_point = np.flatnonzero(rays.point == 62)
+    good, bad = np.flatnonzero(rays.point == 30)[0], np.flatnonzero(rays.point == 31)[0]
+    xy = rays.xy.copy()
+    xy[bad] += 40 * SIGMA
+    spoilt = network.replace(observations=dataclasses.replace(rays, xy=xy))
+    suspects = [(ids[0][rays.image[k]], ids[1][rays.point[k]]) for k in (*of_point, good, bad)]
+    found = adjust(spoilt, snooping="pope", doubtful=suspects)
+    removed = rows_of(found.removed, network)
+    assert removed[of_point].all() and removed[bad] and not removed[good]
+    test = {r.name: r.test for r in found.removed}
+    untested = [name for name, value in test.items() if np.isnan(value)]
+    assert len(untested) == len(of_point) and all("point " + ids[1][62] in n for n in untested)
+    (of_bad,) = (value for name, value in test.items() if "point " + ids[1][31] + " " in name)
+    # 40 σ in both coordinates, √(1 + h) at most √2 as uncertain as predicted.
+    assert 20 < of_bad < 41 * np.sqrt(2) and found.sigma0 < 1.1
+    assert "nothing tests it again" in " ".join(found.report().split())
+    told = [entry["test"] for entry in found.to_dict()["removed"]]
+    assert told.count(None) == len(of_point)
+
+
 def test_predicted_test_of_an_observation(network):
     """v/√(1 + h) against the residual and its covariance, both from the formula of the camera."""
     problem = jaxbundle.make_problem(jaxbundle.check_network(network))

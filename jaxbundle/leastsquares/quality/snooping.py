@@ -125,8 +125,7 @@ def snoop(
         solution = _solve(full_problem, removed, excluded, solution.values, adjust_from)
     # τ has f − 1 degrees of freedom.
     while solution.problem.counts.redundancy >= 2:
-        # Exact data have σ0 = 0, and residuals of rounding that no test may be scaled by.
-        unit = solution.sigma0 if test == "pope" and solution.sigma0 > 0 else 1.0
+        unit = _unit_of_tests(solution, test)
         counts = solution.problem.counts
         critical = critical_w(
             test, significance, touched.tested(solution.problem), counts.redundancy, solution.sigma0
@@ -150,13 +149,19 @@ def snoop(
         solution = _solve(full_problem, removed, excluded, solution.values, again)
     if doubtful:
         # The tests of those that were doubtful from the beginning.
-        unit = solution.sigma0 if test == "pope" and solution.sigma0 > 0 else 1.0
+        unit = _unit_of_tests(solution, test)
         tested = _test_removed(full_problem, solution, touched, removed)
         of_unknown = lambda r, tests: r.test if np.isfinite(r.test) else max(tests) / unit
         removed = [dataclasses.replace(r, test=of_unknown(r, tests)) for r, tests in tested]
     if removed:
         solution = _solve(full_problem, removed, excluded, solution.values, adjust_from)
     return solution, removed
+
+
+def _unit_of_tests(solution: Solution, test: str) -> float:
+    """What normalised residuals w are divided by to give the values of a test."""
+    # Exact data have σ0 = 0, and residuals of rounding that no test may be scaled by.
+    return solution.sigma0 if test == "pope" and solution.sigma0 > 0 else 1.0
 
 
 def _solve(
