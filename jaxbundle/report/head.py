@@ -107,7 +107,7 @@ def first_facts(
     said = [f"{left_out}: see Notes, and left_out in the JSON"] if left_out else []
     if removed := adjustment.removed:
         words = count(sum(len(item.rows) for item in removed), "observation")
-        said.append(f"{words} removed: see Data snooping, and removed in the JSON")
+        said.append(f'{words} by data snooping: see there, and "removed" in the JSON')
     return [*rows, ("Left out", "; ".join(said))] if said else rows
 
 
