@@ -74,7 +74,7 @@ def _in_parts(
     latitude: Float[np.ndarray, "*#shape"],
     together: int = 1 << 18,
 ) -> Float[np.ndarray, "*shape"]:
-    """A function of points, about so many at once: interpolation has a dozen arrays of their
+    """A function of points, about as many `together`: interpolation has a dozen arrays of their
     number, for 2¹⁸ points 25 MB."""
     shape = np.broadcast_shapes(longitude.shape, latitude.shape)
     out = np.empty(shape)
