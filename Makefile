@@ -65,7 +65,7 @@ stubs:
 	$(BIN)/python tests/stubs.py
 
 test: CASES = -m 'not further'
-test-further: CASES = -m further -x
+test-further: CASES = -m further --maxfail 20
 test test-further test-all: install
 	$(BIN)/python -m ruff check jaxbundle tests benchmarks docs
 	$(BIN)/python -m ruff format --check --quiet jaxbundle
