@@ -2,15 +2,16 @@
 what of them is near a point."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxbundle.errors import InputError
+from jaxbundle.geometry.surfaces import squared_distances_to_triangles
 from jaxbundle.system.file_content import check_plain
 from jaxbundle.system.foreign_parsers import foreign_parser
 from jaxbundle.system.rasters import read_heights
@@ -171,6 +172,45 @@ def _read_grid(path: str, _: int) -> TerrainGrid:
     return TerrainGrid(found.heights, found.origin, found.step)
 
 
+def surface_near(
+    surface: Mapping[str, Any], X: Float[np.ndarray, "points 3"], origin: Float[np.ndarray, "3"]
+) -> tuple[tuple[np.ndarray, ...], Bool[np.ndarray, " points"]]:
+    """What `jaxbundle.geometry.surfaces` needs of a surface to give the distances of points that
+    stay near X, a row for each, in coordinates from an origin; and which of them are outside of it,
+    or over a void.
+
+    The surface is `{plane, normal}`, `{mesh}` or `{dem}`: a mesh and a grid as files or arrays."""
+    nowhere = np.zeros(len(X), bool)
+    if "plane" in surface:
+        normal = np.array(surface["normal"], float) / np.linalg.norm(surface["normal"])
+        place = np.array(surface["plane"], float) - origin
+        return (np.tile(place, (len(X), 1)), np.tile(normal, (len(X), 1))), nowhere
+    if "mesh" in surface:
+        mesh = surface["mesh"]
+        mesh = read_mesh(mesh) if isinstance(mesh, str) else Mesh(*map(np.asarray, mesh))
+        return (triangles_near(mesh, X) - origin,), nowhere
+    grid = surface["dem"]
+    grid = read_grid(grid) if isinstance(grid, str) else TerrainGrid(*grid)
+    heights, first = heights_near(grid, X)
+    middle = heights.shape[1] // 2
+    cells = heights[:, middle - 1 : middle + 1, middle - 1 : middle + 1]
+    void = ~np.isfinite(cells).all((1, 2))
+    # Beyond a void or an edge the surface goes on level. A point over a void has no mean.
+    near = np.nanmean(np.where(void[:, None, None], 0.0, heights), (1, 2), keepdims=True)
+    heights = np.where(np.isfinite(heights), heights, near) - origin[2]
+    return (heights, first - origin[:2], np.tile(np.array(grid.step, float), (len(X), 1))), void
+
+
+def have_common_point(places: Sequence, normals: Sequence) -> bool:
+    """Whether planes, each through a place and with a normal, meet in a point."""
+    p, n = np.array(places, float), np.array(normals, float)
+    offset = (n * p).sum(1)
+    misclosure = n @ np.linalg.lstsq(n, offset)[0] - offset
+    # 1e-9: rounding of printed places
+    limit = 1e-9 * np.linalg.norm(n, axis=1).max() * np.abs(p).max(initial=1)
+    return bool(np.abs(misclosure).max() <= limit)
+
+
 def triangles_near(
     mesh: Mesh, X: Float[np.ndarray, "points 3"]
 ) -> Float[np.ndarray, "points candidates 3 3"]:
@@ -182,26 +222,10 @@ def triangles_near(
     for P in X:
         bound = np.linalg.norm(middle - P, axis=1) - reach
         some = np.argpartition(bound, min(BOUNDED, len(bound)) - 1)[:BOUNDED]
-        near = some[np.argsort(distances_to_triangles(P, corners[some]))[:CANDIDATES]]
+        near = some[np.argsort(squared_distances_to_triangles(P, corners[some], np))[:CANDIDATES]]
         # A small mesh: the last one again.
         chosen.append(np.resize(near, CANDIDATES) if len(near) < CANDIDATES else near)
     return corners[np.array(chosen, int)]
-
-
-def distances_to_triangles(
-    P: Float[np.ndarray, "3"], corners: Float[np.ndarray, "k 3 3"]
-) -> Float[np.ndarray, " k"]:
-    """The distances of a point from triangles."""
-    p, q = corners, np.roll(corners, -1, 1)
-    side, away = q - p, P - p
-    normal = np.cross(side[:, 0], side[:, 1])
-    size = np.linalg.norm(normal, axis=1)
-    inside = ((np.cross(side, away) * normal[:, None]).sum(2) >= 0).all(1) & (size > 0)
-    length = (side * side).sum(2)
-    t = np.clip((away * side).sum(2) / np.where(length > 0, length, 1.0), 0, 1)
-    edges = np.linalg.norm(away - t[..., None] * side, axis=2).min(1)
-    off = np.abs((away[:, 0] * normal).sum(1)) / np.where(size > 0, size, 1.0)
-    return np.where(inside, off, edges)
 
 
 def heights_near(

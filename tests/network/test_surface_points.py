@@ -11,10 +11,13 @@ from further_checks import check_jacobians, sample
 
 import jaxbundle
 from jaxbundle.errors import InputError
-from jaxbundle.network.kinds.surface_points import above_grid, on_mesh
+from jaxbundle.geometry.surfaces import (
+    distance_to_nearest_triangle,
+    height_above_grid,
+    squared_distances_to_triangles,
+)
 from jaxbundle.network.surface_models import (
     TerrainGrid,
-    distances_to_triangles,
     heights_near,
     read_grid,
     read_mesh,
@@ -134,14 +137,15 @@ def test_the_nearest_triangle_by_brute_force():
     w = random.dirichlet([0.5, 0.5, 0.5], 20000)
     for P in random.normal(size=(8, 3)):
         sampled = np.linalg.norm(np.einsum("nk,mkd->mnd", w, corners) - P, axis=2).min(1)
-        found = distances_to_triangles(P, corners)
+        found = np.sqrt(squared_distances_to_triangles(P, corners, np))
         assert (found <= sampled + 1e-12).all() and np.abs(found - sampled).max() < 0.05
     vertices, triangles = bumpy()
     for P in random.uniform(-1, 1, (10, 3)):
         (near,) = triangles_near(read_mesh_of(vertices, triangles), P[None])
-        every = distances_to_triangles(P, vertices[triangles])
-        assert distances_to_triangles(P, near).min() == pytest.approx(every.min())
-        signed = float(on_mesh(jnp.asarray(P), (jnp.zeros(()), jnp.asarray(near))))
+        every = np.sqrt(squared_distances_to_triangles(P, vertices[triangles]))
+        nearest = squared_distances_to_triangles(P, near).min()
+        assert nearest == pytest.approx(every.min() ** 2)
+        signed = float(distance_to_nearest_triangle(jnp.asarray(P), jnp.asarray(near)))
         # the plane of a triangle is no farther than the triangle
         assert abs(signed) <= every.min() + 1e-12
 
@@ -164,9 +168,9 @@ def test_heights_are_bilinear():
         h = heights[r : r + 2, c : c + 2]
         expected = (1 - y) * ((1 - x) * h[0, 0] + x * h[0, 1])
         expected += y * ((1 - x) * h[1, 0] + x * h[1, 1])
-        given = tuple(map(jnp.asarray, (np.zeros(()), np.nan_to_num(part), at, step)))
-        assert float(above_grid(jnp.asarray(P), given)) == pytest.approx(-expected, abs=1e-12)
-        slope = jax.grad(above_grid)(jnp.asarray(P), given)
+        given = tuple(map(jnp.asarray, (P, np.nan_to_num(part), at, step)))
+        assert float(height_above_grid(*given)) == pytest.approx(-expected, abs=1e-12)
+        slope = jax.grad(height_above_grid)(*given)
         assert slope[2] == 1 and np.isfinite(slope).all()
 
 

@@ -34,7 +34,6 @@ from jaxbundle.network.kinds.base import (
 from jaxbundle.network.tables import Network
 from jaxbundle.network.units import ANGLE_UNITS
 
-SECTION = "tilt"
 CAMERA_AXES = {"right": (1.0, 0.0, 0.0), "up": (0.0, 1.0, 0.0), "view": (0.0, 0.0, -1.0)}
 AXES = tuple(CAMERA_AXES)
 ZEROS = tuple(f"zero {axis}" for axis in AXES)
@@ -63,21 +62,20 @@ class Tilts(Further):
     elevation: Float[np.ndarray, "n 3"]
     sigma: Float[np.ndarray, "n 3"]
 
-    TABLE, SECTION, IMAGES = "tilts", SECTION, ("image",)
+    TABLE, SECTION, IMAGES = "tilts", "tilt", ("image",)
     MEASURED = "elevation"
     ANGLES_IN_SETTINGS = True
 
     @classmethod
     def from_columns(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Tilts":
         table.check_names(("image",), (*AXES, *(f"s{axis}" for axis in AXES)))
-        check_settings(SECTION, settings, ("free", "sigma"))
-        Parameters.from_settings(SECTION, settings, AXES)
+        check_settings(cls.SECTION, settings, ("free", "sigma"))
+        Parameters.from_settings(cls.SECTION, settings, AXES)
         read = np.stack([table.numbers(axis) for axis in AXES], 1) * radians
         sigma = np.stack([positive_sigma(table, f"s{a}", required=False) for a in AXES], 1)
         for row, k in np.argwhere(np.isnan(read) != np.isnan(sigma))[:1]:
-            raise InputError(
-                f"{table.source(row)}: expected {AXES[k]} and s{AXES[k]}, got one of them"
-            )
+            both = f"{AXES[k]} and s{AXES[k]}"
+            raise InputError(f"{table.source(row)}: expected {both}, got one of them")
         for row in np.flatnonzero(np.isnan(read).all(1))[:1]:
             raise InputError(f"{table.source(row)}: nothing was read: expected {', '.join(AXES)}")
         for row, k in np.argwhere(np.abs(read) > STEEPEST)[:1]:
@@ -96,9 +94,9 @@ class Tilts(Further):
     def columns(self, radians: float) -> dict:
         gone = np.isinf(self.sigma)
         read, sigma = (np.where(gone, np.nan, x / radians) for x in (self.elevation, self.sigma))
-        columns: dict = {"image": self.image}
-        columns |= {axis: read[:, k] for k, axis in enumerate(AXES)}
-        return columns | {f"s{axis}": sigma[:, k] for k, axis in enumerate(AXES)}
+        columns = {axis: read[:, k] for k, axis in enumerate(AXES)}
+        columns |= {f"s{axis}": sigma[:, k] for k, axis in enumerate(AXES)}
+        return {"image": self.image} | columns
 
     def number_of_equations(self) -> int:
         return 2
@@ -106,9 +104,9 @@ class Tilts(Further):
     def declare(self, network: Network, origin: Float[np.ndarray, "3"]) -> Contribution:
         image = rows_of(self.image, network.images)
         camera, of_camera = np.unique(network.images.camera[image], return_inverse=True)
-        parameters = Parameters.from_settings(SECTION, self.settings, AXES)
-        radians = ANGLE_UNITS[network.angle_unit]
-        scaled = {name: radians * sigma for name, sigma in parameters.sigma.items()}
+        parameters = Parameters.from_settings(self.SECTION, self.settings, AXES)
+        unit = ANGLE_UNITS[network.angle_unit]
+        radians = {name: unit * sigma for name, sigma in parameters.sigma.items()}
         zero = Table(
             "clinometer",
             np.zeros((len(camera), 3)),
@@ -118,6 +116,6 @@ class Tilts(Further):
             ZEROS,
             "zero error of the clinometer of camera",
         )
-        priors = dataclasses.replace(parameters, sigma=scaled).priors(zero, AXES, "angle")
+        priors = dataclasses.replace(parameters, sigma=radians).priors(zero, AXES, "angle")
         seen = TILT((image, of_camera), self.elevation, sigma=self.sigma)
         return Contribution((zero,), (seen, *priors))
