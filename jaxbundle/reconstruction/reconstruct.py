@@ -221,8 +221,15 @@ class _ReconstructionRun:
             settings.candidates,
         )
         self.store.drop_unused()
-        # Before marks: all matches of a duplicate are at the same pixels, too.
         sizes = [p.size for p in self.photographs]
+        compared = {m.images for m in matches}
+        # Before duplicates: a background that is always the same would be taken for them.
+        matches, marked = without_marks(matches, features, sizes, settings.marks)
+        if marked:
+            self.notes.append(
+                f"matches at the same pixels of {marked} photographs are not used: a date, a name, "
+                "dirt on the sensor, or the background of an object that turns"
+            )
         duplicates = find_duplicates(matches, features, sizes, settings.duplicates)
         for k, (other, still, number) in duplicates.items():
             self.left_out.setdefault(
@@ -232,13 +239,7 @@ class _ReconstructionRun:
             )
         self._require_two()
         matches = [m for m in matches if not {*m.images} & duplicates.keys()]
-        self.matched_pairs = {m.images for m in matches}
-        matches, marked = without_marks(matches, features, sizes, settings.marks)
-        if marked:
-            self.notes.append(
-                f"matches of marks at the same pixels of {marked} photographs (a date, a name, "
-                "dirt on the sensor) are not used"
-            )
+        self.matched_pairs = {pair for pair in compared if not {*pair} & duplicates.keys()}
         return features, matches
 
     def _match_named(self) -> tuple[list[Features], list[FeatureMatches]]:

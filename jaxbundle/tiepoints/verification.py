@@ -222,7 +222,7 @@ def _orient_by_rows(
         poses = _improve(poses, rows, xy1, xy2, factor * tolerance, settings.min_matches)
     agreed = {}
     for k, (M, b) in poses.items():
-        good = _agree(M, b, xy1[k], xy2[k], tolerance[k])
+        good = agreeing_matches(M, b, xy1[k], xy2[k], tolerance[k])
         use = rows[k][good[rows[k]]]
         enough = len(use) >= max(settings.min_matches, settings.min_share * len(rows[k]))
         # The smaller eigenvalue of the covariance is the variance across a line.
@@ -276,7 +276,7 @@ def _triad(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]) -> Float[np.nda
     return None if length < 1e-3 else np.stack([a, normal / length, np.cross(a, normal / length)])
 
 
-def _agree(
+def agreeing_matches(
     M: Float[np.ndarray, "3 3"],
     b: Float[np.ndarray, "3"],
     xy1: Float[np.ndarray, "n 2"],
@@ -322,7 +322,7 @@ def _improve(
     keys, rows = [], []
     for k, (M, b) in poses.items():
         chosen = candidates[k]
-        good = chosen[_agree(M, b, xy1[k][chosen], xy2[k][chosen], tolerance[k])]
+        good = chosen[agreeing_matches(M, b, xy1[k][chosen], xy2[k][chosen], tolerance[k])]
         if len(good) >= least:
             keys.append(k)
             rows.append(good[batched.spread(len(good), MATCH_SLOTS)])

@@ -530,9 +530,8 @@ def test_what_is_in_a_photograph_twice_matches_nothing():
     assert set(range(20, 60)) <= set(rows[:, 0].tolist()) and len(rows) <= 42
 
 
-def test_marks_at_the_same_pixels_of_photographs_match_nothing(cloud):
-    rng, X, views = cloud
-    marks = rng.uniform([900, 800], [1100, 860], (30, 2))
+def with_marks(X, views, marks, rng):
+    """Features of photographs of an object with marks at the same pixels; all matches of them."""
     size = np.full(len(X) + len(marks), 8.0)
     photographs = [
         Features(np.r_[pixels(seen(X, *view), rng), marks + 0.1 * rng.normal(size=marks.shape)],
@@ -541,8 +540,15 @@ def test_marks_at_the_same_pixels_of_photographs_match_nothing(cloud):
     ]  # fmt: skip
     rows = np.tile(np.arange(len(size))[:, None], 2)
     distance_ratio, single = np.full(len(rows), 0.5), np.ones(len(rows), bool)
-    pair = lambda i, j: FeatureMatches((i, j), rows, distance_ratio, single)
-    matches = [pair(i, j) for i in range(5) for j in range(i)]
+    pairs = ((i, j) for i in range(len(views)) for j in range(i))
+    return photographs, [FeatureMatches(pair, rows, distance_ratio, single) for pair in pairs]
+
+
+def test_marks_at_the_same_pixels_of_photographs_match_nothing(cloud):
+    rng, X, views = cloud
+    marks = rng.uniform([900, 800], [1100, 860], (30, 2))
+    photographs, matches = with_marks(X, views, marks, rng)
+    rows = matches[0].rows
     found, marked = without_marks(matches, photographs, [SIZE] * 5)
     assert marked == 5 and all(set(m.rows[:, 0]) == set(range(len(X))) for m in found)
     # pixels of photographs of different size are not the same, and two of one size are too few
@@ -552,3 +558,20 @@ def test_marks_at_the_same_pixels_of_photographs_match_nothing(cloud):
     assert whole == [(i, j) for i in (3, 4) for j in range(i)]
     same = [photographs[0]] * 5
     assert without_marks(matches, same, [SIZE] * 5)[1] == 0, "photographs from one place"
+
+
+def test_the_background_of_an_object_that_turns_matches_nothing(cloud):
+    """It has three times the matches of the object; so have far objects behind one that a camera
+    passes without turning, but they agree with its orientation."""
+    rng, X, views = cloud
+    background = rng.uniform([0, 0], SIZE, (480, 2))
+    photographs, matches = with_marks(X, views, background, rng)
+    found, marked = without_marks(matches, photographs, [SIZE] * 5)
+    assert marked == 5 and all(set(m.rows[:, 0]) == set(range(len(X))) for m in found)
+    passing = [(np.array([0.8 * k, 0.1 * k, 8.0]), np.eye(3)) for k in range(5)]
+    photographs, matches = with_marks(X, passing, background, rng)
+    assert without_marks(matches, photographs, [SIZE] * 5)[1] == 0, "far objects"
+    # what moves at random has no orientation
+    for photograph in photographs:
+        photograph.xy[: len(X)] = rng.uniform([0, 0], SIZE, (len(X), 2))
+    assert without_marks(matches, photographs, [SIZE] * 5)[1] == 0, "leaves"
