@@ -5,7 +5,7 @@ that turns in front of a fixed camera.
 These features match in any two photographs, without motion. A match is still if
 both features have the same position, size and direction. If the other matches of a pair have moved,
 and hardly any by a small amount, the still ones are not on the object; their positions in three
-photographs are marks, and still matches at marks are left out of all pairs.
+photographs are marks, and matches at marks with a small motion are left out of all pairs.
 
 A background may have most of the matches. Then the moved ones must have a relative orientation, and
 not that of a camera that moves without turning: far objects are still to it.
@@ -95,7 +95,9 @@ def without_marks(
     # A mark at the border of a cell falls into its neighbour in another photograph.
     near = {(size, i + a, j + b) for size, i, j in marks for a in (-1, 0, 1) for b in (-1, 0, 1)}
     remaining, marked = [], set()
-    for m, (rows, _) in zip(matches, still):
+    for m, (_, motion) in zip(matches, still):
+        # Of other features of a mark as well, whose positions are worse.
+        rows = motion < settings.small_motion
         drop = np.zeros(len(m.rows), bool)
         drop[rows] = [cell in near for cell in _cells(m, features, sizes, rows, settings)]
         if drop.any():
