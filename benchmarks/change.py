@@ -41,11 +41,24 @@ def heap(X, Y):
 
 @dataclasses.dataclass
 class Year:
-    """A pair of images without noise and its true coefficients."""
+    """The true coefficients of a pair of images, and what they look at."""
 
-    greys: list
     rpcs: list
+    views: list
     around: object
+    field: object
+    sensor: object
+
+    def photograph(self, seed):
+        """Both images without noise, of ground with a texture of its own for every `seed`."""
+        import surface_satellite as satellite
+
+        from jaxbundle.planning.rendering import Scene
+        from jaxbundle.planning.texture import Texture
+
+        scene = Scene((self.field,), (Texture(satellite.GSD / 2, seed=seed),))
+        shots = [satellite.photograph(view, scene, self.sensor) for view in self.views]
+        return [shot.grey.astype(np.float32) for shot in shots]
 
 
 def years(pixels):
@@ -53,9 +66,8 @@ def years(pixels):
     import surface_satellite as satellite
 
     from jaxbundle.geometry.ellipsoid import WGS84
-    from jaxbundle.planning.rendering import Scene, Sensor
+    from jaxbundle.planning.rendering import Sensor
     from jaxbundle.planning.shapes import HeightField
-    from jaxbundle.planning.texture import Texture
     from jaxbundle.pushbroom.rpc.fitting import fit_image
     from jaxbundle.surfaces.scanner_views import RpcView, neighbourhood
 
@@ -64,20 +76,18 @@ def years(pixels):
     found, around = [], None
     for k, (pitches, ground) in enumerate(zip(PITCHES, grounds)):
         field = HeightField(ground, (-2 * side, -2 * side, 2 * side, 2 * side))
-        scene = Scene((field,), (Texture(satellite.GSD / 2, seed=1),))
-        greys, rpcs = [], []
+        rpcs, views = [], []
         for image, target in satellite.passes(pixels, pitches):
             around = neighbourhood(*target) if around is None else around
             rpc = fit_image(image, WGS84, (-200.0, 300.0))[0].rpc
-            view = RpcView("", np.zeros((pixels, pixels), np.float32), rpc, around)
-            shot = satellite.photograph(view, scene, Sensor(gain=1 - 0.2 * k, offset=10 * k))
-            greys.append(shot.grey.astype(np.float32))
+            views.append(RpcView("", np.zeros((pixels, pixels), np.float32), rpc, around))
             rpcs.append(rpc)
-        found.append(Year(greys, rpcs, around))
+        sensor = Sensor(gain=1 - 0.2 * k, offset=10 * k)
+        found.append(Year(rpcs, views, around, field, sensor))
     return found, grounds
 
 
-def refined_views(year, name, ground, rng, half):
+def refined_views(year, greys, name, ground, rng, half):
     """The images of a year as views, with the coefficients and covariance of a refinement."""
     from jaxbundle.geometry.ellipsoid import WGS84, earth_fixed
     from jaxbundle.io.scanner.refined_orientations import joint_covariance
@@ -98,7 +108,7 @@ def refined_views(year, name, ground, rng, half):
     for k, rpc in enumerate(year.rpcs):
         shift = SHIFT * rng.normal(size=(2, 1))
         wrong = apply_bias(rpc, RpcBias(*shift))[0]
-        size = year.greys[k].shape
+        size = greys[k].shape
         images.append(RpcScannerImage(f"{name}{k}", RpcImage(wrong, *size), prior_of_bias(0)))
         line, sample, _ = (np.asarray(v) for v in project_points(rpc, *place))
         places.append(np.stack([line, sample], 1) + SIGMA_PIXEL * rng.normal(size=(n, 2)))
@@ -111,7 +121,7 @@ def refined_views(year, name, ground, rng, half):
     found = refine(images, points, Observations(image, point, np.concatenate(places), sigma))
     joint, views = joint_covariance(found), []
     for k, one in enumerate(images):
-        noisy = year.greys[k] + NOISE * rng.normal(size=year.greys[k].shape)
+        noisy = greys[k] + NOISE * rng.normal(size=greys[k].shape)
         grey = (9 * np.clip(noisy, 0, 255) + 200).astype(np.uint16)
         view = RpcView(one.id, grey, found.image(one.id).rpc, year.around)
         view.orientation = rpc_orientation(joint, one.id, domain_of_bias(one.image.rpc))
