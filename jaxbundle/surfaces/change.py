@@ -115,9 +115,6 @@ class ChangeSettings:
     reach: int = 15
     """Cells up to which errors are correlated at most. Twice the windows of dense matching (15
     pixels) divided by two pixels a cell."""
-    least_correlation: float = 0.05
-    """ρ below which, at the first distance, errors count as uncorrelated: below it its estimate is
-    noise, of √(1/n) with n independent cells."""
     least_cells: int = 9
     """Cells of the smallest region of significant ones that is listed: 3 × 3."""
     most_regions: int = 50
@@ -254,7 +251,8 @@ def find_change(
     every, quiet = (_NormalEquations(np.zeros((k, k)), np.zeros(k)) for _ in range(2))
     usable = _sum_up(tiles, read, every, quiet, stable)
     rho, ratio = _scatter_of(usable, read, every.solve(1.0)[0], settings)
-    together, limit = float(rho.sum()), float(norm.ppf(1 - level / 2))
+    # more than one cell no cell can count for; in few cells the estimate of ρ says so
+    together, limit = max(float(rho.sum()), 1.0), float(norm.ppf(1 - level / 2))
     enlarge = lambda ratio: max(ratio, 1.0) if settings.enlarge_sigma else 1.0
     reduction = _Reduction(np.zeros(k), np.eye(k), enlarge(ratio), enlarge(ratio))
     tail = ratio
@@ -464,12 +462,14 @@ def correlation_of(
     """ρ of errors by the distance of cells, 1 in the middle, from normalised residuals of a grid,
     or of several parts.
 
-    Products are averaged over all pairs of known cells at a distance. Beyond the first distance
-    where their mean around the middle is below the least correlation they are 0.
+    Products are averaged over all pairs of known cells at a distance, up to a quarter of the sides:
+    beyond it there are too few (Box and Jenkins, 1976). Errors of matching are correlated in
+    stripes, too, where a slope passes through the pixels, and negatively half a stripe apart: no
+    distance or sign is left out, since sums of many cells depend on all.
     """
     parts = list(zip(w, known)) if isinstance(w, list) else [(w, known)]
     shape = np.max([np.shape(a) for a, _ in parts], axis=0)
-    reach = min(settings.reach, *(n - 1 for n in shape))
+    reach = min(settings.reach, *((n - 1) // 4 for n in shape))
     total, number = np.zeros((2, 2 * reach + 1, 2 * reach + 1))
     for a, inside in parts:
         total += _pairs(np.where(inside, a, 0.0), reach)
@@ -481,13 +481,9 @@ def correlation_of(
     middle = rho[reach, reach]
     rho = rho / middle if middle > 0 else np.zeros_like(rho)
     k = np.arange(-reach, reach + 1)
-    distance = np.hypot(k[:, None], k)
-    ring = np.rint(distance).astype(int)
-    means = ndimage.mean(rho, ring, np.arange(ring.max() + 1))
-    low = np.flatnonzero(np.asarray(means) < settings.least_correlation)
-    rho[distance >= (low[0] if len(low) else reach) - 0.5] = 0.0
+    rho[np.hypot(k[:, None], k) > reach] = 0.0
     rho[reach, reach] = 1.0
-    return np.maximum(rho, 0.0)
+    return rho
 
 
 def _pairs(a: Grid, reach: int) -> Float[np.ndarray, "m m"]:
@@ -499,11 +495,11 @@ def _pairs(a: Grid, reach: int) -> Float[np.ndarray, "m m"]:
 
 
 class _VolumeSums:
-    """The sums over the cells of a region: their number, d, L·P^½, and ΣΣ ρᵢⱼ·σᵢ·σⱼ."""
+    """The sums over the cells of a region: their number, d, L·P^½, σᵢ², and ΣΣ ρᵢⱼ·σᵢ·σⱼ."""
 
     def __init__(self, label: int, k: int) -> None:
         self.label, self.cells, self.sum, self.variance = label, 0, 0.0, 0.0
-        self.shared = np.zeros(k)
+        self.squares, self.shared = 0.0, np.zeros(k)
 
     def add(
         self,
@@ -536,12 +532,13 @@ class _VolumeSums:
         else:
             beside = fftconvolve(own, rho, "same")
         self.variance += float(np.sum(own * beside, where=core))
+        self.squares += float(np.sum(own**2, where=core))
 
     def region(self, size: float) -> Region:
         """The volume."""
         a = size**2
-        # ρ and σ are not negative; a rounding of the FFT may be
-        variance = max(self.variance, 0.0) + self.shared @ self.shared
+        # by an estimate of ρ from few cells it may be smaller than without correlation, or negative
+        variance = max(self.variance, self.squares) + self.shared @ self.shared
         mean, volume = self.sum / self.cells, a * self.sum
         sigma = float(a * np.sqrt(variance))
         return Region(self.label, self.cells, self.cells * a, mean, volume, sigma)
