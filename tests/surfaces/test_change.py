@@ -77,6 +77,22 @@ def test_the_correlation_of_neighbours_is_found():
     assert np.std(white) == pytest.approx(noise_of_sum, rel=0.3)
 
 
+def test_the_correlation_of_stripes_is_found_with_its_sign():
+    """Stripes of random phase along the rows: ρ(dr, dc) = share·cos(2π·dc/period), whatever dr."""
+    rng, known, share, period = np.random.default_rng(8), np.ones((ROWS, COLUMNS), bool), 0.4, 9.0
+    j = np.arange(COLUMNS)
+    fields = [
+        np.sqrt(2 * share) * np.cos(2 * np.pi * (j / period + rng.uniform()))
+        + np.sqrt(1 - share) * rng.normal(size=(ROWS, COLUMNS)) for _ in range(20)
+    ]  # fmt: skip
+    rho = np.mean([correlation_of(f, known) for f in fields], axis=0)
+    reach = len(rho) // 2
+    k = np.arange(1, reach + 1)
+    expected = share * np.cos(2 * np.pi * k / period)
+    np.testing.assert_allclose(rho[reach, reach + 1 :], expected, atol=0.02)
+    np.testing.assert_allclose(rho[reach + 1 :, reach], share, atol=0.02)
+
+
 def estimate(L, d, sigma, together):
     """t̂ and P from some cells, of which `together` count as one."""
     weight = 1 / (together * sigma**2)
