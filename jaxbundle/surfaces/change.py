@@ -47,10 +47,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from scipy.signal import fftconvolve
-from scipy.stats import norm
 
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.quality.distributions import normal_quantile
 from jaxbundle.surfaces.height_cells import CellSource, Grid, Modes
 from jaxbundle.surfaces.scatter import robust_sigma
 
@@ -252,7 +252,7 @@ def find_change(
     usable = _sum_up(tiles, read, every, quiet, stable)
     rho, ratio = _scatter_of(usable, read, every.solve(1.0)[0], settings)
     # more than one cell no cell can count for; in few cells the estimate of ρ says so
-    together, limit = max(float(rho.sum()), 1.0), float(norm.ppf(1 - level / 2))
+    together, limit = max(float(rho.sum()), 1.0), normal_quantile(1 - level / 2)
     enlarge = lambda ratio: max(ratio, 1.0) if settings.enlarge_sigma else 1.0
     reduction = _Reduction(np.zeros(k), np.eye(k), enlarge(ratio), enlarge(ratio))
     tail = ratio
@@ -426,7 +426,7 @@ def _scatter_of_stable(
     if len(v) * (1 - h) / together <= 1 / level:
         return None
     s = np.sqrt(np.mean(v**2) / (1 - h))
-    q = np.quantile(v, 1 - level) / (norm.ppf(1 - level / 2) * np.sqrt(1 - h))
+    q = np.quantile(v, 1 - level) / (normal_quantile(1 - level / 2) * np.sqrt(1 - h))
     return float(reduction.scale * s), float(reduction.scale * q)
 
 
