@@ -68,7 +68,7 @@ def map_of(
     model: str | Path | None = None,
     border: int = 33,
     max_pixels: float = 10_000,
-    tell: Callable[[str], None] = lambda _: None,
+    tell: Callable[[str], object] = lambda _: None,
 ) -> MapGrid:
     """The pixels of a map of the whole image, by default with its size on the ground.
 
