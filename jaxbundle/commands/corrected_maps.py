@@ -144,7 +144,8 @@ def correct(  # noqa: PLR0913 (public: the options of the command, all but three
     given = None if sigma is None else _errors_of(errors or {}, file, Path(scanner))
     surface = surface_under(file.image, file.earth, height, dem, geoid, tell)
     system = MapSystem(file.earth, crs)
-    grid = map_of(file.image, surface, system, spacing, None if dem is None else Path(dem))
+    terrain = None if dem is None else Path(dem)
+    grid = map_of(file.image, surface, system, spacing, terrain, tell=tell)
     if crs is not None and (place := system.degrees_of(grid)):
         if said := describe_distance(crs, *place):
             tell(said)

@@ -67,15 +67,18 @@ class ChangeResult(TableMethods):
     def __str__(self) -> str:
         """Shares and volumes in lines."""
         found = self.figures
+        tail, at_level = found["tail_ratio"], ""
+        if tail != found["sigma_ratio"]:
+            at_level = f"; of single cells at this level {tail:.3g}"
         lines = [
             f"{found['cells']} cells of both surfaces; at the level {100 * found['level']:g} % "
             f"(|w| > {found['limit']:.3g}) {100 * found['risen']:.3g} % have risen, "
             f"{100 * found['fallen']:.3g} % fallen",
             f"mean σ of a difference {found['mean_sigma']:.4g}; scatter of the cells over their "
-            f"own σ {found['sigma_ratio']:.3g} (1 is right)"
-            + (", which are multiplied by it" if found["sigma_ratio"] > 1 else ""),
-            f"errors of neighbours are correlated over {found['cells_that_count_as_one']:.3g} "
-            f"cells; {count(found['shared_errors'], 'error')} common to cells"
+            f"own σ {found['sigma_ratio']:.3g} (1 is right{at_level}), which are multiplied by it "
+            "if it is above 1",
+            f"of neighbouring cells {found['cells_that_count_as_one']:.3g} count as one; "
+            f"{count(found['shared_errors'], 'error')} common to cells"
             + ("" if found["shared_errors"] else NOTHING_SHARED),
         ]
         for region in (self.change.total, *self.change.regions[:20]):

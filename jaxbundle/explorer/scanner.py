@@ -17,7 +17,7 @@ import io
 import tempfile
 import zipfile
 from collections.abc import Mapping, Sequence
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -25,7 +25,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Float
 
 from jaxbundle.choices import RESAMPLINGS, Resampling
 from jaxbundle.errors import InputError
@@ -50,6 +50,14 @@ from jaxbundle.explorer.pictures import (
     take_pictures,
     without_pictures,
 )
+from jaxbundle.explorer.scanner_drawing import (
+    ANGLES,
+    draw_accuracy,
+    draw_errors,
+    draw_flight,
+    draw_ground,
+    outline,
+)
 from jaxbundle.explorer.tracks import (
     ORBIT,
     PLACES,
@@ -62,8 +70,7 @@ from jaxbundle.explorer.tracks import (
     tracks_of,
 )
 from jaxbundle.explorer.view import File, Given, check_keys, number, switch, word
-from jaxbundle.geometry import omega_phi_kappa_from_matrix
-from jaxbundle.geometry.ellipsoid import Ellipsoid, earth_fixed, geodetic
+from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.io.rasters.scenes import SceneRaster
 from jaxbundle.io.scanner.writing import write_scanner_image
 from jaxbundle.plotting import image_map
@@ -73,14 +80,12 @@ from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.error_propagation import (
     circular_error,
     closed_form,
-    east_north,
     ground_errors,
     propagate_accuracy,
     spread_positions,
 )
 from jaxbundle.pushbroom.flight import Flight, measured_image, true_image, with_errors_in_rows
-from jaxbundle.pushbroom.image import PushbroomImage, make_image, pose_at, recorded_pose
-from jaxbundle.pushbroom.image_to_ground import locate_points
+from jaxbundle.pushbroom.image import PushbroomImage, make_image
 from jaxbundle.pushbroom.interpolation import METHODS, TimeTable
 from jaxbundle.pushbroom.noise import Noise, Sigma, zero_errors
 from jaxbundle.pushbroom.study import altitude_and_view
@@ -88,17 +93,13 @@ from jaxbundle.pushbroom.surfaces import Ground, GroundSurface, Height, Plane
 from jaxbundle.pushbroom.trajectory import (
     AttitudeTable,
     Trajectory,
-    orbital_frame,
     trajectory_in_pieces,
 )
-from jaxbundle.report.layout import clean, significant
+from jaxbundle.report.layout import clean
 from jaxbundle.report.page import UNKNOWN, Origin, Page, Section
-from jaxbundle.report.page.charts import ChartLayout, Curve, draw_curves, draw_field, draw_plan
-from jaxbundle.report.page.markup import figure, grid, paragraph
+from jaxbundle.report.page.markup import paragraph
 from jaxbundle.types import present
 
-# The index of an angle in an attitude error: about right (pitch), forward (roll), up (yaw).
-ANGLES = {"roll": 1, "pitch": 0, "yaw": 2}
 # Ends of the keys of values that are not negative: of σ, and of walks; the height of an orbit.
 POSITIVE_KEYS = ("white", "walk")
 FLIGHT_FILE, TABLE_FILE, PICTURE_FILE = "flight.zip", "accuracy.csv", "error_map.png"
@@ -313,11 +314,11 @@ class FlightView:
         pictures, difference = self._draw_pictures(chosen, values)
         return {
             "parts": {
-                "flight": self._draw_flight(chosen),
+                "flight": draw_flight(chosen.image, chosen.truth, chosen.earth),
                 "pictures": pictures,
-                "ground": self._draw_ground(chosen),
-                "errors": self._draw_errors(field, told),
-                "accuracy": self._list(told, errors, expected),
+                "ground": draw_ground(chosen.image, chosen.truth, chosen.surface, chosen.earth),
+                "errors": draw_errors(field, told),
+                "accuracy": draw_accuracy(told, errors, expected),
             },
             **told,
             "errors": field.tolist(),
@@ -462,7 +463,7 @@ class FlightView:
                 track = choose_track(self.tracks, self.values({"track": kind}))
                 truth = true_image(dataclasses.replace(self.flight, track=track))
             surface = _surface_at(0.0, chosen.earth)
-            frame = frame_around(truth, surface, _outline(truth))
+            frame = frame_around(truth, surface, outline(truth))
             if self.raster is not None and self._has_coordinates_of_raster(chosen):
                 self._scenes[kind] = frame, scene_of_raster(self.raster, frame, surface)
             else:
@@ -486,120 +487,6 @@ class FlightView:
             return drawn, taken.rms
         except InputError as error:
             return without_pictures(error), None
-
-    def _draw_flight(self, chosen: Chosen, places: int = 240) -> str:
-        """The ends of the track; roll, pitch and yaw over the lines, true and as recorded, in the
-        orbital or the local frame."""
-        image, earth, _, truth = chosen
-        lines = np.linspace(0, image.lines - 1, places)
-        angles = [
-            np.degrees(_angles(one, jnp.asarray(lines), earth is not None))
-            for one in (truth, image)
-        ]
-        charts = []
-        for name, k in ANGLES.items():
-            curves = [
-                Curve(label, lines, values[k], None, kind)
-                for values, label, kind in zip(angles, ("true", "recorded"), ("second", "first"))
-            ]
-            drawn = draw_curves(curves, "line", f"{name} [°]", layout=ChartLayout(height=220))
-            charts.append(figure(drawn, name))
-        ends = np.array(_positions(truth, jnp.asarray([0.0, image.lines - 1.0])))
-        if earth is None:
-            header = ("track", "X [m]", "Y [m]", "Z [m]")
-            rows = [[f"{v:.3f}" for v in P] for P in ends]
-        else:
-            header = ("track", "longitude [°]", "latitude [°]", "height [m]")
-            geodetic_ends = np.array([[float(v) for v in geodetic(earth, tuple(P))] for P in ends])
-            rows = [
-                (f"{np.degrees(a):.6f}", f"{np.degrees(b):.6f}", f"{h:.1f}")
-                for a, b, h in geodetic_ends
-            ]
-        seconds = float(image.times.time(image.lines - 1.0) - image.times.time(0.0))
-        length = np.linalg.norm(ends[1] - ends[0])
-        told = f"{seconds:.6g} s, {length:.6g} m"
-        if seconds > 0:
-            told += f", {length / seconds:.6g} m/s"
-        return (
-            grid(header, [("first line", *rows[0]), ("last line", *rows[1])])
-            + paragraph(f"From the first line to the last: {told}.", "hint")
-            + f'<div class="pictures">\n{"".join(charts)}</div>\n'
-        )
-
-    def _draw_ground(self, chosen: Chosen) -> str:
-        image, earth, surface, truth = chosen
-        # The last place is the middle of the image, from which east and north are counted.
-        size = self.image.lines, self.image.pixels
-        outline = [np.append(v, (n - 1) / 2) for v, n in zip(_outline(self.image), size)]
-        reference = np.asarray(_locate(truth, surface, *outline))
-        O = reference[:, -1]
-        axes = np.asarray(_east_north(surface, tuple(O)))
-
-        def curve(label: str, X: ArrayLike, kind: str) -> Curve:
-            east, north = 1e-3 * axes @ (np.asarray(X) - O[:, None])
-            return Curve(label, east, north, None, kind)
-
-        curves = [
-            curve(label, X[:, :-1], kind)
-            for X, label, kind in (
-                (reference, "footprint, reference", "second"),
-                (np.asarray(_locate(image, surface, *outline)), "footprint", "first"),
-            )
-        ]
-        # as many places as the outline has
-        lines = np.linspace(0, image.lines - 1, len(outline[0]) - 1)
-        P = np.array(_positions(image, jnp.asarray(lines))).T
-        if earth is None:
-            P[2] = 0.0
-            curves.append(curve("track, from above", P, "given"))
-        elif earth.a == earth.b:
-            curves.append(curve("ground track, below the platform", _below(earth, P), "given"))
-        return figure(
-            draw_plan(curves, "east [km]", "north [km]"),
-            "Relative to the image centre; both axes at one scale",
-        )
-
-    def _draw_errors(
-        self, field: Float[np.ndarray, "rows columns"], told: Mapping[str, float]
-    ) -> str:
-        return figure(
-            draw_field(field, 3),
-            f"Error on the ground in metres, RMS of each part of the image, line 0 at the top: RMS "
-            f"{significant(told['rms'])} m, CE90 {significant(told['ce90'])} m",
-        )
-
-    def _list(
-        self,
-        told: Mapping[str, float],
-        errors: Float[np.ndarray, "n 2"],
-        expected: Sequence[Mapping[str, float]],
-    ) -> str:
-        east, north = np.sqrt(np.mean(errors**2, 0))
-        rows = [
-            ("RMS", told["rms"]),
-            ("RMS east", east),
-            ("RMS north", north),
-            ("CE90", told["ce90"]),
-            ("largest", told["largest"]),
-        ]
-        first = grid(("error on the ground", "m"), [(n, significant(v, 4)) for n, v in rows])
-        header = (
-            "σ of the attitude, each axis",
-            "RMS [m]",
-            "CE90 [m]",
-            "RMS, level camera",
-            "CE90, level camera",
-        )
-        names = ("rms", "ce90", "closed_rms", "closed_ce90")
-        table = [
-            (f"{row['sigma']:g}°", *(significant(row[name], 4) for name in names))
-            for row in expected
-        ]
-        return (
-            first
-            + "<h3>Expected accuracy for a constant error over the image</h3>\n"
-            + grid(header, table)
-        )
 
     # --- files ------------------------------------------------------------------------------
 
@@ -693,14 +580,6 @@ def _attitude_with(attitude: AttitudeTable, method: str) -> AttitudeTable:
     )
 
 
-def _outline(image: PushbroomImage, places: int = 9) -> tuple[np.ndarray, np.ndarray]:
-    """Lines and pixels around the image, closed, at `places` places of each side."""
-    s, zero, one = np.linspace(0, 1, places), np.zeros(places), np.ones(places)
-    down = np.concatenate([zero, s, one, s[::-1]])
-    across = np.concatenate([s, one, s[::-1], zero])
-    return down * (image.lines - 1), across * (image.pixels - 1)
-
-
 def _with_value(control: Control, value: Any) -> Control:
     if isinstance(control, Number) and control.low is not None and control.high is not None:
         low, high = min(control.low, value), max(control.high, value)
@@ -717,27 +596,4 @@ def _largest(sigma: Sigma) -> float:
     return float(np.max(sigma))
 
 
-_locate = jax.jit(locate_points)
-_east_north = jax.jit(east_north)
 _pieces = jax.jit(trajectory_in_pieces)
-_positions = jax.jit(
-    lambda image, lines: jax.vmap(lambda line: pose_at(image, image.times.time(line)).P)(lines)
-)
-
-
-@partial(jax.jit, static_argnums=2)
-def _angles(image: PushbroomImage, lines: Float[Array, " n"], orbital: bool) -> Float[Array, "3 n"]:
-    """Pitch, roll, yaw of the platform at some lines, radians."""
-
-    def of_line(line: Array) -> Float[Array, "3"]:
-        P, R, V = recorded_pose(image, image.times.time(line))
-        # angles are those of the transpose, as of ω, φ, κ
-        return omega_phi_kappa_from_matrix((orbital_frame(P, V).T @ R if orbital else R).T)
-
-    return jax.vmap(of_line, out_axes=1)(lines)
-
-
-@jax.jit
-def _below(earth: Ellipsoid, P: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
-    longitude, latitude, _ = geodetic(earth, tuple(P))
-    return jnp.stack(earth_fixed(earth, (longitude, latitude, 0 * longitude)))

@@ -12,17 +12,26 @@ known to be stable its differences dₛ determine t (with the prior N(0, I)):
 
     P = (I + Lₛᵀ·Σₛ⁻¹·Lₛ)⁻¹,    t̂ = P·Lₛᵀ·Σₛ⁻¹·dₛ,    d' = d − L·t̂,    σ_d² = σ² + diag(L·P·Lᵀ).
 
-A cell has changed at the level α if |d'|/σ_d > z(1 − α/2). Of n cells without change α·n are
+A cell has changed at the level α if |d'|/σ_d > z = z(1 − α/2). Of n cells without change α·n are
 expected to be called changed; within one pair they lie together, as the shared errors do.
 
 Volumes of a region R with cells of the area a, ρ the correlation of errors of their own between
 cells, by the distance of these (windows of matching overlap, filters smooth):
 
-    V = a·Σ d'ᵢ,     σ_V² = a²·(ΣΣ ρᵢⱼ·σᵢ·σⱼ + |Σ (L·P^½)ᵢ|²).
+    V = a·Σ d'ᵢ,     σ_V² = a²·(s²·ΣΣ ρᵢⱼ·σᵢ·σⱼ + |Σ (L·P^½)ᵢ|²).
 
-ρ is estimated from d'/σ of unchanged cells. With ρ a cell counts as 1/Σρ of one for t̂. The scatter
-of d'/σ, by the median, multiplies the σ of cells if it is above 1: σ that are too small would call
-more than α·n unchanged cells changed.
+ρ is estimated from d'/σ of unchanged cells. With ρ a cell counts as 1/m of one for t̂, m = Σρ. The
+scatter of d'/σ multiplies the σ of cells if it is above 1: σ that are too small would call more
+than α·n unchanged cells changed. Of n stable cells it follows from their residuals v, of which the
+estimated t̂ have taken a part,
+
+    h = mean of L·P·Lᵀ/(s·σ)²,     s² = mean of (v/σ)²/(1 − h),
+    q = the quantile 1 − α of |v|/σ, over z·√(1 − h):
+
+s for sums of many cells, that is for volumes and t̂, and q for single cells, whose errors have
+longer tails than normal ones. A quantile needs 1/α independent cells, n·(1 − h)/m > 1/α. With
+fewer, or without stable ground, both are the scatter by the median, which cells that have changed
+do not disturb.
 
 Cells are read and computed tile by tile, since the columns of L of a large surface would not be in
 memory: once for the sums of t̂, once for d', σ and w, and again for the tiles of regions; ρ and the
@@ -38,10 +47,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from scipy.signal import fftconvolve
-from scipy.stats import norm
 
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.quality.distributions import normal_quantile
 from jaxbundle.surfaces.height_cells import CellSource, Grid, Modes
 from jaxbundle.surfaces.scatter import robust_sigma
 
@@ -68,7 +77,8 @@ class SurfaceChange:
 
     `limit`: of |w| = |difference|/σ at the `level`; `correlation`: cells that count as one, Σρ;
     `sigma_ratio`: scatter of the cells without shared errors, over their given σ, 1 if these are
-    right; σ are multiplied by it if it is larger;
+    right; by it, if it is larger, σ of volumes are enlarged; `tail_ratio`: the same by the quantile
+    at the `level`, for `sigma` and `sign`;
     `modes`: shared errors; `total` and `regions`: volumes."""
 
     difference: Grid
@@ -82,6 +92,7 @@ class SurfaceChange:
     limit: float
     correlation: float
     sigma_ratio: float
+    tail_ratio: float
     modes: int
     total: Region
     regions: tuple[Region, ...] = ()
@@ -104,9 +115,6 @@ class ChangeSettings:
     reach: int = 15
     """Cells up to which errors are correlated at most. Twice the windows of dense matching (15
     pixels) divided by two pixels a cell."""
-    least_correlation: float = 0.05
-    """ρ below which, at the first distance, errors count as uncorrelated: below it its estimate is
-    noise, of √(1/n) with n independent cells."""
     least_cells: int = 9
     """Cells of the smallest region of significant ones that is listed: 3 × 3."""
     most_regions: int = 50
@@ -243,26 +251,33 @@ def find_change(
     every, quiet = (_NormalEquations(np.zeros((k, k)), np.zeros(k)) for _ in range(2))
     usable = _sum_up(tiles, read, every, quiet, stable)
     rho, ratio = _scatter_of(usable, read, every.solve(1.0)[0], settings)
-    together, scale = float(rho.sum()), max(ratio, 1.0) if settings.enlarge_sigma else 1.0
-    t, P = np.zeros(k), np.eye(k)
+    # more than one cell no cell can count for; in few cells the estimate of ρ says so
+    together, limit = max(float(rho.sum()), 1.0), normal_quantile(1 - level / 2)
+    enlarge = lambda ratio: max(ratio, 1.0) if settings.enlarge_sigma else 1.0
+    reduction = _Reduction(np.zeros(k), np.eye(k), enlarge(ratio), enlarge(ratio))
+    tail = ratio
     if stable is not None:
-        # Σ of cells is scale² times the given one, and only every together-th cell is a new one
-        t, P = quiet.solve(together * scale**2)
-    reduction = _Reduction(t, _root(P).T, scale)
-    limit = float(norm.ppf(1 - level / 2))
+        # Σ of cells is s² times the given one, and only every together-th cell is a new one
+        reduce = lambda s, q: _Reduction.solve(quiet, together, enlarge(s), enlarge(q))
+        within = [corner for corner in usable if stable[tiles.parts(corner, 0)].any()]
+        found = _scatter_of_stable(
+            _sample(within, settings), read, stable, reduce(ratio, ratio), together, level
+        )
+        ratio, tail = found if found is not None else (ratio, ratio)
+        reduction = reduce(ratio, tail)
     # of several tiles in single precision: half the memory, and 1e-7 of a difference
     dtype = np.float64 if len(tiles.corners) == 1 else np.float32
     d, sigma = (np.full(before.shape, np.nan, dtype) for _ in range(2))
     sign, total = np.zeros(before.shape, np.int8), _VolumeSums(0, k)
     for corner in usable:
         tile = read(corner)
-        found, own, LP = reduction(tile)
-        s = np.sqrt(own**2 + np.sum(LP**2, axis=0))
+        rest, own, LP = reduction(tile)
+        s = np.sqrt((reduction.tail * tile.own) ** 2 + np.sum(LP**2, axis=0))
         with np.errstate(invalid="ignore"):
-            sure = np.where(np.abs(found) > limit * s, np.sign(found), 0)
-        d[tile.place], sigma[tile.place] = found[tile.core], s[tile.core]
+            sure = np.where(np.abs(rest) > limit * s, np.sign(rest), 0)
+        d[tile.place], sigma[tile.place] = rest[tile.core], s[tile.core]
         sign[tile.place] = np.where(tile.known, sure, 0)[tile.core]
-        total.add(tile.core, (found, own, LP), tile.known, rho)
+        total.add(tile.core, (rest, own, LP), tile.known, rho)
     if labels is None:
         labels = _significant_labels(sign, d, settings)
     regions = _volumes(labels, usable, tiles, read, reduction, rho)
@@ -278,6 +293,7 @@ def find_change(
         limit,
         together,
         ratio,
+        tail,
         k,
         total.region(before.size),
         regions,
@@ -286,14 +302,24 @@ def find_change(
 
 @dataclasses.dataclass(frozen=True)
 class _Reduction:
-    """The shared errors that are known, t̂, and P^½; by what the σ of cells are multiplied."""
+    """The shared errors that are known, t̂, and P^½; by what the σ of cells are multiplied, in sums
+    of many and alone."""
 
     t: Float[np.ndarray, " k"]
     root: Float[np.ndarray, "k k"]
     scale: float
+    tail: float
+
+    @classmethod
+    def solve(
+        cls, stable: _NormalEquations, together: float, scale: float, tail: float
+    ) -> "_Reduction":
+        """From the normal equations of stable cells, of which `together` count as one."""
+        t, P = stable.solve(together * scale**2)
+        return cls(t, _root(P).T, scale, tail)
 
     def __call__(self, tile: _Tile) -> tuple[Grid, Grid, Modes]:
-        """d', the σ of cells, and L·P^½ of a tile."""
+        """d', the σ of cells in sums, and L·P^½ of a tile."""
         d = tile.d - np.tensordot(self.t, tile.L, 1)
         return d, self.scale * tile.own, np.tensordot(self.root, tile.L, 1)
 
@@ -358,8 +384,7 @@ def _scatter_of(
 ) -> tuple[Float[np.ndarray, "2*reach+1 2*reach+1"], float]:
     """ρ of cells by their distance, and the scatter of cells over their σ, from some tiles: without
     what shared errors explain, which is no correlation of cells."""
-    number = min(len(usable), settings.sampled_tiles)
-    chosen = [usable[k] for k in np.unique(np.linspace(0, len(usable) - 1, number).astype(int))]
+    chosen = _sample(usable, settings)
     fields, quiet = _quiet_cells(chosen, read, t)
     # changed cells would bend t, and what is left of shared errors would pass for scatter
     for _ in range(settings.reweightings):
@@ -372,6 +397,37 @@ def _scatter_of(
         fields, quiet = _quiet_cells(chosen, read, unchanged.solve(1.0)[0])
     rho = correlation_of([np.where(q, f, 0.0) for f, q in zip(fields, quiet)], quiet, settings)
     return rho, float(robust_sigma(np.concatenate([f[q] for f, q in zip(fields, quiet)])))
+
+
+def _sample(corners: list[tuple[int, int]], settings: ChangeSettings) -> list[tuple[int, int]]:
+    """Some tiles, evenly spread."""
+    number = min(len(corners), settings.sampled_tiles)
+    return [corners[k] for k in np.unique(np.linspace(0, len(corners) - 1, number).astype(int))]
+
+
+def _scatter_of_stable(
+    corners: list[tuple[int, int]],
+    read: Callable[[tuple[int, int]], _Tile],
+    stable: Cells,
+    reduction: "_Reduction",
+    together: float,
+    level: float,
+) -> tuple[float, float] | None:
+    """s and q from the residuals of stable cells; None for too few."""
+    residuals, shares = [], []
+    for corner in corners:
+        tile = read(corner)
+        d, sigma, LP = reduction(tile)
+        cells = np.zeros_like(tile.known)
+        cells[tile.core] = (tile.known & stable[tile.rows, tile.columns])[tile.core]
+        residuals.append(np.abs(d[cells] / sigma[cells]))
+        shares.append(np.sum(LP[:, cells] ** 2, axis=0) / sigma[cells] ** 2)
+    v, h = np.concatenate(residuals), float(np.mean(np.concatenate(shares)))
+    if len(v) * (1 - h) / together <= 1 / level:
+        return None
+    s = np.sqrt(np.mean(v**2) / (1 - h))
+    q = np.quantile(v, 1 - level) / (normal_quantile(1 - level / 2) * np.sqrt(1 - h))
+    return float(reduction.scale * s), float(reduction.scale * q)
 
 
 def _quiet_cells(
@@ -406,12 +462,14 @@ def correlation_of(
     """ρ of errors by the distance of cells, 1 in the middle, from normalised residuals of a grid,
     or of several parts.
 
-    Products are averaged over all pairs of known cells at a distance. Beyond the first distance
-    where their mean around the middle is below the least correlation they are 0.
+    Products are averaged over all pairs of known cells at a distance, up to a quarter of the sides:
+    beyond it there are too few (Box and Jenkins, 1976). Errors of matching are correlated in
+    stripes, too, where a slope passes through the pixels, and negatively half a stripe apart: no
+    distance or sign is left out, since sums of many cells depend on all.
     """
     parts = list(zip(w, known)) if isinstance(w, list) else [(w, known)]
     shape = np.max([np.shape(a) for a, _ in parts], axis=0)
-    reach = min(settings.reach, *(n - 1 for n in shape))
+    reach = min(settings.reach, *((n - 1) // 4 for n in shape))
     total, number = np.zeros((2, 2 * reach + 1, 2 * reach + 1))
     for a, inside in parts:
         total += _pairs(np.where(inside, a, 0.0), reach)
@@ -423,13 +481,9 @@ def correlation_of(
     middle = rho[reach, reach]
     rho = rho / middle if middle > 0 else np.zeros_like(rho)
     k = np.arange(-reach, reach + 1)
-    distance = np.hypot(k[:, None], k)
-    ring = np.rint(distance).astype(int)
-    means = ndimage.mean(rho, ring, np.arange(ring.max() + 1))
-    low = np.flatnonzero(np.asarray(means) < settings.least_correlation)
-    rho[distance >= (low[0] if len(low) else reach) - 0.5] = 0.0
+    rho[np.hypot(k[:, None], k) > reach] = 0.0
     rho[reach, reach] = 1.0
-    return np.maximum(rho, 0.0)
+    return rho
 
 
 def _pairs(a: Grid, reach: int) -> Float[np.ndarray, "m m"]:
@@ -441,11 +495,11 @@ def _pairs(a: Grid, reach: int) -> Float[np.ndarray, "m m"]:
 
 
 class _VolumeSums:
-    """The sums over the cells of a region: their number, d, L·P^½, and ΣΣ ρᵢⱼ·σᵢ·σⱼ."""
+    """The sums over the cells of a region: their number, d, L·P^½, σᵢ², and ΣΣ ρᵢⱼ·σᵢ·σⱼ."""
 
     def __init__(self, label: int, k: int) -> None:
         self.label, self.cells, self.sum, self.variance = label, 0, 0.0, 0.0
-        self.shared = np.zeros(k)
+        self.squares, self.shared = 0.0, np.zeros(k)
 
     def add(
         self,
@@ -478,12 +532,13 @@ class _VolumeSums:
         else:
             beside = fftconvolve(own, rho, "same")
         self.variance += float(np.sum(own * beside, where=core))
+        self.squares += float(np.sum(own**2, where=core))
 
     def region(self, size: float) -> Region:
         """The volume."""
         a = size**2
-        # ρ and σ are not negative; a rounding of the FFT may be
-        variance = max(self.variance, 0.0) + self.shared @ self.shared
+        # by an estimate of ρ from few cells it may be smaller than without correlation, or negative
+        variance = max(self.variance, self.squares) + self.shared @ self.shared
         mean, volume = self.sum / self.cells, a * self.sum
         sigma = float(a * np.sqrt(variance))
         return Region(self.label, self.cells, self.cells * a, mean, volume, sigma)
@@ -543,6 +598,7 @@ def summary(change: SurfaceChange) -> Mapping[str, Any]:
         "shared_errors": change.modes,
         "cells_that_count_as_one": change.correlation,
         "sigma_ratio": change.sigma_ratio,
+        "tail_ratio": change.tail_ratio,
         "mean_sigma": float(np.nanmean(change.sigma, dtype=float)),
         "total": dataclasses.asdict(change.total),
         "regions": [dataclasses.asdict(region) for region in change.regions],

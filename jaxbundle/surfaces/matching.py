@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy import stats
+from scipy import special
 
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.measure.least_squares_matching import MatchingStatus
@@ -276,7 +276,7 @@ def variance_factor(
     good = np.isfinite(vtpv) & (redundancy > 0)
     if good.sum() < min_points:
         return 1.0
-    return float(np.median(vtpv[good] / stats.chi2.median(redundancy[good])))
+    return float(np.median(vtpv[good] / special.chdtri(redundancy[good], 0.5)))
 
 
 def _shape_variance(
@@ -332,7 +332,7 @@ def _find_misfits(
     found: IntersectedPoints, factor: float, significance: float
 ) -> Bool[np.ndarray, " n"]:
     """Points whose rays do not meet: vᵀPv beyond its distribution, or not known."""
-    limit = stats.chi2.isf(significance, np.maximum(found.redundancy, 1))
+    limit = special.chdtri(np.maximum(found.redundancy, 1), significance)
     return ~(found.vtpv <= limit * factor)
 
 

@@ -9,16 +9,15 @@ are pure noise if the surface is smooth. The variance factor is a quantile of th
 
 import numpy as np
 from jaxtyping import Float
-from scipy import stats
 from scipy.optimize import brentq
 
-from jaxbundle.leastsquares.quality.distributions import NORMAL_SIGMA_BY_MAD
+from jaxbundle.leastsquares.quality.distributions import NORMAL_SIGMA_BY_MAD, chi2_quantile
 
 # Minimum values for a variance factor: the median of n values of χ²₁ has the standard deviation
 # 1/(2·f·√n), with the density f = 0.47 at the median 0.455; for 100 values 23 % of it.
 MIN_VALUES = 100
 # Median of χ² of one degree of freedom, 0.455.
-CHI2_MEDIAN = float(stats.chi2.median(1))
+CHI2_MEDIAN = chi2_quantile(0.5, 1)
 
 
 def robust_sigma(values: Float[np.ndarray, " n"]) -> float:

@@ -392,11 +392,25 @@ def write_rpc_images(path: Path) -> None:
     from test_surface_commands import write_satellite
 
     write_satellite(path.parent)
+    rpc = jaxbundle.io.read_rpc(path.parent / "a_RPC.TXT")
+    write_geoid(path.parent, float(rpc.longitude_offset), float(rpc.latitude_offset))
+
+
+def write_geoid(folder: Path, longitude: float, latitude: float) -> None:
+    """A geoid 20 m above the ellipsoid, three degrees around a place, under the name of PROJ's."""
+    import rasterio
+
+    grid = {
+        "driver": "GTiff", "width": 12, "height": 12, "count": 1, "dtype": "float32",
+        "crs": "EPSG:4326",
+        "transform": rasterio.Affine(0.5, 0, longitude - 3, 0, -0.5, latitude + 3),
+    }  # fmt: skip
+    with rasterio.open(folder / "us_nga_egm96_15.tif", "w", **grid) as geoid:
+        geoid.write(np.full((12, 12), 20, "float32"), 1)
 
 
 def write_product(path: Path) -> None:
-    """A satellite image with RPC, terrain in tiles, and a geoid 20 m above the ellipsoid under the
-    name of PROJ's."""
+    """A satellite image with RPC, terrain in tiles, and a geoid."""
     import tempfile
 
     import rasterio
@@ -408,13 +422,7 @@ def write_product(path: Path) -> None:
             shutil.copy(file, path.parent)
         shutil.copytree(made / "tiles", path.parent / "tiles")
     with rasterio.open(path.parent / "tiles" / "00.tif") as tile:
-        west, north = tile.transform.c, tile.transform.f
-    grid = {
-        "driver": "GTiff", "width": 12, "height": 12, "count": 1, "dtype": "float32",
-        "crs": "EPSG:4326", "transform": rasterio.Affine(0.5, 0, west - 2, 0, -0.5, north + 2),
-    }  # fmt: skip
-    with rasterio.open(path.parent / "us_nga_egm96_15.tif", "w", **grid) as geoid:
-        geoid.write(np.full((12, 12), 20, "float32"), 1)
+        write_geoid(path.parent, tile.transform.c, tile.transform.f)
 
 
 def write_strips(path: Path) -> None:

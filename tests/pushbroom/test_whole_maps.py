@@ -102,6 +102,18 @@ def blocks_of(image, surface, spacing):
             yield system.nodes(surface, *grid.centres(row + steps, column + steps))
 
 
+def test_terrain_that_has_a_part_of_the_image_is_told(folder, tmp_path):
+    """A quarter of the model, whose middle is that of the image; nothing is said of the whole."""
+    said = []
+    made = make(folder, tmp_path / "part.tif", dem=folder / "tiles" / "00.tif", tell=said.append)
+    (words,) = said
+    share = float(words.partition("no height for ")[2].split()[0])
+    assert "00.tif" in words and share == pytest.approx(75, abs=10)
+    whole = make(folder, tmp_path / "whole.tif", tell=said.append)
+    assert len(said) == 1
+    assert made.rows * made.columns < 0.5 * whole.rows * whole.columns
+
+
 @pytest.mark.further
 @pytest.mark.parametrize("kind", ["rpc", "rigorous", "restless"])
 def test_interpolated_positions_are_those_of_the_model(folder, monkeypatch, kind):

@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -68,13 +68,15 @@ def map_of(
     model: str | Path | None = None,
     border: int = 33,
     max_pixels: float = 10_000,
+    tell: Callable[[str], object] = lambda _: None,
 ) -> MapGrid:
     """The pixels of a map of the whole image, by default with its size on the ground.
 
     **Arguments:** `model` names the file of a terrain in messages; `border`: points along each
     border of the image that bound the map, enough for the bends of a track and of a terrain: what
     they miss is cut off, except for the margin of a pixel; `max_pixels` of the map for one of the
-    image: more indicate a wrong spacing, such as metres where the map is in degrees.
+    image: more indicate a wrong spacing, such as metres where the map is in degrees; `tell`: called
+    if a terrain model does not have the whole ground of the image.
 
     **Raises:** `InputError` if the image shows nothing of the surface, its map does not hold
     together, or is too large.
@@ -89,6 +91,13 @@ def map_of(
             f"{model or 'terrain'}: no height where the image looks; give a model that covers it"
             if isinstance(surface, Terrain)
             else "no point of the image is on the ground; check attitude and mounting"
+        )
+    covered = np.mean(np.isfinite(X).all(0))
+    if isinstance(surface, Terrain) and covered < 1:
+        tell(
+            f"{model or 'terrain'}: no height for {100 * (1 - covered):.2g} % of the image "
+            f"({X[0].size} positions): the map has no data there, or ends; give a model that "
+            "covers the image"
         )
     x, y = system.from_ground(X)
     if not np.isfinite(x).any():

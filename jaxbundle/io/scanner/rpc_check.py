@@ -78,10 +78,12 @@ def check_against_rpc(
             return _warn(chosen_one, message)
         remedy = f"With {_names(chosen)} they agree ({_size(found[best])}): set [corrections] so"
     else:
+        others = "; others leave more"
+        if chosen != image.corrections:
+            others = f"; the smallest difference, with {_names(chosen)}, is {_size(found[best])}"
         remedy = (
-            f"No corrections explain it (the least is left with {_names(chosen)}: "
-            f"{_size(found[best])}): check the origin of lines and pixels, whether the RPC are of "
-            "this image, or use the RPC"
+            f"No corrections explain it{others}. Check the origin of lines and pixels and whether "
+            "the RPC are of this image, or use the RPC"
         )
     return _warn(
         scanner,
