@@ -1,0 +1,451 @@
+"""Products of the roots of error components with M, exactly, from reduced matrices.
+
+With P, Q, A and S of `error_linearisation`, the products of roots F of few columns need only
+
+    FᵀMF = FᵀPF − (AᵀPF)ᵀ·S⁻¹·AᵀPF
+
+the reduced normal equations of an adjustment in which the columns of F are further unknowns of
+cameras and photographs, summed over clusters of observations (`error_clusters`).
+
+A component of many columns, V = F·Fᵀ with a block for every cluster, as of errors along tracks, is
+kept as these blocks. With U = P·A·S^(−½), F̃ = M·F of the few columns, and of n = 1, 2, …
+
+    l_n = tr((P·V)ⁿ),    a_n = Uᵀ·V·(P·V)ⁿ⁻¹·U
+
+powers of M·V follow from det(1 − z·M·V) = det(1 − z·P·V)·det(1 + Σ zⁿ·a_n):
+
+    tr(MV)     = l_1 − tr a_1
+    tr((MV)²)  = l_2 − 2·tr a_2 + tr a_1²
+    tr((MV)³)  = l_3 − 3·tr a_3 + 3·tr(a_1·a_2) − tr a_1³
+    tr((MV)⁴)  = l_4 − 4·tr a_4 + 4·tr(a_1·a_3) + 2·tr a_2² − 4·tr(a_1²·a_2) + tr a_1⁴
+
+l_n, a_1, a_2 and tr(F̃ᵀVF̃) are exact. What only the skewness and the uncertainty of sizes need, a_3,
+a_4 and F̃ᵀV(MV)ⁿF̃ in full, is from some of the clusters where there are many.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxbundle.leastsquares.equations.reduced import DenseFactor, flat
+from jaxbundle.leastsquares.quality.error_clusters import Batch, Clusters, lay_out_clusters
+from jaxbundle.leastsquares.quality.error_linearisation import (
+    Datum,
+    LinearisedRows,
+    datum_of,
+    linearise_rows,
+)
+from jaxbundle.leastsquares.quality.reduced_traces import Powers, ReducedTraces
+from jaxbundle.leastsquares.solution import Solution
+from jaxbundle.types import present
+
+Matrix = Float[np.ndarray, "n m"]
+
+
+class Roots(NamedTuple):
+    """The roots of few columns: `narrow`, a sparse matrix of those with few values in a row, as of
+    photographs, and `wide`: of every other one the sparse matrix, and the dense one that mixes every
+    as many of its columns as it has rows (None: as they are); of the component with a block for
+    every cluster V = F·Fᵀ, sparse, None if there is none. `of_components`: the columns of every
+    component, the narrow ones first; None of that with blocks."""
+
+    narrow: Any
+    wide: list[tuple[Any, Matrix | None]]
+    block: Any | None
+    of_components: list[slice | None]
+
+    @property
+    def number(self) -> int:
+        """Columns of few."""
+        return max((s.stop for s in self.of_components if s is not None), default=0)
+
+    def wide_rows(self, rows: Int[np.ndarray, "m k"]) -> Batch:
+        """The wide roots of some rows."""
+        parts = [np.zeros((rows.size, 0))]
+        for root, mixing in self.wide:
+            x = root[rows.ravel()].toarray()
+            if mixing is not None:
+                x = (x.reshape(-1, len(mixing)) @ mixing).reshape(len(x), -1)
+            parts.append(x)
+        return np.concatenate(parts, 1).reshape(*rows.shape, -1)
+
+
+@dataclasses.dataclass
+class Sums:
+    """Sums over clusters: of kept unknowns A, roots F, and directions h = E·V⁻¹·B_e of the datum
+    (all columns of A and F with P)."""
+
+    AF: Matrix
+    FF: Matrix
+    hF: Matrix
+    AVA: Matrix
+    AVF: Matrix
+    AVPVA: Matrix
+    AVh: Matrix
+    hVh: Matrix
+    FVF: Float[np.ndarray, " q"]
+    powers: Float[np.ndarray, "4"]
+
+
+def sum_products(clusters: Sequence[Clusters], roots: Roots, unknowns: int, datum: Datum) -> Sums:
+    """The sums over all clusters."""
+    # the place behind the last of each stands for none
+    p, n, w = unknowns + 1, roots.narrow.shape[1] + 1, roots.number - roots.narrow.shape[1]
+    d = datum.number
+    both, with_wide, wide = np.zeros((p + n, p + n)), np.zeros((p + n, w)), np.zeros((w, w))
+    AV, AV_wide, AVPVA = np.zeros((p, p + n)), np.zeros((p, w)), np.zeros((p, p))
+    AVh, hVh, hF, hW = np.zeros((p, d)), np.zeros((d, d)), np.zeros((d, n)), np.zeros((d, w))
+    FVF, WVW, powers = np.zeros(n), np.zeros(w), np.zeros(4)
+    flat_rows = lambda x: x.reshape(-1, x.shape[2])
+    for of in clusters:
+        for c in of.portions(of.A.shape[2] + of.F.shape[2] + w):
+            a = c.A.shape[2]
+            at = np.concatenate([c.A_at, p + c.F_at], 1)
+            F, W = c.F, roots.wide_rows(c.rows)
+            if d:
+                h = c.Q @ datum.of_eliminated[c.eliminated]
+                for k, x in enumerate(np.einsum("mkd,mkf->dmf", h, F)):
+                    hF[k] += np.bincount(c.F_at.ravel(), x.ravel(), n)
+                hW += flat_rows(h).T @ flat_rows(W)
+            X, W = c.without_fit(np.concatenate([c.A, F], 2)), c.without_fit(W)
+            wide += flat_rows(W).T @ flat_rows(W)
+            if c.V is not None:
+                VA = c.V @ X[:, :, :a]
+                PVA = c.without_fit(VA)
+                FVF += np.bincount(
+                    c.F_at.ravel(), np.einsum("mkf,mkf->mf", c.V @ X[:, :, a:], X[:, :, a:]).ravel(), n
+                )
+                WVW += np.einsum("mkf,mkf->f", c.V @ W, W)
+                powers += _powers(c)
+                if d:
+                    Vh = c.V @ h
+                    hVh += flat_rows(h).T @ flat_rows(Vh)
+                    for k, x in enumerate(np.einsum("mka,mkd->dma", X[:, :, :a], Vh)):
+                        AVh[:, k] += np.bincount(c.A_at.ravel(), x.ravel(), p)
+            for some in c.by_columns():
+                to, x, y = at[some.start], flat_rows(X[some]), flat_rows(W[some])
+                both[to[:, None], to] += x.T @ x
+                with_wide[to] += x.T @ y
+                if c.V is not None:
+                    to_A, v, b = to[:a], flat_rows(VA[some]), flat_rows(PVA[some])
+                    AV[to_A[:, None], to] += v.T @ x
+                    AV_wide[to_A] += v.T @ y
+                    AVPVA[to_A[:, None], to_A] += b.T @ b
+    kept, narrow = slice(0, p - 1), slice(p, p + n - 1)
+    return Sums(
+        np.concatenate([both[kept, narrow], with_wide[kept]], 1),
+        np.block([[both[narrow, narrow], with_wide[narrow]], [with_wide[narrow].T, wide]]),
+        np.concatenate([hF[:, : n - 1], hW], 1),
+        AV[kept, kept],
+        np.concatenate([AV[kept, narrow], AV_wide[kept]], 1),
+        AVPVA[kept, kept],
+        AVh[kept],
+        hVh,
+        np.concatenate([FVF[: n - 1], WVW]),
+        powers,
+    )
+
+
+def _powers(c: Clusters) -> Float[np.ndarray, "4"]:
+    """Sums of tr((P·V)ⁿ)."""
+    PV = c.without_fit(present(c.V))
+    square = PV @ PV
+    product = lambda x, y: np.sum(x * y.transpose(0, 2, 1))
+    traces = product(PV, square), product(square, square)
+    return np.array([np.trace(PV, axis1=1, axis2=2).sum(), product(PV, PV), *traces])
+
+
+class ErrorProducts:
+    """Products of roots with M at a solution, and the changes of unknowns that they are; `few`: the
+    products S = FᵀMF of all columns of few."""
+
+    def __init__(
+        self,
+        found: Solution,
+        linear: LinearisedRows,
+        clusters: Sequence[Clusters],
+        roots: Roots,
+    ):
+        from scipy.linalg import solve_triangular
+
+        self.found, self.linear, self.clusters, self.roots = found, linear, clusters, roots
+        self.datum = datum_of(found, linear)
+        self.sums = sum_products(clusters, roots, linear.A.shape[1], self.datum)
+        factor = found.factor
+        lower, plan = np.asarray(factor.reduced.lower), found.problem.plan
+        self.scale = np.asarray(flat(plan.kept, factor.scale))[:, None]
+        # S⁻¹ = D·L⁻ᵀ·L⁻¹·D
+        self._forth = lambda x: solve_triangular(lower, self.scale * x, lower=True)
+        self._back = lambda x: self.scale * solve_triangular(lower, x, lower=True, trans=1)
+        self.Y = self._forth(self.sums.AF)
+        self.few = self.sums.FF - self.Y.T @ self.Y
+
+    def changes(self) -> tuple[Matrix, Matrix]:
+        """The changes of kept unknowns by the columns of the roots, N⁻¹AᵀF without the datum, and
+        the motions a into it."""
+        x, datum = self._back(self.Y), self.datum
+        return x, datum.inverse @ (datum.conditions.T @ x + self.sums.hF)
+
+    def blocks_of_few(self, columns: slice, eliminated: bool) -> dict[str, np.ndarray]:
+        """By group the covariance blocks X·Xᵀ that a component of few columns gives, of eliminated
+        rows if wanted."""
+        plan, datum = self.found.problem.plan, self.datum
+        x, a = (y[:, columns] for y in self.changes())
+        moved, found, first = x - datum.motions @ a, {}, 0
+        for g in plan.kept:
+            n, w = plan.groups[g].free.shape
+            of = moved[first : first + n * w].reshape(n, w, -1)
+            found[g], first = of @ of.transpose(0, 2, 1), first + n * w
+        if eliminated and plan.eliminated is not None:
+            found[plan.eliminated] = self._eliminated_of_few(columns, x, a)
+        return found
+
+    def _eliminated_of_few(self, columns: slice, x: Matrix, a: Matrix) -> Batch:
+        """The blocks of eliminated rows, whose changes are L⁻ᵀ·Qᵀ·(F − A·x) − G·a."""
+        datum, number = self.datum, columns.stop - columns.start
+        narrow = self.roots.narrow.shape[1]
+        found = np.zeros((*datum.motions_eliminated.shape[:2], self.linear.Q.shape[1]))
+        below = np.concatenate([x, np.zeros((1, number))])
+        for of in self.clusters:
+            if of.eliminated[0] < 0:
+                continue
+            for c in of.portions(number):
+                if columns.start >= narrow:
+                    wide = slice(columns.start - narrow, columns.stop - narrow)
+                    F = self.roots.wide_rows(c.rows)[:, :, wide]
+                else:
+                    F = np.zeros((*c.rows.shape, number + 1))
+                    at = c.F_at - columns.start
+                    at = np.where((at < 0) | (at >= number), number, at)
+                    m, k = np.indices(c.rows.shape)
+                    F[m[:, :, None], k[:, :, None], at[:, None]] = c.F
+                    F = F[:, :, :number]
+                turned = c.Q.transpose(0, 2, 1)
+                QF, QA = turned @ F, turned @ c.A
+                for some in c.by_columns():
+                    QF[some] -= QA[some] @ below[c.A_at[some.start]]
+                L = np.asarray(self.found.factor.lower_inverse)[c.eliminated]
+                change = L.transpose(0, 2, 1) @ QF - datum.motions_eliminated[c.eliminated] @ a
+                found[c.eliminated] = change @ change.transpose(0, 2, 1)
+        return found
+
+    def blocks_of_block(self, eliminated: bool) -> dict[str, np.ndarray]:
+        """`blocks_of_few` of the component with a block for every cluster."""
+        plan, datum, p = self.found.problem.plan, self.datum, self.linear.A.shape[1]
+        d = datum.number
+        # z = (x, a) = T·(Aᵀ·P·e, hᵀ·e)
+        inverse = self._back(self._forth(np.eye(p)))
+        onto = datum.inverse @ datum.conditions.T @ inverse
+        T = np.block([[inverse, np.zeros((p, d))], [onto, datum.inverse]])
+        C = T @ np.block([[self.sums.AVA, self.sums.AVh], [self.sums.AVh.T, self.sums.hVh]]) @ T.T
+        of_kept = np.concatenate([np.eye(p), -datum.motions], 1)
+        moved, found, first = of_kept @ C @ of_kept.T, {}, 0
+        for g in plan.kept:
+            n, w = plan.groups[g].free.shape
+            of = moved[first : first + n * w, first : first + n * w].reshape(n, w, n, w)
+            found[g], first = of[np.arange(n), :, np.arange(n)], first + n * w
+        if eliminated and plan.eliminated is not None:
+            found[plan.eliminated] = self._eliminated_of_block(T, C)
+        return found
+
+    def _eliminated_of_block(self, T: Matrix, C: Matrix) -> Batch:
+        """The blocks of eliminated rows, whose changes are α·e − β·z."""
+        datum, p = self.datum, self.linear.A.shape[1]
+        found = np.zeros((*datum.motions_eliminated.shape[:2], self.linear.Q.shape[1]))
+        # the last of A's places stands for none
+        T, C = (np.insert(np.insert(x, p, 0.0, 0), p, 0.0, 1) for x in (T, C))
+        of_datum = np.arange(p + 1, len(T))
+        for of in self.clusters:
+            if of.eliminated[0] < 0:
+                continue
+            for c in of.portions(of.A.shape[2]):
+                L = np.asarray(self.found.factor.lower_inverse)[c.eliminated]
+                alpha = L.transpose(0, 2, 1) @ c.Q.transpose(0, 2, 1)
+                beta = np.concatenate([alpha @ c.A, datum.motions_eliminated[c.eliminated]], 2)
+                Va = present(c.V) @ alpha.transpose(0, 2, 1)
+                h = c.Q @ datum.of_eliminated[c.eliminated]
+                onto = np.concatenate([c.without_fit(c.A), h], 2).transpose(0, 2, 1) @ Va
+                blocks = alpha @ Va
+                for some in c.by_columns():
+                    at = np.concatenate([c.A_at[some.start], of_datum])
+                    square = at[:, None], at
+                    b = beta[some]
+                    cross = b @ (T[square] @ onto[some])
+                    blocks[some] += b @ C[square] @ b.transpose(0, 2, 1)
+                    blocks[some] -= cross + cross.transpose(0, 2, 1)
+                found[c.eliminated] = blocks
+        return found
+
+    def powers(self, at_most: int, rng: np.random.Generator) -> "Powers":
+        """Traces and products with powers of M·V of the component with a block for every cluster,
+        what is not exact from `at_most` clusters."""
+        s, q = self.sums, self.roots.number
+        U = lambda x: self._forth(self._forth(x).T)
+        a1, a2, b1 = U(s.AVA), U(s.AVPVA), self._forth(s.AVF) - U(s.AVA) @ self.Y
+        # tr(F̃ᵀVF̃) by column
+        exact = s.FVF - 2 * np.sum(self.Y * self._forth(s.AVF), 0)
+        exact = exact + np.sum(self.Y * (a1 @ self.Y), 0)
+        l = s.powers
+        trace = np.trace
+        t1 = l[0] - trace(a1)
+        t2 = l[1] - 2 * trace(a2) + np.sum(a1 * a1)
+        p = len(a1)
+        number = sum(len(c.rows) for c in self.clusters)
+        chosen = np.zeros(number, bool)
+        chosen[rng.permutation(number)[:at_most]] = True
+        near = np.zeros((q, q)), np.zeros((q, q))
+        a3, a4, b2, R2, R3 = (np.zeros(shape) for shape in ((p, p), (p, p), (p, q), (q, q), (q, q)))
+        first = 0
+        for of in self.clusters:
+            own = np.flatnonzero(chosen[first : first + len(of.rows)])
+            first += len(of.rows)
+            for c in of.some(own).portions(p + q) if len(own) else ():
+                x0 = np.concatenate(self._dense(c), 2)
+                V, flat_rows = present(c.V), lambda x: x.reshape(-1, x.shape[2])
+                x1 = V @ x0
+                x2 = c.without_fit(x1)
+                x3 = V @ x2
+                x4 = flat_rows(c.without_fit(x3))
+                x0, x1, x2, x3 = map(flat_rows, (x0, x1, x2, x3))
+                near[0][:] += x0[:, p:].T @ x0[:, p:]
+                near[1][:] += x0[:, p:].T @ x1[:, p:]
+                u2, f2 = x2[:, :p], x2[:, p:]
+                b2 += u2.T @ f2
+                a3 += u2.T @ x3[:, :p]
+                a4 += x4[:, :p].T @ x4[:, :p]
+                R2 += f2.T @ f2
+                R3 += f2.T @ x3[:, p:]
+        share = number / max(chosen.sum(), 1)
+        a3, a4, b2, R2, R3, white, R1 = (share * x for x in (a3, a4, b2, R2, R3, *near))
+        # errors along a track are nearly independent ones: only the difference is from some
+        like = t1 / max(self.found.problem.counts.redundancy, 1)
+        R1 = R1 + like * (self.few - white)
+        R2 = R2 - b1.T @ b1
+        cross = b1.T @ b2
+        R3 = R3 - cross - cross.T + b1.T @ a1 @ b1
+        t3 = l[2] - 3 * trace(a3) + 3 * np.sum(a1 * a2) - np.sum(a1 @ a1 * a1)
+        square = a1 @ a1
+        t4 = l[3] - 4 * trace(a4) + 4 * np.sum(a1 * a3) + 2 * np.sum(a2 * a2)
+        t4 = t4 - 4 * np.sum(square * a2) + np.sum(square * square)
+        return Powers(np.array([t1, t2, t3, t4]), exact, R1, R2, R3)
+
+    def _dense(self, c: Clusters) -> tuple[Batch, Batch]:
+        """U and F̃ of some clusters."""
+        m, k = np.indices(c.rows.shape)
+        p, n = self.linear.A.shape[1], self.roots.narrow.shape[1]
+
+        def spread(values: Batch, at: np.ndarray, number: int) -> Batch:
+            dense = np.zeros((*c.rows.shape, number + 1))
+            dense[m[:, :, None], k[:, :, None], at[:, None]] = values
+            return dense[:, :, :number]
+
+        A = c.without_fit(spread(c.A, c.A_at, p))
+        U = self._forth(A.reshape(-1, p).T).T
+        F = np.concatenate([spread(c.F, c.F_at, n), self.roots.wide_rows(c.rows)], 2)
+        F = c.without_fit(F).reshape(len(U), -1) - U @ self.Y
+        return U.reshape(*c.rows.shape, -1), F.reshape(*c.rows.shape, -1)
+
+    def traces(self, max_clusters: int, rng: np.random.Generator) -> ReducedTraces:
+        """The traces of all components; `max_clusters`: see `powers`."""
+        powers = self.powers(max_clusters, rng) if self.roots.block is not None else None
+        redundancy = self.found.problem.counts.redundancy
+        return ReducedTraces(self.few, self.roots.of_components, powers, redundancy)
+
+    def blocks(self, theta: Float[np.ndarray, " k"]) -> list[dict[str, np.ndarray]]:
+        """By table the covariance blocks that every component of θ = 1 gives; of the eliminated
+        table, and of the others of a component of many columns, only where its θ is not zero."""
+        found: list[dict[str, np.ndarray]] = []
+        for t, columns in zip(theta[1:], self.roots.of_components):
+            if columns is None:
+                blocks = self.blocks_of_block(bool(t != 0))
+            else:
+                blocks = self.blocks_of_few(columns, bool(t != 0))
+            found.append(self._by_table(blocks))
+        return found
+
+    def _by_table(self, blocks: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Blocks of groups as those of the rows of tables; zero for held unknowns."""
+        problem, found = self.found.problem, {}
+        for table in problem.tables:
+            members = [
+                (g, m)
+                for g in blocks
+                for m in problem.plan.groups[g].members
+                if m.table == table.name
+            ]
+            if not members and table.name == problem.plan.eliminated:
+                continue
+            width = table.space.width
+            of_table = np.zeros((problem.sizes["table", table.name], width, width))
+            for g, m in members:
+                at, rows = slice(m.start, m.start + m.width), slice(None)
+                rows = rows if m.rows is None else np.asarray(m.rows)
+                np.add.at(of_table, rows, blocks[g][:, at, at])
+            found[table.name] = of_table[: table.rows]
+        return found
+
+
+def error_products(
+    found: Solution, roots: Sequence[tuple[Any, Matrix | None]], max_columns: int
+) -> ErrorProducts | None:
+    """The products of roots, sparse matrices [rows, columns] with what mixes their columns.
+
+    None if the reduced system is not factorised densely, or if several have more than
+    `max_columns` and their errors are shared by more than one cluster."""
+    sorted_roots = _sort_roots(roots, max_columns)
+    if sorted_roots is None or not isinstance(found.factor.reduced, DenseFactor):
+        return None
+    linear = linearise_rows(found)
+    clusters = lay_out_clusters(linear, sorted_roots.narrow, sorted_roots.block)
+    if clusters is None:
+        return None
+    return ErrorProducts(found, linear, clusters, sorted_roots)
+
+
+def _sort_roots(
+    roots: Sequence[tuple[Any, Matrix | None]], max_columns: int, max_narrow: int = 8
+) -> Roots | None:
+    """Roots by what they are; None if several have many columns. `max_narrow`: values in a row of
+    a sparse one; a spline of the sensor has 16, and with several image points of a track nearly
+    all."""
+    import scipy.sparse as sp
+
+    many = [k for k, (root, _) in enumerate(roots) if root.shape[1] > max_columns]
+    if not roots or len(many) > 1:
+        return None
+    of_components: list[slice | None] = [None] * len(roots)
+    dense = lambda root: root.nnz > max_narrow * np.count_nonzero(np.diff(root.indptr))
+    few = [k for k in range(len(roots)) if k not in many]
+    # narrow ones first
+    few.sort(key=lambda k: dense(roots[k][0]))
+    narrow, wide = [sp.csr_matrix((roots[0][0].shape[0], 0))], []
+    for k in few:
+        root, mixing = roots[k]
+        first = sum(x.shape[1] for x in narrow) + sum(_width(*x) for x in wide)
+        if dense(root):
+            wide.append((root, mixing))
+        else:
+            narrow.append(root if mixing is None else root @ _repeat(mixing, root.shape[1]))
+        of_components[k] = slice(first, first + _width(root, mixing))
+    block = None
+    for k in many:
+        root, mixing = roots[k]
+        root = root if mixing is None else root @ _repeat(mixing, root.shape[1])
+        block = (root @ root.T).tocsr()
+    return Roots(sp.hstack(narrow).tocsr(), wide, block, of_components)
+
+
+def _width(root: Any, mixing: Matrix | None) -> int:
+    """The number of columns of a mixed root."""
+    number = root.shape[1]
+    return number if mixing is None else number // len(mixing) * mixing.shape[1]
+
+
+def _repeat(mixing: Matrix, columns: int) -> Any:
+    """The sparse matrix that mixes all columns."""
+    import scipy.sparse as sp
+
+    return sp.kron(sp.identity(columns // len(mixing)), sp.csr_matrix(mixing)).tocsr()
