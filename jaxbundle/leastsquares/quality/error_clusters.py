@@ -21,7 +21,7 @@ Places = Int[np.ndarray, "m c"]
 
 @dataclasses.dataclass(frozen=True)
 class Clusters:
-    """m clusters of k rows each: `rows` of the observations, the eliminated row (−1: none), Q, the
+    """m clusters of k rows each: `rows` of the observations, the eliminated row (−1: all have none), Q, the
     values of A and of narrow roots F in the columns `A_at` and `F_at` (the number of columns stands
     for none), and V of a component with a block for every cluster. Clusters of equal columns begin
     at `groups`."""
@@ -78,8 +78,9 @@ def lay_out_clusters(linear: LinearisedRows, F: Any, V: Any | None) -> list[Clus
     order = order[np.argsort(cluster[order], kind="stable")]
     _, start, count = np.unique(cluster[order], return_index=True, return_counts=True)
     sparse, found = [_padded(matrix) for matrix in (linear.A, F)], []
-    for k in np.unique(count):
-        rows = order[start[count == k][:, None] + np.arange(k)]
+    kinds = np.stack([count, alone[order[start]]], 1)
+    for kind in np.unique(kinds, axis=0):
+        rows = order[start[(kinds == kind).all(1)][:, None] + np.arange(kind[0])]
         (A, A_at), (F_, F_at) = (_local(at[rows], x[rows], none) for at, x, none in sparse)
         key = np.concatenate([A_at, F_at], 1)
         # sorted by a random combination of their columns, clusters of equal ones are neighbours

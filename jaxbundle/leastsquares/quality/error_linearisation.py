@@ -104,6 +104,15 @@ class Datum(NamedTuple):
     def number(self) -> int:
         return len(self.inverse)
 
+    def effects(
+        self, Q: Float[np.ndarray, "m k width"], eliminated: Int[np.ndarray, " m"]
+    ) -> Float[np.ndarray, "m k d"]:
+        """h = E·V⁻¹·B_e, with which hᵀe is what errors of observations change in Bᵀx through their
+        eliminated row (−1: they touch none)."""
+        if not len(self.of_eliminated) or (eliminated < 0).any():
+            return np.zeros((*Q.shape[:2], self.number))
+        return Q @ self.of_eliminated[eliminated]
+
 
 def datum_of(found: Solution, linear: LinearisedRows) -> Datum:
     """The datum of a solution; without columns if nothing is open."""
@@ -124,9 +133,8 @@ def datum_of(found: Solution, linear: LinearisedRows) -> Datum:
     if e is not None:
         motions = G[e]
         of_eliminated = np.asarray(found.factor.lower_inverse) @ B[e]
-        some = np.flatnonzero(linear.eliminated >= 0)
-        h = np.zeros((len(linear.Q), d))
-        h[some] = np.einsum("rw,rwd->rd", linear.Q[some], of_eliminated[linear.eliminated[some]])
+        # Q is zero where no row is eliminated
+        h = np.einsum("rw,rwd->rd", linear.Q, of_eliminated[linear.eliminated])
         conditions = conditions - linear.A.T @ h
     return Datum(kept(G), motions, conditions, of_eliminated, np.linalg.inv(gram))
 

@@ -68,9 +68,11 @@ class Roots(NamedTuple):
         for root, mixing in self.wide:
             x = root[rows.ravel()].toarray()
             if mixing is not None:
-                x = (x.reshape(-1, len(mixing)) @ mixing).reshape(len(x), -1)
+                x = x.reshape(len(x), -1, len(mixing)) @ mixing
+                x = x.reshape(len(x), -1)
             parts.append(x)
-        return np.concatenate(parts, 1).reshape(*rows.shape, -1)
+        x = np.concatenate(parts, 1)
+        return x.reshape(*rows.shape, x.shape[1])
 
 
 @dataclasses.dataclass
@@ -99,19 +101,18 @@ def sum_products(clusters: Sequence[Clusters], roots: Roots, unknowns: int, datu
     AV, AV_wide, AVPVA = np.zeros((p, p + n)), np.zeros((p, w)), np.zeros((p, p))
     AVh, hVh, hF, hW = np.zeros((p, d)), np.zeros((d, d)), np.zeros((d, n)), np.zeros((d, w))
     FVF, WVW, powers = np.zeros(n), np.zeros(w), np.zeros(4)
-    flat_rows = lambda x: x.reshape(-1, x.shape[2])
     for of in clusters:
         for c in of.portions(of.A.shape[2] + of.F.shape[2] + w):
             a = c.A.shape[2]
             at = np.concatenate([c.A_at, p + c.F_at], 1)
             F, W = c.F, roots.wide_rows(c.rows)
             if d:
-                h = c.Q @ datum.of_eliminated[c.eliminated]
+                h = datum.effects(c.Q, c.eliminated)
                 for k, x in enumerate(np.einsum("mkd,mkf->dmf", h, F)):
                     hF[k] += np.bincount(c.F_at.ravel(), x.ravel(), n)
-                hW += flat_rows(h).T @ flat_rows(W)
+                hW += _tall(h).T @ _tall(W)
             X, W = c.without_fit(np.concatenate([c.A, F], 2)), c.without_fit(W)
-            wide += flat_rows(W).T @ flat_rows(W)
+            wide += _tall(W).T @ _tall(W)
             if c.V is not None:
                 VA = c.V @ X[:, :, :a]
                 PVA = c.without_fit(VA)
@@ -122,15 +123,15 @@ def sum_products(clusters: Sequence[Clusters], roots: Roots, unknowns: int, datu
                 powers += _powers(c)
                 if d:
                     Vh = c.V @ h
-                    hVh += flat_rows(h).T @ flat_rows(Vh)
+                    hVh += _tall(h).T @ _tall(Vh)
                     for k, x in enumerate(np.einsum("mka,mkd->dma", X[:, :, :a], Vh)):
                         AVh[:, k] += np.bincount(c.A_at.ravel(), x.ravel(), p)
             for some in c.by_columns():
-                to, x, y = at[some.start], flat_rows(X[some]), flat_rows(W[some])
+                to, x, y = at[some.start], _tall(X[some]), _tall(W[some])
                 both[to[:, None], to] += x.T @ x
                 with_wide[to] += x.T @ y
                 if c.V is not None:
-                    to_A, v, b = to[:a], flat_rows(VA[some]), flat_rows(PVA[some])
+                    to_A, v, b = to[:a], _tall(VA[some]), _tall(PVA[some])
                     AV[to_A[:, None], to] += v.T @ x
                     AV_wide[to_A] += v.T @ y
                     AVPVA[to_A[:, None], to_A] += b.T @ b
@@ -147,6 +148,12 @@ def sum_products(clusters: Sequence[Clusters], roots: Roots, unknowns: int, datu
         np.concatenate([FVF[: n - 1], WVW]),
         powers,
     )
+
+
+def _tall(x: Batch) -> Matrix:
+    """The rows of all clusters in one matrix."""
+    m, k, columns = x.shape
+    return x.reshape(m * k, columns)
 
 
 def _powers(c: Clusters) -> Float[np.ndarray, "4"]:
@@ -266,7 +273,7 @@ class ErrorProducts:
                 alpha = L.transpose(0, 2, 1) @ c.Q.transpose(0, 2, 1)
                 beta = np.concatenate([alpha @ c.A, datum.motions_eliminated[c.eliminated]], 2)
                 Va = present(c.V) @ alpha.transpose(0, 2, 1)
-                h = c.Q @ datum.of_eliminated[c.eliminated]
+                h = datum.effects(c.Q, c.eliminated)
                 onto = np.concatenate([c.without_fit(c.A), h], 2).transpose(0, 2, 1) @ Va
                 blocks = alpha @ Va
                 for some in c.by_columns():
@@ -304,12 +311,12 @@ class ErrorProducts:
             first += len(of.rows)
             for c in of.some(own).portions(p + q) if len(own) else ():
                 x0 = np.concatenate(self._dense(c), 2)
-                V, flat_rows = present(c.V), lambda x: x.reshape(-1, x.shape[2])
+                V = present(c.V)
                 x1 = V @ x0
                 x2 = c.without_fit(x1)
                 x3 = V @ x2
-                x4 = flat_rows(c.without_fit(x3))
-                x0, x1, x2, x3 = map(flat_rows, (x0, x1, x2, x3))
+                x4 = _tall(c.without_fit(x3))
+                x0, x1, x2, x3 = map(_tall, (x0, x1, x2, x3))
                 near[0][:] += x0[:, p:].T @ x0[:, p:]
                 near[1][:] += x0[:, p:].T @ x1[:, p:]
                 u2, f2 = x2[:, :p], x2[:, p:]
@@ -345,8 +352,8 @@ class ErrorProducts:
         A = c.without_fit(spread(c.A, c.A_at, p))
         U = self._forth(A.reshape(-1, p).T).T
         F = np.concatenate([spread(c.F, c.F_at, n), self.roots.wide_rows(c.rows)], 2)
-        F = c.without_fit(F).reshape(len(U), -1) - U @ self.Y
-        return U.reshape(*c.rows.shape, -1), F.reshape(*c.rows.shape, -1)
+        F = _tall(c.without_fit(F)) - U @ self.Y
+        return U.reshape(*c.rows.shape, p), F.reshape(*c.rows.shape, F.shape[1])
 
     def traces(self, max_clusters: int, rng: np.random.Generator) -> ReducedTraces:
         """The traces of all components; `max_clusters`: see `powers`."""
