@@ -9,7 +9,12 @@ import pytest
 
 import jaxbundle
 from jaxbundle.adjustment.problem import make_problem
-from jaxbundle.adjustment.quality.correlated_errors import splines
+from jaxbundle.adjustment.quality.correlated_errors import (
+    CorrelationSettings,
+    cubic_splines,
+    root_of_octaves,
+    splines_of_point,
+)
 from jaxbundle.adjustment.quality.given_points import given_points_components, wendland
 from jaxbundle.adjustment.quality.replication import compared_parameters
 from jaxbundle.adjustment.quality.weakness import Weakness
@@ -231,9 +236,22 @@ def test_what_cannot_be_replicated_is_said(clean):
 
 def test_splines_are_a_partition_of_one_and_kernels_are_positive():
     rng = np.random.default_rng(0)
-    at = rng.uniform(-1, 1, (200, 2)) * [1, 0.7]
-    B = splines(at, np.array([1, 0.7]), (11, 9))
+    place = np.append(rng.uniform(0, 1, 200), [0.0, 0.25, 1.0])
+    B, at = cubic_splines(place, 11), np.arange(len(place))[:, None]
     np.testing.assert_allclose(B.sum(1), 1, atol=1e-12)
+    values, which = splines_of_point(place, 11)
+    sparse = np.zeros_like(B)
+    sparse[at, which] = values
+    np.testing.assert_allclose(sparse, B, atol=1e-12)
+    # the finest splines, combined, have the covariance of the splines of all octaves
+    settings = CorrelationSettings()
+    u, v = rng.uniform(0, 1, (2, 50))
+    by_octave = [
+        np.einsum("ni,nj->nji", cubic_splines(u, a), cubic_splines(v, b)).reshape(50, -1)
+        for a, b in settings.octaves_of_knots
+    ]
+    finest = by_octave[0] @ root_of_octaves(settings)
+    np.testing.assert_allclose(finest @ finest.T, sum(B @ B.T for B in by_octave), atol=1e-12)
     X = rng.normal(size=(40, 3))
     K = wendland(np.linalg.norm(X[:, None] - X, axis=2))
     assert np.linalg.eigvalsh(K).min() > 0 and wendland(np.array([0.0, 1.0, 2.0])).sum() == 1

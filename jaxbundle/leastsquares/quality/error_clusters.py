@@ -61,23 +61,27 @@ class Clusters:
             yield slice(first, last)
 
 
-def lay_out_clusters(linear: LinearisedRows, F: Any, V: Any | None) -> list[Clusters] | None:
-    """The clusters of all rows with a derivative or an error, by their number of rows, from narrow
-    roots F and V, sparse; None if V couples rows of different clusters."""
+def lay_out_clusters(linear: LinearisedRows, F: Any, many: Any | None) -> list[Clusters] | None:
+    """The clusters of all rows with a derivative or an error, by their number of rows, from sparse
+    roots: of narrow ones, and of the component of many columns; None if a column of this has rows
+    of different clusters."""
     cluster = linear.eliminated.copy()
     alone = cluster < 0
     cluster[alone] = cluster.max(initial=-1) + 1 + np.arange(alone.sum())
     # rows without weight have neither
     some = (np.diff(linear.A.indptr) + np.diff(F.indptr) > 0) | (linear.Q != 0).any(1)
-    if V is not None:
-        row = np.repeat(np.arange(len(cluster)), np.diff(V.indptr))
-        if (cluster[row] != cluster[V.indices]).any():
+    if many is not None:
+        of_column = np.zeros(many.shape[1], int)
+        row = np.repeat(cluster, np.diff(many.indptr))
+        of_column[many.indices] = row
+        if (of_column[many.indices] != row).any():
             return None
-        some |= np.diff(V.indptr) > 0
+        some |= np.diff(many.indptr) > 0
     order = np.flatnonzero(some)
     order = order[np.argsort(cluster[order], kind="stable")]
     _, start, count = np.unique(cluster[order], return_index=True, return_counts=True)
     sparse, found = [_padded(matrix) for matrix in (linear.A, F)], []
+    root = None if many is None else _padded(many)
     kinds = np.stack([count, alone[order[start]]], 1)
     for kind in np.unique(kinds, axis=0):
         rows = order[start[(kinds == kind).all(1)][:, None] + np.arange(kind[0])]
@@ -85,10 +89,13 @@ def lay_out_clusters(linear: LinearisedRows, F: Any, V: Any | None) -> list[Clus
         key = np.concatenate([A_at, F_at], 1)
         # sorted by a random combination of their columns, clusters of equal ones are neighbours
         by = np.argsort(key @ np.random.default_rng(0).integers(1, 1 << 40, key.shape[1]))
-        blocks = None if V is None else _blocks(V, rows[by])
+        V = None
+        if root is not None:
+            G, _ = _local(root[0][rows[by]], root[1][rows[by]], root[2])
+            V = G @ G.transpose(0, 2, 1)
         given = (rows, linear.eliminated[rows[:, 0]], linear.Q[rows], A, A_at, F_, F_at)
         groups = _begin_groups([A_at[by], F_at[by]])
-        found.append(Clusters(*(x[by] for x in given), blocks, groups))
+        found.append(Clusters(*(x[by] for x in given), V, groups))
     return found
 
 
@@ -136,15 +143,3 @@ def _local(
     cluster, row = np.arange(m)[:, None, None], np.arange(k)[None, :, None]
     dense[cluster, row, of.reshape(m, k, s)] = values
     return dense, places
-
-
-def _blocks(V: Any, rows: Int[np.ndarray, "m k"]) -> Float[np.ndarray, "m k k"]:
-    """The blocks of a sparse matrix."""
-    m, k = rows.shape
-    at, values, _ = _padded(V[rows.ravel()])
-    place = np.zeros(V.shape[0] + 1, int)
-    place[rows] = np.arange(k)
-    blocks = np.zeros((m * k, k))
-    # what stands for none adds zero to the first
-    np.add.at(blocks, (np.arange(m * k)[:, None], place[at]), values)
-    return blocks.reshape(m, k, k)

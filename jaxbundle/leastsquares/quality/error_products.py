@@ -48,13 +48,13 @@ Matrix = Float[np.ndarray, "n m"]
 class Roots(NamedTuple):
     """The roots of few columns: `narrow`, a sparse matrix of those with few values in a row, as of
     photographs, and `wide`: of every other one the sparse matrix, and the dense one that mixes every
-    as many of its columns as it has rows (None: as they are); of the component with a block for
-    every cluster V = F·Fᵀ, sparse, None if there is none. `of_components`: the columns of every
-    component, the narrow ones first; None of that with blocks."""
+    as many of its columns as it has rows (None: as they are). `many`: the sparse root of the
+    component of many columns, None if there is none. `of_components`: the columns of every other
+    component, the narrow ones first."""
 
     narrow: Any
     wide: list[tuple[Any, Matrix | None]]
-    block: Any | None
+    many: Any | None
     of_components: list[slice | None]
 
     @property
@@ -68,8 +68,8 @@ class Roots(NamedTuple):
         for root, mixing in self.wide:
             x = root[rows.ravel()].toarray()
             if mixing is not None:
-                x = x.reshape(len(x), -1, len(mixing)) @ mixing
-                x = x.reshape(len(x), -1)
+                blocks, (b, c) = x.shape[1] // len(mixing), mixing.shape
+                x = (x.reshape(len(x) * blocks, b) @ mixing).reshape(len(x), blocks * c)
             parts.append(x)
         x = np.concatenate(parts, 1)
         return x.reshape(*rows.shape, x.shape[1])
@@ -303,8 +303,11 @@ class ErrorProducts:
         number = sum(len(c.rows) for c in self.clusters)
         chosen = np.zeros(number, bool)
         chosen[rng.permutation(number)[:at_most]] = True
-        near = np.zeros((q, q)), np.zeros((q, q))
-        a3, a4, b2, R2, R3 = (np.zeros(shape) for shape in ((p, p), (p, p), (p, q), (q, q), (q, q)))
+        a3, a4, b2, near, R2, R3 = (
+            np.zeros(shape) for shape in (*[(p, p)] * 2, (p, q), *[(q, q)] * 3)
+        )
+        # errors along a track are nearly independent ones: only the difference is from some
+        like = t1 / max(self.found.problem.counts.redundancy, 1)
         first = 0
         for of in self.clusters:
             own = np.flatnonzero(chosen[first : first + len(of.rows)])
@@ -317,8 +320,7 @@ class ErrorProducts:
                 x3 = V @ x2
                 x4 = _tall(c.without_fit(x3))
                 x0, x1, x2, x3 = map(_tall, (x0, x1, x2, x3))
-                near[0][:] += x0[:, p:].T @ x0[:, p:]
-                near[1][:] += x0[:, p:].T @ x1[:, p:]
+                near += x0[:, p:].T @ (x1 - like * x0)[:, p:]
                 u2, f2 = x2[:, :p], x2[:, p:]
                 b2 += u2.T @ f2
                 a3 += u2.T @ x3[:, :p]
@@ -326,10 +328,8 @@ class ErrorProducts:
                 R2 += f2.T @ f2
                 R3 += f2.T @ x3[:, p:]
         share = number / max(chosen.sum(), 1)
-        a3, a4, b2, R2, R3, white, R1 = (share * x for x in (a3, a4, b2, R2, R3, *near))
-        # errors along a track are nearly independent ones: only the difference is from some
-        like = t1 / max(self.found.problem.counts.redundancy, 1)
-        R1 = R1 + like * (self.few - white)
+        a3, a4, b2, near, R2, R3 = (share * x for x in (a3, a4, b2, near, R2, R3))
+        R1 = like * self.few + near
         R2 = R2 - b1.T @ b1
         cross = b1.T @ b2
         R3 = R3 - cross - cross.T + b1.T @ a1 @ b1
@@ -357,7 +357,7 @@ class ErrorProducts:
 
     def traces(self, max_clusters: int, rng: np.random.Generator) -> ReducedTraces:
         """The traces of all components; `max_clusters`: see `powers`."""
-        powers = self.powers(max_clusters, rng) if self.roots.block is not None else None
+        powers = self.powers(max_clusters, rng) if self.roots.many is not None else None
         redundancy = self.found.problem.counts.redundancy
         return ReducedTraces(self.few, self.roots.of_components, powers, redundancy)
 
@@ -406,7 +406,7 @@ def error_products(
     if sorted_roots is None or not isinstance(found.factor.reduced, DenseFactor):
         return None
     linear = linearise_rows(found)
-    clusters = lay_out_clusters(linear, sorted_roots.narrow, sorted_roots.block)
+    clusters = lay_out_clusters(linear, sorted_roots.narrow, sorted_roots.many)
     if clusters is None:
         return None
     return ErrorProducts(found, linear, clusters, sorted_roots)
@@ -437,12 +437,11 @@ def _sort_roots(
         else:
             narrow.append(root if mixing is None else root @ _repeat(mixing, root.shape[1]))
         of_components[k] = slice(first, first + _width(root, mixing))
-    block = None
+    of_many = None
     for k in many:
         root, mixing = roots[k]
-        root = root if mixing is None else root @ _repeat(mixing, root.shape[1])
-        block = (root @ root.T).tocsr()
-    return Roots(sp.hstack(narrow).tocsr(), wide, block, of_components)
+        of_many = root if mixing is None else root @ _repeat(mixing, root.shape[1])
+    return Roots(sp.hstack(narrow).tocsr(), wide, of_many, of_components)
 
 
 def _width(root: Any, mixing: Matrix | None) -> int:
