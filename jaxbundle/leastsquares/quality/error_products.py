@@ -24,11 +24,11 @@ a_4 and F̃ᵀV(MV)ⁿF̃ in full, is from some of the clusters where there are 
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxbundle.leastsquares.equations.reduced import DenseFactor, flat
 from jaxbundle.leastsquares.quality.error_clusters import Batch, Clusters, lay_out_clusters
@@ -46,33 +46,39 @@ Matrix = Float[np.ndarray, "n m"]
 
 
 class Roots(NamedTuple):
-    """The roots of few columns: `narrow`, a sparse matrix of those with few values in a row, as of
-    photographs, and `wide`: of every other one the sparse matrix, and the dense one that mixes every
-    as many of its columns as it has rows (None: as they are). `many`: the sparse root of the
+    """The roots of few columns in two sparse matrices: `narrow` with few values in a row, as of
+    photographs, and `wide`; `mixing`: by the columns of wide ones of every component the matrix that
+    mixes every as many of them as it has rows (None: as they are). `many`: the sparse root of the
     component of many columns, None if there is none. `of_components`: the columns of every other
-    component, the narrow ones first."""
+    component, mixed, the narrow ones first."""
 
     narrow: Any
-    wide: list[tuple[Any, Matrix | None]]
+    wide: Any
+    mixing: list[tuple[slice, Matrix | None]]
     many: Any | None
     of_components: list[slice | None]
 
     @property
     def number(self) -> int:
-        """Columns of few."""
+        """Mixed columns of few."""
         return max((s.stop for s in self.of_components if s is not None), default=0)
 
-    def wide_rows(self, rows: Int[np.ndarray, "m k"]) -> Batch:
-        """The wide roots of some rows."""
-        parts = [np.zeros((rows.size, 0))]
-        for root, mixing in self.wide:
-            x = root[rows.ravel()].toarray()
+    def mix(self, x: Float[np.ndarray, "*n columns"]) -> Float[np.ndarray, "*n mixed"]:
+        """Quantities by the columns of wide roots as those of mixed ones."""
+        parts = [x[..., :0]]
+        for columns, mixing in self.mixing:
+            part = x[..., columns]
             if mixing is not None:
-                blocks, (b, c) = x.shape[1] // len(mixing), mixing.shape
-                x = (x.reshape(len(x) * blocks, b) @ mixing).reshape(len(x), blocks * c)
-            parts.append(x)
-        x = np.concatenate(parts, 1)
-        return x.reshape(*rows.shape, x.shape[1])
+                b, c = mixing.shape
+                shape, blocks = part.shape[:-1], part.shape[-1] // b
+                rows = int(np.prod(shape)) * blocks
+                part = (part.reshape(rows, b) @ mixing).reshape(*shape, blocks * c)
+            parts.append(part)
+        return np.concatenate(parts, -1)
+
+    def wide_rows(self, rows: Int[np.ndarray, "m k"]) -> Batch:
+        """The wide roots of some rows, not mixed."""
+        return self.wide[rows.ravel()].toarray().reshape(*rows.shape, self.wide.shape[1])
 
 
 @dataclasses.dataclass
@@ -95,37 +101,34 @@ class Sums:
 def sum_products(clusters: Sequence[Clusters], roots: Roots, unknowns: int, datum: Datum) -> Sums:
     """The sums over all clusters."""
     # the place behind the last of each stands for none
-    p, n, w = unknowns + 1, roots.narrow.shape[1] + 1, roots.number - roots.narrow.shape[1]
+    p, n, w = unknowns + 1, roots.narrow.shape[1] + 1, roots.wide.shape[1]
     d = datum.number
-    both, with_wide, wide = np.zeros((p + n, p + n)), np.zeros((p + n, w)), np.zeros((w, w))
+    both, with_wide, wide = np.zeros((p + n, p + n)), np.zeros((p + n, w)), gram(roots.wide)
     AV, AV_wide, AVPVA = np.zeros((p, p + n)), np.zeros((p, w)), np.zeros((p, p))
     AVh, hVh, hF, hW = np.zeros((p, d)), np.zeros((d, d)), np.zeros((d, n)), np.zeros((d, w))
-    FVF, WVW, powers = np.zeros(n), np.zeros(w), np.zeros(4)
+    FVF, powers = np.zeros(n), np.zeros(4)
     for of in clusters:
         for c in of.portions(of.A.shape[2] + of.F.shape[2] + w):
             a = c.A.shape[2]
             at = np.concatenate([c.A_at, p + c.F_at], 1)
-            F, W = c.F, roots.wide_rows(c.rows)
+            W = roots.wide_rows(c.rows)
+            QW = _tall(c.Q.transpose(0, 2, 1) @ W)
+            wide -= QW.T @ QW
+            X = c.without_fit(np.concatenate([c.A, c.F], 2))
+            A, F = X[:, :, :a], X[:, :, a:]
+            h = datum.effects(c.Q, c.eliminated)
             if d:
-                h = datum.effects(c.Q, c.eliminated)
-                for k, x in enumerate(np.einsum("mkd,mkf->dmf", h, F)):
+                for k, x in enumerate(np.einsum("mkd,mkf->dmf", h, c.F)):
                     hF[k] += np.bincount(c.F_at.ravel(), x.ravel(), n)
                 hW += _tall(h).T @ _tall(W)
-            X, W = c.without_fit(np.concatenate([c.A, F], 2)), c.without_fit(W)
-            wide += _tall(W).T @ _tall(W)
             if c.V is not None:
-                VA = c.V @ X[:, :, :a]
+                VA, Vh = c.V @ A, c.V @ h
                 PVA = c.without_fit(VA)
-                FVF += np.bincount(
-                    c.F_at.ravel(), np.einsum("mkf,mkf->mf", c.V @ X[:, :, a:], X[:, :, a:]).ravel(), n
-                )
-                WVW += np.einsum("mkf,mkf->f", c.V @ W, W)
+                FVF += np.bincount(c.F_at.ravel(), np.sum(c.V @ F * F, 1).ravel(), n)
                 powers += _powers(c)
-                if d:
-                    Vh = c.V @ h
-                    hVh += _tall(h).T @ _tall(Vh)
-                    for k, x in enumerate(np.einsum("mka,mkd->dma", X[:, :, :a], Vh)):
-                        AVh[:, k] += np.bincount(c.A_at.ravel(), x.ravel(), p)
+                hVh += _tall(h).T @ _tall(Vh)
+                for k, x in enumerate(np.einsum("mka,mkd->dma", A, Vh)):
+                    AVh[:, k] += np.bincount(c.A_at.ravel(), x.ravel(), p)
             for some in c.by_columns():
                 to, x, y = at[some.start], _tall(X[some]), _tall(W[some])
                 both[to[:, None], to] += x.T @ x
@@ -133,21 +136,75 @@ def sum_products(clusters: Sequence[Clusters], roots: Roots, unknowns: int, datu
                 if c.V is not None:
                     to_A, v, b = to[:a], _tall(VA[some]), _tall(PVA[some])
                     AV[to_A[:, None], to] += v.T @ x
-                    AV_wide[to_A] += v.T @ y
+                    AV_wide[to_A] += b.T @ y
                     AVPVA[to_A[:, None], to_A] += b.T @ b
     kept, narrow = slice(0, p - 1), slice(p, p + n - 1)
+    mixed = roots.mix(with_wide)
+    wide = roots.mix(roots.mix(wide).T)
     return Sums(
-        np.concatenate([both[kept, narrow], with_wide[kept]], 1),
-        np.block([[both[narrow, narrow], with_wide[narrow]], [with_wide[narrow].T, wide]]),
-        np.concatenate([hF[:, : n - 1], hW], 1),
+        np.concatenate([both[kept, narrow], mixed[kept]], 1),
+        np.block([[both[narrow, narrow], mixed[narrow]], [mixed[narrow].T, wide]]),
+        np.concatenate([hF[:, : n - 1], roots.mix(hW)], 1),
         AV[kept, kept],
-        np.concatenate([AV[kept, narrow], AV_wide[kept]], 1),
+        np.concatenate([AV[kept, narrow], roots.mix(AV_wide[kept])], 1),
         AVPVA[kept, kept],
         AVh[kept],
         hVh,
-        np.concatenate([FVF[: n - 1], WVW]),
+        FVF[: n - 1],
         powers,
     )
+
+
+def gram(F: Any) -> Matrix:
+    """FᵀF of a sparse matrix, by dense products of the rows with values in the same columns."""
+    count = np.diff(F.indptr)
+    rows = np.flatnonzero(count)
+    key = np.random.default_rng(0).integers(1, 1 << 40, F.shape[1])[F.indices]
+    pattern = np.add.reduceat(key, F.indptr[rows]) if len(rows) else rows
+    order = np.argsort(pattern, kind="stable")
+    first = np.flatnonzero(np.diff(pattern[order], prepend=-1))
+    if 4 * len(first) > len(rows):
+        return (F.T @ F).toarray()
+    found, rows = np.zeros((F.shape[1],) * 2), rows[order]
+    for a, b in zip(first, [*first[1:], len(rows)]):
+        start, number = F.indptr[rows[a:b]], count[rows[a]]
+        at = F.indices[start[0] : start[0] + number]
+        x = F.data[start[:, None] + np.arange(number)]
+        found[at[:, None], at] += x.T @ x
+    return found
+
+
+def share_of_many(
+    clusters: Sequence[Clusters], roots: Roots, FF: Matrix, chosen: Bool[np.ndarray, " clusters"]
+) -> Float[np.ndarray, " mixed"]:
+    """The diagonal of FᵀPVPF of mixed wide roots, whose FᵀPF is given, from chosen clusters.
+
+    V is nearly a multiple of 1, as of errors along tracks: only the difference is from some of
+    them."""
+    w = len(FF)
+    part, of_white, like, white = np.zeros(w), np.zeros(w), 0.0, 0.0
+    for c in _chosen(clusters, chosen, w):
+        W = c.without_fit(roots.mix(roots.wide_rows(c.rows)))
+        V = present(c.V)
+        part += np.sum(V @ W * W, (0, 1))
+        of_white += np.sum(W * W, (0, 1))
+        like += np.trace(V, axis1=1, axis2=2).sum()
+        white += V.shape[0] * V.shape[1]
+    factor = like / max(white, 1.0)
+    share = len(chosen) / max(chosen.sum(), 1)
+    return factor * np.diag(FF) + share * (part - factor * of_white)
+
+
+def _chosen(
+    clusters: Sequence[Clusters], chosen: Bool[np.ndarray, " clusters"], columns: int
+) -> Iterator[Clusters]:
+    """Chosen clusters, some at a time."""
+    first = 0
+    for of in clusters:
+        own = np.flatnonzero(chosen[first : first + len(of.rows)])
+        first += len(of.rows)
+        if len(own):
+            yield from of.some(own).portions(columns)
 
 
 def _tall(x: Batch) -> Matrix:
@@ -222,7 +279,7 @@ class ErrorProducts:
             for c in of.portions(number):
                 if columns.start >= narrow:
                     wide = slice(columns.start - narrow, columns.stop - narrow)
-                    F = self.roots.wide_rows(c.rows)[:, :, wide]
+                    F = self.roots.mix(self.roots.wide_rows(c.rows))[:, :, wide]
                 else:
                     F = np.zeros((*c.rows.shape, number + 1))
                     at = c.F_at - columns.start
@@ -293,40 +350,38 @@ class ErrorProducts:
         U = lambda x: self._forth(self._forth(x).T)
         a1, a2, b1 = U(s.AVA), U(s.AVPVA), self._forth(s.AVF) - U(s.AVA) @ self.Y
         # tr(F̃ᵀVF̃) by column
-        exact = s.FVF - 2 * np.sum(self.Y * self._forth(s.AVF), 0)
+        number = sum(len(c.rows) for c in self.clusters)
+        order, n = rng.permutation(number), self.roots.narrow.shape[1]
+        chosen, near = np.zeros(number, bool), np.zeros(number, bool)
+        chosen[order[:at_most]] = near[order[: 10 * at_most]] = True
+        exact = share_of_many(self.clusters, self.roots, s.FF[n:, n:], near)
+        exact = np.concatenate([s.FVF, exact]) - 2 * np.sum(self.Y * self._forth(s.AVF), 0)
         exact = exact + np.sum(self.Y * (a1 @ self.Y), 0)
         l = s.powers
         trace = np.trace
         t1 = l[0] - trace(a1)
         t2 = l[1] - 2 * trace(a2) + np.sum(a1 * a1)
         p = len(a1)
-        number = sum(len(c.rows) for c in self.clusters)
-        chosen = np.zeros(number, bool)
-        chosen[rng.permutation(number)[:at_most]] = True
         a3, a4, b2, near, R2, R3 = (
             np.zeros(shape) for shape in (*[(p, p)] * 2, (p, q), *[(q, q)] * 3)
         )
         # errors along a track are nearly independent ones: only the difference is from some
         like = t1 / max(self.found.problem.counts.redundancy, 1)
-        first = 0
-        for of in self.clusters:
-            own = np.flatnonzero(chosen[first : first + len(of.rows)])
-            first += len(of.rows)
-            for c in of.some(own).portions(p + q) if len(own) else ():
-                x0 = np.concatenate(self._dense(c), 2)
-                V = present(c.V)
-                x1 = V @ x0
-                x2 = c.without_fit(x1)
-                x3 = V @ x2
-                x4 = _tall(c.without_fit(x3))
-                x0, x1, x2, x3 = map(_tall, (x0, x1, x2, x3))
-                near += x0[:, p:].T @ (x1 - like * x0)[:, p:]
-                u2, f2 = x2[:, :p], x2[:, p:]
-                b2 += u2.T @ f2
-                a3 += u2.T @ x3[:, :p]
-                a4 += x4[:, :p].T @ x4[:, :p]
-                R2 += f2.T @ f2
-                R3 += f2.T @ x3[:, p:]
+        for c in _chosen(self.clusters, chosen, p + q):
+            x0 = np.concatenate(self._dense(c), 2)
+            V = present(c.V)
+            x1 = V @ x0
+            x2 = c.without_fit(x1)
+            x3 = V @ x2
+            x4 = _tall(c.without_fit(x3))
+            x0, x1, x2, x3 = map(_tall, (x0, x1, x2, x3))
+            near += x0[:, p:].T @ (x1 - like * x0)[:, p:]
+            u2, f2 = x2[:, :p], x2[:, p:]
+            b2 += u2.T @ f2
+            a3 += u2.T @ x3[:, :p]
+            a4 += x4[:, :p].T @ x4[:, :p]
+            R2 += f2.T @ f2
+            R3 += f2.T @ x3[:, p:]
         share = number / max(chosen.sum(), 1)
         a3, a4, b2, near, R2, R3 = (share * x for x in (a3, a4, b2, near, R2, R3))
         R1 = like * self.few + near
@@ -351,7 +406,8 @@ class ErrorProducts:
 
         A = c.without_fit(spread(c.A, c.A_at, p))
         U = self._forth(A.reshape(-1, p).T).T
-        F = np.concatenate([spread(c.F, c.F_at, n), self.roots.wide_rows(c.rows)], 2)
+        W = self.roots.mix(self.roots.wide_rows(c.rows))
+        F = np.concatenate([spread(c.F, c.F_at, n), W], 2)
         F = _tall(c.without_fit(F)) - U @ self.Y
         return U.reshape(*c.rows.shape, p), F.reshape(*c.rows.shape, F.shape[1])
 
@@ -428,26 +484,27 @@ def _sort_roots(
     few = [k for k in range(len(roots)) if k not in many]
     # narrow ones first
     few.sort(key=lambda k: dense(roots[k][0]))
-    narrow, wide = [sp.csr_matrix((roots[0][0].shape[0], 0))], []
+    none = sp.csr_matrix((roots[0][0].shape[0], 0))
+    narrow, wide, mixed, first = [none], [none], [], 0
     for k in few:
         root, mixing = roots[k]
-        first = sum(x.shape[1] for x in narrow) + sum(_width(*x) for x in wide)
+        number = root.shape[1]
         if dense(root):
-            wide.append((root, mixing))
+            before = sum(x.shape[1] for x in wide)
+            mixed.append((slice(before, before + number), mixing))
+            wide.append(root)
         else:
-            narrow.append(root if mixing is None else root @ _repeat(mixing, root.shape[1]))
-        of_components[k] = slice(first, first + _width(root, mixing))
+            narrow.append(root if mixing is None else root @ _repeat(mixing, number))
+        if mixing is not None:
+            number = number // len(mixing) * mixing.shape[1]
+        of_components[k] = slice(first, first + number)
+        first += number
     of_many = None
     for k in many:
         root, mixing = roots[k]
         of_many = root if mixing is None else root @ _repeat(mixing, root.shape[1])
-    return Roots(sp.hstack(narrow).tocsr(), wide, of_many, of_components)
-
-
-def _width(root: Any, mixing: Matrix | None) -> int:
-    """The number of columns of a mixed root."""
-    number = root.shape[1]
-    return number if mixing is None else number // len(mixing) * mixing.shape[1]
+    both = [sp.hstack(x).tocsr() if len(x) > 2 else x[-1] for x in (narrow, wide)]
+    return Roots(*both, mixed, of_many, of_components)
 
 
 def _repeat(mixing: Matrix, columns: int) -> Any:
