@@ -2,8 +2,8 @@
 
 Of `error_linearisation`, P = 1 − Q·Qᵀ has a block for every cluster. Clusters of as many rows are
 laid out in one array, with the columns of A and of sparse roots that each of them has. Clusters
-with the same columns are neighbours: products Xᵀ·Y of sparse matrices are sums of products of tall
-dense ones (2 Gflop in 0.05 s, where sparse products of as many take 8 s).
+with the same columns are neighbours, so that products Xᵀ·Y of sparse matrices are sums of products
+of tall dense ones (2·10⁹ operations in 0.04 s; a product of sparse matrices takes 8 s for these).
 """
 
 import dataclasses
@@ -21,10 +21,10 @@ Places = Int[np.ndarray, "m c"]
 
 @dataclasses.dataclass(frozen=True)
 class Clusters:
-    """m clusters of k rows each: `rows` of the observations, the eliminated row (−1: all have none), Q, the
-    values of A and of narrow roots F in the columns `A_at` and `F_at` (the number of columns stands
-    for none), and V of a component with a block for every cluster. Clusters of equal columns begin
-    at `groups`."""
+    """m clusters of k rows each: `rows` of the observations, the eliminated row (−1: none of these
+    clusters has one), Q, the values of A and of narrow roots F in the columns `A_at` and `F_at`
+    (the number of columns stands for none), and V of a component of many columns. Clusters of
+    equal columns begin at `groups`."""
 
     rows: Int[np.ndarray, "m k"]
     eliminated: Int[np.ndarray, " m"]
@@ -47,9 +47,9 @@ class Clusters:
         picked = {name: None if x is None else x[at] for name, x in fields.items()}
         return Clusters(**picked, groups=_begin_groups([picked["A_at"], picked["F_at"]]))
 
-    def portions(self, columns: int, at_once: int = 4_000_000) -> Iterator["Clusters"]:
-        """Some clusters at a time, whose rows of so many columns have at most `at_once` numbers
-        (32 MB: they stay in the cache of a processor core no longer, but half is as fast)."""
+    def portions(self, columns: int, at_once: int = 1_000_000) -> Iterator["Clusters"]:
+        """Some clusters at a time, whose rows of so many columns have at most `at_once` numbers (8
+        MB: four times as many take the same time, but memory that has to be cleared first)."""
         m, k = self.rows.shape
         step = max(at_once // max(k * columns, 1), 1)
         for first in range(0, m, step):
@@ -80,22 +80,24 @@ def lay_out_clusters(linear: LinearisedRows, F: Any, many: Any | None) -> list[C
     order = np.flatnonzero(some)
     order = order[np.argsort(cluster[order], kind="stable")]
     _, start, count = np.unique(cluster[order], return_index=True, return_counts=True)
-    sparse, found = [_padded(matrix) for matrix in (linear.A, F)], []
-    root = None if many is None else _padded(many)
+    roots = [linear.A, F] if many is None else [linear.A, F, many]
+    padded, found = [_padded(matrix) for matrix in roots], []
+    # sorted by a random number of their columns, clusters of equal ones are neighbours
+    rng = np.random.default_rng(0)
+    of_columns = [rng.integers(1, 1 << 40, none + 1) for *_, none in padded[:2]]
+    key = sum(number[at].sum(1) for number, (at, *_) in zip(of_columns, padded))
     kinds = np.stack([count, alone[order[start]]], 1)
     for kind in np.unique(kinds, axis=0):
         rows = order[start[(kinds == kind).all(1)][:, None] + np.arange(kind[0])]
-        (A, A_at), (F_, F_at) = (_local(at[rows], x[rows], none) for at, x, none in sparse)
-        key = np.concatenate([A_at, F_at], 1)
-        # sorted by a random combination of their columns, clusters of equal ones are neighbours
-        by = np.argsort(key @ np.random.default_rng(0).integers(1, 1 << 40, key.shape[1]))
+        rows = rows[np.argsort(key[rows].sum(1))]
+        (A, A_at), (narrow, narrow_at), *rest = (
+            _local(at[rows], x[rows], none) for at, x, none in padded
+        )
         V = None
-        if root is not None:
-            G, _ = _local(root[0][rows[by]], root[1][rows[by]], root[2])
+        for G, _ in rest:
             V = G @ G.transpose(0, 2, 1)
-        given = (rows, linear.eliminated[rows[:, 0]], linear.Q[rows], A, A_at, F_, F_at)
-        groups = _begin_groups([A_at[by], F_at[by]])
-        found.append(Clusters(*(x[by] for x in given), V, groups))
+        given = rows, linear.eliminated[rows[:, 0]], linear.Q[rows], A, A_at, narrow, narrow_at
+        found.append(Clusters(*given, V, _begin_groups([A_at, narrow_at])))
     return found
 
 
@@ -130,7 +132,7 @@ def _local(
     if m * k * s == 0:
         return np.zeros((m, k, 0)), np.zeros((m, 0), int)
     flat = at.reshape(m, -1)
-    order = np.argsort(flat, 1, kind="stable")
+    order = np.argsort(flat, 1)
     ordered = np.take_along_axis(flat, order, 1)
     new = np.zeros(flat.shape, int)
     new[:, 1:] = ordered[:, 1:] != ordered[:, :-1]

@@ -55,8 +55,8 @@ from jaxbundle.types import present
 class ErrorComponent(NamedTuple):
     """One V = F·Fᵀ: `root`: F as a sparse matrix [rows, columns], rows of all observations in
     units of their a priori σ, set by set (`stack_rows`); a column is the effect of an error of one
-    `unit`. With `mixing` [b, c], F is the root with every b of its columns replaced by c combinations
-    of them, such as splines of all scales by the finest, of which each row has few."""
+    `unit`. With `mixing` [b, c], F is the root with every b of its columns replaced by c
+    combinations of them: splines of all scales by the finest, of which each row has few."""
 
     name: str
     unit: str
@@ -136,7 +136,8 @@ class ErrorSettings:
     - `max_columns`: roots of more columns are those of many (`error_products`), whose products with
       each other, of 8 MB for these, are not formed.
     - `max_clusters`: object points, or other eliminated rows, from which the skewness and the
-      uncertainty of sizes of such a component are, right to √(2/300) = 8 %.
+      uncertainty of sizes of such a component are, right to √(2/200) = 10 %; from ten times as
+      many are its traces with a field on the sensor, right to 1 %.
     - `significance`: a component is left out if its size could be chance (one-sided, at this level
       for all components together). θ ≥ 0 makes chance add to σ, never take from them: 18 % to those
       of the stations of twelve photographs with independent errors if all θ > 0 are taken, 10 % at
@@ -147,7 +148,7 @@ class ErrorSettings:
     """
 
     max_columns: int = 1000
-    max_clusters: int = 300
+    max_clusters: int = 200
     significance: float = 0.05
     draws: int = 100
     seed: int = 0

@@ -59,7 +59,9 @@ def linearise_rows(found: Solution) -> LinearisedRows:
         for touch, J in zip(part.touches, touches):
             J = np.asarray(J).reshape(-1, *J.shape[2:])[place]
             wide = plan.groups[touch.group].width
-            column = first[touch.group] + wide * np.asarray(touch.row)[place // length] + touch.start
+            column = (
+                first[touch.group] + wide * np.asarray(touch.row)[place // length] + touch.start
+            )
             column = column[:, None] + np.arange(J.shape[2])
             shape = J.shape
             entries.append(

@@ -117,27 +117,29 @@ def sum_products(clusters: Sequence[Clusters], roots: Roots, unknowns: int, datu
             X = c.without_fit(np.concatenate([c.A, c.F], 2))
             A, F = X[:, :, :a], X[:, :, a:]
             h = datum.effects(c.Q, c.eliminated)
-            if d:
-                for k, x in enumerate(np.einsum("mkd,mkf->dmf", h, c.F)):
-                    hF[k] += np.bincount(c.F_at.ravel(), x.ravel(), n)
-                hW += _tall(h).T @ _tall(W)
+            # rows of AᵀPW, FᵀPW and hᵀW, and of AᵀPVPW, in one product
+            left = [X, h]
             if c.V is not None:
                 VA, Vh = c.V @ A, c.V @ h
                 PVA = c.without_fit(VA)
+                left.append(PVA)
                 FVF += np.bincount(c.F_at.ravel(), np.sum(c.V @ F * F, 1).ravel(), n)
                 powers += _powers(c)
                 hVh += _tall(h).T @ _tall(Vh)
-                for k, x in enumerate(np.einsum("mka,mkd->dma", A, Vh)):
-                    AVh[:, k] += np.bincount(c.A_at.ravel(), x.ravel(), p)
+            joint = np.concatenate(left, 2)
             for some in c.by_columns():
-                to, x, y = at[some.start], _tall(X[some]), _tall(W[some])
+                to, x, y = at[some.start], _tall(X[some]), _tall(joint[some])
+                to_A, of_wide = to[:a], y.T @ _tall(W[some])
                 both[to[:, None], to] += x.T @ x
-                with_wide[to] += x.T @ y
+                with_wide[to] += of_wide[: len(to)]
+                hW += of_wide[len(to) : len(to) + d]
+                hF[:, to[a:] - p] += _tall(h[some]).T @ _tall(c.F[some])
                 if c.V is not None:
-                    to_A, v, b = to[:a], _tall(VA[some]), _tall(PVA[some])
+                    v, b = _tall(VA[some]), y[:, len(to) + d :]
                     AV[to_A[:, None], to] += v.T @ x
-                    AV_wide[to_A] += b.T @ y
+                    AV_wide[to_A] += of_wide[len(to) + d :]
                     AVPVA[to_A[:, None], to_A] += b.T @ b
+                    AVh[to_A] += x[:, :a].T @ _tall(Vh[some])
     kept, narrow = slice(0, p - 1), slice(p, p + n - 1)
     mixed = roots.mix(with_wide)
     wide = roots.mix(roots.mix(wide).T)

@@ -23,7 +23,6 @@ from jaxtyping import Float
 
 from jaxbundle.leastsquares.quality.size_traces import with_traces
 
-
 Matrix = Float[np.ndarray, "n m"]
 
 
@@ -92,7 +91,9 @@ class ReducedTraces:
                 found[k, t] = found[t, k] = np.trace(both[a, a])
             R = R1 * sizes
             mixed = 2 * (theta[0] * np.trace(R2 * sizes) + of_t * np.trace(R3 * sizes))
-            powers = np.array([theta[0] ** 2, 2 * theta[0] * of_t, of_t**2]) @ self.powers.traces[1:]
+            powers = (
+                np.array([theta[0] ** 2, 2 * theta[0] * of_t, of_t**2]) @ self.powers.traces[1:]
+            )
             found[t, t] = powers + mixed + np.sum(R * R.T)
         for i, a in self.few:
             for j, b in self.few:
