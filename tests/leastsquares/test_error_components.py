@@ -116,8 +116,9 @@ def distances():
     seen = rng.uniform(size=(len(points), len(stations))) < 0.9
     point, station = np.nonzero(seen)
     i, j = np.triu_indices(len(stations), 1)
-    sight = ls.Kind("sight", lambda p, s, d: ((p - s) @ (p - s)) ** 0.5 - d, of=("point", "station"))
-    base = ls.Kind("base", lambda a, b, d: ((a - b) @ (a - b)) ** 0.5 - d, of=("station",) * 2)
+    residual = lambda a, b, d: ((a - b) @ (a - b)) ** 0.5 - d
+    sight = ls.Kind("sight", residual, of=("point", "station"))
+    base = ls.Kind("base", residual, of=("station", "station"))
     between = lambda a, b: np.linalg.norm(a - b, axis=1) + SIGMA * rng.normal(size=len(a))
     sigma = np.full(len(point), SIGMA)
     sigma[[3, 40]] = np.inf
@@ -140,7 +141,7 @@ def distances():
 def components_of_distances(given, used):
     """Offsets of stations, waves (mixed), errors of the distances of a point, those of the bases:
     few and many columns."""
-    (point, station, i, j), rng = given, np.random.default_rng(9)
+    (point, station, i, _), rng = given, np.random.default_rng(9)
     n, rows = len(point), len(point) + len(i)
     number = np.arange(n)
     offsets = sp.csr_matrix((np.ones(n), (number, station)), shape=(rows, 6))

@@ -117,7 +117,7 @@ class ImageRows:
         count[row] = values.shape[2]
         start = np.concatenate([[0], np.cumsum(count)])
         place = start[row][:, :, None] + np.arange(values.shape[2])
-        data, indices = np.zeros(start[-1]), np.zeros(start[-1], int)
+        data, indices = np.zeros(start[-1]), np.zeros(start[-1], np.int32)
         data[place] = values / self.sigma[rays][:, :, None]
         indices[place] = columns
         return sp.csr_matrix((data, indices, start), shape=(self.number, width))

@@ -43,7 +43,9 @@ def linearise_rows(found: Solution) -> LinearisedRows:
     for g in plan.kept:
         first[g] = unknowns
         unknowns += plan.groups[g].free.size
-    entries: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    # indices of 32 bits: half the memory, and what sparse matrices have
+    none = np.zeros(0, np.int32)
+    entries = [(none, none, np.zeros(0))]
     width = 0 if plan.eliminated is None else plan.groups[plan.eliminated].width
     Q, eliminated = np.zeros((total, width)), np.full(total, -1)
     numbers = {o.name: o.number for o in found.problem.observations}
@@ -54,32 +56,26 @@ def linearise_rows(found: Solution) -> LinearisedRows:
         own = np.flatnonzero(source[np.minimum(place, len(source) - 1)] == np.arange(n))
         own = own[place[own] < len(source)]
         place = place[own]
-        r = (touches[0] if E is None else E).shape[2]
+        r = np.asarray(found.residuals[part.set_name]).shape[1]
         row = (starts[part.set_name] + r * own)[:, None] + np.arange(r)
         for touch, J in zip(part.touches, touches):
             J = np.asarray(J).reshape(-1, *J.shape[2:])[place]
             wide = plan.groups[touch.group].width
-            column = (
-                first[touch.group] + wide * np.asarray(touch.row)[place // length] + touch.start
-            )
-            column = column[:, None] + np.arange(J.shape[2])
-            shape = J.shape
-            entries.append(
-                (
-                    np.broadcast_to(row[:, :, None], shape).ravel(),
-                    np.broadcast_to(column[:, None, :], shape).ravel(),
-                    J.ravel(),
-                )
-            )
+            column = first[touch.group] + touch.start + wide * np.asarray(touch.row)
+            column = column[place // length][:, None] + np.arange(J.shape[2])
+            at = row[:, :, None], column[:, None, :]
+            spread = (np.broadcast_to(x.astype(np.int32), J.shape).ravel() for x in at)
+            entries.append((*spread, J.ravel()))
         if E is not None:
             at = np.asarray(part.eliminated).ravel()[place]
             L = np.asarray(found.factor.lower_inverse)[at]
             J = np.asarray(E).reshape(-1, *E.shape[2:])[place]
             Q[row] = J @ L.transpose(0, 2, 1)
             eliminated[row] = at[:, None]
-    rows, columns, values = (np.concatenate(x) if entries else np.zeros(0) for x in zip(*entries))
-    some = values != 0
-    A = sp.csr_matrix((values[some], (rows[some], columns[some])), shape=(total, unknowns))
+    rows, columns, values = (np.concatenate(x) for x in zip(*entries))
+    A = sp.csr_matrix((values, (rows, columns)), shape=(total, unknowns))
+    # of held unknowns, and of observations without weight
+    A.eliminate_zeros()
     return LinearisedRows(A, Q, eliminated)
 
 
@@ -93,8 +89,8 @@ def _derivatives(declared: Declared, plan: Plan, values: Values, data: Data) -> 
 
 class Datum(NamedTuple):
     """Open motions G and conditions B (`datum.conditions`) of kept unknowns and of eliminated rows,
-    with which a change x becomes x − G·a, a = (BᵀG)⁻¹Bᵀx: `inverse`, (BᵀG)⁻¹; `conditions`, the part
-    of B that acts on kept unknowns, B − Aᵀ·E·V⁻¹·B_e; `of_eliminated`, L⁻¹·B_e."""
+    with which a change x becomes x − G·a, a = (BᵀG)⁻¹Bᵀx: `inverse`, (BᵀG)⁻¹; `conditions`, the
+    part of B that acts on kept unknowns, B − Aᵀ·E·V⁻¹·B_e; `of_eliminated`, L⁻¹·B_e."""
 
     motions: Float[np.ndarray, "unknowns d"]
     motions_eliminated: Float[np.ndarray, "n width d"]

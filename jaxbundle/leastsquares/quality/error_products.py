@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxbundle.leastsquares.equations.reduced import DenseFactor, flat
+from jaxbundle.leastsquares.equations.reduced import DenseFactor
 from jaxbundle.leastsquares.quality.error_clusters import Batch, Clusters, lay_out_clusters
 from jaxbundle.leastsquares.quality.error_linearisation import (
     Datum,
@@ -47,10 +47,10 @@ Matrix = Float[np.ndarray, "n m"]
 
 class Roots(NamedTuple):
     """The roots of few columns in two sparse matrices: `narrow` with few values in a row, as of
-    photographs, and `wide`; `mixing`: by the columns of wide ones of every component the matrix that
-    mixes every as many of them as it has rows (None: as they are). `many`: the sparse root of the
-    component of many columns, None if there is none. `of_components`: the columns of every other
-    component, mixed, the narrow ones first."""
+    photographs, and `wide`; `mixing`: by the columns of wide ones of every component the matrix
+    that mixes every as many of them as it has rows (None: as they are). `many`: the sparse root of
+    the component of many columns, None if there is none. `of_components`: the columns of every
+    other component, mixed, the narrow ones first."""
 
     narrow: Any
     wide: Any
@@ -235,19 +235,27 @@ class ErrorProducts:
         clusters: Sequence[Clusters],
         roots: Roots,
     ):
-        from scipy.linalg import solve_triangular
-
         self.found, self.linear, self.clusters, self.roots = found, linear, clusters, roots
         self.datum = datum_of(found, linear)
         self.sums = sum_products(clusters, roots, linear.A.shape[1], self.datum)
         factor = found.factor
-        lower, plan = np.asarray(factor.reduced.lower), found.problem.plan
-        self.scale = np.asarray(flat(plan.kept, factor.scale))[:, None]
-        # S⁻¹ = D·L⁻ᵀ·L⁻¹·D
-        self._forth = lambda x: solve_triangular(lower, self.scale * x, lower=True)
-        self._back = lambda x: self.scale * solve_triangular(lower, x, lower=True, trans=1)
+        self.lower = np.asarray(factor.reduced.lower)
+        kept = [np.asarray(factor.scale[g]).ravel() for g in found.problem.plan.kept]
+        self.scale = np.concatenate([np.zeros(0), *kept])[:, None]
         self.Y = self._forth(self.sums.AF)
         self.few = self.sums.FF - self.Y.T @ self.Y
+
+    def _forth(self, x: Matrix) -> Matrix:
+        """L⁻¹·D·x of S⁻¹ = D·L⁻ᵀ·L⁻¹·D."""
+        from scipy.linalg import solve_triangular
+
+        return solve_triangular(self.lower, self.scale * x, lower=True)
+
+    def _back(self, x: Matrix) -> Matrix:
+        """D·L⁻ᵀ·x."""
+        from scipy.linalg import solve_triangular
+
+        return self.scale * solve_triangular(self.lower, x, lower=True, trans=1)
 
     def changes(self) -> tuple[Matrix, Matrix]:
         """The changes of kept unknowns by the columns of the roots, N⁻¹AᵀF without the datum, and
