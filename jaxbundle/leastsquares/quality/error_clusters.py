@@ -90,12 +90,12 @@ def lay_out_clusters(linear: LinearisedRows, F: Any, many: Any | None) -> list[C
     for kind in np.unique(kinds, axis=0):
         rows = order[start[(kinds == kind).all(1)][:, None] + np.arange(kind[0])]
         rows = rows[np.argsort(key[rows].sum(1))]
-        (A, A_at), (narrow, narrow_at), *rest = (
-            _local(at[rows], x[rows], none) for at, x, none in padded
+        (A, A_at), (narrow, narrow_at) = (
+            _local(at[rows], x[rows], none) for at, x, none in padded[:2]
         )
         V = None
-        for G, _ in rest:
-            V = G @ G.transpose(0, 2, 1)
+        for at, x, none in padded[2:]:
+            V = _products(at[rows], x[rows], none)
         given = rows, linear.eliminated[rows[:, 0]], linear.Q[rows], A, A_at, narrow, narrow_at
         found.append(Clusters(*given, V, _begin_groups([A_at, narrow_at])))
     return found
@@ -117,7 +117,7 @@ def _padded(
     column that stands for none."""
     none, count = matrix.shape[1], np.diff(matrix.indptr)
     shape = len(count), int(count.max(initial=0))
-    at, values = np.full(shape, none), np.zeros(shape)
+    at, values = np.full(shape, none, np.int32), np.zeros(shape)
     row = np.repeat(np.arange(len(count)), count)
     place = np.arange(len(row)) - matrix.indptr[row]
     at[row, place], values[row, place] = matrix.indices, matrix.data
@@ -131,17 +131,30 @@ def _local(
     m, k, s = at.shape
     if m * k * s == 0:
         return np.zeros((m, k, 0)), np.zeros((m, 0), int)
-    flat = at.reshape(m, -1)
+    # columns are sorted once for all neighbours that have the same in every row
+    new = np.ones(m, bool)
+    new[1:] = (at[1:] != at[:-1]).any((1, 2))
+    run = np.cumsum(new) - 1
+    flat = at[new].reshape(-1, k * s)
     order = np.argsort(flat, 1)
     ordered = np.take_along_axis(flat, order, 1)
-    new = np.zeros(flat.shape, int)
-    new[:, 1:] = ordered[:, 1:] != ordered[:, :-1]
-    slot = np.cumsum(new, 1)
-    places = np.full((m, int(slot.max()) + 1), none)
+    slot = np.zeros(flat.shape, int)
+    slot[:, 1:] = np.cumsum(ordered[:, 1:] != ordered[:, :-1], 1)
+    places = np.full((len(flat), int(slot.max()) + 1), none)
     np.put_along_axis(places, slot, ordered, 1)
     of = np.empty_like(slot)
     np.put_along_axis(of, order, slot, 1)
     dense = np.zeros((m, k, places.shape[1]))
     cluster, row = np.arange(m)[:, None, None], np.arange(k)[None, :, None]
-    dense[cluster, row, of.reshape(m, k, s)] = values
-    return dense, places
+    dense[cluster, row, of.reshape(-1, k, s)[run]] = values
+    return dense, places[run]
+
+
+def _products(
+    at: Int[np.ndarray, "m k s"], values: Float[np.ndarray, "m k s"], none: int
+) -> Float[np.ndarray, "m k k"]:
+    """G·Gᵀ of sparse rows G of every cluster."""
+    # columns differ from cluster to cluster, but hardly so if counted from their first
+    relative = np.where(at == none, none, at - at.min((1, 2), initial=none)[:, None, None])
+    G, _ = _local(relative, values, none)
+    return G @ G.transpose(0, 2, 1)
