@@ -187,7 +187,7 @@ def test_a_saved_result_keeps_error_model_and_halves(shaken, tmp_path, monkeypat
     modelled = [one.covariance_of(function) for one in (shaken, again)]
     np.testing.assert_allclose(*modelled, rtol=1e-9)
     f = shaken.cameras["cam"]["parameters"]["fx"]
-    assert np.sqrt(modelled[0][0, 0]) == pytest.approx(f["sigma_correlated"], rel=0.1)
+    assert np.sqrt(modelled[0][0, 0]) == pytest.approx(f["sigma_correlated"], rel=1e-6)
     assert np.sqrt(shaken.covariance(name)[0, 0]) == pytest.approx(np.sqrt(modelled[0][0, 0]))
     assert np.sqrt(shaken.covariance(name, classical=True)[0, 0]) == pytest.approx(f["sigma"])
 
@@ -271,22 +271,23 @@ def test_everything_that_states_a_sigma_asks_the_error_model(shaken):
     np.testing.assert_allclose(
         C, shaken.classical_image_covariance[2][np.ix_([0, 1, 5], [0, 1, 5])], rtol=1e-6
     )
-    # blocks of the along-track component are from random combinations, functions are not
+    # blocks are from reduced matrices, functions from solutions of the normal equations
     C = np.sqrt(np.diag(shaken.covariance(*names)))
     of_image = np.sqrt(np.diagonal(shaken.image_covariance[2]))[[0, 1, 5]]
-    np.testing.assert_allclose(C, of_image, rtol=0.05)
+    np.testing.assert_allclose(C, of_image, rtol=1e-6)
     assert (C > 1.5 * np.sqrt(np.diag(shaken.covariance(*names, classical=True)))).any()
     budget = jaxbundle.sensitivity(shaken, {"camera:cam:k3": 1e-3}, of="camera:cam:fx")
-    np.testing.assert_allclose(budget.sigma, f["sigma_correlated"], rtol=0.05)
+    np.testing.assert_allclose(budget.sigma, f["sigma_correlated"], rtol=1e-6)
     sizes = {size.name: size.size for size in shaken.error_model.sizes}
     start = dataclasses.replace(shaken.problem.data, start=shaken.values)
     design = jaxbundle.precision(shaken.problem, start, names=(names[0],), errors=sizes)
     # a design knows its sizes, which the adjustment has estimated
     known = shaken.error_model.as_estimated
     of_image = np.sqrt(known.covariance("image")[2][0, 0])
-    np.testing.assert_allclose(np.sqrt(design.covariance[0, 0]), of_image, rtol=0.05)
+    # the places of image points are those of the design, without residuals
+    np.testing.assert_allclose(np.sqrt(design.covariance[0, 0]), of_image, rtol=1e-3)
     of_camera = np.sqrt(known.covariance("camera")[0][0, 0])
-    np.testing.assert_allclose(design.cameras[0, 0], of_camera, rtol=0.05)
+    np.testing.assert_allclose(design.cameras[0, 0], of_camera, rtol=1e-3)
     assert of_image < C[0] and of_camera < f["sigma_correlated"]
     with pytest.raises(jaxbundle.InputError, match="no component principal"):
         jaxbundle.precision(shaken.problem, start, errors={"principal": 0.1})

@@ -112,14 +112,16 @@ class ImageRows:
         columns have in the rows of x and y of some rays."""
         import scipy.sparse as sp
 
-        row = self.row[rays][:, None] + np.arange(2)
+        row, s = self.row[rays][:, None] + np.arange(2), values.shape[2]
         count = np.zeros(self.number, int)
-        count[row] = values.shape[2]
+        count[row] = s
         start = np.concatenate([[0], np.cumsum(count)])
-        place = start[row][:, :, None] + np.arange(values.shape[2])
-        data, indices = np.zeros(start[-1]), np.zeros(start[-1], np.int32)
-        data[place] = values / self.sigma[rays][:, :, None]
-        indices[place] = columns
+        data = values / self.sigma[rays][:, :, None]
+        indices = columns.astype(np.int32)
+        if (np.diff(row.ravel()) < 0).any():
+            order = np.argsort(row.ravel())
+            data, indices = (x.reshape(-1, s)[order] for x in (data, indices))
+        data, indices = data.ravel(), indices.ravel()
         return sp.csr_matrix((data, indices, start), shape=(self.number, width))
 
 
@@ -388,7 +390,7 @@ def splines_of_point(
     within = (place * (number - 3) - interval)[:, None]
     # the first begins an interval before
     values = cubic_splines(within, 4)[:, 0]
-    return values, interval.astype(int)[:, None] + np.arange(4)
+    return values, interval.astype(np.int32)[:, None] + np.arange(4, dtype=np.int32)
 
 
 def _along_tracks(rays: ImageRows, scene: StationsAndPoints, reach: float) -> ErrorComponent | None:

@@ -73,6 +73,7 @@ def linearise_rows(found: Solution) -> LinearisedRows:
             Q[row] = J @ L.transpose(0, 2, 1)
             eliminated[row] = at[:, None]
     rows, columns, values = (np.concatenate(x) for x in zip(*entries))
+    del entries
     A = sp.csr_matrix((values, (rows, columns)), shape=(total, unknowns))
     # of held unknowns, and of observations without weight
     A.eliminate_zeros()
@@ -87,7 +88,7 @@ def _derivatives(declared: Declared, plan: Plan, values: Values, data: Data) -> 
     return [differentiate(declared, plan, k, prepared, laid)[1:] for k in numbers]
 
 
-class Datum(NamedTuple):
+class DatumDirections(NamedTuple):
     """Open motions G and conditions B (`datum.conditions`) of kept unknowns and of eliminated rows,
     with which a change x becomes x − G·a, a = (BᵀG)⁻¹Bᵀx: `inverse`, (BᵀG)⁻¹; `conditions`, the
     part of B that acts on kept unknowns, B − Aᵀ·E·V⁻¹·B_e; `of_eliminated`, L⁻¹·B_e."""
@@ -112,7 +113,7 @@ class Datum(NamedTuple):
         return Q @ self.of_eliminated[eliminated]
 
 
-def datum_of(found: Solution, linear: LinearisedRows) -> Datum:
+def datum_of(found: Solution, linear: LinearisedRows) -> DatumDirections:
     """The datum of a solution; without columns if nothing is open."""
     plan, unknowns = found.problem.plan, linear.A.shape[1]
     rows, width = 0, linear.Q.shape[1]
@@ -120,7 +121,7 @@ def datum_of(found: Solution, linear: LinearisedRows) -> Datum:
         rows = plan.groups[plan.eliminated].rows
     if plan.datum is None:
         none = np.zeros((unknowns, 0)), np.zeros((rows, width, 0))
-        return Datum(*none, *none, np.zeros((0, 0)))
+        return DatumDirections(*none, *none, np.zeros((0, 0)))
     declared, _, values, _ = found.arguments
     directions = _directions(declared, plan, values, found.moves)
     G, B, gram = jax.tree.map(np.asarray, directions)
@@ -134,7 +135,7 @@ def datum_of(found: Solution, linear: LinearisedRows) -> Datum:
         # Q is zero where no row is eliminated
         h = np.einsum("rw,rwd->rd", linear.Q, of_eliminated[linear.eliminated])
         conditions = conditions - linear.A.T @ h
-    return Datum(kept(G), motions, conditions, of_eliminated, np.linalg.inv(gram))
+    return DatumDirections(kept(G), motions, conditions, of_eliminated, np.linalg.inv(gram))
 
 
 @compile_once

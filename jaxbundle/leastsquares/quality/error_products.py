@@ -33,7 +33,7 @@ from jaxtyping import Bool, Float, Int
 from jaxbundle.leastsquares.equations.reduced import DenseFactor
 from jaxbundle.leastsquares.quality.error_clusters import Batch, Clusters, lay_out_clusters
 from jaxbundle.leastsquares.quality.error_linearisation import (
-    Datum,
+    DatumDirections,
     LinearisedRows,
     datum_of,
     linearise_rows,
@@ -45,7 +45,7 @@ from jaxbundle.types import present
 Matrix = Float[np.ndarray, "n m"]
 
 
-class Roots(NamedTuple):
+class RootColumns(NamedTuple):
     """The roots of few columns in two sparse matrices: `narrow` with few values in a row, as of
     photographs, and `wide`; `mixing`: by the columns of wide ones of every component the matrix
     that mixes every as many of them as it has rows (None: as they are). `many`: the sparse root of
@@ -82,9 +82,10 @@ class Roots(NamedTuple):
 
 
 @dataclasses.dataclass
-class Sums:
-    """Sums over clusters: of kept unknowns A, roots F, and directions h = E·V⁻¹·B_e of the datum
-    (all columns of A and F with P)."""
+class ClusterSums:
+    """Sums over clusters: AᵀPF, FᵀPF and with V between, AᵀPVPA and so on, of kept unknowns A and
+    roots F; of the directions h = E·V⁻¹·B_e of the datum, hᵀF and AᵀPVh; `FVF`: the diagonal, of
+    narrow roots; `powers`: tr((P·V)ⁿ)."""
 
     AF: Matrix
     FF: Matrix
@@ -98,7 +99,9 @@ class Sums:
     powers: Float[np.ndarray, "4"]
 
 
-def sum_products(clusters: Sequence[Clusters], roots: Roots, unknowns: int, datum: Datum) -> Sums:
+def sum_products(
+    clusters: Sequence[Clusters], roots: RootColumns, unknowns: int, datum: DatumDirections
+) -> ClusterSums:
     """The sums over all clusters."""
     # the place behind the last of each stands for none
     p, n, w = unknowns + 1, roots.narrow.shape[1] + 1, roots.wide.shape[1]
@@ -143,7 +146,7 @@ def sum_products(clusters: Sequence[Clusters], roots: Roots, unknowns: int, datu
     kept, narrow = slice(0, p - 1), slice(p, p + n - 1)
     mixed = roots.mix(with_wide)
     wide = roots.mix(roots.mix(wide).T)
-    return Sums(
+    return ClusterSums(
         np.concatenate([both[kept, narrow], mixed[kept]], 1),
         np.block([[both[narrow, narrow], mixed[narrow]], [mixed[narrow].T, wide]]),
         np.concatenate([hF[:, : n - 1], roots.mix(hW)], 1),
@@ -177,7 +180,10 @@ def gram(F: Any) -> Matrix:
 
 
 def share_of_many(
-    clusters: Sequence[Clusters], roots: Roots, FF: Matrix, chosen: Bool[np.ndarray, " clusters"]
+    clusters: Sequence[Clusters],
+    roots: RootColumns,
+    FF: Matrix,
+    chosen: Bool[np.ndarray, " clusters"],
 ) -> Float[np.ndarray, " mixed"]:
     """The diagonal of FᵀPVPF of mixed wide roots, whose FᵀPF is given, from chosen clusters.
 
@@ -233,7 +239,7 @@ class ErrorProducts:
         found: Solution,
         linear: LinearisedRows,
         clusters: Sequence[Clusters],
-        roots: Roots,
+        roots: RootColumns,
     ):
         self.found, self.linear, self.clusters, self.roots = found, linear, clusters, roots
         self.datum = datum_of(found, linear)
@@ -480,7 +486,7 @@ def error_products(
 
 def _sort_roots(
     roots: Sequence[tuple[Any, Matrix | None]], max_columns: int, max_narrow: int = 8
-) -> Roots | None:
+) -> RootColumns | None:
     """Roots by what they are; None if several have many columns. `max_narrow`: values in a row of
     a sparse one; a spline of the sensor has 16, and with several image points of a track nearly
     all."""
@@ -514,7 +520,7 @@ def _sort_roots(
         root, mixing = roots[k]
         of_many = root if mixing is None else root @ _repeat(mixing, root.shape[1])
     both = [sp.hstack(x).tocsr() if len(x) > 2 else x[-1] for x in (narrow, wide)]
-    return Roots(*both, mixed, of_many, of_components)
+    return RootColumns(*both, mixed, of_many, of_components)
 
 
 def _repeat(mixing: Matrix, columns: int) -> Any:
