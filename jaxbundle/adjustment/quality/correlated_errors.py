@@ -389,7 +389,7 @@ def splines_of_point(
     interval = np.clip(np.floor(place * (number - 3)), 0, number - 4)
     within = (place * (number - 3) - interval)[:, None]
     # the first begins an interval before
-    values = cubic_splines(within, 4)[:, 0]
+    values = np.asarray(cubic_splines(within, 4))[:, 0]
     return values, interval.astype(np.int32)[:, None] + np.arange(4, dtype=np.int32)
 
 

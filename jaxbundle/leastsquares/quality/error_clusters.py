@@ -40,12 +40,21 @@ class Clusters:
         """P·x."""
         return x - self.Q @ (self.Q.transpose(0, 2, 1) @ x)
 
+    def spread(self, values: Batch, at: Places, number: int) -> Batch:
+        """Values in all of a number of columns from those in the columns `at`; others are left
+        out."""
+        dense = np.zeros((*self.rows.shape, number + 1))
+        cluster, row = (np.arange(n) for n in self.rows.shape)
+        at = np.where((at < 0) | (at > number), number, at)
+        dense[cluster[:, None, None], row[:, None], at[:, None]] = values
+        return dense[:, :, :number]
+
     def some(self, at: Any) -> "Clusters":
         """Some of the clusters."""
-        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        del fields["groups"]
-        picked = {name: None if x is None else x[at] for name, x in fields.items()}
-        return Clusters(**picked, groups=_begin_groups([picked["A_at"], picked["F_at"]]))
+        given = self.rows, self.eliminated, self.Q, self.A, self.A_at, self.F, self.F_at
+        rows, eliminated, Q, A, A_at, F, F_at = (x[at] for x in given)
+        V, groups = None if self.V is None else self.V[at], _begin_groups([A_at, F_at])
+        return Clusters(rows, eliminated, Q, A, A_at, F, F_at, V, groups)
 
     def portions(self, columns: int, at_once: int = 1_000_000) -> Iterator["Clusters"]:
         """Some clusters at a time, whose rows of so many columns have at most `at_once` numbers (8
@@ -85,7 +94,9 @@ def lay_out_clusters(linear: LinearisedRows, F: Any, many: Any | None) -> list[C
     # sorted by a random number of their columns, clusters of equal ones are neighbours
     rng = np.random.default_rng(0)
     of_columns = [rng.integers(1, 1 << 40, none + 1) for *_, none in padded[:2]]
-    key = sum(number[at].sum(1) for number, (at, *_) in zip(of_columns, padded))
+    key = np.zeros(len(cluster), int)
+    for number, (at, *_) in zip(of_columns, padded):
+        key += number[at].sum(1)
     kinds = np.stack([count, alone[order[start]]], 1)
     for kind in np.unique(kinds, axis=0):
         rows = order[start[(kinds == kind).all(1)][:, None] + np.arange(kind[0])]

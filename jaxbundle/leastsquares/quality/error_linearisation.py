@@ -45,7 +45,7 @@ def linearise_rows(found: Solution) -> LinearisedRows:
         unknowns += plan.groups[g].free.size
     # indices of 32 bits: half the memory, and what sparse matrices have
     none = np.zeros(0, np.int32)
-    entries = [(none, none, np.zeros(0))]
+    entries: list[tuple[np.ndarray, ...]] = [(none, none, np.zeros(0))]
     width = 0 if plan.eliminated is None else plan.groups[plan.eliminated].width
     Q, eliminated = np.zeros((total, width)), np.full(total, -1)
     numbers = {o.name: o.number for o in found.problem.observations}
@@ -63,9 +63,9 @@ def linearise_rows(found: Solution) -> LinearisedRows:
             wide = plan.groups[touch.group].width
             column = first[touch.group] + touch.start + wide * np.asarray(touch.row)
             column = column[place // length][:, None] + np.arange(J.shape[2])
-            at = row[:, :, None], column[:, None, :]
-            spread = (np.broadcast_to(x.astype(np.int32), J.shape).ravel() for x in at)
-            entries.append((*spread, J.ravel()))
+            spread = lambda x, shape: np.broadcast_to(x.astype(np.int32), shape).ravel()
+            rows, columns = row[:, :, None], column[:, None, :]
+            entries.append((spread(rows, J.shape), spread(columns, J.shape), J.ravel()))
         if E is not None:
             at = np.asarray(part.eliminated).ravel()[place]
             L = np.asarray(found.factor.lower_inverse)[at]

@@ -240,12 +240,13 @@ class ErrorProducts:
         linear: LinearisedRows,
         clusters: Sequence[Clusters],
         roots: RootColumns,
+        reduced: DenseFactor,
     ):
         self.found, self.linear, self.clusters, self.roots = found, linear, clusters, roots
         self.datum = datum_of(found, linear)
         self.sums = sum_products(clusters, roots, linear.A.shape[1], self.datum)
         factor = found.factor
-        self.lower = np.asarray(factor.reduced.lower)
+        self.lower = np.asarray(reduced.lower)
         kept = [np.asarray(factor.scale[g]).ravel() for g in found.problem.plan.kept]
         self.scale = np.concatenate([np.zeros(0), *kept])[:, None]
         self.Y = self._forth(self.sums.AF)
@@ -297,12 +298,7 @@ class ErrorProducts:
                     wide = slice(columns.start - narrow, columns.stop - narrow)
                     F = self.roots.mix(self.roots.wide_rows(c.rows))[:, :, wide]
                 else:
-                    F = np.zeros((*c.rows.shape, number + 1))
-                    at = c.F_at - columns.start
-                    at = np.where((at < 0) | (at >= number), number, at)
-                    m, k = np.indices(c.rows.shape)
-                    F[m[:, :, None], k[:, :, None], at[:, None]] = c.F
-                    F = F[:, :, :number]
+                    F = c.spread(c.F, c.F_at - columns.start, number)
                 turned = c.Q.transpose(0, 2, 1)
                 QF, QA = turned @ F, turned @ c.A
                 for some in c.by_columns():
@@ -412,18 +408,11 @@ class ErrorProducts:
 
     def _dense(self, c: Clusters) -> tuple[Batch, Batch]:
         """U and F̃ of some clusters."""
-        m, k = np.indices(c.rows.shape)
         p, n = self.linear.A.shape[1], self.roots.narrow.shape[1]
-
-        def spread(values: Batch, at: np.ndarray, number: int) -> Batch:
-            dense = np.zeros((*c.rows.shape, number + 1))
-            dense[m[:, :, None], k[:, :, None], at[:, None]] = values
-            return dense[:, :, :number]
-
-        A = c.without_fit(spread(c.A, c.A_at, p))
-        U = self._forth(A.reshape(-1, p).T).T
+        A = _tall(c.without_fit(c.spread(c.A, c.A_at, p)))
+        U = self._forth(A.T).T
         W = self.roots.mix(self.roots.wide_rows(c.rows))
-        F = np.concatenate([spread(c.F, c.F_at, n), W], 2)
+        F = np.concatenate([c.spread(c.F, c.F_at, n), W], 2)
         F = _tall(c.without_fit(F)) - U @ self.Y
         return U.reshape(*c.rows.shape, p), F.reshape(*c.rows.shape, F.shape[1])
 
@@ -460,8 +449,8 @@ class ErrorProducts:
             width = table.space.width
             of_table = np.zeros((problem.sizes["table", table.name], width, width))
             for g, m in members:
-                at, rows = slice(m.start, m.start + m.width), slice(None)
-                rows = rows if m.rows is None else np.asarray(m.rows)
+                at = slice(m.start, m.start + m.width)
+                rows = np.arange(len(blocks[g])) if m.rows is None else np.asarray(m.rows)
                 np.add.at(of_table, rows, blocks[g][:, at, at])
             found[table.name] = of_table[: table.rows]
         return found
@@ -475,13 +464,14 @@ def error_products(
     None if the reduced system is not factorised densely, or if several have more than
     `max_columns` and their errors are shared by more than one cluster."""
     sorted_roots = _sort_roots(roots, max_columns)
-    if sorted_roots is None or not isinstance(found.factor.reduced, DenseFactor):
+    reduced = found.factor.reduced
+    if sorted_roots is None or not isinstance(reduced, DenseFactor):
         return None
     linear = linearise_rows(found)
     clusters = lay_out_clusters(linear, sorted_roots.narrow, sorted_roots.many)
     if clusters is None:
         return None
-    return ErrorProducts(found, linear, clusters, sorted_roots)
+    return ErrorProducts(found, linear, clusters, sorted_roots, reduced)
 
 
 def _sort_roots(
@@ -519,8 +509,8 @@ def _sort_roots(
     for k in many:
         root, mixing = roots[k]
         of_many = root if mixing is None else root @ _repeat(mixing, root.shape[1])
-    both = [sp.hstack(x).tocsr() if len(x) > 2 else x[-1] for x in (narrow, wide)]
-    return RootColumns(*both, mixed, of_many, of_components)
+    joined = lambda x: sp.hstack(x).tocsr() if len(x) > 2 else x[-1]
+    return RootColumns(joined(narrow), joined(wide), mixed, of_many, of_components)
 
 
 def _repeat(mixing: Matrix, columns: int) -> Any:
