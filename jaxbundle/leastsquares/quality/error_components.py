@@ -17,10 +17,10 @@ expectations (MINQUE: Rao 1971; Koch 1999, section 3.6)
 with M² = M: T_00 is the redundancy. How the θ ≥ 0 follow from them, and which are left out because
 chance could explain them: `estimated_sizes`.
 
-These traces, and covariances, are exact (`error_products`) where observations that share an error
-of a component of many columns touch the same eliminated row, as along a track. Else roots of many
-columns are replaced by random combinations of them, F·Ξ/√R with E ΞΞᵀ = R·1, on one side of a trace
-(Hutchinson 1990). Observations that are said to have their own σ (`OTHERS`:
+These traces, and covariances, are exact (`error_products`) where at most one component has many
+columns, and observations that share its errors touch the same eliminated row, as along a track.
+Else roots of many columns are replaced by random combinations of them, F·Ξ/√R with E ΞΞᵀ = R·1, on
+one side of a trace (Hutchinson 1990). Observations that are said to have their own σ (`OTHERS`:
 control, priors beside image points) are independent errors of the size σ0, whatever that of the
 others is.
 
@@ -194,7 +194,8 @@ class IndependentErrors:
 class ErrorModel:
     """The covariance of the observations of a solved problem. `theta` [k]: of the independent part
     and of the `components`, with their covariance; `own`: by table the blocks [rows, width, width]
-    of the covariance of the unknowns that a component of θ = 1 gives, in the order of `components`;
+    of the covariance of the unknowns that a component of θ = 1 gives, in the order of `components`
+    (of the eliminated table only where θ is not zero);
     `equations` of the θ, None where they are stated; `widened`: by `widening`, as all covariances
     that are stated, or as estimated."""
 
