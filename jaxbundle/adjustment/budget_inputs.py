@@ -237,7 +237,7 @@ def shared_errors(
     for theta, spread, component in zip(model.theta[1:], model.theta_sigma[1:], model.components):
         if not theta > 0 or component.name == OTHERS:
             continue
-        size = np.sqrt((np.asarray(component.root.T @ D.T) ** 2).sum(0)) * factor
+        size = np.sqrt((component.products(D.T) ** 2).sum(0)) * factor
         # A size that is hardly determined: no estimate has less than one degree of freedom.
         degrees = max(2 * (theta / spread) ** 2, 1.0) if spread > 0 else math.inf
         unit = adjustment.image_unit if component.unit == "image" else ""

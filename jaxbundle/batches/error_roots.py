@@ -9,7 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxbundle.adjustment.quality.correlated_errors import CorrelationSettings, cubic_splines
+from jaxbundle.adjustment.quality.correlated_errors import (
+    CorrelationSettings,
+    cubic_splines,
+    root_of_octaves,
+)
 from jaxbundle.adjustment.quality.given_points import correlation_of_points, wendland
 from jaxbundle.batches.normal import CameraUnknowns, Sightings
 from jaxbundle.geometry import matrix_from_quaternion
@@ -120,22 +124,6 @@ def _neighbours(
     which = np.full((number, number), -1)
     which[pairs] = which[pairs[::-1]] = np.arange(near.sum())
     return pairs, which
-
-
-def root_of_octaves(settings: CorrelationSettings) -> Float[np.ndarray, "splines splines"]:
-    """R with B·R·(B·R)ᵀ the sum of all octaves, B: the finest splines, of which those of octaves
-    with half as many intervals are sums."""
-    finest, *coarser = settings.octaves_of_knots
-    # a cubic spline between two knots is determined by four places
-    places = [np.linspace(0, 1, 4 * n) for n in finest]
-    total = np.eye(finest[0] * finest[1])
-    for octave in coarser:
-        x, y = (
-            np.linalg.lstsq(cubic_splines(at, n), cubic_splines(at, m), rcond=None)[0]
-            for at, n, m in zip(places, finest, octave)
-        )
-        total += np.kron(y @ y.T, x @ x.T)
-    return np.linalg.cholesky(total)
 
 
 def given_points(used: Float[Array, "views points"]) -> Bool[Array, " points"]:

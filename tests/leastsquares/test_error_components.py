@@ -14,9 +14,11 @@ from jaxbundle.leastsquares.quality.distributions import (
     skewed_quantile,
 )
 from jaxbundle.leastsquares.quality.error_components import (
+    OTHERS,
     ErrorComponent,
     ErrorSettings,
     fit_error_model,
+    products_of,
     quadratic_forms,
 )
 from jaxbundle.leastsquares.quality.error_effects import effects, remove_fit, stack_rows
@@ -98,11 +100,110 @@ def test_sizes_and_covariances_are_those_of_dense_algebra(network):
     np.testing.assert_allclose(estimated.covariance("point"), blocks, **near)
     rows_of = np.eye(3 * POINTS).reshape(-1, POINTS, 3)[:6]
     np.testing.assert_allclose(estimated.propagate_rows({"point": rows_of}), C[:6, :6], **near)
-    # σ of θ: T⁻¹·2·tr(V·MΣM·V·MΣM)·T⁻¹, here by 16 draws
+    # σ of θ: T⁻¹·2·tr(V·MΣM·V·MΣM)·T⁻¹
     P = M @ sum(t * W for t, W in zip(theta, V)) @ M
     G = np.array([[2 * np.trace(W @ P @ U @ P) for U in V] for W in V])
     sigma = np.sqrt(np.diag(np.linalg.solve(T, np.linalg.solve(T, G).T)))
-    np.testing.assert_allclose(model.theta_sigma, sigma, rtol=0.5)
+    np.testing.assert_allclose(model.theta_sigma, sigma, rtol=0.02)
+
+
+@pytest.fixture(scope="module")
+def distances():
+    """Distances between stations and points, which are eliminated, and among stations, in the inner
+    datum of both; two are not used. M and X = N⁻¹Aᵀ (by table) from single errors."""
+    rng = np.random.default_rng(2)
+    stations, points = rng.uniform(-10, 10, (6, 3)), rng.uniform(-5, 5, (12, 3))
+    seen = rng.uniform(size=(len(points), len(stations))) < 0.9
+    point, station = np.nonzero(seen)
+    i, j = np.triu_indices(len(stations), 1)
+    residual = lambda a, b, d: ((a - b) @ (a - b)) ** 0.5 - d
+    sight = ls.Kind("sight", residual, of=("point", "station"))
+    base = ls.Kind("base", residual, of=("station", "station"))
+    between = lambda a, b: np.linalg.norm(a - b, axis=1) + SIGMA * rng.normal(size=len(a))
+    sigma = np.full(len(point), SIGMA)
+    sigma[[3, 40]] = np.inf
+    found = ls.adjust(
+        [ls.Table("point", points), ls.Table("station", stations)],
+        [
+            sight((point, station), between(points[point], stations[station]), sigma=sigma),
+            base((i, j), between(stations[i], stations[j]), sigma=SIGMA),
+        ],
+        eliminate="point", datum="inner", motions=ls.similarity(["point", "station"]),
+    ).solution  # fmt: skip
+    assert found.problem.plan.eliminated == "point" and found.problem.plan.datum is not None
+    rows = len(point) + len(i)
+    left, tables = remove_fit(found, np.eye(rows))
+    used = np.append(np.isfinite(sigma), np.ones(len(i), bool))
+    M = np.where(used, left, 0.0)
+    return found, M, tables, (point, station, i, j), used
+
+
+def components_of_distances(given, used):
+    """Offsets of stations, waves (mixed), errors of the distances of a point, those of the bases:
+    few and many columns."""
+    (point, station, i, _), rng = given, np.random.default_rng(9)
+    n, rows = len(point), len(point) + len(i)
+    number = np.arange(n)
+    offsets = sp.csr_matrix((np.ones(n), (number, station)), shape=(rows, 6))
+    waves = np.cos(np.outer(np.arange(rows), 1 + np.arange(10)))
+    waves[n:] = 0.0
+    K = rng.normal(size=(n, n)) * (point[:, None] == point)
+    along = sp.csr_matrix(np.pad(K, ((0, rows - n), (0, 0))))
+    others = sp.csr_matrix((np.ones(len(i)), (n + np.arange(len(i)), np.arange(len(i)))))
+    mixing = rng.normal(size=(5, 3)) / 4
+    keep = sp.diags(used.astype(float))
+    return [
+        ErrorComponent("offsets", "σ", keep @ offsets),
+        ErrorComponent("along", "σ", keep @ along / 3),
+        ErrorComponent("waves", "σ", keep @ sp.csr_matrix(waves), mixing),
+        ErrorComponent(OTHERS, "σ", keep @ others),
+    ]
+
+
+def test_traces_from_reduced_matrices_are_those_of_dense_algebra(distances):
+    """With a component of many columns that has a block for every point, to rounding."""
+    found, M, tables, given, used = distances
+    parts = components_of_distances(given, used)
+    settings = ErrorSettings(max_columns=20)
+    products = products_of(found, parts, settings)
+    assert products.roots.many is not None and products.roots.wide.shape[1] == 10
+    traces = products.traces(1000, np.random.default_rng(0))
+    F = [part.sparse_root().toarray() for part in parts]
+    V = [M, *(M @ f @ f.T @ M for f in F)]
+    T = np.einsum("iab,jba->ij", V, V)
+    np.testing.assert_allclose(traces.T, T, rtol=1e-9)
+    # traces of three are those of M·V: M·V_0·M = M
+    cubes = np.einsum("iab,jbc,kca->ijk", V, V, V)
+    np.testing.assert_allclose(traces.cubes, cubes, rtol=1e-8)
+    theta = np.array([0.8, 0.5, 0.7, 1.2, -0.3])
+    Sigma = theta[0] * np.eye(len(M)) + sum(t * f @ f.T for t, f in zip(theta[1:], F))
+    P = M @ Sigma @ M
+    forms = [np.eye(len(M)), *(f @ f.T for f in F)]
+    expected = 2 * np.array([[np.trace(A @ P @ B @ P) for B in forms] for A in forms])
+    np.testing.assert_allclose(traces.covariance_of_forms(theta), expected, rtol=1e-8)
+    # the same where the columns of the points are taken as few
+    few = products_of(found, parts, ErrorSettings(max_columns=100))
+    assert few.roots.many is None
+    np.testing.assert_allclose(few.traces(1000, None).T, T, rtol=1e-9)
+    for blocks in (products.blocks(theta), few.blocks(theta)):
+        for f, of_tables in zip(F, blocks):
+            for table, X in tables.items():
+                D = np.einsum("rni,rc->cni", X, f)
+                C = np.einsum("cni,cnj->nij", D, D)
+                np.testing.assert_allclose(of_tables[table], C, atol=1e-9 * np.abs(C).max())
+
+
+def test_traces_from_some_of_the_clusters_are_near_those_of_all(distances):
+    """T is exact but for wide roots with the component of many columns; the rest is unbiased."""
+    found, M, _, given, used = distances
+    parts = components_of_distances(given, used)
+    products = products_of(found, parts, ErrorSettings(max_columns=20))
+    exact = products.traces(1000, np.random.default_rng(0))
+    some = [products.traces(6, np.random.default_rng(seed)) for seed in range(40)]
+    few = np.ix_([0, 1, 2, 4], [0, 1, 2, 4])
+    np.testing.assert_allclose(some[0].T[few], exact.T[few], rtol=1e-9)
+    np.testing.assert_allclose(np.mean([one.T for one in some], 0), exact.T, rtol=0.05)
+    np.testing.assert_allclose(np.mean([one.cubes for one in some], 0), exact.cubes, rtol=0.25)
 
 
 def test_intervals_hold_although_sizes_are_estimated(network):

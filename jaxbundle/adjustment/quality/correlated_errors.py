@@ -28,6 +28,7 @@ from jaxbundle.adjustment.quality.given_points import given_points_components, w
 from jaxbundle.arguments import number as require_number
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.quality.error_components import (
+    IMAGE,
     INDEPENDENT,
     OTHERS,
     ErrorComponent,
@@ -100,30 +101,28 @@ class ImageRows:
     sigma: Float[np.ndarray, "rays 2"]
     number: int
 
-    def root(self, x: Any, y: Any) -> Any:
-        """Rows of all observations from columns in the image unit: [rays, k] of x and of y."""
+    def root(
+        self,
+        rays: Int[np.ndarray, " n"],
+        columns: Int[np.ndarray, "n 2 s"],
+        values: Float[np.ndarray, "n 2 s"],
+        width: int,
+    ) -> Any:
+        """Rows of all observations [number, width] from the values, in the image unit, that s
+        columns have in the rows of x and y of some rays."""
         import scipy.sparse as sp
 
-        rows = [
-            self.place(axis, 1 / self.sigma[:, axis]) @ sp.csr_matrix(columns)
-            for axis, columns in enumerate((x, y))
-        ]
-        return (rows[0] + rows[1]).tocsr()
-
-    def place(self, axis: int, value: Float[np.ndarray, " rays"]) -> Any:
-        """The matrix that puts values of the rays, times `value`, into the rows of x or y."""
-        import scipy.sparse as sp
-
-        shape = (self.number, len(self.row))
-        return sp.csr_matrix((value, (self.row + axis, np.arange(len(self.row)))), shape=shape)
-
-    def by_image(self, column: Float[np.ndarray, " rays"]) -> Any:
-        """A column for every image."""
-        import scipy.sparse as sp
-
-        used, image = np.unique(self.image, return_inverse=True)
-        rays = np.arange(len(column))
-        return sp.csr_matrix((column, (rays, image)), shape=(len(column), len(used)))
+        row, s = self.row[rays][:, None] + np.arange(2), values.shape[2]
+        count = np.zeros(self.number, int)
+        count[row] = s
+        start = np.concatenate([[0], np.cumsum(count)])
+        data = values / self.sigma[rays][:, :, None]
+        indices = columns.astype(np.int32)
+        if (np.diff(row.ravel()) < 0).any():
+            order = np.argsort(row.ravel())
+            data, indices = (x.reshape(-1, s)[order] for x in (data, indices))
+        data, indices = data.ravel(), indices.ravel()
+        return sp.csr_matrix((data, indices, start), shape=(self.number, width))
 
 
 def first_row_of_rays(found: Solution, problem: NetworkProblem) -> Int[np.ndarray, " rays"]:
@@ -181,8 +180,9 @@ def with_given_points_and_others(
     given = given_points_components(found, rays.row, rays.point, rays.sigma, *chosen)
     components = [*components, *given]
 
-    others = np.setdiff1d(np.arange(rays.number), np.concatenate([rays.row, rays.row + 1]))
-    others = others[_have_weight(found)[others]]
+    free = _have_weight(found)
+    free[np.concatenate([rays.row, rays.row + 1])] = False
+    others = np.flatnonzero(free)
     if components and len(others):
         # control, priors, positions: their σ are not those of image points
         shape = (rays.number, len(others))
@@ -237,43 +237,31 @@ def components_of(
     settings: CorrelationSettings,
 ) -> list[ErrorComponent]:
     """The components of image points."""
-    import scipy.sparse as sp
-
     components: list[ErrorComponent] = []
     several = len(cameras) > 1
     for c, camera in enumerate(cameras):
         of = rays.camera == c
-        images = len(np.unique(rays.image[of]))
-        if images < settings.min_images:
+        if len(np.unique(rays.image[of])) < settings.min_images:
             continue
         name = f" of {camera.id}" if several else ""
-        middle, half = _frame(rays.xy[of])
-        at = (rays.xy - middle) / half
-        here = of.astype(float)
-        roots: list[tuple[str, list[Any]]] = []
-        if of.sum() >= settings.min_points_of_field:
-            B = sp.hstack(
-                [
-                    sp.diags(here) @ _sparse_splines(at, _aspect(rays.xy[of]), knots)
-                    for knots in settings.octaves_of_knots
-                ]
-            ).tocsr()
-            # √θ is then the RMS of the field, not the σ of its coefficients
-            B = B / np.sqrt(B.power(2).sum() / of.sum())
-            roots.append(("field on the sensor", [rays.root(B, 0 * B), rays.root(0 * B, B)]))
+        here = np.flatnonzero(of)
+        middle, half = _frame(rays.xy[here])
+        at = (rays.xy[here] - middle) / half
+        if len(here) >= settings.min_points_of_field:
+            components.append(_field(rays, here, at, f"field on the sensor{name}", settings))
         # displacements at the edge of the measured area, x or y = 1, of size 1
-        (x, y), none = at.T, np.zeros(len(at))
-        for what, pairs in (
-            ("principal point by photograph", [(here, none), (none, here)]),
-            ("principal distance by photograph", [(x, y)]),
-            ("affine by photograph", [(x, -y), (y, x)]),
+        used, image = np.unique(rays.image[here], return_inverse=True)
+        number, (x, y), one = len(used), at.T, np.ones(len(at))
+        first, second = image, number + image
+        for what, columns, values in (
+            ("principal point by photograph", [[first], [second]], [[one], [one]]),
+            ("principal distance by photograph", [[first], [first]], [[x], [y]]),
+            ("affine by photograph", [[first, second]] * 2, [[x, y], [-y, x]]),
         ):
-            of_images = lambda u, here=here: rays.by_image(here * u)
-            roots.append((what, [rays.root(of_images(u), of_images(v)) for u, v in pairs]))
-        components += [
-            ErrorComponent(f"{what}{name}", "image", sp.hstack(parts).tocsr())
-            for what, parts in roots
-        ]
+            columns, values = (np.moveaxis(np.array(a), 2, 0) for a in (columns, values))
+            width = number * (1 + (what != "principal distance by photograph"))
+            root = rays.root(here, columns, values, width)
+            components.append(ErrorComponent(f"{what}{name}", IMAGE, root))
     if (track := _along_tracks(rays, scene, settings.reach)) is not None:
         components.append(track)
     return components
@@ -345,16 +333,6 @@ def _aspect(xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "2"]:
     return sides / sides.max()
 
 
-def splines(
-    at: Float[np.ndarray, "n 2"],
-    half: Float[np.ndarray, "2"],
-    knots: tuple[int, int],
-) -> Float[np.ndarray, "n columns*rows"]:
-    """Products of cubic B-splines over −half … half of x and y."""
-    x, y = (cubic_splines((at[:, k] / half[k] + 1) / 2, knots[k]) for k in (0, 1))
-    return np.asarray(y[:, :, None] * x[:, None, :]).reshape(len(at), -1)
-
-
 def cubic_splines(
     place: Float[AnyArray, "*points"], number: int
 ) -> Float[AnyArray, "*points number"]:
@@ -363,15 +341,56 @@ def cubic_splines(
     return ((2 - d).clip(0) ** 3 - 4 * (1 - d).clip(0) ** 3) / 6
 
 
-def _sparse_splines(
-    at: Float[np.ndarray, "n 2"], half: Float[np.ndarray, "2"], knots: tuple[int, int]
-) -> Any:
-    """`splines` as a sparse matrix, of which 16 values a row are not zero; some rows at a time."""
-    import scipy.sparse as sp
+def root_of_octaves(settings: CorrelationSettings) -> Float[np.ndarray, "splines splines"]:
+    """R with B·R·(B·R)ᵀ the sum of all octaves, B: the finest splines, of which those of octaves
+    with half as many intervals are sums."""
+    finest, *coarser = settings.octaves_of_knots
+    # a cubic spline between two knots is determined by four places
+    places = [np.linspace(0, 1, 4 * n) for n in finest]
+    total = np.eye(finest[0] * finest[1])
+    for octave in coarser:
+        x, y = (
+            np.linalg.lstsq(cubic_splines(at, n), cubic_splines(at, m), rcond=None)[0]
+            for at, n, m in zip(places, finest, octave)
+        )
+        total += np.kron(y @ y.T, x @ x.T)
+    return np.linalg.cholesky(total)
 
-    step = 50_000  # 40 MB of a dense matrix
-    parts = [splines(at[k : k + step], half, knots) for k in range(0, len(at), step)]
-    return sp.vstack([sp.csr_matrix(part) for part in parts]).tocsr()
+
+def _field(
+    rays: ImageRows,
+    here: Int[np.ndarray, " n"],
+    at: Float[np.ndarray, "n 2"],
+    name: str,
+    settings: CorrelationSettings,
+) -> ErrorComponent:
+    """A field on the sensor in x and one in y, by the finest splines, of which 16 are not zero at a
+    point."""
+    knots, place = settings.knots, (at / _aspect(rays.xy[here]) + 1) / 2
+    (x, of_x), (y, of_y) = (splines_of_point(u, number) for u, number in zip(place.T, knots))
+    values = (y[:, :, None] * x[:, None, :]).reshape(len(at), -1)
+    columns = (knots[0] * of_y[:, :, None] + of_x[:, None, :]).reshape(len(at), -1)
+    number, root = knots[0] * knots[1], root_of_octaves(settings)
+    both = np.stack([columns, number + columns], 1)
+    B = rays.root(here, both, np.stack([values, values], 1), 2 * number)
+    # √θ is then the RMS of the field, not the σ of its coefficients: Σ_i Σ_j (x_i·y_j)²
+    square = 0.0
+    for octave in settings.octaves_of_knots:
+        x, y = (np.sum(splines_of_point(u, n)[0] ** 2, 1) for u, n in zip(place.T, octave))
+        square += np.mean(x * y)
+    return ErrorComponent(name, IMAGE, B, root / np.sqrt(square))
+
+
+def splines_of_point(
+    place: Float[np.ndarray, " n"], number: int
+) -> tuple[Float[np.ndarray, "n 4"], Int[np.ndarray, "n 4"]]:
+    """The values of the four of `cubic_splines` that are not zero at a place, and which they
+    are."""
+    interval = np.clip(np.floor(place * (number - 3)), 0, number - 4)
+    within = (place * (number - 3) - interval)[:, None]
+    # the first begins an interval before
+    values = np.asarray(cubic_splines(within, 4))[:, 0]
+    return values, interval.astype(np.int32)[:, None] + np.arange(4, dtype=np.int32)
 
 
 def _along_tracks(rays: ImageRows, scene: StationsAndPoints, reach: float) -> ErrorComponent | None:
@@ -398,13 +417,12 @@ def _along_tracks(rays: ImageRows, scene: StationsAndPoints, reach: float) -> Er
         w, E = np.linalg.eigh(wendland(apart / (reach * depth)))
         root = E * np.sqrt(np.clip(w, 0, None))[:, None, :]
         column = first + np.arange(of.size).reshape(of.shape)
-        rows.append(np.broadcast_to(of[:, :, None], root.shape).ravel())
+        rows.append(np.broadcast_to(rays.row[of][:, :, None], root.shape).ravel())
         columns.append(np.broadcast_to(column[:, None, :], root.shape).ravel())
         values.append(root.ravel())
         first += of.size
-    of_rays = sp.csr_matrix(
-        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))),
-        shape=(len(rays.row), first),
-    )
-    parts = [rays.place(axis, np.ones(len(rays.row))) @ of_rays for axis in (0, 1)]
-    return ErrorComponent("along tracks", "σ", sp.hstack(parts).tocsr())
+    row, column, value = (np.concatenate(x) for x in (rows, columns, values))
+    # x, and y
+    both = np.concatenate([row, row + 1]), np.concatenate([column, first + column])
+    root = sp.csr_matrix((np.tile(value, 2), both), shape=(rays.number, 2 * first))
+    return ErrorComponent("along tracks", "σ", root)

@@ -17,8 +17,10 @@ expectations (MINQUE: Rao 1971; Koch 1999, section 3.6)
 with M² = M: T_00 is the redundancy. How the θ ≥ 0 follow from them, and which are left out because
 chance could explain them: `estimated_sizes`.
 
-Roots of many columns are replaced by random combinations of them, F·Ξ/√R with E ΞΞᵀ = R·1, on one
-side of a trace (Hutchinson 1990). Observations that are said to have their own σ (`OTHERS`:
+These traces, and covariances, are exact (`error_products`) where at most one component has many
+columns, and observations that share its errors touch the same eliminated row, as along a track.
+Else roots of many columns are replaced by random combinations of them, F·Ξ/√R with E ΞΞᵀ = R·1, on
+one side of a trace (Hutchinson 1990). Observations that are said to have their own σ (`OTHERS`:
 control, priors beside image points) are independent errors of the size σ0, whatever that of the
 others is.
 
@@ -43,6 +45,7 @@ from jaxbundle.leastsquares.indexing.rows import (
 )
 from jaxbundle.leastsquares.quality.distributions import level_of_one, normal_quantile
 from jaxbundle.leastsquares.quality.error_effects import AT_ONCE, effects, remove_fit, stack_rows
+from jaxbundle.leastsquares.quality.error_products import ErrorProducts, error_products
 from jaxbundle.leastsquares.quality.estimated_sizes import SizeEquations, widening
 from jaxbundle.leastsquares.quality.size_traces import Traces
 from jaxbundle.leastsquares.solution import Solution
@@ -52,11 +55,46 @@ from jaxbundle.types import present
 class ErrorComponent(NamedTuple):
     """One V = F·Fᵀ: `root`: F as a sparse matrix [rows, columns], rows of all observations in
     units of their a priori σ, set by set (`stack_rows`); a column is the effect of an error of one
-    `unit`."""
+    `unit`. With `mixing` [b, c], F is the root with every b of its columns replaced by c
+    combinations of them: splines of all scales by the finest, of which each row has few."""
 
     name: str
     unit: str
     root: Any
+    mixing: Float[np.ndarray, "b c"] | None = None
+
+    @property
+    def columns(self) -> int:
+        """The number of columns of F."""
+        number = self.root.shape[1]
+        if self.mixing is None:
+            return number
+        return number // len(self.mixing) * self.mixing.shape[1]
+
+    def products(self, x: Float[np.ndarray, "rows n"]) -> Float[np.ndarray, "columns n"]:
+        """Fᵀ·x."""
+        found = np.asarray(self.root.T @ x)
+        if self.mixing is None:
+            return found
+        of_blocks = found.reshape(-1, len(self.mixing), x.shape[1])
+        return (self.mixing.T @ of_blocks).reshape(-1, x.shape[1])
+
+    def combine(self, z: Float[np.ndarray, "columns n"]) -> Float[np.ndarray, "rows n"]:
+        """F·z."""
+        if self.mixing is not None:
+            of_blocks = z.reshape(-1, self.mixing.shape[1], z.shape[1])
+            z = (self.mixing @ of_blocks).reshape(-1, z.shape[1])
+        return np.asarray(self.root @ z)
+
+    def sparse_root(self) -> Any:
+        """F."""
+        import scipy.sparse as sp
+
+        root = self.root.tocsr()
+        if self.mixing is None:
+            return root
+        blocks = root.shape[1] // len(self.mixing)
+        return (root @ sp.kron(sp.identity(blocks), sp.csr_matrix(self.mixing))).tocsr()
 
 
 # The unit of components in that of image coordinates.
@@ -95,18 +133,22 @@ class ErrorSize(NamedTuple):
 class ErrorSettings:
     """How components are estimated.
 
-    - `max_columns`: roots of more columns are replaced by random combinations: a column is a
-      solution of the normal equations (10 ms for 60 images and 26 000 points), so that these take
-      ten seconds.
+    - `max_columns`: roots of more columns are those of many (`error_products`), whose products with
+      each other, of 8 MB for these, are not formed.
+    - `max_clusters`: object points, or other eliminated rows, from which the skewness and the
+      uncertainty of sizes of such a component are, right to √(2/200) = 10 %; from ten times as
+      many are its traces with a field on the sensor, right to 1 %.
     - `significance`: a component is left out if its size could be chance (one-sided, at this level
       for all components together). θ ≥ 0 makes chance add to σ, never take from them: 18 % to those
       of the stations of twelve photographs with independent errors if all θ > 0 are taken, 10 % at
       this level for each of them, 3 % for all together.
-    - `draws`: their number. Variances from 100 are right to √(2/100) = 14 %, σ to 7 %.
+    - `draws`: number of random combinations of the columns of a component of many that has no
+      blocks. Variances from 100 are right to √(2/100) = 14 %, σ to 7 %.
     - `seed`: of the combinations.
     """
 
     max_columns: int = 1000
+    max_clusters: int = 200
     significance: float = 0.05
     draws: int = 100
     seed: int = 0
@@ -152,7 +194,8 @@ class IndependentErrors:
 class ErrorModel:
     """The covariance of the observations of a solved problem. `theta` [k]: of the independent part
     and of the `components`, with their covariance; `own`: by table the blocks [rows, width, width]
-    of the covariance of the unknowns that a component of θ = 1 gives, in the order of `components`;
+    of the covariance of the unknowns that a component of θ = 1 gives, in the order of `components`
+    (of the eliminated table only where θ is not zero);
     `equations` of the θ, None where they are stated; `widened`: by `widening`, as all covariances
     that are stated, or as estimated."""
 
@@ -253,8 +296,8 @@ class ErrorModel:
         errors = np.sqrt(independent) * rng.standard_normal((number, size))
         for t, component in zip(self.theta[1:], self.components):
             if t > 0 and component.name != OTHERS:
-                z = rng.standard_normal((component.root.shape[1], number))
-                errors += np.sqrt(t) * np.asarray(component.root @ z).T
+                z = rng.standard_normal((component.columns, number))
+                errors += np.sqrt(t) * component.combine(z).T
         forms = quadratic_forms(self.components, remove_fit(self.found, errors)[0])
         return errors, np.array([present(self.equations).solve(q)[0] for q in forms])
 
@@ -292,7 +335,7 @@ def _of_component(
     component: ErrorComponent, D: Float[np.ndarray, "n rows"]
 ) -> Float[np.ndarray, "n n"]:
     """D·V·Dᵀ of V = F·Fᵀ."""
-    B = np.asarray(component.root.T @ D.T)
+    B = component.products(D.T)
     return B.T @ B
 
 
@@ -304,21 +347,36 @@ def fit_error_model(
     found: Solution, components: Sequence[ErrorComponent], settings: ErrorSettings = DEFAULTS
 ) -> ErrorModel:
     """The sizes of components from the residuals of a solution; `OTHERS` comes last."""
-    rng = np.random.default_rng(settings.seed)
-    F, number = [component.root.tocsr() for component in components], len(components) + 1
     v = stack_rows(found, found.residuals)
-    T, cubes, own = _traces(found, F, settings, rng)
+    products = products_of(found, components, settings)
+    rng = np.random.default_rng(settings.seed)
+    if products is None:
+        F = [component.sparse_root() for component in components]
+        T, cubes, own = _traces(found, F, settings, rng)
+    else:
+        traces = products.traces(settings.max_clusters, rng)
+        T, cubes = traces.T, traces.cubes
     has_others = _has_others(components)
-    critical = settings.critical(number - 1 - has_others)
+    critical = settings.critical(len(components) - has_others)
     system = SizeEquations(T, has_others, critical, cubes)
     theta, score = system.solve(quadratic_forms(components, v))
-    given, independent = _independent_part(components, theta, len(v))
-    F = F[: len(F) - system.has_others]
-    estimated = theta[: len(F) + 1]
-    covariance = _covariance_of_sizes(
-        found, F, estimated, independent, given, system.reduced[0], rng
-    )
-    if system.has_others:
+    if products is None:
+        given, independent = _independent_part(components, theta, len(v))
+        F = F[: len(F) - has_others]
+        estimated = theta[: len(F) + 1]
+        forms = _covariance_of_forms(found, F, estimated, independent, given, rng)
+    else:
+        own = products.blocks(theta)
+        # V_0 without the given rows
+        _, part = system.reduced
+        forms = traces.covariance_of_forms(theta)
+        if has_others:
+            part = np.eye(len(theta))
+            part[-1, 0] = -1.0
+            forms = (part.T @ forms @ part)[:-1, :-1]
+    inverse = np.linalg.pinv(system.reduced[0], 1e-10, hermitian=True)
+    covariance = inverse @ forms @ inverse
+    if has_others:
         # θ of the given rows is σ0² − θ_0, so that their sum is σ0² whatever θ_0 is
         onto = np.concatenate([np.eye(len(covariance)), -np.eye(len(covariance))[:1]])
         covariance = onto @ covariance @ onto.T
@@ -355,13 +413,26 @@ def stated_error_model(
     """The error model of components of known sizes, such as those of a camera from earlier jobs, in
     a solution or a design; `theta`: of the independent part and of the components."""
     rng, own = np.random.default_rng(settings.seed), []
-    for t, component in zip(theta[1:], components):
-        blocks: dict[str, np.ndarray] = {}
-        for columns in _columns(component.root.tocsr(), settings, rng) if t > 0 else ():
-            _add_squares(blocks, remove_fit(found, columns)[1])
-        own.append(blocks)
+    products = products_of(found, components, settings)
+    if products is not None:
+        own = products.blocks(theta)
+    else:
+        for t, component in zip(theta[1:], components):
+            blocks: dict[str, np.ndarray] = {}
+            root = component.sparse_root()
+            for columns in _columns(root, settings, rng) if t > 0 else ():
+                _add_squares(blocks, remove_fit(found, columns)[1])
+            own.append(blocks)
     none = np.zeros(len(theta))
     return ErrorModel(found, tuple(components), theta, np.diag(none), none, tuple(own))
+
+
+def products_of(
+    found: Solution, components: Sequence[ErrorComponent], settings: ErrorSettings
+) -> ErrorProducts | None:
+    """The products of the roots of components with M; None if they cannot be had exactly."""
+    roots = [(component.root.tocsr(), component.mixing) for component in components]
+    return error_products(found, roots, settings.max_columns)
 
 
 def _add_squares(blocks: dict[str, np.ndarray], changes: Mapping[str, np.ndarray]) -> None:
@@ -389,8 +460,8 @@ def quadratic_forms(
     components: Sequence[ErrorComponent], v: Float[np.ndarray, "*draws rows"]
 ) -> Float[np.ndarray, "*draws k"]:
     """q of residuals v: vᵀv, and vᵀV_k·v of the components."""
-    of = lambda root: np.sum(np.asarray(root.T @ v.T) ** 2, 0)
-    return np.stack([np.sum(v**2, -1), *(of(c.root) for c in components)], -1)
+    of = lambda one: np.sum(one.products(np.atleast_2d(v).T) ** 2, 0).reshape(v.shape[:-1])
+    return np.stack([np.sum(v**2, -1), *map(of, components)], -1)
 
 
 def _columns(
@@ -410,19 +481,18 @@ def _columns(
             yield np.asarray(root @ signs).T / np.sqrt(total)
 
 
-def _covariance_of_sizes(
+def _covariance_of_forms(
     found: Solution,
     F: Sequence[Any],
     theta: Float[np.ndarray, " k"],
     independent: Float[np.ndarray, " rows"],
     given: Bool[np.ndarray, " rows"],
-    T: Float[np.ndarray, "k k"],
     rng: np.random.Generator,
     draws: int = AT_ONCE,
 ) -> Float[np.ndarray, "k k"]:
-    """T⁻¹·cov(q)·T⁻¹ of normal errors of the fitted Σ: cov(q)_ij = 2·tr(V_i·MΣM·V_j·MΣM), by
-    residuals drawn from it; `independent`: variances of the rows, of which some are `given`. From
-    16 draws σ of a size is right to about 1/√32 = 18 %."""
+    """cov(q)_ij = 2·tr(V_i·MΣM·V_j·MΣM) of normal errors of the fitted Σ, by residuals drawn from
+    it; `independent`: variances of the rows, of which some are `given`. From 16 draws σ of a size
+    is right to about 1/√32 = 18 %."""
     of_components = [lambda e, f=f: np.asarray((f @ (f.T @ e.T)).T) for f in F]
     of_parts = [lambda e: e * ~given, *of_components]
     parts = list(zip(theta[1:], of_components))
@@ -435,6 +505,5 @@ def _covariance_of_sizes(
     b = [remove_fit(found, V(u))[0] for V in of_parts]
     Sb = [sigma(x) for x in b]
     G = np.array([[np.sum(x * y) / draws for y in Sb] for x in b])
-    inverse = np.linalg.pinv(T, 1e-10, hermitian=True)
-    # G + Gᵀ is twice the symmetric part: the factor 2 of the covariance
-    return inverse @ (G + G.T) @ inverse
+    # twice the symmetric part: the factor 2 of the covariance
+    return G + G.T

@@ -1,0 +1,520 @@
+"""Products of the roots of error components with M, exactly, from reduced matrices.
+
+With P, Q, A and S of `error_linearisation`, the products of roots F of few columns need only
+
+    FᵀMF = FᵀPF − (AᵀPF)ᵀ·S⁻¹·AᵀPF
+
+the reduced normal equations of an adjustment in which the columns of F are further unknowns of
+cameras and photographs, summed over clusters of observations (`error_clusters`).
+
+A component of many columns, V = F·Fᵀ with a block for every cluster, as of errors along tracks, is
+kept as these blocks. With U = P·A·S^(−½), F̃ = M·F of the few columns, and of n = 1, 2, …
+
+    l_n = tr((P·V)ⁿ),    a_n = Uᵀ·V·(P·V)ⁿ⁻¹·U
+
+powers of M·V follow from det(1 − z·M·V) = det(1 − z·P·V)·det(1 + Σ zⁿ·a_n):
+
+    tr(MV)     = l_1 − tr a_1
+    tr((MV)²)  = l_2 − 2·tr a_2 + tr a_1²
+    tr((MV)³)  = l_3 − 3·tr a_3 + 3·tr(a_1·a_2) − tr a_1³
+    tr((MV)⁴)  = l_4 − 4·tr a_4 + 4·tr(a_1·a_3) + 2·tr a_2² − 4·tr(a_1²·a_2) + tr a_1⁴
+
+l_n, a_1, a_2 and tr(F̃ᵀVF̃) are exact. What only the skewness and the uncertainty of sizes need, a_3,
+a_4 and F̃ᵀV(MV)ⁿF̃ in full, is from some of the clusters where there are many.
+"""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxbundle.leastsquares.equations.reduced import DenseFactor
+from jaxbundle.leastsquares.quality.error_clusters import Batch, Clusters, lay_out_clusters
+from jaxbundle.leastsquares.quality.error_linearisation import (
+    DatumDirections,
+    LinearisedRows,
+    datum_of,
+    linearise_rows,
+)
+from jaxbundle.leastsquares.quality.reduced_traces import Powers, ReducedTraces
+from jaxbundle.leastsquares.solution import Solution
+from jaxbundle.types import present
+
+Matrix = Float[np.ndarray, "n m"]
+
+
+class RootColumns(NamedTuple):
+    """The roots of few columns in two sparse matrices: `narrow` with few values in a row, as of
+    photographs, and `wide`; `mixing`: by the columns of wide ones of every component the matrix
+    that mixes every as many of them as it has rows (None: as they are). `many`: the sparse root of
+    the component of many columns, None if there is none. `of_components`: the columns of every
+    other component, mixed, the narrow ones first."""
+
+    narrow: Any
+    wide: Any
+    mixing: list[tuple[slice, Matrix | None]]
+    many: Any | None
+    of_components: list[slice | None]
+
+    @property
+    def number(self) -> int:
+        """Mixed columns of few."""
+        return max((s.stop for s in self.of_components if s is not None), default=0)
+
+    def mix(self, x: Float[np.ndarray, "*n columns"]) -> Float[np.ndarray, "*n mixed"]:
+        """Quantities by the columns of wide roots as those of mixed ones."""
+        parts = [x[..., :0]]
+        for columns, mixing in self.mixing:
+            part = x[..., columns]
+            if mixing is not None:
+                b, c = mixing.shape
+                shape, blocks = part.shape[:-1], part.shape[-1] // b
+                rows = int(np.prod(shape)) * blocks
+                part = (part.reshape(rows, b) @ mixing).reshape(*shape, blocks * c)
+            parts.append(part)
+        return np.concatenate(parts, -1)
+
+    def wide_rows(self, rows: Int[np.ndarray, "m k"]) -> Batch:
+        """The wide roots of some rows, not mixed."""
+        return self.wide[rows.ravel()].toarray().reshape(*rows.shape, self.wide.shape[1])
+
+
+@dataclasses.dataclass
+class ClusterSums:
+    """Sums over clusters: AᵀPF, FᵀPF and with V between, AᵀPVPA and so on, of kept unknowns A and
+    roots F; of the directions h = E·V⁻¹·B_e of the datum, hᵀF and AᵀPVh; `FVF`: the diagonal, of
+    narrow roots; `powers`: tr((P·V)ⁿ)."""
+
+    AF: Matrix
+    FF: Matrix
+    hF: Matrix
+    AVA: Matrix
+    AVF: Matrix
+    AVPVA: Matrix
+    AVh: Matrix
+    hVh: Matrix
+    FVF: Float[np.ndarray, " q"]
+    powers: Float[np.ndarray, "4"]
+
+
+def sum_products(
+    clusters: Sequence[Clusters], roots: RootColumns, unknowns: int, datum: DatumDirections
+) -> ClusterSums:
+    """The sums over all clusters."""
+    # the place behind the last of each stands for none
+    p, n, w = unknowns + 1, roots.narrow.shape[1] + 1, roots.wide.shape[1]
+    d = datum.number
+    both, with_wide, wide = np.zeros((p + n, p + n)), np.zeros((p + n, w)), gram(roots.wide)
+    AV, AV_wide, AVPVA = np.zeros((p, p + n)), np.zeros((p, w)), np.zeros((p, p))
+    AVh, hVh, hF, hW = np.zeros((p, d)), np.zeros((d, d)), np.zeros((d, n)), np.zeros((d, w))
+    FVF, powers = np.zeros(n), np.zeros(4)
+    for of in clusters:
+        for c in of.portions(of.A.shape[2] + of.F.shape[2] + w):
+            a = c.A.shape[2]
+            at = np.concatenate([c.A_at, p + c.F_at], 1)
+            W = roots.wide_rows(c.rows)
+            QW = _tall(c.Q.transpose(0, 2, 1) @ W)
+            wide -= QW.T @ QW
+            X = c.without_fit(np.concatenate([c.A, c.F], 2))
+            A, F = X[:, :, :a], X[:, :, a:]
+            h = datum.effects(c.Q, c.eliminated)
+            # rows of AᵀPW, FᵀPW and hᵀW, and of AᵀPVPW, in one product
+            left = [X, h]
+            if c.V is not None:
+                VA, Vh = c.V @ A, c.V @ h
+                PVA = c.without_fit(VA)
+                left.append(PVA)
+                FVF += np.bincount(c.F_at.ravel(), np.sum(c.V @ F * F, 1).ravel(), n)
+                powers += _powers(c)
+                hVh += _tall(h).T @ _tall(Vh)
+            joint = np.concatenate(left, 2)
+            for some in c.by_columns():
+                to, x, y = at[some.start], _tall(X[some]), _tall(joint[some])
+                to_A, of_wide = to[:a], y.T @ _tall(W[some])
+                both[to[:, None], to] += x.T @ x
+                with_wide[to] += of_wide[: len(to)]
+                hW += of_wide[len(to) : len(to) + d]
+                hF[:, to[a:] - p] += _tall(h[some]).T @ _tall(c.F[some])
+                if c.V is not None:
+                    v, b = _tall(VA[some]), y[:, len(to) + d :]
+                    AV[to_A[:, None], to] += v.T @ x
+                    AV_wide[to_A] += of_wide[len(to) + d :]
+                    AVPVA[to_A[:, None], to_A] += b.T @ b
+                    AVh[to_A] += x[:, :a].T @ _tall(Vh[some])
+    kept, narrow = slice(0, p - 1), slice(p, p + n - 1)
+    mixed = roots.mix(with_wide)
+    wide = roots.mix(roots.mix(wide).T)
+    return ClusterSums(
+        np.concatenate([both[kept, narrow], mixed[kept]], 1),
+        np.block([[both[narrow, narrow], mixed[narrow]], [mixed[narrow].T, wide]]),
+        np.concatenate([hF[:, : n - 1], roots.mix(hW)], 1),
+        AV[kept, kept],
+        np.concatenate([AV[kept, narrow], roots.mix(AV_wide[kept])], 1),
+        AVPVA[kept, kept],
+        AVh[kept],
+        hVh,
+        FVF[: n - 1],
+        powers,
+    )
+
+
+def gram(F: Any) -> Matrix:
+    """FᵀF of a sparse matrix, by dense products of the rows with values in the same columns."""
+    count = np.diff(F.indptr)
+    rows = np.flatnonzero(count)
+    key = np.random.default_rng(0).integers(1, 1 << 40, F.shape[1])[F.indices]
+    pattern = np.add.reduceat(key, F.indptr[rows]) if len(rows) else rows
+    order = np.argsort(pattern, kind="stable")
+    first = np.flatnonzero(np.diff(pattern[order], prepend=-1))
+    if 4 * len(first) > len(rows):
+        return (F.T @ F).toarray()
+    found, rows = np.zeros((F.shape[1],) * 2), rows[order]
+    for a, b in zip(first, [*first[1:], len(rows)]):
+        start, number = F.indptr[rows[a:b]], count[rows[a]]
+        at = F.indices[start[0] : start[0] + number]
+        x = F.data[start[:, None] + np.arange(number)]
+        found[at[:, None], at] += x.T @ x
+    return found
+
+
+def share_of_many(
+    clusters: Sequence[Clusters],
+    roots: RootColumns,
+    FF: Matrix,
+    chosen: Bool[np.ndarray, " clusters"],
+) -> Float[np.ndarray, " mixed"]:
+    """The diagonal of FᵀPVPF of mixed wide roots, whose FᵀPF is given, from chosen clusters.
+
+    V is nearly a multiple of 1, as of errors along tracks: only the difference is from some of
+    them."""
+    w = len(FF)
+    part, of_white, like, white = np.zeros(w), np.zeros(w), 0.0, 0.0
+    for c in _chosen(clusters, chosen, w):
+        W = c.without_fit(roots.mix(roots.wide_rows(c.rows)))
+        V = present(c.V)
+        part += np.sum(V @ W * W, (0, 1))
+        of_white += np.sum(W * W, (0, 1))
+        like += np.trace(V, axis1=1, axis2=2).sum()
+        white += V.shape[0] * V.shape[1]
+    factor = like / max(white, 1.0)
+    share = len(chosen) / max(chosen.sum(), 1)
+    return factor * np.diag(FF) + share * (part - factor * of_white)
+
+
+def _chosen(
+    clusters: Sequence[Clusters], chosen: Bool[np.ndarray, " clusters"], columns: int
+) -> Iterator[Clusters]:
+    """Chosen clusters, some at a time."""
+    first = 0
+    for of in clusters:
+        own = np.flatnonzero(chosen[first : first + len(of.rows)])
+        first += len(of.rows)
+        if len(own):
+            yield from of.some(own).portions(columns)
+
+
+def _tall(x: Batch) -> Matrix:
+    """The rows of all clusters in one matrix."""
+    m, k, columns = x.shape
+    return x.reshape(m * k, columns)
+
+
+def _powers(c: Clusters) -> Float[np.ndarray, "4"]:
+    """Sums of tr((P·V)ⁿ)."""
+    PV = c.without_fit(present(c.V))
+    square = PV @ PV
+    product = lambda x, y: np.sum(x * y.transpose(0, 2, 1))
+    traces = product(PV, square), product(square, square)
+    return np.array([np.trace(PV, axis1=1, axis2=2).sum(), product(PV, PV), *traces])
+
+
+class ErrorProducts:
+    """Products of roots with M at a solution, and the changes of unknowns that they are; `few`: the
+    products S = FᵀMF of all columns of few."""
+
+    def __init__(
+        self,
+        found: Solution,
+        linear: LinearisedRows,
+        clusters: Sequence[Clusters],
+        roots: RootColumns,
+        reduced: DenseFactor,
+    ):
+        self.found, self.linear, self.clusters, self.roots = found, linear, clusters, roots
+        self.datum = datum_of(found, linear)
+        self.sums = sum_products(clusters, roots, linear.A.shape[1], self.datum)
+        factor = found.factor
+        self.lower = np.asarray(reduced.lower)
+        kept = [np.asarray(factor.scale[g]).ravel() for g in found.problem.plan.kept]
+        self.scale = np.concatenate([np.zeros(0), *kept])[:, None]
+        self.Y = self._forth(self.sums.AF)
+        self.few = self.sums.FF - self.Y.T @ self.Y
+
+    def _forth(self, x: Matrix) -> Matrix:
+        """L⁻¹·D·x of S⁻¹ = D·L⁻ᵀ·L⁻¹·D."""
+        from scipy.linalg import solve_triangular
+
+        return solve_triangular(self.lower, self.scale * x, lower=True)
+
+    def _back(self, x: Matrix) -> Matrix:
+        """D·L⁻ᵀ·x."""
+        from scipy.linalg import solve_triangular
+
+        return self.scale * solve_triangular(self.lower, x, lower=True, trans=1)
+
+    def changes(self) -> tuple[Matrix, Matrix]:
+        """The changes of kept unknowns by the columns of the roots, N⁻¹AᵀF without the datum, and
+        the motions a into it."""
+        x, datum = self._back(self.Y), self.datum
+        return x, datum.inverse @ (datum.conditions.T @ x + self.sums.hF)
+
+    def blocks_of_few(self, columns: slice, eliminated: bool) -> dict[str, np.ndarray]:
+        """By group the covariance blocks X·Xᵀ that a component of few columns gives, of eliminated
+        rows if wanted."""
+        plan, datum = self.found.problem.plan, self.datum
+        x, a = (y[:, columns] for y in self.changes())
+        moved, found, first = x - datum.motions @ a, {}, 0
+        for g in plan.kept:
+            n, w = plan.groups[g].free.shape
+            of = moved[first : first + n * w].reshape(n, w, -1)
+            found[g], first = of @ of.transpose(0, 2, 1), first + n * w
+        if eliminated and plan.eliminated is not None:
+            found[plan.eliminated] = self._eliminated_of_few(columns, x, a)
+        return found
+
+    def _eliminated_of_few(self, columns: slice, x: Matrix, a: Matrix) -> Batch:
+        """The blocks of eliminated rows, whose changes are L⁻ᵀ·Qᵀ·(F − A·x) − G·a."""
+        datum, number = self.datum, columns.stop - columns.start
+        narrow = self.roots.narrow.shape[1]
+        found = np.zeros((*datum.motions_eliminated.shape[:2], self.linear.Q.shape[1]))
+        below = np.concatenate([x, np.zeros((1, number))])
+        for of in self.clusters:
+            if of.eliminated[0] < 0:
+                continue
+            for c in of.portions(number):
+                if columns.start >= narrow:
+                    wide = slice(columns.start - narrow, columns.stop - narrow)
+                    F = self.roots.mix(self.roots.wide_rows(c.rows))[:, :, wide]
+                else:
+                    F = c.spread(c.F, c.F_at - columns.start, number)
+                turned = c.Q.transpose(0, 2, 1)
+                QF, QA = turned @ F, turned @ c.A
+                for some in c.by_columns():
+                    QF[some] -= QA[some] @ below[c.A_at[some.start]]
+                L = np.asarray(self.found.factor.lower_inverse)[c.eliminated]
+                change = L.transpose(0, 2, 1) @ QF - datum.motions_eliminated[c.eliminated] @ a
+                found[c.eliminated] = change @ change.transpose(0, 2, 1)
+        return found
+
+    def blocks_of_block(self, eliminated: bool) -> dict[str, np.ndarray]:
+        """`blocks_of_few` of the component with a block for every cluster."""
+        plan, datum, p = self.found.problem.plan, self.datum, self.linear.A.shape[1]
+        d = datum.number
+        # z = (x, a) = T·(Aᵀ·P·e, hᵀ·e)
+        inverse = self._back(self._forth(np.eye(p)))
+        onto = datum.inverse @ datum.conditions.T @ inverse
+        T = np.block([[inverse, np.zeros((p, d))], [onto, datum.inverse]])
+        C = T @ np.block([[self.sums.AVA, self.sums.AVh], [self.sums.AVh.T, self.sums.hVh]]) @ T.T
+        of_kept = np.concatenate([np.eye(p), -datum.motions], 1)
+        moved, found, first = of_kept @ C @ of_kept.T, {}, 0
+        for g in plan.kept:
+            n, w = plan.groups[g].free.shape
+            of = moved[first : first + n * w, first : first + n * w].reshape(n, w, n, w)
+            found[g], first = of[np.arange(n), :, np.arange(n)], first + n * w
+        if eliminated and plan.eliminated is not None:
+            found[plan.eliminated] = self._eliminated_of_block(T, C)
+        return found
+
+    def _eliminated_of_block(self, T: Matrix, C: Matrix) -> Batch:
+        """The blocks of eliminated rows, whose changes are α·e − β·z."""
+        datum, p = self.datum, self.linear.A.shape[1]
+        found = np.zeros((*datum.motions_eliminated.shape[:2], self.linear.Q.shape[1]))
+        # the last of A's places stands for none
+        T, C = (np.insert(np.insert(x, p, 0.0, 0), p, 0.0, 1) for x in (T, C))
+        of_datum = np.arange(p + 1, len(T))
+        for of in self.clusters:
+            if of.eliminated[0] < 0:
+                continue
+            for c in of.portions(of.A.shape[2]):
+                L = np.asarray(self.found.factor.lower_inverse)[c.eliminated]
+                alpha = L.transpose(0, 2, 1) @ c.Q.transpose(0, 2, 1)
+                beta = np.concatenate([alpha @ c.A, datum.motions_eliminated[c.eliminated]], 2)
+                Va = present(c.V) @ alpha.transpose(0, 2, 1)
+                h = datum.effects(c.Q, c.eliminated)
+                onto = np.concatenate([c.without_fit(c.A), h], 2).transpose(0, 2, 1) @ Va
+                blocks = alpha @ Va
+                for some in c.by_columns():
+                    at = np.concatenate([c.A_at[some.start], of_datum])
+                    square = at[:, None], at
+                    b = beta[some]
+                    cross = b @ (T[square] @ onto[some])
+                    blocks[some] += b @ C[square] @ b.transpose(0, 2, 1)
+                    blocks[some] -= cross + cross.transpose(0, 2, 1)
+                found[c.eliminated] = blocks
+        return found
+
+    def powers(self, at_most: int, rng: np.random.Generator) -> "Powers":
+        """Traces and products with powers of M·V of the component with a block for every cluster,
+        what is not exact from `at_most` clusters."""
+        s, q = self.sums, self.roots.number
+        U = lambda x: self._forth(self._forth(x).T)
+        a1, a2, b1 = U(s.AVA), U(s.AVPVA), self._forth(s.AVF) - U(s.AVA) @ self.Y
+        # tr(F̃ᵀVF̃) by column
+        number = sum(len(c.rows) for c in self.clusters)
+        order, n = rng.permutation(number), self.roots.narrow.shape[1]
+        chosen, near = np.zeros(number, bool), np.zeros(number, bool)
+        chosen[order[:at_most]] = near[order[: 10 * at_most]] = True
+        exact = share_of_many(self.clusters, self.roots, s.FF[n:, n:], near)
+        exact = np.concatenate([s.FVF, exact]) - 2 * np.sum(self.Y * self._forth(s.AVF), 0)
+        exact = exact + np.sum(self.Y * (a1 @ self.Y), 0)
+        l = s.powers
+        trace = np.trace
+        t1 = l[0] - trace(a1)
+        t2 = l[1] - 2 * trace(a2) + np.sum(a1 * a1)
+        p = len(a1)
+        a3, a4, b2, near, R2, R3 = (
+            np.zeros(shape) for shape in (*[(p, p)] * 2, (p, q), *[(q, q)] * 3)
+        )
+        # errors along a track are nearly independent ones: only the difference is from some
+        like = t1 / max(self.found.problem.counts.redundancy, 1)
+        for c in _chosen(self.clusters, chosen, p + q):
+            x0 = np.concatenate(self._dense(c), 2)
+            V = present(c.V)
+            x1 = V @ x0
+            x2 = c.without_fit(x1)
+            x3 = V @ x2
+            x4 = _tall(c.without_fit(x3))
+            x0, x1, x2, x3 = map(_tall, (x0, x1, x2, x3))
+            near += x0[:, p:].T @ (x1 - like * x0)[:, p:]
+            u2, f2 = x2[:, :p], x2[:, p:]
+            b2 += u2.T @ f2
+            a3 += u2.T @ x3[:, :p]
+            a4 += x4[:, :p].T @ x4[:, :p]
+            R2 += f2.T @ f2
+            R3 += f2.T @ x3[:, p:]
+        share = number / max(chosen.sum(), 1)
+        a3, a4, b2, near, R2, R3 = (share * x for x in (a3, a4, b2, near, R2, R3))
+        R1 = like * self.few + near
+        R2 = R2 - b1.T @ b1
+        cross = b1.T @ b2
+        R3 = R3 - cross - cross.T + b1.T @ a1 @ b1
+        t3 = l[2] - 3 * trace(a3) + 3 * np.sum(a1 * a2) - np.sum(a1 @ a1 * a1)
+        square = a1 @ a1
+        t4 = l[3] - 4 * trace(a4) + 4 * np.sum(a1 * a3) + 2 * np.sum(a2 * a2)
+        t4 = t4 - 4 * np.sum(square * a2) + np.sum(square * square)
+        return Powers(np.array([t1, t2, t3, t4]), exact, R1, R2, R3)
+
+    def _dense(self, c: Clusters) -> tuple[Batch, Batch]:
+        """U and F̃ of some clusters."""
+        p, n = self.linear.A.shape[1], self.roots.narrow.shape[1]
+        A = _tall(c.without_fit(c.spread(c.A, c.A_at, p)))
+        U = self._forth(A.T).T
+        W = self.roots.mix(self.roots.wide_rows(c.rows))
+        F = np.concatenate([c.spread(c.F, c.F_at, n), W], 2)
+        F = _tall(c.without_fit(F)) - U @ self.Y
+        return U.reshape(*c.rows.shape, p), F.reshape(*c.rows.shape, F.shape[1])
+
+    def traces(self, max_clusters: int, rng: np.random.Generator) -> ReducedTraces:
+        """The traces of all components; `max_clusters`: see `powers`."""
+        powers = self.powers(max_clusters, rng) if self.roots.many is not None else None
+        redundancy = self.found.problem.counts.redundancy
+        return ReducedTraces(self.few, self.roots.of_components, powers, redundancy)
+
+    def blocks(self, theta: Float[np.ndarray, " k"]) -> list[dict[str, np.ndarray]]:
+        """By table the covariance blocks that every component of θ = 1 gives; of the eliminated
+        table, and of the others of a component of many columns, only where its θ is not zero."""
+        found: list[dict[str, np.ndarray]] = []
+        for t, columns in zip(theta[1:], self.roots.of_components):
+            if columns is None:
+                blocks = self.blocks_of_block(bool(t != 0))
+            else:
+                blocks = self.blocks_of_few(columns, bool(t != 0))
+            found.append(self._by_table(blocks))
+        return found
+
+    def _by_table(self, blocks: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Blocks of groups as those of the rows of tables; zero for held unknowns."""
+        problem, found = self.found.problem, {}
+        for table in problem.tables:
+            members = [
+                (g, m)
+                for g in blocks
+                for m in problem.plan.groups[g].members
+                if m.table == table.name
+            ]
+            if not members and table.name == problem.plan.eliminated:
+                continue
+            width = table.space.width
+            of_table = np.zeros((problem.sizes["table", table.name], width, width))
+            for g, m in members:
+                at = slice(m.start, m.start + m.width)
+                rows = np.arange(len(blocks[g])) if m.rows is None else np.asarray(m.rows)
+                np.add.at(of_table, rows, blocks[g][:, at, at])
+            found[table.name] = of_table[: table.rows]
+        return found
+
+
+def error_products(
+    found: Solution, roots: Sequence[tuple[Any, Matrix | None]], max_columns: int
+) -> ErrorProducts | None:
+    """The products of roots, sparse matrices [rows, columns] with what mixes their columns.
+
+    None if the reduced system is not factorised densely, or if several have more than
+    `max_columns` and their errors are shared by more than one cluster."""
+    sorted_roots = _sort_roots(roots, max_columns)
+    reduced = found.factor.reduced
+    if sorted_roots is None or not isinstance(reduced, DenseFactor):
+        return None
+    linear = linearise_rows(found)
+    clusters = lay_out_clusters(linear, sorted_roots.narrow, sorted_roots.many)
+    if clusters is None:
+        return None
+    return ErrorProducts(found, linear, clusters, sorted_roots, reduced)
+
+
+def _sort_roots(
+    roots: Sequence[tuple[Any, Matrix | None]], max_columns: int, max_narrow: int = 8
+) -> RootColumns | None:
+    """Roots by what they are; None if several have many columns. `max_narrow`: values in a row of
+    a sparse one; a spline of the sensor has 16, and with several image points of a track nearly
+    all."""
+    import scipy.sparse as sp
+
+    many = [k for k, (root, _) in enumerate(roots) if root.shape[1] > max_columns]
+    if not roots or len(many) > 1:
+        return None
+    of_components: list[slice | None] = [None] * len(roots)
+    dense = lambda root: root.nnz > max_narrow * np.count_nonzero(np.diff(root.indptr))
+    few = [k for k in range(len(roots)) if k not in many]
+    # narrow ones first
+    few.sort(key=lambda k: dense(roots[k][0]))
+    none = sp.csr_matrix((roots[0][0].shape[0], 0))
+    narrow, wide, mixed, first = [none], [none], [], 0
+    for k in few:
+        root, mixing = roots[k]
+        number = root.shape[1]
+        if dense(root):
+            before = sum(x.shape[1] for x in wide)
+            mixed.append((slice(before, before + number), mixing))
+            wide.append(root)
+        else:
+            narrow.append(root if mixing is None else root @ _repeat(mixing, number))
+        if mixing is not None:
+            number = number // len(mixing) * mixing.shape[1]
+        of_components[k] = slice(first, first + number)
+        first += number
+    of_many = None
+    for k in many:
+        root, mixing = roots[k]
+        of_many = root if mixing is None else root @ _repeat(mixing, root.shape[1])
+    joined = lambda x: sp.hstack(x).tocsr() if len(x) > 2 else x[-1]
+    return RootColumns(joined(narrow), joined(wide), mixed, of_many, of_components)
+
+
+def _repeat(mixing: Matrix, columns: int) -> Any:
+    """The sparse matrix that mixes all columns."""
+    import scipy.sparse as sp
+
+    return sp.kron(sp.identity(columns // len(mixing)), sp.csr_matrix(mixing)).tocsr()
