@@ -36,7 +36,7 @@ from jaxbundle.cameras.pixel_frame import in_model_units
 from jaxbundle.cameras.validity import measured_centre
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.network.tables import Camera
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 
 @print_in_one_screen
@@ -80,7 +80,7 @@ def mapping_error(
     names, C = adjustment.camera_covariance(camera)
     p = np.array(list(adjustment.camera_parameters(camera).values()))
     model = get_model(given.model)
-    uv = grid_of(present(given.image_size), *grid).reshape(-1, 2)
+    uv = grid_of(not_none(given.image_size), *grid).reshape(-1, 2)
     xy = in_model_units(uv, model, given.image_size, given.pixel_size)
     xy = xy[have_rays(model, p, xy)]
     whole = MappingError(_weights(_form(given, p, names, xy, "rotation"), C), len(xy) / len(uv))
@@ -115,7 +115,7 @@ def mapping_form(
     """H of the named parameters of a camera at the values `p` of all: pixels²; `frame` "camera":
     that of A, without a rotation."""
     model = get_model(camera.model)
-    uv = grid_of(present(camera.image_size), *grid).reshape(-1, 2)
+    uv = grid_of(not_none(camera.image_size), *grid).reshape(-1, 2)
     xy = in_model_units(uv, model, camera.image_size, camera.pixel_size)
     return _form(camera, p, names, xy, frame)
 

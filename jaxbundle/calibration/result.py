@@ -27,7 +27,7 @@ from jaxbundle.report.lens_advice import advise_parameters, is_hardly_determined
 from jaxbundle.report.verdict import judge_replication
 from jaxbundle.results import TableMethods
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray, present
+from jaxbundle.types import AnyArray, not_none
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -80,7 +80,7 @@ class Calibration(TableMethods):
         """σ of the free parameters by name, under errors that image points share where these are
         known and their σ are larger."""
         found = self.adjustment.cameras[self.name]["parameters"]
-        return {name: present(stated_sigma_of(found[name])) for name in self.sigma}
+        return {name: not_none(stated_sigma_of(found[name])) for name in self.sigma}
 
     @property
     def camera(self) -> Camera:

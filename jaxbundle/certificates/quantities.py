@@ -42,7 +42,7 @@ from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.reconstruction.result import Reconstruction
 from jaxbundle.refinement import Refinement
 from jaxbundle.report.correlated import stated_sigma, stated_sigma_of
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 
 def offered(kind: str) -> dict[str, Quantity]:
@@ -417,7 +417,7 @@ def _calibrated(
 ) -> Callable[[Subject, str], QuantityValues]:
     def find(subject: Subject, argument: str) -> QuantityValues:
         refuse_argument(argument)
-        camera = present(subject.result).camera
+        camera = not_none(subject.result).camera
         return QuantityValues({"": float(function(subject.result))}, unit, _pitch([camera]))
 
     return find

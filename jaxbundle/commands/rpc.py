@@ -39,7 +39,7 @@ from jaxbundle.pushbroom.rpc.bias import (
 from jaxbundle.pushbroom.rpc.fitting import RpcCheck, RpcTable, fit_image, fit_rpc
 from jaxbundle.pushbroom.rpc.polynomials import Rpc, RpcStatus, locate_points_on, project_points
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 COLUMNS = ("longitude", "latitude", "height", "line", "sample")
 GROUND_SIGMA = ("seast", "snorth", "sheight")
@@ -309,8 +309,8 @@ def _read_points(
         east, north, height = geographic(columns)
     else:
         x, y, height = (columns.numbers(name, required=True) for name in names[:3])
-        transformer = present(MapSystem(WGS84, crs).transformer)
-        if present(transformer.target_crs).is_vertical:
+        transformer = not_none(MapSystem(WGS84, crs).transformer)
+        if not_none(transformer.target_crs).is_vertical:
             # its heights would be taken for heights above the ellipsoid
             raise InputError(
                 f"--crs {crs}: has a system of heights; give its horizontal part, and --geoid for "

@@ -37,7 +37,7 @@ from jaxbundle.network.columns import (
     is_missing,
     refuse_unknown,
 )
-from jaxbundle.network.kinds import KINDS, SECTIONS, Further
+from jaxbundle.network.kinds import KINDS, SECTIONS, ObservationTable
 from jaxbundle.network.rules import (
     AXES,
     CHOICES,
@@ -201,7 +201,9 @@ def add_further(network: Network, *, angle_unit: str | None = None, **further: A
     return network
 
 
-def make_further(given: Mapping[str, Any], radians: float, where: str = "") -> tuple[Further, ...]:
+def make_further(
+    given: Mapping[str, Any], radians: float, where: str = ""
+) -> tuple[ObservationTable, ...]:
     """Observations of further kinds from their tables and the settings of their sections.
 
     **Raises:** `InputError`, also for an unknown name, and for settings without a table."""

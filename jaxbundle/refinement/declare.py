@@ -35,7 +35,7 @@ from jaxbundle.refinement.terrain_heights import (
     terrain_heights,
     update_cells,
 )
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 
 class ImagePointSet(NamedTuple):
@@ -94,7 +94,7 @@ class DeclaredRefinement:
                 size = np.abs(before).max((1, 2), keepdims=True)
                 change = max(change, float((np.abs(lines.scale - before) / size).max()))
         if len(self.levelled):
-            model, cells = present(self.inputs.terrain), measured[TERRAIN_HEIGHTS]
+            model, cells = not_none(self.inputs.terrain), measured[TERRAIN_HEIGHTS]
             measured[TERRAIN_HEIGHTS], off = update_cells(model, cells, X[self.levelled])
             change = max(change, off)
         data = dataclasses.replace(problem.data, measured=measured)
@@ -279,7 +279,7 @@ def _network_of(
     checking: bool,
 ) -> Network:
     """The photographs with the points and rays used; control is declared here (`_points`)."""
-    frames, n = present(inputs.frames), len(X)
+    frames, n = not_none(inputs.frames), len(X)
     # a camera without photographs would be undetermined
     used = list(dict.fromkeys(frames.images.camera.tolist()))
     camera = np.array([used.index(c) for c in frames.images.camera], int)

@@ -22,7 +22,7 @@ from jaxbundle.refinement.declare import DeclaredRefinement
 from jaxbundle.refinement.terrain_heights import TERRAIN_HEIGHTS
 from jaxbundle.refinement.weakness import weaknesses
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray, present
+from jaxbundle.types import AnyArray, not_none
 
 
 class SharedUnknowns(eqx.Module):
@@ -216,7 +216,7 @@ def _describe_removed(declared: DeclaredRefinement, blunder: RemovedRow) -> Remo
         rows = [int(place[before + r]) for r in blunder.rows]
         return Removed("image", rows[0], either_of(told), blunder.test, tuple(rows[1:]))
     if set.kind.name == "control points":
-        p, axis = int(declared.control[blunder.row]), present(blunder.residual)
+        p, axis = int(declared.control[blunder.row]), not_none(blunder.residual)
         name = f"{points.axis_names[axis]} of control point {points.id[chosen[p]]}"
         return Removed("control", 3 * p + axis, name, blunder.test)
     if blunder.set == TERRAIN_HEIGHTS:

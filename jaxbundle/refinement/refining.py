@@ -40,7 +40,7 @@ from jaxbundle.refinement.tables import AnyScannerImage, GroundPoints, with_fram
 from jaxbundle.refinement.terrain_heights import TERRAIN_HEIGHTS, HeightModel
 from jaxbundle.refinement.weakness import weaknesses
 from jaxbundle.results import TableMethods, finite
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 TESTS = ("none", "baarda", "pope")
 
@@ -321,7 +321,7 @@ def _without_terrain(found: RefinementInspection) -> Iterator[str]:
     if len(uncovered):
         ids = np.array(inputs.points.id)[found.declared.rays.points[uncovered]]
         yield (
-            f"{present(inputs.terrain).name} has no height at {count(len(ids), 'tie point')}, "
+            f"{not_none(inputs.terrain).name} has no height at {count(len(ids), 'tie point')}, "
             f"adjusted without one: {list_some(ids)}"
         )
 

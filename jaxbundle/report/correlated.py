@@ -13,7 +13,7 @@ from jaxtyping import Float
 from jaxbundle.leastsquares.quality.error_components import IMAGE
 from jaxbundle.report.layout import clean, heading, paragraph, significant, table
 from jaxbundle.report.lens_advice import ADVICE_ON_FIELD, advise_parameters, is_hardly_determined
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 if TYPE_CHECKING:
     from jaxbundle.adjustment.quality.replication import HalvesDifference
@@ -112,7 +112,7 @@ def component_rows(adjustment: "Adjustment") -> list[tuple[str, str, str, str, s
             unit if size.unit == IMAGE else "a priori σ",
             "" if number == 0 else f"{size.score:.1f}",
         )
-        for number, size in enumerate(present(adjustment.error_model).sizes)
+        for number, size in enumerate(not_none(adjustment.error_model).sizes)
     ]
 
 
@@ -127,7 +127,7 @@ def has_field(adjustment: "Adjustment") -> bool:
 def remarks(adjustment: "Adjustment") -> list[str]:
     """What the components that were found say, in sentences, the most significant first."""
     unit, said = adjustment.image_unit, []
-    sizes = present(adjustment.error_model).sizes[1:]
+    sizes = not_none(adjustment.error_model).sizes[1:]
     for size in sorted(sizes, key=lambda one: -one.score):
         name, of, camera = size.name.partition(" of ")
         if size.size > 0 and name in REMARKS:
@@ -215,7 +215,7 @@ def correlated_lines(adjustment: "Adjustment") -> list[str]:
     lines = [*heading(TITLE), *table(COMPONENT_HEADER, component_rows(adjustment), "lrrlr"), ""]
     lines += [line for said in remarks(adjustment) for line in paragraph(f"- {said}", 0, 2)]
     lines += ["", *paragraph(LEGEND)]
-    if words := not_looked_for(present(adjustment.error_model)):
+    if words := not_looked_for(not_none(adjustment.error_model)):
         lines += paragraph(words)
     lines += ["", *table(SIGMA_HEADER, sigma_rows(adjustment), "lrrr")]
     return [*lines, *_replication_lines(adjustment)]

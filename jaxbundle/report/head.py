@@ -30,7 +30,7 @@ from jaxbundle.report.layout import (
 )
 from jaxbundle.report.lens_advice import FEWER_PARAMETERS
 from jaxbundle.report.rig_scale import scale_of_rigs
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 if TYPE_CHECKING:
     from jaxbundle.adjustment.problem import NetworkProblem
@@ -140,7 +140,7 @@ def reduced_system(adjustment: "Adjustment") -> str:
     plan = adjustment.problem.plan
     how = REDUCTIONS[adjustment.reduction]
     if adjustment.reduction == "banded":
-        how += f" of {present(plan.band).width} unknowns"
+        how += f" of {not_none(plan.band).width} unknowns"
     return f"{adjustment.problem.reduced_size} unknowns, {how}"
 
 
@@ -163,7 +163,7 @@ def datum(adjustment: "Adjustment") -> str:
         parts = [count(*part) for part in known if part[0]]
         return f"{network.datum}; defect 0: given by {', '.join(parts)}"
     open_ones = f"defect {defect}: the observations leave open {open_datum(adjustment)}"
-    weight = np.asarray(present(problem.plan.datum).weight["point"])[: len(network.points)] > 0
+    weight = np.asarray(not_none(problem.plan.datum).weight["point"])[: len(network.points)] > 0
     ids = network.points.id
     if network.datum == "minimal":
         held = [f"{'XYZ'[i]} of {clean(ids[p])}" for p, i in zip(*np.nonzero(weight))]
@@ -189,7 +189,7 @@ def open_datum(adjustment: "Adjustment") -> str:
     # the directions are told about these points, which a rotation about them leaves
     known = network.points.has_role("control", "fixed")
     about = (network.points.position[known] - adjustment.problem.origin).sum(0)
-    gauge = np.asarray(present(adjustment.problem.plan.datum).gauge)
+    gauge = np.asarray(not_none(adjustment.problem.plan.datum).gauge)
     words = open_directions_in_words(gauge, about / max(known.sum(), 1))
     return "position and orientation" if defect == 6 and "scale" not in words else words
 
@@ -317,7 +317,7 @@ def image_precision(adjustment: "Adjustment") -> str:
         parts.insert(0, f"{span(1e3 * adjustment.sigma0 * ends)} µm")
         pitch = {camera.pixel_size for camera in adjustment.problem.network.cameras}
         if len(pitch) == 1 and None not in pitch:
-            size = abs(present(next(iter(pitch)))[0])
+            size = abs(not_none(next(iter(pitch)))[0])
             parts.append(f"{span(adjustment.sigma0 * ends / size, 3)} px")
     return f"{' = '.join(parts)}  (σ0 × {KINDS[adjustment.sigma_origin]} {span(ends, 4)} {unit})"
 

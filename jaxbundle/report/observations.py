@@ -28,7 +28,7 @@ from jaxbundle.report.layout import (
     table,
     to_place_of,
 )
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 if TYPE_CHECKING:
     from jaxbundle.adjustment.result import Adjustment
@@ -237,7 +237,7 @@ def downweighted(adjustment: "Adjustment", most: int) -> list[str]:
         (str(i), item.kind, item.name, significant(item.test, 3), significant(item.weight, 2))
         for i, item in enumerate(suspects[:most], 1)
     ]
-    weighted = len(present(adjustment.weights))
+    weighted = len(not_none(adjustment.weights))
     lines = heading(f"Robust estimation ({adjustment.robust})")
     lines += paragraph(
         f"Scale: {significant(adjustment.robust_scale, 4)} times the a priori σ, a posteriori from "

@@ -25,7 +25,7 @@ from jaxbundle.report.layout import (
     significant,
     table,
 )
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 if TYPE_CHECKING:
     from jaxbundle.adjustment.result import Adjustment
@@ -312,7 +312,7 @@ def far_points(adjustment: "Adjustment", most: int) -> list[str]:
         )
         for i in order[:most]
     ]
-    place = ", ".join(significant(x, 8) for x in present(adjustment.far_points).origin)
+    place = ", ".join(significant(x, 8) for x in not_none(adjustment.far_points).origin)
     angle = network.angle_unit
     lines = [
         *heading(f"Points at any distance: directions from {place}"),

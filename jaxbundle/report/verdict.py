@@ -20,7 +20,7 @@ from jaxbundle.report.correlated import has_shared_errors, remarks
 from jaxbundle.report.head import chi_squared, open_datum
 from jaxbundle.report.layout import clean, significant
 from jaxbundle.report.observations import count_weak, critical_value
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 if TYPE_CHECKING:
     from jaxbundle.adjustment.result import Adjustment
@@ -264,7 +264,7 @@ def _checks(adjustment: "Adjustment") -> list[Finding]:
     rms = ", ".join(f"{axis} {significant(value)}" for axis, value in zip("XYZ", found.rms))
     table = adjustment.table("checks")
     d, s = (np.concatenate([table[f"{kind}{a}"] for a in "XYZ"]) for kind in "ds")
-    given = np.concatenate(present(adjustment.check)[0].sigma.T)
+    given = np.concatenate(not_none(adjustment.check)[0].sigma.T)
     s = np.hypot(s, np.where(np.isfinite(given), given, 0.0))  # of the difference of both
     known = (s > 0) & np.isfinite(d)
     ratio = np.abs(d[known]) / s[known]

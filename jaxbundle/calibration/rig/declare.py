@@ -50,7 +50,7 @@ from jaxbundle.network.kinds.distances import DISTANCES
 from jaxbundle.network.kinds.image_points import image_points
 from jaxbundle.network.kinds.mountings import BASES, MOUNTING, observe_mountings
 from jaxbundle.network.tables import EXTERIOR, Camera
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 POSES = ("epoch", "mounting")
 # The tables of poses on the way from a point to the camera: of boards that are bodies of their own,
@@ -153,7 +153,7 @@ class Rig:
         image."""
         found = np.zeros(len(self.xy))
         for k, camera in enumerate(self.cameras):
-            own, size = self.camera == k, present(camera.image_size)
+            own, size = self.camera == k, not_none(camera.image_size)
             uv = in_pixels(self.xy[own], get_model(camera.model), size, camera.pixel_size)
             found[own] = (uv[:, 1] - (size[1] - 1) / 2) / size[1]
         return found

@@ -15,7 +15,7 @@ from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.geometry.rotations import omega_phi_kappa_from_matrix
 from jaxbundle.network.build import make_network
 from jaxbundle.network.tables import EXTERIOR, UNIT, Camera, Network
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 if TYPE_CHECKING:
     from jaxbundle.calibration.rig.result import RigCalibration
@@ -38,7 +38,7 @@ def network_of_views(found: "RigCalibration") -> Network | None:
         for rows in (mounting, pose)
     )
     # the rig has its points relative to the centroid of the board
-    away = present(rig.centroids)[0]
+    away = not_none(rig.centroids)[0]
     position = [away + pose.position[e] + M[e].T @ mounting.position[k] for k, e in views]
     angles = [np.asarray(omega_phi_kappa_from_matrix(R[k] @ M[e])) for k, e in views]
     ids = [f"{found.names[k]} {rig.epochs[e]}" for k, e in views]

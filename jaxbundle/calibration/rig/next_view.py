@@ -25,7 +25,7 @@ from jaxbundle.cameras.pixel_frame import in_model_units, in_pixels
 from jaxbundle.geometry import matrix_from_rotation_vector, quaternion_from_matrix
 from jaxbundle.leastsquares import Pose, PoseValue
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray, present
+from jaxbundle.types import AnyArray, not_none
 
 if TYPE_CHECKING:
     from jaxbundle.calibration.rig.result import RigCalibration
@@ -176,7 +176,7 @@ def _whitened(
     mounting = jax.tree.map(lambda x: x[k], rig.values("mounting"))
     p = np.array(list(given.parameters.values()))
     xy, J, along = map(np.asarray, _images(model, p, mounting, poses, points))
-    size = np.array(present(given.image_size))
+    size = np.array(not_none(given.image_size))
     uv = in_pixels(xy, model, given.image_size, given.pixel_size)
     inside = ((uv > 0) & (uv < size - 1)).all(-1) & (along < 0) & np.isfinite(J).all((-2, -1))
     there = inside.mean(1) >= settings.min_part
@@ -200,7 +200,7 @@ def _places(
     with pixel, distance, tilt, roll and the matrix; distances are those of the epochs."""
     random = np.random.default_rng(settings.seed)
     given, n = rig.camera(camera), settings.number
-    model, size = get_model(given.model), np.array(present(given.image_size))
+    model, size = get_model(given.model), np.array(not_none(given.image_size))
     p = tuple(given.parameters.values())
     uv = random.uniform(0.15, 0.85, (n, 2)) * size
     xy = in_model_units(uv, model, given.image_size, given.pixel_size)

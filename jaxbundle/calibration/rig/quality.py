@@ -29,7 +29,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.leastsquares import Pose, PoseValue
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray, Scalar, present
+from jaxbundle.types import AnyArray, Scalar, not_none
 
 if TYPE_CHECKING:
     from jaxbundle.calibration.rig.result import RigCalibration
@@ -87,7 +87,7 @@ def rig_uncertainty(
     given, space = rig.camera(name), rig.result.problem.table(rig.rig.row_of(k)[0]).vector
     model = get_model(given.model)
     p = np.array(list(given.parameters.values()))
-    uv = grid_of(present(given.image_size), *grid)
+    uv = grid_of(not_none(given.image_size), *grid)
     xy = in_model_units(uv.reshape(-1, 2), model, given.image_size, given.pixel_size)
     C = rig.covariance(name)
     if frame == "rig":
@@ -112,7 +112,7 @@ def rig_points(rig: "RigCalibration", name: str) -> Float[np.ndarray, "n 2"]:
 
 def rig_coverage(rig: "RigCalibration", name: str) -> Coverage:
     """Coverage of the image of a camera by points of the rig."""
-    return coverage(rig_points(rig, name), present(rig.camera(name).image_size))
+    return coverage(rig_points(rig, name), not_none(rig.camera(name).image_size))
 
 
 def _index(rig: "RigCalibration", name: str) -> int:

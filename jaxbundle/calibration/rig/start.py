@@ -22,7 +22,7 @@ from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.measure.boards import Board, BoardSet
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray, present
+from jaxbundle.types import AnyArray, not_none
 
 if TYPE_CHECKING:
     from jaxbundle.calibration.rig.wand_body import WandBody
@@ -296,7 +296,7 @@ def _hold(mounting: PoseValue, cameras: Sequence[str], known: KnownMountings) ->
         if one.held[0]:
             position[k] = one.position
         if one.held[1]:
-            M = matrix_from_omega_phi_kappa(present(one.angles))
+            M = matrix_from_omega_phi_kappa(not_none(one.angles))
             rotation[k] = quaternion_from_matrix(M)
     return PoseValue(position, rotation)
 

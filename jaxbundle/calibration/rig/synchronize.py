@@ -49,7 +49,7 @@ from jaxbundle.network.kinds.continuous_time import (
     TRAJECTORY,
 )
 from jaxbundle.network.kinds.mountings import MOUNTING
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 Times = Mapping[str, Mapping[str, float]]
 
@@ -165,7 +165,7 @@ def with_trajectory(rig: Rig, trajectory: TargetMotion, pose: PoseValue, spacing
 def without_run(rig: Rig) -> list[tuple[str, str]]:
     """The epochs that are in no run of photographs, and why they are not used."""
     why = "too few photographs before and after it for a motion"
-    return [(rig.epochs[row], why) for row in np.flatnonzero(present(rig.trajectory).run < 0)]
+    return [(rig.epochs[row], why) for row in np.flatnonzero(not_none(rig.trajectory).run < 0)]
 
 
 def _body_of_rows(rig: Rig) -> Int[np.ndarray, " rows"]:
@@ -288,7 +288,7 @@ def adjust_unsynchronized(
 
     First with the clocks held: iterations would walk along a valley if the motion left them open.
     The rig is that with knots by its final clocks."""
-    start = present(rig.trajectory).clocks
+    start = not_none(rig.trajectory).clocks
     none = dataclasses.replace(start, free=np.zeros_like(start.free))
     rig, found = _adjust_until_assigned(_with_clocks(rig, none), settings, max_iterations)
     if not found.converged:
@@ -297,7 +297,7 @@ def adjust_unsynchronized(
     # one iteration for its normal equations alone: its values are not used
     probe = adjust_rig(rig, 1)
     at = Solution(probe.problem, probe.problem.data.start)
-    held = _undetermined(rig, at, present(rig.trajectory).sigma0 ** 2, settings)
+    held = _undetermined(rig, at, not_none(rig.trajectory).sigma0 ** 2, settings)
     while True:
         rig = _hold(rig, held, start)
         rig, found = _adjust_until_assigned(rig, settings, max_iterations)
@@ -311,7 +311,7 @@ def adjust_unsynchronized(
 
 def _with_clocks(rig: Rig, clocks: Clocks) -> Rig:
     return dataclasses.replace(
-        rig, trajectory=dataclasses.replace(present(rig.trajectory), clocks=clocks)
+        rig, trajectory=dataclasses.replace(not_none(rig.trajectory), clocks=clocks)
     )
 
 
@@ -319,7 +319,7 @@ def _started_at(rig: Rig, found: Result) -> Rig:
     """The rig with the poses and mountings of a solution as start values."""
     values = found.minimum.values
     trajectory = dataclasses.replace(
-        present(rig.trajectory), poses=jax.tree.map(np.asarray, values[TRAJECTORY])
+        not_none(rig.trajectory), poses=jax.tree.map(np.asarray, values[TRAJECTORY])
     )
     return dataclasses.replace(
         rig,
@@ -331,14 +331,14 @@ def _started_at(rig: Rig, found: Result) -> Rig:
 
 def _hold(rig: Rig, held: Mapping[str, Mapping[str, str]], start: Clocks) -> Rig:
     """The rig with these unknowns of clocks held at their start values."""
-    clocks = present(rig.trajectory).clocks
+    clocks = not_none(rig.trajectory).clocks
     free, value = clocks.free.copy(), clocks.value.copy()
     for k, camera in enumerate(rig.cameras):
         for unknown in held.get(camera.id, {}):
             j = CLOCK_PARAMETERS.index(unknown)
             free[k, j], value[k, j] = False, start.value[k, j]
     clocks = dataclasses.replace(clocks, free=free, value=value)
-    return _planned_again(rig, dataclasses.replace(present(rig.trajectory), clocks=clocks))
+    return _planned_again(rig, dataclasses.replace(not_none(rig.trajectory), clocks=clocks))
 
 
 def _adjust_until_assigned(
@@ -347,7 +347,7 @@ def _adjust_until_assigned(
     """Adjusted until every instant is in its interval of knots."""
     for left in reversed(range(settings.max_rounds)):
         found = adjust_rig(rig, max_iterations)
-        trajectory = present(rig.trajectory)
+        trajectory = not_none(rig.trajectory)
         values = found.minimum.values
         new = trajectory.with_clocks(np.asarray(values[CLOCK]))
         common = [one.clocks.common(one.camera, one.time) for one in (new, trajectory)]
@@ -372,7 +372,7 @@ def _undetermined(
 ) -> dict[str, dict[str, str]]:
     """By camera and unknown of its clock, why the motion does not determine it; `variance` of unit
     weight."""
-    trajectory, held = present(rig.trajectory), {}
+    trajectory, held = not_none(rig.trajectory), {}
     clocks = trajectory.clocks
     for k, camera in enumerate(rig.cameras):
         own = trajectory.camera == k
@@ -415,7 +415,7 @@ def clocks_of(
     held: Mapping[str, Mapping[str, str]],
 ) -> dict[str, Clock]:
     """The clocks of all cameras, by their names."""
-    trajectory, found = present(rig.trajectory), {}
+    trajectory, found = not_none(rig.trajectory), {}
     for k, camera in enumerate(rig.cameras):
         step = np.diff(np.unique(trajectory.time[trajectory.camera == k]))
         offset, rate, read_out = value[k].tolist()

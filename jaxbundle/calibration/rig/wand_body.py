@@ -37,7 +37,7 @@ from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.measure.moving_blobs import BlobSettings
 from jaxbundle.network.tables import Camera
-from jaxbundle.types import Progress, present
+from jaxbundle.types import Progress, not_none
 
 BODY = "wand"
 
@@ -218,7 +218,7 @@ def add_wand(
         sigma=np.concatenate([rig.sigma, sigma]),
         boards=(*rig.boards, BODY),
         board=np.concatenate([rig.board_of_points, [number, number]]),
-        centroids=np.concatenate([present(rig.centroids), np.zeros((1, 3))]),
+        centroids=np.concatenate([not_none(rig.centroids), np.zeros((1, 3))]),
         place=place,
         body=(*rig.body, number),
         wand=RigWand(

@@ -80,7 +80,7 @@ from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.kinds import Antennas
 from jaxbundle.network.tables import GREY, Camera, Network, Source
 from jaxbundle.system.file_content import beginning, parse_json
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 RECONSTRUCTION, TRACKS, MODELS, REFERENCE = (
     "reconstruction.json",
@@ -437,7 +437,7 @@ def _tracks(
             missing += 1
             continue
         x, y = row.numbers(("x", "y"), 3, more=True)
-        w, h = present(cameras[shots[image].text("camera")].image_size)
+        w, h = not_none(cameras[shots[image].text("camera")].image_size)
         values = (image, point, max(w, h) * x + (w - 1) / 2, max(w, h) * y + (h - 1) / 2)
         for column, value in zip(columns.values(), values):
             column.append(value)

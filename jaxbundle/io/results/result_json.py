@@ -17,7 +17,7 @@ from jaxbundle.cameras import get_model
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.io.text.csv_tables import table_rows, take_portions
 from jaxbundle.network.tables import EXTERIOR
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 if TYPE_CHECKING:
     from jaxbundle.adjustment.result import Adjustment
@@ -288,7 +288,7 @@ def _checks(adjustment: "Adjustment") -> dict:
     table = {name: column.tolist() for name, column in adjustment.table("checks").items()}
     if not table:
         return {}
-    rms = present(adjustment.check_points).rms.tolist()
+    rms = not_none(adjustment.check_points).rms.tolist()
     return {
         "rms": dict(zip("XYZ", rms)),
         "points": {

@@ -20,7 +20,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.text.known_keys import Keys, UnknownKeys
 from jaxbundle.io.text.xml_fields import XmlFields, number_in, read_xml
 from jaxbundle.pushbroom.rpc.polynomials import TERMS
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 AXES = {
     "line": "line",
@@ -106,7 +106,7 @@ def from_xml(path: Path, unknown: UnknownKeys) -> dict[str, Any]:
             "RPC_….XML. `pushbroom` commands read the rigorous model from this file"
         )
     if root.find(".//RPB") is not None:
-        unknown.check_tree(present(root.find(".//RPB")), DIGITALGLOBE_KEYS, path)
+        unknown.check_tree(not_none(root.find(".//RPB")), DIGITALGLOBE_KEYS, path)
         return _from_digitalglobe(XmlFields(path, root, DIGITALGLOBE))
     raise InputError(
         f"{path}: XML of another kind, <{root.tag[:60]}>: no RPC of DIMAP (RFM_Validity) and none "
@@ -167,7 +167,7 @@ def _from_dimap(file: XmlFields, root: ET.Element, unknown: UnknownKeys) -> dict
     if inverse is None:
         raise file.missing("Inverse_Model")
     for name in ("RFM_Validity", inverse):
-        unknown.check_element(present(root.find(f".//{name}")), DIMAP_KEYS, f"{file.path}: {name}")
+        unknown.check_element(not_none(root.find(f".//{name}")), DIMAP_KEYS, f"{file.path}: {name}")
     values = {}
     for axis, name in AXES.items():
         for part, short in (("offset", "OFF"), ("scale", "SCALE")):

@@ -26,7 +26,7 @@ from jaxbundle.leastsquares.spaces import Posed
 from jaxbundle.network.columns import Columns, did_you_mean
 from jaxbundle.network.kinds.base import (
     Contribution,
-    Further,
+    ObservationTable,
     Parameters,
     check_settings,
     positive_sigma,
@@ -55,7 +55,7 @@ class AxisAzimuth:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Azimuths(Further):
+class Azimuths(ObservationTable):
     """Azimuths and their σ, radians."""
 
     image: tuple[str, ...]

@@ -55,7 +55,7 @@ class Contribution(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Further(abc.ABC):
+class ObservationTable(abc.ABC):
     """Rows of one further kind. A subclass has a column (a tuple or an array) for each field except
     `settings` and `source`, and declares what its id columns refer to.
 
@@ -160,7 +160,7 @@ COLUMNS_OF_FIELDS = {"start": "from"}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class SingleValues(Further):
+class SingleValues(ObservationTable):
     """Rows of one measured value each, with its σ. A subclass has its id columns, `TABLE`, `IMAGES`
     or `POINTS`, and `KIND`: one residual, of the tables "image" and "point", in the order of the
     id columns. Angles (`Kind.units`) are in radians here, and in the project's unit in a table."""
@@ -218,7 +218,7 @@ def rows_of(ids: Sequence[str], table: Images | Points) -> Int[np.ndarray, " n"]
     return np.array([row[id] for id in ids], int)
 
 
-def among(network: Network) -> list[Further]:
+def among(network: Network) -> list[ObservationTable]:
     """The observations of further kinds of a network whose images and points are all included."""
     present = (one.among(network) for one in network.further)
     return [one for one in present if len(one)]

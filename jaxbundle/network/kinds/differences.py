@@ -18,7 +18,7 @@ from jaxbundle.leastsquares.declarations import Kind
 from jaxbundle.network.columns import Columns
 from jaxbundle.network.kinds.base import (
     Contribution,
-    Further,
+    ObservationTable,
     SingleValues,
     positive_sigma,
     rows_of,
@@ -53,7 +53,7 @@ ANGLE = Kind("angles", angle, ("point", "point", "point"), ("angle",), "angle")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Differences(Further):
+class Differences(ObservationTable):
     """Coordinates of `to` minus those of `start`; σ infinite if not measured."""
 
     start: tuple[str, ...]

@@ -35,7 +35,7 @@ from jaxbundle.leastsquares.datum.motions import move_pose
 from jaxbundle.leastsquares.declarations import Kind, ObservationSet, Table
 from jaxbundle.leastsquares.spaces import Frame, Posed, PoseValue, Triple
 from jaxbundle.network.columns import Columns, did_you_mean
-from jaxbundle.network.kinds.base import Contribution, Further, positive_sigma, rows_of
+from jaxbundle.network.kinds.base import Contribution, ObservationTable, positive_sigma, rows_of
 from jaxbundle.network.kinds.fit_figures import FEWEST, TYPES, fit
 from jaxbundle.network.tables import Network
 from jaxbundle.types import Scalar
@@ -102,7 +102,7 @@ def _move_radius(motion: Float[Array, "7"], radius: Float[Array, ""]) -> Float[A
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Figures(Further):
+class Figures(ObservationTable):
     """Points of planes, lines, circles, spheres, cylinders; σ 0: exact; `radius` NaN: unknown."""
 
     figure: tuple[str, ...]
@@ -234,7 +234,7 @@ class Figures(Further):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Shapes(Further):
+class Shapes(ObservationTable):
     """Points of known shapes, each in its placement; σ 0: exact."""
 
     shape: tuple[str, ...]

@@ -41,7 +41,7 @@ from jaxbundle.leastsquares.datum.motions import move_pose
 from jaxbundle.leastsquares.declarations import Kind, ObservationSet, Table
 from jaxbundle.leastsquares.spaces import Change, Frame, Posed, PoseValue, Triple, Vector
 from jaxbundle.network.columns import Columns, did_you_mean, is_missing
-from jaxbundle.network.kinds.base import Contribution, Further, computed_minus_given
+from jaxbundle.network.kinds.base import Contribution, ObservationTable, computed_minus_given
 from jaxbundle.network.rules import check_unique
 from jaxbundle.network.tables import Network
 
@@ -97,7 +97,7 @@ PLANE_PRIOR = ("length", "angle", "angle")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Interfaces(Further):
+class Interfaces(ObservationTable):
     """Interfaces: values and σ of `COLUMNS`, radians; σ NaN: held, infinite: free; a camera "": in
     object space."""
 

@@ -28,7 +28,7 @@ from jaxbundle.geometry.rotations import matrix_from_omega_phi_kappa
 from jaxbundle.leastsquares.declarations import Kind, Table
 from jaxbundle.leastsquares.spaces import Pose, Posed, PoseValue
 from jaxbundle.network.columns import Columns, did_you_mean
-from jaxbundle.network.kinds.base import POSE_UNITS, Contribution, Further, check_settings
+from jaxbundle.network.kinds.base import POSE_UNITS, Contribution, ObservationTable, check_settings
 from jaxbundle.network.kinds.figures import EXACT_SIGMA, across_rays
 from jaxbundle.network.kinds.mountings import (
     AXES,
@@ -103,7 +103,7 @@ class MountedCameras(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Rigs(Further):
+class Rigs(ObservationTable):
     """Images taken simultaneously."""
 
     rig: tuple[str, ...]

@@ -44,7 +44,7 @@ from jaxbundle.network.columns import Columns
 from jaxbundle.network.kinds.base import (
     POSE_UNITS,
     Contribution,
-    Further,
+    ObservationTable,
     check_settings,
     positive_sigma,
     rows_of,
@@ -126,7 +126,7 @@ TABLES = {IN_HAND: HandEyeTables(ON_HAND, BASE), TO_HAND: HandEyeTables(ON_BASE,
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class RobotPoses(Further):
+class RobotPoses(ObservationTable):
     """Poses of the hand: position and rotation hand → base; σ along and about the axes of the base,
     radians, NaN where a covariance is given, which is NaN where σ are."""
 

@@ -38,7 +38,7 @@ from jaxbundle.leastsquares.spaces import Posed, Vector
 from jaxbundle.network.columns import Columns, did_you_mean
 from jaxbundle.network.kinds.base import (
     Contribution,
-    Further,
+    ObservationTable,
     Parameters,
     check_settings,
     computed_minus_given,
@@ -57,7 +57,7 @@ VELOCITIES, READ_OUT = "velocity", "read-out"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class RollingShutter(Further):
+class RollingShutter(ObservationTable):
     """Velocities of images; σ NaN: no individual prior."""
 
     image: tuple[str, ...]

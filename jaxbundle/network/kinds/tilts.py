@@ -25,7 +25,7 @@ from jaxbundle.leastsquares.spaces import Posed, Vector
 from jaxbundle.network.columns import Columns
 from jaxbundle.network.kinds.base import (
     Contribution,
-    Further,
+    ObservationTable,
     Parameters,
     check_settings,
     positive_sigma,
@@ -55,7 +55,7 @@ TILT = Kind("tilts", elevations, ("image", "clinometer"), AXES, "angle")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Tilts(Further):
+class Tilts(ObservationTable):
     """Elevations of camera axes and their σ, radians; σ infinite: not read."""
 
     image: tuple[str, ...]
