@@ -10,12 +10,14 @@ import numpy as np
 
 from jaxbundle.choices import TESTS
 from jaxbundle.commands.scanner_inputs import (
+    LOCATED_COLUMNS,
     Message,
     check_spheroid,
     geographic,
     ignore,
     open_scanner,
     surface_of,
+    with_points,
 )
 from jaxbundle.commands.scanner_tables import ScannerTable
 from jaxbundle.display import print_in_one_screen
@@ -75,7 +77,8 @@ def fit(
 
     **Arguments:**
 
-    - `source`: scanner file, or table longitude, latitude (degrees), height, line, sample.
+    - `source`: scanner file, or table longitude, latitude (degrees), height, line, sample; also
+      one that `locate` wrote.
     - `heights`: of the ground, low and high, metres above the ellipsoid.
     - `ridge`: ridge parameter, in units of the normalised equations; automatic if None.
     - `tell`: called with every warning.
@@ -92,7 +95,7 @@ def fit(
             f"heights {low:g}, {high:g}: two finite numbers, the lower first, are expected"
         )
     if path.suffix.lower() == ".csv":
-        table, columns = _read_points(path)
+        table, columns = _read_points(path, tell=tell)
         found = fit_rpc(table, ridge=ridge, source=columns.source)
     else:
         file = open_scanner(path, tell)
@@ -301,8 +304,11 @@ def _read_points(
     optional: tuple[str, ...] = ("id",),
     crs: str | None = None,
     geoid: str | Path | None = None,
+    tell: Message = ignore,
 ) -> tuple[RpcTable, Columns]:
     columns = read_csv(path)
+    if "pixel" in columns.values and "sample" not in columns.values:
+        columns, optional = _as_rpc_table(columns, tell), (*optional, *LOCATED_COLUMNS)
     names = COLUMNS if crs is None else ("x", "y", *COLUMNS[2:])
     columns.check_names(names, optional)
     if crs is None:
@@ -330,6 +336,16 @@ def _read_points(
         height = height + N
     measured = (columns.numbers(name, required=True) for name in COLUMNS[3:])
     return RpcTable(east, north, height, *measured), columns
+
+
+def _as_rpc_table(table: Columns, tell: Message) -> Columns:
+    """A table that `locate` wrote: `pixel` is the sample; rows without a point are left out."""
+    table = with_points(table, tell)
+    values = {"sample" if name == "pixel" else name: x for name, x in table.values.items()}
+    if "height" in values:
+        # Of one --height they differ by the last digits of the intersection, which are no range.
+        values["height"] = np.round(table.numbers("height"), 6)
+    return Columns(values, table.source)
 
 
 def _ids(columns: Columns) -> Sequence[str]:

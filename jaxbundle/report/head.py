@@ -372,10 +372,16 @@ def variance_facts(adjustment: "Adjustment") -> list[tuple[str, str]]:
 def messages(adjustment: "Adjustment") -> list[str]:
     """Warnings: suspicious data; and notes, such as of what was left out."""
     found = []
-    for title, texts in (("Warnings", adjustment.warnings), ("Notes", adjustment.notes)):
+    for title, texts in (("Warnings", warnings(adjustment)), ("Notes", adjustment.notes)):
         lines = [line for text in texts for line in paragraph(f"- {clean(text)}", 0, 2)]
         found += [*heading(title), *cut_lines(lines, 60, "…")] if lines else []
     return found
+
+
+def warnings(adjustment: "Adjustment") -> tuple[str, ...]:
+    """The warnings, without the causes that `failure_facts` gives."""
+    told = () if adjustment.converged else adjustment.findings
+    return tuple(text for text in adjustment.warnings if text not in told)
 
 
 def why_not_solved(adjustment: "Adjustment") -> list[str]:
@@ -384,20 +390,23 @@ def why_not_solved(adjustment: "Adjustment") -> list[str]:
 
 
 def failure_facts(adjustment: "Adjustment") -> list[tuple[str, str]]:
-    """The reason why there is no result, undetermined unknowns, remedy, by name."""
-    names = adjustment.undetermined
+    """The reason why there is no result, its likely causes, undetermined unknowns, remedy, by
+    name."""
+    names, causes = adjustment.undetermined, adjustment.findings
     reason = SINGULAR if names else int(adjustment.minimum.termination)
     tried = int(adjustment.minimum.iterations)
     taken = int(np.asarray(adjustment.minimum.history.accepted)[1:tried].sum())
     rows = [
         ("Why", adjustment.termination),
+        *(("", clean(cause)) for cause in causes),
         ("Iterations", f"{adjustment.iterations}, of which {taken} were steps taken"),
     ]
     if names:
         rows.append(("Not determined", list_some(names, 40, clean)))
     elif adjustment.weakness.unknowns:
         rows.append(("Hardly determined", list_some(adjustment.weakness.unknowns, 40, clean)))
-    advice = [ADVICE.get(reason, ADVICE[STUCK])]
+    # A cause says what to do itself; the general advice may contradict it.
+    advice = [] if causes and not names else [ADVICE.get(reason, ADVICE[STUCK])]
     if reason == LIMIT and taken < tried / 2:
         advice.append("Most steps were rejected: hold parameters that the images hardly determine.")
     advice += [text for kind, text in ADVICE_FOR.items() if any(f" of {kind} " in n for n in names)]

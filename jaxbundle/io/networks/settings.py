@@ -10,6 +10,7 @@ from typing import Any
 
 from jaxbundle.arguments import show
 from jaxbundle.cameras import CameraModel
+from jaxbundle.cameras.names import closest_name
 from jaxbundle.errors import InputError
 from jaxbundle.network.build import CAMERA_FIELDS, make_cameras, make_network
 from jaxbundle.network.columns import Columns, list_some, refuse_unknown
@@ -61,9 +62,17 @@ def apply_overrides(
             value = _words(text) if key == "datum_points" else text
             document["project"][key] = _number(key, text) if key == "sigma_image" else value
         else:
-            known = (*keys, "free", *CAMERA_KEYS, *(f"{name}.KEY" for name in SECTIONS))
-            raise InputError(f"--set {key}: unknown key; known: {', '.join(known)}")
+            raise InputError(f"--set {key}: unknown key{_known_keys(key, keys)}")
     return document
+
+
+def _known_keys(key: str, keys: Sequence[str]) -> str:
+    """The end of a message about an unknown key: all of them, and the probable one."""
+    section, dot, rest = key.partition(".")
+    known = (*keys, "free", *CAMERA_KEYS, *(f"{name}.KEY" for name in SECTIONS))
+    close = closest_name(section, ("camera", *SECTIONS) if dot else (*keys, "free"))
+    meant = "" if close is None else f"; did you mean {f'{close}{dot}{rest}'!r}?"
+    return f"; known: {', '.join(known)}{meant}"
 
 
 def _override_cameras(cameras: list[dict], key: str, text: str) -> None:
