@@ -208,7 +208,7 @@ class Result:
             f"solved in {self.iterations} iterations: {self.termination}",
             f"{n.observations} observations, {n.unknowns} unknowns, datum defect {n.datum}, "
             f"redundancy {n.redundancy}, sigma0 {self.sigma0:.4g}",
-            f"{'kind':32}{'number':>8}{'redundancy':>12}{'estimated sigma':>17}",
+            f"{'kind':32}{'number':>8}{'redundancy':>12}{'sigma/given':>17}",
         ]
         lines += [
             f"{name:32}{c.observations:8d}{c.redundancy:12.2f}{c.sigma:17.4g}"

@@ -39,6 +39,7 @@ class Table:
       per row); default: all. Derivatives with respect to held values are available.
     - `labels`: a name for every row, and `parameters` for its directions, for reports;
       `title`: the name of one row, by default that of the table.
+    - `units`: of its numbers, for reports: as of a `Kind`. Poses and rotations have their own.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Table:
     labels: Sequence[str] | None = None
     parameters: tuple[str, ...] = ()
     title: str = ""
+    units: str | tuple[str, ...] = ""
 
     def __post_init__(self):
         what = f"table {self.name!r}: the start values"
@@ -77,6 +79,11 @@ class Table:
                 f"{list(shape)}"
             ) from None
         object.__setattr__(self, "free", free)
+        if not isinstance(self.units, str) and len(self.units) != self.space.width:
+            raise InputError(
+                f"table {self.name!r}: expected one unit, or {self.space.width}; got "
+                f"{len(self.units)} of them"
+            )
         object.__setattr__(self, "title", self.title or self.name)
 
     @property

@@ -174,11 +174,12 @@ def components(adjustment: "Adjustment") -> list[str]:
             significant(c.vtpv, 5),
             significant(c.sigma, 4),
             span(c.estimated, 3),
+            clean(c.unit),
         )
         for name, c in adjustment.variance_components.items()
     ]
-    header = ("group", "observations", "Σr", "vᵀPv", "σ̂/σ given", "σ̂")
-    lines = [*heading("Variance components"), *table(header, rows, "lrrrrr")]
+    header = ("group", "observations", "Σr", "vᵀPv", "σ̂/σ given", "σ̂", "unit")
+    lines = [*heading("Variance components"), *table(header, rows, "lrrrrrl")]
     if adjustment.sigma_factors:
         names = ", ".join(
             f"{clean(name)} by {significant(factor, 4)}"

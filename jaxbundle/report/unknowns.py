@@ -330,14 +330,13 @@ def far_points(adjustment: "Adjustment", most: int) -> list[str]:
 def further_unknowns(adjustment: "Adjustment", most: int) -> list[str]:
     """The unknowns of further kinds of observations, a line each."""
     lines = []
-    for name, found in adjustment.further_unknowns.items():
-        rows = [
-            (row, parameter, *estimate(one["value"], one["sigma"]))
-            for row, parameters in found.items()
-            for parameter, one in parameters.items()
-        ]
+    tables: dict[str, list] = {}
+    for one in adjustment.further_estimates:
+        shown = estimate(one.value, one.sigma)
+        tables.setdefault(one.table, []).append((one.row, one.name, *shown, clean(one.unit)))
+    for name, rows in tables.items():
         lines += heading(clean(name[0].upper() + name[1:]))
-        lines += table(("of", "unknown", "value", "σ"), rows[:most], "llrr")
+        lines += table(("of", "unknown", "value", "σ", "unit"), rows[:most], "llrrl")
         if len(rows) > most:
             lines += _left_out(len(rows), most, "unknown", "result.json")
     return lines

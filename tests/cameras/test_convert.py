@@ -171,7 +171,7 @@ def test_a_fit_without_differences_is_exact():
     bare = dict(c=30.0, x0=0.1, y0=-0.05)
     found = convert_camera(get_model("brown"), bare, get_model("opencv"), **SIZES)
     assert found.exact and not found.reason and "opencv: exact; largest" in str(found)
-    (pixel, _), (width, height) = PIXEL, SIZE
+    pixel, width = PIXEL[0], SIZE[0]
     expected = dict(fx=30 / pixel, cx=(width - 1) / 2 + 0.1 / pixel, k1=0.0)
     for name, value in expected.items():
         assert found.parameters[name] == pytest.approx(value, abs=1e-9), name

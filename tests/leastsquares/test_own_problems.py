@@ -217,14 +217,15 @@ def test_tables_that_share_a_block_and_an_observation_of_the_first_and_last():
 def test_an_angle_of_180_degrees_is_named():
     """Its sine is the root of a square, which has no derivative where the points are in line."""
 
-    def angle(a, at, b, measured):
+    def residual(a, at, b, measured):
         u, v = a - at, b - at
         sine = jnp.sqrt(jnp.sum(jnp.cross(u, v) ** 2))
         return jnp.arctan2(sine, u @ v) - measured
 
     X = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
-    kinds = ls.Kind("angle", angle, of=("point",) * 3), ls.Kind("place", lambda x, m: x - m, of=("point",))
-    observations = [kinds[0](([0], [1], [2]), np.array([np.pi])), kinds[1]((np.arange(3),), X)]
+    angle = ls.Kind("angle", residual, of=("point",) * 3)
+    place = ls.Kind("place", lambda x, measured: x - measured, of=("point",))
+    observations = [angle(([0], [1], [2]), np.array([np.pi])), place((np.arange(3),), X)]
     result = ls.adjust([ls.Table("point", X)], observations)
     assert not result.converged
     name = "no finite residual or derivative of: angle of point 1 and point 2 and point 3"

@@ -209,6 +209,7 @@ def _components(adjustment: "Adjustment") -> dict:
             "sigma": c.sigma,
             "factor": c.factor,
             "estimated": list(c.estimated),
+            "unit": c.unit,
         }
         for name, c in adjustment.variance_components.items()
     }

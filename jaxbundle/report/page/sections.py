@@ -163,11 +163,13 @@ def residuals(adjustment: "Adjustment") -> Section:
             fixed(c.redundancy, 2),
             significant(c.vtpv, 5),
             significant(c.sigma, 4),
+            head.span(c.estimated, 3),
+            c.unit,
         )
         for name, c in adjustment.variance_components.items()
     ]
-    header = ("group", "observations", "Σr", "vᵀPv", "σ̂/σ given")
-    more = "<h3>Variance components</h3>\n" + grid(header, components)
+    header = ("group", "observations", "Σr", "vᵀPv", "σ̂/σ given", "σ̂", "unit")
+    more = "<h3>Variance components</h3>\n" + grid(header, components, "remarks")
     return show_residuals(adjustment.residuals["tau"], more=more)
 
 
