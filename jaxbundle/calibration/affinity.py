@@ -34,8 +34,8 @@ class MissingAffinity:
 
     @property
     def missed(self) -> bool:
-        # from 4 σ: σ0 contains the neglected affinity itself, and other errors of the model; by
-        # chance once in 16 000
+        # From 4 σ: σ0 contains the neglected affinity itself, and other errors of the model; by
+        # chance once in 16 000.
         return bool((np.abs(self.values) > 4.0 * self.sigma).any())
 
     def __str__(self) -> str:

@@ -108,7 +108,7 @@ def calibrate_opencv(
             raise InputError(
                 f"view {k}: {len(X)} object points and {len(x)} image points; expected as many"
             )
-    # views of one object share its points: the union, with those not seen as missing
+    # Views of one object share its points: the union, with those not seen as missing.
     points, places = np.unique(np.concatenate(objects), axis=0, return_inverse=True)
     xy = np.full((1, len(objects), len(points), 2), np.nan)
     ends = np.cumsum([0, *map(len, objects)])

@@ -100,14 +100,14 @@ def calibrate(  # noqa: PLR0913 keyword arguments of a public function
     _check_given(camera_model, given)
     text("camera", camera)
     text("object_unit", object_unit)
-    # either downweighted or removed: a test of residuals that robust weights changed has no level
+    # Either downweighted or removed: a test of residuals that robust weights changed has no level.
     options |= {"robust": robust, "snooping": None if robust else snooping}
     check_options(**options)
     check_test(snooping, options.get("significance", 0.001))
     views = views_of(photographs, board, progress)
     start = start_values(views, camera_model, free, pixel_size, given)
     columns, rows = views.image_size
-    # held parameters need no prior
+    # Held parameters need no prior.
     prior = {name: s for name, s in dict(camera_model.prior).items() if name in free}
     made = Camera(
         camera,

@@ -62,7 +62,7 @@ class MappingError:
 
     def quantile(self, probability: float = 0.95) -> float:
         """The quantile of √K for this probability, pixels; from a reproducible sample."""
-        # a weighted sum of χ²₁ has no closed distribution; 20 000 samples give it to 1 %
+        # A weighted sum of χ²₁ has no closed distribution; 20 000 samples give it to 1 %.
         z = np.random.default_rng(0).normal(size=(20_000, len(self.weights)))
         return float(np.sqrt(np.quantile(z**2 @ self.weights, probability)))
 
@@ -88,7 +88,7 @@ def mapping_error(
     farthest = adjustment.farthest_measurements[column]
     away = np.linalg.norm(xy - np.asarray(measured_centre(model, p)), axis=1)
     near = xy[away <= farthest]
-    # two points determine the rotation: three angles from two coordinates each
+    # Two points determine the rotation: three angles from two coordinates each.
     if len(near) < 2 or len(near) == len(xy):
         return whole
     part = _weights(_form(given, p, names, near, "rotation"), C)

@@ -52,8 +52,8 @@ class Calibration(TableMethods):
         self.views = views
         self.validated = validated
         self.adjustment = adjustment
-        # report, page, JSON and figures use the same maps, each a propagation of the whole
-        # covariance
+        # Report, page, JSON and figures use the same maps, each a propagation of the whole
+        # covariance.
         self._maps: dict[tuple, UncertaintyMap] = {}
 
     @property
@@ -199,13 +199,13 @@ class Calibration(TableMethods):
             self.rms,
             self._significance,
             get_model(self.camera.model),
-            # only if it was made: four more adjustments are not made for an advice
+            # Only if it was made: four more adjustments are not made for an advice.
             self.__dict__.get("cross_validation"),
         )
         missed = self._missing_affinity
         if missed is not None and missed.missed:
             found = [*found, str(missed)]
-        # image points are removed one by one: only counted by corner do they show a bad print
+        # Image points are removed one by one: only counted by corner do they show a bad print.
         problem = self.adjustment.problem
         removed = [
             row for one in self.adjustment.removed if one.kind == "image" for row in one.rows
@@ -232,8 +232,8 @@ class Calibration(TableMethods):
     def reported_maps(self) -> list[UncertaintyMap]:
         """Near (the median distance of the board), at ten times that, at infinity; and without the
         scene."""
-        # near the board the poses dominate, at infinity the camera; three distances also determine
-        # the whole curve (`quality.over_distance`)
+        # Near the board the poses dominate, at infinity the camera; three distances also determine
+        # the whole curve (`quality.over_distance`).
         near = float(np.median(self.distances))
         chosen = (
             ("scene", near),

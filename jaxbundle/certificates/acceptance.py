@@ -203,7 +203,7 @@ def _accept(
     population = getattr(result, "population", result)
     if isinstance(population, Population):
         if all(one.name != SOLVED for one in found):
-            # an input without a result has no numbers that could fail
+            # An input without a result has no numbers that could fail.
             found.append(read_criterion(f"{SOLVED} >= 100 %"))
         return Acceptance(tuple(judge(population, None, one) for one in found))
     if not np.all(getattr(result, "converged", True)):

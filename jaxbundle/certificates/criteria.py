@@ -64,7 +64,7 @@ def read_criterion(text: str) -> Criterion:
     """A criterion from its text.
 
     **Raises:** `InputError`, with the form that is expected."""
-    # of a locale without UTF-8 a command line has bytes for ≤ and µ
+    # Of a locale without UTF-8 a command line has bytes for ≤ and µ.
     text = in_utf8(text) if isinstance(text, str) else text
     found = PATTERN.fullmatch(text) if isinstance(text, str) else None
     if found is None:

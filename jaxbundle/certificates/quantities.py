@@ -110,7 +110,7 @@ def _parts_of(result: Any) -> list[tuple[tuple[Quantity, ...], dict[str, Any]]]:
     if isinstance(result, Refinement):
         return [(OF_REFINEMENT, {"": result})]
     if isinstance(adjustment := getattr(result, "adjustment", None), Adjustment):
-        # of a camera on a robot, which is above this room
+        # Of a camera on a robot, which is above this room.
         return [(OF_HAND_EYE, {"": result}), (OF_ADJUSTMENT, {"": adjustment})]
     return []
 
@@ -252,7 +252,7 @@ def _image_rms(subject: Subject, argument: str) -> QuantityValues:
     adjustment: Adjustment = subject.result
     rows = adjustment.residuals
     image = rows["kind"] == "image"
-    # two coordinates a point: the RMS of a coordinate
+    # Two coordinates a point: the RMS of a coordinate.
     unit = str(rows["unit"][image][0])
     cameras = adjustment.problem.network.cameras
     pitch = _pitch(cameras)
@@ -489,7 +489,7 @@ def _mountings(rig: RigCalibration, what: str) -> QuantityValues:
     if what == "base":
         values = {f"base of {n}": m.length_sigma for n, m in rig.mountings.items()}
         return QuantityValues(values, rig.object_unit)
-    # angles of a mounting are in degrees
+    # Angles of a mounting are in degrees.
     values = {f"rotation of {n}": float(max(m.sigma[3:])) for n, m in rig.mountings.items()}
     return QuantityValues(values, "deg")
 

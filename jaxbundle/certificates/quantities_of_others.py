@@ -132,7 +132,7 @@ def _check_rms(subject: Subject, argument: str) -> QuantityValues:
     known = np.isfinite(square)
     if not known.any():
         raise LookupError("no check point has this difference")
-    # one scanner image gives no height: what is not known does not count as 0 of it
+    # One scanner image gives no height: what is not known does not count as 0 of it.
     axes = known.any(0)
     mean = np.where(known, square, 0.0).sum(0)[axes] / known.sum(0)[axes]
     return one_value(math.sqrt(mean.sum()), METRES)

@@ -187,7 +187,7 @@ def batch(  # noqa: PLR0913 - the options of the command
             set,
         )
         if not first:
-            # only the first process writes, though all compute
+            # Only the first process writes, though all compute.
             html, table, summary, accept, asked, quiet = "", None, None, None, [], True
     elif not part:
         add_parts(json_lines)  # left by joined processes that were ended
@@ -217,7 +217,7 @@ def batch(  # noqa: PLR0913 - the options of the command
     accepted = None
     if asked:
         found = done.population
-        # read again, for the keys that now have results
+        # Read again, for the keys that now have results.
         beside = {} if columns is None else read_against(columns, found.keys, str(against))
         accepted = accept_result(found, accept)
         write_outputs(found, beside, table, summary, accepted)

@@ -40,7 +40,7 @@ def check_outputs(
             except ImportError as error:
                 raise InputError(f"--table {table}: {error}") from None
     if summary is not None and not force:
-        # a table is a .csv or .parquet by its name; a summary may have any
+        # A table is a .csv or .parquet by its name; a summary may have any.
         check_json(str(summary), FORCE_ADVICE, "--summary")
 
 

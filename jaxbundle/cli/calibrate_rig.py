@@ -287,7 +287,7 @@ def name_cameras(folders: Sequence[str], alone: bool = False) -> dict[str, str]:
 def times_given(times: str, cameras: Mapping[str, str]) -> float | dict[str, float] | Path:
     """The times of photographs: frames per second, by camera if they differ, or a table."""
     if not times:
-        # where `jaxbundle frames` writes it
+        # Where `jaxbundle frames` writes it.
         tables = [Path(folder).parent / "frames.csv" for folder in cameras.values()]
         found = next((table for table in tables if table.is_file()), None)
         if found is None:
@@ -296,7 +296,7 @@ def times_given(times: str, cameras: Mapping[str, str]) -> float | dict[str, flo
                 "table with the columns camera, image, time"
             )
         return found
-    # first of all: the path of a table may have "=" or be a number
+    # First of all: the path of a table may have "=" or be a number.
     if Path(times).is_file():
         return Path(times)
     try:

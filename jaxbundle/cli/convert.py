@@ -74,7 +74,7 @@ def convert(  # noqa: PLR0913 - the options of the command
         tell=tell,
     )
     if not quiet:
-        # only what the writer has found beside
+        # Only what the writer has found beside.
         done = dataclasses.replace(done, lost=tuple(what for what in done.lost if what not in told))
         print(str(done).split("\n", 1)[0])
         for line in str(done).splitlines()[1:]:

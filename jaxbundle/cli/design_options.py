@@ -81,7 +81,7 @@ def normals_of(text: str, network: Network):
         )
     rows = dict(zip(table.values["id"], zip(*(table.values[name] for name in columns[1:]))))
     points = network.points
-    # check points take no part in a design
+    # Check points take no part in a design.
     used = [id for id, role in zip(points.id, points.role) if role != "check"]
     missing = [id for id in used if id not in rows]
     if missing:

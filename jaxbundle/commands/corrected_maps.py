@@ -127,7 +127,7 @@ def correct(  # noqa: PLR0913 (public: the options of the command, all but three
     one_of("compress", compress, COMPRESSIONS)
     if spacing is not None and not spacing > 0:
         raise InputError(f"--spacing {spacing:g}: a positive number is expected")
-    # a pixel: more is a map of other ground
+    # A pixel: more is a map of other ground.
     if not 0 <= tolerance <= 1:
         raise InputError(f"--tolerance {tolerance:g}: 0 to 1 pixel of the image is expected")
     if (truth is None) != (error_map is None):
@@ -137,7 +137,7 @@ def correct(  # noqa: PLR0913 (public: the options of the command, all but three
     picture = _raster_of(scanner, image)
     targets = {"--out": out, "--error-map": error_map, "--sigma": sigma, "--checkpoint": checkpoint}
     _check_targets({key: Path(path) for key, path in targets.items() if path is not None}, picture)
-    # an ellipsoid hides nothing of itself where an image looks down
+    # An ellipsoid hides nothing of itself where an image looks down.
     if occlusion and dem is None:
         raise InputError("--occlusion: needs terrain; give --dem")
     file = open_image(scanner, tell, picture)
@@ -159,7 +159,7 @@ def correct(  # noqa: PLR0913 (public: the options of the command, all but three
         of_words([made, repr(correction), repr(height)]),
     ) as kept:
         if kept is not None:
-            # no other process makes this map: the checkpoint is locked
+            # No other process makes this map: the checkpoint is locked.
             remove_left_behind(out)
         write_corrected(
             picture,

@@ -218,7 +218,7 @@ def compensate(
     if any(name in columns.values for name in GROUND_SIGMA):
         ground = np.stack([columns.numbers(name, required=True) for name in GROUND_SIGMA], 1)
     role = _roles(columns)
-    # the others are checked by the fit
+    # The others are checked by the fit.
     check = np.flatnonzero(role == "check")
     taken = lambda rows: RpcTable(*(np.asarray(column)[rows] for column in table))
     check_domain(given, taken(check), columns.source.take(check))
@@ -237,7 +237,7 @@ def compensate(
     while snooping != "none" and found.redundancy > 0:
         w = np.nan_to_num(np.abs(found.w))
         limit = critical_w(snooping, significance, w.size, found.redundancy, found.sigma0)
-        # with one point less at least as many as the bias needs, and one that tests it
+        # With one point less at least as many as the bias needs, and one that tests it.
         least = len(found.cofactor) // 2 + 1
         if w.max() <= limit or len(used) <= least:
             break
@@ -246,7 +246,7 @@ def compensate(
         used = np.delete(used, worst)
         found = fit(used)
     changed, left = apply_bias(given, found.bias)
-    # the same terms in lines and in samples
+    # The same terms in lines and in samples.
     k = len(found.cofactor) // 2
     names = [f"{axis}_{term}" for axis in ("line", "sample") for term in TERMS[:k]]
     values = [float(v) for axis in (found.bias.line, found.bias.sample) for v in axis[:k]]
@@ -317,7 +317,7 @@ def _read_points(
         x, y, height = (columns.numbers(name, required=True) for name in names[:3])
         transformer = not_none(MapSystem(WGS84, crs).transformer)
         if not_none(transformer.target_crs).is_vertical:
-            # its heights would be taken for heights above the ellipsoid
+            # Its heights would be taken for heights above the ellipsoid.
             raise InputError(
                 f"--crs {crs}: has a system of heights; give its horizontal part, and --geoid for "
                 "heights that are not above the ellipsoid"

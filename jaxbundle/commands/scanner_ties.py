@@ -56,7 +56,7 @@ def tie(
     file = TomlFile(path, document)
     file.require(("images",))
     unit = file.section("refine").text("angle_unit", "deg")
-    # a unit that nobody knows is said by `refine`: it is of priors, which tie points do not need
+    # A unit that nobody knows is said by `refine`: it is of priors, which tie points do not need.
     images, warnings = read_images(file, ANGLE_UNITS.get(unit, 1.0))
     if len(images) < 2:
         raise InputError(f"{path}, [images]: one image; tie points need at least two")

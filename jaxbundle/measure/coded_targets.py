@@ -77,7 +77,7 @@ def find_coded_targets(
             "grey: expected 8-bit grey values [rows, columns], got "
             f"{np.asarray(grey).dtype} {list(np.shape(grey))}; `read_photograph` gives them"
         )
-    # what is masked shows nothing
+    # What is masked shows nothing.
     grey = np.ascontiguousarray(np.ma.filled(grey, 0))
     name, _, option = kind.partition(":")
     if name.startswith("ring"):
@@ -91,7 +91,7 @@ def find_coded_targets(
 def memory_of_targets(rows: int, columns: int, kind: str) -> float:
     """Bytes that the search of targets takes in a photograph, beside its grey values."""
     if kind.startswith("ring"):
-        # bytes a pixel, measured in photographs of 6 and of 54 million pixels
+        # Bytes a pixel, measured in photographs of 6 and of 54 million pixels.
         return 13 * rows * columns
     return memory_of_search(rows, columns, "charuco")
 

@@ -83,7 +83,7 @@ class RefinementInspection:
         problem, at = self.declared.problem, {}
         for k, column in enumerate(self.declared.columns):
             at.setdefault(column.table, []).append((k, column.row, column.direction))
-        # columns, as index arrays of the tables
+        # Columns, as index arrays of the tables.
         at = {t: tuple(np.array(rows).T) for t, rows in at.items()}
         start = {t: jax.device_get(problem.data.start[t]) for t in at}
         return SharedUnknowns(at, start, problem.declared.named_spaces)
@@ -127,7 +127,7 @@ class RefinementInspection:
     @functools.cached_property
     def residuals(self) -> dict[str, Float[np.ndarray, "n r"]]:
         """v of every set of observations in its unit, including removed ones."""
-        # with the weights before snooping: what a removed observation disagrees by is of interest
+        # With the weights before snooping: what a removed observation disagrees by is of interest.
         problem, weight = self.solution.problem, self.declared.problem.data.weight
         data = type(problem.data)(problem.data.start, problem.data.measured, weight)
         found = Solution(with_data(problem, data), self.solution.values).residuals
@@ -206,7 +206,7 @@ def _describe_removed(declared: DeclaredRefinement, blunder: RemovedRow) -> Remo
     if blunder.set in names:
         number = names.index(blunder.set)
         part = declared.parts[number]
-        # the rank of a row, set by set, in the order of the images
+        # The rank of a row, set by set, in the order of the images.
         place = np.argsort(np.argsort(declared.image, kind="stable"))
         before = sum(len(p.rows) for p in declared.parts[:number])
         told = [

@@ -170,7 +170,7 @@ class Refinement(TableMethods):
         inputs, r = self.inspection.declared.inputs, self.redundancy
         frames = [] if inputs.frames is None else [inputs.frames.observations]
         sets = [inputs.observations, *frames]
-        # one set of unstated σ makes vᵀPv a number without scale
+        # One set of unstated σ makes vᵀPv a number without scale.
         origin = next((one.sigma_origin for one in sets if one.sigma_origin != STATED), STATED)
         return chi_squared_test(r * self.sigma0**2, r, origin)
 
@@ -349,7 +349,7 @@ def _checks_upright(points: GroundPoints, earth: Ellipsoid | None) -> GroundPoin
     """The axes of check points as east, north, up, for points at a given height."""
     if earth is None or earth.a != earth.b:
         return points
-    # one ray at a given height leaves two unknowns, which must be along the surface of that height
+    # One ray at a given height leaves two unknowns, which must be along the surface of that height.
     axes, checks = points.axes.copy(), np.array(points.role, dtype=object) == "check"
     axes[checks] = east_north_up(earth, points.X[checks])
     return dataclasses.replace(points, axes=axes)

@@ -100,7 +100,7 @@ def with_frames(points: GroundPoints, frames: Network | None) -> GroundPoints:
     theirs, known = frames.points, {id: k for k, id in enumerate(points.id)}
     X = points.X.copy()
     for k, id in enumerate(theirs.id):
-        # coordinates of a network may be approximate: they only fill gaps
+        # Coordinates of a network may be approximate: they only fill gaps.
         if id in known and np.isnan(X[known[id]]).any():
             X[known[id]] = theirs.position[k]
     new = [k for k, id in enumerate(theirs.id) if id not in known]
@@ -170,7 +170,7 @@ def is_same_earth(one: Ellipsoid | None, other: Ellipsoid | None) -> bool:
     """Whether two ellipsoids are the same but for digits of their axes in files."""
     if one is None or other is None:
         return one is other
-    # a millimetre in the axes is a millimetre in height
+    # A millimetre in the axes is a millimetre in height.
     return all(abs(float(a) - float(b)) < 1e-3 for a, b in zip(one, other))
 
 
@@ -178,12 +178,12 @@ def _limits(one: AnyScannerImage) -> tuple[tuple[float, float], ...]:
     """The first and last line and pixel that a measurement can have."""
     image = one.image
     if isinstance(image, RpcImage) and not image.sized:
-        # a size that nobody stated is that of the domain
+        # A size that nobody stated is that of the domain.
         offsets = image.rpc.line_offset, image.rpc.sample_offset
         scales = image.rpc.line_scale, image.rpc.sample_scale
         reach = [(1 + DOMAIN_MARGIN) * abs(float(scale)) for scale in scales]
         return tuple((float(o) - r, float(o) + r) for o, r in zip(offsets, reach))
-    # pixels are areas about integers, so that the image ends half a pixel beyond the last
+    # Pixels are areas about integers, so that the image ends half a pixel beyond the last.
     return (-0.5, image.lines - 0.5), (-0.5, image.pixels - 0.5)
 
 

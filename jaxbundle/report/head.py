@@ -186,7 +186,7 @@ def open_datum(adjustment: "Adjustment") -> str:
     network, defect = adjustment.problem.network, adjustment.counts.datum
     if defect in (0, 7):
         return "position, orientation and scale" if defect else ""
-    # the directions are told about these points, which a rotation about them leaves
+    # The directions are told about these points, which a rotation about them leaves.
     known = network.points.has_role("control", "fixed")
     about = (network.points.position[known] - adjustment.problem.origin).sum(0)
     gauge = np.asarray(not_none(adjustment.problem.plan.datum).gauge)
@@ -271,7 +271,7 @@ def convergence(adjustment: "Adjustment") -> list[str]:
         )
         for i in range(tried)
     ]
-    # a page of lines: the beginning and the end tell how it went
+    # A page of lines: the beginning and the end tell how it went.
     if len(rows) > 45:
         rows = [*rows[:20], ("…", "", "", ""), *rows[-20:]]
     lines = [
@@ -309,10 +309,10 @@ def image_precision(adjustment: "Adjustment") -> str:
     sigma, unit = image_sigmas(adjustment), adjustment.image_unit
     if not len(sigma) or not np.isfinite(adjustment.sigma0):
         return "–"
-    # the smallest and the largest stand for all
+    # The smallest and the largest stand for all.
     ends = sigma[[0, -1]]
     parts = [f"{span(adjustment.sigma0 * ends)} {unit}"]
-    # readers know the precision of a camera in µm and in pixels
+    # Readers know the precision of a camera in µm and in pixels.
     if unit == "mm":
         parts.insert(0, f"{span(1e3 * adjustment.sigma0 * ends)} µm")
         pitch = {camera.pixel_size for camera in adjustment.problem.network.cameras}

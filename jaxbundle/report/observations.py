@@ -355,7 +355,7 @@ def distances(adjustment: "Adjustment", most: int) -> list[str]:
     places = column_decimals(found["sigma"][rows_of])
     rows = []
     for i in rows_of[:most]:
-        # a distance has its points in the columns of image and point
+        # A distance has its points in the columns of image and point.
         a, b = (adjustment.point_values[row_of[found[end][i]]] for end in ("image", "point"))
         adjusted = float(np.linalg.norm(a - b))
         v, r = found["v"][i], found["r"][i]

@@ -61,7 +61,7 @@ def _one_camera(entry: Mapping[str, Any], model: CameraModel) -> list[str]:
     critical_t = 2.0
     rows, held = [], []
     for name, found in entry["parameters"].items():
-        # held ones follow in one line
+        # Held ones follow in one line.
         if not found["free"]:
             held.append(f"{name} {significant(found['value'], WITHOUT_SIGMA)}")
             continue
@@ -122,7 +122,7 @@ def _many_cameras(adjustment: "Adjustment") -> list[str]:
             ]
             rows += [(camera, *(a for a, _ in cells)), ("   σ", *(b for _, b in cells))]
         lines += [*_equations(model), ""]
-        # six columns of values fit in the width of a page
+        # Six columns of values fit in the width of a page.
         for start in range(0, len(names), 6):
             part = slice(start, start + 6)
             header = ("camera", *names[part])
@@ -215,7 +215,7 @@ def _precision(adjustment: "Adjustment", accuracy_unit: float | None) -> list[st
     sigma = np.stack([stated_sigma(found, axis) for axis in "XYZ"], 1)
     free = adjustment.problem.table("point").free > 0
     free = free & np.isfinite(sigma) & (sigma > 0)
-    # points at infinity have no coordinates whose σ could be counted
+    # Points at infinity have no coordinates whose σ could be counted.
     free &= adjustment.located[:, None]
     if not free.any():
         return ["No point has an estimated coordinate with a standard deviation."]
@@ -236,7 +236,7 @@ def _precision(adjustment: "Adjustment", accuracy_unit: float | None) -> list[st
         (f"{a}–{b}", *(str(column[i]) for column in counted))
         for i, (a, b) in enumerate(zip(text, text[1:]))
     ]
-    # one table, so that both parts have the same columns
+    # One table, so that both parts have the same columns.
     head, *body = table(header, [*rows, ("", "", "", "", ""), *classes], "lrrrr")
     first, second = body[: len(rows)], body[len(rows) + 1 :]
     note = f"Number of σ in classes of σ/s, s = {significant(scale, 3)} {unit} ({meaning})"

@@ -89,7 +89,7 @@ def make_cloud(
     **Raises:** `InputError` naming the point: a coordinate that is not finite, a negative or
     infinite σ, a number of rays that is none."""
     n = len(X)
-    # the extremes of millions of points first: NaN compares as false
+    # The extremes of millions of points first: NaN compares as false.
     if n and not (X.max() < max_coordinate and X.min() > -max_coordinate):
         bad = ~(np.abs(X) < max_coordinate).all(axis=1)
         where = source(int(bad.argmax()))
@@ -110,7 +110,7 @@ def make_cloud(
         if (bad := (values < 0) | (values > limit)).any():
             row = int(bad.argmax())
             raise InputError(f"{source(row)}: {name} is {values[row]:g}; {what} is expected")
-    # what the file does not have is one value for all points, without memory of its own
+    # What the file does not have is one value for all points, without memory of its own.
     same = lambda value, shape, kind=float: np.broadcast_to(np.array(value, kind), shape)
     covariance = same(np.diag(np.full(3, np.nan)), (n, 3, 3))
     if columns.keys() & {*SIGMAS}:

@@ -78,7 +78,7 @@ def _check_records(
     path: Path, file: BinaryIO, what: str, number: int, place: int, end: int
 ) -> Mapping[tuple[bytes, int], bytes]:
     """The content of the record of LAZ; refuses records that go beyond `end`."""
-    # reserved H, user 16s, record H, length H or Q, description 32s
+    # Reserved H, user 16s, record H, length H or Q, description 32s.
     extended = what.startswith("extended")
     form = struct.Struct("<2x16sHQ32x" if extended else "<2x16sHH32x")
     found = {}

@@ -37,7 +37,7 @@ def score(view: OrientedImage, bounds: Bounds, other: OrientedImage) -> float:
     for share in (0.25, 0.5, 0.75):
         X = view.points(uv, q[:, 0] + share * (q[:, 1] - q[:, 0]))
         seen = is_inside(other, other.project(X))
-        # a tenth of the image is a pair not worth its time
+        # A tenth of the image is a pair not worth its time.
         if seen.mean() < 0.1:
             continue
         angle = float(np.median(angle_at((view, other), X[seen])))

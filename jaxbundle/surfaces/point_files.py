@@ -206,8 +206,8 @@ def _write_las(cloud: Cloud, path: Path) -> None:
     span = np.ptp(cloud.X, axis=0).max() if len(cloud) else 1.0
     s = cloud.sigma[np.isfinite(cloud.sigma)]
     fine = 1e-3 * float(np.median(s)) if len(s) else 1e-4
-    # coordinates are whole numbers of 32 bits: 2³¹ steps hold the extent; a power of ten above 1e-9
-    # otherwise, so that decimal coordinates stay what they are
+    # Coordinates are whole numbers of 32 bits: 2³¹ steps hold the extent; a power of ten above 1e-9
+    # otherwise, so that decimal coordinates stay what they are.
     scale = max(10.0 ** np.floor(np.log10(max(fine, 1e-9))), span / 2**30)
     header.scales = np.full(3, scale)
     header.offsets = np.floor(cloud.X.min(0)) if len(cloud) else np.zeros(3)
@@ -225,7 +225,7 @@ def _write_las(cloud: Cloud, path: Path) -> None:
     for k, name in enumerate(SIGMAS):
         las[name] = cloud.sigma[:, k].astype(np.float32)
     las["rays"] = np.minimum(cloud.rays, 255).astype(np.uint8)
-    # in memory, a fraction of the cloud: lazrs hides why the system refuses to write
+    # In memory, a fraction of the cloud: lazrs hides why the system refuses to write.
     file = io.BytesIO()
     las.write(file, do_compress=path.suffix.lower() == ".laz")
     write_bytes(path, file.getvalue())
@@ -244,7 +244,7 @@ def _read_las(path: Path, together: int = 1 << 18) -> Cloud:
         more = {name: [] for name in (*SIGMAS, "rays") if name in names}
         for points in reader.chunk_iterator(together):
             part = slice(begin, begin := begin + len(points))
-            # as laspy's x, without the arrays between
+            # As laspy's x, without the arrays between.
             for k, raw in enumerate((points.X, points.Y, points.Z)):
                 np.multiply(raw, header.scales[k], out=X[part, k])
                 X[part, k] += header.offsets[k]
@@ -268,7 +268,7 @@ def _write_dxf(cloud: Cloud, path: Path) -> None:
         import ezdxf.filemanagement
     except ImportError:
         raise InputError("DXF needs ezdxf: pip install 'jaxbundle[files]'") from None
-    # the drawing of 5 million points takes some GB of memory, and no CAD program reads it
+    # The drawing of 5 million points takes some GB of memory, and no CAD program reads it.
     if len(cloud) > 5_000_000:
         raise InputError(f"{path}: {len(cloud)} points are too many for a drawing; thin the cloud")
     drawing = ezdxf.filemanagement.new("R2010")

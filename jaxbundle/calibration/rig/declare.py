@@ -201,7 +201,7 @@ def declare_rig(rig: Rig) -> tuple[list[Table], list[ObservationSet]]:
     free = seen if rig.points_free else np.full(len(rig.points), rig.point_sigma is not None)
     free = np.repeat(free[:, None], 3, axis=1)
     if rig.wand is not None:
-        # the pose has the other coordinates
+        # The pose has the other coordinates.
         free[-2:] = [[False, False, False], [True, False, False]]
     names = [camera.id for camera in rig.cameras]
     tables = [
@@ -221,7 +221,7 @@ def declare_rig(rig: Rig) -> tuple[list[Table], list[ObservationSet]]:
             Table(
                 "board",
                 rig.place,
-                # the first board of a body is its frame
+                # The first board of a body is its frame.
                 free=np.array(rig.body) != np.arange(len(rig.boards)),
                 labels=rig.boards,
                 parameters=EXTERIOR,
@@ -331,10 +331,10 @@ def adjust_rig(rig: Rig, max_iterations: int = 50, **options: Any) -> Result:
 
     **Returns:** the result; not `converged` if undetermined.
     """
-    # only points that are seen carry the datum; the bases scale with them (`FLOATING`)
+    # Only points that are seen carry the datum; the bases scale with them (`FLOATING`).
     free = {"datum": {"point": np.unique(rig.point)}, "motions": FLOATING}
-    # the epochs, with six unknowns each and by far the most, are eliminated; of control poses an
-    # observation touches four
+    # The epochs, with six unknowns each and by far the most, are eliminated; of control poses an
+    # observation touches four.
     return adjust(
         *declare_rig(rig),
         eliminate="epoch" if rig.trajectory is None else None,
@@ -367,7 +367,7 @@ def snoop_rig(found: Result, test: str, significance: float, max_iterations: int
     """The result without blunders found by a test.
 
     **Raises:** `NotSolvedError` if the remaining observations do not determine a solution."""
-    # each round from the last solution: a removed blunder moves it little
+    # Each round from the last solution: a removed blunder moves it little.
     minimum = found.minimum
 
     def again(problem: Problem, values: Any) -> Solution:

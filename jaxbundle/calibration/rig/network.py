@@ -37,7 +37,7 @@ def network_of_views(found: "RigCalibration") -> Network | None:
         np.array([np.asarray(matrix_from_quaternion(q)) for q in rows.rotation])
         for rows in (mounting, pose)
     )
-    # the rig has its points relative to the centroid of the board
+    # The rig has its points relative to the centroid of the board.
     away = not_none(rig.centroids)[0]
     position = [away + pose.position[e] + M[e].T @ mounting.position[k] for k, e in views]
     angles = [np.asarray(omega_phi_kappa_from_matrix(R[k] @ M[e])) for k, e in views]

@@ -182,7 +182,7 @@ class RigCalibration(TableMethods):
 
     def _photograph(self, camera: int, epoch: int) -> str:
         name = self.rig.epochs[epoch]
-        # of cameras that are not synchronised an epoch is a photograph, and named with its camera
+        # Of cameras that are not synchronised an epoch is a photograph, and named with its camera.
         return name if self.rig.trajectory is not None else f"{self.names[camera]} {name}"
 
     @property
@@ -308,8 +308,8 @@ class RigCalibration(TableMethods):
             for start, width, (k, table, row) in zip(starts, widths, places):
                 rows["mounting"][start : start + POSE, k] = np.eye(POSE)
                 rows[table][start + POSE : start + width, row] = np.eye(width - POSE)
-            # unit rows for the wanted unknowns: only these columns of the cofactor matrix are
-            # computed
+            # Unit rows for the wanted unknowns: only these columns of the cofactor matrix are
+            # computed.
             errors = self._independent if classical else self.errors
             self._covariances[key] = errors.propagate_rows(rows)
         return self._covariances[key]

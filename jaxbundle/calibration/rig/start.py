@@ -185,7 +185,7 @@ def start_rig(
         all_numbers = [*numbers, len(body)]
         found = connect(of_rig, [*names, "wand"], all_numbers, [*views, *ties], given)
     if nearly is not None:
-        # relations are known now; of a motion each photograph has a time and so a pose of its own
+        # Relations are known now; of a motion each photograph has a time and so a pose of its own.
         cameras = sort_views(calibrations, boards, keys_of_photographs(calibrations))
         epochs = epochs_of(cameras)
         views = board_views(cameras, boards, epochs)
@@ -320,7 +320,7 @@ def _rays(
     network, views = camera.calibration.adjustment.problem.network, camera.calibration.views
     rays, used = network.observations, quality.used_rays(camera.calibration.adjustment.problem)
     names = list(boards.boards)
-    # of a video every photograph is an epoch: a search of the list for each takes the square
+    # Of a video every photograph is an epoch: a search of the list for each takes the square.
     number = {key: e for e, key in enumerate(epochs)}
     at = {
         view: row_of[number[key], reference[names.index(board)]]

@@ -108,7 +108,7 @@ def start_unsynchronized(
     bodies_of = list(dict.fromkeys(boards.body.values()))
     body = [bodies_of.index(name) for name in boards.body.values()]
     speeds = speeds_of_cameras(views, time, body, frame, settings.offsets)
-    # without a significant correlation from zero: `_undetermined` says what remains open
+    # Without a significant correlation from zero: `_undetermined` says what remains open.
     offset = np.nan_to_num(start_offsets(speeds, frame, settings.offsets))
     clocks = _start_clocks(calibrations, times, offset, frame, estimated, settings)
     rig, connections = start_rig(
@@ -144,8 +144,8 @@ def with_trajectory(rig: Rig, trajectory: TargetMotion, pose: PoseValue, spacing
     clocks = trajectory.clocks
     common = clocks.common(trajectory.camera, trajectory.time)
     body = _body_of_rows(rig)
-    # an interval without photographs leaves control poses open; 1.5 frames: if knots are closer
-    # than frames, runs still end only where a frame is missing
+    # An interval without photographs leaves control poses open; 1.5 frames: if knots are closer
+    # than frames, runs still end only where a frame is missing.
     runs, run = plan_runs(body, common, spacing, max(spacing, 1.5 * trajectory.frame))
     if not runs:
         raise InputError(
@@ -200,12 +200,12 @@ def _start_clocks(
     settings: SynchronizationSettings,
 ) -> Clocks:
     own = [np.array([*times[name].values()]) for name in calibrations]
-    # about the first photograph, offset and rate would correlate by √3/2
+    # About the first photograph, offset and rate would correlate by √3/2.
     middle = np.array([(t.min() + t.max()) / 2 for t in own])
     free = np.array([[name in estimated for name in CLOCK_PARAMETERS]] * len(own))
-    # the clock of the reference is the common one, but it may have a rolling shutter, too
+    # The clock of the reference is the common one, but it may have a rolling shutter, too.
     free[0, [CLOCK_PARAMETERS.index(OFFSET), CLOCK_PARAMETERS.index(RATE)]] = False
-    # an offset is within the recording, a frame is read out before the next one
+    # An offset is within the recording, a frame is read out before the next one.
     duration = max(float(np.ptp(t)) for t in own)
     ones = np.ones(len(own))
     prior = np.stack([duration * ones, settings.rate_sigma * ones, frame], 1)
@@ -256,7 +256,7 @@ def _knots(
         ends = np.flatnonzero(np.diff(t) > 1.5 * frame) + 1
         whole = zip(np.split(t, ends), np.split(places.reshape(len(t), 9), ends))
         parts += [(a, b) for a, b in whole if len(a) >= 4 * CONTROLS]
-    # half steps of the logarithm, from two frames to a second
+    # Half steps of the logarithm, from two frames to a second.
     tried = frame * 2 ** np.arange(1, np.log2(max(1 / frame, 4)) + 0.5, 0.5)
     score = [sum(_aic(t, x, spacing) for t, x in parts) for spacing in tried]
     return float(tried[int(np.argmin(score))]) if parts else float(tried[0])
@@ -269,14 +269,14 @@ def _aic(t: Float[np.ndarray, " n"], x: Float[np.ndarray, "n 9"], spacing: float
     intervals = max(round((t[-1] - t[0]) / spacing), 1)
     step = (t[-1] - t[0]) / intervals
     knots = t[0] + step * np.arange(-3, intervals + 4)
-    # rounding may put the last photograph beyond the last knot, where the basis ends
+    # Rounding may put the last photograph beyond the last knot, where the basis ends.
     inner = np.clip(t, knots[3], knots[-4] - 1e-9 * step)
     A = BSpline.design_matrix(inner, knots, 3).toarray()
     n, p = A.shape
     if n < p + 3:
         return np.inf
     left = x - A @ np.linalg.lstsq(A, x, rcond=None)[0]
-    # coordinates without any error have no logarithm
+    # Coordinates without any error have no logarithm.
     variance = np.maximum((left**2).mean(0), 1e-300)
     return float((n * np.log(variance) + 2 * p * n / (n - p - 1)).sum())
 
@@ -294,7 +294,7 @@ def adjust_unsynchronized(
     if not found.converged:
         return rig, found, {}
     rig = _with_clocks(_started_at(rig, found), start)
-    # one iteration for its normal equations alone: its values are not used
+    # One iteration for its normal equations alone: its values are not used.
     probe = adjust_rig(rig, 1)
     at = Solution(probe.problem, probe.problem.data.start)
     held = _undetermined(rig, at, not_none(rig.trajectory).sigma0 ** 2, settings)
@@ -354,7 +354,7 @@ def _adjust_until_assigned(
         spacing = min(run.spacing for run in trajectory.runs)
         if np.abs(common[0] - common[1]).max() < settings.max_move * spacing:
             break
-        # control poses belong to the knots they were found with: the last rig keeps these
+        # Control poses belong to the knots they were found with: the last rig keeps these.
         if left == 0 or not np.isfinite(common[0]).all():
             break
         rig = _planned_again(dataclasses.replace(rig, pose=rig.poses(values)), new)
@@ -363,7 +363,7 @@ def _adjust_until_assigned(
 
 def _planned_again(rig: Rig, trajectory: TargetMotion) -> Rig:
     """The rig with knots by other clocks."""
-    # not that of the runs: one of few photographs has wider knots, which are no rule for others
+    # Not that of the runs: one of few photographs has wider knots, which are no rule for others.
     return with_trajectory(rig, trajectory, rig.pose, trajectory.spacing)
 
 
@@ -380,7 +380,7 @@ def _undetermined(
             continue
         half = float(np.ptp(trajectory.time[own])) / 2
         frame = float(np.median(np.diff(np.unique(trajectory.time[own]))))
-        # the effect of each unknown on the time of a photograph, at most
+        # The effect of each unknown on the time of a photograph, at most.
         effect = np.array([1.0, half, 0.5])
         C = variance * _clock_and_mounting(at, k)
         sigma = np.sqrt(np.clip(np.diagonal(C)[:3], 0, None)) * effect

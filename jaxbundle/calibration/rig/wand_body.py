@@ -169,7 +169,7 @@ def _ends(
     names = {name for pair in lengths for name in pair}
     for middle in names:
         of = {next(iter({*pair} - {middle})): x for pair, x in lengths.items() if middle in pair}
-        # three in a line: of the third length, if it is not given, the other two are the parts
+        # Three in a line: of the third length, if it is not given, the other two are the parts.
         if len(names) == 3 and len(lengths) == 2 and len(of) == 2:
             (one, a), (other, b) = of.items()
             found[one, other] = a + b, sigma * np.sqrt(2)
@@ -223,7 +223,7 @@ def add_wand(
         body=(*rig.body, number),
         wand=RigWand(
             wand.length,
-            # all σ are multiplied by σ0 in the end
+            # All σ are multiplied by σ0 in the end.
             wand.sigma_length / _sigma0(calibrations),
             len(rig.epochs),
             poses[:, :3, 2],
@@ -258,7 +258,7 @@ def _in_units(
     boards."""
     uv = np.array([(mark.x, mark.y) for mark in marks])
     own = np.array([(mark.sx, mark.sy) for mark in marks])
-    # as large as the residuals of the wand's network say
+    # As large as the residuals of the wand's network say.
     sigma = np.where(np.isfinite(own), own, wand.sigma_image)
     sigma = sigma * wand.found.adjustment.sigma0 / _sigma0(calibrations)
     xy = np.empty_like(uv)

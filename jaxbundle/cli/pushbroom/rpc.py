@@ -114,7 +114,7 @@ def compensate(  # noqa: PLR0913 - the options of the command
     from jaxbundle.io.scanner.rpc import RASTERS
 
     check_accept(accept, "pushbroom rpc compensate")
-    # the tags of a raster may be replaced in place
+    # The tags of a raster may be replaced in place.
     keep_inputs([control], out=out, csv=csv, json=json)
     keep_inputs([coefficients], csv=csv, json=json, out=None if out.suffix in RASTERS else out)
     found = line_scanners.rpc.compensate(

@@ -95,7 +95,7 @@ def _point(row: TextRow, cells: dict[str, str]) -> tuple[float, float]:
     """A point; NaN if it was not found, or is ignored."""
     if NO_COORDINATE in (cells["x"], cells["y"]):
         return np.nan, np.nan
-    # the columns may stand in any order and apart: as a row of their own they get its messages
+    # The columns may stand in any order and apart: as a row of their own they get its messages.
     x, y = TextRow(row.path, row.number, f"{cells['x']} {cells['y']}").numbers(("x", "y"))
     for name in QUALITY:
         if cells.get(name, NO_COORDINATE) != NO_COORDINATE:

@@ -107,18 +107,18 @@ def find_cameras(path: Path) -> list[tuple[str, Mapping[str, Any]]]:
     head = beginning(path, 1_000_000) if path.suffix.lower() in READ_SUFFIXES else b""
     if _is_xml(head) and FILE_STORAGE not in head:
         return []
-    # every spelling of a camera has one of these
+    # Every spelling of a camera has one of these.
     if not re.search(rb"(?i)[km]\b|intrinsic|matri|mat\b|mtx|fx\b|focal_?length", head):
         return []
     if path.stat().st_size > LARGEST_FILE or is_kalibr(path):
         return []
-    # a result of ours has cameras with their covariance: `io/cameras/result_json.py` reads it
+    # A result of ours has cameras with their covariance: `io/cameras/result_json.py` reads it.
     if b'"converged"' in head and b'"termination"' in head:
         return []
     try:
         return list(cameras_within(read_document(path)))
     except InputError:
-        # a damaged file is reported by its reader
+        # A damaged file is reported by its reader.
         return [("", {})] if re.search(rb"(?i)\bcamera_?matrix\b", head) else []
 
 
@@ -228,12 +228,12 @@ def _core(path: str | Path, found: Found) -> tuple[dict[str, float], float]:
     if "camera_matrix" not in found:
         raise InputError(f"{path}: camera_matrix is missing")
     name, value = found["camera_matrix"]
-    # as Kalibr and ROS write `intrinsics`
+    # As Kalibr and ROS write `intrinsics`.
     if "intrinsic" in name.lower() and isinstance(value, list) and len(value) == 4:
         four = matrix_of(path, name, value, None).tolist()
         return dict(zip(CORE, four)), extra
     K = matrix_of(path, name, value, (3, 3))
-    # its last column can be no principal point
+    # Its last column can be no principal point.
     if not K[:2, 2].any() and K[2, :2].all():
         # Open3D writes nine numbers column by column
         if not isinstance(value, list) or isinstance(value[0], list):
@@ -249,7 +249,7 @@ def _core(path: str | Path, found: Found) -> tuple[dict[str, float], float]:
             )
     core: dict[str, float] = dict(zip(CORE, map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))))
     for key in CORE:
-        # programs that write both round one of them
+        # Programs that write both round one of them.
         if key in found and abs(_number(path, found, key) - core[key]) > 1e-3:
             raise InputError(
                 f"{path}: {found[key][0]} is {found[key][1]:g}, but {name} has {core[key]:g}; "

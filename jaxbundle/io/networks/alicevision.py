@@ -197,7 +197,7 @@ def _camera(row: JsonFields, id: str, version: tuple[int, ...]) -> dict[str, Any
     w, h = (int(_number(row, key)) for key in ("width", "height"))
     kind = row.text("type", "pinhole").lower()
     distortion = row.text("distortionType", kind).lower()
-    # since the kinds and the distortions are apart, a kind is pinhole or equidistant
+    # Since the kinds and the distortions are apart, a kind is pinhole or equidistant.
     name = distortion if kind in ("pinhole", *KINDS) else kind
     if name not in KINDS:
         raise InputError(

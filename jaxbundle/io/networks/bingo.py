@@ -76,7 +76,7 @@ def read_bingo(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     )
     ids = dict.fromkeys(rays.values["point"])
     known = {row["id"]: row for row in points}
-    # new points are only in image.dat: tie points, without start values
+    # New points are only in image.dat: tie points, without start values.
     tie = [{"id": id, "role": "tie"} for id in ids if id not in known]
     table = [*(row for row in points if row["id"] in ids), *tie]
     network = assemble(

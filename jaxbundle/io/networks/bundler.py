@@ -174,7 +174,7 @@ def _names(path: Path, number: int) -> list[str]:
     if path.is_file():
         lines = [line.split() for line in read_text(path).splitlines() if line.strip()]
         names = [words[0].removeprefix("./") for words in lines]
-        # a list of other photographs, or with one twice, names nothing
+        # A list of other photographs, or with one twice, names nothing.
         if len(names) == number and len(set(names)) == number:
             return names
     return [str(k) for k in range(number)]
@@ -208,7 +208,7 @@ def write_bundler(network: Network, path: str | Path) -> tuple[str, ...]:
         for row in ([*all_parameters(network.cameras[c]).values()], *R[i], t[i]):
             lines.append(join_numbers(row))
     key = np.zeros(len(images), int)
-    # the key of a ray is its number in the image, as that of a feature
+    # The key of a ray is its number in the image, as that of a feature.
     of_point: list[list[str]] = [[] for _ in points.id]
     for image, point, (x, y) in zip(rays.image.tolist(), rays.point.tolist(), rays.xy.tolist()):
         of_point[point].append(f"{image} {key[image]} {x!r} {y!r}")

@@ -174,7 +174,7 @@ def _read(folder: Path, where: str, entry: Mapping) -> Columns:
     source = Source(str(folder / file), np.array(lines, np.int64), "line")
     columns = Columns({**texts, **{k: [v] * len(lines) for k, v in constant.items()}}, source)
     scaled = {name: columns.numbers(name) * factor for name, factor in scale.items()}
-    # a σ has no sign, even if its axis is reversed
+    # A σ has no sign, even if its axis is reversed.
     scaled = {name: abs(x) if name.startswith("s") else x for name, x in scaled.items()}
     return Columns({**columns.values, **scaled}, source)
 

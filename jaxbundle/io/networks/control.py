@@ -103,7 +103,7 @@ def read_control(path: str | Path) -> Points:
             )
     source = Source(str(path), np.array([number for number, _ in lines]), "line")
     columns = dict(zip(header, zip(*rows))) if rows else {name: () for name in header}
-    # then a comma is the decimal sign; ids and names keep theirs
+    # Then a comma is the decimal sign; ids and names keep theirs.
     if separator != ",":
         columns = {
             name: column
@@ -142,7 +142,7 @@ def _header(path: Path, number: int, cells: list[str]) -> list[str] | None:
     """The names of the columns; None if the first line is not a header."""
     if not {"x", "y", "z"} <= {cell.lower() for cell in cells}:
         return None
-    # other programs call a σ by these names
+    # Other programs call a σ by these names.
     names = [re.sub("^(σ|sigma_?|std_?)", "s", cell.lower()) for cell in cells]
     for name, cell in zip(names, cells):
         if name not in NAMES:
@@ -280,12 +280,12 @@ def _transform_into_frame(
         source = _intersect(network, places)
     known = np.isfinite(source).all(1)
     source, target = source[known], target[known]
-    # seven parameters of a similarity: three points give nine coordinates
+    # Seven parameters of a similarity: three points give nine coordinates.
     transformation = similarity(source, target) if len(source) >= 3 else None
     extent = np.ptp(target, axis=0).max() if len(target) else 0.0
     if transformation is None:
         return network
-    # the median, here and below: some control points may be misnamed
+    # The median, here and below: some control points may be misnamed.
     if np.median(np.linalg.norm(source - target, axis=1)) <= settings.max_offset * extent:
         return network
     A, t = transformation

@@ -119,7 +119,7 @@ def read_csm_frame(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         centre, turn, warnings = pose_at_centre(isd)
         X0, R, names = centre[None], turn.as_matrix()[None], [path.stem]
     camera = _camera(id, isd, plane)
-    # from the body into our frame, of which the plane has the axes in the frame of the ISD
+    # From the body into our frame, of which the plane has the axes in the frame of the ISD.
     M = plane.axes @ np.swapaxes(R, 1, 2)
     source = Source(str(path), None, "photograph")
     images = image_columns(source, names, [id] * len(names), M, X0)
@@ -134,7 +134,7 @@ def _support_data(path: Path) -> tuple[JsonFields, UnknownKeys]:
     if not text.lstrip().startswith("{"):
         from jaxbundle.io.scanner.csm_state import frame_support_data_of
 
-        # a state: the name of its model, then an object
+        # A state: the name of its model, then an object.
         name, _, rest = text.lstrip().partition("\n")
         if name.strip() != MODEL:
             raise InputError(
@@ -225,7 +225,7 @@ def _focal_plane(isd: JsonFields) -> FocalPlane:
             f"{summing[1]:g}; expected a focal length in mm, and summing above 0"
         )
     A = np.stack([along_sample[1:], along_line[1:]])
-    # parallel but for the rounding of numbers of 12 digits
+    # Parallel but for the rounding of numbers of 12 digits.
     if abs(np.linalg.det(A)) < 1e-12 * np.abs(A).max() ** 2 or not A.any():
         raise InputError(f"{isd.path}: focal2pixel_lines and focal2pixel_samples are dependent")
     to_mm = np.linalg.inv(A) * summing
@@ -252,7 +252,7 @@ def _camera(id: str, isd: JsonFields, plane: FocalPlane) -> Camera:
     (kind,) = kinds
     where = f"optical_distortion.{kind}"
     numbers = lambda n: isd.array(f"{where}.coefficients", (n,))
-    # the images of the axes of the plane in ours: the rows of `axes` without the third
+    # The images of the axes of the plane in ours: the rows of `axes` without the third.
     Q, f = plane.axes[:2, :2], plane.focal_length
     skewed = abs(plane.to_mm[:, 0] @ plane.to_mm[:, 1]) > 1e-9 * np.prod(plane.pixel_size)
     focal: Mapping[str, float] = dict(
@@ -369,6 +369,6 @@ def image_of_transverse(p: Mapping, X: Scalar, Y: Scalar, Z: Scalar) -> Float[Ar
 
 
 def _image(distort: Callable, p: Mapping, X: Scalar, Y: Scalar, Z: Scalar) -> Float[Array, "2"]:
-    # our axes are x right, y up: a ray (X, Y) has −Y along the second
+    # Our axes are x right, y up: a ray (X, Y) has −Y along the second.
     u = p["f"] / Z * (X * p["axes"][0] - Y * p["axes"][1])
     return p["to_pixel"] @ distort(p["distortion"], u) + p["centre"]

@@ -151,7 +151,7 @@ def _calibrated(path: Path, xml: XmlFields, id: str, pixel_size: float) -> Camer
     start |= {"p1": p["P2"] * f, "p2": p["P1"] * f}
     odd = {
         "more than three coefficients": p["R4"] or p["R5"],
-        # equal to the last bit: MicMac writes one number twice (PPaEqPPs)
+        # Equal to the last bit: MicMac writes one number twice (PPaEqPPs).
         "a separate centre of distortion": (p["x"], p["y"]) != (p["cx"], p["cy"]),
     }
     has = " and ".join(what for what, there in odd.items() if there)
@@ -159,7 +159,7 @@ def _calibrated(path: Path, xml: XmlFields, id: str, pixel_size: float) -> Camer
     if has:
         foreign = Foreign(FORMULAS[direction in C2M], p, start, size, (pixel_size, pixel_size))
         return fit_camera(id, foreign, str(path), f"has {has}")
-    # without affinity, or any distortion of the other direction, the formulas are the same
+    # Without affinity, or any distortion of the other direction, the formulas are the same.
     if not (p["b1"] or p["b2"] or (direction in C2M and any(p[name] for name in COEFFICIENTS))):
         return Camera(id, "opencv", start, image_size=size, tie=(("fx", "fy"),))
     model, told = MODELS[1 + (direction in C2M)], f"the pixel size is taken as {pixel_size:g} mm"
@@ -283,7 +283,7 @@ def _from_opencv(camera: Camera) -> dict[str, float]:
         raise InputError(f"camera {camera.id!r}: a fisheye is not written for MicMac")
     f = one_focal_length(camera, "MicMac")
     radial = {f"R{i}": p[f"k{i}"] / f ** (2 * i) for i in (1, 2, 3)}
-    # the decentring terms of OpenCV have their names the other way round
+    # The decentring terms of OpenCV have their names the other way round.
     return p | radial | {"P1": p["p2"] / f, "P2": p["p1"] / f, "b1": 0.0, "b2": 0.0}
 
 

@@ -67,7 +67,7 @@ def unified_camera(
         )
     if states and not S[0] > 0:
         raise InputError(f"{xml.path}: {kind}: the first of Etats must be positive, not {S[0]:g}")
-    # coefficients that are missing are 0
+    # Coefficients that are missing are 0.
     V = (V + [0.0] * most)[:most]
     fisheye, start = "FishEye" in kind, dict(core)
     if fisheye:

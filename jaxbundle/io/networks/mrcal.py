@@ -182,7 +182,7 @@ def _camera(id: str, fields: JsonFields) -> Camera:
     )
     if not exact:
         raise InputError(f"{fields.path}: r0 of the intrinsics is {p['r0']:g}; 1 + r0 must be > 0")
-    # with the axis along z the terms of CAHVOR are those of `opencv` (the module's docstring)
+    # With the axis along z the terms of CAHVOR are those of `opencv` (the module's docstring).
     if p["alpha"] == 0 == p["beta"]:
         return Camera(id, "opencv", exact, image_size=(w, h))
     foreign = Foreign(cahvor, p, exact, (w, h))

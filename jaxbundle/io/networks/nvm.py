@@ -84,7 +84,7 @@ def read_nvm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
             )
     models = []
     while rows.more() and (row := rows.take("the number of cameras")).words:
-        # after the models: comments about PLY files
+        # After the models: comments about PLY files.
         if not row.words[0].isdigit() or not row.integer(0, "the number of cameras"):
             break
         models.append(_Model(rows, row.integer(0, "the number of cameras")))
@@ -98,7 +98,7 @@ def read_nvm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
 def _network(path: Path, model: _Model, overrides: Sequence[str], told: Sequence[str]) -> Network:
     names, values, lines = [], [], []
     for row in model.cameras:
-        # a name may have blanks; ten numbers follow it
+        # A name may have blanks; ten numbers follow it.
         names.append(" ".join(row.words[:-10]) if len(row) > 10 else "")
         if not names[-1]:
             raise row.error(f"{len(row)} values; a name and {', '.join(NUMBERS)}, 0 are expected")

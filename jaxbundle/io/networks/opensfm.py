@@ -163,7 +163,7 @@ def _has_cameras(path: Path, begin: bytes) -> bool:
     head = beginning(path, 1_000_000).lstrip() if path.suffix.lower() == ".json" else b""
     if not head.startswith(begin) or b'"transform_matrix"' in head or b'"viewId"' in head:
         return False
-    # models of 2015 and before have no projection_type: all were perspective
+    # Models of 2015 and before have no projection_type: all were perspective.
     old = b'"focal_prior"' in head or (begin == b"[" and b'"shots"' in head)
     return b'"projection_type"' in head or old
 
@@ -278,7 +278,7 @@ def _add_control(
     unknown = np.full((len(added), 3), np.nan)
     source = Source(str(file.parent / CONTROL), None, "observation")
     if rays is not None and rays.source.numbers is not None:
-        # lines of the tracks; the image points of control have none
+        # Lines of the tracks; the image points of control have none.
         lines = np.r_[rays.source.numbers, np.zeros(len(control.rays), np.int64)]
         source = dataclasses.replace(rays.source, numbers=lines)
     return [*names, *added], np.concatenate([at, unknown]), Columns(columns, source)
@@ -430,7 +430,7 @@ def _tracks(
         if len(row) < 5:
             raise row.error(f"{len(row)} columns; image, track, feature, x, y, … are expected")
         image, point = row.words[:2]
-        # of a photograph without orientation, or of a camera that was refused
+        # Of a photograph without orientation, or of a camera that was refused.
         if image not in shots:
             continue
         if point not in points:

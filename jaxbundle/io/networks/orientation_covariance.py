@@ -99,7 +99,7 @@ def read_orientation_covariance(path: str | Path, radians: float) -> Orientation
                 f"{table.source(seen[unknown])}"
             )
         seen[unknown] = k
-    # correlations are written with all digits: what is below 0 is rounding of them, or edited
+    # Correlations are written with all digits: what is below 0 is rounding of them, or edited.
     if n and np.linalg.eigvalsh(R)[0] < -1e-6 * n:
         raise InputError(
             f"{path}: the correlations are not those of any errors (an eigenvalue of "

@@ -175,7 +175,7 @@ class _Parser:
         if not self._more():
             raise self._error(photo.line, f"the file ends after {photo}")
         number, words = self.lines[self.next]
-        # nine digits: int() of a longer text is no count, and may take minutes
+        # Nine digits: int() of a longer text is no count, and may take minutes.
         if len(words) != 1 or not words[0].isdecimal() or len(words[0]) > 9:
             raise self._error(
                 number,

@@ -46,7 +46,7 @@ def apply_overrides(
     cameras, `free`, which is `camera.*.free`, and `SECTION.…` of a further kind of
     observations.
     """
-    # the document of the caller stays as the file has it
+    # The document of the caller stays as the file has it.
     document = copy.deepcopy(document)
     for override in overrides:
         key, equals, text = (part.strip() for part in override.partition("="))
@@ -79,7 +79,7 @@ def _override_cameras(cameras: list[dict], key: str, text: str) -> None:
     """Apply a setting to the camera named by the key, or to all cameras."""
     rest = key.removeprefix("camera.")
     ids = [str(camera.get("id", "")).strip() for camera in cameras]
-    # the longest id first: "a.b" may be an id beside "a"
+    # The longest id first: "a.b" may be an id beside "a".
     for c in sorted(range(len(ids)), key=lambda c: -len(ids[c])):
         if rest.startswith(f"{ids[c]}."):
             _override_camera(cameras[c], key, rest.removeprefix(f"{ids[c]}."), text)
@@ -129,7 +129,7 @@ def _override_section(document: Document, key: str, text: str) -> None:
         values = [float(word) for word in words]
     except ValueError:
         values = words
-    # a list of one is still a list
+    # A list of one is still a list.
     several = name == "free" or text.startswith("[") or len(values) != 1
     settings[name] = values if several else values[0]
 

@@ -114,7 +114,7 @@ def result_text(
 ) -> Iterator[str]:
     """The result as JSON text, one line that ends with a line feed, in pieces: 2 000 000
     image points take 1 GB. `also`: further entries."""
-    # without the long tables, which would need their memory at once
+    # Without the long tables, which would need their memory at once.
     head = result_dict(adjustment, brief=True) | dict(also)
     if brief or not adjustment.converged:
         yield _text(head) + "\n"

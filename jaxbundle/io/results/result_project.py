@@ -170,7 +170,7 @@ def _given_points(adjustment: "Adjustment") -> Points:
     position[control] = np.where(weight > 0, given, position[control])
     roles = np.array(points.role, dtype=object)
     roles[control[~(weight > 0).any(1)]] = "tie"
-    # a tie point has no observed coordinates
+    # A tie point has no observed coordinates.
     sigma[roles == "tie"] = np.nan
     return dataclasses.replace(points, role=tuple(roles.tolist()), position=position, sigma=sigma)
 
@@ -229,7 +229,7 @@ def _further(adjustment: "Adjustment") -> list[ObservationTable]:
     a kind with one observation per row of its table is followed row by row."""
     problem = adjustment.problem
     network = problem.network
-    # the engine's sets in the order of declaration, the user's own before those of the network
+    # The engine's sets in the order of declaration, the user's own before those of the network.
     kinds = sorted(among(network), key=lambda table: not table.CHANGES_IMAGE_POINTS)
     numbers = [len(table.declare(network, problem.origin).observations) for table in kinds]
     own = len(problem.further_sets) - sum(numbers)

@@ -70,7 +70,7 @@ def support_data_of(state: JsonFields) -> tuple[dict[str, Any], int]:
         "sensor_orientation": {"quaternions": _rows(state, "m_quaternions", 4)},
         "t0_quaternion": number("m_t0Quat"),
         "dt_quaternion": number("m_dtQuat"),
-        # the camera looks along (z·x, z·y, f), which for z = −1 is (x, y, −f) turned round
+        # The camera looks along (z·x, z·y, f), which for z = −1 is (x, y, −f) turned round.
         "focal_length_model": {
             "focal_length": number("m_focalLength") * np.sign(number("m_zDirection", 1))
         },

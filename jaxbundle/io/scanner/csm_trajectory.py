@@ -273,7 +273,7 @@ def _positions(
     if isd.get("instrument_position.velocities") is not None:
         V = scale * isd.array("instrument_position.velocities", (len(t), 3))
         wrong = contradiction(t, P, V, isd.source("instrument_position.velocities"))
-        # orbits are known to better than 100 m; a smaller error is interpolated as usgscsm does
+        # Orbits are known to better than 100 m; a smaller error is interpolated as usgscsm does.
         used = wrong is None or wrong.shift < 100
         if wrong is not None:
             todo = "used all the same" if used else "not used; positions are interpolated alone"

@@ -120,7 +120,7 @@ def read_dimap2(file: XmlFields) -> ScannerInput:
     tables = Tables(t, P, rows, R, positions, attitude)
     x, y, warnings = _look_angles(file, names)
     u = np.arange(pixels)
-    # the optics are polynomials about a mean direction in the middle of the image
+    # The optics are polynomials about a mean direction in the middle of the image.
     frame = sight_frame(
         np.stack([np.polyval(p[::-1], u) for p in (y, -x)]), *tables.directions(last / 2)
     )
@@ -177,7 +177,7 @@ def _period(file: XmlFields, names: Names, lines: int, epoch: np.datetime64) -> 
     for unit in (*known, 1.0, 1e-3, 1e-6):
         if fits(unit):
             return unit * period
-    # where START and END contradict it: the unit documented for the product
+    # Where START and END contradict it: the unit documented for the product.
     if known and period > 0:
         return known[0] * period
     name = names.period.rpartition("/")[2]

@@ -148,7 +148,7 @@ def _place(track: TomlSection, key: str, radians: float, earth: Ellipsoid) -> np
 
 
 def _sigma(section: TomlSection, name: str, radians: float) -> Sigma:
-    # attitudes are given in the unit of angles, positions in metres
+    # Attitudes are given in the unit of angles, positions in metres.
     unit = radians if name.startswith("attitude") else 1.0
     if isinstance(section.values.get(name), list):
         sigma = section.numbers(name, 3)
@@ -177,6 +177,6 @@ def _signal(value: Any, unit: float, where: str) -> float | dict[str, Any] | lis
         if key in ("times", "values"):
             scaled[key] = (unit if key == "values" else 1.0) * section.numbers(key)
         elif key != "kind":
-            # times are no angles
+            # Times are no angles.
             scaled[key] = (1.0 if key in ("period", "step") else unit) * section.number(key)
     return scaled

@@ -141,7 +141,7 @@ def read_jigsaw_residuals(path: str | Path) -> IsisPoints:
     """
     path, points, rays, residuals, rejected = Path(path), {}, [], [], 0
     for number, text in enumerate(read_text(path).splitlines(), 1):
-        # three lines of head
+        # Three lines of head.
         if number <= 3 or not text.strip():
             continue
         fields, where = [field.strip() for field in text.split(",")], f"{path}, line {number}"
@@ -222,7 +222,7 @@ def _points_of(path: Path) -> Iterator[tuple[Fields, list[Fields]]]:
             if blocks.pop()[1] == "CONTROLPOINT":
                 yield fields, measures
         elif entry.value.partition("<")[0].strip().upper() == "NULL":
-            # a value that the network does not have, as if its line were missing
+            # A value that the network does not have, as if its line were missing.
             continue
         elif blocks and blocks[-1][1] == "CONTROLPOINT":
             fields[entry.name] = entry
@@ -304,7 +304,7 @@ def _point(path: Path, fields: Fields) -> tuple[str, str, np.ndarray, np.ndarray
             "is expected"
         )
     X = np.full(3, np.nan)
-    # what a network knew before it was adjusted is the observation
+    # What a network knew before it was adjusted is the observation.
     for source in ("APRIORI", "ADJUSTED"):
         if not np.isfinite(X).all():
             X = np.array([_length(path, fields, f"{source}{axis}") for axis in "XYZ"])
@@ -340,7 +340,7 @@ def _covariance(path: Path, fields: Fields, id: _Entry) -> Float[np.ndarray, "3 
     least = np.linalg.eigvalsh(C)[0]
     if least < -1e-9 * np.trace(C):
         raise InputError(f"{where} is no covariance: it has a negative eigenvalue")
-    # below this eigenvalues are rounding: it would hold the point along an axis of chance
+    # Below this eigenvalues are rounding: it would hold the point along an axis of chance.
     if least <= 1e-14 * np.trace(C):
         raise InputError(
             f"{where} has no error in one direction; give σ above 0 for all, or make the point "

@@ -45,7 +45,7 @@ def read_scanner(path: str | Path) -> ScannerInput:
             f"{path}: a flight file, of an image still to be simulated; simulate it (jaxbundle "
             "pushbroom simulate), and give the scanner.toml of its folder"
         )
-    # a file with a source needs no other section
+    # A file with a source needs no other section.
     file = read_sections(path, SECTIONS, REQUIRED_FIELDS[:1])
     scanner = file.section("scanner")
     if "source" in scanner:
@@ -102,7 +102,7 @@ def _read_source(file: TomlFile, scanner: TomlSection) -> ScannerInput:
         )
     image = dataclasses.replace(product.image, corrections=corrections)
     product = dataclasses.replace(product, image=image, name=scanner.text("name", product.name))
-    # what the user switched is compared, but not replaced
+    # What the user switched is compared, but not replaced.
     return check_against_rpc(product, source, not switched, automatic is not None)
 
 
@@ -126,7 +126,7 @@ def _read_xml(path: Path) -> ScannerInput:
     """The image of a product in XML, by the name of its root and the groups in it."""
     root = read_xml(path)
     has = lambda key: root.find(f".//{key}") is not None
-    # early products of Pléiades have PHR_DIMAP_Document or PHR_Dimap_Document
+    # Early products of Pléiades have PHR_DIMAP_Document or PHR_Dimap_Document.
     if root.tag.lower().endswith("dimap_document"):
         if has(MODEL) or has(EARLY_MODEL):
             return read_dimap2(XmlFields(path, root, "DIMAP 2 of sensor level"))

@@ -138,7 +138,7 @@ def read_refinement(path: str | Path) -> RefineFile:
     frames = None
     if "frames" in section:
         frames = read_network(section.path("frames", "a project of photographs", folder=True))
-    # other programs name an image by its file, without folder and suffix
+    # Other programs name an image by its file, without folder and suffix.
     sources = {one.id: file.section("images").path(one.id, "an image") for one in images}
     names = {re.sub("(?i)_rpc$", "", sources[one.id].stem): one.id for one in images}
     names |= {one.id: one.id for one in images}
@@ -224,7 +224,7 @@ def _read_terrain(section: TomlSection, images: Sequence[AnyScannerImage]) -> He
     ]  # fmt: skip
     terrain = read_terrain(path, earth, joint_extent(extents), above_geoid="geoid" in section)
     if "geoid" in section:
-        # a file beside this one, or the name of a grid of PROJ
+        # A file beside this one, or the name of a grid of PROJ.
         name = section.text("geoid")
         beside = section.beside(name)
         terrain = add_geoid(terrain, beside if beside.exists() else Path(name))

@@ -56,7 +56,7 @@ def read_images(file: TomlFile, radians: float) -> tuple[list[AnyScannerImage], 
         mine, name = own.get(id, {}), f"unknowns.{id}" if id in own else "unknowns"
         is_rpc = _is_rpc(source, models, id)
         known = OF_RPC if is_rpc else fields
-        # what is common to all images is for those that have it
+        # What is common to all images is for those that have it.
         chosen = {k: v for k, v in common.items() if k in known} | mine
         unknowns_of_image = section(name, chosen)
         _check_own_keys(unknowns_of_image, mine, known, is_rpc)
@@ -68,7 +68,7 @@ def read_images(file: TomlFile, radians: float) -> tuple[list[AnyScannerImage], 
         scanner = read_scanner(source)
         warnings += scanner.warnings
         freedom = _read_freedom(unknowns_of_image, radians)
-        # without an entry an image is a sensor of its own
+        # Without an entry an image is a sensor of its own.
         images.append(ScannerImage(id, scanner.image, scanner.earth, freedom, sensors.text(id, id)))
     if all(isinstance(one, ScannerImage) for one in images):
         file.require(("unknowns",))

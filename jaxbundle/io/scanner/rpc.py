@@ -148,7 +148,7 @@ def read_stated_errors(path: str | Path) -> StatedErrors:
         text = read_text(path, fallback="latin-1")
         found = {name: pattern.search(text) for name, pattern in ERRORS.items()}
         said = {name: match and match[1] for name, match in found.items()}
-    # a negative number stands for an unknown one in RPC00B
+    # A negative number stands for an unknown one in RPC00B.
     number = lambda word: max(number_in(str(word), f"{path}: its stated error"), 0.0)
     return StatedErrors(**{name: number(word) for name, word in said.items() if word is not None})
 
@@ -183,7 +183,7 @@ def _from_text(path: Path, text: str, unknown: UnknownKeys) -> dict[str, Any]:
         if name in entries:
             raise InputError(f"{path}, line {number}: {name} occurs twice")
         entries[name] = value.split(), number
-        # as it is written: capitals show where the words of an unknown name begin
+        # As it is written: capitals show where the words of an unknown name begin.
         if TEXT_KEYS.unknown((name,)):
             unknown.check((written,), TEXT_KEYS, f"{path}, line {number}")
 
@@ -241,7 +241,7 @@ def _from_rpb(path: Path, text: str, unknown: UnknownKeys) -> dict[str, Any]:
     for field, (_, key) in FIELDS.items():
         value, where = value_of(key)
         numbers = [part for part in value.strip("() \t").split(",") if part.strip()]
-        # a bracket that was cut off gives fewer
+        # A bracket that was cut off gives fewer.
         if len(numbers) != TERMS:
             raise InputError(f"{where} has {len(numbers)} coefficients; {TERMS} are expected")
         values[field] = [number_in(part, where) for part in numbers]
@@ -278,7 +278,7 @@ def _to_raster(path: Path, rpc: Rpc) -> None:
         raise InputError(f"{path}: no such file; RPC tags are written into a raster that exists")
     try:
         with replace_file(path) as temporary:
-            # the tags of the copy change: after a failure the raster is as it was
+            # The tags of the copy change: after a failure the raster is as it was.
             shutil.copyfile(path, temporary)
             with open_plain(temporary, "r+") as target:
                 target.rpcs = RPC(**given)

@@ -123,7 +123,7 @@ def from_geom(path: Path, text: str) -> dict[str, Any]:
     for number, line in enumerate(text.splitlines(), 1):
         name, colon, value = line.partition(":")
         if colon:
-            # keywords may be prefixed by the image or the projection
+            # Keywords may be prefixed by the image or the projection.
             found[name.strip()] = found[name.strip().rpartition(".")[2]] = value.strip(), number
     kind, line = found.get("polynomial_format", ("B", 0))
     if kind != "B":
@@ -174,7 +174,7 @@ def _from_dimap(file: XmlFields, root: ET.Element, unknown: UnknownKeys) -> dict
             values[f"{axis}_{part}"] = file.number(f"RFM_Validity/{name.upper()}_{short}")
     profile = file.text("Metadata_Identification/METADATA_PROFILE", "").partition("_")[0]
     for axis in ("line", "sample"):
-        # the first pixel is (1, 1) or (0, 0) by the profile of the product
+        # The first pixel is (1, 1) or (0, 0) by the profile of the product.
         values[f"{axis}_offset"] -= DIMAP_ORIGIN.get(profile, DIMAP_OTHER[inverse])
     for field, (axis, part) in FIELDS.items():
         names = [f"{axis}_{part}_coeff_{k}".upper() for k in range(1, TERMS + 1)]

@@ -220,7 +220,7 @@ def _frame(section: TomlSection, earth: Ellipsoid | None, known: Sequence[str]) 
     frame = section.text("frame", "local" if earth is None else "ITRF")
     if frame not in known:
         raise InputError(f"{section.where}unknown frame {frame!r}{did_you_mean(frame, known)}")
-    # attitudes against the orbit are given without an Earth, too
+    # Attitudes against the orbit are given without an Earth, too.
     if (earth is None) != (frame == "local") and frame != "orbit":
         raise InputError(
             f"{section.where}frame is {frame!r}, earth is {'local' if earth is None else 'given'}; "
@@ -256,7 +256,7 @@ def _position(file: TomlFile, earth: Ellipsoid | None) -> tuple[TimeTable, Sourc
 def _check_outside(P: Float[np.ndarray, "n 3"], earth: Ellipsoid, source: Source) -> None:
     """Refuse positions deep inside the Earth, such as in kilometres."""
     distance = np.linalg.norm(P, axis=1)
-    # a hundredth of the axis, 64 km: no camera is so deep
+    # A hundredth of the axis, 64 km: no camera is so deep.
     least = 0.99 * min(float(earth.a), float(earth.b), float(earth.c))
     if (bad := distance < least).any():
         row = int(bad.argmax())
@@ -374,7 +374,7 @@ def optics_of(file: TomlFile, pixels: int) -> Optics:
         raise InputError(f"{section.where}{error}") from None
     values = default_parameters(model) | parameters
     pitch = section.number("pitch")
-    # a negative one counts the pixels the other way
+    # A negative one counts the pixels the other way.
     if pitch == 0:
         raise InputError(f"{section.where}pitch is 0; the size of a pixel in {model.unit}, please")
     return FocalLine(

@@ -57,7 +57,7 @@ class JsonFields:
     def integer(self, key: str, default: int | None = None, least: int = 0) -> int:
         """A whole number that is not less than `least`."""
         value = self.number(key, default)
-        # beyond 2⁵³ floats are all whole: a number there has lost digits
+        # Beyond 2⁵³ floats are all whole: a number there has lost digits.
         if not (value.is_integer() and least <= value < 2**53):
             raise InputError(
                 f"{self.path}: {key} is {value:g}; a whole number from {least} is expected"
@@ -91,7 +91,7 @@ class JsonFields:
     def rows(self, key: str) -> list["JsonFields"]:
         """The objects in a list, counted from 0 in messages; none if it is missing."""
         value = self.get(key, [])
-        # the property trees of Boost write an empty list as an empty text
+        # The property trees of Boost write an empty list as an empty text.
         value = [] if value == "" else value
         if not isinstance(value, list):
             raise InputError(f"{self.path}: {key} is {show(value)}; a list is expected")

@@ -29,14 +29,14 @@ def read_vertices(where: str, content: bytes, names: tuple[str, ...]) -> np.ndar
     found = re.match(rb"ply\r?\nformat (\S+) 1\.0\r?\n(.*?)end_header\r?\n", content, re.DOTALL)
     if found is None or found[1] not in ORDER:
         raise InputError(f"{where}: a binary PLY is expected")
-    # properties belong to the element above them
+    # Properties belong to the element above them.
     fields, number, current = [], 0, ""
     for line in found[2].decode("ascii", errors="replace").splitlines():
         match line.split():
             case ["element", current, many] if many.isdigit():
                 if current == "vertex":
                     number = int(many)
-                # their rows would have to be skipped, and may have lists
+                # Their rows would have to be skipped, and may have lists.
                 elif not fields:
                     raise InputError(f"{where}: its vertices are expected first")
             case ["property", kind, name] if current == "vertex" and kind in TYPES:

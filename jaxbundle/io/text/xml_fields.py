@@ -150,5 +150,5 @@ def time_in(text: str, where: str) -> np.datetime64:
 
 def seconds(time: np.datetime64, epoch: np.datetime64) -> float:
     """The seconds from an epoch to a time."""
-    # through whole nanoseconds: a float of seconds since 1970 has some tenths of a microsecond
+    # Through whole nanoseconds: a float of seconds since 1970 has some tenths of a microsecond.
     return float((time - epoch) / np.timedelta64(1, "ns") * 1e-9)

@@ -48,7 +48,7 @@ class AxisAzimuth:
 
     def __call__(self, pose: Posed, declination: Scalar, measured: Scalar) -> Scalar:
         X, Y, _ = pose.rotation.apply_inverse(self.axis)
-        # turned to where the measured direction is north: 359° and 1° differ by 2°
+        # Turned to where the measured direction is north: 359° and 1° differ by 2°.
         north = measured + declination
         c, s = jnp.cos(north), jnp.sin(north)
         return jnp.arctan2(X * c - Y * s, X * s + Y * c)

@@ -99,7 +99,7 @@ def other_side(A: Rigid, X: Rigid, B: Rigid) -> Rigid:
     """Y of A·X = Y·B, the mean over all poses."""
     Y = A.of(X).of(B.inverse)
     R = nearest_rotation(Y.R.sum(0))
-    # of the places of B, not of its far origin
+    # Of the places of B, not of its far origin.
     t = (A.of(X).t - B.t @ R.T).mean(0)
     return Rigid(R, t)
 

@@ -211,6 +211,6 @@ def observe_mountings(rows: Sequence[int], given: Sequence[GivenMounting]) -> li
 
 
 def _as_measured(one: GivenMounting) -> Float[np.ndarray, "6"]:
-    # what is not given has an infinite σ
+    # What is not given has an infinite σ.
     parts = (np.zeros(3) if part is None else part for part in (one.position, one.angles))
     return np.concatenate([*parts])

@@ -268,7 +268,7 @@ class RobotPoses(ObservationTable):
         else:
             X, Y, _ = solve(A, B)
             eye, frame = (X, Y) if self.type == IN_HAND else (Y, X)
-        # object space → base or hand, as its pose: M and the place where x is 0
+        # Object space → base or hand, as its pose: M and the place where x is 0.
         centre = frame.inverse.t
         return Rigid(eye.R.T, eye.t), Rigid(frame.R, centre)
 
@@ -357,7 +357,7 @@ def _rotations(
     """Rotation matrices hand → base."""
     if names == QUATERNION:
         length = np.linalg.norm(given, axis=1)
-        # a part in a hundred: printed with two digits
+        # A part in a hundred: printed with two digits.
         for row in np.flatnonzero(abs(length - 1) > 0.01)[:1]:
             raise InputError(
                 f"{table.source(row)}: the quaternion has the length {length[row]:.4g}; expected 1"

@@ -68,7 +68,7 @@ def _image_points(result: Refinement) -> list[ImagePoint]:
     xy = lambda table: np.asarray(
         not_none(given.frames).observations.xy if table == PHOTOGRAPH else given.observations.xy
     )
-    # the parts of the equations are in another order than the images
+    # The parts of the equations are in another order than the images.
     measured = declared.image_by_image(xy(p.table)[p.rows] for p in declared.parts)
     scanners = {one.id for one in result.images}
     return [

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 def collect(adjustment: "Adjustment") -> Iterator[Section]:
     """All sections of a solved adjustment between its verdict and its tables."""
-    # a picture soon after the verdict, numbers behind it
+    # A picture soon after the verdict, numbers behind it.
     yield network()
     yield variance_factor(adjustment)
     yield photographs()
