@@ -79,7 +79,8 @@ def angles_near(
     rotation: Float[AnyArray, "4"], d_theta: Float[AnyArray, "3"], given: Float[AnyArray, "3"]
 ) -> Float[Array, "3"]:
     """ω, φ, κ after a small rotation, on the same turn and branch as the given ones."""
-    # ω, φ, κ jump by turns and have two branches: reported angles stay near those of the network.
+    # ω, φ, κ jump by whole turns and have two branches: reported angles stay near those of the
+    # network.
     return omega_phi_kappa_near(
         matrix_from_quaternion(retract_quaternion(rotation, d_theta)), given
     )

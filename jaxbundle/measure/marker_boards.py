@@ -105,8 +105,8 @@ def _first_numbers(seen: SeenMarkers, board: Board) -> Iterator[int]:
 def _fits(
     seen: SeenMarkers, kind: str, k: Int[np.ndarray, " n"], columns: int
 ) -> Iterator[tuple[int, int]]:
-    """How many markers a board of so many columns explains, and its least number of rows, for each
-    numbering there is; `k` counts the markers from the first."""
+    """How many markers a board of `columns` columns explains, and its least number of rows, for
+    each numbering there is; `k` counts the markers from the first."""
     for place in _places(kind, k, columns):
         yield int(_agree(seen, place).sum()), int(place[:, 1].max()) + 1
 

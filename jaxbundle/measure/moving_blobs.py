@@ -36,8 +36,8 @@ class BlobSettings:
     - `max_area_misfit`: of the number of pixels of a blob relative to the area of its ellipse of
       inertia. By the raster alone a cross of five pixels has 0.18, a square 0.05.
     - `max_blobs`: in a frame; with more, such as after a lamp was switched, it is not used.
-    - `sampled`: frames from which b is computed, at least half of it if there are so many. With few
-      a wand that rests enters b; they are kept in memory together.
+    - `sampled`: frames from which b is computed, at least half of it if the video has that many.
+      With few a wand that rests enters b; they are kept in memory together.
     """
 
     dark: bool = False

@@ -27,7 +27,7 @@ from jaxbundle.types import not_none
 SURFACE_TOLERANCE = 1e-9
 
 # Normals of points, coordinates first, or one of all; directions of the texture's coordinates.
-Tangent = tuple[Sequence[float | np.ndarray] | np.ndarray, Float[np.ndarray, "2 3"]]
+TangentPlane = tuple[Sequence[float | np.ndarray] | np.ndarray, Float[np.ndarray, "2 3"]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +83,7 @@ class HeightField:
         """The two coordinates of the texture, those of the plane."""
         return X[..., 0], X[..., 1]
 
-    def axes(self, X: Float[np.ndarray, "n 3"], size: float) -> Tangent:
+    def axes(self, X: Float[np.ndarray, "n 3"], size: float) -> TangentPlane:
         """Normals of points, coordinates first, and the directions of the texture's coordinates;
         slopes are taken over `size`."""
         x, y = X[..., 0], X[..., 1]
@@ -264,7 +264,7 @@ class Rectangle:
         s = self._from_corner(X, self.axes(X, 0.0)[1])
         return s[..., 0], s[..., 1]
 
-    def axes(self, X: Float[np.ndarray, "*n 3"], size: float) -> Tangent:  # noqa: ARG002
+    def axes(self, X: Float[np.ndarray, "*n 3"], size: float) -> TangentPlane:  # noqa: ARG002
         """The normal, and the unit vectors of the texture's coordinates; the same everywhere."""
         unit = lambda v: np.asarray(v, float) / np.linalg.norm(v)
         a, b = unit(self.along), unit(self.across)

@@ -59,7 +59,7 @@ class DsmSettings:
     """Side of the windows of matching, pixels: of dense matching the smallest, which pixels of good
     texture take."""
     max_cells: float = 2e9
-    """A larger grid is refused: the three grids of so many cells take 48 GB."""
+    """A grid of more cells is refused: at this limit its three arrays take 48 GB."""
 
 
 @print_in_one_screen
@@ -223,8 +223,8 @@ def _average_cells(
     alike: Float[np.ndarray, " cells"],
     settings: DsmSettings,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Weighted means by cell, their σ and numbers of points; `alike`: of the points of each cell
-    with points so many count as one."""
+    """Weighted means by cell, their σ and numbers of points; `alike`: for each cell
+    with points, how many of them count as one."""
     order = np.lexsort((Z, cell))
     cell, Z, sigma = cell[order], Z[order], sigma[order]
     cells, first, count = np.unique(cell, return_index=True, return_counts=True)

@@ -55,7 +55,7 @@ class Neighbourhood(eqx.Module):
         latitude: Scalar,
         h: Scalar,
     ) -> Float[Array, "3 *n"]:
-        """The point of (λ, φ, h); longitudes may differ by turns."""
+        """The point of (λ, φ, h); longitudes may differ by whole turns."""
         east = longitude - self.longitude
         east = east - 2 * jnp.pi * jnp.round(east / (2 * jnp.pi))
         return jnp.stack([self.scale[0] * east, self.scale[1] * (latitude - self.latitude), h])

@@ -112,7 +112,7 @@ def _refine_rows(
     margin: int,
 ) -> None:
     """Match some of the windows from their starts in `out`, which is changed, in pieces of the
-    other image with so many pixels around the start."""
+    other image with `margin` pixels around the start."""
     start, A = out.uv.copy(), out.A.copy()
     # 256 windows a call: all iterate until the last has converged
     together = 256

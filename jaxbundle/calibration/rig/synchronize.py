@@ -64,15 +64,15 @@ class SynchronizationSettings:
       as 30), quartz clocks agree to 1e-4.
     - `least_frames`: between knots, at least. With fewer the spline could follow the errors of
       single photographs.
-    - `undersmoothing`: knots are so many times closer than the photographs of single cameras ask
-      for by Akaike's criterion, where errors of the spline are as large as those of a pose: they
-      decrease with the fourth power, and are then small beside σ.
+    - `undersmoothing`: how many times closer the knots are than the photographs of single cameras
+      require by Akaike's criterion, where errors of the spline are as large as those of a pose:
+      they decrease with the fourth power, and are then small beside σ.
     - `max_move`: in parts of the distance of knots, by which the clocks may move instants between
       knots until they are assigned to them anew; the cubic beyond its knot is off by a third power
       of it.
     - `max_rounds` of this.
-    - `min_frames_known`: an offset whose σ times three is beyond so many frames is not determined:
-      photographs could as well be paired with the next ones.
+    - `min_frames_known`: an offset for which 3σ is more than this number of frames is not
+      determined: photographs could as well be paired with the next ones.
     - `offsets`: see `OffsetSettings`.
     """
 

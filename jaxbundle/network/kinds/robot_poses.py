@@ -73,7 +73,7 @@ PARTS = ("robot positions", "robot rotations")
 FEWEST = 3
 # Of half of a rotation of 180°, whose axis is undetermined: no division by 0 there.
 SMALLEST_COSINE = 1e-12
-# Within so many σ of a rotation the axes of the motions of a robot are parallel.
+# Axes of the motions of a robot that differ by fewer σ of a rotation than this are parallel.
 PARALLEL = 3.0
 
 
