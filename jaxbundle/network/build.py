@@ -201,22 +201,20 @@ def add_further(network: Network, *, angle_unit: str | None = None, **further: A
     return network
 
 
-def make_further(
-    given: Mapping[str, Any], radians: float, where: str = ""
-) -> tuple[ObservationTable, ...]:
+def make_further(given: Mapping[str, Any], radians: float) -> tuple[ObservationTable, ...]:
     """Observations of further kinds from their tables and the settings of their sections.
 
     **Raises:** `InputError`, also for an unknown name, and for settings without a table."""
     known = (*KINDS, *SECTIONS)
     for name in given:
-        refuse_unknown(name, known, where, "table")
+        refuse_unknown(name, known, "", "table")
     made = []
     for name, kind in KINDS.items():
         settings = given.get(kind.SECTION, {})
         if given.get(name) is not None:
             made.append(kind.from_columns(as_columns(given[name], name), settings, radians))
         elif settings:
-            raise InputError(f"{where}[{kind.SECTION}] is given, but no table {name}")
+            raise InputError(f"[{kind.SECTION}] is given, but no table {name}")
     return tuple(made)
 
 

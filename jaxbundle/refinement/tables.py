@@ -84,13 +84,12 @@ def local_points(
     role: Sequence[str],
     X: Float[np.ndarray, "points 3"],
     sigma: float | Float[np.ndarray, "#points 3"] | None = None,
-    source: Source = Source("points"),  # noqa: B008
 ) -> GroundPoints:
     """Points with σ along X, Y, Z; without `sigma` control points are held."""
     X = np.asarray(X, float)
     sigma = np.broadcast_to(0.0 if sigma is None else np.asarray(sigma, float), X.shape)
     axes = np.tile(np.eye(3), (len(X), 1, 1))
-    return GroundPoints(tuple(id), tuple(role), X, sigma, axes, source=source)
+    return GroundPoints(tuple(id), tuple(role), X, sigma, axes)
 
 
 def with_frames(points: GroundPoints, frames: Network | None) -> GroundPoints:

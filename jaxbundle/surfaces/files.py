@@ -4,7 +4,7 @@ import csv
 import dataclasses
 import io
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -123,7 +123,6 @@ def make_cloud(
 
 def report_of(
     surface: SurfaceResult,
-    warnings: Sequence[str] = (),
     check: Float[np.ndarray, "n 3"] | None = None,
     heights: str = "",
 ) -> dict[str, Any]:
@@ -144,7 +143,7 @@ def report_of(
             if check is None or not len(check)
             else {"check_points": at_check_points(cloud, check)}
         ),
-        "warnings": [*warnings, *surface.messages],
+        "warnings": [*surface.messages],
     }
 
 

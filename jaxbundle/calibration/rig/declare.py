@@ -32,7 +32,7 @@ from jaxbundle.calibration.rig.trajectory import CONTROLS, TargetMotion
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.pixel_frame import in_pixels
 from jaxbundle.leastsquares import Result, adjust
-from jaxbundle.leastsquares.datum.motions import similarity
+from jaxbundle.leastsquares.datum.motions import scale_position, similarity
 from jaxbundle.leastsquares.declarations import Kind, Motions, ObservationSet, Table
 from jaxbundle.leastsquares.problem import Problem
 from jaxbundle.leastsquares.quality.snooping import RemovedRow, snoop, without
@@ -58,11 +58,6 @@ POSES = ("epoch", "mounting")
 ON_BODIES = ("board", *POSES)
 
 
-def _scale(motion: Float[Array, "7"], mounting: PoseValue) -> PoseValue:
-    """The bases scale with the object."""
-    return mounting._replace(position=jnp.exp(motion[6]) * mounting.position)
-
-
 _OF_OBJECT = similarity(("point",), ("epoch",))
 # What is known of a clock beforehand.
 CLOCK_PRIOR = Kind(
@@ -71,7 +66,9 @@ CLOCK_PRIOR = Kind(
 
 
 # A similarity of the object that also transforms poses and bases.
-FLOATING = Motions(_OF_OBJECT.names, (*_OF_OBJECT.actions, ("mounting", _scale)), _OF_OBJECT.curved)
+FLOATING = Motions(
+    _OF_OBJECT.names, (*_OF_OBJECT.actions, ("mounting", scale_position)), _OF_OBJECT.curved
+)
 
 
 def roll_of_stick(stick: Posed, given: Float[Array, "3"]) -> Array:

@@ -83,11 +83,9 @@ def open_archive(
         yield archive, {n: _member(path, expected, archive, n, i) for n, i in infos.items()}
 
 
-def read_arrays(
-    path: str | Path, expected: str, names: Sequence[str] | None = None
-) -> dict[str, np.ndarray]:
-    """All arrays of an archive, or those of `names` that it has; raises as `open_archive`."""
-    with open_archive(path, expected, names) as (archive, members):
+def read_arrays(path: str | Path, expected: str) -> dict[str, np.ndarray]:
+    """All arrays of an archive; raises as `open_archive`."""
+    with open_archive(path, expected) as (archive, members):
         return {
             name: read_member(path, expected, archive, name, member)
             for name, member in members.items()

@@ -31,7 +31,7 @@ from jaxbundle.arguments import show
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import quaternion_from_matrix
-from jaxbundle.leastsquares.datum.motions import move_pose
+from jaxbundle.leastsquares.datum.motions import move_pose, scale_length
 from jaxbundle.leastsquares.declarations import Kind, ObservationSet, Table
 from jaxbundle.leastsquares.spaces import Frame, Posed, PoseValue, Triple
 from jaxbundle.network.columns import Columns, did_you_mean
@@ -95,10 +95,6 @@ RESIDUALS = {
     "sphere": (on_sphere, ("distance",)),
     "cylinder": (on_cylinder, ("distance",)),
 }
-
-
-def _move_radius(motion: Float[Array, "7"], radius: Float[Array, ""]) -> Float[Array, ""]:
-    return jnp.exp(motion[6]) * radius
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -212,7 +208,7 @@ class Figures(ObservationTable):
                 tables, touched = (type, size.name), (figure[those],) * 2
                 of, own_sigma = point[rows[those]], sigma[those]
                 seen.append(self._observe_points(type, tables, touched, of, own_sigma, not given))
-        actions = (type, move_pose), (size.name, _move_radius)
+        actions = (type, move_pose), (size.name, scale_length)
         return Contribution((frame, size), tuple(seen), actions)
 
     @staticmethod

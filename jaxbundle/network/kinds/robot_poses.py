@@ -37,7 +37,7 @@ from jaxbundle.geometry.quaternions import (
     quaternion_from_matrix,
 )
 from jaxbundle.geometry.rotations import matrix_from_omega_phi_kappa
-from jaxbundle.leastsquares.datum.motions import move_pose
+from jaxbundle.leastsquares.datum.motions import move_pose, scale_position
 from jaxbundle.leastsquares.declarations import Kind, ObservationSet, Table
 from jaxbundle.leastsquares.spaces import Pose, Posed, PoseValue
 from jaxbundle.network.columns import Columns
@@ -238,7 +238,7 @@ class RobotPoses(ObservationTable):
         frame = _pose_table(names.frame, frames[:1], ["robot"], None)
         rows = (image, of_camera, np.zeros(len(image), int))
         sets = [*self._observe(names, rows), *_observe_camera(eye, known)]
-        actions = ((names.eye, _scale_pose), (names.frame, move_pose))
+        actions = ((names.eye, scale_position), (names.frame, move_pose))
         return Contribution((eye, frame), sets, actions)
 
     def _observe(self, names: HandEyeTables, rows: tuple[Any, ...]) -> list[ObservationSet]:
@@ -334,10 +334,6 @@ def _observe_camera(eye: Table, known: GivenMounting | None) -> list[Observation
     if known.covariance is not None:
         spread = {"covariance": np.tile(known.covariance, (eye.rows, 1, 1))}
     return [kind((np.arange(eye.rows),), np.tile(measured, (eye.rows, 1)), **spread)]
-
-
-def _scale_pose(motion: Float[Array, "7"], value: PoseValue) -> PoseValue:
-    return PoseValue(jnp.exp(motion[6]) * value.position, value.rotation)
 
 
 def _attitude_names(table: Columns) -> tuple[str, ...]:
