@@ -126,5 +126,5 @@ def test_what_does_not_fit_is_told(network, alone):
         jaxbundle.adjust(network, also=[differences])
     with pytest.raises(jaxbundle.InputError, match="already has a table 'point'"):
         jaxbundle.adjust(network, also=[ls.Table("point", np.zeros((2, 3)))])
-    with pytest.raises(jaxbundle.InputError, match="also: tables .* are expected"):
+    with pytest.raises(jaxbundle.InputError, match="also: expected tables .*"):
         jaxbundle.adjust(network, also=[3.0])

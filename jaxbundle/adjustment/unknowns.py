@@ -30,13 +30,13 @@ def find_unknowns(problem: NetworkProblem, names: Sequence[tuple[str, str, str]]
     **Raises:** `InputError` without names, or for a name that does not have three parts; `KeyError`
     for an unknown name."""
     if not isinstance(names, list | tuple):
-        raise InputError(f"covariance: a list of names is expected, but it is {show(names)}")
+        raise InputError(f"covariance: expected a list of names, got {show(names)}")
     given: Sequence[Any] = names or (None,)
     for name in given:
         if name is None or isinstance(name, str) or np.shape(name) != (3,):
             said = "none is given" if name is None else f"one is {show(name)}"
             raise InputError(
-                'covariance: names of unknowns are expected, such as ("camera", "cam", "c") or '
+                'covariance: expected names of unknowns, such as ("camera", "cam", "c") or '
                 f'("point", "7", "Z"), but {said}'
             )
     wanted = [Name(*map(str, name)) for name in names]

@@ -296,7 +296,7 @@ def read_against(table: Any, keys: Iterable[str], name: str) -> dict[str, np.nda
     others = [column for column in given.values if column != ID]
     if ID not in given.values or not others:
         raise InputError(
-            f"{name}: a column id and others are expected, but there are "
+            f"{name}: expected a column id and others, but there are "
             f"{', '.join(given.values) or 'none'}"
         )
     rows: dict[str, int] = {}
@@ -340,7 +340,7 @@ def number_or_days(cell: str, where: str) -> float:
         date = datetime.fromisoformat(cell)
     except ValueError:
         raise InputError(
-            f"{where} is {cell!r}; a number or a date such as 2026-05-01 is expected"
+            f"{where} is {cell!r}; expected a number or a date such as 2026-05-01"
         ) from None
     date = date if date.tzinfo else date.replace(tzinfo=UTC)
     return date.timestamp() / 86400

@@ -56,7 +56,7 @@ class RigFolders:
 def _rig(views: Mapping[str, BoardViews | str]) -> tuple[RigViews, dict] | str:
     if len(views) < 2:
         said = f" (only {[*views][0]})" if views else ""
-        return f"a folder of photographs for every camera of the rig is expected here{said}"
+        return f"expected a folder of photographs for every camera of the rig here{said}"
     bad = [f"camera {name}: {one}" for name, one in views.items() if isinstance(one, str)]
     if bad:
         return "; ".join(bad)

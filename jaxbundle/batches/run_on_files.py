@@ -164,7 +164,7 @@ def check_part(part: Sequence[int]) -> None:
 
     **Raises:** `InputError`."""
     if len(part) != 2 or not 1 <= integer("part", part[0]) <= integer("part", part[1]):
-        raise InputError(f"part {part}: (I, N) is expected, the I-th of N parts, I from 1 to N")
+        raise InputError(f"part {part}: expected (I, N), the I-th of N parts, I from 1 to N")
 
 
 def _shares(numbers: Sequence[int], part: tuple[int, int]) -> list[list[int]]:

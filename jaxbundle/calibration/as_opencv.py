@@ -101,7 +101,7 @@ def calibrate_opencv(
     if not objects or len(objects) != len(images):
         raise InputError(
             f"{len(objects)} views of object_points and {len(images)} of image_points are given; "
-            "one of each for every view is expected"
+            "expected one of each for every view"
         )
     for k, (X, x) in enumerate(zip(objects, images)):
         if len(X) != len(x):
@@ -140,7 +140,7 @@ def _view(name: str, k: int, given: Any, width: int) -> Float[np.ndarray, "n wid
     array = numeric_array(f"{name}[{k}]", given, f"an array [n, {width}]").astype(float)
     if array.size and array.ndim > 1 and array.shape[-1] == width:
         return array.reshape(-1, width)
-    raise InputError(f"{name}[{k}]: an array [n, {width}] is expected, not {list(array.shape)}")
+    raise InputError(f"{name}[{k}]: expected an array [n, {width}], got {list(array.shape)}")
 
 
 def _rotation_vector(R: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:

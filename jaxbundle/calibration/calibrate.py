@@ -294,7 +294,7 @@ def _pair(pixel_size: Any) -> tuple[float, float] | None:
         return None
     pair = vector("pixel_size", pixel_size, 2, "a positive length in mm, or two")
     if not (pair > 0).all():
-        raise InputError(f"pixel size {pixel_size}: a positive length in mm is expected")
+        raise InputError(f"pixel size {pixel_size}: expected a positive length in mm")
     return float(pair[0]), float(pair[1])
 
 

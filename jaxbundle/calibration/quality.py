@@ -111,7 +111,7 @@ def uncertainty_map(
     if frame not in FRAMES:
         raise InputError(f"frame {frame!r}: {', '.join(FRAMES)}")
     if not distance > 0:
-        raise InputError(f"distance {distance:g}: a positive distance is expected")
+        raise InputError(f"distance {distance:g}: expected a positive distance")
     network = adjustment.problem.network
     c = [given.id for given in network.cameras].index(camera)
     given = network.cameras[c]

@@ -240,8 +240,8 @@ def _check(
         len(at) == len(calibrations) and len({*at}) >= 3 and np.isfinite(at).all()
     ):
         raise InputError(
-            f"stability: {len(at)} numbers for {len(calibrations)} calibrations; one for each is "
-            "expected, and three different ones at least"
+            f"stability: {len(at)} numbers for {len(calibrations)} calibrations; expected one for "
+            "each, and three different ones at least"
         )
     first, (free, _) = calibrations[0]
     names = _first_of_tied(first, free)

@@ -293,7 +293,7 @@ def _check_unknown(
 ) -> None:
     """Refuse the name of an unknown that no camera, image or point has."""
     if not one.argument:
-        raise InputError("a parameter is expected in parentheses, such as (c), (X0) or (Z)")
+        raise InputError("expected a parameter in parentheses, such as (c), (X0) or (Z)")
     name = one.argument.rpartition(":")[2]
     if command == "calibrate-rig" and name in ("base", "rotation"):
         return

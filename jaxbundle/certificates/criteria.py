@@ -17,7 +17,7 @@ from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
 from jaxbundle.system.terminals import in_utf8
 
-FORM = "QUANTITY < NUMBER UNIT is expected, such as 'sigma(c) < 2 um' or 'sigma0 < 1.2'"
+FORM = "expected QUANTITY < NUMBER UNIT, such as 'sigma(c) < 2 um' or 'sigma0 < 1.2'"
 PATTERN = re.compile(
     r"""\s*(?P<name>[A-Za-z][\w.]*)\s*
     (?:\(\s*(?P<argument>[^()]+?)\s*\)\s*)?

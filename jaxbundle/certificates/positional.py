@@ -247,7 +247,7 @@ def positional_accuracy(
     """
     adjustment = getattr(given, "adjustment", given)
     if not isinstance(adjustment, Adjustment):
-        raise InputError(f"a result of jaxbundle.adjust is expected, not {show(given)}")
+        raise InputError(f"expected a result of jaxbundle.adjust, got {show(given)}")
     found = adjustment.check_points
     if found is None or not np.isfinite(found.difference).any():
         raise InputError(

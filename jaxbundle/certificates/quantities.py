@@ -151,11 +151,11 @@ def _split(argument: str) -> tuple[str, str, str]:
         return kind, id, name
     if mark:
         raise InputError(
-            f"({argument}): a parameter, such as c, or KIND:ID:NAME is expected, such as "
+            f"({argument}): expected a parameter, such as c, or KIND:ID:NAME, such as "
             "camera:cam:c, image:*:X0 or point:7:Z"
         )
     if not argument:
-        raise InputError("a parameter is expected in parentheses, such as (c), (X0) or (Z)")
+        raise InputError("expected a parameter in parentheses, such as (c), (X0) or (Z)")
     if argument in EXTERIOR:
         return "image", "*", argument
     if argument in AXES:
@@ -276,14 +276,14 @@ def _check_rms(subject: Subject, argument: str) -> QuantityValues:
     rms = {axis: _rms(table[f"d{axis}"]) for axis in AXES}
     parts = {"": AXES, "3D": AXES, "H": AXES[:2], "V": AXES[2:], **{a: (a,) for a in AXES}}
     if argument not in parts:
-        raise InputError(f"({argument}): one of X, Y, Z, H, V, 3D is expected")
+        raise InputError(f"({argument}): expected one of X, Y, Z, H, V, 3D")
     return one_value(math.sqrt(sum(rms[axis] ** 2 for axis in parts[argument])), unit)
 
 
 def _check_max(subject: Subject, argument: str) -> QuantityValues:
     table, unit = _differences(subject)
     if argument not in ("", *AXES):
-        raise InputError(f"({argument}): one of X, Y, Z is expected")
+        raise InputError(f"({argument}): expected one of X, Y, Z")
     return QuantityValues(
         {
             f"{axis} of check point {id}": abs(float(d))
@@ -305,7 +305,7 @@ def _control_rms(subject: Subject, argument: str) -> QuantityValues:
     adjustment: Adjustment = subject.result
     rows = adjustment.residuals
     if argument not in ("", *AXES):
-        raise InputError(f"({argument}): one of X, Y, Z is expected")
+        raise InputError(f"({argument}): expected one of X, Y, Z")
     own = rows["kind"] == "control"
     if not own.any():
         raise LookupError("the result has no control points with σ")

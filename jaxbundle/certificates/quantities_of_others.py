@@ -42,7 +42,7 @@ def find_by_path(result: Any, name: str, argument: str) -> QuantityValues:
     **Raises:** `InputError` for an unknown path, and for one that leads to no number."""
     to_dict = getattr(result, "to_dict", None)
     if to_dict is None:
-        raise InputError(f"a result of jaxbundle is expected, not {type(result).__name__}")
+        raise InputError(f"expected a result of jaxbundle, got {type(result).__name__}")
     refuse_argument(argument)
     found = dict(_walk(to_dict(), name.split("."), name, ""))
     if not found:
@@ -81,7 +81,7 @@ def _mounting(subject: Subject, argument: str) -> QuantityValues:
     adjustment = subject.result.adjustment
     network = adjustment.problem.network
     if argument not in ("position", "rotation"):
-        raise InputError(f"({argument}): position or rotation is expected")
+        raise InputError(f"({argument}): expected position or rotation")
     table = subject.result.table()
     values = {
         f"{name} of {of}": float(sigma)
@@ -95,7 +95,7 @@ def _mounting(subject: Subject, argument: str) -> QuantityValues:
 def _repeatability(subject: Subject, argument: str) -> QuantityValues:
     network = subject.result.adjustment.problem.network
     if argument not in ("position", "rotation"):
-        raise InputError(f"({argument}): position or rotation is expected")
+        raise InputError(f"({argument}): expected position or rotation")
     part = PARTS[argument == "rotation"]
     if part not in subject.result.repeatability:
         raise LookupError(f"the repeatability of {part} is not estimated")
@@ -127,7 +127,7 @@ def _check_rms(subject: Subject, argument: str) -> QuantityValues:
     """RMS of an axis; H of the first two; without an argument of all that are known."""
     chosen = {"": [0, 1, 2], "H": [0, 1], "V": [2], **{a: [i] for i, a in enumerate(AXES)}}
     if argument not in chosen:
-        raise InputError(f"({argument}): one of X, Y, Z, H, V is expected")
+        raise InputError(f"({argument}): expected one of X, Y, Z, H, V")
     square = _differences(subject.result)[:, chosen[argument]] ** 2
     known = np.isfinite(square)
     if not known.any():
@@ -140,7 +140,7 @@ def _check_rms(subject: Subject, argument: str) -> QuantityValues:
 
 def _check_max(subject: Subject, argument: str) -> QuantityValues:
     if argument not in ("", *AXES):
-        raise InputError(f"({argument}): one of X, Y, Z is expected")
+        raise InputError(f"({argument}): expected one of X, Y, Z")
     difference = _differences(subject.result)
     values = {
         f"{axis} of check point {id}": abs(float(d))
@@ -157,7 +157,7 @@ def _check_max(subject: Subject, argument: str) -> QuantityValues:
 def _point_sigma(subject: Subject, argument: str) -> QuantityValues:
     result: Refinement = subject.result
     if argument not in AXES:
-        raise InputError(f"({argument}): one of X, Y, Z is expected")
+        raise InputError(f"({argument}): expected one of X, Y, Z")
     sigma = np.asarray(result.inspection.point_sigma)[:, AXES.index(argument)]
     chosen = {f"{argument} of point {k}": float(s) for k, s in zip(result.point_ids, sigma) if s}
     if not chosen:

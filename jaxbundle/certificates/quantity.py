@@ -65,7 +65,7 @@ class Quantity:
         may_be_omitted = not expected or "[" in self.form
         if open_ones or argument in expected or (not argument and may_be_omitted):
             return
-        raise InputError(f"({argument}): one of {', '.join(expected)} is expected")
+        raise InputError(f"({argument}): expected one of {', '.join(expected)}")
 
 
 def one_value(value: float, unit: str = "") -> QuantityValues:

@@ -183,7 +183,7 @@ def choice(
         folded = {word.casefold(): word for word in words}
         close = get_close_matches(value.casefold(), folded, 1)
         mean = f"; did you mean {folded[close[0]]!r}?" if close else ""
-        raise InputError(f"{option.opts[0]} {value!r}: one of {listed} is expected{mean}")
+        raise InputError(f"{option.opts[0]} {value!r}: expected one of {listed}{mean}")
 
     told = (f"{about}: {listed}" if about else listed) if listing else about
     complete = lambda: [word for word in words if word not in forms]

@@ -334,5 +334,5 @@ def _read_against(path: Path, asked: bool) -> "Columns":
 def _part(text: str) -> tuple[int, int]:
     found = re.fullmatch(r"\s*(\d{1,9})\s*/\s*(\d{1,9})\s*", text or "1/1")
     if not found or not 1 <= int(found[1]) <= int(found[2]):
-        raise InputError(f"--part {text}: I/N is expected, the I-th of N parts, such as 1/4")
+        raise InputError(f"--part {text}: expected I/N, the I-th of N parts, such as 1/4")
     return int(found[1]), int(found[2])

@@ -31,7 +31,7 @@ def check_outputs(
             check_file(option, str(path), None, inputs)
     if table is not None:
         if table.suffix.lower() not in (".csv", ".parquet"):
-            raise InputError(f"--table {table}: a name that ends with .csv or .parquet is expected")
+            raise InputError(f"--table {table}: expected a name that ends with .csv or .parquet")
         if summary is not None and table.resolve() == summary.resolve():
             raise InputError(f"--summary {summary}: is also the file of --table")
         if is_parquet(table):

@@ -243,5 +243,5 @@ def values(given: Sequence[str] | None) -> dict[str, float]:
         except ValueError:
             equals = ""
         if not equals:
-            raise InputError(f"--given {item}: NAME=VALUE is expected, such as fx=1200")
+            raise InputError(f"--given {item}: expected NAME=VALUE, such as fx=1200")
     return found

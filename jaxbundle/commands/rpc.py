@@ -91,9 +91,7 @@ def fit(
     path, check, pole = Path(source), None, None
     low, high = heights
     if not (np.isfinite([low, high]).all() and low < high):
-        raise InputError(
-            f"heights {low:g}, {high:g}: two finite numbers, the lower first, are expected"
-        )
+        raise InputError(f"heights {low:g}, {high:g}: expected two finite numbers, the lower first")
     if path.suffix.lower() == ".csv":
         table, columns = _read_points(path, tell=tell)
         found = fit_rpc(table, ridge=ridge, source=columns.source)
@@ -208,9 +206,9 @@ def compensate(
     **Raises:** `InputError`.
     """
     if snooping not in ("none", *TESTS):
-        raise InputError(f"snooping {snooping!r}; one of none, {', '.join(TESTS)} is expected")
+        raise InputError(f"snooping {snooping!r}; expected one of none, {', '.join(TESTS)}")
     if not 0 < significance < 1:
-        raise InputError(f"significance is {significance:g}; between 0 and 1 is expected")
+        raise InputError(f"significance is {significance:g}; expected between 0 and 1")
     given = read_rpc(Path(coefficients))
     optional = ("id", "role", *GROUND_SIGMA)
     table, columns = _read_points(Path(control), optional, crs, geoid)
@@ -278,7 +276,7 @@ def _roles(columns: Columns) -> np.ndarray:
     if (strange := ~np.isin(roles, ("control", "check"))).any():
         row = int(strange.argmax())
         raise InputError(
-            f"{columns.source(row)}: role is {roles[row]!r}; control or check is expected"
+            f"{columns.source(row)}: role is {roles[row]!r}; expected control or check"
         )
     return roles
 

@@ -45,7 +45,7 @@ def tie(
     """
     path, say = Path(input), tell or (lambda _: None)
     if spacing < 1:
-        raise InputError(f"--spacing {spacing}: pixels from 1 on are expected")
+        raise InputError(f"--spacing {spacing}: expected pixels from 1 on")
     if (zmin is None) != (zmax is None) or (
         zmin is not None and zmax is not None and not zmin < zmax
     ):

@@ -155,7 +155,7 @@ def surface(  # noqa: PLR0913 (public: the options of the command, all but one b
     folder = None if photos is None else Path(photos)
     between = _heights(zmin, zmax)
     if dsm is not None and not dsm > 0:
-        raise InputError(f"--dsm {dsm}: a positive size is expected")
+        raise InputError(f"--dsm {dsm}: expected a positive size")
     if (orthophoto or orthophoto_of) and dsm is None:
         raise InputError("--orthophoto: needs --dsm, the size of its pixels")
     # Read before matching, which takes minutes: its errors come at once.

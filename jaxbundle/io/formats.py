@@ -597,8 +597,8 @@ def read_network(
     format = format or recognise_format(path)
     if format is None and is_camera_file(path):
         raise InputError(
-            f"{path}: contains only cameras, without images and points; a project, or another "
-            "network, is expected (jaxbundle camera, compare and convert read it)"
+            f"{path}: contains only cameras, without images and points; expected a project "
+            "or another network (jaxbundle camera, compare and convert read it)"
         )
     if format is None:
         if known := describe_incomplete(path):

@@ -220,7 +220,7 @@ class ObservationSet:
         rows = tuple(_row_numbers(name, r) for r in self.rows)
         if len(rows) != len(kind.of):
             raise InputError(
-                f"{name}: rows of {len(kind.of)} tables are expected ({', '.join(kind.of)}), not "
+                f"{name}: expected rows of {len(kind.of)} tables ({', '.join(kind.of)}), not "
                 f"of {len(rows)}"
             )
         if len({len(r) for r in rows}) > 1:
@@ -277,8 +277,8 @@ class ObservationSet:
         if bad.any():
             row = int(np.argwhere(bad)[0][0])
             raise InputError(
-                f"{self.kind.name}: sigma of observation {row + 1} is {sigma[bad][0]:g}; a "
-                "positive number is expected"
+                f"{self.kind.name}: sigma of observation {row + 1} is {sigma[bad][0]:g}; expected "
+                "a positive number"
             )
         return 1 / sigma
 

@@ -106,7 +106,7 @@ def check_kind(kind: str) -> None:
             f"coded targets {kind!r}: {', '.join(CODED_TARGETS)}{did_you_mean(name, CODED_TARGETS)}"
         )
     if name.startswith("ring") and option not in ("", "codes"):
-        raise InputError(f"coded targets {kind!r}: {name} or {name}:codes is expected")
+        raise InputError(f"coded targets {kind!r}: expected {name} or {name}:codes")
     if name == "charuco":
         _charuco_board(option)
     elif not name.startswith("ring"):
@@ -165,7 +165,7 @@ def _charuco_board(option: str) -> Board:
     try:
         columns, rows = (int(n) for n in option.lower().split(":")[0].split("x"))
     except ValueError:
-        raise InputError(f"charuco:{option}: COLUMNSxROWS is expected, such as 8x6") from None
+        raise InputError(f"charuco:{option}: expected COLUMNSxROWS, such as 8x6") from None
     dictionary = option.split(":")[1] if ":" in option else ARUCO
     return Board(columns, rows, 1.0, "charuco", dictionary=dictionary)
 

@@ -299,7 +299,7 @@ def _ties(where: str, given: Any) -> tuple[tuple[str, ...], ...]:
 
 def _number(where: str, key: str, value: Any) -> float:
     if isinstance(value, NO_NUMBERS) or not isinstance(value, int | float | np.number):
-        raise InputError(f"{where}{key} is {show(value)}; a number is expected")
+        raise InputError(f"{where}{key} is {show(value)}; expected a number")
     try:
         return float(value)
     except OverflowError:
@@ -372,8 +372,8 @@ def _colours(table: Columns) -> UInt8[np.ndarray, "points 3"] | None:
     bad = ~((colour >= 0) & (colour <= 255) & (colour % 1 == 0))
     for row, k in np.argwhere(bad)[:1]:
         raise InputError(
-            f"{table.source(row)}: {POINT_COLOURS[k]} is {show(colour[row, k])}; a whole number "
-            "from 0 to 255 is expected, or no colour at all"
+            f"{table.source(row)}: {POINT_COLOURS[k]} is {show(colour[row, k])}; expected a whole "
+            "number from 0 to 255, or no colour at all"
         )
     return colour.astype(np.uint8)
 

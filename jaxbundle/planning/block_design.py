@@ -117,7 +117,7 @@ def design_block(
         if not 0 <= overlap < 1:
             percent = " (60 % is 0.6)" if 1 < overlap < 100 else ""
             raise InputError(
-                f"{name} is {overlap}; a fraction from 0, below 1 is expected{percent}"
+                f"{name} is {overlap}; expected a fraction, 0 or more and below 1{percent}"
             )
     if pixel_on_ground is not None:
         if pixel is None:

@@ -300,7 +300,7 @@ def refine(
     """
     require_x64()
     if snooping not in TESTS:
-        raise InputError(f"snooping {snooping!r}; one of {', '.join(TESTS)} is expected")
+        raise InputError(f"snooping {snooping!r}; expected one of {', '.join(TESTS)}")
     images = list(images)
     points = with_frames(points, frames)
     check_input(images, points, observations, frames)

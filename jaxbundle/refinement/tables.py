@@ -122,7 +122,7 @@ def check_points_table(points: GroundPoints) -> None:
     for row, (id, role) in enumerate(zip(points.id, points.role)):
         if role not in ROLES:
             raise InputError(
-                f"{points.source(row)}: role {role!r}; one of {', '.join(ROLES)} is expected"
+                f"{points.source(row)}: role {role!r}; expected one of {', '.join(ROLES)}"
             )
         if id in seen:
             raise InputError(
@@ -208,7 +208,7 @@ def _check_on_image(
     raise InputError(
         f"{observations.source(row)}: point {points.id[observations.point[row]]!r} in image "
         f"{one.id!r}: {('line', 'pixel')[k]} {observations.xy[row, k]:g} is off the image, "
-        f"{which}; {low:g} to {high:g} is expected{hint}"
+        f"{which}; expected {low:g} to {high:g}{hint}"
     )
 
 

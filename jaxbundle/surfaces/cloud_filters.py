@@ -84,7 +84,7 @@ def drop_weak(
     if most_sigma is not None:
         limit = positive("greatest σ", most_sigma)
         if len(cloud) and not np.isfinite(cloud.sigma).any():
-            raise InputError("the cloud has no σ: columns sX, sY, sZ are expected")
+            raise InputError("the cloud has no σ: expected columns sX, sY, sZ")
         with np.errstate(invalid="ignore"):
             keep &= (cloud.sigma <= limit).all(1)
     if least_rays is not None:

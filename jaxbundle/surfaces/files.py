@@ -109,7 +109,7 @@ def make_cloud(
             raise InputError(f"{source.name}: {name} has {values.shape[1:]} values a point; one is")
         if (bad := (values < 0) | (values > limit)).any():
             row = int(bad.argmax())
-            raise InputError(f"{source(row)}: {name} is {values[row]:g}; {what} is expected")
+            raise InputError(f"{source(row)}: {name} is {values[row]:g}; expected {what}")
     # What the file does not have is one value for all points, without memory of its own.
     same = lambda value, shape, kind=float: np.broadcast_to(np.array(value, kind), shape)
     covariance = same(np.diag(np.full(3, np.nan)), (n, 3, 3))

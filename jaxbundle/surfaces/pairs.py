@@ -56,7 +56,7 @@ def parse_partners(pairs: Sequence[str], names: Sequence[str]) -> dict[int, list
     for text in pairs:
         parts = [part.strip() for part in text.split(",") if part.strip()]
         if len(parts) < 2:
-            raise InputError(f"--pairs {text!r}: BASE,OTHER[,OTHER…], names of images, is expected")
+            raise InputError(f"--pairs {text!r}: expected BASE,OTHER[,OTHER…], names of images")
         for part in parts:
             if part not in names:
                 raise InputError(

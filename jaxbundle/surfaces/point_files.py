@@ -60,9 +60,7 @@ def write_cloud(cloud: Cloud, path: str | Path) -> None:
         case ".dxf":
             _write_dxf(cloud, path)
         case suffix:
-            raise InputError(
-                f"{path}: suffix {suffix!r}; one of {', '.join(CLOUD_FILES)} is expected"
-            )
+            raise InputError(f"{path}: suffix {suffix!r}; expected one of {', '.join(CLOUD_FILES)}")
 
 
 def read_cloud(path: str | Path) -> Cloud:
@@ -76,7 +74,7 @@ def read_cloud(path: str | Path) -> Cloud:
                ".ply": _read_ply, ".las": _read_las, ".laz": _read_las}  # fmt: skip
     suffix = path.suffix.lower()
     if suffix not in readers:
-        raise InputError(f"{path}: suffix {suffix!r}; .csv, .ply, .las or .laz is expected")
+        raise InputError(f"{path}: suffix {suffix!r}; expected .csv, .ply, .las or .laz")
     return readers[suffix](path)
 
 
@@ -118,7 +116,7 @@ def _read_ply(path: Path) -> Cloud:
         rows = np.frombuffer(body, kinds, number)
         columns = {name: rows[name] for name in names}
     else:
-        raise InputError(f"{path}: format {form!r}; ascii, {', '.join(BYTE_ORDERS)} are expected")
+        raise InputError(f"{path}: format {form!r}; expected ascii, {', '.join(BYTE_ORDERS)}")
     with np.errstate(invalid="ignore"):  # signalling NaN, which are refused
         X = np.stack([columns[axis].astype(float) for axis in "xyz"], 1)
         colour = None

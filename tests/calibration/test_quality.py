@@ -234,7 +234,7 @@ def test_maps_that_cannot_be(sample):
     adjustment = sample[0].adjustment
     with pytest.raises(InputError, match="frame 'board': camera, rotation, scene"):
         uncertainty_map(adjustment, "cam", frame="board")
-    with pytest.raises(InputError, match="distance 0: a positive"):
+    with pytest.raises(InputError, match="distance 0: expected a positive"):
         uncertainty_map(adjustment, "cam", 0.0)
 
 

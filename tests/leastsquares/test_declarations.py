@@ -23,7 +23,7 @@ def adjusted(start=START, rows=ENDS, rise=RISE, free=(False, True, True), labels
     (dict(start=()), "the values must be arrays of rows"),
     (dict(free="yes"), "`free` must be truth values"),
     (dict(free=[[True, False]] * 3), r"`free` must be \[rows, 1\]"),
-    (dict(rows=([0, 1, 0],)), "rows of 2 tables are expected .height, height., not of 1"),
+    (dict(rows=([0, 1, 0],)), "expected rows of 2 tables .height, height., not of 1"),
     (dict(rows=([0, 1, 0.5], [1, 2, 2])), "row numbers or labels, not 0.5"),
     (dict(rows=([0, 1, 3], [1, 2, 2])), "observation 3 touches row 3 of table 'height'"),
     (dict(rows=(["A", "B", "A"], ["B", "C", "D"]), labels="ABC"), "there is no height 'D'"),

@@ -82,7 +82,7 @@ def rig_uncertainty(
     if frame not in FRAMES:
         raise InputError(f"frame {frame!r}: {', '.join(FRAMES)}")
     if not distance > 0:
-        raise InputError(f"distance {distance:g}: a positive distance is expected")
+        raise InputError(f"distance {distance:g}: expected a positive distance")
     k = _index(rig, name)
     given, space = rig.camera(name), rig.result.problem.table(rig.rig.row_of(k)[0]).vector
     model = get_model(given.model)

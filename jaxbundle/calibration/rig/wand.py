@@ -210,7 +210,7 @@ def calibrate_wand(
     if sigma_image is not None:
         positive("sigma_image", sigma_image)
     if not isinstance(markers, Mapping) or len(markers) < 2:
-        raise InputError("markers: those of two cameras at least are expected, by their names")
+        raise InputError("markers: expected those of two cameras at least, by their names")
     for name in markers:
         if name not in cameras:
             raise InputError(

@@ -62,7 +62,7 @@ class Wand:
     def __post_init__(self):
         positive("sigma_length", self.sigma_length)
         if not isinstance(self.markers, Mapping) or len(self.markers) < 2:
-            raise InputError("markers: those of two cameras at least are expected, by their names")
+            raise InputError("markers: expected those of two cameras at least, by their names")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -143,6 +143,6 @@ def _heights(text: str) -> tuple[float, float]:
     # nan is not below
     if not (low < high and abs(low) != float("inf") and high != float("inf")):
         raise InputError(
-            f"--heights {text!r}: two numbers, the lower first, are expected, such as 0:3000"
+            f"--heights {text!r}: expected two numbers, the lower first, such as 0:3000"
         )
     return low, high

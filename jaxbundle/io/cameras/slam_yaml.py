@@ -237,7 +237,7 @@ def _scaramuzza(path: Path, fields: JsonFields) -> Camera:
     unknown.check(fields.child(AFFINE).document, Keys(AFFINE_KEYS.values()), f"{path}, {AFFINE}")
     if a[1]:
         raise InputError(
-            f"{path}: {POLYNOMIAL}.p1 is {a[1]:g}; 0 is expected: rays have no cusp on the axis"
+            f"{path}: {POLYNOMIAL}.p1 is {a[1]:g}; expected 0: rays have no cusp on the axis"
         )
     parameters = {f"a{i}": -a[i] for i in (0, 2, 3, 4)}
     parameters |= {name: fields.number(f"{AFFINE}.{key}") for name, key in AFFINE_KEYS.items()}

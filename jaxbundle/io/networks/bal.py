@@ -175,7 +175,7 @@ def _counts(path: Path, first: Sequence[bytes]) -> tuple[int, ...]:
     """The numbers of cameras, points and observations in the first line."""
     if not _are_counts(first):
         raise InputError(
-            f"{path}, line 1: three whole numbers are expected: cameras, points, observations"
+            f"{path}, line 1: expected three whole numbers: cameras, points, observations"
         )
     # The largest size of a file is 2⁶³ − 1 bytes, a number of 19 digits.
     if max(map(len, first)) > 18:
@@ -217,7 +217,7 @@ def _numbers(path: Path) -> tuple[tuple[int, ...], Float[np.ndarray, " n"]]:
         raise _not_a_number(path, text) from None
     if len(numbers) != expected:
         raise InputError(
-            f"{path}: {len(numbers)} numbers follow the first line; {expected} are expected "
+            f"{path}: {len(numbers)} numbers follow the first line; expected {expected} "
             f"(4 for each of {rows} observations, 9 for each of {cameras} cameras, 3 for each of "
             f"{points} points)"
         )

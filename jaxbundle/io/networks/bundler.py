@@ -69,7 +69,7 @@ def read_bundler(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     rows = TextRows(path)
     head = rows.take(f"{HEAD!r}")
     if " ".join(head.words) != HEAD:
-        raise head.error(f"{HEAD!r} is expected; other versions are not known")
+        raise head.error(f"expected {HEAD!r}; other versions are not known")
     counts = rows.take("the numbers of cameras and points")
     cameras, points = (counts.integer(k, what) for k, what in ((0, "cameras"), (1, "points")))
     interior, R, t, places = _cameras(rows, cameras)

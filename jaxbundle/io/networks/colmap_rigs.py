@@ -108,7 +108,7 @@ class _Words:
 
     def word(self, what: str) -> str:
         if self.position >= len(self.row):
-            raise self.row.error(f"the line ends; {what} is expected")
+            raise self.row.error(f"the line ends; expected {what}")
         self.position += 1
         return self.row.words[self.position - 1]
 

@@ -87,7 +87,7 @@ def _images(path: Path) -> list[ColmapImage]:
         numbers = row.all_numbers("an image point") if parsed is None else parsed[k]
         if len(numbers) % 3:
             raise row.error(
-                f"{len(numbers)} numbers; X, Y, POINT3D_ID are expected for each image point"
+                f"{len(numbers)} numbers; expected X, Y, POINT3D_ID for each image point"
             )
         numbers = numbers.reshape(-1, 3)
         # Beyond 2⁵² floats are all whole: a number there has lost digits.

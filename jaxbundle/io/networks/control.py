@@ -78,7 +78,7 @@ def read_control(path: str | Path) -> Points:
     ]
     if not lines:
         raise InputError(
-            f"{path}: the file is empty; rows of {', '.join(BARE_COLUMNS[:4])} are expected"
+            f"{path}: the file is empty; expected rows of {', '.join(BARE_COLUMNS[:4])}"
         )
     separator = _separator(lines[0][1])
     try:
@@ -91,7 +91,7 @@ def read_control(path: str | Path) -> Points:
     elif len(rows[0]) not in (4, 7):
         raise InputError(
             f"{path}, line {lines[0][0]}: {len(rows[0])} columns without a header; "
-            f"{', '.join(BARE_COLUMNS[:4])}, or these and {', '.join(POINT_SIGMAS)}, are expected"
+            f"expected {', '.join(BARE_COLUMNS[:4])}, or these and {', '.join(POINT_SIGMAS)}"
             f"{_split_name(rows[0], separator)}"
         )
     header = header or BARE_COLUMNS[: len(rows[0])]
@@ -172,8 +172,8 @@ def _points(table: Columns) -> Points:
     sigma = np.stack([table.numbers(name, words=words) for name in POINT_SIGMAS], 1)
     for row, axis in np.argwhere(~(sigma > 0) & ~np.isnan(sigma))[:1]:
         raise InputError(
-            f"{table.source(row)}: {POINT_SIGMAS[axis]} is {show(sigma[row, axis])}; a positive "
-            "number is expected, or nothing for a point that is held"
+            f"{table.source(row)}: {POINT_SIGMAS[axis]} is {show(sigma[row, axis])}; expected a "
+            "positive number, or nothing for a point that is held"
         )
     return Points(ids, roles, position, sigma, table.source)
 

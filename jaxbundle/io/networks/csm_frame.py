@@ -146,8 +146,8 @@ def _support_data(path: Path) -> tuple[JsonFields, UnknownKeys]:
     isd = JsonFields(path, read_object(path, text, "an ISD"))
     if isd.get("name_model") not in (MODEL, PUSH_FRAME):
         raise InputError(
-            f"{path}: name_model is {show(isd.get('name_model'))}; {MODEL} or {PUSH_FRAME} is "
-            "expected: give the support data (ISD) of a frame or push-frame camera"
+            f"{path}: name_model is {show(isd.get('name_model'))}; expected {MODEL} or "
+            f"{PUSH_FRAME}: give the support data (ISD) of a frame or push-frame camera"
         )
     unknown.check(isd.document, KEYS, path)
     return isd, unknown
@@ -168,7 +168,7 @@ def _framelets(
     }
     for name, value in flags.items():
         if not isinstance(value, bool):
-            raise InputError(f"{isd.path}: {name} is {show(value)}; true or false is expected")
+            raise InputError(f"{isd.path}: {name} is {show(value)}; expected true or false")
     if flags["framelets_flipped"]:
         raise InputError(
             f"{isd.path}: framelets_flipped: the lines of every framelet are in reverse order, a "
@@ -185,7 +185,7 @@ def _framelets(
         raise InputError(f"{isd.path}: {lines} lines are less than a framelet of {height}")
     delay = isd.number("interframe_delay")
     if not delay > 0:
-        raise InputError(f"{isd.path}: interframe_delay is {delay:g}; seconds above 0 are expected")
+        raise InputError(f"{isd.path}: interframe_delay is {delay:g}; expected seconds above 0")
     k = np.arange(number)
     k = k[::-1] if flags["framelet_order_reversed"] else k
     first = isd.number("starting_ephemeris_time") + isd.number("exposure_duration") / 2
@@ -248,7 +248,7 @@ def _focal_plane(isd: JsonFields) -> FocalPlane:
 def _camera(id: str, isd: JsonFields, plane: FocalPlane) -> Camera:
     kinds = isd.get("optical_distortion", {"radial": {"coefficients": [0.0]}})
     if not isinstance(kinds, dict) or len(kinds) != 1:
-        raise InputError(f"{isd.path}: optical_distortion {show(kinds)}; one kind is expected")
+        raise InputError(f"{isd.path}: optical_distortion {show(kinds)}; expected one kind")
     (kind,) = kinds
     where = f"optical_distortion.{kind}"
     numbers = lambda n: isd.array(f"{where}.coefficients", (n,))
@@ -288,8 +288,8 @@ def _camera(id: str, isd: JsonFields, plane: FocalPlane) -> Camera:
             why = "has the distortion transverse"
             return _fit(id, isd, plane, focal, image_of_transverse, p, why)
     raise InputError(
-        f"{isd.path}: optical_distortion {show(kind)} of a frame camera is not supported; radial, "
-        "transverse, radtan, dawnfc or cahvor is expected"
+        f"{isd.path}: optical_distortion {show(kind)} of a frame camera is not supported; "
+        "expected radial, transverse, radtan, dawnfc or cahvor"
     )
 
 

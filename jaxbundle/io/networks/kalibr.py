@@ -216,8 +216,8 @@ def _camera(id: str, fields: JsonFields) -> Camera:
     if kind not in READ_MODELS:
         known = ", ".join("-".join(names) for names in READ_MODELS)
         raise InputError(
-            f"{fields.path}: camera_model {kind[0]} with distortion_model {kind[1]}; one of "
-            f"{known} is expected"
+            f"{fields.path}: camera_model {kind[0]} with distortion_model {kind[1]}; expected one "
+            f"of {known}"
         )
     model, core, coefficients = READ_MODELS[kind]
     values = fields.array("intrinsics", (len(core),))

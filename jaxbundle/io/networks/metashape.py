@@ -219,7 +219,7 @@ def _chunk(path: Path, unknown: UnknownKeys) -> ChunkArchive:
         chunks = root.findall("chunk")
         if root.tag != "document" or len(chunks) != 1:
             raise InputError(
-                f"{path}: one <chunk> in a <document> is expected; there are {len(chunks)}"
+                f"{path}: expected one <chunk> in a <document>; there are {len(chunks)}"
             )
         unknown.check_element(root, DOCUMENT_KEYS, path)
         found = ChunkArchive(chunks[0])

@@ -89,7 +89,7 @@ def read_archive(path: Path) -> ChunkArchive:
     # Its frames are changed below.
     chunk = copy.deepcopy(document_of(archive, _members(archive, path), PROJECT))
     if chunk.tag != "chunk":
-        raise InputError(f"{archive}: <chunk> is expected in its doc.xml, not <{chunk.tag}>")
+        raise InputError(f"{archive}: expected <chunk> in its doc.xml, got <{chunk.tag}>")
     frames = chunk.findall("frames/frame")
     if len(frames) > 1:
         told.append(f"the first of {len(frames)} frames is read")

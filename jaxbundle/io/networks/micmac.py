@@ -132,7 +132,7 @@ def _pose(xml: XmlFields) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "
         ("KnownConv", convention, (*M2C, *C2M)),
     ):
         if value not in known:
-            raise InputError(f"{xml.path}: {name} is {value}; {', '.join(known)} is expected")
+            raise InputError(f"{xml.path}: {name} is {value}; expected {', '.join(known)}")
     if xml.find("OrIntImaM2C") is not None:
         for name, wanted in IDENTITY.items():
             if tuple(xml.numbers(f"OrIntImaM2C/{name}", 2)) != wanted:

@@ -131,7 +131,7 @@ def _calibrated(path: Path, xml: XmlFields, id: str, pixel_size: float) -> Camer
     direction = xml.text("KnownConv", M2C[0])
     if direction not in (*M2C, *C2M):
         known = ", ".join((*M2C, *C2M))
-        raise InputError(f"{path}: KnownConv is {direction}; one of {known} is expected")
+        raise InputError(f"{path}: KnownConv is {direction}; expected one of {known}")
     if xml.find("OrIntGlob") is not None:
         raise InputError(f"{path}: OrIntGlob, a separate affine part, is not supported")
     f, (cx, cy), (w, h) = xml.number("F"), xml.numbers("PP", 2), xml.numbers("SzIm", 2)
@@ -142,7 +142,7 @@ def _calibrated(path: Path, xml: XmlFields, id: str, pixel_size: float) -> Camer
     if [kind.tag for kind in kinds if kind.tag != "ModNoDist"] == ["ModUnif"]:
         if direction in C2M:
             raise InputError(
-                f"{path}: ModUnif with KnownConv {direction} is not supported; {M2C[0]} is expected"
+                f"{path}: ModUnif with KnownConv {direction} is not supported; expected {M2C[0]}"
             )
         unified = next(kind for kind in kinds if kind.tag == "ModUnif")
         return unified_camera(id, xml, unified, core, (int(w), int(h)), pixel_size)
@@ -201,7 +201,7 @@ def _distortion(xml: XmlFields, core: Mapping[str, float]) -> dict[str, float]:
             name = kind.findtext("TypeModele", "").strip()
             raise InputError(
                 f"{xml.path}: CalibDistortion {kind.tag} {name}".rstrip()
-                + f" of {len(kinds)}; one of ModNoDist, ModRad, ModPhgrStd, ModUnif is expected"
+                + f" of {len(kinds)}; expected one of ModNoDist, ModRad, ModPhgrStd, ModUnif"
             )
     if not kinds:
         return none | {"x": core["cx"], "y": core["cy"]}

@@ -54,9 +54,8 @@ def unified_camera(
     )
     if kind not in FORMULAS:
         raise InputError(
-            f"{xml.path}: ModUnif {kind or 'without TypeModele'} is not supported; "
-            f"one of {', '.join(FORMULAS)} is expected: calibrate again with one of "
-            "them, or with Fraser"
+            f"{xml.path}: ModUnif {kind or 'without TypeModele'} is not supported; expected one "
+            f"of {', '.join(FORMULAS)}: calibrate again with one of them, or with Fraser"
         )
     formula, states, most = FORMULAS[kind]
     if len(S) < states:

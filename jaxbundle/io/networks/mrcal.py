@@ -138,7 +138,7 @@ def _fields(file: Path) -> JsonFields:
     except (ValueError, SyntaxError, MemoryError, RecursionError, TypeError):
         document = None
     if not isinstance(document, dict) or not all(isinstance(key, str) for key in document):
-        raise InputError(f"{file}: a dictionary of Python, {{'lensmodel': …, …}}, is expected")
+        raise InputError(f"{file}: expected a Python dictionary, {{'lensmodel': …, …}}")
     return JsonFields(
         file,
         {

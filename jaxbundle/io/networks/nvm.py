@@ -101,7 +101,7 @@ def _network(path: Path, model: _Model, overrides: Sequence[str], told: Sequence
         # A name may have blanks; ten numbers follow it.
         names.append(" ".join(row.words[:-10]) if len(row) > 10 else "")
         if not names[-1]:
-            raise row.error(f"{len(row)} values; a name and {', '.join(NUMBERS)}, 0 are expected")
+            raise row.error(f"{len(row)} values; expected a name and {', '.join(NUMBERS)}, 0")
         numbers = row.numbers((*NUMBERS, "0"), len(row) - 10)
         if numbers[-1] != 0:
             raise row.error(
@@ -111,9 +111,7 @@ def _network(path: Path, model: _Model, overrides: Sequence[str], told: Sequence
         values.append(numbers[:-1])
         lines.append(row.number)
         if not values[-1][0] > 0 or not values[-1][1:5].any():
-            raise row.error(
-                f"f is {values[-1][0]:g}; a positive number and a rotation are expected"
-            )
+            raise row.error(f"f is {values[-1][0]:g}; expected a positive number and a rotation")
     names = unique_labels(names, range(len(names)))
     p = np.array(values)
     M = flip_rows(matrices_of_quaternions(p[:, 1:5]))

@@ -243,8 +243,8 @@ def _cameras(scene: JsonFields) -> tuple[dict[int, dict[str, Any]], dict[int, Js
             continue
         if name not in KINDS:
             raise InputError(
-                f"{value.path}: the kind of camera is {name or 'not named'}; one of "
-                f"{', '.join((*KINDS, SPHERICAL))} is expected"
+                f"{value.path}: the kind of camera is {name or 'not named'}; expected one of "
+                f"{', '.join((*KINDS, SPHERICAL))}"
             )
         model, field, coefficients = KINDS[name]
         data = _data(value)

@@ -322,7 +322,7 @@ def _camera(id: str, fields: JsonFields) -> Camera:
         return Camera(id, "equirectangular", {"fx": f, "fy": f} | middle, image_size=size)
     if kind not in (*KINDS, *FITTED_KINDS):
         known = ", ".join((*KINDS, *FITTED_KINDS, *SPHERICAL))
-        raise InputError(f"{fields.path}: projection_type is {kind}; one of {known} is expected")
+        raise InputError(f"{fields.path}: projection_type is {kind}; expected one of {known}")
     single = kind in ("perspective", "fisheye", "dual")  # one focal length, centred
     f = [
         max(size) * fields.number(name)
@@ -428,7 +428,7 @@ def _tracks(
                 raise row.error(f"tracks of version {version[:20]}; 0, 1, 2 and 3 are known")
             continue
         if len(row) < 5:
-            raise row.error(f"{len(row)} columns; image, track, feature, x, y, … are expected")
+            raise row.error(f"{len(row)} columns; expected image, track, feature, x, y, …")
         image, point = row.words[:2]
         # Of a photograph without orientation, or of a camera that was refused.
         if image not in shots:

@@ -183,7 +183,7 @@ def _place(path: Path, uri: str) -> Path:
     # A project from the network would be read from anywhere.
     parts = urlparse(uri)
     if parts.scheme not in ("", "file"):
-        raise InputError(f"{path}: {uri!r}: a file beside the project is expected")
+        raise InputError(f"{path}: {uri!r}: expected a file beside the project")
     return path.parent / unquote(parts.path)
 
 
@@ -192,7 +192,7 @@ def _id(row: JsonFields, key: str) -> str:
     # Not `integer`, which a float beyond 2⁵³ would not reach: identifiers have 64 bits.
     value = row.get(key)
     if isinstance(value, bool) or not isinstance(value, int):
-        said = "missing" if value is None else f"{value!r}; a whole number is expected"
+        said = "missing" if value is None else f"{value!r}; expected a whole number"
         raise InputError(f"{row.path}: {key} is {said}")
     return str(value)
 
@@ -239,7 +239,7 @@ def _camera(
         R = internals.array("radial_distortion", (3,))
         T = internals.array("tangential_distortion", (2,))
         if not f > 0:
-            raise InputError(f"{internals.path}: focal_length_px is {f:g}; above 0 is expected")
+            raise InputError(f"{internals.path}: focal_length_px is {f:g}; expected a positive one")
         core = {"fx": f, "fy": f, "cx": float(cx), "cy": float(cy)}
         terms = dict(zip(("k1", "k2", "k3", "p1", "p2"), map(float, (*R, *T))))
         return {"model": "opencv", "tie": [["fx", "fy"]], **core, **terms}, ""

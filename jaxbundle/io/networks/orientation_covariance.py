@@ -121,5 +121,5 @@ def _number(where: str, name: str, text: str) -> float:
     # 1e-9: a correlation of 1 may be rounded above it
     if not np.isfinite(value) or (value <= 0 if name == "sigma" else abs(value) > 1 + 1e-9):
         what = "a σ above 0" if name == "sigma" else "a correlation"
-        raise InputError(f"{where}: {name} is {text!r}; {what} is expected")
+        raise InputError(f"{where}: {name} is {text!r}; expected {what}")
     return value

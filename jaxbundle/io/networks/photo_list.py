@@ -216,7 +216,7 @@ class _Parser:
             number = None
         # float() reads 1_0 as ten
         if number is None or "_" in word or (finite and not math.isfinite(number)):
-            raise self._error(line, f"{what} is {word!r}; a number is expected")
+            raise self._error(line, f"{what} is {word!r}; expected a number")
         return number
 
     def _more(self) -> bool:

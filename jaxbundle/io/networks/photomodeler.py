@@ -210,7 +210,7 @@ def _read_numbered(rows: TextRows, number: int, what: str) -> TextRow:
     row = _take(rows, f"{what} of photograph {number}")
     # A line that was lost would shift all values after it.
     if row.integer(0, f"the number of the photograph before {what}") != number:
-        raise row.error(f"{what} of photograph {number} is expected, not of {row.words[0]}")
+        raise row.error(f"expected {what} of photograph {number}, not of {row.words[0]}")
     return row
 
 

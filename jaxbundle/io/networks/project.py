@@ -187,7 +187,7 @@ def _read_table(document: Document, table: str, path: Path) -> Columns | None:
             f"[[{INLINE[table]}]] entries"
         )
     if not isinstance(file, str):
-        raise InputError(f"{path}, [project]: {table} is {file!r}; the name of a file is expected")
+        raise InputError(f"{path}, [project]: {table} is {file!r}; expected the name of a file")
     check_plain(path.parent / file)
     if not os.path.isfile(path.parent / file):
         raise InputError(

@@ -170,7 +170,7 @@ def _camera(id: str, row: Row) -> Camera:
     side = max(w, h)
     f = p["f"] * side / SMALL_FORMAT[0]
     if not f > 0:
-        raise InputError(f"{row.where}: the focal length is {p['f']:g}; above 0 is expected")
+        raise InputError(f"{row.where}: the focal length is {p['f']:g}; expected a number above 0")
     core = {"fx": f, "fy": f}
     core |= {"cx": w / 2 + p["px"] * side - PIXEL_CENTRE}
     core |= {"cy": h / 2 + p["py"] * side - PIXEL_CENTRE}
@@ -234,7 +234,7 @@ def _fields(path: Path) -> dict[str, str]:
 def _numbers(path: Path, fields: Mapping[str, str], key: str, n: int) -> np.ndarray:
     words = fields[key].split()
     if len(words) != n:
-        raise InputError(f"{path}: {key} has {len(words)} numbers; {n} are expected")
+        raise InputError(f"{path}: {key} has {len(words)} numbers; expected {n}")
     return np.array([number_in(word, f"{path}: {key}") for word in words])
 
 
@@ -249,7 +249,7 @@ def _interior(path: Path, fields: Mapping[str, str]) -> dict[str, float]:
         )
     number = lambda key, default: number_in(fields.get(key, default), f"{path}: {key}")
     if number("Skew", "0") != 0 or number("AspectRatio", "1") != 1:
-        raise InputError(f"{path}: Skew and AspectRatio are not read; 0 and 1 are expected")
+        raise InputError(f"{path}: Skew and AspectRatio are not read; expected 0 and 1")
     # The six coefficients are there for every model, those it does not have as 0.
     k = np.zeros(6)
     if model != "perspective" and "DistortionCoeficients" in fields:

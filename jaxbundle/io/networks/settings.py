@@ -123,7 +123,7 @@ def _override_section(document: Document, key: str, text: str) -> None:
     for section in sections:
         settings = settings.setdefault(section, {})
         if not isinstance(settings, dict):
-            raise InputError(f"--set {key}: {section} is {show(settings)}; a table is expected")
+            raise InputError(f"--set {key}: {section} is {show(settings)}; expected a table")
     words = _words(text)
     try:
         values = [float(word) for word in words]
@@ -166,7 +166,7 @@ def check_project_settings(project: Mapping[str, Any], where: str) -> None:
     for key, value in project.items():
         refuse_unknown(key, (*SETTINGS, *TABLES), where)
         if key in (*TEXT, *TABLES) and not isinstance(value, str):
-            raise InputError(f"{where}{key} is {value!r}; text in quotes is expected")
+            raise InputError(f"{where}{key} is {value!r}; expected text in quotes")
         if key in CHOICES:
             check_choice(key, value, CHOICES[key], where)
     check_sigma_image(project.get("sigma_image", 1.0), where)

@@ -146,7 +146,7 @@ def _pairs(network: Network, what: str) -> list[StereoPair]:
     mountings = mountings_of(network)
     if mountings is None:
         raise InputError(
-            f"{what} holds the mounting of two cameras; a rig, or one image of each, is expected"
+            f"{what} holds the mounting of two cameras; expected a rig, or one image of each"
         )
     names, T, pairs = _file_names(cameras), np.eye(4), []
     for camera, name, step in zip(cameras[1:], names[1:], mountings):

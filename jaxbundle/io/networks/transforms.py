@@ -144,7 +144,7 @@ def read_transforms(
             continue
         T = frame.array("transform_matrix", (None, 4))
         if len(T) not in (3, 4):
-            raise InputError(f"{frame.path}: transform_matrix has {len(T)} rows; 4 are expected")
+            raise InputError(f"{frame.path}: transform_matrix has {len(T)} rows; expected 4")
         check_rotations(T[:3, :3], f"{frame.path}: transform_matrix")
         names.append(name)
         used.append(cameras[key].id)

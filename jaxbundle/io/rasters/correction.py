@@ -184,9 +184,9 @@ class _SourcePixels:
         dtype = np.dtype(raster.dtypes[0])
         if dtype.kind not in "uif" or len(set(raster.dtypes)) > 1:
             raise InputError(
-                f"{path}: bands of {', '.join(dict.fromkeys(raster.dtypes))}; all of one type, of "
-                "whole or floating point numbers, are expected: convert them with gdal_translate "
-                "-ot, or correct each band alone"
+                f"{path}: bands of {', '.join(dict.fromkeys(raster.dtypes))}; expected all of one "
+                "type, of whole or floating point numbers: convert them with gdal_translate -ot, "
+                "or correct each band alone"
             )
         flags = raster.mask_flag_enums
         values = set(raster.nodatavals)

@@ -129,7 +129,7 @@ def check_crs(crs: str) -> int | None:
         return None
     found = re.fullmatch(r"(?i)epsg:(\d{4,6})", crs.strip())
     if found is None:
-        raise InputError(f"crs {crs!r}: EPSG:NUMBER is expected, such as EPSG:25832")
+        raise InputError(f"crs {crs!r}: expected EPSG:NUMBER, such as EPSG:25832")
     return int(found[1])
 
 

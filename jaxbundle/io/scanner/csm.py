@@ -134,7 +134,7 @@ def _read_support_data(path: Path, unknown: UnknownKeys) -> tuple[JsonFields, in
     # A state has the name of its model before the braces.
     if name and brace and name.replace("_", "").isalnum():
         if name != MODEL:
-            raise InputError(f"{path}: a model state of {show(name)}; {MODEL} is expected")
+            raise InputError(f"{path}: a model state of {show(name)}; expected {MODEL}")
         text = text[text.index("{") : text.rfind("}") + 1 or len(text)]
     isd, order = (
         JsonFields(path, read_object(path, text, "an ISD or a model state")),
@@ -153,7 +153,7 @@ def _read_support_data(path: Path, unknown: UnknownKeys) -> tuple[JsonFields, in
     if model != MODEL:
         kind = FRAME_MODELS.get(str(model))
         hint = "" if kind is None else f" (`jaxbundle convert` reads it as {kind})"
-        raise InputError(f"{path}: name_model is {show(model)}{hint}; {MODEL} is expected")
+        raise InputError(f"{path}: name_model is {show(model)}{hint}; expected {MODEL}")
     unknown.check(isd.document, KEYS, path)
     return isd, order
 

@@ -30,9 +30,7 @@ def optics_of(
     """
     f = isd.number("focal_length_model.focal_length")
     if f == 0:
-        raise InputError(
-            f"{isd.path}: focal_length_model.focal_length is 0; millimetres are expected"
-        )
+        raise InputError(f"{isd.path}: focal_length_model.focal_length is 0; expected millimetres")
     x, y = _focal_plane(isd, np.arange(pixels))
     kind, undistorted = _distortion(isd, x, y)
     sights = np.stack([x / f, y / f])
@@ -80,7 +78,7 @@ def _distortion(
     if isinstance(kinds, dict) and len(kinds) > 1:
         raise InputError(
             f"{isd.path}: optical_distortion has {len(kinds)} kinds ({list_some(kinds)}); "
-            "one is expected"
+            "expected one"
         )
     where = f"optical_distortion.{kind}"
     coefficients = lambda n: isd.array(f"{where}.coefficients", (n,))
@@ -107,7 +105,7 @@ def _distortion(
             return kind, _transverse(isd, a, b, x, y)
     known = f"{', '.join(DISTORTIONS[:-1])} or {DISTORTIONS[-1]}"
     raise InputError(
-        f"{isd.path}: optical_distortion {show(kind)} is not supported; {known} is expected"
+        f"{isd.path}: optical_distortion {show(kind)} is not supported; expected {known}"
     )
 
 

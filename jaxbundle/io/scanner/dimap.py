@@ -65,7 +65,7 @@ def read_dimap(file: XmlFields) -> ScannerInput:
     centre = file.number(f"{setting}SCENE_CENTER_LINE") - 1
     epoch = file.time(f"{setting}SCENE_CENTER_TIME")
     if period <= 0:
-        raise InputError(f"{path}: LINE_PERIOD is {period:g} s; a positive number is expected")
+        raise InputError(f"{path}: LINE_PERIOD is {period:g} s; expected a positive number")
     times = LineTimes(jnp.asarray(-period * centre), jnp.asarray(period))
 
     key = "Ephemeris/Points/Point"

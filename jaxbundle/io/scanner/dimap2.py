@@ -182,8 +182,8 @@ def _period(file: XmlFields, names: Names, lines: int, epoch: np.datetime64) -> 
         return known[0] * period
     name = names.period.rpartition("/")[2]
     raise InputError(
-        f"{file.path}: {name} is {period:g} and START to END {span:g} s for {lines} lines; a "
-        "period in seconds, milliseconds or microseconds that fits is expected"
+        f"{file.path}: {name} is {period:g} and START to END {span:g} s for {lines} lines; "
+        "expected a period in seconds, milliseconds or microseconds that fits"
     )
 
 
@@ -193,7 +193,7 @@ def _read_location(file: XmlFields, name: str, element: ET.Element, k: int) -> l
     _unit(file, element.find(name), {"m": 1.0})
     words = element.findtext(name, "").replace(",", " ").split()
     if len(words) != 3:
-        raise InputError(f"{where} has {len(words)} numbers; 3 are expected")
+        raise InputError(f"{where} has {len(words)} numbers; expected 3")
     return [number_in(word, where) for word in words]
 
 

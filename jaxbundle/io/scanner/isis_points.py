@@ -254,9 +254,7 @@ def _statements(path: Path) -> Iterator[_Entry]:
             if match is None and line.upper() in ("END_OBJECT", "END_GROUP"):
                 match = re.match(r"(\w+)(.*)$", line)
             if match is None:
-                raise InputError(
-                    f"{path}, line {number}: {show(line[:60])}; NAME = value is expected"
-                )
+                raise InputError(f"{path}, line {number}: {show(line[:60])}; expected NAME = value")
             name, value, first = match[1].upper(), match[2].strip(), number
         open_list = value.startswith("(") and ")" not in value
         open_text = value.count('"') % 2 == 1
@@ -286,7 +284,7 @@ def _length(path: Path, fields: Fields, name: str) -> float:
         unit = fields[name].value.partition("<")[2].rstrip("> ").lower()
         if unit not in METRES:
             line = fields[name].line
-            raise InputError(f"{path}, line {line}: {name} in {show(unit)}; meters are expected")
+            raise InputError(f"{path}, line {line}: {name} in {show(unit)}; expected meters")
         value *= METRES[unit]
     return value
 
@@ -300,8 +298,8 @@ def _point(path: Path, fields: Fields) -> tuple[str, str, np.ndarray, np.ndarray
     role = ROLES.get(kind.value.lower())
     if role is None:
         raise InputError(
-            f"{path}, line {kind.line}: PointType {show(kind.value)}; Free, Fixed or Constrained "
-            "is expected"
+            f"{path}, line {kind.line}: PointType {show(kind.value)}; expected Free, Fixed or "
+            "Constrained"
         )
     X = np.full(3, np.nan)
     # What a network knew before it was adjusted is the observation.
@@ -331,9 +329,7 @@ def _covariance(path: Path, fields: Fields, id: _Entry) -> Float[np.ndarray, "3 
     where = f"{path}, line {entry.line}: AprioriCovarianceMatrix"
     words = re.sub(r"<[^>]*>|[()]", " ", entry.value).replace(",", " ").split()
     if len(words) != 6:
-        raise InputError(
-            f"{where} has {len(words)} numbers; six of its upper triangle are expected"
-        )
+        raise InputError(f"{where} has {len(words)} numbers; expected six of its upper triangle")
     C = np.zeros((3, 3))
     C[np.triu_indices(3)] = [number_in(word, where) for word in words]
     C = C + np.triu(C, 1).T

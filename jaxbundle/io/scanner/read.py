@@ -68,7 +68,7 @@ def _read_source(file: TomlFile, scanner: TomlSection) -> ScannerInput:
     automatic = scanner.text("corrections", "") if "corrections" in scanner else None
     if automatic not in (None, "auto"):
         raise InputError(
-            f'{scanner.where}corrections = {show(automatic)}; "auto" is expected, or the section '
+            f'{scanner.where}corrections = {show(automatic)}; expected "auto", or the section '
             "[corrections] with light_time, aberration, refraction"
         )
     for name in file.document:
@@ -86,7 +86,7 @@ def _read_source(file: TomlFile, scanner: TomlSection) -> ScannerInput:
         )
     seconds = scanner.number("extrapolate") if "extrapolate" in scanner else None
     if seconds is not None and seconds < 0:
-        raise InputError(f"{scanner.where}extrapolate is {seconds:g}; seconds are expected")
+        raise InputError(f"{scanner.where}extrapolate is {seconds:g}; expected seconds")
     product = _read_product(source, choice, seconds)
     switches = file.section("corrections")
     switched = {name: switches.switch(name) for name in switches.values}
@@ -149,6 +149,6 @@ def _read_xml(path: Path) -> ScannerInput:
     if has("GEO") and has("EPH") and has("ATT"):
         return read_worldview(XmlFields(path, root, WORLDVIEW))
     raise InputError(
-        f"{path}: XML of another kind, <{root.tag[:60]}>; DIMAP of SPOT 5, Pléiades, SPOT 6 or 7, "
-        "or DigitalGlobe's with the groups GEO, EPH, ATT is expected"
+        f"{path}: XML of another kind, <{root.tag[:60]}>; expected DIMAP of SPOT 5, Pléiades, "
+        "SPOT 6 or 7, or DigitalGlobe's with the groups GEO, EPH, ATT"
     )

@@ -161,7 +161,7 @@ def read_refinement(path: str | Path) -> RefineFile:
     significance = section.number("significance", 0.001)
     if not 0 < significance < 1:
         raise InputError(
-            f"{section.where}significance is {significance}; a number between 0 and 1 is expected"
+            f"{section.where}significance is {significance}; expected a number between 0 and 1"
         )
     rpc_format = section.text("rpc_format", "text")
     if rpc_format not in RPC_ENDINGS:
@@ -187,7 +187,7 @@ def _wants_states(section: TomlSection, images: Sequence[AnyScannerImage]) -> bo
     """Whether rigorous images are written as model states."""
     wanted = section.values.get("csm_states", False)
     if not isinstance(wanted, bool):
-        raise InputError(f"{section.where}csm_states is {wanted!r}; true or false is expected")
+        raise InputError(f"{section.where}csm_states is {wanted!r}; expected true or false")
     local = [one.id for one in images if isinstance(one, ScannerImage) and one.earth is None]
     if wanted and local:
         raise InputError(
@@ -211,7 +211,7 @@ def _read_terrain(section: TomlSection, images: Sequence[AnyScannerImage]) -> He
         )
     if "dem_sigma" not in section:
         raise InputError(
-            f"{section.where}dem_sigma is missing; the σ of a height of {path.name} is expected, "
+            f"{section.where}dem_sigma is missing; expected the σ of a height of {path.name}, "
             "metres: the LE90 of its producer, divided by 1.645"
         )
     sigma = section.number("dem_sigma")

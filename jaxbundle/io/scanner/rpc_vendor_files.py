@@ -157,7 +157,7 @@ def from_geom(path: Path, text: str) -> dict[str, Any]:
 def number_of(path: Path, found: dict[str, tuple[str, int]], name: str) -> float:
     """The number of a keyword."""
     if name not in found:
-        raise InputError(f"{path}: {name} is missing; a keyword list of an OSSIM RPC is expected")
+        raise InputError(f"{path}: {name} is missing; expected a keyword list of an OSSIM RPC")
     value, line = found[name]
     return number_in(value, f"{path}, line {line}: {name}")
 

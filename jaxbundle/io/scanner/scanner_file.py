@@ -166,8 +166,8 @@ def _options(section: TomlSection, method: str) -> dict[str, Any]:
         options["gap"] = section.number("gap")
         if options["gap"] <= 0:
             raise InputError(
-                f"{section.where}gap is {options['gap']:g}; the longest step that is "
-                "interpolated, in seconds, is expected, a positive number"
+                f"{section.where}gap is {options['gap']:g}; expected the longest step that "
+                "is interpolated, a positive number of seconds"
             )
     if "extrapolate" in section:
         options["extrapolate"] = section.number("extrapolate")
@@ -191,7 +191,7 @@ def earth_of(scanner: TomlSection) -> Ellipsoid | None:
         return Ellipsoid(*axes.tolist())
     if value not in ("WGS84", "local"):
         raise InputError(
-            f'{scanner.where}earth is {show(value)}; "WGS84", "local" or [a, b, c] is expected'
+            f'{scanner.where}earth is {show(value)}; expected "WGS84", "local" or [a, b, c]'
         )
     return WGS84 if value == "WGS84" else None
 
@@ -201,7 +201,7 @@ def _times(file: TomlFile, lines: int) -> LineTimes:
     if "table" not in section:
         period = section.number("period")
         if period <= 0:
-            raise InputError(f"{section.where}period is {period}; a positive number is expected")
+            raise InputError(f"{section.where}period is {period}; expected a positive number")
         return LineTimes(jnp.asarray(section.number("first", 0.0)), jnp.asarray(period))
     columns = section.table()
     columns.check_names(("t",), ("line",))
@@ -211,7 +211,7 @@ def _times(file: TomlFile, lines: int) -> LineTimes:
         raise InputError(f"{section.where}table: one line has no period; give first and period")
     if len(t) != lines:
         raise InputError(
-            f"{columns.source.name}: {len(t)} times for {lines} lines; one row a line is expected"
+            f"{columns.source.name}: {len(t)} times for {lines} lines; expected one row a line"
         )
     return LineTimes(jnp.zeros(()), jnp.zeros(()), jnp.asarray(t))
 
@@ -276,14 +276,14 @@ def _orbit(
     most = 1_000_000  # 50 MB of states: more is a mistake in the span or the step
     if not (step > 0 and 0 < (end - start) / step <= most):
         raise InputError(
-            f"{section.where}span from {start:g} to {end:g} s in steps of {step:g} s; 1 to "
-            f"{most} steps forward are expected"
+            f"{section.where}span from {start:g} to {end:g} s in steps of {step:g} s; expected 1 "
+            f"to {most} steps forward"
         )
     t = np.arange(start, end, step)
     if kind == "tle":
         lines = section.values["tle"]
         if not (isinstance(lines, list) and len(lines) == 2):
-            raise InputError(f"{section.where}tle: a list of the two lines is expected")
+            raise InputError(f"{section.where}tle: expected a list of the two lines")
         first, second = lines
         P, V = frames.two_line_orbit(first, second, _epoch(file), t, _orientation(file))
     elif kind == "state":

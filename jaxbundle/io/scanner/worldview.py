@@ -226,7 +226,7 @@ def _numbers(file: XmlFields, element: ET.Element, name: str, used: int) -> list
     """The first numbers of an element with more numbers."""
     words = (element.text or "").replace(",", " ").split()
     if len(words) < used:
-        raise InputError(f"{file.path}: {name} has {len(words)} numbers; {used} are expected")
+        raise InputError(f"{file.path}: {name} has {len(words)} numbers; expected {used}")
     return [number_in(word, f"{file.path}: {name}") for word in words[:used]]
 
 

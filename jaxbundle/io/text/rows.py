@@ -148,7 +148,7 @@ class TextRow:
         digits = word.removeprefix("-")
         # 18 digits fit in 64 bits; isascii, because digits of other scripts count as digits
         if not (digits.isascii() and digits.isdigit() and len(digits) < 19) or int(word) < least:
-            raise self.error(f"{what} is {show(word)}; a whole number from {least} is expected")
+            raise self.error(f"{what} is {show(word)}; expected a whole number from {least}")
         return int(word)
 
     def rays(self, k: int, thing: str, images: int, image: str) -> Float[np.ndarray, "n 4"]:
@@ -172,7 +172,7 @@ class TextRow:
         except ValueError:
             number = math.nan
         if not math.isfinite(number) or "_" in word:
-            raise self.error(f"{what} is {show(word)}; a number is expected")
+            raise self.error(f"{what} is {show(word)}; expected a number")
         return number
 
 
@@ -217,7 +217,7 @@ class TextRows:
         """
         if not self.more():
             last = self.lines[-1][0] if self.lines else 0
-            raise InputError(f"{self.path}: the file ends after line {last}; {what} is expected")
+            raise InputError(f"{self.path}: the file ends after line {last}; expected {what}")
         number, text = self.lines[self.position]
         self.position += 1
         return TextRow(self.path, number, text, self.separator)

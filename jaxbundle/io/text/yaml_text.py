@@ -47,9 +47,9 @@ def parse_yaml(path: str | Path, text: str) -> dict[str, Any]:
     """
     document = parse_document(path, text)
     if document is None:
-        raise InputError(f"{path}: the file is empty; keys and values are expected")
+        raise InputError(f"{path}: the file is empty; expected keys and values")
     if not isinstance(document, dict):
-        raise InputError(f"{path}: keys and values are expected")
+        raise InputError(f"{path}: expected keys and values")
     return document
 
 

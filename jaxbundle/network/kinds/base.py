@@ -185,9 +185,7 @@ class SingleValues(ObservationTable):
         )
         for row, objects in enumerate(zip(*(getattr(made, field) for field in cls.POINTS))):
             if len({*objects}) < len(objects):
-                raise InputError(
-                    f"{table.source(row)}: {len(objects)} different points are expected"
-                )
+                raise InputError(f"{table.source(row)}: expected {len(objects)} different points")
         made.check_values(radians)
         return made
 
@@ -239,7 +237,7 @@ def positive_sigma(
 def check_settings(section: str, given: Mapping[str, Any], known: Sequence[str]) -> None:
     """Refuse settings of a section that are not known."""
     if not isinstance(given, Mapping):
-        raise InputError(f"[{section}]: a section of settings is expected, not {show(given)}")
+        raise InputError(f"[{section}]: expected a section of settings, got {show(given)}")
     for key in given:
         refuse_unknown(key, known, f"[{section}]: ")
 
@@ -253,7 +251,7 @@ def numbers(section: str, key: str, value: Any, length: int) -> Float[np.ndarray
     except (TypeError, ValueError):
         found = np.zeros(0)
     if found.shape != (length,) or not np.isfinite(found).all():
-        raise InputError(f"[{section}]: {key} is {show(value)}; {length} numbers are expected")
+        raise InputError(f"[{section}]: {key} is {show(value)}; expected {length} numbers")
     return found
 
 
@@ -288,10 +286,10 @@ class Parameters:
         **Raises:** `InputError`."""
         free, sigma = settings.get("free", ()), settings.get("sigma", {})
         if isinstance(free, str) or not isinstance(free, Sequence):
-            raise InputError(f"[{section}]: free is {show(free)}; a list of names is expected")
+            raise InputError(f"[{section}]: free is {show(free)}; expected a list of names")
         if not isinstance(sigma, Mapping):
             raise InputError(
-                f"[{section}]: sigma is {show(sigma)}; a table of names and numbers is expected"
+                f"[{section}]: sigma is {show(sigma)}; expected a table of names and numbers"
             )
         for name in (*free, *sigma):
             if name not in names:

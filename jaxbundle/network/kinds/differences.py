@@ -74,8 +74,8 @@ class Differences(ObservationTable):
         given = ~np.isnan(value)
         for row in np.flatnonzero((given != ~np.isnan(sigma)).any(1) | ~given.any(1))[:1]:
             raise InputError(
-                f"{table.source(row)}: a difference dX, dY or dZ with its σ sdX, sdY "
-                "or sdZ is expected, both or neither"
+                f"{table.source(row)}: expected a difference dX, dY or dZ with its σ sdX, sdY or "
+                "sdZ, both or neither"
             )
         return cls(
             start=table.ids("from"),
@@ -110,6 +110,6 @@ class Angles(SingleValues):
     def check_values(self, radians: float) -> None:
         for row in np.flatnonzero(~((self.value > 0) & (self.value < np.pi)))[:1]:
             raise InputError(
-                f"{self.source(row)}: an angle between 0 and half a turn is "
-                f"expected, not {self.value[row] / radians:g}"
+                f"{self.source(row)}: expected an angle between 0 and half a turn, got "
+                f"{self.value[row] / radians:g}"
             )

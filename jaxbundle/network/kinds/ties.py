@@ -92,7 +92,7 @@ class Ties(ObservationTable):
                         f"{did_you_mean(name, known)}"
                     )
             if ids[0] == ids[1]:
-                raise InputError(f"{self.source(row)}: two different cameras are expected")
+                raise InputError(f"{self.source(row)}: expected two different cameras")
             units = [get_model(cameras[id].model).unit for id in ids]
             if units[0] != units[1]:
                 raise InputError(
