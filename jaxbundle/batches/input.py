@@ -327,7 +327,7 @@ def free_parameters(model: CameraModel, free: Any) -> tuple[str, ...]:
                 f"its parameters are {', '.join(model.parameters)}"
             )
     if not free or len({*free}) < len(free):
-        raise InputError("free: name at least one parameter, and each once")
+        raise InputError("free: expected at least one parameter, and each only once")
     return tuple(free)
 
 

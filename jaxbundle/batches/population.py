@@ -308,7 +308,7 @@ def read_against(table: Any, keys: Iterable[str], name: str) -> dict[str, np.nda
     # Keys are PATH#CAMERA; a table of serial numbers knows only the camera.
     place = [rows.get(key, rows.get(key.rpartition("#")[2])) for key in keys]
     if all(row is None for row in place):
-        raise InputError(f"{name}: none of its ids is that of a camera or input")
+        raise InputError(f"{name}: expected ids of cameras or inputs; none of its ids is one")
     chosen = np.array([-1 if row is None else row for row in place], int)
     found = {}
     for column in others:

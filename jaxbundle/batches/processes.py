@@ -41,7 +41,9 @@ def run_joined(inputs: Sequence[str | Path], file: str | Path, **options: Any) -
     **Raises:** also `NotSolvedError` if another process has failed.
     """
     if os.path.exists(file) and not os.path.isfile(file):
-        raise InputError(f"{file}: joined processes write parts beside it; expected a file")
+        raise InputError(
+            f"{file}: joined processes write their parts next to it; expected the name of a file"
+        )
     number, index = jax.process_count(), jax.process_index()
     # A name of this run, the same in all processes, so that files of an earlier one do not count.
     token = int(broadcast_one_to_all(np.array(time.time_ns() % 10**9)))

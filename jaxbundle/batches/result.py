@@ -214,7 +214,7 @@ class BatchCalibration(TableMethods):
         **Raises:** `InputError` where there are not as many ids as cameras."""
         ids = range(len(self)) if ids is None else ids
         if np.shape(ids) != (len(self),):
-            raise InputError(f"ids must be {len(self)}, one a camera, but are {quoted(ids)}")
+            raise InputError(f"ids must be {len(self)}, one for each camera, but are {quoted(ids)}")
         return Population({"key": str(id)} | self.row(i, True) for i, id in enumerate(ids))
 
     def table(self) -> dict[str, np.ndarray]:

@@ -106,7 +106,8 @@ def calibrate_opencv(
     for k, (X, x) in enumerate(zip(objects, images)):
         if len(X) != len(x):
             raise InputError(
-                f"view {k}: {len(X)} object points and {len(x)} image points; expected as many"
+                f"view {k}: {len(X)} object points and {len(x)} image points; expected equal "
+                "numbers"
             )
     # Views of one object share its points: the union, with those not seen as missing.
     points, places = np.unique(np.concatenate(objects), axis=0, return_inverse=True)

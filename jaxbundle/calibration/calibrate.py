@@ -278,7 +278,7 @@ def _model(
         raise InputError(f"free must be a list of names, such as ['fx', 'fy'], but is {free!r:.60}")
     free = model.free if free is None else tuple(free)
     if not free or len({*free}) < len(free):
-        raise InputError("free: name at least one parameter, and each once")
+        raise InputError("free: expected at least one parameter, and each only once")
     for parameter in free:
         if parameter not in model.parameters or parameter in model.never_free:
             known = [p for p in model.parameters if p not in model.never_free]

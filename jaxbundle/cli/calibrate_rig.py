@@ -234,7 +234,7 @@ def wand_given(
         raise InputError("--wand-length: the length of the wand is missing")
     markers = dict(split_named(one, "NAME=VIDEO, NAME=FOLDER or NAME=FILE.csv") for one in sources)
     if len(markers) < len(sources):
-        raise InputError("--wand: two sources are given of one camera; expected one for each")
+        raise InputError("--wand: two sources are given for one camera; expected one for each")
     others = [name for name in markers if name not in cameras]
     if others and not files:
         raise InputError(

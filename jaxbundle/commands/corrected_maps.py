@@ -220,7 +220,7 @@ def _errors_of(
     """The σ of `errors`, in radians and metres; of RPC what its file states."""
     for name, value in errors.items():
         if name not in MAP_ERRORS:
-            raise InputError(f"--error {name}{did_you_mean(name, MAP_ERRORS)}")
+            raise InputError(f"--error {name}: unknown{did_you_mean(name, MAP_ERRORS)}")
         if not (np.isfinite(value) and value >= 0):
             raise InputError(f"--error {name}={value:g}: expected a number from 0 on")
     noise = {name: value for name, value in errors.items() if name in Noise._fields}

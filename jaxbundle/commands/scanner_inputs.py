@@ -164,7 +164,7 @@ def geographic(table: Columns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             row = int(beyond.argmax())
             raise InputError(
                 f"{table.source(row)}: {name} {values[row]:g} is beyond {most}°; expected "
-                "degrees; check the order of columns"
+                "degrees: check their unit and the order of columns"
             )
     return np.radians(longitude), np.radians(latitude), height
 

@@ -228,7 +228,10 @@ class ObservationSet:
         object.__setattr__(self, "rows", rows)
         measured = _arrays(f"{name}: the measured values", self.measured)
         if any(np.shape(x)[:1] != (self.number,) for x in jax.tree.leaves(measured)):
-            raise InputError(f"{name}: {self.number} observations, but not as many measured values")
+            raise InputError(
+                f"{name}: expected measured values of {self.number} observations, got another "
+                "number"
+            )
         object.__setattr__(self, "measured", measured)
         if self.sigma is not None and self.covariance is not None:
             raise InputError(f"{name}: give sigma or covariance, not both")

@@ -129,7 +129,8 @@ def open_image(path: str | Path, content: bytes | None = None) -> Any:
     if columns * rows > MOST_PIXELS:
         image.close()
         raise InputError(
-            f"{path}: {columns} × {rows} pixels; at most {MOST_PIXELS} can be read: make it smaller"
+            f"{path}: {columns} × {rows} pixels; at most {MOST_PIXELS} pixels can be read; reduce "
+            "the image"
         )
     return image
 

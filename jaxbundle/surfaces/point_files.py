@@ -161,7 +161,7 @@ def _ply_numbers(
 def _check_ply_count(path: Path, stated: int, present: int) -> None:
     if stated > present:
         raise InputError(
-            f"{path}: is cut, or damaged: its header counts {stated} points, there are {present}"
+            f"{path}: is cut, or damaged: its header states {stated} points, there are {present}"
         )
 
 
@@ -253,7 +253,7 @@ def _read_las(path: Path, together: int = 1 << 18) -> Cloud:
                 columns.append(np.array(points[name]))
         if begin < len(X):
             raise InputError(
-                f"{path}: is cut, or damaged: its header counts {len(X)} points, there are {begin}"
+                f"{path}: is cut, or damaged: its header states {len(X)} points, there are {begin}"
             )
         crs = header.parse_crs() if len(X) else None
         system = None if crs is None else (crs.to_string() if crs.to_epsg() else crs.to_wkt())

@@ -45,7 +45,7 @@ def raster_parser(path: str | Path) -> Iterator[None]:
                 yield
         except InputError as error:
             if "not recognized" in str(error):
-                raise InputError(f"{path}: expected {EXPECTED}; GDAL does not know it") from None
+                raise InputError(f"{path}: expected {EXPECTED}; GDAL cannot read it") from None
             raise
 
 

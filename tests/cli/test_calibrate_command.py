@@ -88,7 +88,7 @@ def test_two_cameras_and_brief_json_alone(calibrate, folder, tmp_path, monkeypat
      "is part of the input"),
     (["FOLDER", "--board", "9by6", "--square", "1"], "--board '9by6': expected COLUMNSxROWS"),
     (["FOLDER", "--board", "9x6"], "--square is missing"),
-    (["FOLDER", "--board", "9x6", "--square", "1", "--kind", "dots"], "--kind 'dots': expected one of"),
+    (["FOLDER", "--board", "9x6", "--square", "1", "--kind", "dots"], "'dots': expected one of"),
     (["FOLDER", "--board", "9x6", "--square", "1", "--free", "fx,fz"], "no free parameter 'fz'"),
     (["FOLDER", "--board", "9x6", "--square", "1", "--given", "fx"], "expected NAME=VALUE"),
     (["FOLDER", "--board", "9x6", "--square", "1", "--camera", "a"], "either as arguments or by"),

@@ -246,7 +246,7 @@ BROKEN = {
     "zero quaternion": ("images.txt", "1 1 0 0 0 ", "1 0 0 0 0 ", "quaternion is 0"),
     "unknown camera": ("images.txt", "4 1 left", "4 5 left", "the camera 5, which is not in"),
     "unknown point": ("images.txt", "59027", "59028", "the object point 59028 is not in points3D"),
-    "cut line": ("images.txt", " 420.5 240.5 59027", " 420.5 240.5", "8 numbers; expected X, Y, POINT3D_ID"),
+    "cut line": ("images.txt", " 420.5 240.5 59027", " 420.5 240.5", "8 numbers; expected X, Y, "),
     "cut head": ("images.txt", " 4 7 right.jpg", "", "image is expected: IMAGE_ID"),
     "same image": ("images.txt", "\n2 0 1", "\n1 0 1", "image 1 occurs twice"),
     "same name": ("images.txt", "right", "left", "two images are called 'left.jpg'"),

@@ -256,7 +256,7 @@ def test_unified_distortions(tmp_path, kind):
 
 
 @pytest.mark.parametrize("given, said", [
-    (("eModeleRadFour7x2", [0.0], [1.0]), "eModeleRadFour7x2 is not supported; expected one of eModelePoly"),
+    (("eModeleRadFour7x2", [0.0], [1.0]), "RadFour7x2 is not supported; expected one of eMo"),
     (("eModeleEbner", [0.0], []), "eModeleEbner needs 1 Etats, but has 0"),
     (("eModelePolyDeg2", [0.0], [-1.0, 0.0, 0.0]), "the first of Etats must be positive"),
     (("eModele_FishEye_10_5_5", [1.0] * 25, [1.0]), "only the first 24 Params are supported"),

@@ -213,7 +213,7 @@ def test_a_scaled_base_system_is_told(tmp_path):
         ("calibrated.json", '"sensor_id": 3', '"sensor_id": "a"', "expected a whole number"),
         ("calibrated.json", "perspective", "spherical", "a spherical sensor is not read"),
         ("calibrated.json", '"type"', '"radial_scale": 2, "type"', "may change the geometry"),
-        ("calibrated.json", '"focal_length_px": 1000.0', '"focal_length_px": -1', "expected a positive one"),
+        ("calibrated.json", '"focal_length_px": 1000.0', '"focal_length_px": -1', "a positive one"),
         ("tracks.gltf", "3.bin", "none.bin", "cannot be read"),
         ("tracks.gltf", '"count": 9', '"count": 900', "bytes, where"),
         ("tracks.gltf", '"componentType": 5126', '"componentType": 9', "numbers of type 9"),

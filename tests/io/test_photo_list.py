@@ -111,7 +111,7 @@ def test_overrides(write):
     ("3.0 4.0", "3.0 nan", "line 6: y of point 'b' in photograph 'first photo' is 'nan'"),
     ("3.0 4.0", "3.0", "line 6: 4 values where an image point"),
     ("0.02", "nan", "line 4: σ of y of point 'a' in photograph 'first photo' is nan"),
-    ("0.02", "x", "line 4: σ of y of point 'a' in photograph 'first photo' is 'x'; expected a number"),
+    ("0.02", "x", "σ of y of point 'a' in photograph 'first photo' is 'x'; expected a number"),
     ("3 0.1", "3 -0.1", "line 2: σ of omega of photograph 'first photo' is -0.1"),
     ("6 0.5", "6 0", "line 11: σ of X of object point 'b' is 0"),
     ("b 4 5 6", "b 4 five 6", "line 11: Y of object point 'b' is 'five'; expected a number"),

@@ -220,7 +220,7 @@ def test_a_bad_override_is_refused(folder, override, said):
     ("images.csv", "right,cam.1", "left,cam.1", "line 5: image 'left' is already in"),
     ("images.csv", ",fixed", "", "images.csv, line 5: 8 cells where the header has 9"),
     ("points.csv", "role,", "", "points.csv, line 2: 8 cells where the header has 7"),
-    ("points.csv", "b,fixed,10,", "b,fixed,nan,", "points.csv, line 3: X is 'nan'; expected a number"),
+    ("points.csv", "b,fixed,10,", "b,fixed,nan,", "points.csv, line 3: X is 'nan'; expected a num"),
     ("points.csv", "free", "inf", "points.csv, line 2: sZ is 'inf'; expected a number or 'free'"),
     ("points.csv", "b,fixed", ",fixed", "points.csv, line 3: id is missing"),
     ("points.csv", '"e, far"', '"e, far', "points.csv: not a CSV table"),

@@ -147,7 +147,7 @@ def test_an_unknown_dictionary_is_refused_before_any_photograph(make):
 ])  # fmt: skip
 def test_the_commands_list_the_dictionaries(command, run):
     told = command(*run, "--board", "9x6", "--square", 0.03, "--dictionary", "dict_4x4_60")
-    assert told.status == 2 and "--dictionary 'dict_4x4_60': expected one of DICT_4X4_50, " in told.err
+    assert told.status == 2 and "'dict_4x4_60': expected one of DICT_4X4_50, " in told.err
     assert "did you mean 'DICT_4X4_50'" in told.err
 
 

@@ -247,7 +247,7 @@ def test_neighbours_tell_velocities(flown, result):
 def test_free_parameters_are_a_list(flown):
     """Not a word, of which every letter would be one."""
     xy = flown[0].network.observations.xy
-    with pytest.raises(InputError, match=r"\[rolling_shutter\]: free is 'vX'; expected a list of names"):
+    with pytest.raises(InputError, match=r"\[rolling_shutter\]: free is 'vX'; expected a list"):
         moving(flown[0].network, xy, free="vX")
 
 

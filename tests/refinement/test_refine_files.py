@@ -183,7 +183,7 @@ def test_wrong_cells_are_told_with_file_and_row(folder, name, row, column, value
 
 @pytest.mark.parametrize("old,new,message", [
     ('attitude = "free"', 'atitude = "free"', "did you mean 'attitude'"),
-    ('attitude = "free"', 'attitude = "loose"', "'loose'; \"free\", \"held\" or a prior"),
+    ('attitude = "free"', 'attitude = "loose"', "'loose'; expected \"free\", \"held\" or a prior"),
     ('attitude = "free"', "attitude = [1, 2]", "one value or three"),
     ("knot_spacing = 0.25", "knot_spacing = 0", "must be positive"),
     ('"baarda"', '"barda"', "did you mean 'baarda'"),

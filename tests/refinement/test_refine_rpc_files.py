@@ -132,7 +132,7 @@ def test_the_command_writes_compensated_coefficients(folder, scene):
     ("bias_degree = 1", "bias_degree = 3", "bias_degree is 3; expected 0, 1 or 2"),
     ("bias = [6.0, 0.8]", "bias = [1, 2, 3]", "bias is .*; expected one σ, or two"),
     ("bias = [6.0, 0.8]", 'bias = "stated"', "b.RPB states no error|a.tif states no error"),
-    ("bias = [6.0, 0.8]", 'bias = "vague"', "'vague'; \"free\", \"held\" or a prior"),
+    ("bias = [6.0, 0.8]", 'bias = "vague"', "'vague'; expected \"free\", \"held\" or a prior"),
     ("[unknowns]", '[unknowns.A]\nattitude = "free"\n[unknowns]',
      r"\[unknowns.A\]: attitude is no unknown of an image with RPC, which has bias_degree, bias"),
     ("[unknowns]", '[models]\nA = "rigorous"\n[unknowns]', "A = \"rigorous\": .*a.tif has"),

@@ -193,7 +193,7 @@ def _calibrate_cameras(
     for name, one in found.items():
         if not one.converged:
             why = one.adjustment.termination
-            raise NotSolvedError(f"not solved: camera {name} by itself: {why}")
+            raise NotSolvedError(f"not solved: camera {name} alone: {why}")
     return found
 
 

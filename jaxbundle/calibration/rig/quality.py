@@ -80,7 +80,7 @@ def rig_uncertainty(
     **Raises:** `InputError` for an invalid camera, frame or distance.
     """
     if frame not in FRAMES:
-        raise InputError(f"frame {frame!r}: {', '.join(FRAMES)}")
+        raise InputError(f"frame {frame!r}: expected one of {', '.join(FRAMES)}")
     if not distance > 0:
         raise InputError(f"distance {distance:g}: expected a positive distance")
     k = _index(rig, name)

@@ -74,7 +74,10 @@ def write_target(board: Board, path: str | Path) -> None:
     if board.kind == "charuco":
         raise InputError(f"{path}: Kalibr has no board of kind charuco")
     if board.first_marker:
-        raise InputError(f"{path}: Kalibr's tags begin at 0, not {board.first_marker}")
+        raise InputError(
+            f"{path}: Kalibr's tags begin at 0, those of the board at {board.first_marker}; write "
+            "another format"
+        )
     if board.row_spacing not in (None, board.square) and board.kind != "chessboard":
         raise InputError(f"{path}: Kalibr has one spacing for a board of kind {board.kind}")
     if board.kind == "aprilgrid" and board.marker:

@@ -220,7 +220,9 @@ def write_bundler(network: Network, path: str | Path) -> tuple[str, ...]:
     names = path.parent / LIST
     if not numbered:
         if any(character.isspace() for id in images.id for character in id):
-            raise InputError(f"{path.parent / LIST}: names of images cannot have blanks")
+            raise InputError(
+                f"{path.parent / LIST}: names of images cannot contain blanks; rename the images"
+            )
     content: dict[Path, Sequence[str]] = {path: lines}
     if not numbered or names.is_file():  # an existing list would name the images
         content[names] = images.id

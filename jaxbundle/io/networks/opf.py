@@ -384,7 +384,9 @@ def _tracks(
             raise InputError(f"{path}: cameras and image points of its matches do not agree")
         # Before room is made for them: of damaged ranges 2²⁴ matches for every point.
         if (begin + number > len(camera)).any() or number.sum() > len(camera):
-            raise InputError(f"{path}: ranges of matches beyond the last match")
+            raise InputError(
+                f"{path}: ranges of matches extend beyond the last match; the file is damaged"
+            )
         # The rows of the matches of the first point, the second, …: ranges may be in any order.
         point = np.repeat(np.arange(len(X)), number)
         at = np.repeat(begin - np.cumsum(number) + number, number) + np.arange(number.sum())

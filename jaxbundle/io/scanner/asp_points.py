@@ -84,7 +84,7 @@ def read_gcp(path: str | Path) -> ControlFile:
             column, row, *sigma = (number_in(w, where) for w in words[k + 1 : k + FIELDS_OF_IMAGE])
             rays.append((words[k], len(points) - 1, (row, column), sigma[::-1]))
     if not points:
-        raise InputError(f"{path}: no control point; expected one a line")
+        raise InputError(f"{path}: no control point; expected one per line")
     id, place, sigma, row = zip(*points)
     image, point, xy, xy_sigma = zip(*rays) if rays else ((), (), (), ())
     table = lambda rows, width: np.array(rows, float).reshape(-1, width)

@@ -53,7 +53,7 @@ def support_data_of(state: JsonFields) -> tuple[dict[str, Any], int]:
     if len({len(r) for r in rates}) > 1:
         raise InputError(
             f"{state.path}: {', '.join(names)} have {', '.join(str(len(r)) for r in rates)} "
-            "numbers; expected as many of each"
+            "numbers; expected the same number of each"
         )
     flag = number("m_platformFlag", 1)
     if flag not in PLATFORM_ORDERS:

@@ -156,7 +156,9 @@ def read_jigsaw_residuals(path: str | Path) -> IsisPoints:
         rays.append((point, names, (line - 1, sample - 1), (np.nan, np.nan), number))
         residuals.append((dy, dx))
     if not rays:
-        raise InputError(f"{path}: no measurement; expected one a line, after three lines of head")
+        raise InputError(
+            f"{path}: no measurement; expected one per line, after three lines of head"
+        )
     said = [f"{path}: {count(rejected, 'measurement')} rejected by jigsaw, left out"]
     said = (said if rejected else []) + _describe_residuals(path, np.array(residuals))
     unknown = (np.full(3, np.nan), np.zeros((3, 3)))

@@ -34,7 +34,7 @@ def read_support_data(path: Path) -> ET.Element:
         file = beside.get(f".{name}")
         if file is None:
             raise InputError(
-                f"{path}: {path.stem}.{name} is not beside it; {', '.join(GROUPS)} belong together"
+                f"{path}: {path.stem}.{name} is not next to it; {', '.join(GROUPS)} belong together"
             )
         _read(file, ET.SubElement(root, name))
     return root

@@ -75,7 +75,7 @@ def _read_source(file: TomlFile, scanner: TomlSection) -> ScannerInput:
         if name not in ("scanner", "corrections"):
             raise InputError(
                 f"{file.path}, [{name}]: this is read from the source; only [scanner] and "
-                "[corrections] can stand beside it"
+                "[corrections] can be given with it"
             )
     choice = scanner.text("interpolation") if "interpolation" in scanner else None
     source = scanner.path("source", EXPECTED_PRODUCTS)
@@ -97,8 +97,8 @@ def _read_source(file: TomlFile, scanner: TomlSection) -> ScannerInput:
     corrections = product.image.corrections._replace(**switched)
     if corrections.any and product.backwards:
         raise InputError(
-            f"{switches.where}the lines of {source.name} were taken in reverse order, which "
-            "corrections do not know; omit them"
+            f"{switches.where}the lines of {source.name} were taken in reverse order, for "
+            "which there are no corrections; omit them"
         )
     image = dataclasses.replace(product.image, corrections=corrections)
     product = dataclasses.replace(product, image=image, name=scanner.text("name", product.name))

@@ -293,8 +293,8 @@ def _points_of(table: Columns, earth: Ellipsoid | None, radians: float) -> Groun
         if beyond.any():
             row = int(beyond.argmax())
             raise InputError(
-                f"{table.source(row)}: latitude {X[row, 1]:g} is beyond the pole; look at the "
-                "order of columns and at angle_unit"
+                f"{table.source(row)}: latitude {X[row, 1]:g} is beyond the pole; check the "
+                "order of columns and angle_unit"
             )
         X = np.stack(
             [

@@ -130,7 +130,9 @@ def read_rpc(path: str | Path, unknown: UnknownKeys | None = None) -> Rpc:
             raise InputError(f"{path}: the scale of {axis} is 0; expected another number")
     for name in ("line_denominator", "sample_denominator"):
         if values[name][0] == 0:
-            raise InputError(f"{path}: the {name.replace('_', ' ')} begins with 0; 1 is usual")
+            raise InputError(
+                f"{path}: the {name.replace('_', ' ')} begins with 0; expected 1, as usual"
+            )
     return Rpc(**{name: jnp.asarray(value, float) for name, value in values.items()})
 
 

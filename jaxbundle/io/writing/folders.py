@@ -176,8 +176,8 @@ def _refuse_others(folder: Path, real: Path, by: str, names: Sequence[str], said
         )
     if marker is None:
         raise InputError(
-            f"{said}: not a folder of jaxbundle {by}: there is {list_some(entries, 3, str)} in it; "
-            f"{way} write beside that"
+            f"{said}: not a folder of jaxbundle {by}: it contains {list_some(entries, 3, str)}; "
+            f"{way} write into it all the same"
         )
     if marker.by != by:
         there = [str(folder / name) for name in own if os.path.lexists(real / name)]

@@ -253,7 +253,7 @@ class Interfaces(ObservationTable):
         for row, table in enumerate(tables):
             if table != tables[0]:
                 raise InputError(
-                    f"{self.source(row)}: a {table} beside the {tables[0]} of {self.source(0)}: "
+                    f"{self.source(row)}: a {table}, but a {tables[0]} in {self.source(0)}: "
                     "expected all interfaces of a network of one type"
                 )
         own = [id for id in self.camera if id] if tables[0] != SURFACE else [*self.camera]
