@@ -66,8 +66,8 @@ ADVICE = {
 }
 
 LARGER_SIGMA = (
-    "Those of cameras, images and points are the larger ones of the classical standard deviations "
-    "and those under correlated errors: see Correlated errors for both."
+    "For cameras, images and points, the larger of the classical standard deviation and that under "
+    "correlated errors is shown: see Correlated errors for both."
 )
 # What determines the unknowns of each table.
 ADVICE_FOR = {
@@ -284,8 +284,8 @@ def convergence(adjustment: "Adjustment") -> list[str]:
     ]
     if adjustment.removed or adjustment.eliminated or adjustment.sigma_factors:
         lines += paragraph(
-            "This is the last of several adjustments, which began at the result of the one before: "
-            "observations or parameters were removed, or σ estimated, in between (see below)."
+            "This is the last of several adjustments, each started from the result of the previous "
+            "one, after observations or parameters were removed or σ estimated (see below)."
         )
     return lines
 

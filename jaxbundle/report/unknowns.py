@@ -78,8 +78,8 @@ def _one_camera(entry: Mapping[str, Any], model: CameraModel) -> list[str]:
         lines += ["", *facts([("Tied", ", ".join(" = ".join(group) for group in entry["tied"]))])]
     if rows:
         lines += paragraph(
-            f"t = |value|/σ; no: t < {critical_t:g}, not different from 0 at about 95 %. Total "
-            "correlation: the share of a parameter that the others of the camera explain."
+            f"t = |value|/σ; no: t < {critical_t:g}, not significantly different from 0 (95 %). "
+            "Total correlation: the share of a parameter that the others of the camera explain."
         )
     free = entry["free"]
     if len(free) > 1:
@@ -316,8 +316,8 @@ def far_points(adjustment: "Adjustment", most: int) -> list[str]:
     angle = network.angle_unit
     lines = [
         *heading(f"Points at any distance: directions from {place}"),
-        f"Their rays are nearly parallel. σ in {angle}; distance, and from where to where",
-        f"one σ of the inverse distance reaches, in {clean(network.object_unit)}.",
+        f"Their rays are nearly parallel. σ in {angle}; distance, and its interval of one σ of",
+        f"the inverse distance, in {clean(network.object_unit)}.",
         "",
         *table(("point", "uX", "uY", "uZ", "σ", "distance", "from", "to"), rows, "lrrrrrrr"),
     ]

@@ -169,7 +169,7 @@ def judge_replication(adjustment: "Adjustment") -> Finding | None:
         return Finding("Replication", NOTED, halves.sentence, "halves not compared")
     # The root of d²/n: differences are compared with σ, not with variances.
     limit = np.sqrt(chi2_quantile(1 - LEVEL, halves.dof) / halves.dof)
-    words = f"{halves.sentence}; in one of 1000 cases by more than {limit:.2f} by chance"
+    words = f"{halves.sentence}; by chance by more than {limit:.2f} in one of 1000 cases"
     state = DOUBTFUL if halves.probability < LEVEL else GOOD
     return Finding("Replication", state, words, f"halves by {halves.by} contradict each other")
 

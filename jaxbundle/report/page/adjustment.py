@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from jaxbundle.adjustment.result import Adjustment
 
 SIGMA_NOTE = (
-    "Standard deviations are a posteriori, σ0 times those of the a priori weights, unless they are "
-    "said to be a priori."
+    "Standard deviations are a posteriori, σ0 times those of the a priori weights, unless "
+    "called a priori."
 )
 
 
