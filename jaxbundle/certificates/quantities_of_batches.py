@@ -12,7 +12,6 @@ from jaxbundle.certificates.quantity import (
     QuantityValues,
     Subject,
     one_value,
-    refuse_argument,
 )
 from jaxbundle.network.columns import list_some
 
@@ -39,8 +38,7 @@ def _require_of_all(found: Population, name: str, known: Bool[np.ndarray, " inpu
 
 
 def _number(name: str, unit: str = "") -> Callable[[Subject, str], QuantityValues]:
-    def find(subject: Subject, argument: str) -> QuantityValues:
-        refuse_argument(argument)
+    def find(subject: Subject, _: str) -> QuantityValues:
         found: Population = subject.result
         values = found.numbers[name]
         _require_of_all(found, name, np.asarray(np.isfinite(values)))
@@ -83,9 +81,8 @@ def _parameter(what: str) -> Callable[[Subject, str], QuantityValues]:
 
 
 def _share(which: str) -> Callable[[Subject, str], QuantityValues]:
-    def find(subject: Subject, argument: str) -> QuantityValues:
+    def find(subject: Subject, _: str) -> QuantityValues:
         """The share of the inputs, and which are missing."""
-        refuse_argument(argument)
         found: Population = subject.result
         good = {"solved": found.solved, "converged": found.fit}[which]
         if not len(good):
@@ -98,8 +95,7 @@ def _share(which: str) -> Callable[[Subject, str], QuantityValues]:
     return find
 
 
-def _outlying(subject: Subject, argument: str) -> QuantityValues:
-    refuse_argument(argument)
+def _outlying(subject: Subject, _: str) -> QuantityValues:
     found: Population = subject.result
     return one_value(len(found.outlying()))
 
