@@ -17,6 +17,7 @@ from jaxbundle.adjustment.quality.projection_uncertainty import (
     interior_covariance_of_images,
 )
 from jaxbundle.adjustment.result import Adjustment
+from jaxbundle.arguments import one_of
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.compare import Comparison, compare_cameras
@@ -108,8 +109,7 @@ def uncertainty_map(
 
     **Raises:** `InputError` if the image size is unknown or the distance impossible.
     """
-    if frame not in FRAMES:
-        raise InputError(f"frame {frame!r}: {', '.join(FRAMES)}")
+    one_of("frame", frame, FRAMES)
     if not distance > 0:
         raise InputError(f"distance {distance:g}: expected a positive distance")
     network = adjustment.problem.network

@@ -43,7 +43,7 @@ def check_point_quantities(
         found = differences_of(subject.result)
         if found is None:
             raise LookupError("the result has no check points")
-        known = np.isfinite(found.difference).any(0)
+        known = np.asarray(np.isfinite(found.difference).any(0))
         axes = [i for i, axis in enumerate(AXES) if axis in PARTS[argument] and known[i]]
         if not axes:
             raise LookupError("no check point has this difference")

@@ -96,7 +96,8 @@ def _names_and_units(table: Table, size: int) -> tuple[Sequence[str], Sequence[s
     names = table.parameters if named else [str(k + 1) for k in range(size)]
     if table.units:
         return names, (table.units,) * size if isinstance(table.units, str) else table.units
-    known = dict.fromkeys(LENGTHS, "length") | dict.fromkeys(INSTRUMENT_ANGLES, "angle")
+    known: dict[str, str] = dict.fromkeys(LENGTHS, "length")
+    known |= dict.fromkeys(INSTRUMENT_ANGLES, "angle")
     return names, [known.get(name, "") for name in names]
 
 

@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbundle.adjustment.quality.projection_uncertainty import interior_covariance_of_images
+from jaxbundle.arguments import one_of
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.quality import GRID, Coverage, UncertaintyMap, coverage, grid_of
 from jaxbundle.cameras import CameraModel, get_model, image_ray, project
@@ -79,8 +80,7 @@ def rig_uncertainty(
 
     **Raises:** `InputError` for an invalid camera, frame or distance.
     """
-    if frame not in FRAMES:
-        raise InputError(f"frame {frame!r}: expected one of {', '.join(FRAMES)}")
+    one_of("frame", frame, FRAMES)
     if not distance > 0:
         raise InputError(f"distance {distance:g}: expected a positive distance")
     k = _index(rig, name)

@@ -121,7 +121,7 @@ def move_at_once(
     return still.at[:size].set(WEIGHTS / 2 @ moved)
 
 
-def scale_length(motion: Float[Array, "7"], value: Float[Array, "*n"]) -> Float[Array, "*n"]:
+def scale_length(motion: Float[Array, "7"], value: Float[AnyArray, "*n"]) -> Float[Array, "*n"]:
     """Lengths after a similarity of object space."""
     return jnp.exp(motion[6]) * value
 

@@ -391,7 +391,7 @@ def _planes(
 
 def _scale_thicknesses(motion: Float[Array, "7"], value: Float[Array, " n"]) -> Float[Array, " n"]:
     # The three refractive indices before them have no unit.
-    return value.at[3:].multiply(scale_length(motion, 1.0))
+    return value.at[3:].set(scale_length(motion, value[3:]))
 
 
 @dataclasses.dataclass(frozen=True)
