@@ -23,7 +23,7 @@ def main() -> None:
     write_everywhere()
     gc.set_threshold(*GC_THRESHOLDS)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # warnings about unknown tags of TIFF; errors come to the caller, and are said in one line
+    # Warnings about unknown tags of TIFF; errors come to the caller, and are said in one line.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "FATAL")
     if "reconstruct" in sys.argv[1:2]:
         from jaxbundle.system.cores import allow_programs_at_once

@@ -22,7 +22,10 @@ Progress = Callable[[str, int, int], object]
 T = TypeVar("T")
 
 
-def present(value: T | None) -> T:
+def not_none(value: T | None) -> T:
     """A value that cannot be None because of earlier checks, although its type allows it."""
     assert value is not None
     return value
+
+
+present = not_none

@@ -135,7 +135,7 @@ def test_what_nothing_is_left_to_test_has_no_test(network):
     (of_bad,) = (value for name, value in test.items() if "point " + ids[1][31] + " " in name)
     # 40 σ in both coordinates, √(1 + h) at most √2 as uncertain as predicted.
     assert 20 < of_bad < 41 * np.sqrt(2) and found.sigma0 < 1.1
-    assert "nothing tests it again" in " ".join(found.report().split())
+    assert "not tested again" in " ".join(found.report().split())
     told = [entry["test"] for entry in found.to_dict()["removed"]]
     assert told.count(None) == len(of_point)
 

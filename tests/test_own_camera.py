@@ -51,6 +51,20 @@ def test_the_truth_is_found(page):
     assert np.abs(scale * found - true).max() < 0.01
 
 
+def test_a_fisheye_by_distort_is_that_of_kannala_and_brandt(page):
+    """And the number of iterations that its inverse needs is that of the page."""
+    model, camera, size = page["FISHEYE"], page["camera"], (1920, 1440)
+    convert = lambda n: page["convert_camera"](
+        dataclasses.replace(model, iterations=n), camera, "kannala-brandt", image_size=size
+    )
+    found = convert(3)
+    assert found.exact and found.covered == 1 and found.largest < 1e-12
+    for name, value in camera.items():
+        assert found.parameters[name] == pytest.approx(value, rel=1e-10), name
+    with pytest.raises(ValueError, match="only 16 % of the image has a ray"):
+        convert(2)
+
+
 def test_the_report_and_json_name_the_model(page):
     result = page["result"]
     report = result.report()

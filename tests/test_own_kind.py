@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxbundle
+from jaxbundle import InputError
 from jaxbundle import leastsquares as ls
 from jaxbundle.geometry import matrix_from_quaternion
 
@@ -61,6 +62,35 @@ def test_levelling_in_a_network(network, alone):
     assert "levelled height difference" in result.report()
 
 
+def test_tables_have_the_units_of_own_unknowns_and_components(network, alone):
+    """The collimation as the angle of a line of sight of 100 units: radians here, in the unit of
+    the network in the tables."""
+    gon = network.replace(angle_unit="gon")
+    ids, Z = network.points.id, alone.point_values[:, 2]
+    a, b = np.arange(6), np.arange(1, 7)
+    kind = dataclasses.replace(
+        LEVELLED, residual=lambda a, b, t, dh: b[2] - a[2] + 100 * t - dh, units="length"
+    )  # fmt: skip
+    level = ls.Table("level", np.zeros(1), labels=["Ni2"], parameters=("tilt",), units="angle")
+    result = jaxbundle.adjust(gon, also=[level, kind(
+        rows=([ids[k] for k in a], [ids[k] for k in b], ["Ni2"] * 6),
+        measured=Z[b] - Z[a] + 0.4, sigma=0.05,
+    )])  # fmt: skip
+    one = result.further_unknowns["level"]["Ni2"]["tilt"]
+    found = result.unknowns("level")
+    assert one["value"] == pytest.approx(0.004 * 200 / np.pi, rel=1e-4)
+    assert one["sigma"] == pytest.approx(found.sigma[0] * 200 / np.pi, rel=1e-12)
+    (line,) = (line for line in result.report().splitlines() if line.startswith("Ni2"))
+    assert line.split()[1] == "tilt" and line.split()[-1] == "gon"
+    units = {name: c.unit for name, c in result.variance_components.items()}
+    assert units == {
+        "image coordinates": network.image_unit, "levelled height difference": network.object_unit,
+    }  # fmt: skip
+    assert "σ̂  unit" in result.report()
+    with pytest.raises(InputError, match="expected one unit, or 1; got 2 of them"):
+        ls.Table("level", np.zeros(1), units=("angle", "length"))
+
+
 def test_heights_are_those_of_object_space(network, alone):
     """One height that is known: the datum shifts to it, wherever the origin of the arrays is. And
     the plumb line in the frame of every image, measured: the pose is seen as it is."""
@@ -96,5 +126,5 @@ def test_what_does_not_fit_is_told(network, alone):
         jaxbundle.adjust(network, also=[differences])
     with pytest.raises(jaxbundle.InputError, match="already has a table 'point'"):
         jaxbundle.adjust(network, also=[ls.Table("point", np.zeros((2, 3)))])
-    with pytest.raises(jaxbundle.InputError, match="also: tables .* are expected"):
+    with pytest.raises(jaxbundle.InputError, match="also: expected tables .*"):
         jaxbundle.adjust(network, also=[3.0])

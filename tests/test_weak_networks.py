@@ -23,6 +23,7 @@ from jaxbundle.network.build import make_further
 from jaxbundle.network.repetitions import warn_of_repetitions
 from jaxbundle.orientation.one_place import name_one_place
 from jaxbundle.planning.stations import Stations
+from jaxbundle.report.head import failure_facts, warnings
 
 TARGETS = grid_of_targets(5, 5, 0.5, relief=0.2, seed=1)
 RING = ring_of_stations(4, 3.0, 2.5, roll_every=2)
@@ -287,3 +288,7 @@ def test_an_observation_without_derivatives_is_named():
     (cause,) = found.findings
     assert "no derivative" in cause
     assert f"angles of point {ids[0]} and point {ids[1]} and point {ids[2]};" in cause
+    # The report gives it as the reason, not among the warnings, without the remedy for others.
+    reason = dict(failure_facts(found))[""]
+    assert "no derivative" in reason and cause not in warnings(found)
+    assert "behind their cameras" not in found.report()

@@ -56,7 +56,7 @@ from jaxbundle.network.unit_mistakes import (
 )
 from jaxbundle.orientation.network import Oriented, lacks_start_values, without_placeholders
 from jaxbundle.orientation.swapped_control import CONTRADICTORY_CONTROL
-from jaxbundle.types import AnyArray, Progress, present
+from jaxbundle.types import AnyArray, Progress, not_none
 
 # Name of the undetermined if no single unknown dominates.
 UNNAMED = ("a combination of many unknowns",)
@@ -266,7 +266,7 @@ class _AdjustmentState:
         self, again: Minimise, test: str, significance: float, doubtful: Iterable[tuple[str, str]]
     ) -> None:
         self.problem, self.minimum, removed, doubt = snoop_network(
-            present(self.inspection), self.minimum, again, test, significance, doubtful
+            not_none(self.inspection), self.minimum, again, test, significance, doubtful
         )
         self.result_fields |= {"removed": tuple(removed), "doubts": (doubt,) if doubt else ()}
 

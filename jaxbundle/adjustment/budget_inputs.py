@@ -50,7 +50,7 @@ class HeldInput:
         positive("uncertainty", self.uncertainty)
         if self.distribution not in DIVISORS:
             raise InputError(
-                f"distribution {show(self.distribution)}: one of {', '.join(DIVISORS)} is expected"
+                f"distribution {show(self.distribution)}: expected one of {', '.join(DIVISORS)}"
             )
 
     @classmethod

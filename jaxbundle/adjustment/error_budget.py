@@ -175,6 +175,6 @@ def inspection_of(given: Any) -> tuple[Inspection, Errors, float]:
         return found, IndependentErrors(found.solution, 1.0), unit
     if not isinstance(given, Adjustment):
         raise InputError(
-            f"a result of jaxbundle.adjust or jaxbundle.make_problem is expected, not {show(given)}"
+            f"expected a result of jaxbundle.adjust or jaxbundle.make_problem, got {show(given)}"
         )
     return given.cofactors, given.errors, given.angle_scale

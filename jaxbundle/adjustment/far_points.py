@@ -28,7 +28,7 @@ from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network.tables import Network
 from jaxbundle.orientation.batched import matrices_of_quaternions
 from jaxbundle.orientation.rays import sights
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 
 @dataclasses.dataclass(frozen=True)
@@ -228,7 +228,7 @@ def _in_front(
     depth = (ray * (X[seen.point] - position[seen.image])).sum(1)
     sides = np.bincount(seen.point, np.sign(depth), len(X))
     length = np.linalg.norm(X, axis=1)
-    most = LARGEST_DISTANCE * present(problem.lengths)
+    most = LARGEST_DISTANCE * not_none(problem.lengths)
     move = (most > 0) & ((sides < 0) | (length > most))
     factor = np.where(move, np.where(sides < 0, -most, most) / length, 1.0)
     return X * factor[:, None]

@@ -24,8 +24,9 @@ from jaxbundle.network.tables import Camera
 # Reduced systems with more unknowns are not searched for null vectors: the time of a dense
 # eigendecomposition grows with the cube of their number, and would soon be minutes.
 MAX_FOR_EIGENVECTORS = 3000
-# A principal distance that changed by more than this factor is implausible. Not critical: a start
-# value is seldom wrong by more than two, and a collapsing c passes every factor.
+# A principal distance that changed by more than this factor is implausible. Half and double
+# make no difference: a start value is seldom wrong by more than two, and a collapsing c passes
+# every factor.
 LARGEST_FACTOR = 20.0
 
 

@@ -29,7 +29,7 @@ from jaxbundle.network.kinds.image_points import image_coordinates
 from jaxbundle.network.retraction import TurnAboutSeen
 from jaxbundle.network.subsets import split_check_points
 from jaxbundle.network.tables import Network, require_network
-from jaxbundle.types import AnyArray, present
+from jaxbundle.types import AnyArray, not_none
 
 NEGLIGIBLE_MOTION = 1e-6
 """A datum direction with a smaller part of a motion does not contain it. The directions are unit
@@ -206,7 +206,7 @@ class NetworkProblem(engine.Problem):
     @property
     def reduction(self) -> str:
         """Solver of the reduced system."""
-        return present(self.plan.reduction)
+        return not_none(self.plan.reduction)
 
     @property
     def rows_and_unknowns(self) -> Counts:

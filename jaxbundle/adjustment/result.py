@@ -28,6 +28,7 @@ from jaxbundle.adjustment.quality.distortion_reach import (
     distortion_reach,
     farthest_measurements,
 )
+from jaxbundle.adjustment.quality.further_unknowns import Estimate
 from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.adjustment.quality.misfit import doubt_of_fit, doubt_of_unit
 from jaxbundle.adjustment.quality.points_at_any_distance import FarPoints, find_far_points
@@ -741,6 +742,11 @@ class Adjustment:
             known = ", ".join(self.problem.further_tables) or "none"
             raise KeyError(f"there is no further table {table!r}; known: {known}")
         return table_result(self.cofactors.solution, table, self.sigma0)
+
+    @functools.cached_property
+    def further_estimates(self) -> list[Estimate]:
+        """The unknowns of further kinds of observations with their units, a row each."""
+        return result_tables.further_estimates(self)
 
     @functools.cached_property
     def further_unknowns(self) -> dict[str, dict[str, dict[str, dict[str, float]]]]:

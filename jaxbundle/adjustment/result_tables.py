@@ -11,13 +11,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbundle.adjustment.problem import NetworkProblem
-from jaxbundle.adjustment.quality.further_unknowns import estimates
+from jaxbundle.adjustment.quality.further_unknowns import Estimate, estimates
 from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.leastsquares.declarations import ObservationSet
 from jaxbundle.leastsquares.quality.correlation import correlation_matrix, total_correlation
 from jaxbundle.leastsquares.quality.reliability import external_reliability, minimal_detectable
 from jaxbundle.network.tables import EXTERIOR
-from jaxbundle.network.units import ANGLE_UNITS
+from jaxbundle.network.units import unit_words
 
 if TYPE_CHECKING:
     from jaxbundle.adjustment.result import Adjustment
@@ -209,11 +209,7 @@ def observations(problem: NetworkProblem, *found: BySet) -> Iterator[KindRows]:
     blank = lambda rows: np.full(rows, "", dtype=object)
     known = {o.name: o for o in problem.observations}
 
-    words = {
-        "length": (1.0, network.object_unit),
-        "angle": (1 / ANGLE_UNITS[network.angle_unit], network.angle_unit),
-        "image": (1.0, network.image_unit),
-    }
+    words = unit_words(network)
 
     def quantities(name: str) -> tuple[np.ndarray, tuple[np.ndarray, ...], list]:
         weights, units = problem.weights(name), known[name].kind.units
@@ -261,16 +257,27 @@ def _of_further_kind(
     return given.kind.name, blank, np.array(touched, dtype=object), axes
 
 
+def further_estimates(adjustment: "Adjustment") -> list[Estimate]:
+    """The unknowns of further kinds of observations in the units of the network, with their
+    words."""
+    names, origin = set(adjustment.problem.further_tables), adjustment.problem.origin
+    if not names:
+        return []
+    words = unit_words(adjustment.network)
+    found = estimates(adjustment.cofactors.solution, names, adjustment.sigma0, origin)
+    scaled = ((one, *words.get(one.unit, (1.0, ""))) for one in found)
+    return [
+        one._replace(value=one.value * scale, sigma=one.sigma * scale, unit=word)
+        for one, scale, word in scaled
+    ]
+
+
 def further_unknowns(adjustment: "Adjustment") -> dict[str, dict]:
     """By table, row and name: value and sigma, like `Adjustment.further_unknowns`."""
     found: dict[str, dict] = {}
-    names, origin = set(adjustment.problem.further_tables), adjustment.problem.origin
-    if not names:
-        return found
-    for one in estimates(adjustment.cofactors.solution, names, adjustment.sigma0, origin):
-        unit = adjustment.angle_scale if one.angle else 1.0
+    for one in adjustment.further_estimates:
         row = found.setdefault(one.table, {}).setdefault(one.row, {})
-        row[one.name] = {"value": one.value * unit, "sigma": one.sigma * unit}
+        row[one.name] = {"value": one.value, "sigma": one.sigma}
     return found
 
 

@@ -318,7 +318,7 @@ def uncertainty_budget(
     adjustment = getattr(given, "adjustment", given)
     if not isinstance(adjustment, Adjustment):
         raise InputError(
-            f"a result of jaxbundle.adjust or jaxbundle.calibrate is expected, not {show(given)}"
+            f"expected a result of jaxbundle.adjust or jaxbundle.calibrate, got {show(given)}"
         )
     coverage = number("coverage", coverage)
     if not 0 < coverage < 1:

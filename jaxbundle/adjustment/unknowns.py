@@ -30,13 +30,13 @@ def find_unknowns(problem: NetworkProblem, names: Sequence[tuple[str, str, str]]
     **Raises:** `InputError` without names, or for a name that does not have three parts; `KeyError`
     for an unknown name."""
     if not isinstance(names, list | tuple):
-        raise InputError(f"covariance: a list of names is expected, but it is {show(names)}")
+        raise InputError(f"covariance: expected a list of names, got {show(names)}")
     given: Sequence[Any] = names or (None,)
     for name in given:
         if name is None or isinstance(name, str) or np.shape(name) != (3,):
             said = "none is given" if name is None else f"one is {show(name)}"
             raise InputError(
-                'covariance: names of unknowns are expected, such as ("camera", "cam", "c") or '
+                'covariance: expected names of unknowns, such as ("camera", "cam", "c") or '
                 f'("point", "7", "Z"), but {said}'
             )
     wanted = [Name(*map(str, name)) for name in names]
@@ -79,7 +79,8 @@ def angles_near(
     rotation: Float[AnyArray, "4"], d_theta: Float[AnyArray, "3"], given: Float[AnyArray, "3"]
 ) -> Float[Array, "3"]:
     """ω, φ, κ after a small rotation, on the same turn and branch as the given ones."""
-    # ω, φ, κ jump by turns and have two branches: reported angles stay near those of the network.
+    # ω, φ, κ jump by whole turns and have two branches: reported angles stay near those of the
+    # network.
     return omega_phi_kappa_near(
         matrix_from_quaternion(retract_quaternion(rotation, d_theta)), given
     )

@@ -131,9 +131,9 @@ def calibrate_batch(  # noqa: PLR0913 keyword arguments of a public function
         )
 
     portions, parts, done = [], [], 0
-    # threads, not processes: compiled code leaves Python alone, and the programs are shared
+    # Threads, not processes: compiled code leaves Python alone, and the programs are shared.
     with ThreadPoolExecutor(threads if on_cpu else 1) as pool:
-        # the first are solved while the next are padded
+        # The first are solved while the next are padded.
         solving = [
             (portions.append(portion), pool.submit(run, portion))[1]
             for portion in batch.portions(on_cpu)
@@ -164,7 +164,7 @@ def _without_padding(portion: Portion, shape: tuple[int, int], solved: Rows) -> 
         if name not in OF_A_START
     }
     camera = np.arange(len(portion.cameras))[:, None]
-    # the solver saw only views that show anything, in front; the user's numbers of views come back
+    # The solver saw only views that show anything, in front; the user's numbers of views come back.
     for name in {"views", "removed", *OF_A_VIEW} & {*rows}:
         values = rows[name] if name != "removed" else rows[name][:, :, :points]
         rows[name] = np.zeros((len(values), views, *values.shape[2:]), values.dtype)
@@ -183,8 +183,8 @@ def _result(model: CameraModel, batch: Batch, rows: Rows) -> BatchCalibration:
     for i in np.flatnonzero(np.isin(ended, (LIMIT, SINGULAR))):
         points = batch.point if batch.point.ndim == 2 else batch.point[i]
         weak[i] = weak_geometry(points, batch.xy[i].astype(float), batch.visible[i])
-    # the last RMS of those at the limit: the residuals may fit perfectly where nothing is
-    # determined
+    # The last RMS of those at the limit: the residuals may fit perfectly where nothing is
+    # determined.
     rms = np.where(ended == LIMIT, rows["rms"], np.nan)
     for name in {*OF_A_VIEW} & {*rows}:
         rows[name][~rows["views"]] = np.nan
@@ -194,7 +194,7 @@ def _result(model: CameraModel, batch: Batch, rows: Rows) -> BatchCalibration:
     rows["rms"] = np.where((weak != "") & ~solved, rms, rows["rms"])
     ended = np.where(weak != "", WEAK, ended)
     ended = np.where(solved & undetermined.any(1), WEAK, ended)
-    # last, since it compares the cameras that have values
+    # Last, since it compares the cameras that have values.
     ended = np.where(misfits(rows["rms"], rows["mean_length"], solved), MISFIT, ended)
     del rows["reduced"], rows["mean_length"]
     rows["undetermined"], rows["status"] = undetermined, np.array(STATUS)[ended]
@@ -209,7 +209,7 @@ def _under_errors(batch: Batch, rows: Rows, solved: SolvedPortions, together: bo
     ended = np.where(batch.finite, rows["status"], NOT_FINITE)
     forms, traced = solved.forms(), solved.traced(together)
     forms.q[ended != CONVERGED] = np.nan
-    # without residuals everything is zero, as it is classically
+    # Without residuals everything is zero, as it is classically.
     variance = rows["sigma0"] ** 2
     factor = np.divide(1.0, variance, out=np.zeros_like(variance), where=variance > 0)
     interior = factor[:, None, None] * rows["covariance"]
@@ -280,14 +280,14 @@ def _snoop(
         )
         if not len(open_ones):
             break
-        # the others get no points: they end at once as "too few points", and keep their rows
+        # The others get no points: they end at once as "too few points", and keep their rows.
         left = np.zeros_like(weight)
         left[open_ones] = [cameras[i].used for i in open_ones]
         seen = dataclasses.replace(portion.seen, weight=left)
         again = solve(dataclasses.replace(portion, seen=seen))
         for name, values in rows.items():
             values[open_ones] = again[name][open_ones]
-    # neither with nor without: nothing says that the removed points are blunders
+    # Neither with nor without: nothing says that the removed points are blunders.
     lost = (first["status"] != CONVERGED) & (rows["status"] != CONVERGED)
     for name, values in rows.items():
         values[lost] = first[name][lost]

@@ -168,7 +168,7 @@ def rig_settings(
         if name not in SECTIONS:
             raise InputError(f"unknown section {name!r}{did_you_mean(name, SECTIONS)}")
         if not isinstance(given, Mapping):
-            raise InputError(f"{name} is {show(given)}; a table of settings is expected")
+            raise InputError(f"{name} is {show(given)}; expected a table of settings")
     if moves := sections.get("rolling_shutter"):
         positive("rolling_shutter: line_time", moves.get("line_time"))
         make_further({"velocities": {"image": ["1"]}, "rolling_shutter": with_free(moves)}, 1.0)
@@ -179,7 +179,7 @@ def rig_settings(
     if pixel_size is not None:
         pair = vector("pixel_size", pixel_size, 2, "a positive length in mm, or two")
         if not (pair > 0).all():
-            raise InputError(f"pixel size {pixel_size}: a positive length in mm is expected")
+            raise InputError(f"pixel size {pixel_size}: expected a positive length in mm")
         size = float(pair[0]), float(pair[1])
     if found.unit == "mm" and size is None:
         raise InputError(f"model {found.name!r} is in mm: give the size of a pixel (--pixel-size)")

@@ -94,15 +94,15 @@ def solve_camera(
     rows = 2 * jnp.sum(seen.weight > 0)
     redundancy = rows - len(free) - POSE * jnp.sum(views)
     zero = jnp.asarray(0.0)
-    # ends where no unknown would move by more than 1e-5 of its σ: the printed digits do not depend
-    # on the start, and as convergence is quadratic, this costs a step at most
+    # Ends where no unknown would move by more than 1e-5 of its σ: the printed digits do not depend
+    # on the start, and as convergence is quadratic, this costs a step at most.
     tolerance = Tolerance(redundancy, rows * size**2, zero + 1e-5, zero)
 
     def linearise(at: CameraUnknowns) -> tuple[Float[Array, "views n n"], Float[Array, ""]]:
         N = normal_equations(model, free, seen, at)
         return N, jnp.where(jnp.all(jnp.isfinite(N)), 0.5 * jnp.sum(N[:, -1, -1]), jnp.nan)
 
-    # stopped before the first step: without redundancy the residuals vanish whatever the camera
+    # Stopped before the first step: without redundancy the residuals vanish whatever the camera.
     few = (redundancy < 1) | ~jnp.any(views)
     loop = iterate(
         linearise,

@@ -179,7 +179,7 @@ def _forms(
     by_view = [jnp.sum(of_view[:, of] ** 2) for of in BY_VIEW]
     K = correlation_of_views(at, used, settings.reach, seen)
     along_tracks = jnp.sum(jnp.einsum("vw,wap->vap", K, v) * v)
-    # sums over leading axes, which are vectorised
+    # Sums over leading axes, which are vectorised.
     given, squares = given_points(used), jnp.sum(by_point**2, 1)
     K = correlation_of_given(jnp.asarray(seen.point), used, settings)
     point = jnp.sum(by_point * by_axis, (1, 2)) * given

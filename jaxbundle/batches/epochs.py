@@ -31,7 +31,7 @@ def contradicting(
     # movements between the exposures remain; smaller: epochs of blurred photographs are lost.
     limit = max(3.0 * float(np.median(rms[seen])), 1.0)
     rms = np.where(shared, rms, 0.0)
-    # at once only those above half of the worst, which affects the others through the mounting
+    # At once only those above half of the worst, which affects the others through the mounting.
     return np.flatnonzero(rms > max(limit, 0.5 * rms.max()))
 
 
@@ -51,7 +51,7 @@ def epoch_keys(
         found = re.findall(r"\d+", whole(name))
         return found[-1].lstrip("0") or "0" if found else ""
 
-    # equal names first: numbers of two cameras may be equal by chance
+    # Equal names first: numbers of two cameras may be equal by chance.
     some = None
     for key in (whole, number):
         keys = {camera: [key(name) for name in given] for camera, given in names.items()}

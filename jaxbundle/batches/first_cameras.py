@@ -166,7 +166,7 @@ def parameters_of(
         if name in free or name in model.principal_distance
     }
     if "format_factor" in model.parameters:
-        # the radial polynomial is zero at 100/F: in the corners of the image
+        # The radial polynomial is zero at 100/F: in the corners of the image.
         diagonal = np.hypot(*(np.array(image_size) * (width, height)))
         parameters["format_factor"] = 200 / float(diagonal)
     return parameters | given

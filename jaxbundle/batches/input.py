@@ -162,7 +162,7 @@ class Batch:
             "visible", visible, "true or false [cameras, views, points]", truths=True
         )
         check_shapes(X, xy, size, visible)
-        # single precision stays until a portion is on the device: half of the memory
+        # Single precision stays until a portion is on the device: half of the memory.
         xy = xy if xy.dtype in (np.float32, np.float64) else xy.astype(float)
         cameras = len(xy)
         free = free_parameters(model, free)
@@ -194,7 +194,7 @@ class Batch:
         """Cameras in portions, separated by planar and spatial objects, and by number of views."""
         settings = settings or PortionSettings()
         points = self.xy.shape[2]
-        # few points: to whole vectors of 8 doubles, which cost nothing
+        # Few points: to whole vectors of 8 doubles, which cost nothing.
         points = bucket(points) if points > 128 else -(-points // 8) * 8
         shown = self.visible.any(2) & self.finite[:, None]
         widths = self._widths(shown.sum(1), points, settings.points_worth_compiling)
@@ -252,7 +252,7 @@ class Batch:
             xy=wide(of_views(self.xy), size, *shape),
             weight=wide(visible.astype(np.float32), size, *shape),
         )
-        # cameras that fill up the portion have the start values of the last one, and no points
+        # Cameras that fill up the portion have the start values of the last one, and no points.
         interior = np.pad(self.interior[cameras], [(0, size - len(cameras)), (0, 0)], mode="edge")
         return Portion(
             cameras,
@@ -327,7 +327,7 @@ def free_parameters(model: CameraModel, free: Any) -> tuple[str, ...]:
                 f"its parameters are {', '.join(model.parameters)}"
             )
     if not free or len({*free}) < len(free):
-        raise InputError("free: name at least one parameter, and each once")
+        raise InputError("free: expected at least one parameter, and each only once")
     return tuple(free)
 
 
@@ -382,10 +382,10 @@ def _principal_axes(
     middle = X.sum(1) / number
     centred = np.where(seen[..., None], X - middle[:, None], 0.0)
     values, vectors = np.linalg.eigh(np.einsum("cpi,cpj->cij", centred, centred))
-    # the longest first, right-handed: a flat object lies in the plane Z = 0, as `start` needs it
+    # The longest first, right-handed: a flat object lies in the plane Z = 0, as `start` needs it.
     axes = vectors[:, :, ::-1].swapaxes(1, 2)
     axes = axes * np.linalg.det(axes)[:, None, None]
-    # flat with a thickness below 2 % of the second extent: start values of H, which neglect it, are
+    # Flat with a thickness below 2 % of the second extent: start values of H, which neglect it, are
     # then nearer than those of P, which hardly follow from it; larger or smaller: not critical,
     # both are adjusted. Or on a line, to rounding.
     flat = values[:, 0] <= np.maximum(0.02**2 * values[:, 1], 1e-12 * values[:, 2])

@@ -77,7 +77,7 @@ def misfits(
     found[candidates] = rms[candidates] > settings.max_tail * NORMAL * mean_length[candidates]
     factor = settings.min_ratio_of_few
     if solved.sum() >= settings.min_cameras:
-        # in the logarithm, since an RMS is positive and its scatter proportional to it
+        # In the logarithm, since an RMS is positive and its scatter proportional to it.
         log = np.log(np.maximum(rms[solved], settings.negligible))
         spread = NORMAL_SIGMA_BY_MAD * np.median(np.abs(log - np.median(log)))
         factor = np.exp(max(np.log(settings.min_ratio), settings.max_deviations * spread))
@@ -159,7 +159,7 @@ def axes_remark(xy: Float[np.ndarray, "points 2"], size: Float[np.ndarray, "2"],
         far = int(_beyond(xy, size, down, DEFAULTS.far_outside).sum())
         points = "image point is" if far == 1 else "image points are"
         return f"{far} {points} far outside the image: data snooping removes them" * (far > 0)
-    # nine points in ten decide about a wrong axis: the others may be blunders
+    # Nine points in ten decide about a wrong axis: the others may be blunders.
     if not down and ((xy > -0.5) & (xy < size)).all(1).mean() > 0.9:
         return (
             "the image points seem to be counted from a corner of the image: in this model (0, 0) "

@@ -170,8 +170,8 @@ def factorise(
     E = rows_of(N[:, :POSE, :POSE])
     s = [scale[:, i] for i in range(POSE)]
     E = [[s[i] * s[j] * E[i][j] for j in range(i + 1)] for i in range(POSE)]
-    # the unit diagonal of Marquardt's scaling; views that take no part get it too, so that they are
-    # solvable and change nothing
+    # The unit diagonal of Marquardt's scaling; views that take no part get it too, so that they are
+    # solvable and change nothing.
     for i in range(POSE):
         E[i][i] = jnp.where(views, 1.0 + damping, 1.0)
     # Nₑₑ = L·Lᵀ, Y = L⁻¹·[Nₑᵢ gₑ]: S = Σ Nᵢᵢ − YᵀY, with the reduced right hand side as its last

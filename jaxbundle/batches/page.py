@@ -86,7 +86,7 @@ def _rms(found: Population) -> list[Section]:
     if not len(values):
         return []
     middle = float(np.median(values))
-    # from 0, so that heights of two batches compare, and without the tail of a few misfits
+    # From 0, so that heights of two batches compare, and without the tail of a few misfits.
     top = max(min(3 * middle, float(values.max())), 1e-12)
     edges = np.linspace(0, top, 25)
     above = (values > top).any()

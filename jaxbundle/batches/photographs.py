@@ -84,7 +84,7 @@ class PhotographFolders:
 
         `tell(part)`: the fraction of the photographs searched."""
         files = {folder: self._files(folder) for folder in chosen}
-        # by content, not by name: a photograph copied to two folders is searched once
+        # By content, not by name: a photograph copied to two folders is searched once.
         contents = {path: self.kept.content(path) for of in files.values() for path in of.values()}
         tasks = {
             content: (path, self.board)

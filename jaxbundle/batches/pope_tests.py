@@ -44,8 +44,8 @@ def point_tests(
     def test(columns: list[ByPoint]) -> ByPoint:
         h = _leverage(factor, columns[:-1])
         redundancy = jnp.where(used > 0, 1 - h, 1 + h)
-        # a point of less redundancy is controlled by no other: far above rounding, far below any
-        # redundancy number that serves a test
+        # A point of less redundancy is controlled by no other: far above rounding, far below any
+        # redundancy number that serves a test.
         known = (seen.weight > 0) & (redundancy > 1e-6)
         value = jnp.abs(columns[-1]) / jnp.sqrt(jnp.where(known, redundancy, 1.0))
         return jnp.where(known, value, jnp.nan)

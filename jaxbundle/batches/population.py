@@ -86,7 +86,7 @@ class Population:
             name: np.abs(self._apart(values, self.sigma[name]))
             for name, values in self.values.items()
         }
-        # views that determine nothing: weak without values
+        # Views that determine nothing: weak without values.
         self._void = np.array(
             [row.get("status") == STATUS[WEAK] and not row["parameters"] for row in kept], bool
         )
@@ -274,7 +274,7 @@ def _correlation(
     n = len(values)
     r = float(np.corrcoef(_ranks(with_it), _ranks(values))[0, 1])
     square = r * r * (n - 2) / max(1 - r * r, 1e-300)
-    # a rank correlation has no unit: the change of the median says how much it matters
+    # A rank correlation has no unit: the change of the median says how much it matters.
     upper = with_it > np.median(with_it)
     change = np.median(values[upper]) - np.median(values[~upper]) if upper.any() else np.nan
     return Correlation(column, name, n, r, f_tail(square, 1, n - 2), float(change))
@@ -296,7 +296,7 @@ def read_against(table: Any, keys: Iterable[str], name: str) -> dict[str, np.nda
     others = [column for column in given.values if column != ID]
     if ID not in given.values or not others:
         raise InputError(
-            f"{name}: a column id and others are expected, but there are "
+            f"{name}: expected a column id and others, but there are "
             f"{', '.join(given.values) or 'none'}"
         )
     rows: dict[str, int] = {}
@@ -305,10 +305,10 @@ def read_against(table: Any, keys: Iterable[str], name: str) -> dict[str, np.nda
             raise InputError(f"{given.source(row)}: id {id!r} occurs twice")
         rows[id] = row
     keys = list(keys)
-    # keys are PATH#CAMERA; a table of serial numbers knows only the camera
+    # Keys are PATH#CAMERA; a table of serial numbers knows only the camera.
     place = [rows.get(key, rows.get(key.rpartition("#")[2])) for key in keys]
     if all(row is None for row in place):
-        raise InputError(f"{name}: none of its ids is that of a camera or input")
+        raise InputError(f"{name}: expected ids of cameras or inputs; none of its ids is one")
     chosen = np.array([-1 if row is None else row for row in place], int)
     found = {}
     for column in others:
@@ -340,7 +340,7 @@ def number_or_days(cell: str, where: str) -> float:
         date = datetime.fromisoformat(cell)
     except ValueError:
         raise InputError(
-            f"{where} is {cell!r}; a number or a date such as 2026-05-01 is expected"
+            f"{where} is {cell!r}; expected a number or a date such as 2026-05-01"
         ) from None
     date = date if date.tzinfo else date.replace(tzinfo=UTC)
     return date.timestamp() / 86400

@@ -41,9 +41,11 @@ def run_joined(inputs: Sequence[str | Path], file: str | Path, **options: Any) -
     **Raises:** also `NotSolvedError` if another process has failed.
     """
     if os.path.exists(file) and not os.path.isfile(file):
-        raise InputError(f"{file}: joined processes write parts beside it; a file is expected")
+        raise InputError(
+            f"{file}: joined processes write their parts next to it; expected the name of a file"
+        )
     number, index = jax.process_count(), jax.process_index()
-    # a name of this run, the same in all processes, so that files of an earlier one do not count
+    # A name of this run, the same in all processes, so that files of an earlier one do not count.
     token = int(broadcast_one_to_all(np.array(time.time_ns() % 10**9)))
     waiting = f"{file}.joined-{token}"
     own = {key: value for key, value in options.items() if key not in ("retry", "renew")}
@@ -55,7 +57,7 @@ def run_joined(inputs: Sequence[str | Path], file: str | Path, **options: Any) -
             run_batch(inputs, file, compute=False, **options)
             _tell(waiting, "begin")
         if not _wait(waiting, ["begin"])["begin"]:
-            # into a file of its own: appending to one file from several machines is not atomic
+            # Into a file of its own: appending to one file from several machines is not atomic.
             part = f"{file}.part-{index + 1}-of-{number}"
             with use_own_devices():
                 run_batch(inputs, part, part=(index + 1, number), known=file, **own)
@@ -93,7 +95,7 @@ def _clear(file: str | Path, waiting: str) -> None:
 
 
 def _tell(waiting: str, name: str, words: str = "") -> None:
-    # renamed when complete, so that no process reads half of it
+    # Renamed when complete, so that no process reads half of it.
     path = Path(waiting, f".{name}")
     path.write_text(words, encoding="utf-8")
     path.rename(Path(waiting, name))
@@ -131,7 +133,7 @@ def add_parts(file: str | Path) -> None:
             held.enter_context(hold_lock(path))
         parts = [JsonLines(path) for _, path in sorted(found)]
         lines, some = JsonLines(file), []
-        # parts have every N-th input: taken in turn they are in the order of the inputs
+        # Parts have every N-th input: taken in turn they are in the order of the inputs.
         in_turn = chain.from_iterable(zip_longest(*(part.rows(part.heads) for part in parts)))
         for row in in_turn:
             if row is not None and row["key"] not in lines:

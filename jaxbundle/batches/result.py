@@ -17,7 +17,7 @@ from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.report.layout import significant
 from jaxbundle.results import TableMethods
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 
 @print_in_one_screen
@@ -125,7 +125,7 @@ class BatchCalibration(TableMethods):
         }
 
     def _components(self, i: int) -> list[dict[str, Any]]:
-        sizes = present(self.component_sizes)[i]
+        sizes = not_none(self.component_sizes)[i]
         return [
             {"name": name, "sigma": float(size), "unit": "px"}
             for name, size in zip(COMPONENTS, sizes)
@@ -198,7 +198,7 @@ class BatchCalibration(TableMethods):
             names = ("position", "angles", "sigma_position", "sigma_angles")
             if self.sigma_correlated is not None:
                 names += ("sigma_position_correlated", "sigma_angles_correlated")
-                row["covariance_correlated"] = present(self.covariance_correlated)[i].tolist()
+                row["covariance_correlated"] = not_none(self.covariance_correlated)[i].tolist()
             columns = zip(*(getattr(self, name)[i][:views].tolist() for name in names))
             row |= {
                 "covariance": self.covariance[i].tolist(),
@@ -214,7 +214,7 @@ class BatchCalibration(TableMethods):
         **Raises:** `InputError` where there are not as many ids as cameras."""
         ids = range(len(self)) if ids is None else ids
         if np.shape(ids) != (len(self),):
-            raise InputError(f"ids must be {len(self)}, one a camera, but are {quoted(ids)}")
+            raise InputError(f"ids must be {len(self)}, one for each camera, but are {quoted(ids)}")
         return Population({"key": str(id)} | self.row(i, True) for i, id in enumerate(ids))
 
     def table(self) -> dict[str, np.ndarray]:

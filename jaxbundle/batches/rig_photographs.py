@@ -41,7 +41,7 @@ class RigFolders:
         """Some of the rigs, with what a line says of their photographs; or why there is none."""
         cameras = {i: camera_folders(self.folders[i]) for i in chosen}
         every = [(i, path) for i, of in cameras.items() for path in of]
-        # all folders of all rigs at once, so that the processes are never idle
+        # All folders of all rigs at once, so that the processes are never idle.
         found = self._folders_of([str(path) for _, path in every])
         views = found.measure(range(len(every)), tell) if every else {}
         of_rig: dict[int, dict[str, BoardViews | str]] = {i: {} for i in chosen}
@@ -56,7 +56,7 @@ class RigFolders:
 def _rig(views: Mapping[str, BoardViews | str]) -> tuple[RigViews, dict] | str:
     if len(views) < 2:
         said = f" (only {[*views][0]})" if views else ""
-        return f"a folder of photographs for every camera of the rig is expected here{said}"
+        return f"expected a folder of photographs for every camera of the rig here{said}"
     bad = [f"camera {name}: {one}" for name, one in views.items() if isinstance(one, str)]
     if bad:
         return "; ".join(bad)

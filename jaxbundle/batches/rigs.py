@@ -84,7 +84,7 @@ def solve_rigs(
     for number, (rig, first) in enumerate(zip(rigs, firsts), 1):
         solved.append(_solve(rig, first, settings))
         tell(number / len(rigs))
-    # misfits in the end, since they are found by comparison with the other rigs
+    # Misfits in the end, since they are found by comparison with the other rigs.
     lengths = [_residual_lengths(result, settings) for _, result in solved]
     rms = np.array([np.sqrt(np.mean(v**2)) if len(v) else np.nan for v in lengths])
     mean = np.array([v.mean() if len(v) else np.nan for v in lengths])
@@ -104,14 +104,14 @@ def _first_cameras(
     places: dict[tuple, list[tuple[int, int]]] = {}
     for i, rig in enumerate(rigs):
         for c, size in enumerate(rig.sizes):
-            # one call of `calibrate_batch` has one image size and one number of points
+            # One call of `calibrate_batch` has one image size and one number of points.
             if not (np.abs(rig.xy[c]) > LARGEST_NUMBER).any() and np.isfinite(rig.xy[c]).any():
                 places.setdefault((size, len(rig.points)), []).append((i, c))
     for (size, points), of in places.items():
         xy = np.full((len(of), max(len(rigs[i].epochs) for i, _ in of), points, 2), np.nan)
         for row, (i, c) in enumerate(of):
             xy[row, : len(rigs[i].epochs)] = rigs[i].xy[c]
-        # one list of points if all have the same, which saves memory and keeps them exact
+        # One list of points if all have the same, which saves memory and keeps them exact.
         X = np.array([rigs[i].points for i, _ in of])
         X = X[0] if (X == X[:1]).all() else X
         for (i, c), first in zip(of, first_cameras(X, xy, size, settings.model, settings.free)):

@@ -110,7 +110,7 @@ def run_batch(  # noqa: PLR0913 keyword arguments of a public function
         ours = _shares([len(work.keys) for work in works], part)
         total = sum(map(len, ours))
         lines = JsonLines(file)
-        # all inputs are checked before anything is dropped: an error leaves the file as it was
+        # All inputs are checked before anything is dropped: an error leaves the file as it was.
         again = [
             key
             for work, share in zip(works, ours)
@@ -134,7 +134,7 @@ def run_batch(  # noqa: PLR0913 keyword arguments of a public function
                 done += len(rows)
                 progress(STAGE, done, total)
                 networks += work.is_network
-                # networks of many sizes leave a compiled program each: dropped from time to time
+                # Networks of many sizes leave a compiled program each: dropped from time to time.
                 if work.is_network and networks % 50 == 0:
                     jax.clear_caches()
     keys = (work.keys[i] for work, share in zip(works, ours) for i in share)
@@ -154,7 +154,7 @@ def result_rows(inputs: Sequence[str | Path], file: str | Path) -> Iterator[dict
 def key_of(path: str | Path, file: str | Path) -> str:
     """The path of an input relative to the folder of the result file, with / between folders."""
     folder, name = os.path.split(os.path.abspath(path))
-    # the folder without links, but not the input itself, whose name the user gave
+    # The folder without links, but not the input itself, whose name the user gave.
     path = os.path.join(os.path.realpath(folder), name)
     return Path(relative_path(path, os.path.dirname(os.path.realpath(file)))).as_posix()
 
@@ -164,14 +164,14 @@ def check_part(part: Sequence[int]) -> None:
 
     **Raises:** `InputError`."""
     if len(part) != 2 or not 1 <= integer("part", part[0]) <= integer("part", part[1]):
-        raise InputError(f"part {part}: (I, N) is expected, the I-th of N parts, I from 1 to N")
+        raise InputError(f"part {part}: expected (I, N), the I-th of N parts, I from 1 to N")
 
 
 def _shares(numbers: Sequence[int], part: tuple[int, int]) -> list[list[int]]:
     """Which cameras or networks of each input belong to a part."""
     ends = [0, *itertools.accumulate(numbers)]
-    # every N-th, not a block: inputs of similar size are often neighbours, and the parts take
-    # equally long
+    # Every N-th, not a block: inputs of similar size are often neighbours, and the parts take
+    # equally long.
     ranges = [range(first, last) for first, last in zip(ends, ends[1:])]
     return [[i - r.start for i in r if i % part[1] == part[0] - 1] for r in ranges]
 

@@ -30,7 +30,7 @@ def cholesky(N: Rows) -> Rows:
         new = []
         for j in range(i):
             new.append((row[j] - _dot(new, L[j][:j])) * L[j][j])
-        # the reciprocal once, since a division takes as long as many products
+        # The reciprocal once, since a division takes as long as many products.
         new.append(1 / jnp.sqrt(row[i] - _dot(new, new)))
         L.append(new)
     return L

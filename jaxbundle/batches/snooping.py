@@ -52,7 +52,7 @@ class Snooping:
             rows = np.flatnonzero(largest > max(critical, REMOVED_TOGETHER * largest.max()))
             self.used[rows, worst[rows]] = False
             return True
-        # each only once, so that no point alternates
+        # Each only once, so that no point alternates.
         back = self.seen & ~self.used & ~self.returned & (tests < critical) & (tests > 0)
         self.used |= back
         self.returned |= back

@@ -84,7 +84,7 @@ class SolvedPortions(NamedTuple):
                 portion, found
             )
             of = portion.views.shape[1]
-            # indices on both sides of a slice put the cameras and views in front
+            # Indices on both sides of a slice put the cameras and views in front.
             pose[portion.cameras[:, None], :, portion.views] = padded.swapaxes(1, 2)[:, :of]
         return ComponentParts(remaining, interior, pose)
 

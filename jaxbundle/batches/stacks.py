@@ -150,7 +150,7 @@ def _names(path: str | Path, arrays: Mapping[str, np.ndarray], name: str) -> tup
 def _rows(path: str | Path, archive: zipfile.ZipFile, name: str, member: ArchiveMember) -> Any:
     """An array, or on demand the rows of a large one with one row per camera."""
     by_camera = len(member.shape) in BY_CAMERA.get(name, ())
-    # a stack may exceed the memory: rows are read from the file when needed
+    # A stack may exceed the memory: rows are read from the file when needed.
     if by_camera and (member.dtype.kind == "b") == (name == "visible"):
         found = find_stored_rows(path, EXPECTED, archive, name, member)
         if found is not None:

@@ -98,7 +98,7 @@ def start_values(
     # K⁻¹·H or K⁻¹·P; excluded views get the pose R = 1 at a distance, whose image exists
     a = [(c[0] / fx, c[1] / fy, c[2]) for c in columns]
     axes, shift = (_pose_of_flat if flat else _pose_of_solid)(a)
-    # rows of M, a view each
+    # Rows of M, a view each.
     M = [
         [jnp.where(usable, s * axes[j][i], s * (i == j)) for j in range(3)]
         for i, s in enumerate(FLIP)
@@ -206,7 +206,7 @@ def _focal_of_solid(
     length = _norm(rows[2])
 
     def median(row: Column) -> Array:
-        # the third row of P is that of R, so the rest of the first has the length f
+        # The third row of P is that of R, so the rest of the first has the length f.
         along = _dot(row, third)
         f = _norm([a - along * b for a, b in zip(row, third)]) / length
         return jnp.nanmedian(jnp.where(usable, f, jnp.nan))

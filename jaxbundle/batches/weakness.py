@@ -35,11 +35,11 @@ def vanishing(reduced: Float[np.ndarray, "cameras k k"]) -> Bool[np.ndarray, "ca
     """Parameters with part in the null space of the scaled reduced normal matrix."""
     finite = np.all(np.isfinite(reduced), axis=(1, 2))
     values, vectors = np.linalg.eigh(np.where(finite[:, None, None], reduced, 0.0))
-    # before the elimination the diagonal is 1, so that an eigenvalue is the part that remains
+    # Before the elimination the diagonal is 1, so that an eigenvalue is the part that remains.
     null = values < INDETERMINATE
     share = np.einsum("cij,cj->ci", vectors**2, null.astype(float))
-    # a twentieth of the square of the direction: of those that nothing determines, the ones that
-    # change visibly together
+    # A twentieth of the square of the direction: of those that nothing determines, the ones that
+    # change visibly together.
     return finite[:, None] & (share > 0.05)
 
 
@@ -75,7 +75,7 @@ def weak_geometry(
     if len(tilts) < 2 or not np.isfinite(tilts).all():
         return ""
     extent = np.median(extents)
-    # the tilts about the middle of one view, in the same unit of length
+    # The tilts about the middle of one view, in the same unit of length.
     tilts, middles = np.array(tilts) * (extent / np.array(extents))[:, None], np.array(middles)
     if np.linalg.norm(tilts, axis=1).max() < straight:
         return (
@@ -101,7 +101,7 @@ def _find_tilt(
     middle = xy.mean(0)
     extent = np.sqrt(((xy - middle) ** 2).sum(1).mean())
     x, ones, zero = (xy - middle) / extent, np.ones((len(xy), 1)), np.zeros((len(xy), 3))
-    # the direct linear transformation of the plane (Hartley, 1997); its least singular vector
+    # The direct linear transformation of the plane (Hartley, 1997); its least singular vector.
     from_plane = np.concatenate([X, ones], 1)
     A = np.concatenate(
         [

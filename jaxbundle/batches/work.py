@@ -170,7 +170,7 @@ class BatchSettings:
 
     @property
     def _asked(self) -> dict:
-        # lines of earlier versions do not have it
+        # Lines of earlier versions do not have it.
         return {"correlated": True} if self.correlated else {}
 
     @property
@@ -193,13 +193,13 @@ def plan_works(
         else:
             works[name] = _network(path, name, settings)
     if settings.board is not None and folders:
-        # corners are kept beside the results, except where these are no file (/dev/stdout)
+        # Corners are kept beside the results, except where these are no file (/dev/stdout).
         regular = os.path.isfile(file) or not os.path.exists(file)
         kept = held.enter_context(KeptCorners(f"{file}.corners" if regular else ":memory:"))
-        # the photographs of a folder are of one size
+        # The photographs of a folder are of one size.
         of_folders = (filter(is_photograph, Path(one).rglob("*")) for one in folders.values())
         some = [path for found in of_folders for path in islice(found, 1)]
-        # bytes of a process that searches boards, before its first photograph (measured)
+        # Bytes of a process that searches boards, before its first photograph (measured).
         at_once = searches_at_once(some, settings.board, 280e6)
         workers = held.enter_context(Workers(search_alone, at_once))
         if settings.rig:
@@ -257,7 +257,7 @@ def _detect(found: PhotographFolders, keys: tuple[str, ...], settings: BatchSett
             rows[i] |= of_photographs(views[i], brief)
         return [rows[i] for i in chosen]
 
-    # the board is a setting of the lines: other corners are found with another one
+    # The board is a setting of the lines: other corners are found with another one.
     lines = settings.of_cameras() | {"board": repr(found.board)}
     portion = sys.maxsize if plain else RIGS_A_WRITE
     return Work(keys, lines, found.fingerprint, solve, "its photographs", portion=portion)
@@ -314,6 +314,6 @@ def network_row(path: str, overrides: Sequence[str] = (), **options: Any) -> dic
     except (InputError, NotSolvedError) as error:
         status = "bad input" if isinstance(error, InputError) else "not solved"
         return {"status": status, "error": str(error)}
-    # one broken network must not end a night of others
+    # One broken network must not end a night of others.
     except UNEXPECTED as error:
         return {"status": "failed", "error": f"{type(error).__name__}: {error}"}

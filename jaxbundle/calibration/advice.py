@@ -151,7 +151,7 @@ def repeated(
     for k in range(len(position)):
         first = np.flatnonzero(~found[:k])
         move = np.linalg.norm(position[first] - position[k], axis=1) / away[k]
-        # of a small rotation by a, trace(R) = 1 + 2·cos(a)
+        # Of a small rotation by a, trace(R) = 1 + 2·cos(a).
         cosine = (np.einsum("nij,ij->n", rotation[first], rotation[k]) - 1) / 2
         turn = np.arccos(np.clip(cosine, -1, 1))
         found[k] = (np.maximum(move, turn) < min_move).any()

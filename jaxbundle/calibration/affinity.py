@@ -16,7 +16,7 @@ from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.calibration.observation_equations import lagrange_multipliers, linearise_image_points
 from jaxbundle.cameras import get_model, is_own
 from jaxbundle.display import print_in_one_screen
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 AFFINE = ("b1", "b2")
 
@@ -34,8 +34,8 @@ class MissingAffinity:
 
     @property
     def missed(self) -> bool:
-        # from 4 σ: σ0 contains the neglected affinity itself, and other errors of the model; by
-        # chance once in 16 000
+        # From 4 σ: σ0 contains the neglected affinity itself, and other errors of the model; by
+        # chance once in 16 000.
         return bool((np.abs(self.values) > 4.0 * self.sigma).any())
 
     def __str__(self) -> str:
@@ -69,6 +69,6 @@ def find_missing_affinity(adjustment: Adjustment) -> MissingAffinity | None:
     b = -cofactor @ score
     sigma = adjustment.sigma0 * np.sqrt(np.diagonal(cofactor))
     # Δx = b1·x̄ + b2·ȳ, largest in a corner
-    half = np.multiply(present(given.image_size), given.pixel_size) / 2
+    half = np.multiply(not_none(given.image_size), given.pixel_size) / 2
     reach = [half[AFFINE.index(name)] for name in names]
     return MissingAffinity(names, b, sigma, float(np.abs(b) @ reach / given.pixel_size[0]))

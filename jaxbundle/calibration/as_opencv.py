@@ -101,14 +101,15 @@ def calibrate_opencv(
     if not objects or len(objects) != len(images):
         raise InputError(
             f"{len(objects)} views of object_points and {len(images)} of image_points are given; "
-            "one of each for every view is expected"
+            "expected one of each for every view"
         )
     for k, (X, x) in enumerate(zip(objects, images)):
         if len(X) != len(x):
             raise InputError(
-                f"view {k}: {len(X)} object points and {len(x)} image points; expected as many"
+                f"view {k}: {len(X)} object points and {len(x)} image points; expected equal "
+                "numbers"
             )
-    # views of one object share its points: the union, with those not seen as missing
+    # Views of one object share its points: the union, with those not seen as missing.
     points, places = np.unique(np.concatenate(objects), axis=0, return_inverse=True)
     xy = np.full((1, len(objects), len(points), 2), np.nan)
     ends = np.cumsum([0, *map(len, objects)])
@@ -140,7 +141,7 @@ def _view(name: str, k: int, given: Any, width: int) -> Float[np.ndarray, "n wid
     array = numeric_array(f"{name}[{k}]", given, f"an array [n, {width}]").astype(float)
     if array.size and array.ndim > 1 and array.shape[-1] == width:
         return array.reshape(-1, width)
-    raise InputError(f"{name}[{k}]: an array [n, {width}] is expected, not {list(array.shape)}")
+    raise InputError(f"{name}[{k}]: expected an array [n, {width}], got {list(array.shape)}")
 
 
 def _rotation_vector(R: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:

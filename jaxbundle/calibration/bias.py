@@ -164,8 +164,8 @@ def find_bias(
     if degrees < settings.min_cells or more < 1:
         return None
     omega, of_cells = float(left @ left), slice(0, 2 * len(cells))
-    # each over the root of its redundancy number, so that its σ is 1; the median of |x| as σ; 1e-3:
-    # a t that determines a parameter alone has the number 0 but for rounding
+    # Each over the root of its redundancy number, so that its σ is 1; the median of |x| as σ; 1e-3:
+    # a t that determines a parameter alone has the number 0 but for rounding.
     root = np.sqrt(np.clip(1 - np.sum(U**2, 1), 1e-3, None))
     noise = float(np.median(np.abs(left / root)[of_cells])) / normal_quantile(0.75)
     tests = {"cells": _f_test(adjustment.vtpv - omega, more, omega, degrees)}
@@ -249,8 +249,8 @@ def cells_of_four(problem: NetworkProblem, *grids: tuple[int, int]) -> Int[np.nd
     place[problem.image[used], problem.point[used]] = used
     cells = []
     for (rows, columns), own in zip(grids, np.split(place, np.cumsum(sizes)[:-1], axis=1)):
-        # cells share no corner, so that their t are independent; an odd last row or column is not
-        # used
+        # Cells share no corner, so that their t are independent; an odd last row or column is not
+        # used.
         whole = own.reshape(-1, rows, columns)[:, : rows // 2 * 2, : columns // 2 * 2]
         corners = [whole[:, i::2, j::2].ravel() for i in (0, 1) for j in (0, 1)]
         cells.append(np.stack(corners, 1))
@@ -266,11 +266,11 @@ def _equations(
     problem = adjustment.problem
     (name,) = (table.name for table in problem.cameras)
     cut = lambda x: x[cells].reshape(len(cells), 8, -1)
-    # the last left singular vectors of J [8, 6] span what no pose of the cell can move
+    # The last left singular vectors of J [8, 6] span what no pose of the cell can move.
     N = np.linalg.svd(cut(found.slopes["image"]))[0][:, :, 6:]
     t = np.einsum("cek,cep->ckp", N, cut(found.v)).ravel()
     of_camera = np.einsum("cek,cep->ckp", N, cut(found.slopes[name]))
-    # a free or weighted board: its coordinates are columns of A, too
+    # A free or weighted board: its coordinates are columns of A, too.
     free = problem.table("point").free.astype(bool)
     of_points = np.zeros((len(cells), 2, *free.shape))
     if free.any():

@@ -100,14 +100,14 @@ def calibrate(  # noqa: PLR0913 keyword arguments of a public function
     _check_given(camera_model, given)
     text("camera", camera)
     text("object_unit", object_unit)
-    # either downweighted or removed: a test of residuals that robust weights changed has no level
+    # Either downweighted or removed: a test of residuals that robust weights changed has no level.
     options |= {"robust": robust, "snooping": None if robust else snooping}
     check_options(**options)
     check_test(snooping, options.get("significance", 0.001))
     views = views_of(photographs, board, progress)
     start = start_values(views, camera_model, free, pixel_size, given)
     columns, rows = views.image_size
-    # held parameters need no prior
+    # Held parameters need no prior.
     prior = {name: s for name, s in dict(camera_model.prior).items() if name in free}
     made = Camera(
         camera,
@@ -278,7 +278,7 @@ def _model(
         raise InputError(f"free must be a list of names, such as ['fx', 'fy'], but is {free!r:.60}")
     free = model.free if free is None else tuple(free)
     if not free or len({*free}) < len(free):
-        raise InputError("free: name at least one parameter, and each once")
+        raise InputError("free: expected at least one parameter, and each only once")
     for parameter in free:
         if parameter not in model.parameters or parameter in model.never_free:
             known = [p for p in model.parameters if p not in model.never_free]
@@ -294,7 +294,7 @@ def _pair(pixel_size: Any) -> tuple[float, float] | None:
         return None
     pair = vector("pixel_size", pixel_size, 2, "a positive length in mm, or two")
     if not (pair > 0).all():
-        raise InputError(f"pixel size {pixel_size}: a positive length in mm is expected")
+        raise InputError(f"pixel size {pixel_size}: expected a positive length in mm")
     return float(pair[0]), float(pair[1])
 
 

@@ -92,7 +92,7 @@ def file_name(name: str) -> str:
 
 def files_of(names: Sequence[str]) -> list[str]:
     """Files that a calibration of these cameras may write, figures as patterns."""
-    # what may be replaced in a folder that is written again; anything else in it is somebody's
+    # What may be replaced in a folder that is written again; anything else in it is somebody's.
     found = [REPORT, PAGE, RESULT]
     for name in map(file_name, names):
         place = "" if len(names) == 1 else f"{name}/"
@@ -111,7 +111,7 @@ def files_of(names: Sequence[str]) -> list[str]:
             )
         ]
     if len(names) > 1:
-        # names of a rig may be of cameras that see no board
+        # Names of a rig may be of cameras that see no board.
         found += ["rig_*.toml", "rig_*.png"]
         found += rig_files()
         found += [f"{ADJUSTED}/{file}" for file in NETWORK_FILES]
@@ -160,7 +160,7 @@ def _fill(
     write_text(folder / REPORT, head_line(origin) + calibration.report())
     write_text(folder / PAGE, compose_calibration(calibration, origin, choice))
     write_text(folder / RESULT, json_text(calibration.to_dict()))
-    # the report says why; files of a camera that is none would be used
+    # The report says why; files of a camera that is none would be used.
     if not calibration.converged:
         return
     network = adjusted_network(calibration.adjustment)
@@ -179,7 +179,7 @@ def _write_foreign(network: Network, folder: Path, name: str, limits: Sequence[s
     model = get_model(network.cameras[0].model)
     if model.name not in FOREIGN:
         try:
-            # beyond 90° a perspective model has no image
+            # Beyond 90° a perspective model has no image.
             nearest = "kannala-brandt" if model.wide else "opencv"
             network, cost = convert_cameras(network, nearest)
         except InputError as error:
@@ -231,7 +231,7 @@ def fill_calibrations(
             write_text(folder / f"rig_{file_name(name)}.toml", text)
         fill_rig(found.rig.network(), folder / RIG)
         views = network_of_views(found.rig)
-        # a camera may have the name of this folder
+        # A camera may have the name of this folder.
         if views is not None and ADJUSTED not in map(file_name, found.cameras):
             fill_project(views, folder / ADJUSTED)
         if plots:
@@ -245,7 +245,7 @@ def fill_rig(network: Network, folder: Path) -> None:
     said = [IN_BOARD_UNITS]
     for kind, (name, _) in RIG_FILES.items():
         target, refused = TARGETS[kind], ""
-        # as it is, else with the models that the format has, its best one first
+        # As it is, else with the models that the format has, its best one first.
         for model in (None, *target.models[:2]):
             try:
                 fitted, costs = network, {}
@@ -256,7 +256,7 @@ def fill_rig(network: Network, folder: Path) -> None:
                 refused = refused or f"{name}: not written: {error}"
                 continue
             said += [f"{name}: camera {id!r} → {cost}" for id, cost in costs.items()]
-            # the mounting itself is in every format
+            # The mounting itself is in every format.
             said += [f"{name}: not kept: {what}" for what in lost if what != Rigs.TABLE]
             if target.parts is not None and len(network.cameras) > 2:
                 parts = (
@@ -295,7 +295,7 @@ def fill_comparison(
 
 def save_plots(calibration: "Calibration", folder: Path, progress: Progress | None = None) -> None:
     """The figures of quality, and those of the adjustment."""
-    # drawn when needed: most of the time of a figure is matplotlib's
+    # Drawn when needed: most of the time of a figure is matplotlib's.
     near = float(np.median(calibration.distances))
     drawings = {
         "coverage": ((7, 5.6), None, calibration.plot_coverage),

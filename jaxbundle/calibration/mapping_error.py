@@ -36,7 +36,7 @@ from jaxbundle.cameras.pixel_frame import in_model_units
 from jaxbundle.cameras.validity import measured_centre
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.network.tables import Camera
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 
 @print_in_one_screen
@@ -62,7 +62,7 @@ class MappingError:
 
     def quantile(self, probability: float = 0.95) -> float:
         """The quantile of √K for this probability, pixels; from a reproducible sample."""
-        # a weighted sum of χ²₁ has no closed distribution; 20 000 samples give it to 1 %
+        # A weighted sum of χ²₁ has no closed distribution; 20 000 samples give it to 1 %.
         z = np.random.default_rng(0).normal(size=(20_000, len(self.weights)))
         return float(np.sqrt(np.quantile(z**2 @ self.weights, probability)))
 
@@ -80,7 +80,7 @@ def mapping_error(
     names, C = adjustment.camera_covariance(camera)
     p = np.array(list(adjustment.camera_parameters(camera).values()))
     model = get_model(given.model)
-    uv = grid_of(present(given.image_size), *grid).reshape(-1, 2)
+    uv = grid_of(not_none(given.image_size), *grid).reshape(-1, 2)
     xy = in_model_units(uv, model, given.image_size, given.pixel_size)
     xy = xy[have_rays(model, p, xy)]
     whole = MappingError(_weights(_form(given, p, names, xy, "rotation"), C), len(xy) / len(uv))
@@ -88,7 +88,7 @@ def mapping_error(
     farthest = adjustment.farthest_measurements[column]
     away = np.linalg.norm(xy - np.asarray(measured_centre(model, p)), axis=1)
     near = xy[away <= farthest]
-    # two points determine the rotation: three angles from two coordinates each
+    # Two points determine the rotation: three angles from two coordinates each.
     if len(near) < 2 or len(near) == len(xy):
         return whole
     part = _weights(_form(given, p, names, near, "rotation"), C)
@@ -115,7 +115,7 @@ def mapping_form(
     """H of the named parameters of a camera at the values `p` of all: pixels²; `frame` "camera":
     that of A, without a rotation."""
     model = get_model(camera.model)
-    uv = grid_of(present(camera.image_size), *grid).reshape(-1, 2)
+    uv = grid_of(not_none(camera.image_size), *grid).reshape(-1, 2)
     xy = in_model_units(uv, model, camera.image_size, camera.pixel_size)
     return _form(camera, p, names, xy, frame)
 

@@ -119,8 +119,8 @@ class ModelComparison(TableMethods):
         self.failed: dict[str, str] = dict(failed)
         self.folds, self.views, self.gross = folds, tuple(views), tuple(gross)
         self.best = min(self.candidates, key=lambda one: one.left_out)
-        # one standard error (Breiman et al.): between models that the scatter of the photographs
-        # cannot separate, the simpler one
+        # One standard error (Breiman et al.): between models that the scatter of the photographs
+        # cannot separate, the simpler one.
         enough = [one for one in self.candidates if self.excess(one)[0] <= self.excess(one)[1]]
         self.suffices = min(enough, key=lambda one: (one.free, one.left_out))
 
@@ -288,8 +288,8 @@ def _candidate(
     if not again.converged:
         return f"{name}: all observations together: {again.termination}"
     squares = np.zeros(len(network.observations))
-    # every fold-th view, not a block: neighbouring photographs are alike, and a block would leave a
-    # part of the poses out
+    # Every fold-th view, not a block: neighbouring photographs are alike, and a block would leave a
+    # part of the poses out.
     turns = np.arange(len(network.images)) % folds
     for fold in range(folds):
         left = turns[network.observations.image] == fold
@@ -345,7 +345,7 @@ def _difference(best: Candidate, one: Candidate) -> ModelDifference | None:
     covariances = covariance(best), covariance(one)
     C = expected_difference(comparison, *mappings, covariances, **sizes)
     size = unit_size(mappings[0][0], camera.pixel_size)[0]
-    # lengths over the σ of a length: √ of the trace
+    # Lengths over the σ of a length: √ of the trace.
     sigma = np.sqrt(np.trace(C, axis1=2, axis2=3))
     ratio = comparison.length / sigma
     return ModelDifference(

@@ -99,7 +99,7 @@ def _linearise(
             )
             p = dict(enumerate(interior)) | {c: interior[c] + b[k] for k, c in enumerate(columns)}
             residual = jnp.stack(of(pose, tuple(p.values()), tuple(ray), tuple(xy)))
-            # returned twice: value and derivatives in one pass
+            # Returned twice: value and derivatives in one pass.
             residual = jnp.where(weight > 0, weight * residual, 0.0)
             return residual, residual
 

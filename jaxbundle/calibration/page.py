@@ -121,7 +121,7 @@ def _quality(
     covered: Coverage, maps: Sequence[UncertaintyMap], unit: str, name: str = "", number: int = 0
 ) -> Section:
     """Coverage, and the uncertainty of a projected point over the image."""
-    # cells without points stay white
+    # Cells without points stay white.
     counts = np.where(covered.counts > 0, covered.counts, np.nan)
     caption = f"Measured points by cell: {coverage_in_words(covered)}"
     parts = [figure(draw_field(counts, 0), caption)]

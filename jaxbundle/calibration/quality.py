@@ -17,6 +17,7 @@ from jaxbundle.adjustment.quality.projection_uncertainty import (
     interior_covariance_of_images,
 )
 from jaxbundle.adjustment.result import Adjustment
+from jaxbundle.arguments import one_of
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.compare import Comparison, compare_cameras
@@ -108,10 +109,9 @@ def uncertainty_map(
 
     **Raises:** `InputError` if the image size is unknown or the distance impossible.
     """
-    if frame not in FRAMES:
-        raise InputError(f"frame {frame!r}: {', '.join(FRAMES)}")
+    one_of("frame", frame, FRAMES)
     if not distance > 0:
-        raise InputError(f"distance {distance:g}: a positive distance is expected")
+        raise InputError(f"distance {distance:g}: expected a positive distance")
     network = adjustment.problem.network
     c = [given.id for given in network.cameras].index(camera)
     given = network.cameras[c]
@@ -124,8 +124,8 @@ def uncertainty_map(
         views = np.flatnonzero(network.images.camera == c)
         p = np.array(list(adjustment.camera_parameters(camera).values()))
         there = np.flatnonzero(have_rays(model, p, xy))
-        # fixed in the scene, a point moves with the pose of each view as well, and poses are
-        # correlated with the camera: the whole covariance, by propagation through a function
+        # Fixed in the scene, a point moves with the pose of each view as well, and poses are
+        # correlated with the camera: the whole covariance, by propagation through a function.
         table, row = adjustment.problem.table_of_camera(c)
         function = images_through_scene(
             model, (table.name, row), views, adjustment.values, xy[there], distance
@@ -157,7 +157,7 @@ def over_distance(
     so its variance is a quadratic polynomial in 1/d, found exactly by Lagrange interpolation of
     `maps` at three distances.
     """
-    # infinity is the point 0 of 1/d, and as good a node as any other
+    # Infinity is the point 0 of 1/d, and as good a node as any other.
     near = np.array([1 / m.distance for m in maps])
     variance = np.array([_in_corners(m.sigma**2) for m in maps])
     middle = np.array([m.middle**2 for m in maps])
@@ -205,7 +205,7 @@ def coverage(
     counts, *_ = np.histogram2d(
         uv[:, 1], uv[:, 0], (rows, columns), ((-0.5, h - 0.5), (-0.5, w - 0.5))
     )
-    # a corner is about a quarter of the height and a sixth of the width: nearly a square
+    # A corner is about a quarter of the height and a sixth of the width: nearly a square.
     top, left = max(rows // 4, 1), max(columns // 6, 1)
     corners = {
         "upper left": counts[:top, :left],
@@ -260,7 +260,7 @@ def cross_validation(result: Adjustment) -> CrossValidation | None:
     if len(network.images) < 8:  # four photographs are few for a camera, fewer none
         return None
     network = start_at_result(network, result)
-    # every other photograph, so that both halves have poses from all around
+    # Every other photograph, so that both halves have poses from all around.
     turns = np.arange(len(network.images)) % 2
     try:
         again = partial(adjust, robust=result.robust)
@@ -268,8 +268,8 @@ def cross_validation(result: Adjustment) -> CrossValidation | None:
         if not all(half.converged for half in halves):
             return None
         name = network.cameras[0].id
-        # each half with the camera of the other, whose poses alone are estimated: the residuals
-        # grow by what the camera does not know of unseen photographs
+        # Each half with the camera of the other, whose poses alone are estimated: the residuals
+        # grow by what the camera does not know of unseen photographs.
         own = [half.camera_parameters(name) for half in halves]
         held = [
             again(_with_fixed_camera(take_images(network, turns == 1 - half), own[half]))
@@ -279,7 +279,7 @@ def cross_validation(result: Adjustment) -> CrossValidation | None:
         return None
     if not all(other.converged for other in held):
         return None
-    # independent halves: Σ(p₁ − p₂) = C₁ + C₂
+    # Independent halves: Σ(p₁ − p₂) = C₁ + C₂.
     names, C = halves[0].camera_covariance(name)
     C = C + halves[1].camera_covariance(name)[1]
     d = np.array([own[0][n] - own[1][n] for n in names])

@@ -92,7 +92,7 @@ def _camera(calibration: "Calibration") -> list[str]:
     lines = heading(f"Camera ({calibration.adjustment.network.cameras[0].model})")
     free = calibration.stated_sigma
     rows = []
-    # parameters held at zero are not part of the camera, to a reader
+    # Parameters held at zero are not part of the camera, to a reader.
     for name, value in calibration.parameters.items():
         if name in free:
             rows.append((name, *estimate(value, free[name])))
@@ -101,7 +101,7 @@ def _camera(calibration: "Calibration") -> list[str]:
     lines += table(("parameter", "value", "σ"), rows, "lrr")
     rms = calibration.rms
     removed = len(calibration.adjustment.removed)
-    # the first as OpenCV states it, the second to compare with σ of a coordinate
+    # The first as OpenCV states it, the second to compare with σ of a coordinate.
     lines += ["", f"RMS of an image point {rms:.4f} px, of a coordinate {rms / np.sqrt(2):.4f} px"]
     lines += [f"Removed as gross errors: {count(removed, 'image point')}"] if removed else []
     return lines

@@ -27,7 +27,7 @@ from jaxbundle.report.lens_advice import advise_parameters, is_hardly_determined
 from jaxbundle.report.verdict import judge_replication
 from jaxbundle.results import TableMethods
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray, present
+from jaxbundle.types import AnyArray, not_none
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -52,8 +52,8 @@ class Calibration(TableMethods):
         self.views = views
         self.validated = validated
         self.adjustment = adjustment
-        # report, page, JSON and figures use the same maps, each a propagation of the whole
-        # covariance
+        # Report, page, JSON and figures use the same maps, each a propagation of the whole
+        # covariance.
         self._maps: dict[tuple, UncertaintyMap] = {}
 
     @property
@@ -80,7 +80,7 @@ class Calibration(TableMethods):
         """σ of the free parameters by name, under errors that image points share where these are
         known and their σ are larger."""
         found = self.adjustment.cameras[self.name]["parameters"]
-        return {name: present(stated_sigma_of(found[name])) for name in self.sigma}
+        return {name: not_none(stated_sigma_of(found[name])) for name in self.sigma}
 
     @property
     def camera(self) -> Camera:
@@ -199,13 +199,13 @@ class Calibration(TableMethods):
             self.rms,
             self._significance,
             get_model(self.camera.model),
-            # only if it was made: four more adjustments are not made for an advice
+            # Only if it was made: four more adjustments are not made for an advice.
             self.__dict__.get("cross_validation"),
         )
         missed = self._missing_affinity
         if missed is not None and missed.missed:
             found = [*found, str(missed)]
-        # image points are removed one by one: only counted by corner do they show a bad print
+        # Image points are removed one by one: only counted by corner do they show a bad print.
         problem = self.adjustment.problem
         removed = [
             row for one in self.adjustment.removed if one.kind == "image" for row in one.rows
@@ -232,8 +232,8 @@ class Calibration(TableMethods):
     def reported_maps(self) -> list[UncertaintyMap]:
         """Near (the median distance of the board), at ten times that, at infinity; and without the
         scene."""
-        # near the board the poses dominate, at infinity the camera; three distances also determine
-        # the whole curve (`quality.over_distance`)
+        # Near the board the poses dominate, at infinity the camera; three distances also determine
+        # the whole curve (`quality.over_distance`).
         near = float(np.median(self.distances))
         chosen = (
             ("scene", near),

@@ -39,7 +39,7 @@ def simulate_views(
     if camera.image_size is None:
         raise InputError(f"camera {camera.id!r}: image_size is needed, in pixels")
     for row in np.flatnonzero(stations.position[:, 2] <= 0)[:1]:
-        raise InputError(f"station {row + 1} stands behind the board, at Z ≤ 0")
+        raise InputError(f"station {row + 1} is behind the board, at Z ≤ 0; expected Z > 0")
     model, points = get_model(camera.model), board.points
     width, height = unit_size(model, camera.pixel_size)
     network = simulate(

@@ -190,7 +190,7 @@ def stability(
     columns = [_line_of(p[:, k], sigma[:, k]) for k in range(len(names))]
     mean, mean_sigma, tau, probability = np.array(columns).T
     model = get_model(cameras[0].model)
-    # the derivatives of the image at the mean camera
+    # The derivatives of the image at the mean camera.
     every, changes = _changes_of_tied(cameras[0], names)
     whole = {
         **default_parameters(model),
@@ -202,7 +202,7 @@ def stability(
         changes.T @ mapping_form(cameras[0], given, every, frame=f) @ changes
         for f in ("camera", "rotation")
     )
-    # images by H, without rotation: what matters to a user who orients each photograph anew
+    # Images by H, without rotation: what matters to a user who orients each photograph anew.
     F = _without_rotation(G, H, sigma.mean(0))
     d = p - p.mean(0)
     found = float(np.einsum("nk,kl,nl->", d, H, d)) / (len(p) - 1)
@@ -240,8 +240,8 @@ def _check(
         len(at) == len(calibrations) and len({*at}) >= 3 and np.isfinite(at).all()
     ):
         raise InputError(
-            f"stability: {len(at)} numbers for {len(calibrations)} calibrations; one for each is "
-            "expected, and three different ones at least"
+            f"stability: {len(at)} numbers for {len(calibrations)} calibrations; expected one for "
+            "each, and three different ones at least"
         )
     first, (free, _) = calibrations[0]
     names = _first_of_tied(first, free)
@@ -313,7 +313,7 @@ def _line_of(
     x: Float[np.ndarray, " epochs"] | None = None,
 ) -> tuple[float, float, float, float]:
     """Mean, or slope against x, and its σ; τ about it, and the probability of χ² without τ."""
-    # about the mean of x, mean and slope are nearly independent
+    # About the mean of x, mean and slope are nearly independent.
     A = np.ones((len(p), 1)) if x is None else np.stack([np.ones(len(p)), x - x.mean()], 1)
     degrees = len(p) - A.shape[1]
 
@@ -329,7 +329,7 @@ def _line_of(
     chi2 = fit(0.0)[2]
     if chi2 <= degrees:
         high = 0.0
-    # bisection, down to neighbouring numbers: χ² decreases with τ²
+    # Bisection, down to neighbouring numbers: χ² decreases with τ².
     for _ in range(200 if high else 0):
         middle = (low + high) / 2
         low, high = (middle, high) if fit(middle)[2] > degrees else (low, middle)

@@ -75,7 +75,7 @@ def start_values(
         gross = _gross_views(views, solved)
         if not gross.any():
             break
-        # fewer than two views would be left: nothing says which are right
+        # Fewer than two views would be left: nothing says which are right.
         if gross.sum() > len(views) - 2:
             raise NotSolvedError(
                 "not solved: the photographs contradict one another: the points of "
@@ -110,7 +110,7 @@ def _gross_views(views: BoardViews, solved: FirstCamera) -> Bool[np.ndarray, " v
     computed = images_of_board(
         model, interior, solved.position, solved.rotation, views.board.points
     )
-    # lengths of the residuals, pixels; NaN for missing points
+    # Lengths of the residuals, pixels; NaN for missing points.
     v = np.linalg.norm(computed - in_model_units(views.xy, model, views.image_size), axis=2)
     typical = NORMAL_SIGMA_BY_MAD * np.nanmedian(v)
     # Gross: above 12 times the typical size and 3 pixels. (Of lengths 1.4826·median is not σ of a

@@ -70,7 +70,7 @@ def find(calibration: "Calibration") -> list[Finding]:
         words = " ".join(cross_validation_in_words(calibration))
         found.append(Finding("Cross-validation", state, words, "halves that contradict each other"))
     if (bias := calibration.bias) is not None:
-        # half of the variance: as large as all errors of measurement together
+        # Half of the variance: as large as all errors of measurement together.
         state = GOOD if not bias.found else DOUBTFUL if bias.ratio > 0.5 else NOTED
         brief = f"{100 * bias.ratio:.0f} % of the residual variance are a bias"
         found.append(Finding("Bias", state, bias.sentence, brief))

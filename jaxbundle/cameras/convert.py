@@ -150,6 +150,10 @@ def _as_conversion(
             "image: its field of view is narrower; convert a smaller area, or to another model"
         )
     worst = int(np.argmax(length))
+    # A fit may find the same camera, as of two models whose distortions are all zero. Rounding of
+    # an inverse to double precision is some 1e-15 of the coordinates, enlarged by the distortion.
+    if length[worst] <= 1e-12 * np.abs(xy).max():
+        reason = ""
     return Conversion(
         target.name,
         {name: float(v) for name, v in found.items()},

@@ -38,7 +38,7 @@ def distortion_table(
     **Raises:** `ValueError` for a step or end that is not positive.
     """
     if not (0 < step <= largest < np.inf):
-        raise ValueError(f"the step is {step} and the end {largest}; 0 < step ≤ end is expected")
+        raise ValueError(f"the step is {step} and the end {largest}; expected 0 < step ≤ end")
     values = {**default_parameters(model), **parameters}
     p = np.array([values[name] for name in model.parameters], float)
     radius = step * np.arange(1, int(largest / step * (1 + 1e-12)) + 1)

@@ -66,9 +66,9 @@ def field_of_view_of_rays(
     values = {**default_parameters(model), **parameters}
     rays = rays_of(model, values, np.array(ends).reshape(-1, 2)).reshape(4, 2, 3)
     a, b = rays[:, 0], rays[:, 1]
-    # the angle at the sphere by its tangent: exact for small and large ones alike
+    # The angle at the sphere by its tangent: exact for small and large ones alike.
     angles = np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(1))
-    # beyond 180° the opening looks to the other side
+    # Beyond 180° the opening looks to the other side.
     middle = a + b
     angles = np.where(middle[:, 2] > 0, 2 * np.pi - angles, angles)
     return FieldOfView(float(angles[0]), float(angles[1]), float(angles[2:].max()))

@@ -40,8 +40,8 @@ def radial_spline(number: int, degrees: float) -> CameraModel:
     least, most = 2, 40
     if not (least <= number <= most and 0 < degrees <= 360):
         raise ValueError(
-            f"a radial spline of {number} values over {degrees:g}°: {least} to {most} values and a "
-            "field of view up to 360° are expected, such as radial-spline-6-120"
+            f"a radial spline of {number} values over {degrees:g}°: expected {least} to {most} "
+            "values and a field of view up to 360°, such as radial-spline-6-120"
         )
     last = float(np.radians(degrees / 2) ** 2)
     of_values = through_values(number + 1)[:, 1:]

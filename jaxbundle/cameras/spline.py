@@ -106,8 +106,8 @@ def spline(columns: int, rows: int, degrees: float) -> CameraModel:
     least, most = 4, 40
     if not (least <= min(columns, rows) and max(columns, rows) <= most and 0 < degrees <= 350):
         raise ValueError(
-            f"a spline of {columns} × {rows} knots over {degrees:g}°: {least} to {most} knots "
-            "either way and a field of view up to 350° are expected, such as spline-12x9-110"
+            f"a spline of {columns} × {rows} knots over {degrees:g}°: expected {least} to {most} "
+            "knots either way and a field of view up to 350°, such as spline-12x9-110"
         )
     per_unit = float((columns - 3) / (4 * np.tan(np.radians(degrees) / 4)))
     grid = _Grid(columns, rows, per_unit)

@@ -203,7 +203,7 @@ def _accept(
     population = getattr(result, "population", result)
     if isinstance(population, Population):
         if all(one.name != SOLVED for one in found):
-            # an input without a result has no numbers that could fail
+            # An input without a result has no numbers that could fail.
             found.append(read_criterion(f"{SOLVED} >= 100 %"))
         return Acceptance(tuple(judge(population, None, one) for one in found))
     if not np.all(getattr(result, "converged", True)):
@@ -293,7 +293,7 @@ def _check_unknown(
 ) -> None:
     """Refuse the name of an unknown that no camera, image or point has."""
     if not one.argument:
-        raise InputError("a parameter is expected in parentheses, such as (c), (X0) or (Z)")
+        raise InputError("expected a parameter in parentheses, such as (c), (X0) or (Z)")
     name = one.argument.rpartition(":")[2]
     if command == "calibrate-rig" and name in ("base", "rotation"):
         return

@@ -17,7 +17,7 @@ from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
 from jaxbundle.system.terminals import in_utf8
 
-FORM = "QUANTITY < NUMBER UNIT is expected, such as 'sigma(c) < 2 um' or 'sigma0 < 1.2'"
+FORM = "expected QUANTITY < NUMBER UNIT, such as 'sigma(c) < 2 um' or 'sigma0 < 1.2'"
 PATTERN = re.compile(
     r"""\s*(?P<name>[A-Za-z][\w.]*)\s*
     (?:\(\s*(?P<argument>[^()]+?)\s*\)\s*)?
@@ -64,7 +64,7 @@ def read_criterion(text: str) -> Criterion:
     """A criterion from its text.
 
     **Raises:** `InputError`, with the form that is expected."""
-    # of a locale without UTF-8 a command line has bytes for ≤ and µ
+    # Of a locale without UTF-8 a command line has bytes for ≤ and µ.
     text = in_utf8(text) if isinstance(text, str) else text
     found = PATTERN.fullmatch(text) if isinstance(text, str) else None
     if found is None:

@@ -131,7 +131,7 @@ def read_details(given: Any) -> CertificateDetails:
     if isinstance(given, str | Path):
         where, given = str(given), read_toml(Path(given))
     if not isinstance(given, Mapping):
-        raise InputError(f"details: the path of a TOML file is expected, not {show(given)}")
+        raise InputError(f"details: expected the path of a TOML file, got {show(given)}")
     _check_keys(given, ("certificate", "evaluation", "input"), where)
     stated = _section(given, "certificate", where)
     _check_keys(stated, FIELDS, f"{where}, [certificate]")
@@ -139,7 +139,7 @@ def read_details(given: Any) -> CertificateDetails:
     _check_keys(evaluation, EVALUATION, f"{where}, [evaluation]")
     inputs = given.get("input", [])
     if not isinstance(inputs, list) or not all(isinstance(one, Mapping) for one in inputs):
-        raise InputError(f"{where}: [[input]] sections are expected")
+        raise InputError(f"{where}: expected [[input]] sections")
     return CertificateDetails(
         fields={name: str(value) for name, value in stated.items()},
         inputs=_inputs(inputs, where),
@@ -150,7 +150,7 @@ def read_details(given: Any) -> CertificateDetails:
 def _section(given: Mapping[str, Any], name: str, where: str) -> Mapping[str, Any]:
     found = given.get(name, {})
     if not isinstance(found, Mapping):
-        raise InputError(f"{where}: a section [{name}] is expected")
+        raise InputError(f"{where}: expected a section [{name}]")
     return found
 
 
@@ -164,9 +164,9 @@ def _evaluation(given: Mapping[str, Any], where: str) -> dict[str, Any]:
     if "coverage" in given:
         found["coverage"] = number(f"{where}, coverage", given["coverage"])
         if not 0 < found["coverage"] < 1:
-            raise InputError(f"{where}, coverage: a probability between 0 and 1 is expected")
+            raise InputError(f"{where}, coverage: expected a probability between 0 and 1")
     if "rule" in given and given["rule"] not in RULES:
-        raise InputError(f"{where}, rule: one of {', '.join(RULES)} is expected")
+        raise InputError(f"{where}, rule: expected one of {', '.join(RULES)}")
     for name in ("mpe", "rule"):
         if name in given:
             found[name] = str(given[name])
@@ -176,14 +176,14 @@ def _evaluation(given: Mapping[str, Any], where: str) -> dict[str, Any]:
     if "measurands" in given:
         names = given["measurands"]
         if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
-            raise InputError(f"{where}, measurands: a list of names KIND:ID:NAME is expected")
+            raise InputError(f"{where}, measurands: expected a list of names KIND:ID:NAME")
         for name in names:
             split_name(name)
         found["measurands"] = tuple(names)
     if "volume" in given:
         sides = given["volume"]
         if not isinstance(sides, list) or len(sides) != 3:  # noqa: PLR2004 - width, depth, height
-            raise InputError(f"{where}, volume: three sides are expected, such as [2.0, 2.0, 1.5]")
+            raise InputError(f"{where}, volume: expected three sides, such as [2.0, 2.0, 1.5]")
         found["volume"] = tuple(positive(f"{where}, volume", side) for side in sides)
     return found
 
@@ -205,10 +205,10 @@ def _inputs(given: list[Mapping[str, Any]], where: str) -> dict[str, HeldInput]:
 def _input(one: Mapping[str, Any], place: str) -> HeldInput:
     given = [key for key in ("sigma", "limits", "expanded") if key in one]
     if len(given) != 1:
-        raise InputError(f"{place}: one of sigma, limits, expanded is expected")
+        raise InputError(f"{place}: expected one of sigma, limits, expanded")
     distribution = str(one.get("distribution", "rectangular" if "limits" in one else "normal"))
     if distribution not in DIVISORS:
-        raise InputError(f"{place}, distribution: one of {', '.join(DIVISORS)} is expected")
+        raise InputError(f"{place}, distribution: expected one of {', '.join(DIVISORS)}")
     value = positive(f"{place}, {given[0]}", one[given[0]])
     if given[0] == "limits":
         value /= DIVISORS[distribution]

@@ -167,7 +167,7 @@ def _adjustments(result: Any) -> dict[str, Adjustment | Calibration]:
         one = len(result.parts) == 1
         return {"" if one else part.name: part.adjustment for part in result.parts}
     raise InputError(
-        "a result of jaxbundle.adjust, calibrate, calibrate_rig or reconstruct is expected, not "
+        "expected a result of jaxbundle.adjust, calibrate, calibrate_rig or reconstruct, got "
         f"{show(result)}"
     )
 

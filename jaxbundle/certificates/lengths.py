@@ -87,7 +87,7 @@ def read_mpe(text: str, unit: str) -> PermissibleError:
     found = MPE_FORM.fullmatch(text) if isinstance(text, str) else None
     if found is None:
         raise InputError(
-            f"MPE {show(text)}: A UNIT + L/K is expected, such as '20 um + L/50000', or '50 um'"
+            f"MPE {show(text)}: expected A UNIT + L/K, such as '20 um + L/50000', or '50 um'"
         )
     if unit not in LENGTHS:
         raise InputError(f"MPE {text!r}: the object unit {unit!r} is no length")
@@ -361,7 +361,7 @@ def length_errors(
     """
     adjustment = getattr(given, "adjustment", given)
     if not isinstance(adjustment, Adjustment):
-        raise InputError(f"a result of jaxbundle.adjust is expected, not {show(given)}")
+        raise InputError(f"expected a result of jaxbundle.adjust, got {show(given)}")
     one_of("rule", rule, RULES)
     known = read_lengths(lengths)
     if adjustment.counts.datum == 7:  # noqa: PLR2004 - three shifts, three rotations, scale
@@ -435,10 +435,10 @@ def join_length_tests(tests: Sequence[LengthTest] | Mapping[str, LengthTest]) ->
     **Raises:** `InputError` without tests, or for different units, limits or rules."""
     given = list(tests.values()) if isinstance(tests, Mapping) else list(tests)
     if not given:
-        raise InputError("tests: at least one is expected")
+        raise InputError("tests: expected at least one")
     first = given[0]
     if any((t.unit, t.mpe, t.rule) != (first.unit, first.mpe, first.rule) for t in given):
-        raise InputError("tests of one unit, MPE and decision rule are expected")
+        raise InputError("expected tests of one unit, MPE and decision rule")
     lengths = CalibratedLengths(
         tuple(ends for t in given for ends in t.lengths.ends),
         np.concatenate([t.lengths.value for t in given]),

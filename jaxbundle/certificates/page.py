@@ -195,7 +195,7 @@ def draw_network(adjustment: "Adjustment") -> str:
     extent = float(np.ptp(np.concatenate([points, stations]), axis=0).max()) or 1.0
     roots = [_ellipse_root(one) for one in C]
     largest = max((float(np.linalg.norm(root)) for root in roots), default=0.0)
-    # the largest ellipse a twentieth of the network, times a round number
+    # The largest ellipse a twentieth of the network, times a round number.
     factor = round_down(0.05 * extent / largest) if largest > 0 else 0.0
     turn = np.linspace(0, 2 * np.pi, 33)
     circle = np.stack([np.cos(turn), np.sin(turn)])

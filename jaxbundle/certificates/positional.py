@@ -28,7 +28,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.network.columns import count
 from jaxbundle.report.layout import fixed, significant, table
 from jaxbundle.results import TableMethods
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 STANDARD = (
     "ASPRS Positional Accuracy Standards for Digital Geospatial Data, Edition 2, Version 2 (2024)"
@@ -247,7 +247,7 @@ def positional_accuracy(
     """
     adjustment = getattr(given, "adjustment", given)
     if not isinstance(adjustment, Adjustment):
-        raise InputError(f"a result of jaxbundle.adjust is expected, not {show(given)}")
+        raise InputError(f"expected a result of jaxbundle.adjust, got {show(given)}")
     found = adjustment.check_points
     if found is None or not np.isfinite(found.difference).any():
         raise InputError(
@@ -260,7 +260,7 @@ def positional_accuracy(
     for name, value in (("horizontal", horizontal_class), ("vertical", vertical_class)):
         if value is not None:
             positive(f"{name}_class", value)
-    sigma = np.array(present(adjustment.check)[0].sigma, float)
+    sigma = np.array(not_none(adjustment.check)[0].sigma, float)
     sigma[~np.isfinite(sigma)] = np.nan
     return PositionalAccuracy(
         found.id, found.difference, sigma, unit, horizontal_class, vertical_class

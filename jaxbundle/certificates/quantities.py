@@ -17,6 +17,7 @@ from jaxbundle.batches.population import Population
 from jaxbundle.calibration.result import Calibration
 from jaxbundle.calibration.rig.result import RigCalibration
 from jaxbundle.calibration.several import Calibrations
+from jaxbundle.certificates.check_differences import CheckDifferences, check_point_quantities
 from jaxbundle.certificates.lengths import LengthTest
 from jaxbundle.certificates.quantities_of_batches import OF_BATCH
 from jaxbundle.certificates.quantities_of_others import (
@@ -32,7 +33,6 @@ from jaxbundle.certificates.quantity import (
     Subject,
     number_of_result,
     one_value,
-    refuse_argument,
     require_parameter,
 )
 from jaxbundle.certificates.units import NO_PITCH, PixelPitch
@@ -42,7 +42,7 @@ from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.reconstruction.result import Reconstruction
 from jaxbundle.refinement import Refinement
 from jaxbundle.report.correlated import stated_sigma, stated_sigma_of
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 
 def offered(kind: str) -> dict[str, Quantity]:
@@ -75,6 +75,7 @@ def find_quantity(
     for quantities, subjects in groups:
         known = {one.name: one for one in quantities}
         if name in known:
+            known[name].check_argument(argument)
             parts = {
                 label: known[name].find(Subject(one, lengths), argument)
                 for label, one in subjects.items()
@@ -110,7 +111,7 @@ def _parts_of(result: Any) -> list[tuple[tuple[Quantity, ...], dict[str, Any]]]:
     if isinstance(result, Refinement):
         return [(OF_REFINEMENT, {"": result})]
     if isinstance(adjustment := getattr(result, "adjustment", None), Adjustment):
-        # of a camera on a robot, which is above this room
+        # Of a camera on a robot, which is above this room.
         return [(OF_HAND_EYE, {"": result}), (OF_ADJUSTMENT, {"": adjustment})]
     return []
 
@@ -151,11 +152,11 @@ def _split(argument: str) -> tuple[str, str, str]:
         return kind, id, name
     if mark:
         raise InputError(
-            f"({argument}): a parameter, such as c, or KIND:ID:NAME is expected, such as "
+            f"({argument}): expected a parameter, such as c, or KIND:ID:NAME, such as "
             "camera:cam:c, image:*:X0 or point:7:Z"
         )
     if not argument:
-        raise InputError("a parameter is expected in parentheses, such as (c), (X0) or (Z)")
+        raise InputError("expected a parameter in parentheses, such as (c), (X0) or (Z)")
     if argument in EXTERIOR:
         return "image", "*", argument
     if argument in AXES:
@@ -247,12 +248,11 @@ def _rms_sigma(subject: Subject, argument: str) -> QuantityValues:
     return dataclasses.replace(found, values={"": float(np.sqrt(np.mean(values**2)))})
 
 
-def _image_rms(subject: Subject, argument: str) -> QuantityValues:
-    refuse_argument(argument)
+def _image_rms(subject: Subject, _: str) -> QuantityValues:
     adjustment: Adjustment = subject.result
     rows = adjustment.residuals
     image = rows["kind"] == "image"
-    # two coordinates a point: the RMS of a coordinate
+    # Two coordinates a point: the RMS of a coordinate.
     unit = str(rows["unit"][image][0])
     cameras = adjustment.problem.network.cameras
     pitch = _pitch(cameras)
@@ -263,54 +263,28 @@ def _image_rms(subject: Subject, argument: str) -> QuantityValues:
     return QuantityValues({"": float(np.sqrt(np.mean(v**2)))}, unit, pitch)
 
 
-def _differences(subject: Subject) -> tuple[dict[str, np.ndarray], str]:
-    adjustment: Adjustment = subject.result
-    found = adjustment.table("checks")
-    if not found:
-        raise LookupError("the result has no check points")
-    return found, adjustment.network.object_unit
-
-
-def _check_rms(subject: Subject, argument: str) -> QuantityValues:
-    table, unit = _differences(subject)
-    rms = {axis: _rms(table[f"d{axis}"]) for axis in AXES}
-    parts = {"": AXES, "3D": AXES, "H": AXES[:2], "V": AXES[2:], **{a: (a,) for a in AXES}}
-    if argument not in parts:
-        raise InputError(f"({argument}): one of X, Y, Z, H, V, 3D is expected")
-    return one_value(math.sqrt(sum(rms[axis] ** 2 for axis in parts[argument])), unit)
-
-
-def _check_max(subject: Subject, argument: str) -> QuantityValues:
-    table, unit = _differences(subject)
-    if argument not in ("", *AXES):
-        raise InputError(f"({argument}): one of X, Y, Z is expected")
-    return QuantityValues(
-        {
-            f"{axis} of check point {id}": abs(float(d))
-            for axis in AXES
-            if argument in ("", axis)
-            for id, d in zip(table["id"], table[f"d{axis}"])
-            if math.isfinite(d)
-        },
-        unit,
-    )
-
-
-def _rms(x: np.ndarray) -> float:
-    known = x[np.isfinite(x)]
-    return float(np.sqrt(np.mean(known**2))) if len(known) else 0.0
+def _differences(result: Adjustment) -> CheckDifferences | None:
+    table = result.table("checks")
+    if not table:
+        return None
+    difference = np.stack([table[f"d{axis}"] for axis in AXES], 1)
+    return CheckDifferences(table["id"].tolist(), difference, result.network.object_unit)
 
 
 def _control_rms(subject: Subject, argument: str) -> QuantityValues:
     adjustment: Adjustment = subject.result
     rows = adjustment.residuals
-    if argument not in ("", *AXES):
-        raise InputError(f"({argument}): one of X, Y, Z is expected")
     own = rows["kind"] == "control"
     if not own.any():
         raise LookupError("the result has no control points with σ")
-    rms = [_rms(rows["v"][own & (rows["axis"] == a)]) for a in AXES if argument in ("", a)]
-    return one_value(math.sqrt(sum(x * x for x in rms)), adjustment.network.object_unit)
+    mean = [
+        np.mean(rows["v"][chosen] ** 2)
+        for axis in AXES
+        if argument in ("", axis) and (chosen := own & (rows["axis"] == axis)).any()
+    ]
+    if not mean:
+        raise LookupError(f"no control point has a σ in {argument}")
+    return one_value(math.sqrt(sum(mean)), adjustment.network.object_unit)
 
 
 def _lengths(subject: Subject) -> LengthTest:
@@ -319,20 +293,17 @@ def _lengths(subject: Subject) -> LengthTest:
     return subject.lengths
 
 
-def _lme(subject: Subject, argument: str) -> QuantityValues:
-    refuse_argument(argument)
+def _lme(subject: Subject, _: str) -> QuantityValues:
     test = _lengths(subject)
     errors = zip(test.lengths.ends, np.abs(test.error).tolist())
     return QuantityValues({f"length {a} – {b}": error for (a, b), error in errors}, test.unit)
 
 
-def _lme_rms(subject: Subject, argument: str) -> QuantityValues:
-    refuse_argument(argument)
+def _lme_rms(subject: Subject, _: str) -> QuantityValues:
     return one_value(_lengths(subject).rms, _lengths(subject).unit)
 
 
-def _lme_number(subject: Subject, argument: str) -> QuantityValues:
-    refuse_argument(argument)
+def _lme_number(subject: Subject, _: str) -> QuantityValues:
     return one_value(len(_lengths(subject).lengths))
 
 
@@ -389,19 +360,7 @@ OF_ADJUSTMENT: tuple[Quantity, ...] = (
         "correlation(NAME)", "", "total correlation of a camera parameter", _total_correlation
     ),
     Quantity("image.rms", "px, length", "RMS residual of an image coordinate", _image_rms),
-    Quantity(
-        "check.rms[(X|Y|Z|H|V|3D)]",
-        "length",
-        "RMS difference at check points, of all axes",
-        _check_rms,
-    ),
-    Quantity("check.max[(X|Y|Z)]", "length", "largest difference at check points", _check_max),
-    Quantity(
-        "check.number",
-        "",
-        "number of check points",
-        number_of_result(lambda a: 0 if a.check_points is None else len(a.check_points.id)),
-    ),
+    *check_point_quantities(_differences),
     Quantity("control.rms[(X|Y|Z)]", "length", "RMS residual of control", _control_rms),
     Quantity("LME", "length", "largest length measurement error (--lengths)", _lme),
     Quantity("LME.rms", "length", "RMS of length measurement errors", _lme_rms),
@@ -415,9 +374,8 @@ OF_ADJUSTMENT: tuple[Quantity, ...] = (
 def _calibrated(
     function: Callable[[Calibration], float], unit: str = ""
 ) -> Callable[[Subject, str], QuantityValues]:
-    def find(subject: Subject, argument: str) -> QuantityValues:
-        refuse_argument(argument)
-        camera = present(subject.result).camera
+    def find(subject: Subject, _: str) -> QuantityValues:
+        camera = not_none(subject.result).camera
         return QuantityValues({"": float(function(subject.result))}, unit, _pitch([camera]))
 
     return find
@@ -489,7 +447,7 @@ def _mountings(rig: RigCalibration, what: str) -> QuantityValues:
     if what == "base":
         values = {f"base of {n}": m.length_sigma for n, m in rig.mountings.items()}
         return QuantityValues(values, rig.object_unit)
-    # angles of a mounting are in degrees
+    # Angles of a mounting are in degrees.
     values = {f"rotation of {n}": float(max(m.sigma[3:])) for n, m in rig.mountings.items()}
     return QuantityValues(values, "deg")
 

@@ -12,7 +12,6 @@ from jaxbundle.certificates.quantity import (
     QuantityValues,
     Subject,
     one_value,
-    refuse_argument,
 )
 from jaxbundle.network.columns import list_some
 
@@ -39,8 +38,7 @@ def _require_of_all(found: Population, name: str, known: Bool[np.ndarray, " inpu
 
 
 def _number(name: str, unit: str = "") -> Callable[[Subject, str], QuantityValues]:
-    def find(subject: Subject, argument: str) -> QuantityValues:
-        refuse_argument(argument)
+    def find(subject: Subject, _: str) -> QuantityValues:
         found: Population = subject.result
         values = found.numbers[name]
         _require_of_all(found, name, np.asarray(np.isfinite(values)))
@@ -55,7 +53,7 @@ def _parameter(what: str) -> Callable[[Subject, str], QuantityValues]:
         """The values or σ of a parameter; of an input with several cameras ("left fx") of each."""
         found: Population = subject.result
         columns = {"value": found.values, "sigma": found.sigma}[what]
-        # a rig has "left fx", "right fx": fx is that of every camera
+        # A rig has "left fx", "right fx": fx is that of every camera.
         names = [n for n in columns if argument in (n, n.rpartition(" ")[2])]
         if not names:
             known = ", ".join(columns) or "none"
@@ -69,7 +67,7 @@ def _parameter(what: str) -> Callable[[Subject, str], QuantityValues]:
             if np.isfinite(value)
         }
         label = lambda name, key: f"{name} of {key}"
-        # cameras of several models may share a file of results
+        # Cameras of several models may share a file of results.
         units = {unit_of_parameter(m, argument.rpartition(" ")[2]) for m in found.models}
         if len(units) > 1:
             raise LookupError(f"{argument} has different units: {', '.join(sorted(units))}")
@@ -83,14 +81,13 @@ def _parameter(what: str) -> Callable[[Subject, str], QuantityValues]:
 
 
 def _share(which: str) -> Callable[[Subject, str], QuantityValues]:
-    def find(subject: Subject, argument: str) -> QuantityValues:
+    def find(subject: Subject, _: str) -> QuantityValues:
         """The share of the inputs, and which are missing."""
-        refuse_argument(argument)
         found: Population = subject.result
         good = {"solved": found.solved, "converged": found.fit}[which]
         if not len(good):
             raise LookupError("there are no inputs")
-        # named, because a share alone says nobody which input to look at
+        # Named, because a share alone says nobody which input to look at.
         others = found.keys[~good].tolist()
         words = f"all but {list_some(others, as_text=str)}" if others else f"all {len(good)} inputs"
         return QuantityValues({words: float(good.mean())}, owners={words: others})
@@ -98,8 +95,7 @@ def _share(which: str) -> Callable[[Subject, str], QuantityValues]:
     return find
 
 
-def _outlying(subject: Subject, argument: str) -> QuantityValues:
-    refuse_argument(argument)
+def _outlying(subject: Subject, _: str) -> QuantityValues:
     found: Population = subject.result
     return one_value(len(found.outlying()))
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxbundle.certificates.check_differences import CheckDifferences, check_point_quantities
 from jaxbundle.certificates.quantity import (
     AXES,
     Quantity,
@@ -42,7 +43,7 @@ def find_by_path(result: Any, name: str, argument: str) -> QuantityValues:
     **Raises:** `InputError` for an unknown path, and for one that leads to no number."""
     to_dict = getattr(result, "to_dict", None)
     if to_dict is None:
-        raise InputError(f"a result of jaxbundle is expected, not {type(result).__name__}")
+        raise InputError(f"expected a result of jaxbundle, got {type(result).__name__}")
     refuse_argument(argument)
     found = dict(_walk(to_dict(), name.split("."), name, ""))
     if not found:
@@ -80,8 +81,6 @@ def _mounting(subject: Subject, argument: str) -> QuantityValues:
     """σ of the two poses that are estimated."""
     adjustment = subject.result.adjustment
     network = adjustment.problem.network
-    if argument not in ("position", "rotation"):
-        raise InputError(f"({argument}): position or rotation is expected")
     table = subject.result.table()
     values = {
         f"{name} of {of}": float(sigma)
@@ -94,8 +93,6 @@ def _mounting(subject: Subject, argument: str) -> QuantityValues:
 
 def _repeatability(subject: Subject, argument: str) -> QuantityValues:
     network = subject.result.adjustment.problem.network
-    if argument not in ("position", "rotation"):
-        raise InputError(f"({argument}): position or rotation is expected")
     part = PARTS[argument == "rotation"]
     if part not in subject.result.repeatability:
         raise LookupError(f"the repeatability of {part} is not estimated")
@@ -117,47 +114,13 @@ OF_HAND_EYE: tuple[Quantity, ...] = (
 # --- scanner images -------------------------------------------------------------------------
 
 
-def _differences(result: Refinement) -> np.ndarray:
-    if result.check is None:
-        raise LookupError("the result has no check points")
-    return result.check.difference
-
-
-def _check_rms(subject: Subject, argument: str) -> QuantityValues:
-    """RMS of an axis; H of the first two; without an argument of all that are known."""
-    chosen = {"": [0, 1, 2], "H": [0, 1], "V": [2], **{a: [i] for i, a in enumerate(AXES)}}
-    if argument not in chosen:
-        raise InputError(f"({argument}): one of X, Y, Z, H, V is expected")
-    square = _differences(subject.result)[:, chosen[argument]] ** 2
-    known = np.isfinite(square)
-    if not known.any():
-        raise LookupError("no check point has this difference")
-    # one scanner image gives no height: what is not known does not count as 0 of it
-    axes = known.any(0)
-    mean = np.where(known, square, 0.0).sum(0)[axes] / known.sum(0)[axes]
-    return one_value(math.sqrt(mean.sum()), METRES)
-
-
-def _check_max(subject: Subject, argument: str) -> QuantityValues:
-    if argument not in ("", *AXES):
-        raise InputError(f"({argument}): one of X, Y, Z is expected")
-    difference = _differences(subject.result)
-    values = {
-        f"{axis} of check point {id}": abs(float(d))
-        for i, axis in enumerate(AXES)
-        if argument in ("", axis)
-        for id, d in zip(subject.result.check.id, difference[:, i])
-        if math.isfinite(d)
-    }
-    if not values:
-        raise LookupError("no check point has this difference")
-    return QuantityValues(values, METRES)
+def _differences(result: Refinement) -> CheckDifferences | None:
+    found = result.check
+    return None if found is None else CheckDifferences(found.id, found.difference, METRES)
 
 
 def _point_sigma(subject: Subject, argument: str) -> QuantityValues:
     result: Refinement = subject.result
-    if argument not in AXES:
-        raise InputError(f"({argument}): one of X, Y, Z is expected")
     sigma = np.asarray(result.inspection.point_sigma)[:, AXES.index(argument)]
     chosen = {f"{argument} of point {k}": float(s) for k, s in zip(result.point_ids, sigma) if s}
     if not chosen:
@@ -176,17 +139,5 @@ OF_REFINEMENT: tuple[Quantity, ...] = (
     ),
     Quantity("warnings", "", "number of warnings", number_of_result(lambda r: len(r.warnings))),
     Quantity("sigma(X|Y|Z)", "length", "σ of the points, the largest", _point_sigma),
-    Quantity(
-        "check.rms[(X|Y|Z|H|V)]",
-        "length",
-        "RMS difference at check points, of all axes",
-        _check_rms,
-    ),
-    Quantity("check.max[(X|Y|Z)]", "length", "largest difference at check points", _check_max),
-    Quantity(
-        "check.number",
-        "",
-        "number of check points",
-        number_of_result(lambda r: 0 if r.check is None else len(r.check.id)),
-    ),
+    *check_point_quantities(_differences),
 )

@@ -37,7 +37,7 @@ class QuantityValues:
 @dataclasses.dataclass(frozen=True)
 class Quantity:
     """A quantity: its `form` for lists ("sigma(NAME)", in brackets what may be omitted), its `unit`
-    in words, what it is; `find` its values in a subject, by the argument."""
+    in words, what it is; `find` its values in a subject, by an argument of its form."""
 
     form: str
     unit: str
@@ -65,7 +65,7 @@ class Quantity:
         may_be_omitted = not expected or "[" in self.form
         if open_ones or argument in expected or (not argument and may_be_omitted):
             return
-        raise InputError(f"({argument}): one of {', '.join(expected)} is expected")
+        raise InputError(f"({argument}): expected one of {', '.join(expected)}")
 
 
 def one_value(value: float, unit: str = "") -> QuantityValues:
@@ -80,8 +80,7 @@ def refuse_argument(argument: str) -> None:
 def number_of_result(function: Callable[[Any], float]) -> Callable[[Subject, str], QuantityValues]:
     """How to find a quantity without an argument: one number, a function of the result."""
 
-    def find(subject: Subject, argument: str) -> QuantityValues:
-        refuse_argument(argument)
+    def find(subject: Subject, _: str) -> QuantityValues:
         return one_value(function(subject.result))
 
     return find

@@ -76,4 +76,4 @@ def _refusal(given: str, wanted: str) -> str:
     more = ""
     if {kind_of(given), kind_of(wanted)} == {"length", "image"}:
         more = "; pixels and lengths need one pixel_size of all cameras"
-    return f"one of {', '.join(known)} is expected, but {said} is given{more}"
+    return f"expected one of {', '.join(known)}, but {said} is given{more}"

@@ -164,7 +164,7 @@ def adjust(  # noqa: PLR0913 - the options of the command
             check,
         )
         if not first:
-            # only the first process writes, though all compute
+            # Only the first process writes, though all compute.
             json, out, html, save, quiet, print_report = "", None, "", "", True, False
             judged, gis, crs = CertificateOptions(), "", ""
     network = read_network(input, format=format, overrides=tuple(set or ()), control=control)
@@ -174,7 +174,7 @@ def adjust(  # noqa: PLR0913 - the options of the command
     if correlated is None:
         correlated = network.observations.sigma_origin == ESTIMATED
     held = held_of(budget, network)
-    # before an adjustment that may take hours
+    # Before an adjustment that may take hours.
     check_targets(input, network, json, out, control, force, html, save)
     files = network_files(input, network, control)
     check_gis(gis, crs, files, force)
@@ -188,7 +188,7 @@ def adjust(  # noqa: PLR0913 - the options of the command
         force=force,
     )
     origin = Origin(computed=in_words(now()))
-    # fingerprints read all files once more: only for outputs that state them
+    # Fingerprints read all files once more: only for outputs that state them.
     if html or certificate or out is not None:
         origin = trace_origin(
             input,

@@ -183,7 +183,7 @@ def choice(
         folded = {word.casefold(): word for word in words}
         close = get_close_matches(value.casefold(), folded, 1)
         mean = f"; did you mean {folded[close[0]]!r}?" if close else ""
-        raise InputError(f"{option.opts[0]} {value!r}: one of {listed} is expected{mean}")
+        raise InputError(f"{option.opts[0]} {value!r}: expected one of {listed}{mean}")
 
     told = (f"{about}: {listed}" if about else listed) if listing else about
     complete = lambda: [word for word in words if word not in forms]
@@ -226,7 +226,7 @@ def run(prepare: Callable[[], object] | None = None) -> None:
     except (InputError, NotSolvedError) as error:
         _end(error, BAD_INPUT if isinstance(error, InputError) else NOT_SOLVED)
     except (BrokenPipeError, SystemExit):  # typer ends a command that meets a broken pipe
-        # nobody reads: what Python flushes at its end must not fail once more
+        # Nobody reads: what Python flushes at its end must not fail once more.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         leave(NO_READER)
     except typer.Abort as error:  # typer's word for EOFError
@@ -238,7 +238,7 @@ def run(prepare: Callable[[], object] | None = None) -> None:
     except (OverflowError, RecursionError) as error:
         _end(" ".join(str(error).split()), BAD_INPUT)
     except UnicodeEncodeError as error:
-        # a name of a file, in a locale without its letters
+        # A name of a file, in a locale without its letters.
         if error.encoding != sys.getfilesystemencoding():
             raise
         _end(

@@ -187,7 +187,7 @@ def batch(  # noqa: PLR0913 - the options of the command
             set,
         )
         if not first:
-            # only the first process writes, though all compute
+            # Only the first process writes, though all compute.
             html, table, summary, accept, asked, quiet = "", None, None, None, [], True
     elif not part:
         add_parts(json_lines)  # left by joined processes that were ended
@@ -217,7 +217,7 @@ def batch(  # noqa: PLR0913 - the options of the command
     accepted = None
     if asked:
         found = done.population
-        # read again, for the keys that now have results
+        # Read again, for the keys that now have results.
         beside = {} if columns is None else read_against(columns, found.keys, str(against))
         accepted = accept_result(found, accept)
         write_outputs(found, beside, table, summary, accepted)
@@ -334,5 +334,5 @@ def _read_against(path: Path, asked: bool) -> "Columns":
 def _part(text: str) -> tuple[int, int]:
     found = re.fullmatch(r"\s*(\d{1,9})\s*/\s*(\d{1,9})\s*", text or "1/1")
     if not found or not 1 <= int(found[1]) <= int(found[2]):
-        raise InputError(f"--part {text}: I/N is expected, the I-th of N parts, such as 1/4")
+        raise InputError(f"--part {text}: expected I/N, the I-th of N parts, such as 1/4")
     return int(found[1]), int(found[2])

@@ -31,7 +31,7 @@ def check_outputs(
             check_file(option, str(path), None, inputs)
     if table is not None:
         if table.suffix.lower() not in (".csv", ".parquet"):
-            raise InputError(f"--table {table}: a name that ends with .csv or .parquet is expected")
+            raise InputError(f"--table {table}: expected a name that ends with .csv or .parquet")
         if summary is not None and table.resolve() == summary.resolve():
             raise InputError(f"--summary {summary}: is also the file of --table")
         if is_parquet(table):
@@ -40,7 +40,7 @@ def check_outputs(
             except ImportError as error:
                 raise InputError(f"--table {table}: {error}") from None
     if summary is not None and not force:
-        # a table is a .csv or .parquet by its name; a summary may have any
+        # A table is a .csv or .parquet by its name; a summary may have any.
         check_json(str(summary), FORCE_ADVICE, "--summary")
 
 

@@ -42,7 +42,7 @@ def board_given(
 def _size(text: str) -> tuple[int, int]:
     found = re.fullmatch(r"\s*(\d{1,4})\s*[x×X,]\s*(\d{1,4})\s*", text)
     if not found:
-        raise InputError(f"--board {text!r}: COLUMNSxROWS is expected, such as 9x6")
+        raise InputError(f"--board {text!r}: expected COLUMNSxROWS, such as 9x6")
     return int(found[1]), int(found[2])
 
 
@@ -54,7 +54,7 @@ def _spacing(text: str) -> tuple[float, float | None]:
         sides = []
     if len(sides) not in (1, 2):
         raise InputError(
-            f"--square {text!r}: a length is expected, such as 0.03, or two if a print has "
-            "stretched the board: distance of columns, distance of rows, such as 30.0,30.2"
+            f"--square {text!r}: expected a length, such as 0.03, or two if a print has stretched "
+            "the board: distance of columns, distance of rows, such as 30.0,30.2"
         )
     return sides[0], sides[1] if len(sides) == 2 else None

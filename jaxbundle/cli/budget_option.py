@@ -16,9 +16,7 @@ def held_of(given: list[str] | None, network: Network) -> dict[str, float]:
     for text in given or ():
         name, mark, sigma = text.rpartition("=")
         if not mark:
-            raise InputError(
-                f"--budget {text!r}: NAME=SIGMA is expected, such as camera:cam:K3=1e-6"
-            )
+            raise InputError(f"--budget {text!r}: expected NAME=SIGMA, such as camera:cam:K3=1e-6")
         try:
             parameter = split_name(name)[2]
         except InputError as error:

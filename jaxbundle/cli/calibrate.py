@@ -179,7 +179,7 @@ def _cameras(photos: Sequence[str] | None, named: Sequence[str] | None) -> dict[
     for item in named or ():
         name, equals, pattern = (part.strip() for part in item.partition("="))
         if not (name and equals and pattern):
-            raise InputError(f"--camera {item}: NAME=PATTERN is expected, such as left=left/*.jpg")
+            raise InputError(f"--camera {item}: expected NAME=PATTERN, such as left=left/*.jpg")
         if name in cameras:
             raise InputError(
                 f"--camera {name} is given twice: {name}={cameras[name][0]}, {name}={pattern}; "

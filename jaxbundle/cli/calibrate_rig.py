@@ -234,7 +234,7 @@ def wand_given(
         raise InputError("--wand-length: the length of the wand is missing")
     markers = dict(split_named(one, "NAME=VIDEO, NAME=FOLDER or NAME=FILE.csv") for one in sources)
     if len(markers) < len(sources):
-        raise InputError("--wand: two sources are given of one camera; expected one for each")
+        raise InputError("--wand: two sources are given for one camera; expected one for each")
     others = [name for name in markers if name not in cameras]
     if others and not files:
         raise InputError(
@@ -287,7 +287,7 @@ def name_cameras(folders: Sequence[str], alone: bool = False) -> dict[str, str]:
 def times_given(times: str, cameras: Mapping[str, str]) -> float | dict[str, float] | Path:
     """The times of photographs: frames per second, by camera if they differ, or a table."""
     if not times:
-        # where `jaxbundle frames` writes it
+        # Where `jaxbundle frames` writes it.
         tables = [Path(folder).parent / "frames.csv" for folder in cameras.values()]
         found = next((table for table in tables if table.is_file()), None)
         if found is None:
@@ -296,7 +296,7 @@ def times_given(times: str, cameras: Mapping[str, str]) -> float | dict[str, flo
                 "table with the columns camera, image, time"
             )
         return found
-    # first of all: the path of a table may have "=" or be a number
+    # First of all: the path of a table may have "=" or be a number.
     if Path(times).is_file():
         return Path(times)
     try:

@@ -66,7 +66,7 @@ def calibrate_wand(  # noqa: PLR0913 - the options of the command
     from jaxbundle.io.writing.folders import replace_folder
     from jaxbundle.measure import BlobSettings
 
-    # a video that is no video is reported by an error, not by messages of a codec
+    # A video that is no video is reported by an error, not by messages of a codec.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     sources = dict(split_named(one, "NAME=VIDEO, NAME=FOLDER or NAME=FILE.csv") for one in markers)
@@ -74,7 +74,7 @@ def calibrate_wand(  # noqa: PLR0913 - the options of the command
         raise InputError("two sources are given of one camera; expected one for each")
     check_json_target(json, [*sources.values(), *cameras])
     known = cameras_by_name(cameras, list(sources))
-    # what the files say is free was so in another adjustment: here it is given, unless asked for
+    # What the files say is free was so in another adjustment: here it is given, unless asked for.
     own = tuple(words(free))
     for name, camera in known.items():
         sigma = {parameter: s for parameter, s in camera.sigma.items() if parameter in own}
@@ -136,10 +136,10 @@ def cameras_by_name(files: Sequence[str], names: Sequence[str], option: str = "-
     found = {}
     for given in files:
         name, equals, path = given.partition("=")
-        # a file whose path has "=" is meant as a whole
+        # A file whose path has "=" is meant as a whole.
         if equals and not Path(given).exists():
             cameras = read_cameras(path)
-            # the name in the file may be another one: which is meant must be clear
+            # The name in the file may be another one: which is meant must be clear.
             if len(cameras) != 1:
                 raise InputError(f"{path}: has {len(cameras)} cameras; expected one, {name!r}")
             found[name] = cameras[0]

@@ -137,7 +137,7 @@ class CalibrationOutputs:
         try:
             yield
         except NotSolvedError as error:
-            # a failure makes no folder, unless a file that was asked for belongs in it
+            # A failure makes no folder, unless a file that was asked for belongs in it.
             inside = name_inside(self.json, self.out) or name_inside(self.html, self.out)
             place = self.out if inside else None
             page = partial(compose_failure, error, origin, KIND)
@@ -165,7 +165,7 @@ class CalibrationOutputs:
         text = json_text(document) if self.json else ""
         written = is_in_file(self.json, self.out, self.html, self.judged.certificate)
         silent = self.json == "-" or (self.quiet and written)
-        # with a folder, the whole report is there: hundreds of lines
+        # With a folder, the whole report is there: hundreds of lines.
         whole = self.out is None or compared is not None
         report = "" if silent else (compared or found).report() if whole else found.summary()
         if report:
@@ -219,7 +219,7 @@ def check_names(cameras: Iterable[str]) -> None:
     """Refuse cameras that would share an output folder."""
     folders: dict[str, str] = {}
     for name in cameras:
-        # some systems do not tell the letters of a name from capitals
+        # Some systems do not tell the letters of a name from capitals.
         other = folders.setdefault(file_name(name).casefold(), name)
         if other != name:
             raise InputError(
@@ -243,5 +243,5 @@ def values(given: Sequence[str] | None) -> dict[str, float]:
         except ValueError:
             equals = ""
         if not equals:
-            raise InputError(f"--given {item}: NAME=VALUE is expected, such as fx=1200")
+            raise InputError(f"--given {item}: expected NAME=VALUE, such as fx=1200")
     return found

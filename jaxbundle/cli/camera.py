@@ -46,7 +46,7 @@ def camera(
         described = jaxbundle.camera(file, step=step, about_origin=about_origin, **sizes)
         if json != "-":
             print(described.report())
-        # two files may have cameras of one name
+        # Two files may have cameras of one name.
         id = described.camera.id
         found[id if id not in found else f"{id} ({file})"] = described
     if json:

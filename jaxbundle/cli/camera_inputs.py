@@ -36,7 +36,7 @@ def pair(option: str, text: str) -> tuple[float, float] | None:
     try:
         first, second = (float(word) for word in text.split(","))
     except ValueError:
-        raise InputError(f"{option} {text}: two numbers A,B are expected") from None
+        raise InputError(f"{option} {text}: expected two numbers A,B") from None
     return first, second
 
 

@@ -115,6 +115,6 @@ def _errors(option: str, given: list[str] | None) -> dict[str, float]:
             found[name] = float(value)
         except ValueError:
             raise InputError(
-                f"{option} {text}: NAME=SIGMA is expected, such as vertical=0.2"
+                f"{option} {text}: expected NAME=SIGMA, such as vertical=0.2"
             ) from None
     return found

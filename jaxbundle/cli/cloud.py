@@ -89,7 +89,7 @@ def _check_targets(inputs: Sequence[Path], out: Path | None, dsm: Path | None, f
     from jaxbundle.cli.outputs import FORCE_ADVICE, check_content, check_file
 
     if out is not None and out.suffix.lower() not in CLOUD_FILES:
-        raise InputError(f"--out {out}: one of {', '.join(CLOUD_FILES)} is expected")
+        raise InputError(f"--out {out}: expected one of {', '.join(CLOUD_FILES)}")
     targets = [("--dsm", dsm, TIFF, "a TIFF")]
     if out is not None:
         targets.append(("--out", out, CONTENT[out.suffix.lower()], "a cloud"))

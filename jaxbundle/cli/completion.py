@@ -32,7 +32,7 @@ def completion(shell: Annotated[str, choice(SHELLS, argument=True)]) -> None:
     zsh a file that ~/.zshrc sources after compinit, of fish
     ~/.config/fish/completions/jaxbundle.fish.
     """
-    # a command registers itself when its file is imported
+    # A command registers itself when its file is imported.
     for command in COMMANDS:
         import_command(command)
     parser = typer.main.get_command(app)

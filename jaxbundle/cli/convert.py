@@ -50,7 +50,7 @@ def convert(  # noqa: PLR0913 - the options of the command
     overrides = tuple(set or ())
     size = pair("--image-size", image_size)
     if size is not None and not all(number.is_integer() for number in size):
-        raise InputError(f"--image-size {image_size}: whole numbers of pixels are expected")
+        raise InputError(f"--image-size {image_size}: expected whole numbers of pixels")
     told: list[str] = []
 
     def tell(lost: Sequence[str]) -> None:
@@ -74,7 +74,7 @@ def convert(  # noqa: PLR0913 - the options of the command
         tell=tell,
     )
     if not quiet:
-        # only what the writer has found beside
+        # Only what the writer has found beside.
         done = dataclasses.replace(done, lost=tuple(what for what in done.lost if what not in told))
         print(str(done).split("\n", 1)[0])
         for line in str(done).splitlines()[1:]:

@@ -83,7 +83,7 @@ def design(  # noqa: PLR0913 - the options of the command
     from jaxbundle.network_design.aims import Aim
     from jaxbundle.network_design.conditions import Conditions
     from jaxbundle.network_design.design_json import design_dict
-    from jaxbundle.types import present
+    from jaxbundle.types import not_none
 
     network = read_oriented(project)
     check_writable(json, out, "design", FILES, network_files(project, network), force)
@@ -95,7 +95,7 @@ def design(  # noqa: PLR0913 - the options of the command
         incidence=None if incidence is None else np.radians(incidence),
         normals=normals_of(normals, network),
         apart=apart,
-        obstacles=tuple(present(box_of("--obstacle", text)) for text in obstacle or ()),
+        obstacles=tuple(not_none(box_of("--obstacle", text)) for text in obstacle or ()),
         targets=box_of("--targets", targets),
     )
     designed = jaxbundle.design(

@@ -27,7 +27,7 @@ def parse_aim(given: list[str] | None):
         id, mark, name = rest.rpartition(":")
         if not mark:
             raise InputError(
-                f"--of {text!r}: points, cameras, or KIND:ID:NAME is expected, such "
+                f"--of {text!r}: expected points, cameras, or KIND:ID:NAME, such "
                 "as camera:cam:c or point:7:Z"
             )
         names.append((kind, id, name))
@@ -59,7 +59,7 @@ def _numbers(option: str, text: str, size: int) -> np.ndarray:
     except ValueError:
         found = np.zeros(0)
     if len(found) != size:
-        raise InputError(f"{option} {text!r}: {size} numbers separated by commas are expected")
+        raise InputError(f"{option} {text!r}: expected {size} numbers separated by commas")
     return found
 
 
@@ -76,12 +76,12 @@ def normals_of(text: str, network: Network):
     columns = ("id", "NX", "NY", "NZ")
     if set(table.values) != set(columns):
         raise InputError(
-            f"{text}: the columns {', '.join(columns)} are expected, but there are "
+            f"{text}: expected the columns {', '.join(columns)}, but there are "
             f"{', '.join(table.values)}"
         )
     rows = dict(zip(table.values["id"], zip(*(table.values[name] for name in columns[1:]))))
     points = network.points
-    # check points take no part in a design
+    # Check points take no part in a design.
     used = [id for id, role in zip(points.id, points.role) if role != "check"]
     missing = [id for id in used if id not in rows]
     if missing:

@@ -37,7 +37,7 @@ def check_gis(gis: str, crs: str, inputs: Iterable[str | Path], force: bool = Fa
         return
     suffix = Path(gis).suffix.lower()
     if suffix not in SUFFIXES:
-        raise InputError(f"--gis {gis}: a name that ends with .gpkg or .geojson is expected")
+        raise InputError(f"--gis {gis}: expected a name that ends with .gpkg or .geojson")
     check_file("--gis", gis, None, inputs)
     check_crs(crs)
     if suffix != ".gpkg":

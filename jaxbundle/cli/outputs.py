@@ -171,7 +171,7 @@ def check_file(option: str, file: str, out: Path | None, inputs: Iterable[str | 
             raise InputError(f"{option} {file}: there is no folder {path.parent}")
         if not os.access(path.parent, os.W_OK | os.X_OK):
             raise InputError(f"{option} {file}: cannot be written: no permission in {path.parent}")
-    # by real paths: an input may be named through a link
+    # By real paths: an input may be named through a link.
     if any(str(real) == os.path.realpath(given) for given in inputs):
         raise InputError(
             f"{option} {file}: is part of the input and would be overwritten; give another"
@@ -225,7 +225,7 @@ def check_content(option: str, file: str, like: re.Pattern[bytes], noun: str, wa
         return
     try:
         with path.open("rb") as stream:
-            # enough for blanks before the first sign
+            # Enough for blanks before the first sign.
             head = stream.read(4096)
     except OSError as error:
         raise InputError(f"{option} {file}: cannot be read: {error.strerror}") from None
@@ -293,14 +293,14 @@ def write_result(
                     write_text(new / PAGE, page())
                 if (name := name_inside(html, out)) not in (None, PAGE):
                     write_bytes(new / name, (new / PAGE).read_bytes())
-    # only now: if the folder could not be written, neither is the rest
+    # Only now: if the folder could not be written, neither is the rest.
     if json not in ("", "-"):
         write_text(Path(json), text)
     if page is not None and html and name_inside(html, out) is None:
         if out is None:
             write_text(Path(html), page())
         else:
-            # a copy: the page of a large result takes seconds to make
+            # A copy: the page of a large result takes seconds to make.
             write_bytes(Path(html), (out / PAGE).read_bytes())
 
 

@@ -88,7 +88,7 @@ def _sizes(given: Sequence[str]) -> dict[str, float]:
         except ValueError:
             mark = ""
         if not mark:
-            raise InputError(f"--errors {text!r}: NAME=SIZE is expected, a size in mm")
+            raise InputError(f"--errors {text!r}: expected NAME=SIZE, a size in mm")
     return found
 
 
@@ -97,5 +97,5 @@ def _require_pair(option: str, text: str) -> tuple[float, float]:
 
     found = pair(option, text)
     if found is None:
-        raise InputError(f"{option}: two numbers A,B are expected")
+        raise InputError(f"{option}: expected two numbers A,B")
     return found

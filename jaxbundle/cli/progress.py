@@ -49,7 +49,7 @@ class _Staged(Progress):
 def counting(quiet: bool) -> Progress:
     """A bar with the number done out of the total."""
     console = Console(stderr=True)
-    # the default columns have a percentage, but not the numbers
+    # The default columns have a percentage, but not the numbers.
     columns = (*Progress.get_default_columns(), MofNCompleteColumn())
     bar = _Staged(
         *columns, console=console, transient=True, disable=quiet or not console.is_terminal

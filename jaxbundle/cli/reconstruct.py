@@ -93,14 +93,14 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
 
     if surface and not (len(photos) == 1 and photos[0].is_dir()):
         raise InputError("--surface: give one folder of photographs")
-    # read here, before --out becomes this command's: their errors leave nothing behind
+    # Read here, before --out becomes this command's: their errors leave nothing behind.
     if targets is not None:
         check_kind(targets)
     given = None if camera is None else calibration_given(camera)[0]
     known = open_control(control, control_sigma, check or ())
     bars = () if distances is None else read_distances(distances)
     files = [p for p in (*photos, control, distances) if p is not None and p.is_file()]
-    # before the search, which opens every photograph; after it the photographs are inputs, too
+    # Before the search, which opens every photograph; after it the photographs are inputs, too.
     check_writable(json, out, COMMAND, FILES, files, force)
     judged = CertificateOptions(accept, certificate, details, lengths)
     judge = judge_of(
@@ -108,7 +108,7 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
     )
     found, _ = find_photographs(photos)
     check_writable(json, out, COMMAND, FILES, [*files, *(p.path for p in found)], force, html)
-    # targets are found again in seconds
+    # Targets are found again in seconds.
     kept = nullcontext() if features == "none" else keep_matches(out, force)
     with kept as store, staging(quiet or json == "-") as tell:
         if store is not None:

@@ -129,7 +129,7 @@ def _write_part(
     try:
         fill_colmap(network, folder / MODEL, False)
     except InputError as error:
-        # a camera that COLMAP cannot have must not cost the rest of the result
+        # A camera that COLMAP cannot have must not cost the rest of the result.
         print(f"no COLMAP model: {error}")
 
 

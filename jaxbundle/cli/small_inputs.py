@@ -18,7 +18,7 @@ def is_small(path: Path) -> bool:
             if total > SMALL_INPUT or file.is_dir():
                 return False
         if path.suffix == ".toml":
-            # paths that lead upwards, or begin at a root, are of files that were not counted
+            # Paths that lead upwards, or begin at a root, are of files that were not counted.
             return not re.search(r"""["'](\.\.|/|\w:)""", path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return False  # The command says so.

@@ -41,7 +41,7 @@ def report_times() -> Iterator[None]:
     try:
         yield
     finally:
-        # of a notebook or a test: the next command must not be heard here
+        # Of a notebook or a test: the next command must not be heard here.
         monitoring.unregister_event_duration_listener(hear_time)
         monitoring.unregister_event_listener(hear)
         devices = jax.devices()  # only now: the command sets their number

@@ -82,7 +82,7 @@ def open_calibration(
     if is_result(path):
         results = read_calibrated(path)
         cameras, covariances = [c for c, _ in results], {c.id: C for c, C in results}
-    # a project of oriented photographs alone, as `surface` takes it, has cameras but no points
+    # A project of oriented photographs alone, as `surface` takes it, has cameras but no points.
     elif is_camera_file(path) or (path.is_file() and recognise_format(path) == "project"):
         cameras = read_cameras(path)
     elif path.exists() and recognise_format(path) is None:
@@ -93,7 +93,7 @@ def open_calibration(
     else:
         network = read_network(path, image_size=image_size)
         cameras = network.cameras
-        # of the whole file: what was not understood may concern each of its cameras
+        # Of the whole file: what was not understood may concern each of its cameras.
         cameras = tuple(with_messages(camera, *network.warnings) for camera in cameras)
     camera = choose_camera(cameras, id, f"{file} (FILE#ID)")
     return camera, covariances.get(camera.id)

@@ -206,7 +206,7 @@ def compare(
 
 def is_saved_adjustment(given: Any) -> bool:
     """Whether this is a file that `Adjustment.save` has written."""
-    # no camera file begins like an archive
+    # No camera file begins like an archive.
     return (
         isinstance(given, str | Path)
         and beginning(given, len(SAVED_ADJUSTMENT)) == SAVED_ADJUSTMENT
@@ -270,7 +270,7 @@ def _compare_calibrations(
     }
     try:
         found = compare_cameras(one, other, radius=radius, **known)
-        # a tenth of half the diagonal: ten rings
+        # A tenth of half the diagonal: ten rings.
         width = np.hypot(np.ptp(found.x), np.ptp(found.y)) / 20 if step is None else step
         rings = difference_rings(found, width)
     except ValueError as error:
@@ -281,7 +281,7 @@ def _compare_calibrations(
         return CalibrationComparison(first, second, found, rings)
     C = expected_difference(found, one, other, (C_first, C_second), **known)
     expected = np.sqrt(np.trace(C, axis1=2, axis2=3))
-    # rings of a difference that is σ everywhere: their RMS is what is expected
+    # Rings of a difference that is σ everywhere: their RMS is what is expected.
     as_map = dataclasses.replace(found, difference=expected[..., None] * [1.0, 0.0])
     rings["expected"] = difference_rings(as_map, width)["rms"]
     return CalibrationComparison(first, second, found, rings, C)

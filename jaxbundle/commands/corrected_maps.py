@@ -126,10 +126,10 @@ def correct(  # noqa: PLR0913 (public: the options of the command, all but three
     compress = compress or ("deflate" if cog else "none")
     one_of("compress", compress, COMPRESSIONS)
     if spacing is not None and not spacing > 0:
-        raise InputError(f"--spacing {spacing:g}: a positive number is expected")
-    # a pixel: more is a map of other ground
+        raise InputError(f"--spacing {spacing:g}: expected a positive number")
+    # A pixel: more is a map of other ground.
     if not 0 <= tolerance <= 1:
-        raise InputError(f"--tolerance {tolerance:g}: 0 to 1 pixel of the image is expected")
+        raise InputError(f"--tolerance {tolerance:g}: expected 0 to 1 pixel of the image")
     if (truth is None) != (error_map is None):
         raise InputError("--truth and --error-map: give both, or none")
     if errors and sigma is None:
@@ -137,7 +137,7 @@ def correct(  # noqa: PLR0913 (public: the options of the command, all but three
     picture = _raster_of(scanner, image)
     targets = {"--out": out, "--error-map": error_map, "--sigma": sigma, "--checkpoint": checkpoint}
     _check_targets({key: Path(path) for key, path in targets.items() if path is not None}, picture)
-    # an ellipsoid hides nothing of itself where an image looks down
+    # An ellipsoid hides nothing of itself where an image looks down.
     if occlusion and dem is None:
         raise InputError("--occlusion: needs terrain; give --dem")
     file = open_image(scanner, tell, picture)
@@ -160,7 +160,7 @@ def correct(  # noqa: PLR0913 (public: the options of the command, all but three
         of_words([made, repr(correction), repr(height)]),
     ) as kept:
         if kept is not None:
-            # no other process makes this map: the checkpoint is locked
+            # No other process makes this map: the checkpoint is locked.
             remove_left_behind(out)
         write_corrected(
             picture,
@@ -221,9 +221,9 @@ def _errors_of(
     """The σ of `errors`, in radians and metres; of RPC what its file states."""
     for name, value in errors.items():
         if name not in MAP_ERRORS:
-            raise InputError(f"--error {name}{did_you_mean(name, MAP_ERRORS)}")
+            raise InputError(f"--error {name}: unknown{did_you_mean(name, MAP_ERRORS)}")
         if not (np.isfinite(value) and value >= 0):
-            raise InputError(f"--error {name}={value:g}: a number from 0 on is expected")
+            raise InputError(f"--error {name}={value:g}: expected a number from 0 on")
     noise = {name: value for name, value in errors.items() if name in Noise._fields}
     others = {name: value for name, value in errors.items() if name not in noise}
     if isinstance(file.image, RpcImage):

@@ -105,7 +105,7 @@ class PlannedBlock(TableMethods):
     def _rows(self) -> list[tuple[str, str]]:
         design, view = self.design, self.field_of_view
         degrees = ", ".join(f"{np.degrees(angle):.2f}°" for angle in view)
-        # of 1 % of the flying height, so that other heights follow by proportion
+        # Of 1 % of the flying height, so that other heights follow by proportion.
         relief = relief_displacement(self.image[1] / 2, 0.01 * design.height, design.height)
         ground = "" if design.pixel_on_ground is None else f"  pixel {design.pixel_on_ground:.4g} m"
         rows = [

@@ -88,7 +88,7 @@ def reconstruct(  # noqa: PLR0913 (public: the options of the command, all but o
     if points is not None:
         settings = replace(settings, points=points)
     if not square_pixels:
-        # an infinite σ is no prior
+        # An infinite σ is no prior.
         settings = replace(settings, aspect_sigma=inf)
     if not truth("correlated", correlated):
         settings = replace(settings, correlated=False)

@@ -10,12 +10,14 @@ import numpy as np
 
 from jaxbundle.choices import TESTS
 from jaxbundle.commands.scanner_inputs import (
+    LOCATED_COLUMNS,
     Message,
     check_spheroid,
     geographic,
     ignore,
     open_scanner,
     surface_of,
+    with_points,
 )
 from jaxbundle.commands.scanner_tables import ScannerTable
 from jaxbundle.display import print_in_one_screen
@@ -39,7 +41,7 @@ from jaxbundle.pushbroom.rpc.bias import (
 from jaxbundle.pushbroom.rpc.fitting import RpcCheck, RpcTable, fit_image, fit_rpc
 from jaxbundle.pushbroom.rpc.polynomials import Rpc, RpcStatus, locate_points_on, project_points
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 COLUMNS = ("longitude", "latitude", "height", "line", "sample")
 GROUND_SIGMA = ("seast", "snorth", "sheight")
@@ -75,7 +77,8 @@ def fit(
 
     **Arguments:**
 
-    - `source`: scanner file, or table longitude, latitude (degrees), height, line, sample.
+    - `source`: scanner file, or table longitude, latitude (degrees), height, line, sample; also
+      one that `locate` wrote.
     - `heights`: of the ground, low and high, metres above the ellipsoid.
     - `ridge`: ridge parameter, in units of the normalised equations; automatic if None.
     - `tell`: called with every warning.
@@ -88,11 +91,9 @@ def fit(
     path, check, pole = Path(source), None, None
     low, high = heights
     if not (np.isfinite([low, high]).all() and low < high):
-        raise InputError(
-            f"heights {low:g}, {high:g}: two finite numbers, the lower first, are expected"
-        )
+        raise InputError(f"heights {low:g}, {high:g}: expected two finite numbers, the lower first")
     if path.suffix.lower() == ".csv":
-        table, columns = _read_points(path)
+        table, columns = _read_points(path, tell=tell)
         found = fit_rpc(table, ridge=ridge, source=columns.source)
     else:
         file = open_scanner(path, tell)
@@ -205,9 +206,9 @@ def compensate(
     **Raises:** `InputError`.
     """
     if snooping not in ("none", *TESTS):
-        raise InputError(f"snooping {snooping!r}; one of none, {', '.join(TESTS)} is expected")
+        raise InputError(f"snooping {snooping!r}; expected one of none, {', '.join(TESTS)}")
     if not 0 < significance < 1:
-        raise InputError(f"significance is {significance:g}; between 0 and 1 is expected")
+        raise InputError(f"significance is {significance:g}; expected between 0 and 1")
     given = read_rpc(Path(coefficients))
     optional = ("id", "role", *GROUND_SIGMA)
     table, columns = _read_points(Path(control), optional, crs, geoid)
@@ -215,7 +216,7 @@ def compensate(
     if any(name in columns.values for name in GROUND_SIGMA):
         ground = np.stack([columns.numbers(name, required=True) for name in GROUND_SIGMA], 1)
     role = _roles(columns)
-    # the others are checked by the fit
+    # The others are checked by the fit.
     check = np.flatnonzero(role == "check")
     taken = lambda rows: RpcTable(*(np.asarray(column)[rows] for column in table))
     check_domain(given, taken(check), columns.source.take(check))
@@ -234,7 +235,7 @@ def compensate(
     while snooping != "none" and found.redundancy > 0:
         w = np.nan_to_num(np.abs(found.w))
         limit = critical_w(snooping, significance, w.size, found.redundancy, found.sigma0)
-        # with one point less at least as many as the bias needs, and one that tests it
+        # With one point less at least as many as the bias needs, and one that tests it.
         least = len(found.cofactor) // 2 + 1
         if w.max() <= limit or len(used) <= least:
             break
@@ -243,7 +244,7 @@ def compensate(
         used = np.delete(used, worst)
         found = fit(used)
     changed, left = apply_bias(given, found.bias)
-    # the same terms in lines and in samples
+    # The same terms in lines and in samples.
     k = len(found.cofactor) // 2
     names = [f"{axis}_{term}" for axis in ("line", "sample") for term in TERMS[:k]]
     values = [float(v) for axis in (found.bias.line, found.bias.sample) for v in axis[:k]]
@@ -275,7 +276,7 @@ def _roles(columns: Columns) -> np.ndarray:
     if (strange := ~np.isin(roles, ("control", "check"))).any():
         row = int(strange.argmax())
         raise InputError(
-            f"{columns.source(row)}: role is {roles[row]!r}; control or check is expected"
+            f"{columns.source(row)}: role is {roles[row]!r}; expected control or check"
         )
     return roles
 
@@ -301,17 +302,20 @@ def _read_points(
     optional: tuple[str, ...] = ("id",),
     crs: str | None = None,
     geoid: str | Path | None = None,
+    tell: Message = ignore,
 ) -> tuple[RpcTable, Columns]:
     columns = read_csv(path)
+    if "pixel" in columns.values and "sample" not in columns.values:
+        columns, optional = _as_rpc_table(columns, tell), (*optional, *LOCATED_COLUMNS)
     names = COLUMNS if crs is None else ("x", "y", *COLUMNS[2:])
     columns.check_names(names, optional)
     if crs is None:
         east, north, height = geographic(columns)
     else:
         x, y, height = (columns.numbers(name, required=True) for name in names[:3])
-        transformer = present(MapSystem(WGS84, crs).transformer)
-        if present(transformer.target_crs).is_vertical:
-            # its heights would be taken for heights above the ellipsoid
+        transformer = not_none(MapSystem(WGS84, crs).transformer)
+        if not_none(transformer.target_crs).is_vertical:
+            # Its heights would be taken for heights above the ellipsoid.
             raise InputError(
                 f"--crs {crs}: has a system of heights; give its horizontal part, and --geoid for "
                 "heights that are not above the ellipsoid"
@@ -330,6 +334,16 @@ def _read_points(
         height = height + N
     measured = (columns.numbers(name, required=True) for name in COLUMNS[3:])
     return RpcTable(east, north, height, *measured), columns
+
+
+def _as_rpc_table(table: Columns, tell: Message) -> Columns:
+    """A table that `locate` wrote: `pixel` is the sample; rows without a point are left out."""
+    table = with_points(table, tell)
+    values = {"sample" if name == "pixel" else name: x for name, x in table.values.items()}
+    if "height" in values:
+        # Of one --height they differ by the last digits of the intersection, which are no range.
+        values["height"] = np.round(table.numbers("height"), 6)
+    return Columns(values, table.source)
 
 
 def _ids(columns: Columns) -> Sequence[str]:

@@ -67,7 +67,7 @@ class ScannerInfo(TableMethods):
         names = [name for name in self.corners if name != "corner"]
         lines += ["", f"{'corner':26}" + "".join(f"{name:>14}" for name in names)]
         for row in rows_of(self.table()):
-            # degrees to a millimetre, metres likewise
+            # Degrees to a millimetre, metres likewise.
             places = {"longitude": 8, "latitude": 8, "line": 0, "pixel": 0}
             # + 0.0: of −0 made by rounding
             cells = (
@@ -103,7 +103,7 @@ def info(
         "pixels": image.pixels,
         "height": float(getattr(surface, "level", 0.0)),
     }
-    # the middle, the next line, the next pixel; the corners
+    # The middle, the next line, the next pixel; the corners.
     line, pixel = (image.lines - 1) / 2, (image.pixels - 1) / 2
     last = image.lines - 1.0, image.pixels - 1.0
     X = _locate(

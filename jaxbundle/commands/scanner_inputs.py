@@ -49,7 +49,7 @@ def surface_of(
     if geoid is not None and dem is None:
         raise InputError("--geoid: needs a terrain model; give --dem")
     if height is not None and not np.isfinite(height):
-        raise InputError(f"--height {height}: a finite number is expected, in metres")
+        raise InputError(f"--height {height}: expected a finite number, in metres")
     if dem is not None:
         if height is not None:
             raise InputError("--height and --dem: give one of them")
@@ -163,8 +163,8 @@ def geographic(table: Columns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         if (beyond := ~(np.abs(values) <= most)).any():
             row = int(beyond.argmax())
             raise InputError(
-                f"{table.source(row)}: {name} {values[row]:g} is beyond {most}°; degrees are "
-                "expected; check the order of columns"
+                f"{table.source(row)}: {name} {values[row]:g} is beyond {most}°; expected "
+                "degrees: check their unit and the order of columns"
             )
     return np.radians(longitude), np.radians(latitude), height
 
@@ -209,8 +209,8 @@ def off_image(
         if outside.any() and said is None:
             row = int(outside.argmax())
             said = (
-                f"{source(row)}: {name} {values[row]:g} is {OFF_IMAGE}, which has {size}; -0.5 to "
-                f"{size - 0.5:g} is expected"
+                f"{source(row)}: {name} {values[row]:g} is {OFF_IMAGE}, which has {size}; "
+                f"expected -0.5 to {size - 0.5:g}"
             )
         off |= outside
     if said is not None:

@@ -307,7 +307,7 @@ def accuracy(  # noqa: PLR0913 (public: the options of the command, all but one 
     }
     by_cell = lambda values: np.asarray(values).reshape(len(row) * len(column), -1)
     known = lambda values: np.isfinite(values).sum(1)
-    # a cell where every ray misses the surface has no mean
+    # A cell where every ray misses the surface has no mean.
     mean = lambda values: np.nansum(values, 1) / np.where(known(values) > 0, known(values), np.nan)
     rms = lambda values: np.sqrt(mean(values**2))
     if truth is not None:

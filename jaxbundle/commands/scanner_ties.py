@@ -45,7 +45,7 @@ def tie(
     """
     path, say = Path(input), tell or (lambda _: None)
     if spacing < 1:
-        raise InputError(f"--spacing {spacing}: pixels from 1 on are expected")
+        raise InputError(f"--spacing {spacing}: expected pixels from 1 on")
     if (zmin is None) != (zmax is None) or (
         zmin is not None and zmax is not None and not zmin < zmax
     ):
@@ -56,7 +56,7 @@ def tie(
     file = TomlFile(path, document)
     file.require(("images",))
     unit = file.section("refine").text("angle_unit", "deg")
-    # a unit that nobody knows is said by `refine`: it is of priors, which tie points do not need
+    # A unit that nobody knows is said by `refine`: it is of priors, which tie points do not need.
     images, warnings = read_images(file, ANGLE_UNITS.get(unit, 1.0))
     if len(images) < 2:
         raise InputError(f"{path}, [images]: one image; tie points need at least two")

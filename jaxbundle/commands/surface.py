@@ -155,16 +155,16 @@ def surface(  # noqa: PLR0913 (public: the options of the command, all but one b
     folder = None if photos is None else Path(photos)
     between = _heights(zmin, zmax)
     if dsm is not None and not dsm > 0:
-        raise InputError(f"--dsm {dsm}: a positive size is expected")
+        raise InputError(f"--dsm {dsm}: expected a positive size")
     if (orthophoto or orthophoto_of) and dsm is None:
         raise InputError("--orthophoto: needs --dsm, the size of its pixels")
-    # read before matching, which takes minutes: its errors come at once
+    # Read before matching, which takes minutes: its errors come at once.
     given = read_cloud(check).X if isinstance(check, str | Path) else check
     if given is not None:
         given = numeric_array("check", given, "coordinates X, Y, Z [n, 3]")
     options = {"points": points, "step": step, "dense": dense, "settings": settings}
     say = tell or (lambda _: None)
-    # photographs come in one folder, scanner and RPC images one by one
+    # Photographs come in one folder, scanner and RPC images one by one.
     if len(inputs) > 1 or is_ground_image(inputs[0]):
         match = _match_ground_images
     else:
@@ -208,7 +208,7 @@ def _match_photographs(
     if reference.geoid is not None:
         if network.object_unit != "m":
             raise InputError(f"--geoid: the unit of the block is {network.object_unit}; expected m")
-        # also without heights: a grid that does not cover the block is refused before matching
+        # Also without heights: a grid that does not cover the block is refused before matching.
         x, y = np.stack([view.X0[:2] for view in views], 1)
         inside = reference.as_computed(heights or (0.0, 0.0), x, y)
         heights = heights and inside

@@ -134,7 +134,7 @@ def frames(
             length = min(len(look) - skipped for look, skipped in zip(looks, begin))
             chosen = np.arange(0, length, integer("every", every, least=1))
         for path, name, skipped in zip(paths, names, begin):
-            # equal numbers in the names are one instant
+            # Equal numbers in the names are one instant.
             write_frames(path, chosen + skipped, skipped, new / name)
             progress(f"writing {name}", 1, 1)
         numbers = np.stack([chosen + skipped for skipped in begin])
@@ -178,7 +178,7 @@ def _check_together(looks: Sequence[VideoLook], first: Sequence[int]) -> None:
             )
     length = min(len(look) - begin for look, begin in zip(looks, first))
     for look in looks[1:]:
-        # after the whole video they may differ by half a frame
+        # After the whole video they may differ by half a frame.
         if abs(look.rate / looks[0].rate - 1) * length > 0.5:
             raise InputError(
                 f"{look.path}: {look.rate:g} frames a second, but {looks[0].path} has "

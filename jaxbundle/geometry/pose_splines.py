@@ -77,6 +77,6 @@ def spline_position(positions: Sequence[Triple], u: Scalar) -> Triple:
 def turn_back_by_steps(steps: Sequence[Triple], u: Scalar, x: Triple) -> Triple:
     """M_i·M(t)ᵀ·x by the steps h_1, h_2, h_3 from a control rotation to the next."""
     for weight, h in reversed(list(zip(cumulative_basis(u), steps))):
-        # the inverse of C(h) is C(−h)
+        # The inverse of C(h) is C(−h).
         x = turn_by_gibbs(tuple(-weight * c for c in h), x)
     return x

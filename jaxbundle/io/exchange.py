@@ -117,7 +117,7 @@ def convert(  # noqa: PLR0913, as the options of the command
     model = None if model is None else key_of(model)
     models = check_own_models(models)
     if format in (None, *CAMERA_KINDS) and is_camera_file(input):
-        # real paths: one of them may be a link
+        # Real paths: one of them may be a link.
         _refuse_overlap({os.path.realpath(input)}, {os.path.realpath(output)}, output)
         _keep_others(output, kind, force)
         cameras = _add_sizes(read_cameras(input, models), image_size, pixel_size)
@@ -144,7 +144,7 @@ def convert(  # noqa: PLR0913, as the options of the command
     if kind in CAMERA_KINDS:
         costs = None
         if model is not None and measured:
-            # the fit over the measurements needs the network; then there is nothing to convert
+            # The fit over the measurements needs the network; then there is nothing to convert.
             network, costs = convert_cameras(network, model, measured=True)
             model = None
         made = _convert_cameras(
@@ -182,7 +182,7 @@ def _convert_network(
             lost = TARGETS[kind].write(network, new)
     parts = tuple(path for path in _parts(network, output, kind) if path.exists())
     parts = () if parts == (output,) else parts
-    # a writer may meet more than the format loses by itself
+    # A writer may meet more than the format loses by itself.
     lost = (*told, *(what for what in lost if what not in told))
     return Converted(kind, output, costs, lost, network.warnings, network.notes, parts)
 
@@ -253,7 +253,7 @@ def _keep_input(
         network.distances,
         *network.further,
     )
-    # real paths: an output may be the input by a link, or by a path with `..`
+    # Real paths: an output may be the input by a link, or by a path with `..`.
     read = {os.path.realpath(p) for p in (input, *(table.source.name for table in tables))}
     folders = {os.path.realpath(Path(p).parent) for p in read}
     written = {os.path.realpath(p) for p in (output, output / FILE_NAME)}
@@ -285,7 +285,7 @@ def _keep_others(output: Path, kind: str, force: bool, network: Network | None =
     if folder is not None:
         names = TARGETS[kind].files
         return check_folder(folder, "convert", names, force=force, option="")
-    # files that a writer adds to the one that is named
+    # Files that a writer adds to the one that is named.
     beside = {
         "csv": [images_path(output)],
         "bundler": [output.parent / LIST],

@@ -534,7 +534,7 @@ def has_model(models: Sequence[str], model: str | CameraModel) -> bool:
 def recognise_target(path: Path) -> str | None:
     """The kind of an output, from its name."""
     kinds = (
-        # the narrow names of cameras first, the broad ones after the networks
+        # The narrow names of cameras first, the broad ones after the networks.
         *((name, kind) for name, kind in CAMERA_KINDS.items() if not kind.broad),
         *TARGETS.items(),
         *CAMERA_KINDS.items(),
@@ -597,16 +597,16 @@ def read_network(
     format = format or recognise_format(path)
     if format is None and is_camera_file(path):
         raise InputError(
-            f"{path}: contains only cameras, without images and points; a project, or another "
-            "network, is expected (jaxbundle camera, compare and convert read it)"
+            f"{path}: contains only cameras, without images and points; expected a project "
+            "or another network (jaxbundle camera, compare and convert read it)"
         )
     if format is None:
         if known := describe_incomplete(path):
             raise InputError(f"{path}: {known}")
         raise InputError(f"{path}: the kind of input is not recognised; {expected_inputs(path)}")
-    # read before the network, which may take long: its errors come at once
+    # Read before the network, which may take long: its errors come at once.
     control_points = None if control is None else read_control(control)
-    # other formats have names of their own for their models
+    # Other formats have names of their own for their models.
     own = (check_own_models(models),) if FORMATS[format].names_models else ()
     sized = image_size is not None and FORMATS[format].takes_image_size
     sizes = {"image_size": image_size} if sized else {}
@@ -646,7 +646,7 @@ def expected_inputs(path: Path) -> str:
     word = "folder" if path.is_dir() else path.suffix.lower() or "…"
     kinds = {k: look for k, look in (CAMERA_INPUTS | NETWORK_FILES).items() if word in look.lower()}
     looks = "; ".join(kinds.values())
-    # a message is one line: 200 characters are two lines of a terminal
+    # A message is one line: 200 characters are two lines of a terminal.
     if kinds and len(looks) < 200:
         return f"known formats of this name: {looks}"
     names = (

@@ -28,6 +28,7 @@ from jaxbundle.leastsquares.iterations.search import SEARCHES
 from jaxbundle.leastsquares.iterations.solver import Minimum
 from jaxbundle.leastsquares.iterations.stopping import SINGULAR, TERMINATIONS, converged
 from jaxbundle.leastsquares.problem import Problem, SystemCounts, make_problem, with_factor
+from jaxbundle.leastsquares.quality.nondifferentiable import without_derivatives
 from jaxbundle.leastsquares.quality.null_space import undetermined_unknowns
 from jaxbundle.leastsquares.quality.reliability import external_reliability, minimal_detectable
 from jaxbundle.leastsquares.quality.robust import SuspectRow, reweight
@@ -120,10 +121,21 @@ class Result:
 
         **Raises:** `NotSolvedError` if there is none."""
         if not self.converged:
-            names = ", ".join(self.undetermined[:8])
-            what = f"; not determined: {names}" if names else ""
-            raise NotSolvedError(f"not solved ({self.termination}){what}", list(self.undetermined))
+            raise NotSolvedError(self._failure, list(self.undetermined))
         return self._solution
+
+    @functools.cached_property
+    def _failure(self) -> str:
+        """Why there is no solution: the undetermined unknowns, or observations without
+        derivatives."""
+        what, names = "not determined", self.undetermined
+        if not names:
+            sets = [given.name for given in self.problem.observations]
+            names = tuple(without_derivatives(self.problem, self.minimum.values, sets))
+            what = "no finite residual or derivative of"
+        return f"not solved: {self.termination}" + (
+            f"; {what}: {', '.join(names[:8])}" if names else ""
+        )
 
     @property
     def counts(self) -> SystemCounts:
@@ -190,13 +202,13 @@ class Result:
 
     def __str__(self) -> str:
         if not self.converged:
-            return f"not solved: {self.termination}; {', '.join(self.undetermined[:8])}"
+            return self._failure
         n = self.counts
         lines = [
             f"solved in {self.iterations} iterations: {self.termination}",
             f"{n.observations} observations, {n.unknowns} unknowns, datum defect {n.datum}, "
             f"redundancy {n.redundancy}, sigma0 {self.sigma0:.4g}",
-            f"{'kind':32}{'number':>8}{'redundancy':>12}{'estimated sigma':>17}",
+            f"{'kind':32}{'number':>8}{'redundancy':>12}{'sigma/given':>17}",
         ]
         lines += [
             f"{name:32}{c.observations:8d}{c.redundancy:12.2f}{c.sigma:17.4g}"

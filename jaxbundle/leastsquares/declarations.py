@@ -39,6 +39,7 @@ class Table:
       per row); default: all. Derivatives with respect to held values are available.
     - `labels`: a name for every row, and `parameters` for its directions, for reports;
       `title`: the name of one row, by default that of the table.
+    - `units`: of its numbers, for reports: as of a `Kind`. Poses and rotations have their own.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Table:
     labels: Sequence[str] | None = None
     parameters: tuple[str, ...] = ()
     title: str = ""
+    units: str | tuple[str, ...] = ""
 
     def __post_init__(self):
         what = f"table {self.name!r}: the start values"
@@ -77,6 +79,11 @@ class Table:
                 f"{list(shape)}"
             ) from None
         object.__setattr__(self, "free", free)
+        if not isinstance(self.units, str) and len(self.units) != self.space.width:
+            raise InputError(
+                f"table {self.name!r}: expected one unit, or {self.space.width}; got "
+                f"{len(self.units)} of them"
+            )
         object.__setattr__(self, "title", self.title or self.name)
 
     @property
@@ -213,7 +220,7 @@ class ObservationSet:
         rows = tuple(_row_numbers(name, r) for r in self.rows)
         if len(rows) != len(kind.of):
             raise InputError(
-                f"{name}: rows of {len(kind.of)} tables are expected ({', '.join(kind.of)}), not "
+                f"{name}: expected rows of {len(kind.of)} tables ({', '.join(kind.of)}), not "
                 f"of {len(rows)}"
             )
         if len({len(r) for r in rows}) > 1:
@@ -221,7 +228,10 @@ class ObservationSet:
         object.__setattr__(self, "rows", rows)
         measured = _arrays(f"{name}: the measured values", self.measured)
         if any(np.shape(x)[:1] != (self.number,) for x in jax.tree.leaves(measured)):
-            raise InputError(f"{name}: {self.number} observations, but not as many measured values")
+            raise InputError(
+                f"{name}: expected measured values of {self.number} observations, got another "
+                "number"
+            )
         object.__setattr__(self, "measured", measured)
         if self.sigma is not None and self.covariance is not None:
             raise InputError(f"{name}: give sigma or covariance, not both")
@@ -270,8 +280,8 @@ class ObservationSet:
         if bad.any():
             row = int(np.argwhere(bad)[0][0])
             raise InputError(
-                f"{self.kind.name}: sigma of observation {row + 1} is {sigma[bad][0]:g}; a "
-                "positive number is expected"
+                f"{self.kind.name}: sigma of observation {row + 1} is {sigma[bad][0]:g}; expected "
+                "a positive number"
             )
         return 1 / sigma
 

@@ -19,7 +19,7 @@ from jaxbundle.leastsquares.iterations.retraction import changes_of_tables
 from jaxbundle.leastsquares.problem import Problem, pad_data, pad_values, without_filling
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 
 class DeterminedRows(NamedTuple):
@@ -44,7 +44,7 @@ def determine_excluded(solution: Solution, problem: Problem) -> DeterminedRows:
     **Arguments:** `problem`: with the kept tables of the solution's problem, at their adjusted
     values and with the same free unknowns.
     """
-    plan, e = problem.plan, present(problem.plan.eliminated)
+    plan, e = problem.plan, not_none(problem.plan.eliminated)
     data = pad_data(problem, problem.data)
     values, inverse, spread = _intersect(problem.declared, plan, data)
     number, every = problem.table(e).rows, []
@@ -84,7 +84,7 @@ def _intersect(
     """The eliminated rows with all others given, by Gauss–Newton steps; V⁻¹, and V⁻¹·Wᵀ of every
     incidence. All steps are taken, more than converging rows need: one loop for all rows would
     wait for the slowest."""
-    laid, e = lay_out_data(plan, data), present(plan.eliminated)
+    laid, e = lay_out_data(plan, data), not_none(plan.eliminated)
     group = plan.groups[e]
     held = (1.0 - group.free)[:, :, None] * jnp.eye(group.width)
     space = declared.spaces[e]

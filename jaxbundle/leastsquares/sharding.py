@@ -34,7 +34,7 @@ from jaxbundle.leastsquares.problem import (
     without_filling,
 )
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray, present
+from jaxbundle.types import AnyArray, not_none
 
 AXIS = "devices"
 _ALONE = ContextVar("alone", default=False)
@@ -96,7 +96,7 @@ def find_minimum_of_shards(
     datum. `start` must be finite: devices that end at different steps would deadlock.
 
     **Raises:** `NotSolvedError` if one of several processes is lost."""
-    problem, e = shards.problem, present(shards.problem.plan.eliminated)
+    problem, e = shards.problem, not_none(shards.problem.plan.eliminated)
     here = dataclasses.replace(problem, sizes=shards.sizes)
     given = jax.tree.map(np.asarray, problem.data.start if start is None else start)
     part = lambda rows: pad_values(here, given | {e: _take(given[e], rows)})
@@ -177,7 +177,7 @@ def _plan_part(
     problem: Problem, rows: Int[np.ndarray, " n"], seen: dict[str, Int[np.ndarray, " m"]]
 ) -> tuple[Plan, Sizes]:
     """The plan of some eliminated rows and observations, on the host, and its sizes."""
-    e, groups = present(problem.plan.eliminated), problem.plan.groups.items()
+    e, groups = not_none(problem.plan.eliminated), problem.plan.groups.items()
     # The masks of the whole problem, too: a part in which all rows happen to be free would be
     # another program.
     free = {("all free", name): group.all_free for name, group in groups}

@@ -54,7 +54,7 @@ from jaxbundle.leastsquares.quality.cofactors import (
 from jaxbundle.leastsquares.quality.reliability import Reliability, reliability
 from jaxbundle.leastsquares.sharding import distribute, find_minimum_of_shards, sharing_devices
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray, present
+from jaxbundle.types import AnyArray, not_none
 
 # Placeholder of the plan in a factor returned by a compiled function.
 PLAN_PLACEHOLDER = "the plan"
@@ -353,7 +353,7 @@ def _jacobian_eliminated(
     declared: Declared, plan: Plan, values: Values, data: Data
 ) -> dict[str, Float[Array, "n r w"]]:
     laid, prepared, found = lay_out_data(plan, data), prepare(declared, values), []
-    width = plan.groups[present(plan.eliminated)].width
+    width = plan.groups[not_none(plan.eliminated)].width
     for number in range(len(plan.parts)):
         r, _, E = differentiate(declared, plan, number, prepared, laid)
         found.append(jnp.zeros((*r.shape, width)) if E is None else E)

@@ -98,7 +98,7 @@ def measure_board_set(
         if progress is not None and done % len(boards) == 0:
             progress(SEARCHING, done // len(boards), len(file_of))
 
-    # as many at once as of the board whose search takes most memory
+    # As many at once as of the board whose search takes most memory.
     at_once = min(searches_at_once([*file_of.values()], one) for one in boards.values())
     looks = dict(zip(tasks, map_in_threads(search, tasks, at_once, tell)))
     refuse_sizes({name: look[0] for (name, _), look in looks.items() if not isinstance(look, str)})

@@ -77,7 +77,7 @@ def find_coded_targets(
             "grey: expected 8-bit grey values [rows, columns], got "
             f"{np.asarray(grey).dtype} {list(np.shape(grey))}; `read_photograph` gives them"
         )
-    # what is masked shows nothing
+    # What is masked shows nothing.
     grey = np.ascontiguousarray(np.ma.filled(grey, 0))
     name, _, option = kind.partition(":")
     if name.startswith("ring"):
@@ -91,7 +91,7 @@ def find_coded_targets(
 def memory_of_targets(rows: int, columns: int, kind: str) -> float:
     """Bytes that the search of targets takes in a photograph, beside its grey values."""
     if kind.startswith("ring"):
-        # bytes a pixel, measured in photographs of 6 and of 54 million pixels
+        # Bytes a pixel, measured in photographs of 6 and of 54 million pixels.
         return 13 * rows * columns
     return memory_of_search(rows, columns, "charuco")
 
@@ -106,7 +106,7 @@ def check_kind(kind: str) -> None:
             f"coded targets {kind!r}: {', '.join(CODED_TARGETS)}{did_you_mean(name, CODED_TARGETS)}"
         )
     if name.startswith("ring") and option not in ("", "codes"):
-        raise InputError(f"coded targets {kind!r}: {name} or {name}:codes is expected")
+        raise InputError(f"coded targets {kind!r}: expected {name} or {name}:codes")
     if name == "charuco":
         _charuco_board(option)
     elif not name.startswith("ring"):
@@ -165,7 +165,7 @@ def _charuco_board(option: str) -> Board:
     try:
         columns, rows = (int(n) for n in option.lower().split(":")[0].split("x"))
     except ValueError:
-        raise InputError(f"charuco:{option}: COLUMNSxROWS is expected, such as 8x6") from None
+        raise InputError(f"charuco:{option}: expected COLUMNSxROWS, such as 8x6") from None
     dictionary = option.split(":")[1] if ":" in option else ARUCO
     return Board(columns, rows, 1.0, "charuco", dictionary=dictionary)
 

@@ -59,7 +59,7 @@ def find_board_points(grey: Grey, board: Board) -> BoardPoints:
         try:
             return find(cv2, grey, board)
         except InputError as error:
-            # circles are searched light and dark anyway
+            # Circles are searched light and dark anyway.
             if find is _circles or find is _chessboard and not _is_in_small(cv2, 255 - grey, board):
                 raise
             try:
@@ -70,8 +70,8 @@ def find_board_points(grey: Grey, board: Board) -> BoardPoints:
 
 def memory_of_search(rows: int, columns: int, kind: str) -> float:
     """Bytes that the search of a board of a kind takes in a photograph, beside its grey values."""
-    # bytes a pixel, measured in a photograph of 3072 × 2048 pixels: in a search of markers 6; of a
-    # chessboard that is not there, the worst case, 230 of the largest copy
+    # Bytes a pixel, measured in a photograph of 3072 × 2048 pixels: in a search of markers 6; of a
+    # chessboard that is not there, the worst case, 230 of the largest copy.
     if kind in ("charuco", "aprilgrid"):
         return 6 * rows * columns
     factor = min(1.0, SIDES[-1] / max(rows, columns, 1))
@@ -180,7 +180,7 @@ def _chessboard(cv2: ModuleType, grey: Grey, board: Board) -> BoardPoints:
     size = (board.columns, board.rows)
 
     def seek(grey: Grey) -> Any:
-        # the detector of Duda and Frese (2018) first, the older one where it finds nothing
+        # The detector of Duda and Frese (2018) first, the older one where it finds nothing.
         flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
         found, xy = cv2.findChessboardCornersSB(grey, size, flags=flags)
         if not found:
@@ -265,7 +265,7 @@ def _charuco(cv2: ModuleType, grey: Grey, board: Board) -> BoardPoints:
         size = (board.columns, board.rows)
         known = aruco.CharucoBoard(size, min(board.spacing), marker, dictionary, numbers)
         known.setLegacyPattern(legacy)
-        # markers are searched once: they take the time
+        # Markers are searched once: they take the time.
         xy, ids, *markers = aruco.CharucoDetector(known).detectBoard(grey, **seen)
         if markers[1] is None:
             break
@@ -282,7 +282,7 @@ def _charuco(cv2: ModuleType, grey: Grey, board: Board) -> BoardPoints:
     on_grid = np.full((*board.grid, 2), np.nan)
     on_grid.reshape(-1, 2)[ids] = xy
     lines = lines_of_grid(on_grid).reshape(-1, 2, 2)[ids]
-    # least median of squares: corners interpolated from a wrongly read marker are outliers
+    # Least median of squares: corners interpolated from a wrongly read marker are outliers.
     H, _ = cv2.findHomography(X, xy, cv2.LMEDS)
     if H is None:
         raise InputError("the corners of the ChArUco board found lie on a line")
@@ -349,8 +349,8 @@ def _blob_finder(cv2: ModuleType, grey: Grey, shade: int) -> Any:
     """Round blobs of any size in the image; the limit of OpenCV is 5000 pixels."""
     wanted = cv2.SimpleBlobDetector_Params()
     wanted.blobColor = shade
-    # of 4 pixels across to an eighth of the image, a board of 3 × 3; ellipses of circles seen
-    # obliquely, far from round; not the background between them, which is not convex
+    # Of 4 pixels across to an eighth of the image, a board of 3 × 3; ellipses of circles seen
+    # obliquely, far from round; not the background between them, which is not convex.
     wanted.minArea, wanted.maxArea = 15, grey.size / 8
     wanted.minDistBetweenBlobs = 4
     wanted.filterByInertia, wanted.minInertiaRatio = True, 0.05

@@ -17,7 +17,7 @@ def filter_cloud(
     """
     points = np.asarray(points, float)
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
-        raise InputError("point cloud: finite coordinates [points, 3] are expected")
+        raise InputError("point cloud: expected finite coordinates [points, 3]")
     if not (np.isfinite(size) and size > 0) or least < 1:
         raise InputError(
             f"point cloud: cubes of {size:g} with at least {least} points are impossible"

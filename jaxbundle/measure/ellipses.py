@@ -63,7 +63,7 @@ def fit_ellipse(
     )
     back = -jnp.linalg.solve(S3, S2.T)
     T = S1 + S2 @ back
-    # points exactly on an ellipse leave T singular: rounding, some hundred ε, is added
+    # Points exactly on an ellipse leave T singular: rounding, some hundred ε, is added.
     T = T + 1e-13 * jnp.trace(S1) * jnp.eye(3)
     L = jnp.linalg.cholesky(T)
     inverse = jax.scipy.linalg.solve_triangular(L, jnp.eye(3), lower=True)
@@ -81,7 +81,7 @@ def fit_ellipse(
     redundancy = jnp.maximum(jnp.sum(p > 0) - 5, 1)
     sigma0 = jnp.sqrt(jnp.sum(p * distance**2) / redundancy)
     design = jnp.sqrt(p)[:, None] * rows / slope[:, None]
-    # the length of the conic's coefficients has no meaning: it is held
+    # The length of the conic's coefficients has no meaning: it is held.
     N = design.T @ design + jnp.trace(design.T @ design) * jnp.outer(conic, conic)
     J = jax.jacfwd(_centre)(conic)
     covariance = sigma0**2 * J @ jnp.linalg.solve(N, J.T)

@@ -110,7 +110,7 @@ def fit_fiducials(
     if not (np.isfinite(source).all() and np.isfinite(target).all()):
         raise InputError("fiducial marks: every coordinate must be a finite number")
     p = np.ones(marks) if weights is None else np.asarray(weights, float)
-    # pixels of thousands beside mm: reduced to the centroid and the spread, N is well scaled
+    # Pixels of thousands beside mm: reduced to the centroid and the spread, N is well scaled.
     middle, size = source.mean(0), max(float(source.std()), 1e-300)
     fit = _fit(kind, unknowns, (source - middle) / size, target, p)
     if not bool(fit.determined):
@@ -151,7 +151,7 @@ def _fit(
     ) -> Float[Array, " 2*marks"]:
         return (root * (_transform_all(kind, q, source) - target)).ravel()
 
-    # linear ones end with the first step; the projective one starts from it
+    # Linear ones end with the first step; the projective one starts from it.
     if kind == "projective":
         first = affine.fit(source, target, p)
         start = jnp.concatenate([first, jnp.zeros(2)])

@@ -21,8 +21,8 @@ def normal_equations(
     p, one = prior * noise[:, None] ** 2, np.eye(J.shape[2])
     weighted = J * weight[:, :, None]
     N = np.matmul(weighted.transpose(0, 2, 1), J) + p[:, :, None] * one
-    # few pixels may leave an unknown open: a billionth of the trace, far above rounding and far
-    # below the weight of any observation
+    # Few pixels may leave an unknown open: a billionth of the trace, far above rounding and far
+    # below the weight of any observation.
     N = N + 1e-9 * np.trace(N, axis1=1, axis2=2)[:, None, None] * one
     return N, np.einsum("npi,np->ni", weighted, r) + p * away
 
@@ -32,5 +32,5 @@ def noise_of_residuals(
 ) -> Float[np.ndarray, " n"]:
     """σ of the grey values from the residuals of each fit, at least that of rounding."""
     freedom = np.maximum(weight.sum(1) - unknowns, 1)
-    # rounding to whole grey values is uniform over ±½, of variance ∫x²dx = 1/12
+    # Rounding to whole grey values is uniform over ±½, of variance ∫x²dx = 1/12.
     return np.sqrt(np.maximum((weight * r**2).sum(1) / freedom, 1 / 12))

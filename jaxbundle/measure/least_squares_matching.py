@@ -158,7 +158,7 @@ def match_least_squares(
     other = spline_coefficients((image.astype(dtype) - mean) / unit)
     offset = jnp.arange(n, dtype=dtype) - n // 2
     y, x = (a.ravel() for a in jnp.meshgrid(offset, offset, indexing="ij"))
-    # unknowns scaled by their effect at the edge of the window
+    # Unknowns scaled by their effect at the edge of the window.
     size = jnp.asarray([n // 2, n // 2, 1, n // 2, n // 2, 1, 1, 1], dtype)
     computed = lambda p: jax.vmap(_compute, (None, None, 0, 0))(p / size, other, x, y)
     p = size * _with_radiometry(start, other, x, y)
@@ -212,7 +212,7 @@ def _status(
         (~textured, MatchingStatus.NO_TEXTURE),
         (jnp.any(reach > middle), MatchingStatus.OUTSIDE),
         (
-            # so written that NaN counts, too
+            # So written that NaN counts, too.
             ~((away < settings.max_shift * n) & (area > settings.min_scale)),
             MatchingStatus.DIVERGED,
         ),
@@ -241,11 +241,11 @@ def grey_value(
     """The grey value of an image at (u, v), by its `spline_coefficients`."""
     rows, columns = coefficients.shape
     i, j = (jnp.floor(jax.lax.stop_gradient(a)) for a in (v, u))
-    # from the pixel before: the first coefficient is before the first pixel
+    # From the pixel before: the first coefficient is before the first pixel.
     row = [jnp.clip(i.astype(int) + k, 0, rows - 1) for k in (0, 1, 2, 3)]
     column = [jnp.clip(j.astype(int) + k, 0, columns - 1) for k in (0, 1, 2, 3)]
     down, along = _spline_weights(v - i), _spline_weights(u - j)
-    # sums written out: one loop over the window, whereas small products are one call each
+    # Sums written out: one loop over the window, whereas small products are one call each.
     nil = jnp.zeros((), coefficients.dtype)
     line = lambda r: sum((b * coefficients[r, c] for b, c in zip(along, column)), nil)
     return sum((a * line(r) for a, r in zip(down, row)), nil)
@@ -268,7 +268,7 @@ def _prefilter(n: int) -> Float[np.ndarray, "m n"]:
     The inverse of the banded matrix of ⅙, ⅔, ⅙, dense: windows are small, and two products with it
     are one call for all of a batch, where the recursive filter of Unser is a loop over the rows."""
     B = (np.eye(n, k=-1) + 4 * np.eye(n) + np.eye(n, k=1)) / 6
-    # second derivatives c₋₁ − 2·c₀ + c₁ of 0 at the ends: there c₀ is the value itself
+    # Second derivatives c₋₁ − 2·c₀ + c₁ of 0 at the ends: there c₀ is the value itself.
     B[[0, -1]] = np.eye(n)[[0, -1]]
     c = np.linalg.inv(B)
     return np.concatenate([2 * c[:1] - c[1:2], c, 2 * c[-1:] - c[-2:-1]])
@@ -276,7 +276,7 @@ def _prefilter(n: int) -> Float[np.ndarray, "m n"]:
 
 def _remaining_noise(t: Pixels) -> Pixels:
     """κ: variance of interpolated white noise of variance 1, t from a pixel, along one axis."""
-    # the prefilter's response √3·(√3 − 2)^|k|; 0.27²⁴ is rounding
+    # The prefilter's response √3·(√3 − 2)^|k|; 0.27²⁴ is rounding.
     k = np.arange(-24, 25)
     response = np.sqrt(3.0) * (np.sqrt(3.0) - 2) ** np.abs(k)
     correlation = np.correlate(response, response, "full")[2 * 24 :][:4]
@@ -300,7 +300,7 @@ def _bend(
     their covariance from correlated residuals."""
     x, y = x / jnp.max(x), y / jnp.max(y)
     second = [J[:, k] * term for k in (2, 5) for term in (x * x, x * y, y * y)]
-    # as unknowns in units of their σ: columns of 0 if `bend` is 0, which change nothing
+    # As unknowns in units of their σ: columns of 0 if `bend` is 0, which change nothing.
     J = jnp.column_stack([J, *(bend * column for column in second)])
     weight = jnp.diag(variance * np.repeat([0, 1], [UNKNOWNS, len(second)]).astype(J.dtype))
     Q, _ = _inverse(J.T @ J + weight, min_pivot)
@@ -400,7 +400,7 @@ def _minimise(
 
     def improve(state: tuple[Any, ...]) -> tuple[Any, ...]:
         count, p, N, g, square, damping, moving = state
-        # scaled to a unit diagonal; by 1e-20 the step of an unknown without effect is 0, not NaN
+        # Scaled to a unit diagonal; by 1e-20 the step of an unknown without effect is 0, not NaN.
         scale = 1 / jnp.sqrt(jnp.diag(N) + 1e-20)
         scaled = N * scale * scale[:, None] + damping * jnp.eye(UNKNOWNS, dtype=N.dtype)
         step = -scale * cho_solve(cho_factor(scaled), scale * g)

@@ -89,7 +89,7 @@ def _of_numbers(seen: SeenMarkers, board: Board) -> Board | None:
         }
         most = max(agreeing for agreeing, _ in fits.values())
         best = [columns for columns, (agreeing, _) in fits.items() if agreeing == most]
-        # wrongly read numbers are rare: the codes of a dictionary differ in several bits
+        # Wrongly read numbers are rare: the codes of a dictionary differ in several bits.
         if most >= max(MIN_MARKERS, 0.9 * len(seen.number)) and len(best) == 1:
             rows = max(fits[best[0]][1], SMALLEST_SIDE[board.kind])
             return dataclasses.replace(board, columns=best[0], rows=rows, first_marker=first)
@@ -105,8 +105,8 @@ def _first_numbers(seen: SeenMarkers, board: Board) -> Iterator[int]:
 def _fits(
     seen: SeenMarkers, kind: str, k: Int[np.ndarray, " n"], columns: int
 ) -> Iterator[tuple[int, int]]:
-    """How many markers a board of so many columns explains, and its least number of rows, for each
-    numbering there is; `k` counts the markers from the first."""
+    """How many markers a board of `columns` columns explains, and its least number of rows, for
+    each numbering there is; `k` counts the markers from the first."""
     for place in _places(kind, k, columns):
         yield int(_agree(seen, place).sum()), int(place[:, 1].max()) + 1
 
@@ -118,7 +118,7 @@ def _places(
     if kind == "aprilgrid":
         yield np.stack([k % columns, k // columns], 1).astype(float)
         return
-    # the second square of a ChArUco board is its first white one; in OpenCV before 4.6 the first of
+    # The second square of a ChArUco board is its first white one; in OpenCV before 4.6 the first of
     # boards of an even number of rows. Two rows of squares have as many markers as columns.
     for shift in (1, 0):
         in_first_row = len(range(shift, columns, 2))
@@ -137,5 +137,5 @@ def _agree(seen: SeenMarkers, place: Float[np.ndarray, "n 2"]) -> Bool[np.ndarra
     if H is None:
         return nobody
     there = cv2.perspectiveTransform(place[None], H)[0]
-    # half a diagonal of a marker: distortion bends a board less, and the next place is further
+    # Half a diagonal of a marker: distortion bends a board less, and the next place is further.
     return np.linalg.norm(there - seen.middle, axis=1) < seen.size

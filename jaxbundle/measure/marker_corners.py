@@ -104,15 +104,15 @@ def fit_marker_corners(
     number = len(near)
     xy = np.asarray(near, float)
     blur = np.full((number, 4), settings.edges.blur_in_focus)
-    # first from the detected corners, a few pixels off, then from the ones of the first fit
+    # First from the detected corners, a few pixels off, then from the ones of the first fit.
     for coarse in (True, False):
         edges, fits, xy, covariance = _fit_sides(fitting, xy, cells, blur, coarse)
-        # one lens, one distance: τ of a marker is the median over its sides
+        # One lens, one distance: τ of a marker is the median over its sides.
         own = fits.blur.reshape(-1, 4)
         before, blur = blur, np.repeat(np.median(own, axis=1), 4).reshape(own.shape)
         lost = ~_is_near(xy, near)
         xy[lost] = near[lost]
-    # where the cells are narrow, or the blur was not the expected one, once more from there
+    # Where the cells are narrow, or the blur was not the expected one, once more from there.
     strip = np.minimum(edges.inner, edges.outer).min(1).reshape(number, 4)
     again = ((np.abs(np.log(blur / before)) > 0.2) | (strip < settings.wide_strip * blur)).any(1)
     if again.any():
@@ -125,7 +125,7 @@ def fit_marker_corners(
         xy[lost] = near[lost]
     shift = edge_shift(fitting, xy, cells, fits)
     if shift is not None:
-        # the sides back outwards, by a shift in τ towards the dark side
+        # The sides back outwards, by a shift in τ towards the dark side.
         fits.curve[:, 0] -= shift[0] * fits.blur
         fits.covariance[:, 0, 0] += (shift[1] * fits.blur) ** 2
         xy, covariance = _intersect(edges, _with_model_errors(edges, fits, settings), number)
@@ -144,7 +144,7 @@ def _find_reasons(
     before."""
     number = len(covariance)
     strip = np.minimum(edges.inner, edges.outer).min(1) / fits.blur
-    # a side with another contrast than the marker: another edge was met
+    # A side with another contrast than the marker: another edge was met.
     contrast = fits.contrast.reshape(number, 4)
     usual = np.median(contrast, axis=1, keepdims=True)
     solved = fits.solved.reshape(number, 4) & (np.abs(contrast - usual) < 0.4 * np.abs(usual))
@@ -173,7 +173,7 @@ def _fit_sides(
 ) -> tuple[StraightEdges, EdgeFits, Quadrilaterals, Float[np.ndarray, "markers 4 2 2"]]:
     """The sides of markers whose corners are expected at `xy`: edges, fits, corners, covariance."""
     edges, settings = _sides_of(xy, cells, fitting.border), fitting.settings
-    # in groups of similar length, so that arrays have little padding
+    # In groups of similar length, so that arrays have little padding.
     group, parts, order = np.digitize(2 * edges.half, settings.lengths), [], []
     for g in np.unique(group):
         rows = np.flatnonzero(group == g)
@@ -255,8 +255,8 @@ def edge_shift(
     found = fit_edges(fitting.grey, inside, blur[marker], fitting.curvature, settings.edges)
     shift = (found.curve[:, 0] - bent) / (found.blur * factor)
     sigma = np.sqrt(found.covariance[:, 0, 0]) / (found.blur * factor)
-    # shifts by gamma are of the order of τ/3: an edge of σ 0.5 says nothing; edges of the other
-    # sign of contrast are not the ones meant
+    # Shifts by gamma are of the order of τ/3: an edge of σ 0.5 says nothing; edges of the other
+    # sign of contrast are not the ones meant.
     good = found.solved & (sigma < 0.5) & (found.contrast * fits.contrast[4 * marker] > 0)
     if good.sum() < settings.min_shift_edges:
         return None
@@ -269,8 +269,8 @@ def _robust_mean(
     good: Bool[np.ndarray, " edges"],
 ) -> tuple[float, float]:
     """The mean of shifts without outliers, and its σ from their scatter."""
-    # outliers beyond 3.5 σ of the median, σ from the median deviation; 0.01 and
-    # 0.02 τ: what no photograph does better
+    # Outliers beyond 3.5 σ of the median, σ from the median deviation; 0.01 and
+    # 0.02 τ: what no photograph does better.
     for _ in range(3):
         middle = np.median(shift[good])
         spread = NORMAL_SIGMA_BY_MAD * np.median(np.abs(shift[good] - middle)) + 0.01
@@ -307,7 +307,7 @@ def _inner_edges(
         a, b = np.stack([x, row], 1), np.stack([x, row + 1.0], 1)
         if turn:
             a, b = a[:, ::-1], b[:, ::-1]
-        # the inner side is to the right of start → end as seen in the image
+        # The inner side is to the right of start → end as seen in the image.
         swap = dark_beyond if turn == 0 else ~dark_beyond
         start.append(np.where(swap[:, None], b, a))
         end.append(np.where(swap[:, None], a, b))
@@ -320,7 +320,7 @@ def _inner_edges(
     start, end = (_image(H[marker : marker + 1], np.concatenate(x))[0] for x in (start, end))
     factor, bent = np.concatenate(factor), np.concatenate(bent)
     useful = factor > 0.5  # others hardly show the shift: the corners share it
-    # the smaller distance of opposite sides of the quadrilateral, roughly, over its cells
+    # The smaller distance of opposite sides of the quadrilateral, roughly, over its cells.
     four = xy[marker]
     a, b = four[2] - four[0], four[3] - four[1]
     area = abs(a[0] * b[1] - a[1] * b[0]) / 2

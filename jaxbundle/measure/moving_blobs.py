@@ -36,8 +36,8 @@ class BlobSettings:
     - `max_area_misfit`: of the number of pixels of a blob relative to the area of its ellipse of
       inertia. By the raster alone a cross of five pixels has 0.18, a square 0.05.
     - `max_blobs`: in a frame; with more, such as after a lamp was switched, it is not used.
-    - `sampled`: frames from which b is computed, at least half of it if there are so many. With few
-      a wand that rests enters b; they are kept in memory together.
+    - `sampled`: frames from which b is computed, at least half of it if the video has that many.
+      With few a wand that rests enters b; they are kept in memory together.
     """
 
     dark: bool = False
@@ -75,7 +75,7 @@ def find_still_scene(frames: Iterable[Grey], settings: BlobSettings) -> StillSce
         if number % (1 << stride) == 0:
             kept.append(grey)
             if len(kept) > settings.sampled:
-                # every second of them, and from here on half as many
+                # Every second of them, and from here on half as many.
                 kept, stride = kept[::2], stride + 1
         number += 1
     if number < 3:
@@ -83,7 +83,7 @@ def find_still_scene(frames: Iterable[Grey], settings: BlobSettings) -> StillSce
             f"{count(number, 'frame')}; expected three or more, with the wand at different places"
         )
     stack = _brighten(np.array(kept), settings)
-    # of an even number the lower of the middle two: a marker in half of the frames is none of it
+    # Of an even number the lower of the middle two: a marker in half of the frames is none of it.
     row = (len(stack) - 1) // 2
     background = np.partition(stack, row, axis=0)[row]
     # Signed: darker than the background is less than 0, not 255.
@@ -108,7 +108,7 @@ def find_moving_blobs(grey: Grey, scene: StillScene, settings: BlobSettings) -> 
         inside = labels[window] == label
         if not _is_ellipse(inside, settings.max_area_misfit):
             continue
-        # the blurred edge of a neighbour would pull the centre
+        # The blurred edge of a neighbour would pull the centre.
         around = labels[tuple(slice(max(s.start - MARGIN, 0), s.stop + MARGIN) for s in window)]
         if np.any((around != 0) & (around != label)):
             continue
@@ -117,7 +117,7 @@ def find_moving_blobs(grey: Grey, scene: StillScene, settings: BlobSettings) -> 
         try:
             target = centre_by_grey_values(signal, near)
         except InputError:
-            # cut by the edge of the image, or within the noise
+            # Cut by the edge of the image, or within the noise.
             continue
         # A centre outside of the blob is that of something else.
         if target.bright and np.linalg.norm(target.xy - near) < max(inside.shape):
@@ -136,6 +136,6 @@ def _is_ellipse(inside: Bool[np.ndarray, "rows columns"], tolerance: float) -> b
     if xy.shape[1] < SpotSettings().min_pixels:
         return False
     away = xy - xy.mean(1, keepdims=True)
-    # the area of a pixel has the moment 1/12; an ellipse with the moments C has 4π·√det C
+    # The area of a pixel has the moment 1/12; an ellipse with the moments C has 4π·√det C.
     C = away @ away.T / xy.shape[1] + np.eye(2) / 12
     return abs(xy.shape[1] / (4 * np.pi * np.sqrt(np.linalg.det(C))) - 1) < tolerance

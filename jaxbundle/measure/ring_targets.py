@@ -83,7 +83,7 @@ def find_ring_targets(
             found.append((misfit, str(number[code]), target))
     distinct: list[tuple[str, Target]] = []
     for _, name, target in sorted(found, key=lambda read: read[0]):
-        # a sector of a ring may look like a disc with a ring; the more distinct one is right
+        # A sector of a ring may look like a disc with a ring; the more distinct one is right.
         ring = 3 * target.axes[0]
         if all(np.linalg.norm(target.xy - t.xy) > max(ring, 3 * t.axes[0]) for _, t in distinct):
             distinct.append((name, target))
@@ -92,7 +92,7 @@ def find_ring_targets(
 
 def find_plain_discs(grey: Grey, coded: Sequence[Target], settings: RingSettings) -> list[Target]:
     """Light discs that are neither coded targets nor sectors of their rings."""
-    # the outermost parts of a ring are 3 radii from the centre
+    # The outermost parts of a ring are 3 radii from the centre.
     return [
         disc
         for disc in find_discs(grey, settings)
@@ -114,8 +114,8 @@ def find_discs(grey: Grey, settings: RingSettings) -> Iterator[Target]:
 def _blobs(grey: Grey, settings: RingSettings) -> Iterator[Float[np.ndarray, "2"]]:
     """Centres of light blobs that fill the ellipse of their outline."""
     cv2 = need_opencv()
-    # a local threshold follows uneven light; 8 grey values above the mean of a window of a
-    # twentieth of the image: noise of σ 2 exceeds it once in 30 000 pixels
+    # A local threshold follows uneven light; 8 grey values above the mean of a window of a
+    # twentieth of the image: noise of σ 2 exceeds it once in 30 000 pixels.
     side = max(15, (min(grey.shape) // 20) | 1)
     light = cv2.adaptiveThreshold(
         grey, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY, side, -8
@@ -126,9 +126,9 @@ def _blobs(grey: Grey, settings: RingSettings) -> Iterator[Float[np.ndarray, "2"
         if area < settings.min_pixels or len(outline) < 6:  # fitEllipse needs five points
             continue
         middle, axes, _ = cv2.fitEllipse(outline)
-        # the outline passes through the centres of the outermost pixels
+        # The outline passes through the centres of the outermost pixels.
         full = np.pi / 4 * axes[0] * axes[1]
-        # a ratio of axes of 0.25: a target seen 75° from its normal
+        # A ratio of axes of 0.25: a target seen 75° from its normal.
         misfit = abs(area / max(full, 1e-9) - 1)
         if min(axes) > 0.25 * max(axes) and misfit < settings.max_area_misfit:
             yield np.array(middle)
@@ -146,12 +146,12 @@ def _read_code(
     c, s = np.cos(target.angle), np.sin(target.angle)
     turn = np.array([[c, -s], [s, c]])
     rim = target.axes * np.stack([np.cos(t), np.sin(t)], 1) @ turn.T
-    # in the middle of the gap (r to 2·r) and of the ring (2·r to 3·r), and beyond it, still on
-    # the dark ground
+    # In the middle of the gap (r to 2·r) and of the ring (2·r to 3·r), and beyond it, still on
+    # the dark ground.
     places = target.xy + np.array([1.5, 2.5, 3.4])[:, None, None] * rim
     u, v = places[..., 0], places[..., 1]
     inside = (u >= 0) & (v >= 0) & (u <= grey.shape[1] - 1) & (v <= grey.shape[0] - 1)
-    # a ring at the edge of the photograph is whole; the ground beyond it need not be
+    # A ring at the edge of the photograph is whole; the ground beyond it need not be.
     if not inside[:2].all():
         return None
     gap, ring, beyond = map_coordinates(grey.astype(float), [v, u], order=1)
@@ -159,7 +159,7 @@ def _read_code(
     gap, value, beyond = ((a - dark) / target.contrast for a in (gap, ring, beyond[inside[2]]))
     if np.abs(gap).max() > tolerance or beyond.mean() > 0.5:
         return None
-    # the sectors begin where the values within them vary least; their blurred ends do not count
+    # The sectors begin where the values within them vary least; their blurred ends do not count.
     by_start = np.stack([np.roll(value, -k).reshape(bits, samples) for k in range(samples)])
     inner = by_start[:, :, samples // 5 : -(samples // 5)]
     best = int(inner.var(2).sum(1).argmin())

@@ -118,8 +118,8 @@ def fit_saddles(
         found, blur = _fit(grey, near, lines, strips, half, settings)
     if np.median(blur) < settings.blur_to_reduce or min(grey.shape) < settings.min_rows_to_reduce:
         return found
-    # an image blurred over several pixels loses nothing in half the pixels, and the windows then
-    # contain the whole change
+    # An image blurred over several pixels loses nothing in half the pixels, and the windows then
+    # contain the whole change.
     rows, columns = (n // 2 * 2 for n in grey.shape)
     small = grey[:rows, :columns].reshape(rows // 2, 2, columns // 2, 2).mean((1, 3))
     strips = None if strips is None else strips / 2
@@ -153,7 +153,7 @@ class _Windows:
         height, width = grey.shape
         inside = np.all((place >= 0) & (place < [width, height]), axis=2)
         column, row = np.where(inside[..., None], place, 0).astype(int).transpose(2, 0, 1)
-        # single precision is faster by half, and exact to 1e-5 pixels
+        # Single precision is faster by half, and exact to 1e-5 pixels.
         g, place = grey[row, column].astype(np.float32), place.astype(np.float32)
         return cls(place, g, inside, half, None if strips is None else strips.astype(np.float32))
 
@@ -244,8 +244,8 @@ def _judge(
     largest = np.linalg.eigvalsh(np.nan_to_num(covariance, nan=1e9))[:, 1]
     why[~(largest <= MAX_SIGMA**2)] = TOO_SMALL
     why[narrow < settings.min_strip * blur] = TOO_SMALL
-    # residuals far above those of the other corners, and visible beside the contrast (D is half of
-    # it): something covers the window in part; at 0.4·D there is no saddle at all
+    # Residuals far above those of the other corners, and visible beside the contrast (D is half of
+    # it): something covers the window in part; at 0.4·D there is no saddle at all.
     covered = (noise > settings.max_relative_noise * np.median(noise)) & (noise > 0.05 * contrast)
     why[lost | (noise > 0.4 * contrast) | covered] = NO_CORNER
     return covariance, why

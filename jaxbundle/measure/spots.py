@@ -104,7 +104,7 @@ def _nearest_spot(
     contrast = window[bright].mean() - window[~bright].mean() if bright.any() else 0.0
     if contrast < max(settings.min_contrast_sigma * noise_of(window), settings.min_contrast):
         return None, threshold
-    # most of the rim of the window is background
+    # Most of the rim of the window is background.
     rim = np.concatenate([bright[0], bright[-1], bright[1:-1, 0], bright[1:-1, -1]])
     labels, number = scipy.ndimage.label(bright if rim.mean() < 0.5 else ~bright)
     sizes = scipy.ndimage.sum_labels(np.ones_like(window), labels, np.arange(1, number + 1))
@@ -141,15 +141,15 @@ def _levels(
     cut = (slice(first[1], last[1]), slice(first[0], last[0]))
     window, inside = window[cut], inside[cut]
     bright = window[inside].mean() > window[~inside].mean()
-    # the level of the target two pixels within it, where the blurred edge ends; a spot that small
-    # is nowhere at its level, which is then between its middle and its extreme
+    # The level of the target two pixels within it, where the blurred edge ends; a spot that small
+    # is nowhere at its level, which is then between its middle and its extreme.
     core = inside & ~scipy.ndimage.binary_dilation(~inside, iterations=2)
     level = (
         np.median(window[core])
         if core.sum() >= settings.min_pixels
         else np.quantile(window[inside], 0.9 if bright else 0.1)
     )
-    # the background from a ring of two pixels beyond the blurred edge, without neighbours
+    # The background from a ring of two pixels beyond the blurred edge, without neighbours.
     around = scipy.ndimage.binary_dilation(inside, iterations=MARGIN + 2)
     around &= ~scipy.ndimage.binary_dilation(inside, iterations=MARGIN)
     around &= ~(window > threshold if bright else window < threshold)
@@ -174,7 +174,7 @@ def otsu(grey: Real[np.ndarray, "rows columns"]) -> float:
     above = below[-1] - below
     with np.errstate(divide="ignore", invalid="ignore"):
         between = below * above * (total / below - (total[-1] - total) / above) ** 2
-    # between two peaks all empty bins are equally good: their middle
+    # Between two peaks all empty bins are equally good: their middle.
     best = np.flatnonzero(between >= np.nanmax(between, initial=0.0) * (1 - 1e-12))
     return float(edges[1:][best].mean()) if len(best) else low
 

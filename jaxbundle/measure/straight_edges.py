@@ -32,7 +32,7 @@ from jaxbundle.measure.grey_value_fit import noise_of_residuals, normal_equation
 
 # The unknowns of edges, in the order of `UNKNOWNS`.
 Theta = Float[np.ndarray, "n 9"]
-# a, b, c, W at the middle, its change to the end, the same of B, V, ln τ.
+# A, b, c, W at the middle, its change to the end, the same of B, V, ln τ.
 UNKNOWNS = 9
 
 
@@ -160,19 +160,19 @@ def fit_edges(
     for step in range(settings.max_steps):
         model, J = _model(theta, pixels)
         r = pixels.grey - model
-        # not earlier: at the start whole edges are off, and parts contradict one another
+        # Not earlier: at the start whole edges are off, and parts contradict one another.
         if step == 3:
             weight = pixels.weight * _consistent_parts(J, r, pixels.weight, part, settings)[0]
         N, b = normal_equations(J, r, weight, prior, expected - theta, noise)
         d = np.linalg.solve(N, b[..., None])[..., 0]
-        # beyond τ the step is not linear: a, b, c by τ at most, τ by a factor of 1.5
+        # Beyond τ the step is not linear: a, b, c by τ at most, τ by a factor of 1.5.
         limit = np.exp(theta[:, 8])[:, None]
         d[:, :3] = np.clip(d[:, :3], -limit, limit)
         d[:, 8] = np.clip(d[:, 8], -0.4, 0.4)
         theta = theta + d
         theta[:, 8] = np.clip(theta[:, 8], np.log(settings.min_blur), np.log(settings.max_blur))
         noise = noise_of_residuals(r, weight, UNKNOWNS)
-        # edges that do not exist never settle: a tenth of them may go on
+        # Edges that do not exist never settle: a tenth of them may go on.
         if step > 2 and np.quantile(np.abs(d[:, 0]), 0.9) < settings.last_step:
             break
     model, J = _model(theta, pixels)
@@ -182,8 +182,8 @@ def fit_edges(
     Q = np.linalg.inv(N)[:, :3, :3]
     contrast = theta[:, 5] - theta[:, 3]
     used = weight.sum(1)
-    # an edge has twice as many pixels as unknowns, stands out of its residuals five times, and
-    # keeps 60 % of its pixels
+    # An edge has twice as many pixels as unknowns, stands out of its residuals five times, and
+    # keeps 60 % of its pixels.
     solved = (used > 2 * UNKNOWNS) & (noise < 0.2 * np.abs(contrast)) & np.isfinite(Q).all((1, 2))
     solved &= (weight * pixels.weight).sum(1) > 0.6 * pixels.weight.sum(1)
     scale = noise * excess
@@ -251,11 +251,11 @@ class _Pixels:
         weight &= np.abs(t) < 1
         level = np.zeros_like(t)
         if np.any(weight & (s > inner - settings.reach * blur[:, None])):
-            # the cells behind the strip, blurred along the edge
+            # The cells behind the strip, blurred along the edge.
             sharp = (half / blur)[:, None, None]
             passed = scipy.special.ndtr(sharp * (t[:, :, None] - edges.far[:, None]))
             level = np.einsum("npc,nc->np", passed[:, :, :-1] - passed[:, :, 1:], edges.level)
-        # single precision is faster, and exact to 1e-5 pixels
+        # Single precision is faster, and exact to 1e-5 pixels.
         return cls(*(x.astype(np.float32) for x in (s, t, grey[v, u], weight, inner, outer, level)))
 
 
@@ -359,7 +359,7 @@ def _consistent_parts(
     shift = add(weight * J[:, :, 0] * r) / np.where(known, information, np.inf)
     noise = noise_of_residuals(r, weight, UNKNOWNS)[:, None]
     z = shift * np.sqrt(information) / noise
-    # the median over the known parts: unknown ones come last
+    # The median over the known parts: unknown ones come last.
     order = np.sort(np.where(known, np.abs(z), np.inf), axis=1)
     middle = np.maximum(known.sum(1) - 1, 0) // 2
     spread = NORMAL_SIGMA_BY_MAD * np.take_along_axis(order, middle[:, None], 1)
@@ -367,7 +367,7 @@ def _consistent_parts(
     redundancy = good.sum(1) - 3  # a, b, c
     chi2 = np.where(good, z, 0.0) ** 2
     excess = np.sqrt(chi2.sum(1) / np.maximum(redundancy, 1))
-    # not where it is within the spread of χ² itself, √(2/f), twice
+    # Not where it is within the spread of χ² itself, √(2/f), twice.
     significant = excess**2 > 1 + 2 * np.sqrt(2 / np.maximum(redundancy, 1))
     excess = np.where((redundancy > 2) & significant, excess, 1.0)
     keep = np.take_along_axis(good | ~known, part, 1)

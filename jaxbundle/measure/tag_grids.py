@@ -72,7 +72,7 @@ def find_tags(cv2: ModuleType, grey: Grey, board: Board) -> BoardPoints:
             f"({board.dictionary}), or only of one row, found"
         )
     for place in (board.rows - 1 - rows, rows):  # from the bottom, from the top
-        # points of the board that are the corners of the tags, by their row from the top
+        # Points of the board that are the corners of the tags, by their row from the top.
         i, j = 2 * place[:, None] + [0, 0, 1, 1], 2 * columns[:, None] + [0, 1, 1, 0]
         corners: Int[np.ndarray, "tags 4"] = i * 2 * board.columns + j
         near = _places(cv2, board.points[corners, :2], seen)
@@ -81,13 +81,13 @@ def find_tags(cv2: ModuleType, grey: Grey, board: Board) -> BoardPoints:
     else:
         raise InputError(f"the tags found are not those of a flat grid: {board}")
     side = np.linalg.norm(np.diff(seen, axis=1), axis=2).min(1)
-    # the squares of the gaps end where the next tag begins, in sides of a tag
+    # The squares of the gaps end where the next tag begins, in sides of a tag.
     gap = min(1.0, min(board.spacing) / board.marker_side - 1)
     xy, rows, lines = [], [], []
     for which, there, four, length in zip(corners, near, seen, side):
         apart = np.linalg.norm(there[:, None] - four, axis=2)
-        # in sides of the tag; larger: wrongly read tags pass; smaller: tags at the edge of a wide
-        # lens are lost, where the homographies fit worst; not critical
+        # In sides of the tag; larger: wrongly read tags pass; smaller: tags at the edge of a wide
+        # lens are lost, where the homographies fit worst; not critical.
         if len({*apart.argmin(1).tolist()}) == 4 and apart.min(1).max() < 0.25 * length:
             xy += list(there)  # OpenCV's corners reach into the squares of the gaps
             rows += which.tolist()

@@ -123,7 +123,7 @@ def centre_by_ellipse(
     where = "at ({:.1f}, {:.1f})".format(*(xy + spot.corner))
     if seen < settings.min_seen:
         raise InputError(f"{where}: the edge of the target is not fully visible")
-    # the centre of grey values is that of the ellipse, but for a neighbour in the window
+    # The centre of grey values is that of the ellipse, but for a neighbour in the window.
     if not np.isfinite(covariance).all() or np.linalg.norm(centre - xy) > 0.3 * axes[0] + 1:
         raise InputError(f"{where}: the edge of the target is not an ellipse")
     return _target(spot, centre, covariance, axes, angle)
@@ -188,8 +188,8 @@ def _fit_disc(
     turn = np.array([[c, -s], [s, c]])
     M = turn @ np.diag(np.asarray(axes) ** -2.0) @ turn.T
     theta = np.array([*xy, M[0, 0], M[0, 1], M[1, 1], spot.background, spot.contrast, 0.0, 0, 0])
-    # changes of the unknowns that move the rim by a pixel, or the grey values by as much as the
-    # noise: N is then well scaled
+    # Changes of the unknowns that move the rim by a pixel, or the grey values by as much as the
+    # noise: N is then well scaled.
     contrast = abs(spot.contrast)
     curved = 2 / axes[1] ** 3
     scale = np.array([1, 1, curved, curved, curved, contrast, contrast, 1, spot.noise, spot.noise])
@@ -198,7 +198,7 @@ def _fit_disc(
     consistent = _consistent_sectors(A, r, weight, sector, settings)
     if not consistent.all():
         theta, A, r, weight, sector = _iterate(theta, scale, places, grey, consistent, settings)
-    # grey values are rounded: variance 1/12
+    # Grey values are rounded: variance 1/12.
     noise = max(np.sqrt(r @ r / max(weight.sum() - UNKNOWNS, 1)), 12**-0.5)
     inverse = np.linalg.inv(_normal_matrix(A))
     excess = _excess(A, r, inverse, sector, noise, settings.sectors)
@@ -238,7 +238,7 @@ def _iterate(
         while not _is_ellipse(*(theta + change)[2:5]) and np.abs(change).max() > 1e-12:
             change = change / 2
         theta = theta + change
-        # a pixel's area alone has τ = 1/√12 = 0.29; a blur of half the disc leaves no rim
+        # A pixel's area alone has τ = 1/√12 = 0.29; a blur of half the disc leaves no rim.
         theta[7] = np.clip(theta[7], np.log(0.35), np.log(0.5 * minor + 1))
         step += 1
         still = np.abs(change[:2]).max() < settings.last_step

@@ -37,7 +37,7 @@ from jaxbundle.network.columns import (
     is_missing,
     refuse_unknown,
 )
-from jaxbundle.network.kinds import KINDS, SECTIONS, Further
+from jaxbundle.network.kinds import KINDS, SECTIONS, ObservationTable
 from jaxbundle.network.rules import (
     AXES,
     CHOICES,
@@ -201,20 +201,20 @@ def add_further(network: Network, *, angle_unit: str | None = None, **further: A
     return network
 
 
-def make_further(given: Mapping[str, Any], radians: float, where: str = "") -> tuple[Further, ...]:
+def make_further(given: Mapping[str, Any], radians: float) -> tuple[ObservationTable, ...]:
     """Observations of further kinds from their tables and the settings of their sections.
 
     **Raises:** `InputError`, also for an unknown name, and for settings without a table."""
     known = (*KINDS, *SECTIONS)
     for name in given:
-        refuse_unknown(name, known, where, "table")
+        refuse_unknown(name, known, "", "table")
     made = []
     for name, kind in KINDS.items():
         settings = given.get(kind.SECTION, {})
         if given.get(name) is not None:
             made.append(kind.from_columns(as_columns(given[name], name), settings, radians))
         elif settings:
-            raise InputError(f"{where}[{kind.SECTION}] is given, but no table {name}")
+            raise InputError(f"[{kind.SECTION}] is given, but no table {name}")
     return tuple(made)
 
 
@@ -299,7 +299,7 @@ def _ties(where: str, given: Any) -> tuple[tuple[str, ...], ...]:
 
 def _number(where: str, key: str, value: Any) -> float:
     if isinstance(value, NO_NUMBERS) or not isinstance(value, int | float | np.number):
-        raise InputError(f"{where}{key} is {show(value)}; a number is expected")
+        raise InputError(f"{where}{key} is {show(value)}; expected a number")
     try:
         return float(value)
     except OverflowError:
@@ -372,8 +372,8 @@ def _colours(table: Columns) -> UInt8[np.ndarray, "points 3"] | None:
     bad = ~((colour >= 0) & (colour <= 255) & (colour % 1 == 0))
     for row, k in np.argwhere(bad)[:1]:
         raise InputError(
-            f"{table.source(row)}: {POINT_COLOURS[k]} is {show(colour[row, k])}; a whole number "
-            "from 0 to 255 is expected, or no colour at all"
+            f"{table.source(row)}: {POINT_COLOURS[k]} is {show(colour[row, k])}; expected a whole "
+            "number from 0 to 255, or no colour at all"
         )
     return colour.astype(np.uint8)
 

@@ -165,7 +165,7 @@ def _check_images(network: Network) -> None:
         images,
         np.isinf(values),
         "image",
-        lambda _row, k: f"{EXTERIOR[k]} is infinite; a number is expected",
+        lambda _row, k: f"{EXTERIOR[k]} is infinite; expected a number",
     )
     hint = "are these degrees?" if unit == "rad" else f"is {unit!r} right?"
     _refuse(
@@ -220,7 +220,7 @@ def _check_points(network: Network) -> Network:
         points,
         np.isinf(points.position),
         "point",
-        lambda _row, k: f"{AXES[k]} is infinite; a number is expected",
+        lambda _row, k: f"{AXES[k]} is infinite; expected a number",
     )
     _refuse(
         points,
@@ -272,7 +272,7 @@ def _check_observations(network: Network) -> None:
     for row, k in np.argwhere(~np.isfinite(observations.xy))[:1]:
         raise InputError(
             f"{observations.source(row)}: {'xy'[k]} of {_sighting(network, row)} is "
-            f"{observations.xy[row, k]}; a finite number is expected"
+            f"{observations.xy[row, k]}; expected a finite number"
         )
     sigma = observations.sigma
     for row, k in np.argwhere(~(np.isfinite(sigma) & (sigma > 0)))[:1]:

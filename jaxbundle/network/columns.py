@@ -139,7 +139,7 @@ class Columns:
         if not good or isinstance(value, NO_NUMBERS):
             or_word = "".join(f" or {word!r}" for word in words)
             raise InputError(
-                f"{self.source(row)}: {name} is {show(value)}; a number{or_word} is expected"
+                f"{self.source(row)}: {name} is {show(value)}; expected a number{or_word}"
             )
         return number
 

@@ -180,7 +180,7 @@ def _check_pair(where: str, name: str, pair: Any, meaning: str) -> None:
 def check_sigma_image(sigma: float, where: str = "") -> None:
     """Refuse a default σ of image coordinates that is not finite and positive."""
     if isinstance(sigma, bool) or not isinstance(sigma, int | float | np.number):
-        raise InputError(f"{where}sigma_image is {show(sigma)}; a number is expected")
+        raise InputError(f"{where}sigma_image is {show(sigma)}; expected a number")
     if not _positive(sigma):
         raise InputError(f"{where}sigma_image is {show(sigma)}; it must be finite and positive")
 

@@ -302,7 +302,7 @@ class Network:
         )
 
 
-def require_network(network: Network, name: str = "network") -> Network:
+def require_network(network: Network) -> Network:
     """The network, or an error for anything else.
 
     **Raises:** `InputError`."""
@@ -315,5 +315,5 @@ def require_network(network: Network, name: str = "network") -> Network:
         else ("use jaxbundle.read_network(path), make_network or simulate")
     )
     raise InputError(
-        f"{name} must be a Network, but is {show(network)}: {remedy}" + " reads it" * is_path
+        f"network must be a Network, but is {show(network)}: {remedy}" + " reads it" * is_path
     )

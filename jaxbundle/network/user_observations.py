@@ -54,8 +54,8 @@ def split(also: Sequence[Table | ObservationSet]) -> tuple[list[Table], list[Obs
     for item in also:
         if not isinstance(item, Table | ObservationSet):
             raise InputError(
-                "also: tables (leastsquares.Table) and observations (a Kind, called) are expected, "
-                f"but one is {show(item)}"
+                "also: expected tables (leastsquares.Table) and observations (a Kind, called), "
+                f"got {show(item)}"
             )
     for table in tables:
         if table.name.split(",")[0] in OWN:

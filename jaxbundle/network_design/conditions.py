@@ -93,7 +93,7 @@ def box(name: str, given: ArrayLike) -> Box:
     **Raises:** `InputError`."""
     corners = numeric_array(name, given, "two corners X, Y, Z").astype(float)
     if corners.shape != (2, 3) or not np.isfinite(corners).all():
-        raise InputError(f"{name}: two corners X, Y, Z are expected, but given is {show(given)}")
+        raise InputError(f"{name}: expected two corners X, Y, Z, got {show(given)}")
     if not (corners[0] < corners[1]).all():
         raise InputError(
             f"{name}: the box from {corners[0].tolist()} to {corners[1].tolist()} is empty; the "
@@ -110,8 +110,7 @@ def interval(name: str, given: ArrayLike) -> tuple[float, float]:
     ends = numeric_array(name, given, "a smallest and a largest length").astype(float)
     if ends.shape != (2,) or not (0 <= ends[0] < ends[1]):
         raise InputError(
-            f"{name}: a smallest and a larger largest length are expected, but given is "
-            f"{show(given)}"
+            f"{name}: expected a smallest and a larger largest length, got {show(given)}"
         )
     return float(ends[0]), float(ends[1])
 

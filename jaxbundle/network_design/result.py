@@ -22,7 +22,7 @@ from jaxbundle.network_design.proof import Proof, prove
 from jaxbundle.network_design.realise import problem_of
 from jaxbundle.network_design.search import Step
 from jaxbundle.results import TableMethods
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 
 @dataclasses.dataclass(frozen=True)
@@ -175,4 +175,4 @@ class Design(TableMethods):
         if not self.converged:
             yield "the search did not converge; give more iterations"
         if "proof" in self.__dict__:
-            yield f"proof: {present(self.proof)}"
+            yield f"proof: {not_none(self.proof)}"

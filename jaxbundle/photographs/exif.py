@@ -82,7 +82,7 @@ class Exif:
     def principal_distance(self) -> StatedDistance | None:
         """The principal distance in pixels of this file, whatever the size of the photograph as it
         was taken; None if unknown."""
-        # without knowing which part of the sensor is left
+        # Without knowing which part of the sensor is left.
         if self.cropped:
             return None
         long = max(self.size)
@@ -92,7 +92,7 @@ class Exif:
             source = "focal length and sensor"
         elif self.focal_length_35:
             value = self.focal_length_35 / FILM_DIAGONAL * math.hypot(*self.size)
-            # a whole number of mm, whose rounding has σ = 1/√12
+            # A whole number of mm, whose rounding has σ = 1/√12.
             relative = math.hypot(NOMINAL_SIGMA, 1 / math.sqrt(12) / self.focal_length_35)
             source = "focal length equivalent to 35 mm film"
         elif self.focal_length and self.resolution:
@@ -125,9 +125,9 @@ def read_exif(path: str | Path) -> Exif:
     sides = (Tag.ExifImageWidth, Tag.ExifImageHeight)
     taken = sorted(_positive(details.get(side)) or 0 for side in sides)
     if resolution and taken[1]:
-        # of the original photograph: programs that reduce it usually keep this
+        # Of the original photograph: programs that reduce it usually keep this.
         resolution *= max(size) / taken[1]
-    # the ratio of the sides differs by up to 2 % without a crop, from rounding and borders
+    # The ratio of the sides differs by up to 2 % without a crop, from rounding and borders.
     cropped = taken[0] > 0 and abs(math.log(taken[1] / taken[0] * min(size) / max(size))) > 0.02
     xmp = parse_xmp(packet) if isinstance(packet, bytes | str) else Xmp()
     date = details.get(Tag.DateTimeOriginal) or head.get(Tag.DateTime)

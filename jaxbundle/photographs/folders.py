@@ -17,7 +17,7 @@ HIDDEN = ("thumbs.db", "desktop.ini")
 def list_photographs(folder: Path) -> list[Path]:
     """The photographs in a folder, by name: also those whose format cannot be read."""
     files = [p for p in _visible(folder) if p.is_file() and is_photograph(p)]
-    # raw and JPEG of one exposure have one name; the raw file alone is listed, and refused by name
+    # Raw and JPEG of one exposure have one name; the raw file alone is listed, and refused by name.
     read = {p.stem.lower() for p in files if p.suffix.lower() in SUFFIXES}
     return [p for p in files if p.suffix.lower() not in RAW or p.stem.lower() not in read]
 

@@ -65,7 +65,7 @@ def remedy(path: str | Path) -> str:
             head = file.read(12)
     except OSError:
         return ""
-    # an ISO media file begins with a box of type ftyp, whose first field is its brand
+    # An ISO media file begins with a box of type ftyp, whose first field is its brand.
     return BRANDS.get(head[8:12], "") if head[4:8] == b"ftyp" else ""
 
 

@@ -129,7 +129,8 @@ def open_image(path: str | Path, content: bytes | None = None) -> Any:
     if columns * rows > MOST_PIXELS:
         image.close()
         raise InputError(
-            f"{path}: {columns} × {rows} pixels; at most {MOST_PIXELS} can be read: make it smaller"
+            f"{path}: {columns} × {rows} pixels; at most {MOST_PIXELS} pixels can be read; reduce "
+            "the image"
         )
     return image
 
@@ -185,15 +186,15 @@ def _looks_cut(content: bytes) -> bool:
     """Whether a JPEG file has no end mark after its last scan, or a PNG file no end."""
     if content.startswith(START):
         return content.rfind(END) < content.rfind(SCAN)
-    # a JPEG preview inside has an end mark of its own, but before the last scan; PNG ends with a
-    # chunk IEND of 12 bytes, which padding may follow
+    # A JPEG preview inside has an end mark of its own, but before the last scan; PNG ends with a
+    # chunk IEND of 12 bytes, which padding may follow.
     return content.startswith(b"\x89PNG") and b"IEND" not in content[-64:]
 
 
 def _refuse_cut(path: str | Path, content: bytes) -> None:
     """Refuse a file that Pillow cannot decode to its end: the marks alone are no proof."""
     try:
-        # of a file Python makes room for as many bytes as a damaged length says; not of memory
+        # Of a file Python makes room for as many bytes as a damaged length says; not of memory.
         with open_image(path, content) as image, foreign_parser(path, EXPECTED, shortage=False):
             image.load()
     except InputError:
@@ -212,7 +213,7 @@ def _stretch(pixels: Shaped[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"
     reflections and hot pixels would otherwise leave a few grey values to the object."""
     if pixels.dtype == np.uint8:
         return pixels
-    # every 64th pixel of a large photograph suffices for a percentile
+    # Every 64th pixel of a large photograph suffices for a percentile.
     some = pixels[::8, ::8] if pixels.size > 2**20 else pixels
     high = float(np.nanpercentile(some, 99.8))
     scale = 255 / high if high > 0 else 1.0

@@ -92,7 +92,7 @@ def sensor_width(make: str, model: str) -> float | None:
     make, model = make.lower().strip(), " ".join(model.lower().split())
     first = make.split(" ")[0]
     name = model if first and model.startswith(first) else f"{first} {model}"
-    # a known name that continues with a digit is another camera: a D80 is not a D800
+    # A known name that continues with a digit is another camera: a D80 is not a D800.
     goes_on = lambda known: known[-1].isdigit() and name[len(known) :][:1].isdigit()
     alike = (known for known in WIDTHS if name.startswith(known) and not goes_on(known))
     best = max(alike, key=len, default=None)

@@ -75,7 +75,7 @@ def look_at_video(path: Path, settings: FrameSettings, progress: Progress) -> Vi
         stated = max(int(video.get(cv2.CAP_PROP_FRAME_COUNT)), 1)
         for grey in _grey_frames(video):
             small = _reduce(grey, settings.side).astype(np.float32)
-            # of the same view at another exposure it is the same; blur does not change the mean
+            # Of the same view at another exposure it is the same; blur does not change the mean.
             sharpness.append(cv2.Laplacian(small, cv2.CV_32F).var() / max(small.mean(), 1.0) ** 2)
             tiny = _reduce(small, settings.thumbnail).ravel()
             thumbnails.append((tiny - tiny.mean()) / max(float(tiny.std()), 1.0))
@@ -83,7 +83,7 @@ def look_at_video(path: Path, settings: FrameSettings, progress: Progress) -> Vi
                 progress(f"frames of {path.name}", min(len(sharpness), stated), stated)
     if not sharpness:
         raise InputError(f"{path}: a video without frames")
-    # some containers state no rate
+    # Some containers state no rate.
     rate = rate if np.isfinite(rate) and rate > 0 else 30.0
     return VideoLook(path, rate, np.array(sharpness), np.array(thumbnails))
 
@@ -96,7 +96,7 @@ def choose_frames(
 
     **Raises:** `InputError` if there is none."""
     length = min(len(v) - f for v, f in zip(videos, first))
-    # blurred in one video is of no use in the others
+    # Blurred in one video is of no use in the others.
     sharp = np.ones(length, bool)
     for video, skipped in zip(videos, first):
         sharpness = video.sharpness[skipped : skipped + length]
@@ -109,11 +109,11 @@ def choose_frames(
     pictures = [v.thumbnail[f : f + length][candidates] for v, f in zip(videos, first)]
     change = np.full(len(candidates), np.inf)
     chosen: list[int] = []
-    # begins with the sharpest, relative to the brightness of its own video
+    # Begins with the sharpest, relative to the brightness of its own video.
     best = int(np.argmax(videos[0].sharpness[first[0] : first[0] + length][candidates]))
     while len(chosen) < settings.number and change[best] >= settings.min_change:
         chosen.append(best)
-        # new in one video is new
+        # New in one video is new.
         difference = [np.sqrt(((p - p[best]) ** 2).mean(1)) for p in pictures]
         change = np.minimum(change, np.max(difference, axis=0))
         best = int(np.argmax(change))
@@ -146,7 +146,7 @@ def write_frames(path: Path, numbers: Int[np.ndarray, " n"], first: int, folder:
     wanted, written = set(numbers.tolist()), 0
     folder.mkdir()
     with _opened(path) as video:
-        # one by one: to jump to a frame is inexact with most codecs
+        # One by one: to jump to a frame is inexact with most codecs.
         for number in range(int(numbers.max(initial=-1)) + 1):
             if not video.grab():
                 break

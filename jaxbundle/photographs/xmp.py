@@ -60,8 +60,8 @@ def rotation_of(attitude: CameraAttitude, convergence: float = 0.0) -> Float[np.
     """M of an attitude, from east, north, up of a map to the camera: x to the right of the picture,
     y to its top, looking along −z; `convergence`: of the meridian, degrees, grid north less it."""
     yaw, pitch, roll = np.radians([attitude.yaw - convergence, attitude.pitch, attitude.roll])
-    # the axes of the picture in east, north, up: yaw about the vertical, then pitch about the right
-    # axis, then roll about the viewing direction
+    # The axes of the picture in east, north, up: yaw about the vertical, then pitch about the right
+    # axis, then roll about the viewing direction.
     right = np.array([math.cos(yaw), -math.sin(yaw), 0.0])
     level = np.array([math.sin(yaw), math.cos(yaw), 0.0])
     ahead = math.cos(pitch) * level + math.sin(pitch) * np.array([0.0, 0.0, 1.0])
@@ -76,10 +76,10 @@ def rotation_of(attitude: CameraAttitude, convergence: float = 0.0) -> Float[np.
 def _attitude(number: Callable[[str], float | None]) -> CameraAttitude | None:
     stated = _largest([number(f"IMU{axis}Accuracy") for axis in PIX4D])
     sigma = stated if stated and stated > 0 else SIGMA_ATTITUDE
-    # the pitch of the horizon is 0 in DJI's tags, 90 in Pix4D's
+    # The pitch of the horizon is 0 in DJI's tags, 90 in Pix4D's.
     for names, horizon in ((DJI, 0.0), (PIX4D, 90.0)):
         angles = [angle for angle in map(number, names) if angle is not None]
-        # a missing or failed gimbal gives all zeros
+        # A missing or failed gimbal gives all zeros.
         if len(angles) == 3 and any(angles):
             yaw, pitch, roll = angles
             return CameraAttitude(yaw, pitch - horizon, roll, sigma)
@@ -89,13 +89,13 @@ def _attitude(number: Callable[[str], float | None]) -> CameraAttitude | None:
 def _fields(packet: bytes | str) -> Mapping[str, str]:
     """Attributes and elements by their names without namespace, the first of each."""
     content = packet if isinstance(packet, bytes) else packet.encode()
-    # packets have 64 KB at most within JPEG; a megabyte is far beyond what drones write
+    # Packets have 64 KB at most within JPEG; a megabyte is far beyond what drones write.
     whole = re.search(rb"<(\w+:)?RDF\b.*</(\w+:)?RDF>", content[: 2**20], re.DOTALL)
-    # entities may grow without limit ("billion laughs"); no camera uses them
+    # Entities may grow without limit ("billion laughs"); no camera uses them.
     head = content[: whole.start()] if whole else b""
     if whole is None or b"<!DOCTYPE" in head or b"<!ENTITY" in content:
         return {}
-    # some drones declare namespaces outside the part that is read
+    # Some drones declare namespaces outside the part that is read.
     spaces = dict(re.findall(r'xmlns:(\w+)="([^"]*)"', head.decode(errors="replace")))
     text = whole[0].decode(errors="replace")
     opening = re.match(r"<[\w:]+", text)

@@ -16,7 +16,7 @@ import math
 from collections.abc import Mapping
 
 from jaxbundle.errors import InputError
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 
 def scale(c: float, height: float, terrain: float = 0.0) -> float:
@@ -117,14 +117,14 @@ def design_block(
         if not 0 <= overlap < 1:
             percent = " (60 % is 0.6)" if 1 < overlap < 100 else ""
             raise InputError(
-                f"{name} is {overlap}; a fraction from 0, below 1 is expected{percent}"
+                f"{name} is {overlap}; expected a fraction, 0 or more and below 1{percent}"
             )
     if pixel_on_ground is not None:
         if pixel is None:
             raise InputError("pixel_on_ground needs the pixel size (pixel, mm)")
         scale_number = pixel_on_ground / pixel * 1000
     if height is None:
-        height = present(scale_number) * c / 1000
+        height = not_none(scale_number) * c / 1000
     # Lengths of 1e-9 of a base more are rounding, and need no further photograph.
     ratio = height / c
     footprint = (image_format[0] * ratio, image_format[1] * ratio)

@@ -73,7 +73,7 @@ def _control(points: int, every: int | None) -> list[int]:
     if every is None:
         return [0, points // 2, points - 1]
     if every < 1:
-        raise InputError(f"control every {every} bases: a number from 1 is expected")
+        raise InputError(f"control every {every} bases: expected a number from 1")
     return sorted({*range(0, points, 2 * every), points - 1})
 
 

@@ -25,7 +25,7 @@ from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.network.tables import Camera
-from jaxbundle.planning.shapes import Shape, Tangent
+from jaxbundle.planning.shapes import Shape, TangentPlane
 from jaxbundle.planning.texture import Texture
 from jaxbundle.system.cores import available_cores
 from jaxbundle.system.programs import compile_once
@@ -237,7 +237,7 @@ def _first(
 
 
 def _on_the_tangent_plane(
-    tangent: Tangent,
+    tangent: TangentPlane,
     t: Float[np.ndarray, " n"],
     d: Float[np.ndarray, "3 n"],
     moved: Float[np.ndarray, "3 n"],

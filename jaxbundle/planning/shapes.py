@@ -20,14 +20,14 @@ from jaxtyping import Float, Int
 
 from jaxbundle.arguments import positive, vector
 from jaxbundle.errors import InputError
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 # Of f for a point on the surface, relative to the length of the ray, or to the relief where the ray
 # grazes a summit: 1 µm at 1 km, far below what a photograph shows, and a million roundings.
 SURFACE_TOLERANCE = 1e-9
 
 # Normals of points, coordinates first, or one of all; directions of the texture's coordinates.
-Tangent = tuple[Sequence[float | np.ndarray] | np.ndarray, Float[np.ndarray, "2 3"]]
+TangentPlane = tuple[Sequence[float | np.ndarray] | np.ndarray, Float[np.ndarray, "2 3"]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +83,7 @@ class HeightField:
         """The two coordinates of the texture, those of the plane."""
         return X[..., 0], X[..., 1]
 
-    def axes(self, X: Float[np.ndarray, "n 3"], size: float) -> Tangent:
+    def axes(self, X: Float[np.ndarray, "n 3"], size: float) -> TangentPlane:
         """Normals of points, coordinates first, and the directions of the texture's coordinates;
         slopes are taken over `size`."""
         x, y = X[..., 0], X[..., 1]
@@ -109,7 +109,7 @@ class HeightField:
         spread = lambda a: np.nan_to_num(widest(away(a)), nan=np.inf).ravel()
         # A ray at t is within |Δo| + |Δd|·t of the central one, which changes f by up to √(1 + L²)
         # times that.
-        slack = np.hypot(1.0, present(self.steepest))
+        slack = np.hypot(1.0, not_none(self.steepest))
         t = self._follow(
             middle(o),
             middle(d),
@@ -132,10 +132,10 @@ class HeightField:
     ) -> Float[np.ndarray, " n"]:
         """Lengths to where f − near − spread·t is about 0 (`last`: exactly); inf where a ray
         leaves the bounds."""
-        low, high = present(self.bounds)
+        low, high = not_none(self.bounds)
         relief = max(high - low, 1e-9 * (self.extent[2] - self.extent[0]))
         with np.errstate(invalid="ignore", divide="ignore"):
-            reach = np.abs(d[:, 2]) + present(self.steepest) * np.hypot(d[:, 0], d[:, 1])
+            reach = np.abs(d[:, 2]) + not_none(self.steepest) * np.hypot(d[:, 0], d[:, 1])
             enter = np.where(o[:, 2] > high, (high - o[:, 2]) / d[:, 2], 0.0)
             leave = np.where(d[:, 2] < 0, (low - o[:, 2]) / d[:, 2], (high - o[:, 2]) / d[:, 2])
         usable = np.isfinite(d).all(1) & (enter >= 0) & np.isfinite(enter)
@@ -264,7 +264,7 @@ class Rectangle:
         s = self._from_corner(X, self.axes(X, 0.0)[1])
         return s[..., 0], s[..., 1]
 
-    def axes(self, X: Float[np.ndarray, "*n 3"], size: float) -> Tangent:  # noqa: ARG002
+    def axes(self, X: Float[np.ndarray, "*n 3"], size: float) -> TangentPlane:  # noqa: ARG002
         """The normal, and the unit vectors of the texture's coordinates; the same everywhere."""
         unit = lambda v: np.asarray(v, float) / np.linalg.norm(v)
         a, b = unit(self.along), unit(self.across)

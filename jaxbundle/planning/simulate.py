@@ -163,7 +163,9 @@ def simulate_with_truth(  # noqa: PLR0913 (public: a table of options, all but t
     of_station = _camera_of_station(cameras, camera_of_station, len(stations))
     begin = cameras if start is None else make_cameras(start, "start: ")
     if len(begin) != len(cameras):
-        raise InputError(f"start has {len(begin)} cameras, camera {len(cameras)}; give as many")
+        raise InputError(
+            f"start has {len(begin)} cameras, camera {len(cameras)}; give the same number"
+        )
     # Before any drawing, so that faults of arguments are reported without computing.
     role = _roles(len(targets), control, control_sigma, check)
     sigma_xy = _not_negative(noise, 2, "noise")
@@ -287,7 +289,8 @@ def _camera_of_station(
     indices = numeric_array("camera_of_station", given, "indices of cameras")
     if indices.shape != (stations,) or not np.isin(indices, np.arange(len(cameras))).all():
         raise InputError(
-            f"camera_of_station must be {stations} indices below {len(cameras)}, one a station"
+            f"camera_of_station must be {stations} indices below {len(cameras)}, one for each "
+            "station"
         )
     return indices.astype(np.int64)
 

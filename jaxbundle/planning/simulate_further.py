@@ -17,7 +17,7 @@ from jaxbundle.leastsquares.declarations import Kind, ObservationSet, Table
 from jaxbundle.leastsquares.indexing.rows import evaluate, scalars
 from jaxbundle.leastsquares.spaces import Space
 from jaxbundle.network.declare import declare
-from jaxbundle.network.kinds import Further
+from jaxbundle.network.kinds import ObservationTable
 from jaxbundle.network.tables import Network, require_network
 from jaxbundle.planning.stations import LARGEST_SEED
 from jaxbundle.system.programs import compile_once
@@ -71,7 +71,7 @@ def simulate_further(
 
 
 def _image_points(
-    truth: Network, rows: Further, values: dict[str, PyTree]
+    truth: Network, rows: ObservationTable, values: dict[str, PyTree]
 ) -> Float[np.ndarray, "rays 2"]:
     """The image points of the truth in the moving camera, where an image point is exposed with
     its line, which depends on the image point; or through its interfaces."""

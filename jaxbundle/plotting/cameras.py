@@ -62,7 +62,7 @@ def distortion_curve(adjustment: "Adjustment", camera: str, ax: "Axes | None" = 
     quiet(ax)
     ax.set_xlim(0, found.radius[-1] or 1.0)
     bottom, top = ax.get_ylim()
-    # rounding, far below 0.1 µm or px, must not look like distortion
+    # Rounding, far below 0.1 µm or px, must not look like distortion.
     ax.set_ylim(min(bottom, -0.1), max(top, 0.1))
     label(ax, "x", "distance from the principal point", found.unit)
     label(ax, "y", "distortion, measured − ideal", unit)

@@ -131,7 +131,7 @@ def places_tried(designed: "Design", ax: "Axes | None" = None) -> "Axes":
     from matplotlib.colors import LogNorm
 
     position, aims = designed.tried
-    # a place from which the network is nearly singular would take the whole range of colours
+    # A place from which the network is nearly singular would take the whole range of colours.
     network, good = designed.network, aims < 1e3 * np.min(aims)
     marks = ax.scatter(*position[good, :2].T, c=aims[good], norm=LogNorm(), s=26, cmap="viridis_r")
     ax.figure.colorbar(marks, ax=ax, label=f"{designed.aim} with a photograph there")
@@ -153,6 +153,6 @@ def _box_edges(box: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "12 2 3"]:
     corners = np.array(
         [[box[i, 0], box[j, 1], box[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
     )
-    # the bits of a corner's number are its sides: along an edge one of them differs
+    # The bits of a corner's number are its sides: along an edge one of them differs.
     pairs = [(a, b) for a in range(8) for b in range(a) if bin(a ^ b).count("1") == 1]
     return corners[np.array(pairs)]

@@ -111,9 +111,9 @@ def distortion_at(
     ideal = _ideal(model, p, centre + radius[:, None, None] * out)
     found = _harmonics(model, p, centre, ideal, radius, jnp.asarray(out))
     values, slopes = (np.array(x) for x in found)
-    # image coordinates are exact to about 450 times the rounding of one operation
+    # Image coordinates are exact to about 450 times the rounding of one operation.
     noise = np.abs(values) < 1e-13 * (np.abs(centre).max() + radius)
-    # the amplitude has no derivative where it is zero
+    # The amplitude has no derivative where it is zero.
     slopes[1][noise[1]] = 0
     values[noise] = 0
     return values, slopes

@@ -190,13 +190,13 @@ def png(
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    # margins by the layout, and no savefig: both it and cropping draw once more
+    # Margins by the layout, and no savefig: both it and cropping draw once more.
     layout = ConstrainedLayoutEngine(w_pad=margin, h_pad=margin)
     figure = Figure(figsize=size, dpi=dots_per_inch, layout=layout)
     canvas = FigureCanvasAgg(figure)
     data = io.BytesIO()
     with warnings.catch_warnings():
-        # names in a script missing from the font: boxes in the figure, no action required
+        # Names in a script missing from the font: boxes in the figure, no action required.
         warnings.filterwarnings("ignore", message="Glyph .* missing")
         draw(ax=figure.add_subplot(projection=projection))  # some measure their text
         canvas.print_png(data)

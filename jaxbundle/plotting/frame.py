@@ -26,7 +26,7 @@ def image_frame(
     size, pitch = given.image_size, given.pixel_size
     if size is not None and model.unit == "px":
         half = np.array(size) / 2
-        # the first pixel has its centre, not its corner, at 0
+        # The first pixel has its centre, not its corner, at 0.
         centre = half - 0.5 if model.axes == "down" else np.zeros(2)
         return centre - half, centre + half, True
     if size is not None and pitch is not None:

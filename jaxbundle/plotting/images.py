@@ -154,7 +154,7 @@ def residual_histogram(adjustment: "Adjustment", ax: "Axes | None" = None) -> "A
     ax = axes(ax, (6.5, 4.2))
     tau = adjustment.residuals["tau"]
     tau = tau[np.isfinite(tau)]
-    # bars of a few observations are ragged: fewer, wider ones
+    # Bars of a few observations are ragged: fewer, wider ones.
     step = 0.5 if len(tau) < 400 else 0.25
     reach = float(np.clip(np.ceil(np.abs(tau).max(initial=0.0)), 4, 6))
     edges = np.arange(-reach, reach + step / 2, step)

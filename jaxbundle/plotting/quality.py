@@ -85,7 +85,7 @@ def _smooth(
 def _label_places(lines: "QuadContourSet", size: np.ndarray) -> list[tuple[float, ...]]:
     """Where the contours have their labels: in the middle of the longest piece of each, away from
     the frame of the image and from one another."""
-    # two digits of σ, 7 points high, are about 0.08 of an image as wide as the figure
+    # Two digits of σ, 7 points high, are about 0.08 of an image as wide as the figure.
     margin, found = 0.08 * size, []
     for pieces in lines.allsegs:
         for vertices in sorted(pieces, key=len, reverse=True)[:1]:

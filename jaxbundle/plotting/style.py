@@ -122,7 +122,7 @@ def round_number(x: float) -> float:
     if not (math.isfinite(x) and x > 0):
         return 1.0
     power = 10.0 ** math.floor(math.log10(x))
-    # the tolerance keeps 5 at 5 where rounding made it 4.999…
+    # The tolerance keeps 5 at 5 where rounding made it 4.999….
     return max(step * power for step in (1, 2, 5) if step * power <= x * (1 + 1e-12))
 
 
@@ -132,7 +132,7 @@ def extent(xyz: ArrayLike) -> tuple[np.ndarray, float]:
     xyz = xyz[np.isfinite(xyz).all(1)]
     if not len(xyz):
         return np.zeros(3), 1.0
-    # a few per cent of outliers do not change these quantiles
+    # A few per cent of outliers do not change these quantiles.
     low, middle, high = np.quantile(xyz, [0.02, 0.5, 0.98], axis=0)
     reach = 3 * np.maximum(high - low, 1e-12 + 1e-3 * (high - low).max())
     seen = xyz[(np.abs(xyz - middle) <= reach).all(1)]

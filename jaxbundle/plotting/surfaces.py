@@ -30,7 +30,7 @@ def cloud_perspective(
     few = cloud.take(np.arange(0, len(cloud), max(1, -(-len(cloud) // max_points))))
     sigma = few.sigma[:, "XYZ".index(axis)]
     limit = np.nanpercentile(sigma, 95) if np.isfinite(sigma).any() else 1.0
-    # marks that touch their neighbours: of an area of about 300 by 300 typographical points
+    # Marks that touch their neighbours: of an area of about 300 by 300 typographical points.
     mark = np.clip(300**2 / max(len(few), 1), 1.0, 16.0)
     drawn = view.scatter(
         *few.X.T, c=sigma, s=mark, cmap="viridis", vmin=0, vmax=limit, linewidths=0
@@ -53,9 +53,9 @@ def dsm_relief(dsm: Dsm, ax: Axes | None = None) -> Axes:
     ax = axes(ax, (7.0, 6.0))
     Z = np.where(np.isfinite(dsm.height), dsm.height, np.nanmean(dsm.height))
     down, right = np.gradient(Z, dsm.size) if min(Z.shape) > 1 else (0 * Z, 0 * Z)
-    # from the upper left, as in maps: under light from below, valleys look like ridges
+    # From the upper left, as in maps: under light from below, valleys look like ridges.
     azimuth, elevation, ambient = np.radians(315.0), np.radians(45.0), 0.35
-    # the normal (−∂Z/∂x, −∂Z/∂y, 1), y against the rows
+    # The normal (−∂Z/∂x, −∂Z/∂y, 1), y against the rows.
     light = np.array(
         [
             np.sin(azimuth) * np.cos(elevation),

@@ -29,7 +29,7 @@ def label_ticks(ticks: Sequence[float] | Float[np.ndarray, " n"]) -> tuple[float
     digits = math.log10(max(largest, 1.0)) + max(_places(values), 0)
     if largest <= 10 * span or digits < TICK_DIGITS:
         return 0.0, name_ticks(values)
-    # the smallest power of ten not below the span, by a logarithm that rounding may raise
+    # The smallest power of ten not below the span, by a logarithm that rounding may raise.
     unit = 10.0 ** math.ceil(math.log10(span) - 1e-9)
     offset = math.floor(values[0] / unit + 1e-6) * unit
     return offset, name_ticks(values - offset)

@@ -133,7 +133,7 @@ def network_plan(adjustment: "Adjustment", ax: "Axes | None" = None) -> "Axes":
         ids.append((adjustment.images["id"], centres, INK, away[:, :2] / size))
     if len(points["id"]) <= MAX_LABELS:
         ids.append((points["id"], points["xyz"], BLUE, upper_right))
-    # beyond some thousands of dots an id finds no room in any case
+    # Beyond some thousands of dots an id finds no room in any case.
     places = np.concatenate([centres, points["xyz"][: 50 * MAX_LABELS]])[:, :2]
     _write_ids(ax, ids, places)
     return ax
@@ -251,11 +251,11 @@ def camera_pyramids(adjustment: "Adjustment", size: float) -> np.ndarray:
         chosen = [c for c, other in enumerate(models) if other == model]
         p = interior[np.array(chosen), : len(model.parameters)]
         corners[chosen] = _corner_rays(model, p, frames[chosen])
-    # if the distortion turns back inside the frame there is no ray: an approximate corner instead
+    # If the distortion turns back inside the frame there is no ray: an approximate corner instead.
     missing = ~np.all(np.isfinite(corners), axis=2)
     plain = np.array([(-1, -1, -1.4), (1, -1, -1.4), (1, 1, -1.4), (-1, 1, -1.4)])
     corners = np.where(missing[:, :, None], plain, corners)
-    # corners at one depth, of a lens far from a hemisphere, make a plane rectangle
+    # Corners at one depth, of a lens far from a hemisphere, make a plane rectangle.
     flat = np.all(corners[:, :, 2] < -0.2, axis=1)
     corners[flat] /= -corners[flat][:, :, 2:]
     corners /= np.linalg.norm(corners, axis=2).mean(1)[:, None, None]
@@ -377,7 +377,7 @@ def choose_ellipses(adjustment: "Adjustment", size: float, settings: EllipseSett
     neighbour = _neighbour(places[rows, :dimensions])
     reach = np.clip(0.45 * neighbour, settings.smallest * size, settings.widest * size)
     longest = settings.longest * size
-    # one in twenty at most is too wide
+    # One in twenty at most is too wide.
     middle, most = np.quantile(half_axis, [0.5, 0.95], method="lower")
     factor = round_number(min(reach / middle, longest / most))
     wide = factor * half_axis > longest
@@ -403,7 +403,7 @@ def thin_out(
     low, high = np.quantile(xyz, [0.01, 0.99], axis=0)
     wide = np.argsort(low - high)[:2]
     sides = np.maximum((high - low)[wide], 1e-12 * max(float((high - low).max()), 1e-300))
-    # two half-axes, and half of one between neighbours; along a line cells are as many as ellipses
+    # Two half-axes, and half of one between neighbours; along a line cells are as many as ellipses.
     room = 2.5 * settings.smallest * size
     sampled = np.clip(np.prod(np.maximum(sides / room, 1)), 1, settings.sampled)
     cells = np.maximum(np.sqrt(sampled * sides / sides[::-1]).astype(int), 1)
@@ -485,7 +485,7 @@ def _write_ids(
     ax.figure.canvas.figure.draw_without_rendering()  # the layout moves the axes
     frame = ax.get_window_extent()
     dots = ax.figure.dpi / 72
-    # of text of 7 points: a letter, a line and the gap between a dot and its text, in points
+    # Of text of 7 points: a letter, a line and the gap between a dot and its text, in points.
     letter, line, gap = 4.9, 8.0, 4.0
     taken = [(x - dots, x + dots, y - dots, y + dots) for x, y in ax.transData.transform(places)]
     for ids, xyz, colour, away in tables:

@@ -102,7 +102,7 @@ def _read_gcp_list(path: Path, system: str, rows: Sequence[tuple[int, str]]) -> 
             image = cells[5]
         except (ValueError, IndexError):
             raise InputError(
-                f"{path}, line {number}: X Y Z u v photograph [name] are expected, not {line!r}"
+                f"{path}, line {number}: expected X Y Z u v photograph [name], got {line!r}"
             ) from None
         # Without a name rows of one point are known by their equal coordinates, as text.
         name = cells[6] if len(cells) > 6 else f"{cells[0]},{cells[1]}"
@@ -133,7 +133,7 @@ def _read_table(path: Path, head: Sequence[str], rows: Sequence[tuple[int, str]]
                 return float(text) if text else otherwise
             except ValueError:
                 raise InputError(
-                    f"{path}, line {number}: {name} is {text!r}; a number is expected"
+                    f"{path}, line {number}: {name} is {text!r}; expected a number"
                 ) from None
 
         id, role = cells["id"].strip(), (cells.get("role") or "control").strip()

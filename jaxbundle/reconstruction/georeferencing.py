@@ -46,7 +46,7 @@ from jaxbundle.reconstruction.oriented_block import (
     MeasuredPoint,
     OrientedBlock,
 )
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 
 def georeference(
@@ -122,7 +122,7 @@ def _tabulate(
         measured = dataclasses.replace(final.measure(id), good=choice.points[id].good)
         X, residual = np.full(3, np.nan), np.full(3, np.nan)
         if id in compared:
-            X = present(checks).position[compared[id]]
+            X = not_none(checks).position[compared[id]]
         elif id in final.row_of_point:
             X = final.X[final.row_of_point[id]]
         if np.isfinite(X).all():

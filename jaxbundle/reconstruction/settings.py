@@ -87,6 +87,6 @@ class ReconstructionSettings:
                 "ring14"
             )
         if self.uncoded and not (self.targets or "").startswith("ring"):
-            raise InputError("uncoded: ring-coded targets are expected, such as ring14")
+            raise InputError("uncoded: expected ring-coded targets, such as ring14")
         if not self.aspect_sigma > 0:
             raise InputError(f"aspect_sigma: expected a positive number, got {self.aspect_sigma}")

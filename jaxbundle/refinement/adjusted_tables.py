@@ -18,7 +18,7 @@ def point_rows(result: Refinement) -> list[dict]:
     """Adjusted points of a `Refinement`: id, role, X, Y, Z and σ of them, metres, in `COLUMNS`."""
     found, chosen = result.inspection, result.inspection.declared.rays.points
     axes = result.points.axes[chosen]
-    # the engine's cofactors are along the axes of each point: Σ = σ0²·Aᵀ·Q·A in X, Y, Z
+    # The engine's cofactors are along the axes of each point: Σ = σ0²·Aᵀ·Q·A in X, Y, Z.
     covariance = found.sigma0**2 * axes.transpose(0, 2, 1) @ found.point_cofactor @ axes
     sigma = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))
     names = [(result.points.id[k], result.points.role[k]) for k in chosen]
@@ -51,7 +51,7 @@ def adjusted_photographs(result: Refinement) -> Network | None:
     kept = np.zeros(len(network.observations), bool)
     for part in declared.parts:
         if part.table == PHOTOGRAPH:
-            # a point whose two coordinates were both removed by snooping is left out
+            # A point whose two coordinates were both removed by snooping is left out.
             kept[part.rows] = found.has_weight[part.set].any(1)
     adjusted = dict(zip(result.point_ids, result.positions))
     points = network.points

@@ -42,7 +42,7 @@ def choose_rays(
     number = np.bincount(observations.point, minlength=len(points))
     number += np.bincount(frame_point, minlength=len(points))
     role = np.array(points.role, dtype=object)
-    # two equations for three coordinates: such a point would be undetermined
+    # Two equations for three coordinates: such a point would be undetermined.
     lone = (role == "tie") & (number == 1)
     warnings = []
     if lone.any():
@@ -78,7 +78,7 @@ def start_points(inputs: RefinementInput, rays: Rays) -> Float[np.ndarray, "poin
         return X
     centre, direction, point = (np.concatenate(x) for x in zip(*_sights(inputs, rays)))
     at = np.searchsorted(chosen, point)
-    # the rays sorted by their points, without those of points whose coordinates are given
+    # The rays sorted by their points, without those of points whose coordinates are given.
     order = np.argsort(at, kind="stable")
     order = order[wanted[at[order]]]
     rows, first, number = np.unique(at[order], return_index=True, return_counts=True)

@@ -68,7 +68,7 @@ def intersect(found: RefinementInspection, rays: Rays) -> RefinementCheckPoints:
     known, axes = problem.table("point").free > 0, start["point"].axes
     change = np.asarray(values["point"].position - start["point"].position)
     sigma = found.sigma0 * np.sqrt(np.diagonal(Q, axis1=1, axis2=2))
-    # residuals at the given coordinates, not at those that the rays determine
+    # Residuals at the given coordinates, not at those that the rays determine.
     here = Solution(problem, start)
     A = _slopes(*here.arguments, found.shared_unknowns, found.estimate)
     real = lambda o: np.asarray(A[o])[: problem.observations_of(o).number]

@@ -35,7 +35,7 @@ from jaxbundle.refinement.terrain_heights import (
     terrain_heights,
     update_cells,
 )
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 
 class ImagePointSet(NamedTuple):
@@ -90,11 +90,11 @@ class DeclaredRefinement:
             if part.table == IMAGE:
                 lines, _ = _lines(self.inputs, values, X, part.rows, part.image, part.point)
                 before, measured[part.set] = np.asarray(measured[part.set].scale), lines
-                # relative to the largest element: those off the diagonal are nearly zero
+                # Relative to the largest element: those off the diagonal are nearly zero.
                 size = np.abs(before).max((1, 2), keepdims=True)
                 change = max(change, float((np.abs(lines.scale - before) / size).max()))
         if len(self.levelled):
-            model, cells = present(self.inputs.terrain), measured[TERRAIN_HEIGHTS]
+            model, cells = not_none(self.inputs.terrain), measured[TERRAIN_HEIGHTS]
             measured[TERRAIN_HEIGHTS], off = update_cells(model, cells, X[self.levelled])
             change = max(change, off)
         data = dataclasses.replace(problem.data, measured=measured)
@@ -174,7 +174,7 @@ def _photographs(
     """The photographs as declared, and by the id of a camera its table and row; their image points
     are added to `parts`."""
     photographs = declare_network(network, inputs.origin)
-    # the network has a set of image points for every camera model
+    # The network has a set of image points for every camera model.
     for set_name, rows in photographs.image_rows.items():
         image, point = network.observations.image[rows], network.observations.point[rows]
         image = image + len(inputs.images)
@@ -216,7 +216,7 @@ def _scanner_points(
     and what their rows are. `index`: of the points among those used."""
     observed, parts, away = [], [], []
     measured, sigma = inputs.observations, inputs.observations.sigma
-    # images differ in their equations by corrections and ellipsoid; their sizes were padded alike
+    # Images differ in their equations by corrections and ellipsoid; their sizes were padded alike.
     kind_of_image: list = [inputs.kind(i) for i in range(len(inputs.rigorous))]
     kind_of_image += [RPC_POINTS] * len(inputs.rpc)
     for kind in dict.fromkeys(kind_of_image):
@@ -257,7 +257,7 @@ def _points(
     sigma = np.nan_to_num(points.sigma[chosen], nan=0.0, posinf=np.inf)
     control = (role == "control")[:, None]
     free = ~(control & (sigma == 0))
-    # one ray gives no height: such a check point moves along its first two axes only
+    # One ray gives no height: such a check point moves along its first two axes only.
     free[(role == "check") & (seen < 2), 2] = False
     placed = kinds.Placed(X, points.axes[chosen])
     labels = [points.id[k] for k in chosen]
@@ -279,8 +279,8 @@ def _network_of(
     checking: bool,
 ) -> Network:
     """The photographs with the points and rays used; control is declared here (`_points`)."""
-    frames, n = present(inputs.frames), len(X)
-    # a camera without photographs would be undetermined
+    frames, n = not_none(inputs.frames), len(X)
+    # A camera without photographs would be undetermined.
     used = list(dict.fromkeys(frames.images.camera.tolist()))
     camera = np.array([used.index(c) for c in frames.images.camera], int)
     seen, d = frames.observations.take(rays.frame), frames.distances
@@ -290,8 +290,8 @@ def _network_of(
     return frames.replace(
         cameras=tuple(frames.cameras[c] for c in used),
         images=dataclasses.replace(frames.images, camera=camera),
-        # all of them tie points here: control is along the axes of each point, which the network
-        # does not know
+        # All of them tie points here: control is along the axes of each point, which the network
+        # does not know.
         points=Points(ids, ("tie",) * n, X, np.full((n, 3), np.nan)),
         observations=dataclasses.replace(seen, point=index[inputs.frame_point[seen.point]]),
         distances=Distances(ends[kept], d.value[kept], d.sigma[kept]),

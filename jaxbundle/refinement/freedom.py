@@ -159,7 +159,7 @@ def make_form(image: PushbroomImage, earth: Ellipsoid | None, freedom: Freedom) 
 def _axes(image: PushbroomImage, local: bool) -> Float[Array, "3 3"]:
     """F: across, along, up at the middle line."""
     t, trajectory = image.middle_time, image.trajectory
-    # in a local frame the centre of the Earth is nowhere; up is Z
+    # In a local frame the centre of the Earth is nowhere; up is Z.
     up = jnp.array([0.0, 0.0, 1.0]) if local else position_at(trajectory, t)
     return orbital_frame(up, velocity_at(trajectory, t))
 
@@ -204,7 +204,7 @@ def change_offsets(
 
 def change_optics(image: PushbroomImage, change: Change) -> ChangedOptics:
     """The optics with focal length and look angles changed."""
-    # a zero coefficient more: a polynomial must have one
+    # A zero coefficient more: a polynomial must have one.
     pad = lambda a: jnp.concatenate([a, jnp.zeros(1)])
     middle, half = middle_and_half(image)
     added = AnglePolynomial(

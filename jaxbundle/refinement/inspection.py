@@ -22,7 +22,7 @@ from jaxbundle.refinement.declare import DeclaredRefinement
 from jaxbundle.refinement.terrain_heights import TERRAIN_HEIGHTS
 from jaxbundle.refinement.weakness import weaknesses
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray, present
+from jaxbundle.types import AnyArray, not_none
 
 
 class SharedUnknowns(eqx.Module):
@@ -83,7 +83,7 @@ class RefinementInspection:
         problem, at = self.declared.problem, {}
         for k, column in enumerate(self.declared.columns):
             at.setdefault(column.table, []).append((k, column.row, column.direction))
-        # columns, as index arrays of the tables
+        # Columns, as index arrays of the tables.
         at = {t: tuple(np.array(rows).T) for t, rows in at.items()}
         start = {t: jax.device_get(problem.data.start[t]) for t in at}
         return SharedUnknowns(at, start, problem.declared.named_spaces)
@@ -127,7 +127,7 @@ class RefinementInspection:
     @functools.cached_property
     def residuals(self) -> dict[str, Float[np.ndarray, "n r"]]:
         """v of every set of observations in its unit, including removed ones."""
-        # with the weights before snooping: what a removed observation disagrees by is of interest
+        # With the weights before snooping: what a removed observation disagrees by is of interest.
         problem, weight = self.solution.problem, self.declared.problem.data.weight
         data = type(problem.data)(problem.data.start, problem.data.measured, weight)
         found = Solution(with_data(problem, data), self.solution.values).residuals
@@ -206,7 +206,7 @@ def _describe_removed(declared: DeclaredRefinement, blunder: RemovedRow) -> Remo
     if blunder.set in names:
         number = names.index(blunder.set)
         part = declared.parts[number]
-        # the rank of a row, set by set, in the order of the images
+        # The rank of a row, set by set, in the order of the images.
         place = np.argsort(np.argsort(declared.image, kind="stable"))
         before = sum(len(p.rows) for p in declared.parts[:number])
         told = [
@@ -216,7 +216,7 @@ def _describe_removed(declared: DeclaredRefinement, blunder: RemovedRow) -> Remo
         rows = [int(place[before + r]) for r in blunder.rows]
         return Removed("image", rows[0], either_of(told), blunder.test, tuple(rows[1:]))
     if set.kind.name == "control points":
-        p, axis = int(declared.control[blunder.row]), present(blunder.residual)
+        p, axis = int(declared.control[blunder.row]), not_none(blunder.residual)
         name = f"{points.axis_names[axis]} of control point {points.id[chosen[p]]}"
         return Removed("control", 3 * p + axis, name, blunder.test)
     if blunder.set == TERRAIN_HEIGHTS:

@@ -81,7 +81,7 @@ class AlongAxes:
     def retract(self, value: Placed, change: Float[AnyArray, "3"]) -> Placed:
         return value._replace(position=value.position + change @ value.axes)
 
-    # the axes of the origin: `retract` moves along them, and they do not change
+    # The axes of the origin: `retract` moves along them, and they do not change.
     def difference(self, value: Placed, origin: Placed) -> Float[Array, "3"]:
         return jnp.matmul(origin.axes, value.position - origin.position)
 

@@ -40,7 +40,7 @@ from jaxbundle.types import AnyArray, Scalar
 
 def refined_image(image: PushbroomImage, form: Form, change: Change) -> PushbroomImage:
     """An image without offsets that equals `image` with its changes."""
-    # without the jitter, which has no middle: the attitude is computed time by time below
+    # Without the jitter, which has no middle: the attitude is computed time by time below.
     moved = change_image(image, form, change._replace(jitter=0 * change.jitter), image.middle_time)
     return PushbroomImage(
         Trajectory(_position(moved), _attitude(image, form, change, _position(moved))),
@@ -77,7 +77,7 @@ def _rotations(
     first, last = (old.position.times[k] for k in (0, -1))
 
     def turned_frame(t: Scalar) -> Float[Array, "3 3"]:
-        # rows of the attitude may be beyond those of the positions, where no line is
+        # Rows of the attitude may be beyond those of the positions, where no line is.
         t = jnp.clip(t, first, last)
         frame = lambda table: orbital_frame(position_at(table, t), velocity_at(table, t))
         return frame(new).T @ frame(old)
@@ -98,11 +98,11 @@ def _attitude(
     old = image.trajectory.attitude
     rows = np.asarray(old.table.times)
     first, last = (float(image.times.time(line)) for line in (-0.5, image.lines - 0.5))
-    # two rows more than the image needs, so that readers may interpolate otherwise
+    # Two rows more than the image needs, so that readers may interpolate otherwise.
     start = max(np.searchsorted(rows, first, side="right") - 1 - 2, 0)
     end = min(np.searchsorted(rows, last) + 2, len(rows) - 1)
     covered = np.clip([first, last], *span(old.table))
-    # an extrapolated end becomes a row
+    # An extrapolated end becomes a row.
     times = np.union1d(rows[start : end + 1], covered[(covered < rows[0]) | (covered > rows[-1])])
     centres = form.spline.centres
     times = np.union1d(times, centres[(centres > first) & (centres < last)])
@@ -118,9 +118,9 @@ def _attitude(
         # 1e-9 rad is a millimetre from 1000 km. The error of slerp is largest in the middle; each
         # halving leaves a quarter of it.
         wrong = np.linalg.norm(_turns(half, there), axis=1) > 1e-9
-        # a gap has no values to be followed
+        # A gap has no values to be followed.
         wrong &= ~np.isin(times[left + 1], gaps)
-        # both halves of a split interval are checked again
+        # Both halves of a split interval are checked again.
         order = np.argsort(np.r_[times, middle[wrong]], kind="stable")
         split = np.zeros(len(times) - 1, bool)
         split[left[wrong]] = True
@@ -168,7 +168,7 @@ def _optics(image: PushbroomImage, change: Change) -> Optics:
     base, e = image.optics, change.focal_length
     if isinstance(base, FocalLine):
         parameters = base.parameters
-        # a longer principal distance is the same only without distortion
+        # A longer principal distance is the same only without distortion.
         candidate = dataclasses.replace(base, parameters=jnp.asarray(parameters).at[0].mul(1 + e))
     elif isinstance(base, AnglePolynomial):
         candidate = _sum(base, e, wanted.polynomials)
@@ -176,7 +176,7 @@ def _optics(image: PushbroomImage, change: Change) -> Optics:
         candidate = base
     u = jnp.arange(image.pixels, dtype=float)
     target = _slopes(wanted, u)
-    # the same up to rounding: a nanometre in a kilometre
+    # The same up to rounding: a nanometre in a kilometre.
     if float(jnp.abs(_slopes(candidate, u) - target).max()) <= 1e-12:
         return candidate
     return AngleTable(jnp.arctan(target[0]), jnp.arctan(target[1]))

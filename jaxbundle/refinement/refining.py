@@ -40,7 +40,7 @@ from jaxbundle.refinement.tables import AnyScannerImage, GroundPoints, with_fram
 from jaxbundle.refinement.terrain_heights import TERRAIN_HEIGHTS, HeightModel
 from jaxbundle.refinement.weakness import weaknesses
 from jaxbundle.results import TableMethods, finite
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 TESTS = ("none", "baarda", "pope")
 
@@ -170,7 +170,7 @@ class Refinement(TableMethods):
         inputs, r = self.inspection.declared.inputs, self.redundancy
         frames = [] if inputs.frames is None else [inputs.frames.observations]
         sets = [inputs.observations, *frames]
-        # one set of unstated σ makes vᵀPv a number without scale
+        # One set of unstated σ makes vᵀPv a number without scale.
         origin = next((one.sigma_origin for one in sets if one.sigma_origin != STATED), STATED)
         return chi_squared_test(r * self.sigma0**2, r, origin)
 
@@ -300,7 +300,7 @@ def refine(
     """
     require_x64()
     if snooping not in TESTS:
-        raise InputError(f"snooping {snooping!r}; one of {', '.join(TESTS)} is expected")
+        raise InputError(f"snooping {snooping!r}; expected one of {', '.join(TESTS)}")
     images = list(images)
     points = with_frames(points, frames)
     check_input(images, points, observations, frames)
@@ -321,7 +321,7 @@ def _without_terrain(found: RefinementInspection) -> Iterator[str]:
     if len(uncovered):
         ids = np.array(inputs.points.id)[found.declared.rays.points[uncovered]]
         yield (
-            f"{present(inputs.terrain).name} has no height at {count(len(ids), 'tie point')}, "
+            f"{not_none(inputs.terrain).name} has no height at {count(len(ids), 'tie point')}, "
             f"adjusted without one: {list_some(ids)}"
         )
 
@@ -349,7 +349,7 @@ def _checks_upright(points: GroundPoints, earth: Ellipsoid | None) -> GroundPoin
     """The axes of check points as east, north, up, for points at a given height."""
     if earth is None or earth.a != earth.b:
         return points
-    # one ray at a given height leaves two unknowns, which must be along the surface of that height
+    # One ray at a given height leaves two unknowns, which must be along the surface of that height.
     axes, checks = points.axes.copy(), np.array(points.role, dtype=object) == "check"
     axes[checks] = east_north_up(earth, points.X[checks])
     return dataclasses.replace(points, axes=axes)

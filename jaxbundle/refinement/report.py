@@ -8,7 +8,7 @@ import numpy as np
 from jaxbundle.leastsquares.quality.global_test import describe_test
 from jaxbundle.leastsquares.quality.reliability import minimal_detectable
 from jaxbundle.refinement.tables import UNIT_OF_WEIGHT
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 if TYPE_CHECKING:
     from jaxbundle.refinement.refining import Refinement
@@ -179,7 +179,7 @@ def _tests(rows: list[dict], most: int) -> Iterator[str]:
 
 
 def _checks(result: "Refinement") -> Iterator[str]:
-    c = present(result.check)
+    c = not_none(result.check)
     earth = result.images[0].earth is not None
     names = ("east", "north", "up") if earth else ("X", "Y", "Z")
     yield f"Check points, computed − given ({', '.join(names)}; m)"

@@ -140,7 +140,7 @@ def prior_of_bias(
     **Raises:** `InputError` for a degree other than 0, 1, 2.
     """
     if degree not in range(len(BIAS_TERMS)):
-        raise InputError(f"degree {degree} of a bias; 0, 1 or 2 is expected")
+        raise InputError(f"degree {degree} of a bias; expected 0, 1 or 2")
     return np.tile([shift, *[variation] * (BIAS_TERMS[degree] - 1)], (2, 1))
 
 

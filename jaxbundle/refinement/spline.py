@@ -49,7 +49,7 @@ class JitterSpline:
     def basis(self) -> Float[np.ndarray, "coefficients unknowns"]:
         """Z."""
         k = np.arange(self.coefficients)
-        # the columns of Q behind those that span constant and line
+        # The columns of Q behind those that span constant and line.
         full = np.linalg.qr(np.stack([np.ones_like(k), k], 1).astype(float), mode="complete")[0]
         return full[:, 2:]
 
@@ -70,7 +70,7 @@ class JitterSpline:
 
 def make_spline(first: float, last: float, spacing: float) -> JitterSpline:
     """The spline over a span of time with knots at most `spacing` seconds apart."""
-    # less 1e-9, or rounding would make four intervals of three
+    # Less 1e-9, or rounding would make four intervals of three.
     intervals = max(int(np.ceil((last - first) / spacing - 1e-9)), MIN_INTERVALS)
     return JitterSpline(float(first), float((last - first) / intervals), intervals)
 

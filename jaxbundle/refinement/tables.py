@@ -84,13 +84,12 @@ def local_points(
     role: Sequence[str],
     X: Float[np.ndarray, "points 3"],
     sigma: float | Float[np.ndarray, "#points 3"] | None = None,
-    source: Source = Source("points"),  # noqa: B008
 ) -> GroundPoints:
     """Points with σ along X, Y, Z; without `sigma` control points are held."""
     X = np.asarray(X, float)
     sigma = np.broadcast_to(0.0 if sigma is None else np.asarray(sigma, float), X.shape)
     axes = np.tile(np.eye(3), (len(X), 1, 1))
-    return GroundPoints(tuple(id), tuple(role), X, sigma, axes, source=source)
+    return GroundPoints(tuple(id), tuple(role), X, sigma, axes)
 
 
 def with_frames(points: GroundPoints, frames: Network | None) -> GroundPoints:
@@ -100,7 +99,7 @@ def with_frames(points: GroundPoints, frames: Network | None) -> GroundPoints:
     theirs, known = frames.points, {id: k for k, id in enumerate(points.id)}
     X = points.X.copy()
     for k, id in enumerate(theirs.id):
-        # coordinates of a network may be approximate: they only fill gaps
+        # Coordinates of a network may be approximate: they only fill gaps.
         if id in known and np.isnan(X[known[id]]).any():
             X[known[id]] = theirs.position[k]
     new = [k for k, id in enumerate(theirs.id) if id not in known]
@@ -123,7 +122,7 @@ def check_points_table(points: GroundPoints) -> None:
     for row, (id, role) in enumerate(zip(points.id, points.role)):
         if role not in ROLES:
             raise InputError(
-                f"{points.source(row)}: role {role!r}; one of {', '.join(ROLES)} is expected"
+                f"{points.source(row)}: role {role!r}; expected one of {', '.join(ROLES)}"
             )
         if id in seen:
             raise InputError(
@@ -170,7 +169,7 @@ def is_same_earth(one: Ellipsoid | None, other: Ellipsoid | None) -> bool:
     """Whether two ellipsoids are the same but for digits of their axes in files."""
     if one is None or other is None:
         return one is other
-    # a millimetre in the axes is a millimetre in height
+    # A millimetre in the axes is a millimetre in height.
     return all(abs(float(a) - float(b)) < 1e-3 for a, b in zip(one, other))
 
 
@@ -178,12 +177,12 @@ def _limits(one: AnyScannerImage) -> tuple[tuple[float, float], ...]:
     """The first and last line and pixel that a measurement can have."""
     image = one.image
     if isinstance(image, RpcImage) and not image.sized:
-        # a size that nobody stated is that of the domain
+        # A size that nobody stated is that of the domain.
         offsets = image.rpc.line_offset, image.rpc.sample_offset
         scales = image.rpc.line_scale, image.rpc.sample_scale
         reach = [(1 + DOMAIN_MARGIN) * abs(float(scale)) for scale in scales]
         return tuple((float(o) - r, float(o) + r) for o, r in zip(offsets, reach))
-    # pixels are areas about integers, so that the image ends half a pixel beyond the last
+    # Pixels are areas about integers, so that the image ends half a pixel beyond the last.
     return (-0.5, image.lines - 0.5), (-0.5, image.pixels - 0.5)
 
 
@@ -209,7 +208,7 @@ def _check_on_image(
     raise InputError(
         f"{observations.source(row)}: point {points.id[observations.point[row]]!r} in image "
         f"{one.id!r}: {('line', 'pixel')[k]} {observations.xy[row, k]:g} is off the image, "
-        f"{which}; {low:g} to {high:g} is expected{hint}"
+        f"{which}; expected {low:g} to {high:g}{hint}"
     )
 
 

@@ -76,7 +76,7 @@ def _cells(
 ) -> tuple[Cell, Float[Array, " n"]]:
     def of_one(X: Float[AnyArray, "3"]) -> tuple[Cell, Array]:
         column, row, h = equation.place(X)
-        # a point on the last line of the grid is in the last cell
+        # A point on the last line of the grid is in the last cell.
         last = [jnp.where(at == n - 1, n - 2.0, jnp.floor(at))
                 for at, n in zip((column, row), heights.shape[::-1])]  # fmt: skip
         cell = cell_at(heights, *last)

@@ -55,7 +55,7 @@ def weaknesses(
     """All weak directions, the weakest first; jitter is one per axis."""
     S, names = _observe(declared, found)
     if not np.isfinite(S).all():
-        # a point that its own observations leave open, so that it could not be eliminated
+        # A point that its own observations leave open, so that it could not be eliminated.
         vague = undetermined_unknowns(found.problem, found.values)
         sentence = f"the points do not determine {', '.join(vague[: settings.most_named])}"
         return [WeakDirection(0.0, tuple(vague), sentence)]
@@ -69,7 +69,7 @@ def weaknesses(
         named = [name for name, share in shares if share >= least][: settings.most_named]
         is_null = bool(value < settings.null_eigenvalue)
         if " jitter of " in named[0]:
-            # many directions of one spline: one sentence
+            # Many directions of one spline: one sentence.
             jitter.add((named[0], is_null))
             continue
         weak.append(WeakDirection(float(value), tuple(named), _sentence(named, value, is_null)))
@@ -99,7 +99,7 @@ def _shares(vector: Float[np.ndarray, " m"], names: list[UnknownName]) -> list[t
     total = {}
     for part, name in zip(vector, names):
         word = f"{name.group} of {name.owner}"
-        # of eigenvector components, whose squares add up: all coefficients of a spline as one
+        # Of eigenvector components, whose squares add up: all coefficients of a spline as one.
         total[word] = total.get(word, 0.0) + part**2
     return sorted(((n, float(np.sqrt(s))) for n, s in total.items()), key=lambda x: -x[1])
 
@@ -123,6 +123,6 @@ def _observe(
     kept = np.array([place in columns for place in places])
     points = np.array([place[0] == "point" for place in places])
     cross = S[np.ix_(kept, points)]
-    # the pseudoinverse: what no observation determines of these points is not eliminated
+    # The pseudoinverse: what no observation determines of these points is not eliminated.
     less = cross @ np.linalg.pinv(S[np.ix_(points, points)], 1e-13, hermitian=True) @ cross.T
     return S[np.ix_(kept, kept)] - less, [columns[p] for p, k in zip(places, kept) if k]

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from jaxbundle.leastsquares.quality.error_components import IMAGE
 from jaxbundle.report.layout import clean, heading, paragraph, significant, table
 from jaxbundle.report.lens_advice import ADVICE_ON_FIELD, advise_parameters, is_hardly_determined
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 if TYPE_CHECKING:
     from jaxbundle.adjustment.quality.replication import HalvesDifference
@@ -30,11 +30,11 @@ LEGEND = (
 
 
 REPLICATION_LEGEND = (
-    "Differences of the interior orientations of two halves that share no image point. d² is their "
-    "square over its covariance; the mean of d²/n is 1 where σ are right. Halves by photographs of "
-    "one camera share the remainder of its lens model, halves by points all that belongs to "
-    "photographs, and all halves the errors of given coordinates, as of a bent board: they cannot "
-    "show these errors."
+    "Difference between the interior orientations of two halves that share no image point. d²: its "
+    "square over its covariance; d²/n is 1 on average if σ are right. Halves by photographs of one "
+    "camera have the errors of its lens model in common, halves by points all errors that belong "
+    "to photographs, and all halves the errors of given coordinates, such as those of a bent "
+    "board: they cannot show these errors."
 )
 DIFFERENCE_HEADER = ("parameter", "difference", "σ", "in σ", "σ correlated", "in it")
 FIELD = "field on the sensor"
@@ -43,16 +43,16 @@ REMARKS = {
     FIELD: "a field of {} common to all photographs, which the lens model does not have: ",
     "principal point by photograph": "the principal point moves by {} between photographs",
     "principal distance by photograph": "the principal distance changes between photographs, by {} "
-    "at the edge of the image: hold focus and zoom",
+    "at the edge of the image: keep focus and zoom fixed",
     "affine by photograph": "shear and ratio of scales change between photographs, by {} at the "
     "edge of the image: a moving shutter, or film that is not flat",
-    "along tracks": "errors of {} along the tracks of points, alike from stations near to each "
-    "other: measured against one image",
-    "given points in plane": "points held, as those of a board, are not where they are given in "
-    "its plane, by {} in images: a stretched or inexact print; measure its squares, or estimate "
-    "its points (--board-free)",
-    "given points out of plane": "points held, as those of a board, are not in its plane, by {} in "
-    "images: use a flat board, or estimate its points (--board-free)",
+    "along tracks": "errors of {} along the tracks of points, similar from neighbouring stations: "
+    "measured against one image",
+    "given points in plane": "given points, such as those of a board, are displaced in its "
+    "plane, by {} in images: a stretched or inexact print; measure its squares, or estimate its "
+    "points (--board-free)",
+    "given points out of plane": "given points, such as those of a board, are out of its plane, by "
+    "{} in images: use a flat board, or estimate its points (--board-free)",
 }
 # σ under correlated errors over classical ones from which the difference is a finding: five in a
 # hundred exceed 1.96 classical σ where the model is right, thirteen at this ratio.
@@ -112,7 +112,7 @@ def component_rows(adjustment: "Adjustment") -> list[tuple[str, str, str, str, s
             unit if size.unit == IMAGE else "a priori σ",
             "" if number == 0 else f"{size.score:.1f}",
         )
-        for number, size in enumerate(present(adjustment.error_model).sizes)
+        for number, size in enumerate(not_none(adjustment.error_model).sizes)
     ]
 
 
@@ -127,7 +127,7 @@ def has_field(adjustment: "Adjustment") -> bool:
 def remarks(adjustment: "Adjustment") -> list[str]:
     """What the components that were found say, in sentences, the most significant first."""
     unit, said = adjustment.image_unit, []
-    sizes = present(adjustment.error_model).sizes[1:]
+    sizes = not_none(adjustment.error_model).sizes[1:]
     for size in sorted(sizes, key=lambda one: -one.score):
         name, of, camera = size.name.partition(" of ")
         if size.size > 0 and name in REMARKS:
@@ -215,7 +215,7 @@ def correlated_lines(adjustment: "Adjustment") -> list[str]:
     lines = [*heading(TITLE), *table(COMPONENT_HEADER, component_rows(adjustment), "lrrlr"), ""]
     lines += [line for said in remarks(adjustment) for line in paragraph(f"- {said}", 0, 2)]
     lines += ["", *paragraph(LEGEND)]
-    if words := not_looked_for(present(adjustment.error_model)):
+    if words := not_looked_for(not_none(adjustment.error_model)):
         lines += paragraph(words)
     lines += ["", *table(SIGMA_HEADER, sigma_rows(adjustment), "lrrr")]
     return [*lines, *_replication_lines(adjustment)]

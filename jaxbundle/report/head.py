@@ -30,7 +30,7 @@ from jaxbundle.report.layout import (
 )
 from jaxbundle.report.lens_advice import FEWER_PARAMETERS
 from jaxbundle.report.rig_scale import scale_of_rigs
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 if TYPE_CHECKING:
     from jaxbundle.adjustment.problem import NetworkProblem
@@ -66,8 +66,8 @@ ADVICE = {
 }
 
 LARGER_SIGMA = (
-    "Those of cameras, images and points are the larger ones of the classical standard deviations "
-    "and those under correlated errors: see Correlated errors for both."
+    "For cameras, images and points, the larger of the classical standard deviation and that under "
+    "correlated errors is shown: see Correlated errors for both."
 )
 # What determines the unknowns of each table.
 ADVICE_FOR = {
@@ -140,7 +140,7 @@ def reduced_system(adjustment: "Adjustment") -> str:
     plan = adjustment.problem.plan
     how = REDUCTIONS[adjustment.reduction]
     if adjustment.reduction == "banded":
-        how += f" of {present(plan.band).width} unknowns"
+        how += f" of {not_none(plan.band).width} unknowns"
     return f"{adjustment.problem.reduced_size} unknowns, {how}"
 
 
@@ -163,7 +163,7 @@ def datum(adjustment: "Adjustment") -> str:
         parts = [count(*part) for part in known if part[0]]
         return f"{network.datum}; defect 0: given by {', '.join(parts)}"
     open_ones = f"defect {defect}: the observations leave open {open_datum(adjustment)}"
-    weight = np.asarray(present(problem.plan.datum).weight["point"])[: len(network.points)] > 0
+    weight = np.asarray(not_none(problem.plan.datum).weight["point"])[: len(network.points)] > 0
     ids = network.points.id
     if network.datum == "minimal":
         held = [f"{'XYZ'[i]} of {clean(ids[p])}" for p, i in zip(*np.nonzero(weight))]
@@ -186,10 +186,10 @@ def open_datum(adjustment: "Adjustment") -> str:
     network, defect = adjustment.problem.network, adjustment.counts.datum
     if defect in (0, 7):
         return "position, orientation and scale" if defect else ""
-    # the directions are told about these points, which a rotation about them leaves
+    # The directions are told about these points, which a rotation about them leaves.
     known = network.points.has_role("control", "fixed")
     about = (network.points.position[known] - adjustment.problem.origin).sum(0)
-    gauge = np.asarray(present(adjustment.problem.plan.datum).gauge)
+    gauge = np.asarray(not_none(adjustment.problem.plan.datum).gauge)
     words = open_directions_in_words(gauge, about / max(known.sum(), 1))
     return "position and orientation" if defect == 6 and "scale" not in words else words
 
@@ -271,7 +271,7 @@ def convergence(adjustment: "Adjustment") -> list[str]:
         )
         for i in range(tried)
     ]
-    # a page of lines: the beginning and the end tell how it went
+    # A page of lines: the beginning and the end tell how it went.
     if len(rows) > 45:
         rows = [*rows[:20], ("…", "", "", ""), *rows[-20:]]
     lines = [
@@ -284,8 +284,8 @@ def convergence(adjustment: "Adjustment") -> list[str]:
     ]
     if adjustment.removed or adjustment.eliminated or adjustment.sigma_factors:
         lines += paragraph(
-            "This is the last of several adjustments, which began at the result of the one before: "
-            "observations or parameters were removed, or σ estimated, in between (see below)."
+            "This is the last of several adjustments, each started from the result of the previous "
+            "one, after observations or parameters were removed or σ estimated (see below)."
         )
     return lines
 
@@ -309,15 +309,15 @@ def image_precision(adjustment: "Adjustment") -> str:
     sigma, unit = image_sigmas(adjustment), adjustment.image_unit
     if not len(sigma) or not np.isfinite(adjustment.sigma0):
         return "–"
-    # the smallest and the largest stand for all
+    # The smallest and the largest stand for all.
     ends = sigma[[0, -1]]
     parts = [f"{span(adjustment.sigma0 * ends)} {unit}"]
-    # readers know the precision of a camera in µm and in pixels
+    # Readers know the precision of a camera in µm and in pixels.
     if unit == "mm":
         parts.insert(0, f"{span(1e3 * adjustment.sigma0 * ends)} µm")
         pitch = {camera.pixel_size for camera in adjustment.problem.network.cameras}
         if len(pitch) == 1 and None not in pitch:
-            size = abs(present(next(iter(pitch)))[0])
+            size = abs(not_none(next(iter(pitch)))[0])
             parts.append(f"{span(adjustment.sigma0 * ends / size, 3)} px")
     return f"{' = '.join(parts)}  (σ0 × {KINDS[adjustment.sigma_origin]} {span(ends, 4)} {unit})"
 
@@ -372,10 +372,16 @@ def variance_facts(adjustment: "Adjustment") -> list[tuple[str, str]]:
 def messages(adjustment: "Adjustment") -> list[str]:
     """Warnings: suspicious data; and notes, such as of what was left out."""
     found = []
-    for title, texts in (("Warnings", adjustment.warnings), ("Notes", adjustment.notes)):
+    for title, texts in (("Warnings", warnings(adjustment)), ("Notes", adjustment.notes)):
         lines = [line for text in texts for line in paragraph(f"- {clean(text)}", 0, 2)]
         found += [*heading(title), *cut_lines(lines, 60, "…")] if lines else []
     return found
+
+
+def warnings(adjustment: "Adjustment") -> tuple[str, ...]:
+    """The warnings, without the causes that `failure_facts` gives."""
+    told = () if adjustment.converged else adjustment.findings
+    return tuple(text for text in adjustment.warnings if text not in told)
 
 
 def why_not_solved(adjustment: "Adjustment") -> list[str]:
@@ -384,20 +390,23 @@ def why_not_solved(adjustment: "Adjustment") -> list[str]:
 
 
 def failure_facts(adjustment: "Adjustment") -> list[tuple[str, str]]:
-    """The reason why there is no result, undetermined unknowns, remedy, by name."""
-    names = adjustment.undetermined
+    """The reason why there is no result, its likely causes, undetermined unknowns, remedy, by
+    name."""
+    names, causes = adjustment.undetermined, adjustment.findings
     reason = SINGULAR if names else int(adjustment.minimum.termination)
     tried = int(adjustment.minimum.iterations)
     taken = int(np.asarray(adjustment.minimum.history.accepted)[1:tried].sum())
     rows = [
         ("Why", adjustment.termination),
+        *(("", clean(cause)) for cause in causes),
         ("Iterations", f"{adjustment.iterations}, of which {taken} were steps taken"),
     ]
     if names:
         rows.append(("Not determined", list_some(names, 40, clean)))
     elif adjustment.weakness.unknowns:
         rows.append(("Hardly determined", list_some(adjustment.weakness.unknowns, 40, clean)))
-    advice = [ADVICE.get(reason, ADVICE[STUCK])]
+    # A cause says what to do itself; the general advice may contradict it.
+    advice = [] if causes and not names else [ADVICE.get(reason, ADVICE[STUCK])]
     if reason == LIMIT and taken < tried / 2:
         advice.append("Most steps were rejected: hold parameters that the images hardly determine.")
     advice += [text for kind, text in ADVICE_FOR.items() if any(f" of {kind} " in n for n in names)]

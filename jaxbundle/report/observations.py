@@ -28,7 +28,7 @@ from jaxbundle.report.layout import (
     table,
     to_place_of,
 )
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 if TYPE_CHECKING:
     from jaxbundle.adjustment.result import Adjustment
@@ -54,9 +54,10 @@ def residuals(adjustment: Any, limit: float, test: str, max_rows: int = 100) -> 
     lines += paragraph(
         f"Test: {'Pope, τ = w/σ0, σ a posteriori' if test == 'pope' else 'Baarda, σ a priori'}; "
         f"critical value {significant(critical_value(adjustment, test), 3)} for one observation at "
-        f"0.1 %. v, σ (a priori) and MDB in the unit of their row; r redundancy number; MDB the "
-        "smallest blunder that the test of w finds (α 0.1 %, power 80 %), with σ a priori; "
-        "ext. (external reliability) its largest effect on an unknown, in σ of that unknown."
+        "0.1 %. v, σ (a priori) and MDB: in the unit of their row. r: redundancy number. MDB: the "
+        "smallest blunder that the test of w detects (α 0.1 %, power 80 %), by the a priori σ. "
+        "ext. (external reliability): the largest effect of such a blunder on an unknown, in σ of "
+        "that unknown."
     )
     lines.append("")
     if len(over):
@@ -174,11 +175,12 @@ def components(adjustment: "Adjustment") -> list[str]:
             significant(c.vtpv, 5),
             significant(c.sigma, 4),
             span(c.estimated, 3),
+            clean(c.unit),
         )
         for name, c in adjustment.variance_components.items()
     ]
-    header = ("group", "observations", "Σr", "vᵀPv", "σ̂/σ given", "σ̂")
-    lines = [*heading("Variance components"), *table(header, rows, "lrrrrr")]
+    header = ("group", "observations", "Σr", "vᵀPv", "σ̂/σ given", "σ̂", "unit")
+    lines = [*heading("Variance components"), *table(header, rows, "lrrrrrl")]
     if adjustment.sigma_factors:
         names = ", ".join(
             f"{clean(name)} by {significant(factor, 4)}"
@@ -213,8 +215,8 @@ def removals(adjustment: Any) -> list[str]:
             )
         if any(math.isnan(item.test) for item in adjustment.removed):
             lines += paragraph(
-                "–: was suspected, and the rays that remain do not determine its point, so that "
-                "nothing tests it again."
+                "–: suspected, but not tested again, because the remaining rays do not determine "
+                "its point."
             )
     if adjustment.eliminated:
         names = ", ".join(clean(name) for name in adjustment.eliminated)
@@ -237,13 +239,13 @@ def downweighted(adjustment: "Adjustment", most: int) -> list[str]:
         (str(i), item.kind, item.name, significant(item.test, 3), significant(item.weight, 2))
         for i, item in enumerate(suspects[:most], 1)
     ]
-    weighted = len(present(adjustment.weights))
+    weighted = len(not_none(adjustment.weights))
     lines = heading(f"Robust estimation ({adjustment.robust})")
     lines += paragraph(
-        f"Scale: {significant(adjustment.robust_scale, 4)} times the a priori σ, a posteriori from "
+        f"Scale: {significant(adjustment.robust_scale, 4)} times the a priori σ, estimated from "
         "the median of the residuals (MAD). "
-        f"{len(suspects)} of {count(weighted, 'image point')} have residuals above "
-        f"the critical length{', in σ times the scale (test):' if rows else '.'}"
+        f"{len(suspects)} of {count(weighted, 'image point')} have residuals longer "
+        f"than the critical length{', in σ times the scale (test):' if rows else '.'}"
     )
     if rows:
         header = ("", "kind", "observation", "test", "weight")
@@ -296,9 +298,9 @@ def check_points(adjustment: "Adjustment", most: int) -> list[str]:
 CONTROL_HEADER = ("point", "dX", "dY", "dZ", "σX", "σY", "σZ", "p %")
 MEASUREMENT_HEADER = ("image", "point", "dx", "dy", "σx", "σy", "p %")
 PREDICTION_LEGEND = (
-    "Each point, and each measurement, as all other observations predict it: predicted − given, "
-    "with the σ of a good one, and the probability of a larger difference by chance. Where there "
-    "are no check points, these differences take their place; – is not predicted."
+    "Each point, and each measurement, as predicted by all other observations: predicted − given, "
+    "the σ of this difference without blunders, and the probability of a larger one by chance. "
+    "Without check points, these differences take their place. –: not predicted."
 )
 
 
@@ -354,7 +356,7 @@ def distances(adjustment: "Adjustment", most: int) -> list[str]:
     places = column_decimals(found["sigma"][rows_of])
     rows = []
     for i in rows_of[:most]:
-        # a distance has its points in the columns of image and point
+        # A distance has its points in the columns of image and point.
         a, b = (adjustment.point_values[row_of[found[end][i]]] for end in ("image", "point"))
         adjusted = float(np.linalg.norm(a - b))
         v, r = found["v"][i], found["r"][i]

@@ -39,7 +39,7 @@ def scale_of_rigs(adjustment: "Adjustment") -> str:
     best = int((sigma / length).argmin())
     table = problem.table(MOUNTING)
     one, other = (table.label(row) for row in bases[best])
-    # a held mounting has a σ of rounding
+    # A held mounting has a σ of rounding.
     held = (table.free[list(bases[best]), :3] == 0).all()
     how = "held" if held else f"± {sigma[best]:.2g} ({100 * sigma[best] / length[best]:.2g} %)"
     return f"the scale is that of the rig: base of {one} and {other} {length[best]:.6g}, {how}"

@@ -117,7 +117,8 @@ def _points(adjustment: "Adjustment") -> str:
             parts.append(f"σ{axis} {significant(middle)} ({significant(most)})")
     if not parts:
         return "no coordinate is estimated with a σ"
-    return f"median {', '.join(parts)} {unit}, in brackets {100 * share:g} % of them are smaller"
+    brackets = f"in brackets the value that {100 * share:g} % do not exceed"
+    return f"median {', '.join(parts)} {unit}, {brackets}"
 
 
 def _far_points(adjustment: "Adjustment") -> Iterator[tuple[str, str]]:

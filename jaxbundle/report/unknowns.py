@@ -25,7 +25,7 @@ from jaxbundle.report.layout import (
     significant,
     table,
 )
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 if TYPE_CHECKING:
     from jaxbundle.adjustment.result import Adjustment
@@ -61,7 +61,7 @@ def _one_camera(entry: Mapping[str, Any], model: CameraModel) -> list[str]:
     critical_t = 2.0
     rows, held = [], []
     for name, found in entry["parameters"].items():
-        # held ones follow in one line
+        # Held ones follow in one line.
         if not found["free"]:
             held.append(f"{name} {significant(found['value'], WITHOUT_SIGMA)}")
             continue
@@ -78,8 +78,8 @@ def _one_camera(entry: Mapping[str, Any], model: CameraModel) -> list[str]:
         lines += ["", *facts([("Tied", ", ".join(" = ".join(group) for group in entry["tied"]))])]
     if rows:
         lines += paragraph(
-            f"t = |value|/σ; no: t < {critical_t:g}, not different from 0 at about 95 %. Total "
-            "correlation: the share of a parameter that the others of the camera explain."
+            f"t = |value|/σ; no: t < {critical_t:g}, not significantly different from 0 (95 %). "
+            "Total correlation: the share of a parameter that the others of the camera explain."
         )
     free = entry["free"]
     if len(free) > 1:
@@ -122,7 +122,7 @@ def _many_cameras(adjustment: "Adjustment") -> list[str]:
             ]
             rows += [(camera, *(a for a, _ in cells)), ("   σ", *(b for _, b in cells))]
         lines += [*_equations(model), ""]
-        # six columns of values fit in the width of a page
+        # Six columns of values fit in the width of a page.
         for start in range(0, len(names), 6):
             part = slice(start, start + 6)
             header = ("camera", *names[part])
@@ -215,7 +215,7 @@ def _precision(adjustment: "Adjustment", accuracy_unit: float | None) -> list[st
     sigma = np.stack([stated_sigma(found, axis) for axis in "XYZ"], 1)
     free = adjustment.problem.table("point").free > 0
     free = free & np.isfinite(sigma) & (sigma > 0)
-    # points at infinity have no coordinates whose σ could be counted
+    # Points at infinity have no coordinates whose σ could be counted.
     free &= adjustment.located[:, None]
     if not free.any():
         return ["No point has an estimated coordinate with a standard deviation."]
@@ -236,7 +236,7 @@ def _precision(adjustment: "Adjustment", accuracy_unit: float | None) -> list[st
         (f"{a}–{b}", *(str(column[i]) for column in counted))
         for i, (a, b) in enumerate(zip(text, text[1:]))
     ]
-    # one table, so that both parts have the same columns
+    # One table, so that both parts have the same columns.
     head, *body = table(header, [*rows, ("", "", "", "", ""), *classes], "lrrrr")
     first, second = body[: len(rows)], body[len(rows) + 1 :]
     note = f"Number of σ in classes of σ/s, s = {significant(scale, 3)} {unit} ({meaning})"
@@ -312,12 +312,12 @@ def far_points(adjustment: "Adjustment", most: int) -> list[str]:
         )
         for i in order[:most]
     ]
-    place = ", ".join(significant(x, 8) for x in present(adjustment.far_points).origin)
+    place = ", ".join(significant(x, 8) for x in not_none(adjustment.far_points).origin)
     angle = network.angle_unit
     lines = [
         *heading(f"Points at any distance: directions from {place}"),
-        f"Their rays are nearly parallel. σ in {angle}; distance, and from where to where",
-        f"one σ of the inverse distance reaches, in {clean(network.object_unit)}.",
+        f"Their rays are nearly parallel. σ in {angle}; distance, and its interval of one σ of",
+        f"the inverse distance, in {clean(network.object_unit)}.",
         "",
         *table(("point", "uX", "uY", "uZ", "σ", "distance", "from", "to"), rows, "lrrrrrrr"),
     ]
@@ -330,14 +330,13 @@ def far_points(adjustment: "Adjustment", most: int) -> list[str]:
 def further_unknowns(adjustment: "Adjustment", most: int) -> list[str]:
     """The unknowns of further kinds of observations, a line each."""
     lines = []
-    for name, found in adjustment.further_unknowns.items():
-        rows = [
-            (row, parameter, *estimate(one["value"], one["sigma"]))
-            for row, parameters in found.items()
-            for parameter, one in parameters.items()
-        ]
+    tables: dict[str, list] = {}
+    for one in adjustment.further_estimates:
+        shown = estimate(one.value, one.sigma)
+        tables.setdefault(one.table, []).append((one.row, one.name, *shown, clean(one.unit)))
+    for name, rows in tables.items():
         lines += heading(clean(name[0].upper() + name[1:]))
-        lines += table(("of", "unknown", "value", "σ"), rows[:most], "llrr")
+        lines += table(("of", "unknown", "value", "σ", "unit"), rows[:most], "llrrl")
         if len(rows) > most:
             lines += _left_out(len(rows), most, "unknown", "result.json")
     return lines

@@ -20,7 +20,7 @@ from jaxbundle.report.correlated import has_shared_errors, remarks
 from jaxbundle.report.head import chi_squared, open_datum
 from jaxbundle.report.layout import clean, significant
 from jaxbundle.report.observations import count_weak, critical_value
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 if TYPE_CHECKING:
     from jaxbundle.adjustment.result import Adjustment
@@ -100,7 +100,7 @@ def conclude(
 ) -> Verdict:
     """The verdict on a solved adjustment, for a command with its own `findings` `without` some of
     those of the adjustment, and with further `warnings`."""
-    # those of the command first: they are about its own question
+    # Those of the command first: they are about its own question.
     found = [*findings, *(f for f in judge(adjustment) if f.about not in without)]
     return Verdict(*in_words(found, warnings + len(adjustment.warnings)), tuple(found))
 
@@ -169,7 +169,7 @@ def judge_replication(adjustment: "Adjustment") -> Finding | None:
         return Finding("Replication", NOTED, halves.sentence, "halves not compared")
     # The root of d²/n: differences are compared with σ, not with variances.
     limit = np.sqrt(chi2_quantile(1 - LEVEL, halves.dof) / halves.dof)
-    words = f"{halves.sentence}; in one of 1000 cases by more than {limit:.2f} by chance"
+    words = f"{halves.sentence}; by chance by more than {limit:.2f} in one of 1000 cases"
     state = DOUBTFUL if halves.probability < LEVEL else GOOD
     return Finding("Replication", state, words, f"halves by {halves.by} contradict each other")
 
@@ -249,7 +249,7 @@ def _held_control(adjustment: "Adjustment", parts: str) -> Finding:
     own = (rows["kind"] == "image") & np.isin(rows["point"], np.array(ids, object))
     largest, limit, said = _tested(adjustment, own)
     words, brief = f"{parts} held exactly, because no σ is stated; ", "control held exactly"
-    # three points are a similarity: they fit any network
+    # Three points are a similarity: they fit any network.
     if len(ids) <= 3 or np.isnan(largest):
         return Finding("Control", DOUBTFUL, words + "nothing tests so few: state σ", brief)
     state = GOOD if largest <= limit else DOUBTFUL
@@ -264,7 +264,7 @@ def _checks(adjustment: "Adjustment") -> list[Finding]:
     rms = ", ".join(f"{axis} {significant(value)}" for axis, value in zip("XYZ", found.rms))
     table = adjustment.table("checks")
     d, s = (np.concatenate([table[f"{kind}{a}"] for a in "XYZ"]) for kind in "ds")
-    given = np.concatenate(present(adjustment.check)[0].sigma.T)
+    given = np.concatenate(not_none(adjustment.check)[0].sigma.T)
     s = np.hypot(s, np.where(np.isfinite(given), given, 0.0))  # of the difference of both
     known = (s > 0) & np.isfinite(d)
     ratio = np.abs(d[known]) / s[known]
@@ -356,7 +356,7 @@ def judge_blunders(
     if removed > max(LARGEST_REMOVED * rays, explained_by_chance(rays)):
         brief = f"{removed} of {rays:.0f} image points removed as blunders"
         return Finding("Blunders", DOUBTFUL, words, brief)
-    # more than chance explains, but none that stands out: σ of some are too small
+    # More than chance explains, but none that stands out: σ of some are too small.
     many = over > explained_by_chance(len(size))
     brief = f"{count(over, 'large residual')} where chance gives {significant(expected, 2)}"
     return Finding("Blunders", NOTED if many else GOOD, words, brief)
@@ -373,7 +373,7 @@ def _compare_largest(largest: float, limit: float, number: int) -> str:
 def explained_by_chance(number: float, level: float = LEVEL) -> float:
     """The largest number of rejections among good observations that chance explains: their mean,
     three standard deviations, and one always."""
-    # the number is binomial, its variance n·p·(1 − p) ≈ n·p
+    # The number is binomial, its variance n·p·(1 − p) ≈ n·p.
     expected = level * number
     return expected + 3 * np.sqrt(expected) + 1
 

@@ -91,7 +91,7 @@ def bend_at(nodes: GuideNodes, uv: Float[np.ndarray, "n 2"], settings: BendingSe
     guide = nodes.guide
     place = (uv - guide.first) / guide.step
     nearest = np.clip(np.rint(place[:, ::-1]).astype(int), 0, np.array(guide.q.shape) - 1)
-    # many points share a node
+    # Many points share a node.
     node = np.ravel_multi_index(tuple(nearest.T), guide.q.shape)
     nodes_used, node_of_point = np.unique(node, return_inverse=True)
     i, j = np.unravel_index(nodes_used, guide.q.shape)
@@ -99,7 +99,7 @@ def bend_at(nodes: GuideNodes, uv: Float[np.ndarray, "n 2"], settings: BendingSe
     wide, narrow = (_fit_polynomials(nodes, i, j, reach, settings) for reach in reaches)
     derivatives = np.where(wide.reliable[:, None], wide.derivatives, narrow.derivatives)
     derivatives = derivatives[node_of_point]
-    # the slopes at the point, not at the node
+    # The slopes at the point, not at the node.
     du, dv = (place - nearest[:, ::-1]).T * guide.step
     derivatives[:, 0] += derivatives[:, 2] * du + derivatives[:, 3] * dv
     derivatives[:, 1] += derivatives[:, 3] * du + derivatives[:, 4] * dv
@@ -125,7 +125,7 @@ def _fit_polynomials(
     values = (around(guide.q, mode="edge") - guide.q[i, j][:, None]) * rate
     weight = there / (around(nodes.sigma, mode="edge") ** 2 + settings.node_sigma**2)
     N = np.einsum("nk,ka,kb->nab", weight, A, A, optimize=True)
-    # against a singular N without nodes; of the weights, 10 and more, it is nothing
+    # Against a singular N without nodes; of the weights, 10 and more, it is nothing.
     tiny = 1e-6
     N = N + tiny * np.eye(A.shape[1])
     p = np.linalg.solve(N, ((weight * values) @ A)[..., None])[..., 0]
@@ -157,12 +157,12 @@ def sharpen(
         if not len(k):
             break
         here, normal = guide.q[row[k], column[k]], guide.normal[row[k], column[k]]
-        # the node is between pixels if the guide ends above the finest level
+        # The node is between pixels if the guide ends above the finest level.
         shift = uv[k] - node_uv[k]
         slope = bend_at(rough, uv[k], settings).derivatives[:, :2]
         here = here + np.sum(slope * shift, 1)
         window = windows(base, other, base.points(uv[k], here), normal)
-        # pixels of this image per pixel of the guide's rate, by a step of a thousandth
+        # Pixels of this image per pixel of the guide's rate, by a step of a thousandth.
         ends = here[:, None] + [0.0, 1e-3] / guide.rate[row[k], column[k]][:, None]
         places = positions(base, other, uv[k], ends)
         start, rate = places[:, 0], (places[:, 1] - places[:, 0]) * 1e3
@@ -222,12 +222,12 @@ def response(
     for first in range(0, len(uv), MATRICES_AT_ONCE):
         part = slice(first, first + MATRICES_AT_ONCE)
         T, gx, gy = _cut_out_with_gradient(grey, np.rint(uv[part]).astype(int), half)
-        # the unknowns: c, the four elements of B, brightness, contrast
+        # The unknowns: c, the four elements of B, brightness, contrast.
         G = np.stack([gx, gy, gx * x, gx * y, gy * x, gy * y, np.ones_like(T), T], 2)
         w = np.einsum("nij,nkj->nki", np.linalg.inv(A[part]), second[part])
         moved = np.einsum("nki,kp->nip", w, squares)
         away = gx * moved[:, 0] + gy * moved[:, 1]
-        # columns of length 1: gradients and grey values have different units
+        # Columns of length 1: gradients and grey values have different units.
         scale = 1 / np.maximum(np.linalg.norm(G, axis=1), 1e-9)
         G = G * scale[:, None]
         # 1e-9 of the unit diagonal: without texture N is singular, and `solve` would raise
@@ -253,7 +253,7 @@ def correct_bending(
     base, other = pair
     second = second_differences(base, other, uv, q, bend, settings.difference_step)
     good = bend.reliable & np.isfinite(second).all((1, 2)) & np.isfinite(match.A).all((1, 2))
-    # an area in the other image of a fiftieth: a window seen from its side, or a failed match
+    # An area in the other image of a fiftieth: a window seen from its side, or a failed match.
     good &= np.abs(np.linalg.det(np.where(good[:, None, None], match.A, np.eye(2)))) > 0.02
     rows = np.flatnonzero(good)
     found = np.full((len(uv), 2), np.nan)
@@ -263,7 +263,7 @@ def correct_bending(
     corrected = np.isfinite(found[:, 0])  # both components or none
     off = np.where(corrected[:, None], found, 0.0)
     squares = off[:, :, None] * off[:, None]
-    # without a fitting polynomial the effect of bending may be as large as elsewhere
+    # Without a fitting polynomial the effect of bending may be as large as elsewhere.
     unknown = squares[corrected].mean(0) if corrected.any() else np.zeros((2, 2))
     doubt = np.where(
         corrected[:, None, None],

@@ -25,7 +25,7 @@ class Bounds:
             return whole.copy()
         q = self.view.bounds(uv, self.low, self.high)
         inside = np.stack([np.fmax(q[:, 0], whole[:, 0]), np.fmin(q[:, 1], whole[:, 1])], 1)
-        # a line of sight that never reaches these heights keeps a range without matches
+        # A line of sight that never reaches these heights keeps a range without matches.
         return np.where((inside[:, :1] < inside[:, 1:]), inside, whole)
 
 
@@ -58,7 +58,7 @@ def bounds_from_geometry(
     near, far = base / np.tan(1.2), base / np.tan(0.003)
     meetings = [s for o in others if (s := _distance_to_axis(view, o)) is not None]
     if meetings:
-        # cameras that look at one thing: a quarter to four times its distance
+        # Cameras that look at one thing: a quarter to four times its distance.
         s = float(np.median(meetings))
         near, far = max(near, s / 4), min(far, s * 4)
         if near >= far:
@@ -80,7 +80,7 @@ def _distance_to_axis(view: FrameView, other: FrameView) -> float | None:
     parallel."""
     a, b, t = -view.M[2], -other.M[2], other.X0 - view.X0
     sine2 = 1 - (a @ b) ** 2
-    # axes within 3° are parallel: where they meet depends on errors of the orientation
+    # Axes within 3° are parallel: where they meet depends on errors of the orientation.
     if sine2 < np.sin(np.radians(3)) ** 2:
         return None
     s = (t @ a - (a @ b) * (t @ b)) / sine2

@@ -45,7 +45,7 @@ def thin(cloud: Cloud, size: float, least: int = 1, place: str = "mean") -> Clou
         total = np.bincount(group, weight)
         mean = lambda a: np.bincount(group, weight * a) / total
         X = np.stack([mean(a) for a in cloud.X.T], 1)
-        # not 1/total: the errors of neighbours are not independent (see above)
+        # Not 1/total: the errors of neighbours are not independent (see above).
         harmonic = count / total
         C = found.covariance * (harmonic / filled[best])[:, None, None]
         if found.shared is not None:
@@ -69,7 +69,7 @@ def drop_isolated(cloud: Cloud, neighbours: int = 8, limit: float = 3.0) -> Clou
     distance, _ = cKDTree(cloud.X).query(cloud.X, neighbours + 1)
     mean = distance[:, 1:].mean(1)
     middle = np.median(mean)
-    # at least a tenth of the median distance: the distances of a regular grid have no spread
+    # At least a tenth of the median distance: the distances of a regular grid have no spread.
     spread = max(robust_sigma(mean), 0.1 * float(middle))
     return cloud.take(mean <= middle + limit * spread)
 
@@ -84,7 +84,7 @@ def drop_weak(
     if most_sigma is not None:
         limit = positive("greatest σ", most_sigma)
         if len(cloud) and not np.isfinite(cloud.sigma).any():
-            raise InputError("the cloud has no σ: columns sX, sY, sZ are expected")
+            raise InputError("the cloud has no σ: expected columns sX, sY, sZ")
         with np.errstate(invalid="ignore"):
             keep &= (cloud.sigma <= limit).all(1)
     if least_rays is not None:

@@ -31,10 +31,10 @@ def compare(
         raise InputError("a comparison needs clouds of at least four points")
     tree = cKDTree(other.X)
     k = min(neighbours, len(other))
-    # the median of 20 000 distances is within 1 % of that of all
+    # The median of 20 000 distances is within 1 % of that of all.
     spacing = float(np.median(tree.query(other.X[:: max(1, len(other) // 20_000)], 2)[0][:, 1]))
     distance, sigma = np.full(len(cloud), np.nan), np.full(len(cloud), np.nan)
-    # the neighbours of 65 536 points and their matrices take under 100 MB
+    # The neighbours of 65 536 points and their matrices take under 100 MB.
     together = 1 << 16
     for first in range(0, len(cloud), together):
         part = slice(first, min(first + together, len(cloud)))
@@ -67,10 +67,10 @@ def _distances_to_planes(
     d = neighbours - middle[:, None]
     _, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", d, d))
     normal = vectors[:, :, 0]
-    # upwards, so that the sign of a distance has a meaning
+    # Upwards, so that the sign of a distance has a meaning.
     normal = normal * np.where(normal[:, 2:] < 0, -1.0, 1.0)
     distance = np.einsum("ni,ni->n", X - middle, normal)
-    # neighbours share the errors of their base image: their mean is not more precise than one
+    # Neighbours share the errors of their base image: their mean is not more precise than one.
     C = cloud.covariance[part] + np.nan_to_num(other.covariance[index]).mean(1)
     sigma = np.sqrt(np.einsum("ni,nij,nj->n", normal, C, normal))
     return np.where(near[:, min(3, k - 1)] <= farthest, distance, np.nan), sigma

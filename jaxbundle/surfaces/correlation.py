@@ -52,16 +52,16 @@ def _interpolate(
     all_inside = u.min() >= 0 and u.max() <= columns - 1 and v.min() >= 0 and v.max() <= rows - 1
     inside = None if all_inside else (u >= 0) & (u <= columns - 1) & (v >= 0) & (v <= rows - 1)
     known_places = (u, v) if inside is None else (u[inside], v[inside])
-    # only a part of large images: OpenCV's remap has coordinates of 15 bits
+    # Only a part of large images: OpenCV's remap has coordinates of 15 bits.
     (left, right), (top, bottom) = map(_find_extent, known_places, (columns, rows))
     if max(right - left, bottom - top) >= MAX_REMAP_SIDE:
-        # by halves of the rows, or of the columns of a single one: a place alone needs four pixels
+        # By halves of the rows, or of the columns of a single one: a place alone needs four pixels.
         axis = 0 if len(place) > 1 else 1
         halves = np.array_split(place, 2, axis)
         return np.concatenate([_interpolate(grey, half) for half in halves], axis)
     part = grey[top:bottom, left:right].astype(np.float32)
     u, v = (u - left).astype(np.float32), (v - top).astype(np.float32)
-    # repeated beyond the edge: a place in the last row has four neighbours, two of weight 0
+    # Repeated beyond the edge: a place in the last row has four neighbours, two of weight 0.
     found = cv2.remap(part, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return found if inside is None else np.where(inside, found, np.float32(np.nan))
 
@@ -79,7 +79,7 @@ def _halve(a: Grey) -> Float32[np.ndarray, "half_rows half_columns"]:
     rows, columns = (max(n // 2, 1) for n in a.shape)
     out = np.empty((rows, columns), np.float32)
     high, wide = (2 if n > 1 else 1 for n in a.shape)
-    # by strips: a whole image of 16 bits would be held as floating point, too
+    # By strips: a whole image of 16 bits would be held as floating point, too.
     strip = 512
     for first in range(0, rows, strip):
         last = min(first + strip, rows)
@@ -119,14 +119,14 @@ def correlate(
     spacing = scale * np.linalg.norm(window.other_axis, axis=1)
     k = np.arange(steps) - (steps - 1) / 2
     with np.errstate(invalid="ignore", divide="ignore"):
-        # in the order of q, though the epipolar axis may be opposite
+        # In the order of q, though the epipolar axis may be opposite.
         length = segment.length[:, None] / 2 + k * spacing[:, None]
         q = segment.parameter(length)
     place = positions(*pair, uv, q)
     forward = np.sum((place[:, -1] - place[:, 0]) * window.other_axis, axis=1) >= 0
     sign = np.where(forward, 1.0, -1.0)[:, None]
 
-    # the strips of 256 points fit into a processor's cache
+    # The strips of 256 points fit into a processor's cache.
     together = 256
 
     def correlate_rows(first: int) -> Float[np.ndarray, "m steps"]:
@@ -160,7 +160,7 @@ def slide(
     norm = np.sqrt(np.einsum("nyx,nyx->n", t, t))
     outside = np.isnan(strip)
     lost = _sliding_sum(np.asarray(outside.any(1), np.float64), w) > 0
-    # without the mean of the strip: the sums of squares below would lose digits
+    # Without the mean of the strip: the sums of squares below would lose digits.
     s = np.where(outside, 0, strip)
     s -= s.sum((1, 2), keepdims=True) / np.maximum((~outside).sum((1, 2), keepdims=True), 1)
     s[outside] = 0
@@ -192,9 +192,9 @@ def find_peaks(rho: Float[np.ndarray, "n k"]) -> tuple[np.ndarray, np.ndarray, n
     with np.errstate(invalid="ignore"):
         bend = left - 2 * peak + right
         inner = (best > 0) & (best < last) & np.isfinite(bend) & (bend < 0)
-        # the vertex of the parabola through the largest value and its neighbours
+        # The vertex of the parabola through the largest value and its neighbours.
         shift = np.where(inner, 0.5 * (left - right) / np.where(inner, bend, 1.0), 0.0)
-    # a peak of correlation is up to two positions wide on each side
+    # A peak of correlation is up to two positions wide on each side.
     away = np.abs(np.arange(rho.shape[1]) - best[:, None]) > 2
     second = np.where(away, filled, -np.inf).max(1)
     none = lambda a: np.where(np.isfinite(a), a, np.nan)

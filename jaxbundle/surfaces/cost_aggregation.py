@@ -20,7 +20,7 @@ def aggregate(
     for axis in (0, 1):
         turned = np.moveaxis(cost, axis, 0)
         out = np.moveaxis(total, axis, 0)
-        # the four diagonals run from row to row, with a shift of one column
+        # The four diagonals run from row to row, with a shift of one column.
         shifts = (0, 1, -1) if axis == 0 else (0,)
         for shift in shifts:
             for order in (1, -1):

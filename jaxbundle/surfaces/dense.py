@@ -82,7 +82,7 @@ def match_dense(pair: RowPair, span: int, settings: DenseSettings = DenseSetting
     left, right = _prepare(pair)
     inside = np.isfinite(pair.left)
     start = _search(left, right, inside, np.isfinite(pair.right), span, settings)
-    # parts visible in one image only match the repetition of their texture in the other
+    # Parts visible in one image only match the repetition of their texture in the other.
     start[find_repetitions(left, start, span, settings.search)] = np.nan
     return refine_disparities(left, right, start, settings.refinement, inside)
 
@@ -143,7 +143,7 @@ def _prepare(pair: RowPair) -> tuple[RowImage, RowImage]:
     values = np.concatenate([g[:: max(1, len(g) // 200_000)] for g in grey])
     low, high = (
         (0.0, 255.0)
-        # of 8 bits; cubic splines overshoot a little
+        # Of 8 bits; cubic splines overshoot a little.
         if values.max() <= 260 and values.min() >= -5
         else (np.percentile(values, [0.2, 99.8]))
     )

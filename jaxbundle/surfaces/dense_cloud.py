@@ -137,7 +137,7 @@ def _points(
     d = base.points(uv, np.ones(len(uv))) - base.X0
     length = 1 / q
     along = variance / q**4  # of the distance 1/q: σ = σ_q/q²
-    # across the line of sight: the part of a match's error due to the base image
+    # Across the line of sight: the part of a match's error due to the base image.
     pixel = np.sqrt(variance / 2) * found[0].length * length
     dd = d[:, :, None] * d[:, None]
     covariance = along[:, None, None] * dd + (pixel**2)[:, None, None] * (np.eye(3) - dd)
@@ -190,8 +190,8 @@ def combine(
         mean = np.where(use, weight * np.where(use, q, 0), 0).sum(0) / weight.sum(0)
         pull = np.where(use, weight * np.where(use, sigma, 0), 0) / weight.sum(0)
         cosine = np.ones((len(q), len(q))) if cosine is None else cosine
-        # half of each variance is of the window in the base, common to all pairs; the other halves
-        # are independent: Σwₖ²σₖ²/(Σw)² = 1/Σw for w = 1/σ²
+        # Half of each variance is of the window in the base, common to all pairs; the other halves
+        # are independent: Σwₖ²σₖ²/(Σw)² = 1/Σw for w = 1/σ².
         variance = np.einsum("kn,kl,ln->n", pull, cosine, pull) / 2 + 0.5 / weight.sum(0)
     return np.where(number > 0, mean, np.nan), variance, number
 

@@ -59,7 +59,7 @@ def dense_ground_cloud(
     for u0 in range(0, columns, piece):
         for v0 in range(0, rows, piece):
             window = u0, v0, min(u0 + piece, columns) - 1, min(v0 + piece, rows) - 1
-            # one grid over all pieces
+            # One grid over all pieces.
             u, v = (
                 np.arange(-(-first // step) * step, last + 1, step)
                 for first, last in zip(window[:2], window[2:])
@@ -118,9 +118,9 @@ def _match_piece(
     look_up = lambda a: a[place[:, 1], place[:, 0]]
     d, sigma = look_up(found.disparity), look_up(found.sigma)
     known = np.isfinite(d) & np.isfinite(sigma)
-    # the slope of the disparities takes the value of the nearest column to the pixel itself
+    # The slope of the disparities takes the value of the nearest column to the pixel itself.
     slopes = [np.nan_to_num(look_up(np.gradient(found.disparity, axis=axis))) for axis in (1, 0)]
-    # a slope of more than half a pixel per pixel is a step in the surface
+    # A slope of more than half a pixel per pixel is a step in the surface.
     slopes = [np.where(np.abs(s) < 0.5, s, 0) for s in slopes]
     d = d + slopes[0] * (ab - place)[:, 0] + slopes[1] * (ab - place)[:, 1] + pair.lowest
     match, rows = np.full((len(pixels), 2), np.nan), np.flatnonzero(known)
@@ -147,8 +147,8 @@ def _intersect(
     places = np.stack([uv, *(match.place[rows][keep] for match in found)], 1)
     n, views = len(uv), (base, *(match.other for match in found))
     start = base.points(uv, np.full(n, found[0].q0))
-    # half of a match's variance is of the window in the base; the other half, the same noise in the
-    # other image, is stretched by A there
+    # Half of a match's variance is of the window in the base; the other half, the same noise in the
+    # other image, is stretched by A there.
     in_others = []
     for match, s in zip(found, sigma):
         A = windows(base, match.other, start).A

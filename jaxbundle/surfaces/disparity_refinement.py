@@ -136,7 +136,7 @@ def refine_disparities(
     distance, step = _find_steps(start, whole, settings)
     outliers = settings.outliers_at_step * np.exp(-distance / settings.outlier_range)
     outliers = np.where(own_texture, settings.textured_outliers * outliers, outliers)
-    # a step itself, and its neighbours: two surfaces in their smallest windows
+    # A step itself, and its neighbours: two surfaces in their smallest windows.
     good = np.isfinite(found.disparity) & (outliers <= settings.max_outliers) & (distance >= 1)
     d = np.where(good, found.disparity, np.float32(np.nan))
     relief = _measure_relief(d, settings.shape_half_window)
@@ -184,9 +184,9 @@ def _match_windows(
     largest = max(settings.half_windows)
     reach = max(settings.shape_half_window, largest) + largest + 2
     margin = settings.rounds * reach
-    # many rounds have larger pieces: a third of one side, at least, is not margin
+    # Many rounds have larger pieces: a third of one side, at least, is not margin.
     most = [max(n, 3 * margin) - 2 * margin for n in settings.piece]
-    # pieces of one size without an almost empty last one
+    # Pieces of one size without an almost empty last one.
     height, width = (-(-n // -(-n // m)) for n, m in zip(left.shape, most))
     sides = height + 2 * margin, width + 2 * margin
     made = np.full((len(settings.half_windows), 3, rows, columns), np.nan, np.float32)
@@ -238,7 +238,7 @@ def _refine_piece(
         shape, windows = first_shape, first
         for _ in range(settings.rounds - 1):
             delta = np.clip(np.nan_to_num(windows.correct(size).delta), -limit, limit)
-            # a smooth shape and the windows' mean of what is left of it: no bias from curvature
+            # A smooth shape and the windows' mean of what is left of it: no bias from curvature.
             shape = _smooth(
                 np.where(known, shape + delta, np.nan), known, max(half, size), tolerance
             )
@@ -283,8 +283,8 @@ def _choose_windows(
             )
             shapes.append(np.maximum(apart - expected, 0))
             bends.append(np.maximum(apart - limit * expected, 0))
-    # what bends the surface moves a disparity by the square of the side of the window, so that its
-    # variance grows by the fourth power
+    # What bends the surface moves a disparity by the square of the side of the window, so that its
+    # variance grows by the fourth power.
     halves = settings.half_windows
     for values in (shapes, bends):
         values.insert(0, values[0] * (halves[0] / halves[1]) ** 4)
@@ -316,11 +316,11 @@ def _mean_of_known(a: RowImage, half: int) -> RowImage:
 def _measure_relief(d: RowImage, half: int) -> RowImage:
     """Root mean squares of disparities about their planes in windows."""
     cv2 = need_opencv()
-    # double precision: squares of disparities of hundreds of pixels, and relief of hundredths
+    # Double precision: squares of disparities of hundreds of pixels, and relief of hundredths.
     d = d.astype(np.float64)
     mean = _mean_of_known(d, half)
     square = _mean_of_known(d * d, half) - mean * mean
-    # an unknown disparity has no effect on the slopes as the mean of those known
+    # An unknown disparity has no effect on the slopes as the mean of those known.
     around = np.nan_to_num(np.where(np.isfinite(d), d, mean))
     offset = np.arange(-half, half + 1, dtype=float)
     spread = float(np.mean(offset**2))

@@ -82,7 +82,7 @@ def equalise_exposures(
     for a, there in ((left, inside), (right, right_inside)):
         away = np.where(there, a - mean(a * there) / np.maximum(mean(there), 1e-6), 0)
         contrast = float(np.std(away[there])) if there.any() else 0.0
-        # the right image gets the contrast of the left one
+        # The right image gets the contrast of the left one.
         spread = spread or max(contrast, settings.min_contrast)
         stretched = 128 + away * (spread / max(contrast, 1.0))
         found.append(np.clip(stretched, 0, 255).astype(np.float32))
@@ -104,12 +104,12 @@ def semi_global(
     large, rows = left.size * number >= settings.max_costs, len(left)
     mode = cv2.STEREO_SGBM_MODE_SGBM if large else cv2.STEREO_SGBM_MODE_HH4
     eight = [np.clip(np.rint(a), 0, 255).astype(np.uint8) for a in (left, right)]
-    # columns of the left image without a full range of disparities are matched with a margin
+    # Columns of the left image without a full range of disparities are matched with a margin.
     wide = [cv2.copyMakeBorder(a, 0, 0, number, 0, cv2.BORDER_REPLICATE) for a in eight]
     strip = -(-rows // available_cores()) if large else rows
 
-    # rows above and below a strip that are matched with it: paths begin there, and after some ten
-    # rows hardly depend on their beginning
+    # Rows above and below a strip that are matched with it: paths begin there, and after some ten
+    # rows hardly depend on their beginning.
     margin = 128
     block = settings.block_side
 
@@ -168,8 +168,8 @@ def find_repetitions(
     """Pixels whose texture repeats itself along the row within the range of disparities, on a small
     separate surface: parts visible in one image only match the repetition in the other."""
     cv2 = need_opencv()
-    # at a quarter of the size: 64 times as fast, and repetitions finer than that are within one
-    # window of the search
+    # At a quarter of the size: 64 times as fast, and repetitions finer than that are within one
+    # window of the search.
     coarser = 4
     rows, columns = (n // coarser for n in left.shape)
     coarse = cv2.resize(left, (columns, rows), interpolation=cv2.INTER_AREA)
@@ -180,12 +180,12 @@ def find_repetitions(
         cv2.resize(repeated.astype(np.uint8), left.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
     )
     known = np.isfinite(disparity)
-    # units of a sixteenth of a pixel, OpenCV's, or larger ones for ranges beyond its 16 bits
+    # Units of a sixteenth of a pixel, OpenCV's, or larger ones for ranges beyond its 16 bits.
     per_pixel = max(1, min(16, MAX_INT16 // (span + 1)))
     unknown = -MAX_INT16
     whole = np.where(known, per_pixel * np.nan_to_num(disparity), unknown).astype(np.int16)
     min_surface_pixels = int(settings.min_repetitive_share * left.size)
-    # neighbours of one surface differ by up to a pixel
+    # Neighbours of one surface differ by up to a pixel.
     remaining, _ = cv2.filterSpeckles(whole, unknown, min_surface_pixels, per_pixel)
     return known & repeated & (remaining == unknown)
 

@@ -59,7 +59,7 @@ class DsmSettings:
     """Side of the windows of matching, pixels: of dense matching the smallest, which pixels of good
     texture take."""
     max_cells: float = 2e9
-    """A larger grid is refused: the three grids of so many cells take 48 GB."""
+    """A grid of more cells is refused: at this limit its three arrays take 48 GB."""
 
 
 @print_in_one_screen
@@ -208,7 +208,7 @@ def _points_that_count_as_one(
     with np.errstate(invalid="ignore"):
         reach = np.maximum.reduceat(uv, first) - np.minimum.reduceat(uv, first)
     independent = np.prod(1 + reach / window, axis=1)
-    # without a pixel a point stands for itself
+    # Without a pixel a point stands for itself.
     independent = np.minimum(np.where(np.isfinite(independent), independent, count), count)
     of_cell = keys // len(cloud.images)
     return np.bincount(of_cell, count) / np.bincount(of_cell, independent)
@@ -223,8 +223,8 @@ def _average_cells(
     alike: Float[np.ndarray, " cells"],
     settings: DsmSettings,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Weighted means by cell, their σ and numbers of points; `alike`: of the points of each cell
-    with points so many count as one."""
+    """Weighted means by cell, their σ and numbers of points; `alike`: for each cell
+    with points, how many of them count as one."""
     order = np.lexsort((Z, cell))
     cell, Z, sigma = cell[order], Z[order], sigma[order]
     cells, first, count = np.unique(cell, return_index=True, return_counts=True)
@@ -235,7 +235,7 @@ def _average_cells(
     spread = NORMAL_SIGMA_BY_MAD * _sorted_medians(away[again], first, count)
     least = settings.min_spread * size
     keep = away <= settings.max_deviation * np.maximum(spread, least)[group]
-    # a point without σ, or of a σ that no measurement has, 0 or ∞, counts as one of the median σ
+    # A point without σ, or of a σ that no measurement has, 0 or ∞, counts as one of the median σ.
     with np.errstate(divide="ignore", over="ignore", under="ignore"):
         weight = np.where(sigma > 0, 1 / sigma**2, np.nan)
     known = np.isfinite(weight) & (weight > 0)
@@ -269,16 +269,16 @@ def _fill(dsm: Dsm, reach: int, settings: DsmSettings) -> Dsm:
         return dsm
     distance = np.asarray(ndimage.distance_transform_edt(~known))
     k = np.arange(-2 * reach, 2 * reach + 1)
-    # inverse squares of distances; a cell itself, at distance 0, has no height where this is used
+    # Inverse squares of distances; a cell itself, at distance 0, has no height where this is used.
     kernel = 1 / np.maximum(np.hypot(k[:, None], k), 0.5) ** 2
     weigh = lambda a: ndimage.convolve(np.where(known, a, 0.0), kernel, mode="constant")
     weight = weigh(1.0 * known)
     gap = ~known & (distance <= reach) & (weight > 0)
-    # only cells with heights on opposite sides, not the outer edge
+    # Only cells with heights on opposite sides, not the outer edge.
     around = ndimage.binary_closing(np.pad(known, 2 * reach), iterations=reach)
     gap &= around[2 * reach : -2 * reach, 2 * reach : -2 * reach]
     safe = np.where(weight > 0, weight, 1.0)
-    # heights above their mean: squares of large heights would lose the digits of their scatter
+    # Heights above their mean: squares of large heights would lose the digits of their scatter.
     level = np.nanmean(dsm.height)
     mean, square = weigh(dsm.height - level) / safe, weigh((dsm.height - level) ** 2) / safe
     height = np.where(gap, level + mean, dsm.height)

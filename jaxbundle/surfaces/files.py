@@ -4,7 +4,7 @@ import csv
 import dataclasses
 import io
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -89,7 +89,7 @@ def make_cloud(
     **Raises:** `InputError` naming the point: a coordinate that is not finite, a negative or
     infinite σ, a number of rays that is none."""
     n = len(X)
-    # the extremes of millions of points first: NaN compares as false
+    # The extremes of millions of points first: NaN compares as false.
     if n and not (X.max() < max_coordinate and X.min() > -max_coordinate):
         bad = ~(np.abs(X) < max_coordinate).all(axis=1)
         where = source(int(bad.argmax()))
@@ -109,8 +109,8 @@ def make_cloud(
             raise InputError(f"{source.name}: {name} has {values.shape[1:]} values a point; one is")
         if (bad := (values < 0) | (values > limit)).any():
             row = int(bad.argmax())
-            raise InputError(f"{source(row)}: {name} is {values[row]:g}; {what} is expected")
-    # what the file does not have is one value for all points, without memory of its own
+            raise InputError(f"{source(row)}: {name} is {values[row]:g}; expected {what}")
+    # What the file does not have is one value for all points, without memory of its own.
     same = lambda value, shape, kind=float: np.broadcast_to(np.array(value, kind), shape)
     covariance = same(np.diag(np.full(3, np.nan)), (n, 3, 3))
     if columns.keys() & {*SIGMAS}:
@@ -123,7 +123,6 @@ def make_cloud(
 
 def report_of(
     surface: SurfaceResult,
-    warnings: Sequence[str] = (),
     check: Float[np.ndarray, "n 3"] | None = None,
     heights: str = "",
 ) -> dict[str, Any]:
@@ -144,7 +143,7 @@ def report_of(
             if check is None or not len(check)
             else {"check_points": at_check_points(cloud, check)}
         ),
-        "warnings": [*warnings, *surface.messages],
+        "warnings": [*surface.messages],
     }
 
 

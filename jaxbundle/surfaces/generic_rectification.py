@@ -62,20 +62,20 @@ def straighten(
     shape = windows(base, other, X)
     if not shape.usable.any():
         return None
-    # one direction for the whole piece: that of most epipolar lines
+    # One direction for the whole piece: that of most epipolar lines.
     e = np.median(shape.axis[shape.usable], axis=0)
     e = e / np.linalg.norm(e)
     axes = np.array([e, [-e[1], e[0]]])
     uv, q = base.project(X), base.parameter(X)
-    # where the piece's epipolar line sees at q0 what the other image has of X
+    # Where the piece's epipolar line sees at q0 what the other image has of X.
     here = other.project(base.points(uv, np.full(len(uv), q0)))
     there = other.project(X)
     along = np.sum((there - here) * shape.other_axis, 1) / np.sum(shape.other_axis**2, 1)
-    # a − δ looks at q0 where X is: its image is there
+    # A − δ looks at q0 where X is: its image is there.
     shift = -along[shape.usable & np.isfinite(along) & np.isfinite(q)]
     if not len(shift):
         return None
-    # without the few wrong nodes of a guide
+    # Without the few wrong nodes of a guide.
     low, high = np.percentile(shift, [0.3, 99.7])
     margin = relative_margin * (high - low) + min_margin
     lowest = int(np.floor(low - margin))
@@ -120,8 +120,8 @@ def _sample(view: OrientedImage, uv: Places) -> Float32[np.ndarray, " n"]:
     inside = (uv > -0.5).all(1) & (uv < np.array(view.size) - 0.5).all(1)
     if not inside.any():
         return np.full(len(uv), np.nan, np.float32)
-    # the spline's coefficients at a pixel depend on others by 0.27 per pixel of distance: 16 pixels
-    # more on all sides, and the part has the grey values of the whole image
+    # The spline's coefficients at a pixel depend on others by 0.27 per pixel of distance: 16 pixels
+    # more on all sides, and the part has the grey values of the whole image.
     low = np.maximum(np.floor(uv[inside].min(0)).astype(int) - 16, 0)
     high = np.ceil(uv[inside].max(0)).astype(int) + 17
     piece = np.asarray(view.grey[low[1] : high[1], low[0] : high[0]], np.float32)

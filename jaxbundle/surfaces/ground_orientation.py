@@ -53,12 +53,12 @@ def _orientation(
     owners = {unknown[:2] for unknown in every}
     strange = [u for u in joint.unknowns if u[:2] in owners and u not in every]
     if strange:
-        # left out it would count as held, and σ would be too small
+        # Left out it would count as held, and σ would be too small.
         raise InputError(
             f"{' '.join(strange[0][:2])} has no unknown {strange[0][2]!r}; the names are those "
             "that pushbroom refine writes"
         )
-    # without a row in the covariance: held in the refinement, so that it has no error
+    # Without a row in the covariance: held in the refinement, so that it has no error.
     held = joint.index(every) < 0
     columns = tuple(np.flatnonzero(~held).tolist())
     return GroundOrientation(joint, tuple(every[k] for k in columns), columns, form, domain)
@@ -89,10 +89,10 @@ def scanner_orientation(
     for word in look:
         # coefficients are counted by their largest exponent: lower ones may be held, and not listed
         named = [name for name in of("sensor", sensor) if f"look angle {word}" in name]
-        # one without a number is refused below, like all that is not known
+        # One without a number is refused below, like all that is not known.
         exponents = [text for name in named if (text := name.rpartition("^")[2]).isdecimal()]
         look[word] = max((int(text) + 1 for text in exponents), default=0)
-    # only which unknowns there are matters here: σ are those of the covariance
+    # Only which unknowns there are matters here: σ are those of the covariance.
     freedom = Freedom(
         jitter=(1.0, 1.0, 1.0) if jitter else (0.0, 0.0, 0.0),
         knot_spacing=knot_spacing,
@@ -119,7 +119,7 @@ def scanner_derivative(
     assert form is not None
     kind = ScannerPoint(image.corrections, earth, form.sizes)
     number = sum(form.sizes)
-    # at changes of 0, since the image is the refined one
+    # At changes of 0, since the image is the refined one.
     zero = np.zeros(form.image_unknowns), np.zeros(number - form.image_unknowns)
     # `refinement` has (line, pixel), a view (u, v) = (pixel, line): turned round, and back below
     lines, _ = lines_of(kind, image, form, np.zeros(3), *zero, X, places[:, ::-1])
@@ -144,6 +144,6 @@ def bias_derivative(
 ) -> Float[Array, "2 12"]:
     """∂(sample, line) of one point by all terms of a bias, of lines before those of samples."""
     terms = jnp.stack(bias_terms(domain, *project(rpc, longitude, latitude, h)))
-    # rows are (u, v) = (sample, line), columns as `names_of_terms`: those of lines first
+    # Rows are (u, v) = (sample, line), columns as `names_of_terms`: those of lines first.
     none = jnp.zeros_like(terms)
     return jnp.stack([jnp.concatenate([none, terms]), jnp.concatenate([terms, none])])

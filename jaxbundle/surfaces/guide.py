@@ -149,8 +149,8 @@ def coarsest_level(
 ) -> int:
     """The first level for segments of this length in pixels."""
     level, side = 0, settings.coarse_side
-    # a coarser level also if the image is large for its segments: it costs a quarter, and its
-    # windows show four times the surroundings
+    # A coarser level also if the image is large for its segments: it costs a quarter, and its
+    # windows show four times the surroundings.
     while min(size) / 2 ** (level + 1) >= side and (
         length / 2**level > settings.max_coarse_steps or min(size) / 2**level > 3 * side
     ):
@@ -242,7 +242,7 @@ def _prepare_searches(
     settings: GuideSettings,
 ) -> tuple[list[PairSearch], int]:
     """The images in which nodes are visible, and the number of common positions of all."""
-    # at least 8 positions: a peak, its neighbours, and others to tell it from (`find_peaks`)
+    # At least 8 positions: a peak, its neighbours, and others to tell it from (`find_peaks`).
     searches, steps = [], 8
     for other, pyramid in zip(others, pyramids):
         r = visible_range(base, other, uv, q)
@@ -335,7 +335,7 @@ def search(
         ]
     ).max(0)
     number = np.nan_to_num(number)
-    # powers of two: at most twice the positions that a point needs, in few groups
+    # Powers of two: at most twice the positions that a point needs, in few groups.
     bucket = np.clip(2 ** np.ceil(np.log2(number + 3)), 8, settings.max_steps).astype(int)
     out = np.full((3, len(uv)), np.nan)
     for steps in np.unique(bucket):
@@ -435,7 +435,7 @@ def _normals(
     on a plane: positions that change by more than `max_change` pixels."""
     du, dv = (_difference(X, axis) for axis in (1, 0))
     normal = np.cross(du, dv)
-    # the nodes on both sides of a change are at an edge
+    # The nodes on both sides of a change are at an edge.
     bent = np.zeros(q.shape, bool)
     for axis in (0, 1):
         change = np.abs(np.diff(q, axis=axis)) * (rate[1:] if axis == 0 else rate[:, 1:])
@@ -445,8 +445,8 @@ def _normals(
         bent |= np.pad(off, width)
         width[axis] = (0, 1)
         bent |= np.pad(off, width)
-    # the line of sight, to a point one pixel of the other image nearer (q itself may be 0: a
-    # height)
+    # The line of sight, to a point one pixel of the other image nearer (q itself may be 0: a
+    # height).
     d = X - base.points(uv, (q + 1 / rate).ravel()).reshape(X.shape)
     bent |= ~(np.linalg.norm(normal, axis=-1) > 0)
     found = np.where(bent[..., None], d, normal)

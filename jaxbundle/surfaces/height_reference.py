@@ -70,7 +70,7 @@ class HeightReference:
     ) -> tuple[float, float]:
         """The range of computed heights that contains a range of wanted ones at all of some
         places."""
-        # computed = wanted − added, and added differs over the area.
+        # Computed = wanted − added, and added differs over the area.
         added = self.correction(x, y)
         low, high = heights
         return float(low - added.max(initial=-np.inf)), float(high - added.min(initial=np.inf))

@@ -77,7 +77,7 @@ def read_orientations(path: str | Path) -> tuple[FrameView, ...]:
 def _read_joint_covariance(path: Path, network: Network) -> OrientationCovariance | None:
     """The covariance of the orientations beside a project, if an adjustment has written it."""
     folder = path if path.is_dir() else path.parent
-    # a folder of results contains the folder of its project
+    # A folder of results contains the folder of its project.
     file = next((f / FILE for f in (folder, folder / ADJUSTED) if (f / FILE_NAME).is_file()), None)
     if file is None or not file.is_file():
         return None

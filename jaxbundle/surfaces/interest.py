@@ -23,7 +23,7 @@ def interest_points(grey: Grey, kind: str, step: int) -> Float[np.ndarray, "n 2"
         v, u = np.mgrid[0:rows:step, 0:columns:step].reshape(2, -1)
         return np.stack([u, v], 1).astype(float)
     if kind not in SURFACE_POINTS:
-        raise InputError(f"points {kind!r}: one of {', '.join(SURFACE_POINTS)} is expected")
+        raise InputError(f"points {kind!r}: expected one of {', '.join(SURFACE_POINTS)}")
     limits = sample_percentiles(grey, 1, 99)
     find = _find_corners if kind == "corners" else _find_edges
     rows, columns = grey.shape

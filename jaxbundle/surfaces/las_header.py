@@ -69,7 +69,7 @@ def check_las(path: Path) -> None:
             _check_compression(path, file, found, begin, size, points, row)
         elif begin + points * row > size:
             raise InputError(
-                f"{path}: is cut, or damaged: its header counts {points} points, there are "
+                f"{path}: is cut, or damaged: its header states {points} points, there are "
                 f"{(size - begin) // row}"
             )
 
@@ -78,7 +78,7 @@ def _check_records(
     path: Path, file: BinaryIO, what: str, number: int, place: int, end: int
 ) -> Mapping[tuple[bytes, int], bytes]:
     """The content of the record of LAZ; refuses records that go beyond `end`."""
-    # reserved H, user 16s, record H, length H or Q, description 32s
+    # Reserved H, user 16s, record H, length H or Q, description 32s.
     extended = what.startswith("extended")
     form = struct.Struct("<2x16sHQ32x" if extended else "<2x16sHH32x")
     found = {}
@@ -136,7 +136,7 @@ def _check_compression(
     _, chunks = unpack("<II", table)
     fixed = chunk != VARIABLE_CHUNKS
     if (fixed and chunks != -(-points // chunk)) or chunks > min(points, size):
-        raise InputError(f"{path}: damaged: its header counts {chunks} chunks for {points} points")
+        raise InputError(f"{path}: damaged: its header states {chunks} chunks for {points} points")
     file.seek(begin)
     for held, length in _read_chunks(path, file, laszip):
         place = begin + 8
@@ -169,4 +169,4 @@ def _read(path: Path, file: BinaryIO, place: int, length: int) -> bytes:
 
 
 def _beyond(path: Path, what: str) -> InputError:
-    return InputError(f"{path}: damaged: its header counts more {what} than it has room for")
+    return InputError(f"{path}: damaged: its header states more {what} than the file holds")

@@ -149,7 +149,7 @@ def match_points(
     table = _Rays(
         (base, *others),
         np.concatenate([uv[:, None], places], 1),
-        # half of a match's variance is due to the window in the base, half to the other window
+        # Half of a match's variance is due to the window in the base, half to the other window.
         np.concatenate([mean[:, None], covariance], 1) / 2,
         np.concatenate([np.ones((len(uv), 1), bool), used], 1),
     )
@@ -243,7 +243,7 @@ def _accept(
     if shape is None:
         factor, shape = max(factor, 1.0), np.zeros_like(found.covariance)
     bad = _find_misfits(found, factor, settings.significance)
-    # with two rays it cannot be told which is wrong
+    # With two rays it cannot be told which is wrong.
     several = bad & (found.rays > max(settings.min_rays, 2))
     if several.any():
         table, found = _drop_worst_rays(table, found, several)
@@ -291,8 +291,8 @@ def _shape_variance(
     X, place = found.X[good], table.uv[good, 0].astype(int)
     step = int(np.gcd.reduce(np.diff(np.unique(place[:, 0])))) or 1
     column, row = ((place - place.min(0)) // step).T
-    # along the line of sight d: σ of each point, and the length that moves it by one pixel in the
-    # other image where it moves most
+    # Along the line of sight d: σ of each point, and the length that moves it by one pixel in the
+    # other image where it moves most.
     d = line_of_sight(base.derivative(X))
     sigma_along = np.sqrt(factor * np.einsum("ni,nij,nj->n", d, found.covariance[good], d))
     pixels_per_length = [
@@ -309,7 +309,7 @@ def _shape_variance(
         grid[row, column] = values
         return grid
 
-    # points whose windows do not overlap
+    # Points whose windows do not overlap.
     apart = -(-(2 * settings.half_fine_window + 1) // step)
     missing = missing_sigma(
         on_grid(q),
@@ -321,7 +321,7 @@ def _shape_variance(
     )
     if missing is None:
         return None
-    # scatter beyond the σ that the matches have without the factor is the shape of the surface
+    # Scatter beyond the σ that the matches have without the factor is the shape of the surface.
     missing = min(missing, np.sqrt(1 / factor - 1) * np.median(sigma_along / length_of_pixel))
     C = np.zeros_like(found.covariance)
     C[good] = ((missing * length_of_pixel) ** 2)[:, None, None] * d[:, :, None] * d[:, None]

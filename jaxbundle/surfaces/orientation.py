@@ -51,10 +51,10 @@ class OrientationErrors:
             if used[:, k].any():
                 J[used[:, k], k] = view.derivative(X[used[:, k]])
         N = np.einsum("nkij,nkil->njl", J, J)
-        # without a ray a point has no errors from any
+        # Without a ray a point has no errors from any.
         scale = np.maximum(np.trace(N, axis1=1, axis2=2), 1e-300)[:, None, None]
-        # of a point with one ray, or parallel rays, N is singular: 1e-14 of its trace is added, 50
-        # roundings, which changes no other point
+        # Of a point with one ray, or parallel rays, N is singular: 1e-14 of its trace is added, 50
+        # roundings, which changes no other point.
         Q = np.linalg.inv(N / scale + 1e-14 * np.eye(3)) / scale
         first = 0
         for k in self.uncertain:
@@ -83,7 +83,7 @@ def orientation_errors(views: Sequence[OrientedImage]) -> OrientationErrors:
     )
     # C of a point is S·W·(S·W)ᵀ, symmetric and positive whatever the rounding
     root = _square_root(joint)
-    # held parameters have no errors; 1e-12 of a variance is its rounding
+    # Held parameters have no errors; 1e-12 of a variance is its rounding.
     scale = np.maximum(np.sqrt(np.diagonal(joint)), 1e-300)
     root = root[:, np.max(np.abs(root / scale[:, None]), axis=0) > 1e-6]
     return OrientationErrors(views, tuple(uncertain), root)

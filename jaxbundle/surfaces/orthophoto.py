@@ -101,6 +101,6 @@ def _are_hidden(
         row, column = (np.rint(a).astype(int) for a in dsm.place(there))
         inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
         Z = height[np.where(inside, row, 0), np.where(inside, column, 0)]
-        # higher by a whole cell: a slope of 45° does not hide itself by the steps of its cells
+        # Higher by a whole cell: a slope of 45° does not hide itself by the steps of its cells.
         hidden |= inside & (Z > there[:, 2] + dsm.size)
     return hidden

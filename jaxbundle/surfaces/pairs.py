@@ -37,7 +37,7 @@ def score(view: OrientedImage, bounds: Bounds, other: OrientedImage) -> float:
     for share in (0.25, 0.5, 0.75):
         X = view.points(uv, q[:, 0] + share * (q[:, 1] - q[:, 0]))
         seen = is_inside(other, other.project(X))
-        # a tenth of the image is a pair not worth its time
+        # A tenth of the image is a pair not worth its time.
         if seen.mean() < 0.1:
             continue
         angle = float(np.median(angle_at((view, other), X[seen])))
@@ -56,7 +56,7 @@ def parse_partners(pairs: Sequence[str], names: Sequence[str]) -> dict[int, list
     for text in pairs:
         parts = [part.strip() for part in text.split(",") if part.strip()]
         if len(parts) < 2:
-            raise InputError(f"--pairs {text!r}: BASE,OTHER[,OTHER…], names of images, is expected")
+            raise InputError(f"--pairs {text!r}: expected BASE,OTHER[,OTHER…], names of images")
         for part in parts:
             if part not in names:
                 raise InputError(

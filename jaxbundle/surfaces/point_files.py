@@ -60,9 +60,7 @@ def write_cloud(cloud: Cloud, path: str | Path) -> None:
         case ".dxf":
             _write_dxf(cloud, path)
         case suffix:
-            raise InputError(
-                f"{path}: suffix {suffix!r}; one of {', '.join(CLOUD_FILES)} is expected"
-            )
+            raise InputError(f"{path}: suffix {suffix!r}; expected one of {', '.join(CLOUD_FILES)}")
 
 
 def read_cloud(path: str | Path) -> Cloud:
@@ -76,7 +74,7 @@ def read_cloud(path: str | Path) -> Cloud:
                ".ply": _read_ply, ".las": _read_las, ".laz": _read_las}  # fmt: skip
     suffix = path.suffix.lower()
     if suffix not in readers:
-        raise InputError(f"{path}: suffix {suffix!r}; .csv, .ply, .las or .laz is expected")
+        raise InputError(f"{path}: suffix {suffix!r}; expected .csv, .ply, .las or .laz")
     return readers[suffix](path)
 
 
@@ -118,7 +116,7 @@ def _read_ply(path: Path) -> Cloud:
         rows = np.frombuffer(body, kinds, number)
         columns = {name: rows[name] for name in names}
     else:
-        raise InputError(f"{path}: format {form!r}; ascii, {', '.join(BYTE_ORDERS)} are expected")
+        raise InputError(f"{path}: format {form!r}; expected ascii, {', '.join(BYTE_ORDERS)}")
     with np.errstate(invalid="ignore"):  # signalling NaN, which are refused
         X = np.stack([columns[axis].astype(float) for axis in "xyz"], 1)
         colour = None
@@ -163,7 +161,7 @@ def _ply_numbers(
 def _check_ply_count(path: Path, stated: int, present: int) -> None:
     if stated > present:
         raise InputError(
-            f"{path}: is cut, or damaged: its header counts {stated} points, there are {present}"
+            f"{path}: is cut, or damaged: its header states {stated} points, there are {present}"
         )
 
 
@@ -206,8 +204,8 @@ def _write_las(cloud: Cloud, path: Path) -> None:
     span = np.ptp(cloud.X, axis=0).max() if len(cloud) else 1.0
     s = cloud.sigma[np.isfinite(cloud.sigma)]
     fine = 1e-3 * float(np.median(s)) if len(s) else 1e-4
-    # coordinates are whole numbers of 32 bits: 2³¹ steps hold the extent; a power of ten above 1e-9
-    # otherwise, so that decimal coordinates stay what they are
+    # Coordinates are whole numbers of 32 bits: 2³¹ steps hold the extent; a power of ten above 1e-9
+    # otherwise, so that decimal coordinates stay what they are.
     scale = max(10.0 ** np.floor(np.log10(max(fine, 1e-9))), span / 2**30)
     header.scales = np.full(3, scale)
     header.offsets = np.floor(cloud.X.min(0)) if len(cloud) else np.zeros(3)
@@ -225,7 +223,7 @@ def _write_las(cloud: Cloud, path: Path) -> None:
     for k, name in enumerate(SIGMAS):
         las[name] = cloud.sigma[:, k].astype(np.float32)
     las["rays"] = np.minimum(cloud.rays, 255).astype(np.uint8)
-    # in memory, a fraction of the cloud: lazrs hides why the system refuses to write
+    # In memory, a fraction of the cloud: lazrs hides why the system refuses to write.
     file = io.BytesIO()
     las.write(file, do_compress=path.suffix.lower() == ".laz")
     write_bytes(path, file.getvalue())
@@ -244,7 +242,7 @@ def _read_las(path: Path, together: int = 1 << 18) -> Cloud:
         more = {name: [] for name in (*SIGMAS, "rays") if name in names}
         for points in reader.chunk_iterator(together):
             part = slice(begin, begin := begin + len(points))
-            # as laspy's x, without the arrays between
+            # As laspy's x, without the arrays between.
             for k, raw in enumerate((points.X, points.Y, points.Z)):
                 np.multiply(raw, header.scales[k], out=X[part, k])
                 X[part, k] += header.offsets[k]
@@ -255,7 +253,7 @@ def _read_las(path: Path, together: int = 1 << 18) -> Cloud:
                 columns.append(np.array(points[name]))
         if begin < len(X):
             raise InputError(
-                f"{path}: is cut, or damaged: its header counts {len(X)} points, there are {begin}"
+                f"{path}: is cut, or damaged: its header states {len(X)} points, there are {begin}"
             )
         crs = header.parse_crs() if len(X) else None
         system = None if crs is None else (crs.to_string() if crs.to_epsg() else crs.to_wkt())
@@ -268,7 +266,7 @@ def _write_dxf(cloud: Cloud, path: Path) -> None:
         import ezdxf.filemanagement
     except ImportError:
         raise InputError("DXF needs ezdxf: pip install 'jaxbundle[files]'") from None
-    # the drawing of 5 million points takes some GB of memory, and no CAD program reads it
+    # The drawing of 5 million points takes some GB of memory, and no CAD program reads it.
     if len(cloud) > 5_000_000:
         raise InputError(f"{path}: {len(cloud)} points are too many for a drawing; thin the cloud")
     drawing = ezdxf.filemanagement.new("R2010")

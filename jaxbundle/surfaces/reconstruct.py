@@ -71,7 +71,7 @@ def find_bounds(
     guessed = []
     for view in views:
         others = [o for o in views if o is not view]
-        # a view between the heights is not bounded by them
+        # A view between the heights is not bounded by them.
         between = heights is not None and low <= view.X0[2] <= high
         q = bounds_from_points(view, tie) if len(tie) and (heights is None or between) else None
         if q is None:
@@ -80,7 +80,7 @@ def find_bounds(
                 raise InputError(
                     f"{view.name}: all images are at one position: a surface needs a base"
                 )
-            # given heights are searched at any distance: q of the geometry says only the order
+            # Given heights are searched at any distance: q of the geometry says only the order.
             bounded = heights is not None and not between
             q = (1e-2 * wide[0], 1e2 * wide[1]) if bounded else wide
             if not bounded:
@@ -109,7 +109,7 @@ def ground_bounds(
             raise InputError("line scanner images need --zmin and --zmax, heights of the surface")
         heights = max(low for low, _ in ranges), min(high for _, high in ranges)
         messages = (
-            # millimetres, and not −1e-9 for 0
+            # Millimetres, and not −1e-9 for 0.
             f"heights from {round(heights[0], 3) + 0.0:.6g} to {round(heights[1], 3) + 0.0:.6g} "
             "are searched, the range of the "
             "coefficients; give --zmin and --zmax",
@@ -125,7 +125,7 @@ class _Pyramids:
         self.cache: dict[int, Pyramid] = {}
 
     def __getitem__(self, k: int) -> Pyramid:
-        # a dictionary keeps the order of insertion: the first is the one not used for longest
+        # A dictionary keeps the order of insertion: the first is the one not used for longest.
         pyramid = self.cache.pop(k, None)
         if pyramid is None:
             while len(self.cache) >= self.number:
@@ -165,8 +165,8 @@ def reconstruct_surface(
             "orientation and its units, --zmin and --zmax"
         )
     tell = progress or (lambda *_: None)
-    # every pixel of a photograph is searched between the bounds, without a guide, if their range is
-    # not too wide
+    # Every pixel of a photograph is searched between the bounds, without a guide, if their range is
+    # not too wide.
     beforehand = {
         i: others
         for i, others in partners.items()
@@ -178,7 +178,7 @@ def reconstruct_surface(
         guides[i]
     if beforehand:
         tell("depths", len(beforehand), len(beforehand))
-    # pixels between the points of a dense cloud, so that those of all base images fit into memory
+    # Pixels between the points of a dense cloud, so that those of all base images fit into memory.
     pixels = sum(views[i].size[0] * views[i].size[1] for i in partners)
     every = step or max(1, int(np.ceil(np.sqrt(pixels / settings.dense.max_points))))
     thinned = f"every {every}th pixel in both directions, to limit memory; --step 1 takes all"

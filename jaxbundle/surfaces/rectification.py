@@ -118,10 +118,10 @@ def rectify(
     depth = depth[depth > 0]
     if not len(depth):
         return None
-    # without the few wrong nodes of a guide
+    # Without the few wrong nodes of a guide.
     d_low, d_high = np.percentile(f * length / depth, [0.3, 99.7])
     margin = settings.relative_margin * (d_high - d_low) + settings.min_margin
-    # a disparity of 0 is a point at infinity
+    # A disparity of 0 is a point at infinity.
     lowest = int(np.floor(max(d_low - margin, 0.0)))
     span = int(np.ceil(d_high + margin)) - lowest
     # `span` columns more on the left: a pixel of the base image at column c ≥ span has its match at

@@ -44,8 +44,8 @@ class RowWindows:
         self.weight = known.astype(np.float32)
         L, R = left - offset, right - offset
         ratio = self._contrast_ratio(L, R)
-        # gradients in grey values of the left image, for any exposure of the right one; the
-        # disparity moves the right image against its columns: −∂R/∂x
+        # Gradients in grey values of the left image, for any exposure of the right one; the
+        # disparity moves the right image against its columns: −∂R/∂x.
         x, y = (-0.5 * (_gradient(L, axis) + ratio * _gradient(R, axis)) for axis in (1, 0))
         self.known, self.left = known, L
         L, R, x, y = (a * self.weight for a in (L, R, x, y))
@@ -69,7 +69,7 @@ class RowWindows:
         difference)."""
         half, limit = 7, 5.0
         n = np.maximum(_sum_windows(self.weight, half), 1)
-        # at least a standard deviation of one grey value
+        # At least a standard deviation of one grey value.
         LL, RR = (
             np.maximum(
                 _sum_windows(self.weight * a * a, half) / n
@@ -85,7 +85,7 @@ class RowWindows:
         reflection."""
         n = np.maximum(_sum_windows(self.weight, half), 1)
         mean = {name: _sum_windows(a, half) / n for name, a in self.first.items()}
-        # moments about the means of the windows, times the number of their pixels
+        # Moments about the means of the windows, times the number of their pixels.
         moment = lambda name: (
             _sum_windows(self.second[name], half) - n * mean[name[0]] * mean[name[1]]
         )
@@ -161,7 +161,7 @@ def _min_side_variance(a: Piece, half: int) -> Piece:
             for x in (wide, wide * wide)
         )
         variance = square - mean * mean
-        # from the first pixel of the window, and from the one after its middle
+        # From the first pixel of the window, and from the one after its middle.
         down, right = (half + 1, 0) if window[1] == half else (0, half + 1)
         for r, c in ((0, 0), (down, right)):
             np.minimum(found, variance[r : r + rows, c : c + columns], out=found)

@@ -144,7 +144,7 @@ def read_refined_views(
             if isinstance(orientation, Rpc)
             else orientation[0]
         )
-        # the size alone is needed: a view of one number instead of gigabytes of pixels
+        # The size alone is needed: a view of one number instead of gigabytes of pixels.
         nothing = np.broadcast_to(np.uint8(0), (image.lines, image.pixels))
         view = _view(one.id, nothing, orientation, around)
         _add_covariance(view, orientation, one, block)
@@ -206,7 +206,7 @@ def _add_covariance(
         return
     try:
         if isinstance(orientation, Rpc):
-            # compensated coefficients have a domain of their own; the bias belongs to the given
+            # Compensated coefficients have a domain of their own; the bias belongs to the given.
             domain = one.domain if one.domain is not None else domain_of_bias(orientation)
             view.orientation = rpc_orientation(joint, one.id, domain)
         else:
@@ -269,7 +269,7 @@ def to_map(cloud: Cloud, around: Neighbourhood, crs: str) -> Cloud:
 
     **Raises:** `InputError` for a system unknown to pyproj."""
     X, covariance = np.empty_like(cloud.X), np.empty_like(cloud.covariance)
-    # the arrays of 262 144 points take about 50 MB
+    # The arrays of 262 144 points take about 50 MB.
     together = 1 << 18
     for first in range(0, len(cloud), together):
         part = slice(first, first + together)
@@ -283,7 +283,7 @@ def map_derivative(
     X: Float[np.ndarray, "n 3"], around: Neighbourhood, crs: str
 ) -> Float[np.ndarray, "n 3 3"]:
     """The derivatives of coordinates in a map system by those of the neighbourhood."""
-    # differences over one metre: a map's curvature within it is 1e-7
+    # Differences over one metre: a map's curvature within it is 1e-7.
     x, y = map_coordinates(X, around, crs)
     columns = []
     for axis in range(2):

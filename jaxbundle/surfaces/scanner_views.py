@@ -55,7 +55,7 @@ class Neighbourhood(eqx.Module):
         latitude: Scalar,
         h: Scalar,
     ) -> Float[Array, "3 *n"]:
-        """The point of (λ, φ, h); longitudes may differ by turns."""
+        """The point of (λ, φ, h); longitudes may differ by whole turns."""
         east = longitude - self.longitude
         east = east - 2 * jnp.pi * jnp.round(east / (2 * jnp.pi))
         return jnp.stack([self.scale[0] * east, self.scale[1] * (latitude - self.latitude), h])
@@ -153,8 +153,8 @@ class ScannerView(_GroundView):
         ) + np.array(self.shift)
 
     def _locate(self, X: Float[Array, "3 n"]) -> Places:
-        # positions up to 200 pixels outside the image are found as well, so that segments that
-        # leave it have both ends
+        # Positions up to 200 pixels outside the image are found as well, so that segments that
+        # leave it have both ends.
         found = project_points(self.image, self.search, X, margin=200.0)
         return np.stack([np.asarray(found.pixel[0]), np.asarray(found.line[0])], 1)
 
@@ -166,7 +166,7 @@ class ScannerView(_GroundView):
         """∂(u, v) by the unknowns."""
         if self.orientation is None:
             return np.zeros((len(X), 2, 0))
-        # without the shift, and of points outside the image those of its corner, finite
+        # Without the shift, and of points outside the image those of its corner, finite.
         places = np.nan_to_num(self.project(X) - np.array(self.shift))
         Xt = run_in_lanes(lambda frame, X: _trajectory_points(frame, X).T, self._frame, X)
         return scanner_derivative(self.orientation, self.image, self._frame.earth, Xt, places)

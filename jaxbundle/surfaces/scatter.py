@@ -47,8 +47,8 @@ def scatter_factor(
         rows, n = a.shape[0], a.shape[1] - 3 * step
         if n < side:
             continue
-        # strips of a grid of more than 4 million values are sampled: a quantile of its thousands of
-        # blocks needs no more
+        # Strips of a grid of more than 4 million values are sampled: a quantile of its thousands of
+        # blocks needs no more.
         every = side * max(1, round(a.size / 4_000_000))
         full = [
             robust_factor(block)
@@ -72,7 +72,7 @@ def missing_sigma(
     if σ² alone is enough, None if no block has enough values."""
 
     def excess(s: float) -> float:
-        # the smoother of both directions: the other may contain the shape of the surface
+        # The smoother of both directions: the other may contain the shape of the surface.
         factors = scatter_factor(d, np.hypot(sigma, s * unit), step, side, quantile)
         return min(factors, default=np.nan) - 1
 
@@ -81,8 +81,8 @@ def missing_sigma(
         return None
     if without <= 0:
         return 0.0
-    # one unit (a pixel) at most: a scatter above it is that of the surface, and matches of such σ
-    # are rejected in any case
+    # One unit (a pixel) at most: a scatter above it is that of the surface, and matches of such σ
+    # are rejected in any case.
     largest = 1.0
     if excess(largest) >= 0:
         return largest
@@ -95,12 +95,12 @@ def _blocks(
     """Third differences over their σ along some rows, in blocks of `side` columns with enough known
     values."""
     n = a.shape[1] - 3 * step
-    # third differences: those of a quadratic surface are 0
+    # Third differences: those of a quadratic surface are 0.
     parts = [(w, slice(k * step, k * step + n)) for k, w in enumerate((1.0, -3.0, 3.0, -1.0))]
     difference = sum(w * a[:, part] for w, part in parts)
     square = sum(w * w * s[:, part] ** 2 for w, part in parts)
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio = difference / np.sqrt(square)
     blocks = (ratio[:, first : first + side] for first in range(0, n, side))
-    # a block of which two thirds are missing lies across the edge of a surface
+    # A block of which two thirds are missing lies across the edge of a surface.
     return [b for b in blocks if np.isfinite(b).sum() > max(MIN_VALUES, side**2 / 3)]

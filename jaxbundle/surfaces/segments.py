@@ -132,7 +132,7 @@ def windows(
     across = d + f
     across = across / np.linalg.norm(across, axis=1, keepdims=True)
     if normal is not None:
-        # sine of the smaller angle between the plane and a line of sight: 1 if seen from the front
+        # Sine of the smaller angle between the plane and a line of sight: 1 if seen from the front.
         facing = np.minimum(np.abs(np.sum(normal * d, 1)), np.abs(np.sum(normal * f, 1)))
         # A plane seen from nearly its side is stretched without limit. Below a sine of 0.2 (12°)
         # the windows would be five times as long in one direction; a normal of the guide is rarely
@@ -140,7 +140,7 @@ def windows(
         across = np.where((facing > 0.2)[:, None], normal, across)
     with np.errstate(invalid="ignore", divide="ignore"):
         A = K @ steps_on_plane(J, across)
-        # the image in the base of the line of sight of the other: its epipolar line
+        # The image in the base of the line of sight of the other: its epipolar line.
         e = np.einsum("nij,nj->ni", J, f)
         e = e / np.linalg.norm(e, axis=1, keepdims=True)
         along = np.einsum("nij,nj->ni", A, e)

@@ -89,15 +89,15 @@ def refine(
         np.full(n, int(MatchingStatus.OUTSIDE)),
     )
     known = is_inside(base, uv, half)
-    # how far the corners of the windows are from their middle, along the rows or the columns; half
-    # a pixel more, as pieces begin at whole pixels; NaN, where A does not exist, is within nothing
+    # How far the corners of the windows are from their middle, along the rows or the columns; half
+    # a pixel more, as pieces begin at whole pixels; NaN, where A does not exist, is within nothing.
     reach = half * np.abs(A).sum(2).max(1) + 0.5
     held = -1.0
     for stretch in (settings.max_stretch, max(settings.max_stretch, np.sqrt(2) * MAX_SCALE)):
         margin = int(np.ceil(stretch * half)) + settings.search_margin
         rows = known & (reach > held) & (reach <= margin) & is_inside(other, start, margin + 1)
         _refine_rows(base, other, uv, out, np.flatnonzero(rows), half, margin)
-        # few windows are larger: in pieces of their own, which take more time
+        # Few windows are larger: in pieces of their own, which take more time.
         held = float(margin)
     return out
 
@@ -112,7 +112,7 @@ def _refine_rows(
     margin: int,
 ) -> None:
     """Match some of the windows from their starts in `out`, which is changed, in pieces of the
-    other image with so many pixels around the start."""
+    other image with `margin` pixels around the start."""
     start, A = out.uv.copy(), out.A.copy()
     # 256 windows a call: all iterate until the last has converged
     together = 256

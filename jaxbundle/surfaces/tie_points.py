@@ -88,7 +88,7 @@ class TiePoints(TableMethods):
         """The names of the points, by their numbers."""
         (of_base,) = np.nonzero(self.image == self.base[self.point])
         rows = of_base[np.argsort(self.point[of_base])]
-        # hundredths of a pixel: places of one image are farther apart
+        # Hundredths of a pixel: places of one image are farther apart.
         place = lambda k: ":".join(f"{v:.2f}".rstrip("0").rstrip(".") for v in self.xy[k])
         return [f"T:{self.images[self.image[k]]}:{place(k)}" for k in rows]
 
@@ -151,7 +151,7 @@ def match_tie_points(
                 (base, views[j]), (pyramids[i], pyramids[j]), uv, bounds[i], settings, lost
             )
             if pair is None:
-                # from the other side it is the same
+                # From the other side it is the same.
                 if i < j:
                     failed.append((i, j))
                 continue
@@ -159,7 +159,7 @@ def match_tie_points(
         others = found.sum(1)
         tied = np.flatnonzero(others)
         found[tied, i], place[tied, i] = True, uv[tied]
-        # the base is measured once, at the corner: the mean variance of what its pairs say
+        # The base is measured once, at the corner: the mean variance of what its pairs say.
         mean = (in_base[tied] ** 2).sum(1) / others[tied, None]
         sigma[tied, i] = np.sqrt(mean)
         for j in range(len(views)):
@@ -193,7 +193,7 @@ def _describe_untied(
     """Which pairs whose matching has failed share no point."""
     shown = np.zeros((int(point.max(initial=-1)) + 1, len(names)), bool)
     shown[point, image] = True
-    # corners near known points are not matched again: a pair may be tied by an earlier base alone
+    # Corners near known points are not matched again: a pair may be tied by an earlier base alone.
     return tuple(
         f"{names[i]} and {names[j]}: too few matches"
         for i, j in failed
@@ -239,7 +239,7 @@ def _match_pair(
             return None
         return _refine_pair(pair, uv, q, settings, lost)
     finally:
-        # another base has another error
+        # Another base has another error.
         other.shift = before
 
 
@@ -257,18 +257,18 @@ def _search_heights(
     out = np.full((3, len(uv)), np.nan)
     rows = np.flatnonzero(np.isfinite(wide).all(1) & (wide[:, 0] < wide[:, 1]))
     wide = wide[rows]
-    # heights per pixel of the curve; below a pixel the whole range is one step
+    # Heights per pixel of the curve; below a pixel the whole range is one step.
     pixels = np.maximum(segments(base, other, uv[rows], wide).length, 1.0)
     rate, q = (wide[:, 1] - wide[:, 0]) / pixels, wide
     for level in range(len(pyramids[0].levels) - 1, -1, -1):
         found = search(base, [other], both, uv[rows], q, None, level, settings.guide)
         middle = np.where(np.isfinite(found[0]), found[0], q.mean(1))
-        # what the search of this level may be off is searched in the next one
+        # What the search of this level may be off is searched in the next one.
         reach = settings.matching.search_margin * 2.0**level * rate
         q = np.clip(middle[:, None] + reach[:, None] * [-1, 1], wide[:, :1], wide[:, 1:])
         out[:2, rows] = found[:2]
         if level == len(pyramids[0].levels) - 1:
-            # only the search of all heights tells whether there are two
+            # Only the search of all heights tells whether there are two.
             out[2, rows] = found[2]
     return out
 
@@ -291,7 +291,7 @@ def _refine_pair(
     good = window.usable & is_confirmed(match, start, limits)
     good &= has_texture(base.grey, uv, match.sigma0, half, limits.windows.min_texture)
     lost["not confirmed by least squares matching"] += int((~good).sum())
-    # along the curve heights move a match, across it only errors do
+    # Along the curve heights move a match, across it only errors do.
     across = np.stack([-window.other_axis[:, 1], window.other_axis[:, 0]], 1)
     across = across / np.linalg.norm(across, axis=1, keepdims=True)
     off = np.einsum("ni,ni->n", match.uv - start, across)
@@ -327,7 +327,7 @@ def _near_the_curve(
     A = np.column_stack([np.ones(len(uv)), uv - uv.mean(0)])
     A[:, 1:] /= np.maximum(np.abs(A[:, 1:]).max(0), 1.0)
     kept, rest = good.copy(), np.full(len(uv), np.nan)
-    # the first fit has the blunders in it, the last ones have not
+    # The first fit has the blunders in it, the last ones have not.
     for _ in range(5):
         if kept.sum() < settings.least_matches:
             return np.zeros_like(good), rest

@@ -46,7 +46,7 @@ def write_example(name: str, folder: str | Path) -> None:
     **Raises:** `InputError` for an unknown name, or a folder that cannot or may not be written.
     """
     if name not in EXAMPLES:
-        raise InputError(f"no example {name!r}: one of {', '.join(EXAMPLES)} is expected")
+        raise InputError(f"no example {name!r}: expected one of {', '.join(EXAMPLES)}")
     target = Path(os.path.abspath(folder))
     if os.path.lexists(target) and not (target.is_dir() and not any(target.iterdir())):
         why = "is not empty" if target.is_dir() else "is no folder"

@@ -22,7 +22,7 @@ DESCRIPTORS = (Path("/dev"), Path("/dev/fd"), Path("/proc/self/fd"))
 DEEPEST_NESTING = 64
 # The largest power of two that is a float of double precision (IEEE 754).
 LARGEST_INTEGER = 2**1023
-TOO_LARGE = "too large a number; finite numbers are expected"
+TOO_LARGE = "too large a number; expected finite numbers"
 # Said of a file that ends where more is expected.
 ENDS_EARLY = "; the file ends there: is it cut off, or not completely copied?"
 QUOTED = re.compile(r'"(?:\\.|[^"\\])*"|\'[^\']*\'')

@@ -50,6 +50,6 @@ def _describe(error: BaseException, expected: str) -> str:
         return f"cannot be read: {error.strerror}"
     said = " ".join(str(error).split())[:200]
     kind = "" if said else type(error).__name__
-    # the bare text of a KeyError is only the key
+    # The bare text of a KeyError is only the key.
     said = f"no {said}" if isinstance(error, KeyError) else said
     return f"is not {expected}, or is damaged: {said or kind}"

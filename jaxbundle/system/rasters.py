@@ -45,7 +45,7 @@ def raster_parser(path: str | Path) -> Iterator[None]:
                 yield
         except InputError as error:
             if "not recognized" in str(error):
-                raise InputError(f"{path}: expected {EXPECTED}; GDAL does not know it") from None
+                raise InputError(f"{path}: expected {EXPECTED}; GDAL cannot read it") from None
             raise
 
 
@@ -61,7 +61,7 @@ def open_raster(path: str | Path) -> Iterator["DatasetReader"]:
     with raster_parser(path):
         source = open_plain(path)
     with source:
-        # imaging spectrometers have hundreds of bands; of a hundred thousand GDAL would think long
+        # Imaging spectrometers have hundreds of bands; of a hundred thousand GDAL would think long.
         if not 1 <= source.count <= 4096:
             raise InputError(f"{path}: is damaged, or no image: it has {source.count} bands")
         try:
@@ -132,7 +132,7 @@ def read_heights(path: str | Path) -> HeightRaster:
         crs = source.crs
         return HeightRaster(
             values,
-            # heights are of the centres of cells
+            # Heights are of the centres of cells.
             (place.c + 0.5 * place.a, place.f + 0.5 * place.e),
             (place.a, place.e),
             None if crs is None else crs.to_wkt(),
@@ -166,7 +166,7 @@ def check_pixels(
     (top, bottom), (left, right) = window or ((0, source.height), (0, source.width))
     size = sum(np.dtype(source.dtypes[k - 1]).itemsize for k in bands or source.indexes)
     needed, present = (bottom - top) * (right - left) * size, os.path.getsize(path)
-    # a VRT is a text about other files
+    # A VRT is a text about other files.
     if needed > harmless and needed > ratio * present and source.driver != "VRT":
         raise InputError(
             f"{path}: is damaged, or nearly empty: {present} bytes that claim to hold {needed} of "

@@ -177,7 +177,7 @@ def _search_tile(
     for k, point in enumerate(points):
         x, y = point.pt[0] + l, point.pt[1] + t
         point.pt = (x, y)
-        # half-open, so that a feature in the margin of two tiles is taken once
+        # Half-open, so that a feature in the margin of two tiles is taken once.
         if left - 0.5 <= x < right - 0.5 and top - 0.5 <= y < bottom - 0.5:
             inside.append(k)
     return [points[k] for k in inside], descriptors[inside]

@@ -27,8 +27,8 @@ class CandidateSettings:
     of the own strip and of two on each side. More: all pairs, in the end; fewer: strips come
     apart."""
     min_matches: int = 4
-    """Minimum matches of the largest features for a candidate pair. Low, since a candidate in vain
-    is rejected by its verification."""
+    """Minimum matches of the largest features for a candidate pair. Low, since the verification
+    rejects a needless candidate."""
     largest_features: int = 800
     """Number of largest features that decide whether two photographs may overlap. The time of this
     check grows with the square, and with that of the number of photographs."""

@@ -226,7 +226,7 @@ def test_a_batch_is_a_population(three, solved):
     assert list(population.keys) == ["a", "b", "c"] and population.fit.all()
     np.testing.assert_array_equal(population.values["fx"], solved.values[:, 0])
     assert population.summary()["parameters"]["fx"]["median"] == np.median(solved.values[:, 0])
-    with pytest.raises(jaxbundle.InputError, match="ids must be 3, one a camera"):
+    with pytest.raises(jaxbundle.InputError, match="ids must be 3, one for each camera"):
         solved.population(["a"])
 
 

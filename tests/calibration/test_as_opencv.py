@@ -71,7 +71,7 @@ def test_arrays_of_other_shapes_are_named():
     objects, images = views(partly=False)
     for X, x, why in (
         ([], [], "0 views"), (objects[:3], images[:2], "3 views of object_points and 2"),
-        ([objects[0][:, :2]], images[:1], r"object_points\[0\]: an array \[n, 3\]"),
+        ([objects[0][:, :2]], images[:1], r"object_points\[0\]: expected an array \[n, 3\]"),
         ([objects[0][:5]], images[:1], "5 object points and 48 image points"),
         ([objects[0][[0, 0, 1, 2, 3, 4]]], [images[0][:6]], "occurs twice"),
     ):  # fmt: skip

@@ -136,7 +136,7 @@ def test_folders_of_rigs(command, tmp_path, monkeypatch):
     assert told.status == 0, told.err
     good, bad = map(json.loads, Path("rigs.jsonl").read_text().splitlines())
     assert good["status"] == "converged" and good["rms"] < 0.1
-    assert "for every camera of the rig is expected" in bad["error"]
+    assert "expected a folder of photographs for every camera of the rig" in bad["error"]
     assert good["image_size"] == {"left": [480, 360], "right": [480, 360]}
     assert good["images"].keys() >= {"left/l_001.png", "right/r_000.png"}
     X0 = mounting(good)["X0"]
@@ -206,7 +206,7 @@ def test_models_that_calibrate_batch_refuses():
 @pytest.mark.parametrize("given, said", [
     (dict(cameras=["left"]), "cameras must be 2 different names"),
     (dict(visible=np.ones((5, 2))), "visible must have the shape"),
-    (dict(rolling_shutter=3), "rolling_shutter is 3; a table of settings"),
+    (dict(rolling_shutter=3), "rolling_shutter is 3; expected a table of settings"),
     (dict(rolling_shutter={"free": ["vX"]}), "rolling_shutter: line_time"),
     (dict(rolling_shutter={"line_time": 1e-5, "sigma": {"vx": 1}}), "unknown 'vx'.*'vX'"),
     (dict(rig={"sigma_posit": 1}), "sigma_posit"),

@@ -273,7 +273,7 @@ def test_what_cannot_be_calibrated_says_why(folder, tmp_path):
         ({"model": "brown"}, "is in mm: give the size of a pixel"),
         ({"model": "opencw"}, "did you mean 'opencv'"),
         ({"free": ["fx", "K1"]}, "no free parameter 'K1'"),
-        ({"pixel_size": -1}, "pixel size -1: a positive"),
+        ({"pixel_size": -1}, "pixel size -1: expected a positive"),
         ({"sigma_image": 0}, "sigma_image must be a positive number"),
         ({"board_free": True, "board_sigma": 1e-4}, "either free or has a σ"),
         ({"given": {"K9": 1}}, "no parameter 'K9'"),

@@ -255,6 +255,6 @@ def test_simulated_views_are_what_cv2_projects():
     assert views.visible.any(1).all() and not views.visible.all()
     noisy = simulate_views(BOARD, camera, stations, noise=0.5, seed=1).xy - views.xy
     assert 0.3 < np.nanstd(noisy) < 0.7
-    with pytest.raises(InputError, match="station 2 stands behind the board"):
+    with pytest.raises(InputError, match="station 2 is behind the board"):
         behind = stations_looking_at(places * [[1, 1, 1], [1, 1, -1]], middle)
         simulate_views(BOARD, camera, behind, noise=0.0)

@@ -232,9 +232,9 @@ def test_the_mapping_error_of_the_measured_part_is_that_of_its_map(without_corne
 
 def test_maps_that_cannot_be(sample):
     adjustment = sample[0].adjustment
-    with pytest.raises(InputError, match="frame 'board': camera, rotation, scene"):
+    with pytest.raises(InputError, match="must be one of camera, rotation, scene, not 'board'"):
         uncertainty_map(adjustment, "cam", frame="board")
-    with pytest.raises(InputError, match="distance 0: a positive"):
+    with pytest.raises(InputError, match="distance 0: expected a positive"):
         uncertainty_map(adjustment, "cam", 0.0)
 
 

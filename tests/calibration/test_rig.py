@@ -234,7 +234,7 @@ def test_maps_and_coverage_of_a_rig(rig, tmp_path):
         assert turned.middle < far.middle
         assert rig.uncertainty(name) is far
     for arguments, said in ((("middle",), "not of the rig"), (("left", -1.0), "positive"),
-                            (("left", 1.0, "scene"), "frame 'scene'")):  # fmt: skip
+                            (("left", 1.0, "scene"), "frame must be one of")):  # fmt: skip
         with pytest.raises(InputError, match=said):
             rig.uncertainty(*arguments)
     save_rig_plots(rig, tmp_path)

@@ -166,6 +166,19 @@ def test_what_cannot_be_converted_is_said(source, values, target, sizes, message
         convert_camera(get_model(source), values, get_model(target), **sizes)
 
 
+def test_a_fit_without_differences_is_exact():
+    """Backward Brown as OpenCV is a fit, which finds a camera without distortion to rounding."""
+    bare = dict(c=30.0, x0=0.1, y0=-0.05)
+    found = convert_camera(get_model("brown"), bare, get_model("opencv"), **SIZES)
+    assert found.exact and not found.reason and "opencv: exact; largest" in str(found)
+    pixel, width = PIXEL[0], SIZE[0]
+    expected = dict(fx=30 / pixel, cx=(width - 1) / 2 + 0.1 / pixel, k1=0.0)
+    for name, value in expected.items():
+        assert found.parameters[name] == pytest.approx(value, abs=1e-9), name
+    bent = convert_camera(get_model("brown"), bare | {"K1": -2e-5}, get_model("opencv"), **SIZES)
+    assert not bent.exact and bent.reason
+
+
 def test_why_a_conversion_is_not_exact():
     reasons = {
         "brown-projected": convert_camera(

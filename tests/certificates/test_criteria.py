@@ -213,7 +213,7 @@ def test_status_0_if_all_are_met_and_2_before_the_work(command, tmp_path):
     assert command("adjust", PROJECT, "--accept", "sigma0 < 1.2", "--quiet").status == 0
     for options, why in (
         (["--accept", "sigm0 < 1"], "unknown quantity 'sigm0'"),
-        (["--accept", "sigma0 smaller than 1"], "QUANTITY < NUMBER UNIT is expected"),
+        (["--accept", "sigma0 smaller than 1"], "expected QUANTITY < NUMBER UNIT"),
         (["--details", tmp_path / "no.toml"], "no such file"),
         (["--certificate", "-"], "standard output"),
         (["--lengths", tmp_path / "no.csv"], "no such file"),

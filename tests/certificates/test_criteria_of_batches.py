@@ -10,7 +10,9 @@ import pytest
 
 from jaxbundle.batches.population import Population
 from jaxbundle.certificates.acceptance import accept, accept_known, check_criteria
+from jaxbundle.certificates.check_differences import CheckDifferences, check_point_quantities
 from jaxbundle.certificates.quantities import offered
+from jaxbundle.certificates.quantity import Subject
 from jaxbundle.errors import InputError
 
 ROOT = Path(__file__).parents[2]
@@ -90,7 +92,7 @@ def test_criteria_of_a_batch_are_checked_before_the_work():
         check_criteria(["sigma(c) < 1 m"], "pushbroom refine")
     # the numbers of their JSON are known afterwards
     check_criteria(["anything.at.all < 1"], "replicate")
-    with pytest.raises(InputError, match="is expected"):
+    with pytest.raises(InputError, match="expected "):
         check_criteria(["anything"], "replicate")
 
 
@@ -186,4 +188,22 @@ def test_any_command_ends_with_status_4_and_writes_everything(command, tmp_path)
     assert command(*plan, "--accept", "scale_number <= 10000").status == 0
     assert command(*plan, "--accept", "scale_number < 10000").status == 4
     told = command(*plan, "--accept", "scale_number")
-    assert told.status == 2 and "is expected" in told.err
+    assert told.status == 2 and "expected " in told.err
+
+
+def test_an_axis_that_no_check_point_has_is_not_met_by_0():
+    difference = np.array([[0.3, 0.0, np.nan], [0.3, 0.8, np.nan]])
+    rms, largest, number = check_point_quantities(
+        lambda _: CheckDifferences(("p", "q"), difference, "m")
+    )
+    subject = Subject(None)
+    assert rms.find(subject, "").values[""] == pytest.approx(np.sqrt(0.09 + 0.32))
+    assert largest.find(subject, "Y").values == {"Y of check point p": 0, "Y of check point q": 0.8}
+    assert number.find(subject, "").values == {"": 2}
+    for quantity in (rms, largest):
+        with pytest.raises(LookupError, match="no check point has this difference"):
+            quantity.find(subject, "Z")
+    nothing = check_point_quantities(lambda _: None)
+    with pytest.raises(LookupError, match="no check points"):
+        nothing[0].find(subject, "")
+    assert nothing[2].find(subject, "").values == {"": 0}

@@ -29,8 +29,8 @@ ERRORS = [
     ("adjust x --jsno y", "--json"),
     ("adjust x --max-iterations many", "--max-iterations"),
     ("adjust x --method gauss-newtn", "did you mean 'gauss-newton'"),
-    ("adjust x --snooping popes", "--snooping 'popes': one of pope, baarda is expected"),
-    ("batch x --json-lines y --snooping baarda", "one of pope, none is expected"),
+    ("adjust x --snooping popes", "--snooping 'popes': expected one of pope, baarda"),
+    ("batch x --json-lines y --snooping baarda", "expected one of pope, none"),
     ("calibrate x --kind chesboard", "did you mean 'chessboard'"),
     ("cloud x --place men", "did you mean 'mean'"),
     ("design x --order frist", "did you mean 'first'"),
@@ -38,7 +38,7 @@ ERRORS = [
     ("reconstruct x --out y --features shift", "did you mean 'sift'"),
     ("surface x --out y --points edge", "did you mean 'edges'"),
     ("pushbroom correct x y --out z --resampling cubical", "did you mean 'cubic'"),
-    ("pushbroom accuracy x --table drift", "one of bias, white is expected"),
+    ("pushbroom accuracy x --table drift", "expected one of bias, white"),
     ("pushbroom rpc compensate x --control y --out z --model affin", "did you mean 'affine'"),
 ]
 ALL_IN_ONE_PROCESS = """

@@ -83,7 +83,7 @@ def test_a_damaged_compressed_file(tmp_path):
 def test_a_count_of_thousands_of_digits(tmp_path):
     path = tmp_path / "problem.txt"
     path.write_text(f"{'9' * 5000} 6 12\n")
-    with pytest.raises(InputError, match="line 1: three whole numbers are expected"):
+    with pytest.raises(InputError, match="line 1: expected three whole numbers"):
         jaxbundle.read_network(path, format="bal")
     path.write_text(f"{'9' * 50} 6 12\n")
     with pytest.raises(InputError, match="line 1: 9+ 6 12: more cameras.* than a file can hold"):

@@ -101,9 +101,9 @@ def test_bundler_leaves_out_what_is_not_oriented(tmp_path):
 
 
 BROKEN = {
-    "version": ("v0.3", "v0.4", "line 1: '# Bundle file v0.3' is expected"),
+    "version": ("v0.3", "v0.4", "line 1: expected '# Bundle file v0.3'"),
     "count": ("2 1\n", "2.5 1\n", "line 2: cameras is '2.5'"),
-    "many points": ("2 1\n", "2 999999999999999999\n", "ends after line 15; coordinates of po"),
+    "many points": ("2 1\n", "2 999999999999999999\n", "line 15; expected coordinates of po"),
     "negative": ("2 1\n", "2 -1\n", "points is '-1'"),
     "too many lines": ("2 1\n", "2 0\n", "line 13: a line after the last of 0 points"),
     "not a rotation": ("1 0 0\n0 1", "1 0 0\n0 2", "line 3: R of camera 0 of 2 is not a rotation"),
@@ -113,7 +113,7 @@ BROKEN = {
     "camera": ("2 0 17", "2 7 17", "line 15: camera 7 does not exist; there are 2"),
     "rays": ("2 0 17", "3 0 17", "3 rays are announced; 12 numbers should follow, not 8"),
     "huge rays": ("2 0 17", "999999999999999999 0 17", "announced"),
-    "cut": ("9 9 9\n2 0 17 80 40 1 3 1 1\n", "9 9 9", "ends after line 14; rays of point 0"),
+    "cut": ("9 9 9\n2 0 17 80 40 1 3 1 1\n", "9 9 9", "line 14; expected rays of point 0"),
     "colour": ("9 9 9", "9 9", "line 14: 2 values where 3 are expected .red, green, blue"),
 }
 

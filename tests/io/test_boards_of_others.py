@@ -39,7 +39,7 @@ def test_corners(tmp_path):
 
 
 @pytest.mark.parametrize("old, new, message", [
-    ("# filename x y level\n", "", "line 2: a line '# filename"), ("x y", "u v", "line 2: columns"),
+    ("# filename x y level\n", "", "a line '# filename"), ("x y", "u v", "line 2: columns"),
     ("a.jpg 0.25", "a.jpg", "line 3: 3 values where 4"), ("a.jpg 0.25", "a.jpg nan", "x is 'nan'"),
     ("a.jpg 0.25 10.25 0\n", "", "photograph 'a.jpg' has 11 points; the board, .*, has 12"),
 ])  # fmt: skip
@@ -81,7 +81,7 @@ def test_a_target_by_hand(tmp_path):
     right, up = 0.088 * (5 * 1.3 + 1), 0.088 * (4 * 1.3 + 1)
     np.testing.assert_allclose(grid.points[11], [right, up, 0], rtol=1e-15)
     for old, new, message in [
-        ("'checkerboard'", "hexagons", "target_type hexagons: checkerboard or"),
+        ("'checkerboard'", "hexagons", "target_type hexagons: expected checkerboard or"),
         ("targetRows", "rows", "unknown key 'rows'"),
         ("targetRows: 7", "", "targetRows is missing"), ("Cols: 6", "Cols: 6.5", "targetCols is"),
     ]:  # fmt: skip
@@ -120,7 +120,7 @@ def test_results(tmp_path):
     assert left.parameters["p2"] == -0.0004 and right.model == "kannala-brandt"
     assert_allclose(np.sqrt(np.diag(C)), [0.3, 0.4, 0.2, 0.1, 0.001, 0.002, 0.0001, 0.0002])
     for old, new, message in [
-        ("531.5 ", "", "cam0: projection has 3 numbers; 4"), ("+- [0.3", "[0.3", "projection: "),
+        ("531.5 ", "", "projection has 3 numbers; expected 4"), ("+- [0.3", "[0.3", "projection: "),
         ("DistortedPinhole", "X", "cam0: cameras of type X"), ("0.085", "nan", "finite numbers"),
         ("    type", "    kind", "cam0: type is missing"),
     ]:  # fmt: skip

@@ -124,7 +124,7 @@ BROKEN = {
     "number": ("id,X,Y,Z\n1,0,zero,0\n", "line 2: Y is 'zero'"),
     "missing": ("id,X,Y,Z\n1,0,,0\n", "line 2: Y is missing"),
     "twice": ("1,0,0,0\n1,1,1,1\n", "line 2: point '1' is already in .*line 1"),
-    "sigma": ("1,0,0,0,0.1,0.1,-0.1\n", "line 1: sZ is -0.1; a positive number"),
+    "sigma": ("1,0,0,0,0.1,0.1,-0.1\n", "line 1: sZ is -0.1; expected a positive number"),
     "role": ("id,role,X,Y,Z\n1,tied,0,0,0\n", "line 2: role must be one of"),
     "nobody": ("id,X,Y,Z\nP1,0,0,0\n", "none of its 1 points is one of the network; it has '1'"),
     "quotes": ('id,X,Y,Z\n"1,0,0,0\n', "not a table"),

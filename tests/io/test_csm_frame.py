@@ -230,7 +230,7 @@ REFUSED = {
     "dependent": ({"focal2pixel_lines": [0, 40.0, 0]}, "are dependent"),
     "jitter": ({"jitter": {"lineJitterCoefficients": [1.0]}}, "jitter"),
     "crop": ({"geotransform": [100.0, 1, 0, 0, 0, 1]}, "whole raw image"),
-    "two kinds": ({"optical_distortion": {"radial": {}, "dawnfc": {}}}, "one kind is expected"),
+    "two kinds": ({"optical_distortion": {"radial": {}, "dawnfc": {}}}, "expected one kind"),
     "too many": (of("radial", coefficients=[0, 0, 0, 1e-9]), "at most 3 coefficients"),
     "pointing": ({"instrument_pointing": {}}, "instrument_pointing.ephemeris_times is missing"),
     "key": ({"lens_offset": 1}, "unknown key 'lens_offset'"),

@@ -141,14 +141,14 @@ def test_fields_of_the_header_of_las(tmp_path, suffix, case):
 @pytest.mark.parametrize("offset, form, value, said", [
     (0, "<4s", b"PNG ", "it does not begin with LASF"),
     (105, "<H", 1, "points of format 7 with 1 bytes"),
-    (247, "<Q", 2**40, "counts"),
+    (247, "<Q", 2**40, "states"),
 ])  # fmt: skip
 def test_what_is_wrong_with_a_header_of_las_is_said(tmp_path, suffix, offset, form, value, said):
     """The format without the bit of compression; a count of points beyond any compression."""
     path = tmp_path / f"c{suffix}"
     write_cloud(some_points(), path)
     damage(path, offset, form, value)
-    refused(read_cloud, path, said, *["more points"] * (said == "counts" and suffix == ".laz"))
+    refused(read_cloud, path, said, *["more points"] * (said == "states" and suffix == ".laz"))
 
 
 def test_chunks_of_laz_larger_than_the_memory(tmp_path):

@@ -103,7 +103,7 @@ def test_patterns_are_named_and_replaced_by_force(tmp_path):
 
 def test_a_folder_of_somebody_else(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(InputError, match="there is notes.txt in it; .*to write beside that"):
+    with pytest.raises(InputError, match="it contains notes.txt; .*to write into it all the same"):
         check_folder(tmp_path, "adjust", [*NEWER])
     write(tmp_path, NEWER, force=True)
     assert content(tmp_path) == NEWER | {"notes.txt": "mine"}

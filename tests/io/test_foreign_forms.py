@@ -603,7 +603,7 @@ def test_sensors_of_alicevision_without_size(tmp_path, old, new, message):
 def test_a_setting_of_vins_without_cameras(tmp_path):
     path = write_sample(tmp_path, "vins")
     path.write_text(path.read_text().replace("num_of_cam: 2", "num_of_cam: 0"))
-    with pytest.raises(InputError, match="num_of_cam is 0; a whole number from 1"):
+    with pytest.raises(InputError, match="num_of_cam is 0; expected a whole number from 1"):
         read_network(path)
     path.write_text('a:\n  cam0_calib: "left.yaml"\n')
     with pytest.raises(InputError, match="cam0_calib is missing at the first level"):

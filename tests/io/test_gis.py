@@ -135,7 +135,7 @@ def test_the_command_writes_it_and_refuses_before_the_work(command, tmp_path):
     assert told.status == 0 and (tmp_path / "n.gpkg").read_bytes()[:15] == b"SQLite format 3"
     (tmp_path / "x.gpkg").write_text("notes")
     for options, why in (
-        (["--gis", tmp_path / "n.shp"], ".gpkg or .geojson is expected"),
+        (["--gis", tmp_path / "n.shp"], "expected a name that ends with .gpkg or .geojson"),
         (["--gis", tmp_path / "n.geojson"], "longitude and latitude"),
         (["--gis", tmp_path / "n.gpkg", "--crs", "utm"], "EPSG:NUMBER"),
         (["--crs", "EPSG:25832"], "it is for --gis"),

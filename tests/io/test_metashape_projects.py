@@ -130,7 +130,7 @@ def test_missing_and_damaged_archives(tmp_path, name, content, why):
 @pytest.mark.parametrize(
     ("member", "content", "why"),
     [
-        ("points0_ply", b"ply\nformat ascii 1.0\nend_header\n", "a binary PLY is expected"),
+        ("points0_ply", b"ply\nformat ascii 1.0\nend_header\n", "expected a binary PLY"),
         ("points0_ply", ply(("x", "y", "id"), [1], [2], [3]), "the property z is missing"),
         ("points0_ply", ply(("x", "y", "z", "id"), [np.nan], [2], [3], [4]), "a finite x"),
         ("points0_ply", ply(("x", "y", "z", "id"), [1], [2], [3], [4])[:-2], "shorter than"),

@@ -149,9 +149,9 @@ BROKEN = {
     "centre": ("Orientation-0.jpg.xml", "<Centre>-1.5 ", "<Centre>", "Centre has 2 numbers"),
     "kind": ("AutoCal_cam.xml", "ModPhgrStd", "ModUnif", "ModUnif: unknown key 'P1'"),
     "F": ("AutoCal_cam.xml", "<F>4", "<F>-4", "F and SzIm must be positive"),
-    "no F": ("AutoCal_cam.xml", "F>", "G>", "F is missing; a calibration of MicMac"),
+    "no F": ("AutoCal_cam.xml", "F>", "G>", "F is missing; expected a calibration of MicMac"),
     "NaN": ("AutoCal_cam.xml", "<P1>", "<P1>x", "P1 is 'x"),
-    "size": ("AutoCal_cam.xml", "6000 4000", "6000", "SzIm has 1 numbers; 2"),
+    "size": ("AutoCal_cam.xml", "6000 4000", "6000", "SzIm has 1 numbers; expected 2"),
     "entity": ("AutoCal_cam.xml", "<ExportAPERO>", "<!DOCTYPE x [<!ENTITY a 'b'>]><ExportAPERO>",
                "entities"),
 }  # fmt: skip
@@ -256,7 +256,7 @@ def test_unified_distortions(tmp_path, kind):
 
 
 @pytest.mark.parametrize("given, said", [
-    (("eModeleRadFour7x2", [0.0], [1.0]), "eModeleRadFour7x2 is not supported; one of eModelePoly"),
+    (("eModeleRadFour7x2", [0.0], [1.0]), "RadFour7x2 is not supported; expected one of eMo"),
     (("eModeleEbner", [0.0], []), "eModeleEbner needs 1 Etats, but has 0"),
     (("eModelePolyDeg2", [0.0], [-1.0, 0.0, 0.0]), "the first of Etats must be positive"),
     (("eModele_FishEye_10_5_5", [1.0] * 25, [1.0]), "only the first 24 Params are supported"),

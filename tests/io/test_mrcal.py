@@ -126,7 +126,7 @@ def test_a_folder_there_and_back(tmp_path):
 
 
 BROKEN = {
-    "text": ("{", "[", "a dictionary of Python"), "code": ("[ 1, 2 ]", "f(1)", "a dictionary"),
+    "text": ("{", "[", "expected a Python dictionary"), "code": ("[ 1, 2 ]", "f(1)", "Python dict"),
     "name": ("_PINHOLE", "_SPLINED_STEREOGRAPHIC_order=2_Nx=30_Ny=20_fov_x_deg=170",
              "SPLINED_STEREOGRAPHIC_order=2.* is not offered here; these are: PINHOLE"),
     "knots": ("_PINHOLE", "_SPLINED_STEREOGRAPHIC_order=3_Nx=2_Ny=20_fov_x_deg=170", "4 to 40 kn"),

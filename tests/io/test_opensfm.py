@@ -153,12 +153,12 @@ def test_shots_of_a_camera_that_none_comes_near_are_left_out(tmp_path):
 
 
 BROKEN = {
-    "object": (lambda s: s[1].update(shots=[1] * 9), "shots is .*; an object"),
+    "object": (lambda s: s[1].update(shots=[1] * 9), "shots is .*; expected an object"),
     "camera": (lambda s: s[1]["shots"]["b.jpg"].update(camera="x"), "camera 'x' is not among"),
     "kind": (lambda s: s[1]["cameras"]["v2 cam 1.5"].update(projection_type="x"), "_type is x"),
     "focal": (lambda s: s[1]["cameras"]["v2 cam 1.5"].pop("focal_x"), "1.5'?, focal_x is missing|"
               "focal_x is missing"),
-    "width": (lambda s: s[1]["cameras"]["v2 cam 1.5"].update(width=0), "width is 0; a whole"),
+    "width": (lambda s: s[1]["cameras"]["v2 cam 1.5"].update(width=0), "width is 0; expected a"),
     "rotation": (lambda s: s[1]["shots"]["b.jpg"].update(rotation=[1, 2]), "b.jpg'?: rotation is"),
     "NaN": (lambda s: s[1]["points"]["3"].update(coordinates=[0, 1, None]), "points '3': coord"),
     "empty": (lambda s: s.clear(), "no reconstruction"),

@@ -52,9 +52,9 @@ def test_the_objects_are_the_network(objects):
 
 def test_other_objects_and_a_machine_without_opensfm(objects, monkeypatch):
     _, reconstruction, tracks = objects
-    with pytest.raises(InputError, match="an opensfm.types.Reconstruction is expected, not int"):
+    with pytest.raises(InputError, match="expected an opensfm.types.Reconstruction, got int"):
         jaxbundle.from_opensfm(3)
-    with pytest.raises(InputError, match="an opensfm.pymap.TracksManager is expected, not dict"):
+    with pytest.raises(InputError, match="expected an opensfm.pymap.TracksManager, got dict"):
         jaxbundle.from_opensfm(reconstruction, {})
     with pytest.raises(InputError, match="^reconstruction.*there are no shots"):
         reconstruction.shots = {}

@@ -251,12 +251,12 @@ def test_sigma0_of_a_real_export():
 BROKEN = {
     "title": ("Bundle Soln test\n", "", "tolerance|values|number"),
     "photograph": ("  1 e:\\photos\\b", "  x e:\\photos\\b", "number of a photograph is 'x'"),
-    "order": ("  1 1.6 ", "  2 1.6 ", "orientation of photograph 1 is expected, not of 2"),
+    "order": ("  1 1.6 ", "  2 1.6 ", "orientation of photograph 1, not of 2"),
     "NaN": ("-1.5 -0.2 4.0", "-1.5 nan 4.0", "line 7: Y is 'nan'"),
     "format": (" 6.4 3.6 ", " 0.0 3.6 ", "format .* must be positive"),
     "unknown photo": ("\n 2 12 ", "\n 7 12 ", "photograph 7 does not exist; there are 3, 0 to 2"),
     "short ray": (" 0.10000 0.10000\n", "\n", "2 values where 4 are expected"),
-    "id": ("\n 1 ", "\n one ", "is 'one'; a whole number"),
+    "id": ("\n 1 ", "\n one ", "is 'one'; expected a whole number"),
 }
 
 

@@ -54,7 +54,7 @@ def test_an_adjustment_goes_with_its_solution_and_a_setting_frees_parameters(con
 
 
 def test_what_is_no_reconstruction_or_has_no_images():
-    with pytest.raises(InputError, match="a pycolmap.Reconstruction is expected, not int"):
+    with pytest.raises(InputError, match="expected a pycolmap.Reconstruction, got int"):
         jaxbundle.from_pycolmap(3)
     with pytest.raises(InputError, match="^reconstruction: the model has no images"):
         jaxbundle.from_pycolmap(pycolmap.Reconstruction())

@@ -156,7 +156,7 @@ def test_both_directions(tmp_path, name):
         ("xcr:PosePrior=", "xcr:LensTwist=", "may change the geometry"),
         (f'"{F}"', '"-3"', "above 0"),
         (f'"{F}"', '"x"', "a finite number"),
-        ("<xcr:Rotation>", "<xcr:Rotation>1 ", "has 10 numbers; 9"),
+        ("<xcr:Rotation>", "<xcr:Rotation>1 ", "has 10 numbers; expected 9"),
         ("</x:xmpmeta>", "", "not valid XML"),
     ],
 )

@@ -107,7 +107,7 @@ BROKEN = {
     "focal": (
         lambda d: [d.pop(name) for name in ("fl_x", "fl_y")], "fl_x and camera_angle_x are missing"
     ),
-    "width": (lambda d: d.update(w=12.5), "w is 12.5; a whole number"),
+    "width": (lambda d: d.update(w=12.5), "w is 12.5; expected a whole number"),
     "matrix": (lambda d: d["frames"][1].update(transform_matrix=[[1, 2]]), r"s\[1\]: transform"),
     "mirror": (
         lambda d: d["frames"][1].update(transform_matrix=(-np.eye(4)).tolist()), "that mirrors"

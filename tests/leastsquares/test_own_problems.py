@@ -214,6 +214,26 @@ def test_tables_that_share_a_block_and_an_observation_of_the_first_and_last():
     np.testing.assert_allclose(found, x, atol=1e-9)
 
 
+def test_an_angle_of_180_degrees_is_named():
+    """Its sine is the root of a square, which has no derivative where the points are in line."""
+
+    def residual(a, at, b, measured):
+        u, v = a - at, b - at
+        sine = jnp.sqrt(jnp.sum(jnp.cross(u, v) ** 2))
+        return jnp.arctan2(sine, u @ v) - measured
+
+    X = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    angle = ls.Kind("angle", residual, of=("point",) * 3)
+    place = ls.Kind("place", lambda x, measured: x - measured, of=("point",))
+    observations = [angle(([0], [1], [2]), np.array([np.pi])), place((np.arange(3),), X)]
+    result = ls.adjust([ls.Table("point", X)], observations)
+    assert not result.converged
+    name = "no finite residual or derivative of: angle of point 1 and point 2 and point 3"
+    assert str(result).endswith(name)
+    with pytest.raises(NotSolvedError, match=name):
+        result["point"]
+
+
 def line(n=12):
     """Numbers on a line y = a + b·t of one row [2], exact."""
     t = np.linspace(-1, 1, n)

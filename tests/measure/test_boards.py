@@ -134,7 +134,7 @@ def test_dictionaries_are_those_of_opencv():
 def test_an_unknown_dictionary_is_refused_before_any_photograph(make):
     with pytest.raises(InputError, match="no dictionary 'DICT_.*DICT_4X4_50, .*_APRILTAG_36h11"):
         make("9X9")
-    with pytest.raises(InputError, match="charuco:8: COLUMNSxROWS is expected"):
+    with pytest.raises(InputError, match="charuco:8: expected COLUMNSxROWS"):
         check_kind("charuco:8")
     with pytest.raises(InputError, match="ring12:codes"):
         check_kind("ring12:8")
@@ -147,7 +147,7 @@ def test_an_unknown_dictionary_is_refused_before_any_photograph(make):
 ])  # fmt: skip
 def test_the_commands_list_the_dictionaries(command, run):
     told = command(*run, "--board", "9x6", "--square", 0.03, "--dictionary", "dict_4x4_60")
-    assert told.status == 2 and "--dictionary 'dict_4x4_60': one of DICT_4X4_50, " in told.err
+    assert told.status == 2 and "'dict_4x4_60': expected one of DICT_4X4_50, " in told.err
     assert "did you mean 'DICT_4X4_50'" in told.err
 
 

@@ -260,10 +260,10 @@ def test_unknown_settings_are_refused(flight):
 
 @pytest.mark.parametrize("setting, message", [
     ("antenna.fre=shift", "unknown key 'fre'; did you mean 'free'"),
-    ("antenna.sigma=3", "sigma is 3.0; a table of names and numbers"),
+    ("antenna.sigma=3", "sigma is 3.0; expected a table of names and numbers"),
     ("antenna.free=3", "unknown 3.0"),
     ("antenna.sigma.shift=abc", "sigma of shift must be a positive number, but is 'abc'"),
-    ("antenna.lever_arm=abc", "lever_arm is 'abc'; 3 numbers are expected"),
+    ("antenna.lever_arm=abc", "lever_arm is 'abc'; expected 3 numbers"),
     ("rolling_shutter.line_time=1e-5", "given, but no table velocities"),
 ])  # fmt: skip
 def test_settings_that_cannot_be_end_in_a_line(flight, tmp_path, setting, message):

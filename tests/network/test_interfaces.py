@@ -264,7 +264,7 @@ def test_the_error_of_a_held_index_has_no_unit(dived):
 
 def test_what_does_not_go_together_is_named(dived):
     network = dived.network
-    with pytest.raises(InputError, match="a dome port beside the flat port of"):
+    with pytest.raises(InputError, match="a dome port, but a flat port in"):
         with_interfaces(network, FLAT, DOME)
     with pytest.raises(InputError, match="two interfaces before one camera"):
         with_interfaces(network, FLAT, FLAT | {"interface": "other"})

@@ -253,11 +253,11 @@ def test_jacobians(simulated):
 
 
 @pytest.mark.parametrize("section, message", [
-    ({"mounting": 3}, "for each camera what is known"),
+    ({"mounting": 3}, "what is known of the mounting of each camera"),
     ({"mounting": {"right": {}}}, r"\[rig.mounting.right\]: give position, angles, or both"),
     ({"mounting": {"right": {"positon": [1, 2, 3]}}}, "unknown key 'positon'"),
-    ({"mounting": {"right": {"position": [1, 2]}}}, "3 numbers are expected"),
-    ({"mounting": {"right": GIVEN | {"sigma_angle": 0}}}, "a positive number or three"),
+    ({"mounting": {"right": {"position": [1, 2]}}}, "expected 3 numbers"),
+    ({"mounting": {"right": GIVEN | {"sigma_angle": 0}}}, "a positive number, or three"),
     ({"mounting": {"right": {"angles": [0, 0, 0], "sigma_position": 1}}}, "without position"),
     ({"mounting": {"right": GIVEN | {"covariance": [[0] * 6] * 6}}}, "positive definite"),
     ({"mounting": {"right": GIVEN | {"covariance": np.eye(6).tolist(), "sigma_angle": 1}}},
@@ -270,7 +270,7 @@ def test_jacobians(simulated):
     ({"bases": [{"cameras": ["left", "right"], "length": -1, "sigma": 1}]}, "length"),
     ({"bases": [{"cameras": ["left", "right"], "length": 1}]}, "sigma"),
     ({"bases": [{"cameras": ["left", "middle"], "length": 1, "sigma": 1}]}, "no rig has a camera"),
-    ({"bases": 1}, "a list is expected"),
+    ({"bases": 1}, "expected a list"),
 ])  # fmt: skip
 def test_what_is_wrong_is_named(simulated, section, message):
     with pytest.raises(InputError, match=message):

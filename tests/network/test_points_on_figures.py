@@ -233,8 +233,8 @@ def test_a_project_keeps_them(simulated, tmp_path):
     ("figures", {"radius": 2.0}, "row 1: a plane has no radius"),
     ("figures", {"figure": "the line"}, "'the line' is a line here, but a plane"),
     ("shapes", {"x": None}, "row 1: x is missing"),
-    ("angles", {"at": "1"}, "row 1: 3 different points"),
-    ("differences", {"sdZ": None}, "row 1: a difference dX, dY or dZ with its σ"),
+    ("angles", {"at": "1"}, "row 1: expected 3 different points"),
+    ("differences", {"sdZ": None}, "row 1: expected a difference dX, dY or dZ with its σ"),
 ])  # fmt: skip
 def test_what_is_wrong_is_named(simulated, table, row, message):
     given = tables(SIGMA) | {

@@ -247,7 +247,7 @@ def test_neighbours_tell_velocities(flown, result):
 def test_free_parameters_are_a_list(flown):
     """Not a word, of which every letter would be one."""
     xy = flown[0].network.observations.xy
-    with pytest.raises(InputError, match=r"\[rolling_shutter\]: free is 'vX'; a list of names is"):
+    with pytest.raises(InputError, match=r"\[rolling_shutter\]: free is 'vX'; expected a list"):
         moving(flown[0].network, xy, free="vX")
 
 
@@ -255,7 +255,7 @@ def test_neighbours_need_times(flown, tmp_path):
     made, _ = flown
     with pytest.raises(InputError, match="row 1: t, the time of exposure, is missing"):
         moving(made.network, made.network.observations.xy, neighbours=NEIGHBOURS)
-    with pytest.raises(InputError, match="σ of velocities and turns are expected"):
+    with pytest.raises(InputError, match="expected the σ of velocities and turns"):
         moving(made.network, made.network.observations.xy, neighbours=3)
     network = with_neighbours(made.network, made.network.observations.xy)
     again = jaxbundle.read_network(jaxbundle.write_project(network, tmp_path / "timed"))
@@ -271,7 +271,7 @@ def test_the_line_is_needed(flown):
         jaxbundle.make_problem(network.replace(cameras=(camera,)))
     for given, said in ("fast", "'fast'"), ({"cam": True}, "True"):
         network = moving(made.network, made.network.observations.xy, line_time=given)
-        with pytest.raises(InputError, match=f"line_time is {said}; a number is expected"):
+        with pytest.raises(InputError, match=f"line_time is {said}; expected a number"):
             jaxbundle.make_problem(network)
     with pytest.raises(InputError, match=r"\[rolling_shutter\]: line_time is missing"):
         make_further({"velocities": {"image": ["IMG 1"]}}, 1.0)

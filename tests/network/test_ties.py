@@ -179,7 +179,7 @@ def test_a_sigma_of_the_difference_lets_it_move():
 @pytest.mark.parametrize("table, message", [
     (rows("c") | {"other": ["rigth"]}, "camera 'rigth' is unknown; did you mean 'right'"),
     (rows("k1"), "camera 'left' has no 'k1'; did you mean 'K1'"),
-    (rows("c") | {"other": ["left"]}, "two different cameras are expected"),
+    (rows("c") | {"other": ["left"]}, "expected two different cameras"),
     (rows("x0"), "x0 is free in neither 'left' nor 'right'"),
     (rows("c", sigma=[-1.0]), "sigma is -1; it must be positive"),
 ])  # fmt: skip

@@ -52,7 +52,7 @@ def test_photographs_of_any_size_but_what_cannot_be_decoded(tmp_path):
         return path
 
     assert photograph_size(head(20_000, 10_000)) == (20_000, 10_000)
-    with pytest.raises(InputError, match="40000 × 40000 pixels; at most .* make it smaller"):
+    with pytest.raises(InputError, match="40000 × 40000 pixels; at most .* reduce the image"):
         photograph_size(head(40_000, 40_000))
 
 

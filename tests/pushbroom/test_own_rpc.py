@@ -101,7 +101,7 @@ def test_corrections_that_the_rpc_choose_are_asked_for(tmp_path, uncorrected):
     with pytest.raises(InputError, match="give one of them"):
         read_scanner(path)
     path.write_text('[scanner]\nsource = "image.xml"\ncorrections = "none"\n')
-    with pytest.raises(InputError, match='"auto" is expected'):
+    with pytest.raises(InputError, match='expected "auto"'):
         read_scanner(path)
 
 

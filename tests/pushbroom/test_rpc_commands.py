@@ -49,6 +49,26 @@ def test_a_table_is_fitted(tmp_path, run):
     assert check.largest.max() < 1e-3
 
 
+def test_a_table_of_locate_is_fitted(tmp_path, run):
+    """Its columns, with pixels for samples; rows without a point are skipped. Of one height only,
+    which its intersections reach to rounding, it is refused."""
+    given = table_of(RPC)
+    names = ("line", "pixel", "X", "Y", "Z", "longitude", "latitude", "height", "status")
+    rows = [
+        [line, sample, 1.0, 2.0, 3.0, *np.degrees([east, north]), height, "found"]
+        for east, north, height, line, sample in zip(*given)
+    ]
+    write_csv(tmp_path / "located.csv", names, [*rows, [0, 0, *[""] * 6, "misses the surface"]])
+    status, out, err = run("fit", tmp_path / "located.csv", "--out", tmp_path / "a.RPB")
+    assert status == 0 and "no point (1 rows are skipped)" in err
+    assert check_rpc(read_rpc(tmp_path / "a.RPB"), table_of(RPC, (5, 4, 3))).largest.max() < 1e-3
+    level = [[*row[:7], 100 + 1e-9 * k, "found"] for k, row in enumerate(rows)]
+    write_csv(tmp_path / "level.csv", names, level)
+    status, _, err = run("fit", tmp_path / "level.csv", "--out", tmp_path / "b.RPB")
+    assert status == 2 and "level.csv: every height is 100; give points at several heights" in err
+    assert not (tmp_path / "b.RPB").exists()
+
+
 def test_a_scanner_is_fitted_as_well_as_its_wobble_allows(tmp_path, run):
     """Its attitude sways by 1e-4 at 0.7 Hz: more than a pixel that no cubic can follow; this is
     reported."""

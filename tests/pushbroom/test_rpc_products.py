@@ -132,7 +132,7 @@ REFUSED = {
     "no inverse": ("a.xml", dimap(RPC, inverse="Other"), ["Inverse_Model is missing"]),
     "few": (
         "a.xml", digitalglobe(RPC).replace("<LINENUMCOEF>", "<LINENUMCOEF>1 "),
-        ["LINENUMCOEF has 21 numbers; 20"],
+        ["LINENUMCOEF has 21 numbers; expected 20"],
     ),
     "RPC00A": ("a.xml", digitalglobe(RPC).replace("RPC00B", "RPC00A"), ["SPECID", "RPC00A"]),
     "format A": (

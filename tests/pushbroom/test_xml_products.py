@@ -158,7 +158,7 @@ def test_worldview_as_text(tmp_path):
         for word in words:
             assert word in str(refused.value), refused.value
     (tmp_path / "image.GEO").unlink()
-    with pytest.raises(InputError, match="image.GEO is not beside it"):
+    with pytest.raises(InputError, match="image.GEO is not next to it"):
         read_scanner(tmp_path / "image.IMD")
 
 

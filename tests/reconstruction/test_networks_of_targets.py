@@ -97,7 +97,7 @@ def test_targets_match_by_their_names():
 def test_what_targets_alone_need():
     with pytest.raises(InputError, match="features none: .* give targets"):
         ReconstructionSettings(natural_points=False)
-    with pytest.raises(InputError, match="ring-coded targets are expected"):
+    with pytest.raises(InputError, match="expected ring-coded targets"):
         ReconstructionSettings(targets="aruco", uncoded=True)
 
 

@@ -67,7 +67,7 @@ def test_tables_with_and_without_measurements(tmp_path):
 
 @pytest.mark.parametrize("text, said", [
     ("", "the file is empty"),
-    ("EPSG:4326\n15 48 200 1 a.jpg\n", "line 2: X Y Z u v photograph"),
+    ("EPSG:4326\n15 48 200 1 a.jpg\n", "line 2: expected X Y Z u v photograph"),
     ("EPSG:32633\n1 2 3 4 5 a.jpg P\n1 2 9 4 5 b.jpg P\n", "line 3: point P has other"),
     ("EPSG:32633\n", "no control points"),
     ("id,X,Y,Z,image,u,v\nP,1,2,x,a.jpg,1,2\n", "line 2: z is 'x'"),

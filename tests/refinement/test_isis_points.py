@@ -196,7 +196,7 @@ def test_residuals_of_jigsaw_are_measurements(scene, folder):
     (GOOD, "CONTROLNETWORK is not closed"), (GOOD.split("Group")[0], "is not closed"),
     (GOOD.replace("Constrained", "Loose") + "End_Object\nEnd\n", "PointType 'Loose'"),
     (GOOD.replace("AprioriX =", "Apriori =") + "End_Object\nEnd\n", "without AprioriX"),
-    (GOOD.replace("<meters>", "<degrees>") + "End_Object\nEnd\n", "meters are expected"),
+    (GOOD.replace("<meters>", "<degrees>") + "End_Object\nEnd\n", "expected meters"),
     (GOOD.replace("(1.0, 0.0", "(-1.0, 0.0") + "End_Object\nEnd\n", "negative eigenvalue"),
     (GOOD.replace("(1.0, 0.0", "(0.0, 0.0") + "End_Object\nEnd\n", "no error in one direction"),
     (GOOD.replace("End_Group", "") + "End_Object\nEnd\n", "END_OBJECT without a beginning"),

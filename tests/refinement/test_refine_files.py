@@ -165,7 +165,7 @@ WRONG = [
     ("observations", 7, "image", "B", r"line 9: image 'B' is unknown"),
     ("observations", 7, "point", "P6", r"line 9: point 'P6' in image 'A' is measured twice"),
     ("observations", 7, "line", "x", r"line 9: line is 'x'"),
-    ("points", 2, "role", "gcp", r"line 4: role 'gcp'; one of control, tie, check"),
+    ("points", 2, "role", "gcp", r"line 4: role 'gcp'; expected one of control, tie, check"),
     ("points", 2, "id", "P1", r"line 4: point 'P1' occurs twice"),
     ("points", 2, "height", "", r"line 4: control point 'P2' needs all coordinates"),
     ("points", 2, "latitude", 95.0, r"line 4: latitude 95 is beyond the pole"),
@@ -183,7 +183,7 @@ def test_wrong_cells_are_told_with_file_and_row(folder, name, row, column, value
 
 @pytest.mark.parametrize("old,new,message", [
     ('attitude = "free"', 'atitude = "free"', "did you mean 'attitude'"),
-    ('attitude = "free"', 'attitude = "loose"', "'loose'; \"free\", \"held\" or a prior"),
+    ('attitude = "free"', 'attitude = "loose"', "'loose'; expected \"free\", \"held\" or a prior"),
     ('attitude = "free"', "attitude = [1, 2]", "one value or three"),
     ("knot_spacing = 0.25", "knot_spacing = 0", "must be positive"),
     ('"baarda"', '"barda"', "did you mean 'baarda'"),
@@ -247,5 +247,5 @@ def test_refined_images_as_model_states(folder):
     stated = float(told[0].split("up to ")[1].split(" m")[0]) if told else 3e-3
     assert off < 1.5 * stated + 1e-6
     (folder / "refine.toml").write_text(TEXT.replace("[images]", "csm_states = 1\n[images]"))
-    with pytest.raises(InputError, match="csm_states is 1; true or false"):
+    with pytest.raises(InputError, match="csm_states is 1; expected true or false"):
         read_refinement(folder / "refine.toml")

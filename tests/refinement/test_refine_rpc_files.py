@@ -129,15 +129,15 @@ def test_the_command_writes_compensated_coefficients(folder, scene):
 
 
 @pytest.mark.parametrize("old,new,message", [
-    ("bias_degree = 1", "bias_degree = 3", "bias_degree is 3; 0, 1 or 2 is expected"),
-    ("bias = [6.0, 0.8]", "bias = [1, 2, 3]", "bias is .*; one σ, or two"),
+    ("bias_degree = 1", "bias_degree = 3", "bias_degree is 3; expected 0, 1 or 2"),
+    ("bias = [6.0, 0.8]", "bias = [1, 2, 3]", "bias is .*; expected one σ, or two"),
     ("bias = [6.0, 0.8]", 'bias = "stated"', "b.RPB states no error|a.tif states no error"),
-    ("bias = [6.0, 0.8]", 'bias = "vague"', "'vague'; \"free\", \"held\" or a prior"),
+    ("bias = [6.0, 0.8]", 'bias = "vague"', "'vague'; expected \"free\", \"held\" or a prior"),
     ("[unknowns]", '[unknowns.A]\nattitude = "free"\n[unknowns]',
      r"\[unknowns.A\]: attitude is no unknown of an image with RPC, which has bias_degree, bias"),
     ("[unknowns]", '[models]\nA = "rigorous"\n[unknowns]', "A = \"rigorous\": .*a.tif has"),
     ("[unknowns]", '[models]\nA = "rcp"\n[unknowns]', "'rcp'.*rpc"),
-    ("dem_sigma = 300.0", "", "dem_sigma is missing; the σ of a height of dem.tif"),
+    ("dem_sigma = 300.0", "", "dem_sigma is missing; expected the σ of a height of dem.tif"),
     ("dem_sigma = 300.0", "dem_sigma = 0.0", "dem_sigma is 0; expected metres above 0"),
     ('dem = "dem.tif"', "", "dem_sigma: needs a terrain model; give dem"),
     ("dem_sigma = 300.0", 'dem_sigma = 300.0\nrpc_format = "xml"', "rpc_format 'xml'"),
@@ -168,7 +168,7 @@ def test_files_that_do_not_fit_are_named(folder, monkeypatch, capsys):
         path.write_bytes(function(before))
         return {path: before}
 
-    told(["c_RPC.TXT, line", "NAME: value is expected"],
+    told(["c_RPC.TXT, line", "expected NAME: value"],
          damage("c_RPC.TXT", lambda b: b[: len(b) // 2]))
     told(["b.RPB", "coefficients"], damage("b.RPB", lambda b: b[: len(b) - 300]))
     exchanged = b"image,point,pixel,line"

@@ -102,7 +102,7 @@ def test_lonely_and_weak_points_go(plane):
     # A point has no eight neighbours among eight: nothing is said of its distance from the others.
     assert len(drop_isolated(plane.take(np.arange(8)))) == 8
     without = dataclasses.replace(plane, covariance=np.full_like(plane.covariance, np.nan))
-    with pytest.raises(InputError, match="the cloud has no σ: columns sX, sY, sZ"):
+    with pytest.raises(InputError, match="the cloud has no σ: expected columns sX, sY, sZ"):
         drop_weak(without, 0.06)
     assert len(drop_weak(without, least_rays=3)) == (plane.rays > 2).sum()
 

@@ -17,7 +17,7 @@ from jaxbundle.surfaces.reconstruct import find_bounds, reconstruct_surface
 from jaxbundle.surfaces.rectification import RectifiedPair, rectify
 from jaxbundle.surfaces.subpixel_matching import refine
 from jaxbundle.surfaces.views import FrameView, is_inside, line_of_sight, steps_on_plane
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 NONE = np.zeros((0, 3))
 
@@ -230,13 +230,13 @@ def test_dense_matching_finds_most_pixels_with_honest_sigma(pair):
 def test_rectified_points_are_where_they_are(pair):
     views, truth, _ = pair
     X = truth[0][::16, ::16].reshape(-1, 3)
-    found, span = present(rectify(*views, X))
+    found, span = not_none(rectify(*views, X))
     place, d = found.places(X), found.disparity(X)
     assert (d > 0).all() and (d < span).all()
     np.testing.assert_allclose(found.points(place, d), X, atol=1e-9)
     # the same point is as bright in both rectified images, on one row
     row, column = np.rint(place[:, 1]).astype(int), np.rint(place[:, 0]).astype(int)
-    assert present(rectify(*views[::-1], X))[0].base == found.base
+    assert not_none(rectify(*views[::-1], X))[0].base == found.base
     assert np.isfinite(found.left[row, column]).all()
     # and only what the photograph shows, up to half a pixel from the centres of those at its edge
     rows, columns = found.left.shape

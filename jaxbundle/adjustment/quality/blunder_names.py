@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.leastsquares.quality import robust, snooping
 from jaxbundle.network.blunders import Removed, Suspect, either_of
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 
 def name_removed(problem: NetworkProblem, found: snooping.RemovedRow) -> Removed:
@@ -15,7 +15,7 @@ def name_removed(problem: NetworkProblem, found: snooping.RemovedRow) -> Removed
     names = [_name(problem, found.set, row, found.residual) for row in found.rows]
     # Control points lose single axes: their rows count axes, three a point.
     if kind == "control":
-        rows = tuple(3 * row + present(found.residual) for row in rows)
+        rows = tuple(3 * row + not_none(found.residual) for row in rows)
     return Removed(kind, rows[0], either_of(names), found.test, rows[1:])
 
 
@@ -61,7 +61,7 @@ def _name(problem: NetworkProblem, name: str, row: int, residual: int | None) ->
         image = network.images.id[problem.image[place]]
         return f"point {points[problem.point[place]]} in image {image}"
     if kind == "control":
-        return f"{'XYZ'[present(residual)]} of control point {points[given.rows[0][row]]}"
+        return f"{'XYZ'[not_none(residual)]} of control point {points[given.rows[0][row]]}"
     if kind == "distance":
         a, b = (points[int(p)] for p in network.distances.points[place])
         return f"distance {a}–{b}"

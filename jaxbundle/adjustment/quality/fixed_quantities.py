@@ -53,8 +53,8 @@ def find_causes(problem: NetworkProblem, values: Values, held: Mapping[Any, Any]
     positive."""
     if not isinstance(held, Mapping) or not held:
         raise InputError(
-            'held: σ of what is held, by name, are expected, such as {"camera:cam:K3": 1e-6}; '
-            f"not {show(held)}"
+            'held: expected σ of held quantities by name, such as {"camera:cam:K3": 1e-6}; '
+            f"got {show(held)}"
         )
     return [_cause(problem, values, name, given) for name, given in held.items()]
 
@@ -104,9 +104,7 @@ def split_name(name: Any) -> tuple[str, str, str]:
         id, _, parameter = rest.rpartition(":")
         parts = kind, id, parameter
     if not isinstance(parts, tuple) or len(parts) != 3 or not all(map(str, parts)):
-        raise InputError(
-            f"{show(name)}: KIND:ID:NAME is expected, such as camera:cam:K3 or point:*:Z"
-        )
+        raise InputError(f"{show(name)}: expected KIND:ID:NAME, such as camera:cam:K3 or point:*:Z")
     kind, id, parameter = map(str, parts)
     return kind, id, parameter
 

@@ -13,7 +13,7 @@ from jaxbundle.geometry import matrix_from_quaternion, omega_phi_kappa_near
 from jaxbundle.leastsquares.declarations import Table
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.leastsquares.spaces import PoseValue, Rotation, Space
-from jaxbundle.network.kinds.base import INSTRUMENT_ANGLES
+from jaxbundle.network.kinds.base import INSTRUMENT_ANGLES, LENGTHS
 from jaxbundle.network.kinds.interfaces import PORT
 from jaxbundle.network.kinds.rigs import MOUNTING
 from jaxbundle.network.kinds.robot_poses import ON_BASE, ON_HAND
@@ -26,15 +26,15 @@ RELATIVE = (MOUNTING, PORT, ON_HAND, ON_BASE)
 
 
 class Estimate(NamedTuple):
-    """An unknown of a row: table, row, name, value, a posteriori σ (0 if held); `angle`:
-    radians."""
+    """An unknown of a row: table, row, name, value, a posteriori σ (0 if held); `unit`: "length",
+    "angle" (radians), "image", or "" for another or none."""
 
     table: str
     row: str
     name: str
     value: float
     sigma: float
-    angle: bool = False
+    unit: str = ""
 
 
 def estimates(
@@ -51,11 +51,11 @@ def estimates(
             shown[:, :3] += origin
         variance = np.einsum("nij,njk,nik->ni", A, Q, A)
         sigma = sigma0 * np.sqrt(np.clip(variance, 0, None))
-        labels, angles = _labels(table, shown.shape[1])
+        labels, units = _names_and_units(table, shown.shape[1])
         every += [
             Estimate(table.name, table.label(row), *one)
             for row in range(table.rows)
-            for one in zip(labels, shown[row].tolist(), sigma[row].tolist(), angles)
+            for one in zip(labels, shown[row].tolist(), sigma[row].tolist(), units)
         ]
     return every
 
@@ -86,15 +86,19 @@ def _read(space: Space, value: Any, near: Float[Array, "3"]) -> Float[Array, " n
     return jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(value)])
 
 
-def _labels(table: Table, size: int) -> tuple[Sequence[str], tuple[bool, ...]]:
-    """The names of these numbers, and which of them are angles."""
+def _names_and_units(table: Table, size: int) -> tuple[Sequence[str], Sequence[str]]:
+    """The names of these numbers, and their units."""
     if isinstance(table.value, PoseValue):
-        return ("X0", "Y0", "Z0", *ANGLES), (False,) * 3 + (True,) * 3
+        return ("X0", "Y0", "Z0", *ANGLES), ("length",) * 3 + ("angle",) * 3
     if isinstance(table.space, Rotation):
-        return ANGLES, (True,) * 3
+        return ANGLES, ("angle",) * 3
     named = len(table.parameters) == size
-    labels = table.parameters if named else [str(k + 1) for k in range(size)]
-    return labels, tuple(label in INSTRUMENT_ANGLES for label in labels)
+    names = table.parameters if named else [str(k + 1) for k in range(size)]
+    if table.units:
+        return names, (table.units,) * size if isinstance(table.units, str) else table.units
+    known: dict[str, str] = dict.fromkeys(LENGTHS, "length")
+    known |= dict.fromkeys(INSTRUMENT_ANGLES, "angle")
+    return names, [known.get(name, "") for name in names]
 
 
 def _angles(q: Float[AnyArray, "4"], near: Float[AnyArray, "3"]) -> Float[Array, "3"]:

@@ -58,7 +58,7 @@ def given_points_components(
     column = np.searchsorted(chosen, point[own])
     rows = np.concatenate([rows[own], rows[own] + 1])
     number = sum(np.asarray(v).size for v in found.residuals.values())
-    # the normal of the plane is the last
+    # The normal of the plane is the last.
     axes = np.linalg.svd(X[chosen] - X[chosen].mean(0), full_matrices=True)[2]
     parts = []
     for axis in axes:

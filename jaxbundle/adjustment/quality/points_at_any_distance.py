@@ -10,7 +10,7 @@ from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.leastsquares.any_distance import is_at_infinity, shares
 from jaxbundle.leastsquares.quality.error_components import Errors
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 
 @print_in_one_screen
@@ -56,7 +56,7 @@ def find_far_points(inspection: Inspection, errors: Errors) -> FarPoints | None:
     # without unit (`any_distance.shares`). σ of the direction is an ellipse, not two axes of X, Y,
     # Z.
     X = np.asarray(coordinates(inspection.adjusted))[rows]
-    s = present(problem.lengths)[rows]
+    s = not_none(problem.lengths)[rows]
     across, along = shares(X, s)
     C = errors.covariance("point")[rows]
     ellipse = np.linalg.eigvalsh(C[:, :2, :2])[:, ::-1] * across[:, None] ** 2

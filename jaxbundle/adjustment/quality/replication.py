@@ -241,7 +241,7 @@ def random_halves(
     rng, rays = np.random.default_rng(seed), network.observations
     exposure = _exposures(network)
     if by == "runs":
-        # of each camera by itself: photographs of several may follow each other
+        # Of each camera by itself: photographs of several may follow each other.
         camera, later = network.images.camera, np.zeros(len(network.images), bool)
         for c in np.unique(camera):
             own = np.flatnonzero(camera == c)

@@ -64,7 +64,7 @@ def request_results(inspection: Inspection, errors: Errors, of: Any = WORDS) -> 
     single = isinstance(of, tuple) and len(of) == 3 and of[0] in ("camera", "image", "point")
     given = (of,) if isinstance(of, str) or single else of
     if not isinstance(given, Sequence):
-        raise InputError(f"of: names of results are expected, not {show(of)}")
+        raise InputError(f"of: expected names of results, got {show(of)}")
     # All results are one function of the values, so that one solution per held quantity (or one per
     # result, in the other direction) gives the effects on all of them.
     parts, asked, sigmas, first = [], [], [], 0

@@ -6,17 +6,20 @@ import numpy as np
 
 from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.leastsquares.quality.variance_components import VarianceGroup as Group
-from jaxbundle.network.units import ANGLE_UNITS
+from jaxbundle.network.units import unit_words
 
 
 def groups(problem: NetworkProblem) -> list[Group]:
     """Image coordinates (by camera, if several have several images), control points by axis,
     priors, distances; further kinds by name."""
     network = problem.network
+    words = unit_words(network)
+    length, angle, image = (words[kind] for kind in ("length", "angle", "image"))
     # A camera for each image has too few observations for a component of its own: one for all.
     own = np.array_equal(network.images.camera, np.arange(len(network.cameras)))
     if len(network.cameras) == 1 or own:
-        found = [Group("image coordinates", [(name, np.s_[:]) for name in problem.image_rows])]
+        parts = [(name, np.s_[:]) for name in problem.image_rows]
+        found = [Group("image coordinates", parts, *image)]
     else:
         found = [
             Group(
@@ -25,6 +28,7 @@ def groups(problem: NetworkProblem) -> list[Group]:
                     (name, np.flatnonzero(problem.camera[rows] == c))
                     for name, rows in problem.image_rows.items()
                 ],
+                *image,
             )
             for c, given in enumerate(network.cameras)
         ]
@@ -37,19 +41,18 @@ def groups(problem: NetworkProblem) -> list[Group]:
 
     # Heights of control are often of another precision than its position.
     for i, axis in enumerate("XYZ"):
-        found.append(Group(f"control points in {axis}", every("control", columns=i)))
-    angle = 1 / ANGLE_UNITS[network.angle_unit]
+        found.append(Group(f"control points in {axis}", every("control", columns=i), *length))
     found += [
-        Group("exterior orientation, position", every("exterior", columns=np.s_[:3])),
-        Group("exterior orientation, angles", every("exterior", columns=np.s_[3:]), angle),
+        Group("exterior orientation, position", every("exterior", columns=np.s_[:3]), *length),
+        Group("exterior orientation, angles", every("exterior", columns=np.s_[3:]), *angle),
         Group("interior orientation", every(*interior), np.nan),
-        Group("distances", every("distance")),
+        Group("distances", every("distance"), *length),
     ]
     # Of kinds with several units the factor has none.
-    scale, further = {"length": 1.0, "image": 1.0, "angle": angle}, {}
+    further: dict[str, tuple[list, tuple[float, str]]] = {}
     for name in problem.further_sets:
         kind = problem.observations_of(name).kind
         units = kind.units if isinstance(kind.units, str) else "several"
-        _, parts = further.setdefault(kind.name, (scale.get(units, np.nan), []))
+        parts, _ = further.setdefault(kind.name, ([], words.get(units, (np.nan, ""))))
         parts.append((name, np.s_[:]))
-    return found + [Group(name, parts, unit) for name, (unit, parts) in further.items()]
+    return found + [Group(name, parts, *unit) for name, (parts, unit) in further.items()]

@@ -95,7 +95,7 @@ def _advise_weakest(rig: "RigCalibration") -> str:
 
 def _remedy(rig: "RigCalibration", name: str) -> str:
     """What determines the mounting of a camera better."""
-    # a tie by motion divides the cameras: those on the other side of the reference depend on it
+    # A tie by motion divides the cameras: those on the other side of the reference depend on it.
     if any(name in tie.cameras[1] for tie in rig.ties):
         return (
             "rotate the rig about an axis across this direction, by larger angles, with all boards "
@@ -111,7 +111,7 @@ def _remedy(rig: "RigCalibration", name: str) -> str:
 
 
 def _direction(along: Float[np.ndarray, "3"]) -> str:
-    # the sign of an axis is arbitrary: its largest part is positive
+    # The sign of an axis is arbitrary: its largest part is positive.
     along = along * np.sign(along[np.abs(along).argmax()])
-    # no negative zeros
+    # No negative zeros.
     return f"({', '.join(f'{x + 0.0:.2f}' for x in along.round(2))})"

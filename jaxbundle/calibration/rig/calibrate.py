@@ -162,7 +162,7 @@ def _unknowns_of_clocks(
     if times is not None and not found:
         raise InputError("times: are for cameras that are not synchronised; give synchronize, too")
     if found and board_free:
-        # a similarity of the points has no action on control poses (`declare.FLOATING`)
+        # A similarity of the points has no action on control poses (`declare.FLOATING`).
         raise InputError(
             "board_free: points of a board are not free where cameras are not synchronised; "
             "expected board_sigma, or known points"
@@ -193,7 +193,7 @@ def _calibrate_cameras(
     for name, one in found.items():
         if not one.converged:
             why = one.adjustment.termination
-            raise NotSolvedError(f"not solved: camera {name} by itself: {why}")
+            raise NotSolvedError(f"not solved: camera {name} alone: {why}")
     return found
 
 
@@ -223,7 +223,7 @@ def _adjust_together(
         rig, found, held = adjust_unsynchronized(rig, max_iterations)
         left_out = without_run(rig)
     require_solved(found, connections.ties)
-    # each time from the start values: a wrong epoch may have led the adjustment far away
+    # Each time from the start values: a wrong epoch may have led the adjustment far away.
     while (bad := _contradictions(rig, found, size)) and snooping:
         why = (
             "does not fit the mounting (RMS {:.1f} px): photographs not simultaneous?"
@@ -277,15 +277,15 @@ def _contradictions(
     """Epochs of several views that do not fit, with their RMS in pixels; `size` of a pixel,
     [cameras, 2]."""
     v = rig.in_order(found.solution.residuals) * rig.sigma / size[rig.camera]
-    # views of each pose: a board by a camera
+    # Views of each pose: a board by a camera.
     number = np.zeros((len(rig.epochs), len(size), len(rig.boards)))
     board = rig.board_of_points[rig.point]
     np.add.at(number, (rig.epoch, rig.camera, board), used_rays(rig, found.problem))
     number = number.reshape(len(number), -1)
     rays = number.sum(1)
     rms = np.sqrt(np.bincount(rig.epoch, (v**2).sum(1), len(rays)) / np.maximum(rays, 1))
-    # only epochs of several views can contradict the mounting, or the relations of boards; or the
-    # motion before and after them
+    # Only epochs of several views can contradict the mounting, or the relations of boards; or the
+    # motion before and after them.
     shared = rays > 0 if rig.trajectory is not None else (number > 0).sum(1) > 1
     bad = contradicting(rms, rays > 0, shared)
     return {int(e): float(rms[e]) for e in bad}

@@ -32,7 +32,7 @@ from jaxbundle.calibration.rig.trajectory import CONTROLS, TargetMotion
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.pixel_frame import in_pixels
 from jaxbundle.leastsquares import Result, adjust
-from jaxbundle.leastsquares.datum.motions import similarity
+from jaxbundle.leastsquares.datum.motions import scale_position, similarity
 from jaxbundle.leastsquares.declarations import Kind, Motions, ObservationSet, Table
 from jaxbundle.leastsquares.problem import Problem
 from jaxbundle.leastsquares.quality.snooping import RemovedRow, snoop, without
@@ -50,17 +50,12 @@ from jaxbundle.network.kinds.distances import DISTANCES
 from jaxbundle.network.kinds.image_points import image_points
 from jaxbundle.network.kinds.mountings import BASES, MOUNTING, observe_mountings
 from jaxbundle.network.tables import EXTERIOR, Camera
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 POSES = ("epoch", "mounting")
 # The tables of poses on the way from a point to the camera: of boards that are bodies of their own,
 # and of boards on bodies.
 ON_BODIES = ("board", *POSES)
-
-
-def _scale(motion: Float[Array, "7"], mounting: PoseValue) -> PoseValue:
-    """The bases scale with the object."""
-    return mounting._replace(position=jnp.exp(motion[6]) * mounting.position)
 
 
 _OF_OBJECT = similarity(("point",), ("epoch",))
@@ -71,7 +66,9 @@ CLOCK_PRIOR = Kind(
 
 
 # A similarity of the object that also transforms poses and bases.
-FLOATING = Motions(_OF_OBJECT.names, (*_OF_OBJECT.actions, ("mounting", _scale)), _OF_OBJECT.curved)
+FLOATING = Motions(
+    _OF_OBJECT.names, (*_OF_OBJECT.actions, ("mounting", scale_position)), _OF_OBJECT.curved
+)
 
 
 def roll_of_stick(stick: Posed, given: Float[Array, "3"]) -> Array:
@@ -153,7 +150,7 @@ class Rig:
         image."""
         found = np.zeros(len(self.xy))
         for k, camera in enumerate(self.cameras):
-            own, size = self.camera == k, present(camera.image_size)
+            own, size = self.camera == k, not_none(camera.image_size)
             uv = in_pixels(self.xy[own], get_model(camera.model), size, camera.pixel_size)
             found[own] = (uv[:, 1] - (size[1] - 1) / 2) / size[1]
         return found
@@ -201,7 +198,7 @@ def declare_rig(rig: Rig) -> tuple[list[Table], list[ObservationSet]]:
     free = seen if rig.points_free else np.full(len(rig.points), rig.point_sigma is not None)
     free = np.repeat(free[:, None], 3, axis=1)
     if rig.wand is not None:
-        # the pose has the other coordinates
+        # The pose has the other coordinates.
         free[-2:] = [[False, False, False], [True, False, False]]
     names = [camera.id for camera in rig.cameras]
     tables = [
@@ -221,7 +218,7 @@ def declare_rig(rig: Rig) -> tuple[list[Table], list[ObservationSet]]:
             Table(
                 "board",
                 rig.place,
-                # the first board of a body is its frame
+                # The first board of a body is its frame.
                 free=np.array(rig.body) != np.arange(len(rig.boards)),
                 labels=rig.boards,
                 parameters=EXTERIOR,
@@ -331,10 +328,10 @@ def adjust_rig(rig: Rig, max_iterations: int = 50, **options: Any) -> Result:
 
     **Returns:** the result; not `converged` if undetermined.
     """
-    # only points that are seen carry the datum; the bases scale with them (`FLOATING`)
+    # Only points that are seen carry the datum; the bases scale with them (`FLOATING`).
     free = {"datum": {"point": np.unique(rig.point)}, "motions": FLOATING}
-    # the epochs, with six unknowns each and by far the most, are eliminated; of control poses an
-    # observation touches four
+    # The epochs, with six unknowns each and by far the most, are eliminated; of control poses an
+    # observation touches four.
     return adjust(
         *declare_rig(rig),
         eliminate="epoch" if rig.trajectory is None else None,
@@ -367,7 +364,7 @@ def snoop_rig(found: Result, test: str, significance: float, max_iterations: int
     """The result without blunders found by a test.
 
     **Raises:** `NotSolvedError` if the remaining observations do not determine a solution."""
-    # each round from the last solution: a removed blunder moves it little
+    # Each round from the last solution: a removed blunder moves it little.
     minimum = found.minimum
 
     def again(problem: Problem, values: Any) -> Solution:

@@ -27,14 +27,14 @@ def rig_errors(rig: Rig, found: Solution, settings: CorrelationSettings) -> Erro
     for table, own in rig.sets:
         row[own] = starts[table.image_set] + 2 * np.arange(len(own))
     used = used_rays(rig, found.problem)
-    # computed − measured
+    # Computed − measured.
     xy = rig.xy + rig.in_order(found.residuals) * rig.sigma
     epochs = len(rig.epochs)
     image = rig.camera * epochs + rig.epoch
     rays = ImageRows(
         row[used],
         image[used],
-        # a body moves between epochs, but its points and their errors are the same
+        # A body moves between epochs, but its points and their errors are the same.
         rig.point[used],
         rig.camera[used],
         xy[used],

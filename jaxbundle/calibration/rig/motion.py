@@ -101,7 +101,7 @@ def tie_by_motion(A: Float[np.ndarray, "n 4 4"], B: Float[np.ndarray, "n 4 4"]) 
         apart = A - X @ B @ Z
         off = np.linalg.norm(apart[:, :3, :3], axis=(1, 2))
         off = off + np.linalg.norm(apart[:, :3, 3], axis=1) / size
-        # the sum of distances instead of squares: a wrong epoch pulls no harder than a right one
+        # The sum of distances instead of squares: a wrong epoch pulls no harder than a right one.
         weight = 1 / np.maximum(off, max(float(np.median(off)), ROUNDING))
         weight = weight / weight.mean()
     mean = np.einsum("e,eij->ij", weight / weight.sum(), R)

@@ -90,7 +90,7 @@ def _to_angles(
         return frame - R @ (own + jnp.stack(block.centre)), R.T
 
     base, R = place(block)
-    # angles near the given ones, so that κ does not jump by a full turn in the derivatives
+    # Angles near the given ones, so that κ does not jump by a full turn in the derivatives.
     given = omega_phi_kappa_from_matrix(R)
 
     def change(d: Float[Array, "6"]) -> Float[Array, "6"]:

@@ -15,7 +15,7 @@ from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.geometry.rotations import omega_phi_kappa_from_matrix
 from jaxbundle.network.build import make_network
 from jaxbundle.network.tables import EXTERIOR, UNIT, Camera, Network
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 if TYPE_CHECKING:
     from jaxbundle.calibration.rig.result import RigCalibration
@@ -37,8 +37,8 @@ def network_of_views(found: "RigCalibration") -> Network | None:
         np.array([np.asarray(matrix_from_quaternion(q)) for q in rows.rotation])
         for rows in (mounting, pose)
     )
-    # the rig has its points relative to the centroid of the board
-    away = present(rig.centroids)[0]
+    # The rig has its points relative to the centroid of the board.
+    away = not_none(rig.centroids)[0]
     position = [away + pose.position[e] + M[e].T @ mounting.position[k] for k, e in views]
     angles = [np.asarray(omega_phi_kappa_from_matrix(R[k] @ M[e])) for k, e in views]
     ids = [f"{found.names[k]} {rig.epochs[e]}" for k, e in views]

@@ -25,7 +25,7 @@ from jaxbundle.cameras.pixel_frame import in_model_units, in_pixels
 from jaxbundle.geometry import matrix_from_rotation_vector, quaternion_from_matrix
 from jaxbundle.leastsquares import Pose, PoseValue
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray, present
+from jaxbundle.types import AnyArray, not_none
 
 if TYPE_CHECKING:
     from jaxbundle.calibration.rig.result import RigCalibration
@@ -110,7 +110,7 @@ def next_view(
     if given.trajectory is not None or not alone or camera not in rig.mountings:
         return None
     seen = np.bincount(given.board_of_points[given.point], minlength=len(given.boards))
-    # one board, or the trials would be multiplied: that with most image points
+    # One board, or the trials would be multiplied: that with most image points.
     board = max(alone, key=lambda b: seen[b])
     points = rig.values("point")[given.board_of_points == board]
     poses, facts = _places(rig, camera, settings)
@@ -129,7 +129,7 @@ def next_view(
     own = starts[names.index(camera)] + np.arange(3)
     before = float(np.sqrt(np.linalg.eigvalsh(C[np.ix_(own, own)])[-1]))
     best = None
-    # seen by this camera alone, the unknown pose takes all that it says on the mounting
+    # Seen by this camera alone, the unknown pose takes all that it says on the mounting.
     for n in np.flatnonzero(there[names.index(camera)] & (there.sum(0) > 1)):
         after = _sigma_with(C, J[n], J_pose[n], own)
         if best is None or after < best.after:
@@ -152,7 +152,7 @@ def _sigma_with(
     own: np.ndarray,
 ) -> float:
     """σ of the base in its weakest direction with one more photograph of all cameras."""
-    # by factors of QR: J_pᵀ·J_p would square the condition of a small board far away
+    # By factors of QR: J_pᵀ·J_p would square the condition of a small board far away.
     Q, _ = np.linalg.qr(J_pose)
     A = J - Q @ (Q.T @ J)
     AC = A @ C
@@ -176,12 +176,12 @@ def _whitened(
     mounting = jax.tree.map(lambda x: x[k], rig.values("mounting"))
     p = np.array(list(given.parameters.values()))
     xy, J, along = map(np.asarray, _images(model, p, mounting, poses, points))
-    size = np.array(present(given.image_size))
+    size = np.array(not_none(given.image_size))
     uv = in_pixels(xy, model, given.image_size, given.pixel_size)
     inside = ((uv > 0) & (uv < size - 1)).all(-1) & (along < 0) & np.isfinite(J).all((-2, -1))
     there = inside.mean(1) >= settings.min_part
     own = rig.rig.camera == k
-    # a posteriori, as C is
+    # A posteriori, as C is.
     sigma = rig.sigma0 * np.median(rig.rig.sigma[own], axis=0)
     J = np.where((inside & there[:, None])[..., None, None], J / sigma[:, None], 0.0)
     J = J.reshape(len(J), -1, J.shape[-1])
@@ -200,7 +200,7 @@ def _places(
     with pixel, distance, tilt, roll and the matrix; distances are those of the epochs."""
     random = np.random.default_rng(settings.seed)
     given, n = rig.camera(camera), settings.number
-    model, size = get_model(given.model), np.array(present(given.image_size))
+    model, size = get_model(given.model), np.array(not_none(given.image_size))
     p = tuple(given.parameters.values())
     uv = random.uniform(0.15, 0.85, (n, 2)) * size
     xy = in_model_units(uv, model, given.image_size, given.pixel_size)
@@ -211,7 +211,7 @@ def _places(
     distance = random.uniform(nearest, farthest, n)
     tilt, roll = random.uniform(0, settings.max_tilt, n), random.uniform(0, 180, n)
     axis = random.uniform(0, 2 * np.pi, n)
-    # the printed side is that which the cameras have seen: +z of the board towards them, or −z
+    # The printed side is that which the cameras have seen: +z of the board towards them, or −z.
     faces = np.sign(np.median(_normals(rig)))
     at = rig.mountings[camera]
     found = []
@@ -220,7 +220,7 @@ def _places(
         R = np.asarray(matrix_from_rotation_vector(turn))
         R = R @ np.asarray(matrix_from_rotation_vector(np.radians(roll[k]) * np.eye(3)[2]))
         R = R @ np.diag([1.0, faces, faces])
-        # board to camera, then to the reference camera: Y = Rᵀ·x + b
+        # Board to camera, then to the reference camera: Y = Rᵀ·x + b.
         R, t = at.rotation.T @ R, at.rotation.T @ (distance[k] * rays[k]) + at.base
         found.append((-R.T @ t, np.asarray(quaternion_from_matrix(R)), transformation(R, t)))
     position, rotation, pose = (np.array(column) for column in zip(*found))

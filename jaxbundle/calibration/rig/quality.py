@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbundle.adjustment.quality.projection_uncertainty import interior_covariance_of_images
+from jaxbundle.arguments import one_of
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.quality import GRID, Coverage, UncertaintyMap, coverage, grid_of
 from jaxbundle.cameras import CameraModel, get_model, image_ray, project
@@ -29,7 +30,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.leastsquares import Pose, PoseValue
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray, Scalar, present
+from jaxbundle.types import AnyArray, Scalar, not_none
 
 if TYPE_CHECKING:
     from jaxbundle.calibration.rig.result import RigCalibration
@@ -79,15 +80,14 @@ def rig_uncertainty(
 
     **Raises:** `InputError` for an invalid camera, frame or distance.
     """
-    if frame not in FRAMES:
-        raise InputError(f"frame {frame!r}: {', '.join(FRAMES)}")
+    one_of("frame", frame, FRAMES)
     if not distance > 0:
-        raise InputError(f"distance {distance:g}: a positive distance is expected")
+        raise InputError(f"distance {distance:g}: expected a positive distance")
     k = _index(rig, name)
     given, space = rig.camera(name), rig.result.problem.table(rig.rig.row_of(k)[0]).vector
     model = get_model(given.model)
     p = np.array(list(given.parameters.values()))
-    uv = grid_of(present(given.image_size), *grid)
+    uv = grid_of(not_none(given.image_size), *grid)
     xy = in_model_units(uv.reshape(-1, 2), model, given.image_size, given.pixel_size)
     C = rig.covariance(name)
     if frame == "rig":
@@ -112,7 +112,7 @@ def rig_points(rig: "RigCalibration", name: str) -> Float[np.ndarray, "n 2"]:
 
 def rig_coverage(rig: "RigCalibration", name: str) -> Coverage:
     """Coverage of the image of a camera by points of the rig."""
-    return coverage(rig_points(rig, name), present(rig.camera(name).image_size))
+    return coverage(rig_points(rig, name), not_none(rig.camera(name).image_size))
 
 
 def _index(rig: "RigCalibration", name: str) -> int:

@@ -61,7 +61,7 @@ def rig_text(rig: "RigCalibration") -> str:
             *paragraph(f"{said.capitalize()}. Uncertainty of a projected point (σ, pixels):"),
         ]
         lines += table(MAPS_HEADER, map_rows(rig.reported_maps(name), unit), "lrr")
-    # residuals with |τ| above 3 are listed: one in 370 without blunders
+    # Residuals with |τ| above 3 are listed: one in 370 without blunders.
     lines += observations.residuals(rig, 3.0, "pope")
     lines += [*observations.redundancy(rig), *observations.removals(rig)]
     return "\n".join(line.rstrip() for line in lines) + "\n"

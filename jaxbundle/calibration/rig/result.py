@@ -41,7 +41,7 @@ from jaxbundle.network.kinds.continuous_time import CLOCK
 from jaxbundle.network.tables import Camera, Network, units_of
 from jaxbundle.results import TableMethods
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray, present
+from jaxbundle.types import AnyArray, not_none
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -182,7 +182,7 @@ class RigCalibration(TableMethods):
 
     def _photograph(self, camera: int, epoch: int) -> str:
         name = self.rig.epochs[epoch]
-        # of cameras that are not synchronised an epoch is a photograph, and named with its camera
+        # Of cameras that are not synchronised an epoch is a photograph, and named with its camera.
         return name if self.rig.trajectory is not None else f"{self.names[camera]} {name}"
 
     @property
@@ -192,7 +192,7 @@ class RigCalibration(TableMethods):
         rows_of = {table.image_set: rows for table, rows in rig.sets}
         for item in self.result.removed:
             if item.set == "control":
-                axis = present(item.residual)  # coordinates are tested individually
+                axis = not_none(item.residual)  # coordinates are tested individually
                 name = f"{'XYZ'[axis]} of point {rig.ids[item.row]}"
                 found.append(Removed("control", 3 * item.row + axis, name, item.test))
                 continue
@@ -210,7 +210,7 @@ class RigCalibration(TableMethods):
     def board(self) -> Float[np.ndarray, "points 3"]:
         """Adjusted coordinates of the board, object unit; of several boards those of all, each in
         the frame of its own."""
-        return self.values("point") + present(self.rig.centroids)[self.rig.board_of_points]
+        return self.values("point") + not_none(self.rig.centroids)[self.rig.board_of_points]
 
     @functools.cached_property
     def clocks(self) -> dict[str, Clock]:
@@ -280,7 +280,7 @@ class RigCalibration(TableMethods):
         settings = [one.adjustment.correlations for one in self.cameras.values()]
         if not self.converged or any(one is None for one in settings):
             return None
-        return rig_errors(self.rig, self.result.solution, present(settings[0]))
+        return rig_errors(self.rig, self.result.solution, not_none(settings[0]))
 
     @functools.cached_property
     def errors(self) -> Errors:
@@ -308,8 +308,8 @@ class RigCalibration(TableMethods):
             for start, width, (k, table, row) in zip(starts, widths, places):
                 rows["mounting"][start : start + POSE, k] = np.eye(POSE)
                 rows[table][start + POSE : start + width, row] = np.eye(width - POSE)
-            # unit rows for the wanted unknowns: only these columns of the cofactor matrix are
-            # computed
+            # Unit rows for the wanted unknowns: only these columns of the cofactor matrix are
+            # computed.
             errors = self._independent if classical else self.errors
             self._covariances[key] = errors.propagate_rows(rows)
         return self._covariances[key]
@@ -339,7 +339,7 @@ class RigCalibration(TableMethods):
         their own."""
         if self.rig.place is None:
             return {}
-        centroids = present(self.rig.centroids)
+        centroids = not_none(self.rig.centroids)
         covariance, values = self.errors.covariance("board"), self.values("board")
         return {
             name: placement_of(
@@ -437,7 +437,7 @@ class RigCalibration(TableMethods):
 
     def plot_coverage(self, name: str, ax: "Axes | None" = None) -> "Axes":
         """Coverage of the image of a camera by points of the rig; matplotlib axes."""
-        size = present(self.camera(name).image_size)
+        size = not_none(self.camera(name).image_size)
         return plotting.coverage_map(self.coverage(name), rig_points(self, name), size, name, ax)
 
     def plot_uncertainty(
@@ -445,7 +445,7 @@ class RigCalibration(TableMethods):
     ) -> "Axes":
         """σ of a projected point over the image of a camera; matplotlib axes."""
         found = self.uncertainty(name, distance, frame, DRAWN)
-        size = present(self.camera(name).image_size)
+        size = not_none(self.camera(name).image_size)
         return plotting.uncertainty_image(found, size, self.object_unit, name, ax)
 
     def report(self) -> str:

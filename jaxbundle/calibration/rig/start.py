@@ -22,7 +22,7 @@ from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.measure.boards import Board, BoardSet
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray, present
+from jaxbundle.types import AnyArray, not_none
 
 if TYPE_CHECKING:
     from jaxbundle.calibration.rig.wand_body import WandBody
@@ -185,7 +185,7 @@ def start_rig(
         all_numbers = [*numbers, len(body)]
         found = connect(of_rig, [*names, "wand"], all_numbers, [*views, *ties], given)
     if nearly is not None:
-        # relations are known now; of a motion each photograph has a time and so a pose of its own
+        # Relations are known now; of a motion each photograph has a time and so a pose of its own.
         cameras = sort_views(calibrations, boards, keys_of_photographs(calibrations))
         epochs = epochs_of(cameras)
         views = board_views(cameras, boards, epochs)
@@ -296,7 +296,7 @@ def _hold(mounting: PoseValue, cameras: Sequence[str], known: KnownMountings) ->
         if one.held[0]:
             position[k] = one.position
         if one.held[1]:
-            M = matrix_from_omega_phi_kappa(present(one.angles))
+            M = matrix_from_omega_phi_kappa(not_none(one.angles))
             rotation[k] = quaternion_from_matrix(M)
     return PoseValue(position, rotation)
 
@@ -320,7 +320,7 @@ def _rays(
     network, views = camera.calibration.adjustment.problem.network, camera.calibration.views
     rays, used = network.observations, quality.used_rays(camera.calibration.adjustment.problem)
     names = list(boards.boards)
-    # of a video every photograph is an epoch: a search of the list for each takes the square
+    # Of a video every photograph is an epoch: a search of the list for each takes the square.
     number = {key: e for e, key in enumerate(epochs)}
     at = {
         view: row_of[number[key], reference[names.index(board)]]

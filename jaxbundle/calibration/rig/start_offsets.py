@@ -69,7 +69,7 @@ def speeds_of_cameras(
         T = np.array([view.pose for view in own])
         first, last = np.arange(len(own) - 2 * h), np.arange(2 * h, len(own))
         span = t[last] - t[first]
-        # half a frame of tolerance: none is missing between
+        # Half a frame of tolerance: none is missing between.
         close = (span > 0) & (span < (2 * h + 0.5) * frame[camera])
         first, last, span = first[close], last[close], span[close]
         if not len(span):
@@ -137,7 +137,7 @@ def _offset_of_pair(
         return 0.0, -np.inf
     before, at, after = score[max(k - 1, 0)], score[k], score[min(k + 1, len(tried) - 1)]
     bend = before - 2 * at + after
-    # the vertex of the parabola through three values
+    # The vertex of the parabola through three values.
     shift = 0.5 * (before - after) / bend if bend < 0 else 0.0
     return float(tried[k] + step * np.clip(shift, -0.5, 0.5)), float(at)
 
@@ -153,7 +153,7 @@ def _scores(
 ) -> Float[np.ndarray, " offsets"]:
     """The likelihood ratio of a positive correlation at every offset of b."""
     found, least = np.zeros(len(tried)), settings.min_overlap * min(len(a.time), len(b.time))
-    # speeds over several frames are not independent
+    # Speeds over several frames are not independent.
     independent = 1 / (2 * settings.half_window)
     for k, offset in enumerate(tried):
         t = a.time - offset

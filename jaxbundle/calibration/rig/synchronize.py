@@ -49,7 +49,7 @@ from jaxbundle.network.kinds.continuous_time import (
     TRAJECTORY,
 )
 from jaxbundle.network.kinds.mountings import MOUNTING
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 Times = Mapping[str, Mapping[str, float]]
 
@@ -64,15 +64,15 @@ class SynchronizationSettings:
       as 30), quartz clocks agree to 1e-4.
     - `least_frames`: between knots, at least. With fewer the spline could follow the errors of
       single photographs.
-    - `undersmoothing`: knots are so many times closer than the photographs of single cameras ask
-      for by Akaike's criterion, where errors of the spline are as large as those of a pose: they
-      decrease with the fourth power, and are then small beside σ.
+    - `undersmoothing`: how many times closer the knots are than the photographs of single cameras
+      require by Akaike's criterion, where errors of the spline are as large as those of a pose:
+      they decrease with the fourth power, and are then small beside σ.
     - `max_move`: in parts of the distance of knots, by which the clocks may move instants between
       knots until they are assigned to them anew; the cubic beyond its knot is off by a third power
       of it.
     - `max_rounds` of this.
-    - `min_frames_known`: an offset whose σ times three is beyond so many frames is not determined:
-      photographs could as well be paired with the next ones.
+    - `min_frames_known`: an offset for which 3σ is more than this number of frames is not
+      determined: photographs could as well be paired with the next ones.
     - `offsets`: see `OffsetSettings`.
     """
 
@@ -108,7 +108,7 @@ def start_unsynchronized(
     bodies_of = list(dict.fromkeys(boards.body.values()))
     body = [bodies_of.index(name) for name in boards.body.values()]
     speeds = speeds_of_cameras(views, time, body, frame, settings.offsets)
-    # without a significant correlation from zero: `_undetermined` says what remains open
+    # Without a significant correlation from zero: `_undetermined` says what remains open.
     offset = np.nan_to_num(start_offsets(speeds, frame, settings.offsets))
     clocks = _start_clocks(calibrations, times, offset, frame, estimated, settings)
     rig, connections = start_rig(
@@ -144,8 +144,8 @@ def with_trajectory(rig: Rig, trajectory: TargetMotion, pose: PoseValue, spacing
     clocks = trajectory.clocks
     common = clocks.common(trajectory.camera, trajectory.time)
     body = _body_of_rows(rig)
-    # an interval without photographs leaves control poses open; 1.5 frames: if knots are closer
-    # than frames, runs still end only where a frame is missing
+    # An interval without photographs leaves control poses open; 1.5 frames: if knots are closer
+    # than frames, runs still end only where a frame is missing.
     runs, run = plan_runs(body, common, spacing, max(spacing, 1.5 * trajectory.frame))
     if not runs:
         raise InputError(
@@ -165,7 +165,7 @@ def with_trajectory(rig: Rig, trajectory: TargetMotion, pose: PoseValue, spacing
 def without_run(rig: Rig) -> list[tuple[str, str]]:
     """The epochs that are in no run of photographs, and why they are not used."""
     why = "too few photographs before and after it for a motion"
-    return [(rig.epochs[row], why) for row in np.flatnonzero(present(rig.trajectory).run < 0)]
+    return [(rig.epochs[row], why) for row in np.flatnonzero(not_none(rig.trajectory).run < 0)]
 
 
 def _body_of_rows(rig: Rig) -> Int[np.ndarray, " rows"]:
@@ -200,12 +200,12 @@ def _start_clocks(
     settings: SynchronizationSettings,
 ) -> Clocks:
     own = [np.array([*times[name].values()]) for name in calibrations]
-    # about the first photograph, offset and rate would correlate by √3/2
+    # About the first photograph, offset and rate would correlate by √3/2.
     middle = np.array([(t.min() + t.max()) / 2 for t in own])
     free = np.array([[name in estimated for name in CLOCK_PARAMETERS]] * len(own))
-    # the clock of the reference is the common one, but it may have a rolling shutter, too
+    # The clock of the reference is the common one, but it may have a rolling shutter, too.
     free[0, [CLOCK_PARAMETERS.index(OFFSET), CLOCK_PARAMETERS.index(RATE)]] = False
-    # an offset is within the recording, a frame is read out before the next one
+    # An offset is within the recording, a frame is read out before the next one.
     duration = max(float(np.ptp(t)) for t in own)
     ones = np.ones(len(own))
     prior = np.stack([duration * ones, settings.rate_sigma * ones, frame], 1)
@@ -256,7 +256,7 @@ def _knots(
         ends = np.flatnonzero(np.diff(t) > 1.5 * frame) + 1
         whole = zip(np.split(t, ends), np.split(places.reshape(len(t), 9), ends))
         parts += [(a, b) for a, b in whole if len(a) >= 4 * CONTROLS]
-    # half steps of the logarithm, from two frames to a second
+    # Half steps of the logarithm, from two frames to a second.
     tried = frame * 2 ** np.arange(1, np.log2(max(1 / frame, 4)) + 0.5, 0.5)
     score = [sum(_aic(t, x, spacing) for t, x in parts) for spacing in tried]
     return float(tried[int(np.argmin(score))]) if parts else float(tried[0])
@@ -269,14 +269,14 @@ def _aic(t: Float[np.ndarray, " n"], x: Float[np.ndarray, "n 9"], spacing: float
     intervals = max(round((t[-1] - t[0]) / spacing), 1)
     step = (t[-1] - t[0]) / intervals
     knots = t[0] + step * np.arange(-3, intervals + 4)
-    # rounding may put the last photograph beyond the last knot, where the basis ends
+    # Rounding may put the last photograph beyond the last knot, where the basis ends.
     inner = np.clip(t, knots[3], knots[-4] - 1e-9 * step)
     A = BSpline.design_matrix(inner, knots, 3).toarray()
     n, p = A.shape
     if n < p + 3:
         return np.inf
     left = x - A @ np.linalg.lstsq(A, x, rcond=None)[0]
-    # coordinates without any error have no logarithm
+    # Coordinates without any error have no logarithm.
     variance = np.maximum((left**2).mean(0), 1e-300)
     return float((n * np.log(variance) + 2 * p * n / (n - p - 1)).sum())
 
@@ -288,16 +288,16 @@ def adjust_unsynchronized(
 
     First with the clocks held: iterations would walk along a valley if the motion left them open.
     The rig is that with knots by its final clocks."""
-    start = present(rig.trajectory).clocks
+    start = not_none(rig.trajectory).clocks
     none = dataclasses.replace(start, free=np.zeros_like(start.free))
     rig, found = _adjust_until_assigned(_with_clocks(rig, none), settings, max_iterations)
     if not found.converged:
         return rig, found, {}
     rig = _with_clocks(_started_at(rig, found), start)
-    # one iteration for its normal equations alone: its values are not used
+    # One iteration for its normal equations alone: its values are not used.
     probe = adjust_rig(rig, 1)
     at = Solution(probe.problem, probe.problem.data.start)
-    held = _undetermined(rig, at, present(rig.trajectory).sigma0 ** 2, settings)
+    held = _undetermined(rig, at, not_none(rig.trajectory).sigma0 ** 2, settings)
     while True:
         rig = _hold(rig, held, start)
         rig, found = _adjust_until_assigned(rig, settings, max_iterations)
@@ -311,7 +311,7 @@ def adjust_unsynchronized(
 
 def _with_clocks(rig: Rig, clocks: Clocks) -> Rig:
     return dataclasses.replace(
-        rig, trajectory=dataclasses.replace(present(rig.trajectory), clocks=clocks)
+        rig, trajectory=dataclasses.replace(not_none(rig.trajectory), clocks=clocks)
     )
 
 
@@ -319,7 +319,7 @@ def _started_at(rig: Rig, found: Result) -> Rig:
     """The rig with the poses and mountings of a solution as start values."""
     values = found.minimum.values
     trajectory = dataclasses.replace(
-        present(rig.trajectory), poses=jax.tree.map(np.asarray, values[TRAJECTORY])
+        not_none(rig.trajectory), poses=jax.tree.map(np.asarray, values[TRAJECTORY])
     )
     return dataclasses.replace(
         rig,
@@ -331,14 +331,14 @@ def _started_at(rig: Rig, found: Result) -> Rig:
 
 def _hold(rig: Rig, held: Mapping[str, Mapping[str, str]], start: Clocks) -> Rig:
     """The rig with these unknowns of clocks held at their start values."""
-    clocks = present(rig.trajectory).clocks
+    clocks = not_none(rig.trajectory).clocks
     free, value = clocks.free.copy(), clocks.value.copy()
     for k, camera in enumerate(rig.cameras):
         for unknown in held.get(camera.id, {}):
             j = CLOCK_PARAMETERS.index(unknown)
             free[k, j], value[k, j] = False, start.value[k, j]
     clocks = dataclasses.replace(clocks, free=free, value=value)
-    return _planned_again(rig, dataclasses.replace(present(rig.trajectory), clocks=clocks))
+    return _planned_again(rig, dataclasses.replace(not_none(rig.trajectory), clocks=clocks))
 
 
 def _adjust_until_assigned(
@@ -347,14 +347,14 @@ def _adjust_until_assigned(
     """Adjusted until every instant is in its interval of knots."""
     for left in reversed(range(settings.max_rounds)):
         found = adjust_rig(rig, max_iterations)
-        trajectory = present(rig.trajectory)
+        trajectory = not_none(rig.trajectory)
         values = found.minimum.values
         new = trajectory.with_clocks(np.asarray(values[CLOCK]))
         common = [one.clocks.common(one.camera, one.time) for one in (new, trajectory)]
         spacing = min(run.spacing for run in trajectory.runs)
         if np.abs(common[0] - common[1]).max() < settings.max_move * spacing:
             break
-        # control poses belong to the knots they were found with: the last rig keeps these
+        # Control poses belong to the knots they were found with: the last rig keeps these.
         if left == 0 or not np.isfinite(common[0]).all():
             break
         rig = _planned_again(dataclasses.replace(rig, pose=rig.poses(values)), new)
@@ -363,7 +363,7 @@ def _adjust_until_assigned(
 
 def _planned_again(rig: Rig, trajectory: TargetMotion) -> Rig:
     """The rig with knots by other clocks."""
-    # not that of the runs: one of few photographs has wider knots, which are no rule for others
+    # Not that of the runs: one of few photographs has wider knots, which are no rule for others.
     return with_trajectory(rig, trajectory, rig.pose, trajectory.spacing)
 
 
@@ -372,7 +372,7 @@ def _undetermined(
 ) -> dict[str, dict[str, str]]:
     """By camera and unknown of its clock, why the motion does not determine it; `variance` of unit
     weight."""
-    trajectory, held = present(rig.trajectory), {}
+    trajectory, held = not_none(rig.trajectory), {}
     clocks = trajectory.clocks
     for k, camera in enumerate(rig.cameras):
         own = trajectory.camera == k
@@ -380,7 +380,7 @@ def _undetermined(
             continue
         half = float(np.ptp(trajectory.time[own])) / 2
         frame = float(np.median(np.diff(np.unique(trajectory.time[own]))))
-        # the effect of each unknown on the time of a photograph, at most
+        # The effect of each unknown on the time of a photograph, at most.
         effect = np.array([1.0, half, 0.5])
         C = variance * _clock_and_mounting(at, k)
         sigma = np.sqrt(np.clip(np.diagonal(C)[:3], 0, None)) * effect
@@ -415,7 +415,7 @@ def clocks_of(
     held: Mapping[str, Mapping[str, str]],
 ) -> dict[str, Clock]:
     """The clocks of all cameras, by their names."""
-    trajectory, found = present(rig.trajectory), {}
+    trajectory, found = not_none(rig.trajectory), {}
     for k, camera in enumerate(rig.cameras):
         step = np.diff(np.unique(trajectory.time[trajectory.camera == k]))
         offset, rate, read_out = value[k].tolist()

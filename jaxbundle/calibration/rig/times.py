@@ -51,7 +51,7 @@ def _of_camera(camera: str, photographs: list[str], given: Any) -> dict[str, flo
     if isinstance(given, Mapping):
         found = {}
         for photograph in photographs:
-            # tables of frames have names of files, photographs may have folders before theirs
+            # Tables of frames have names of files, photographs may have folders before theirs.
             key = photograph if photograph in given else Path(photograph).name
             if key not in given:
                 known = did_you_mean(key, [str(k) for k in given])
@@ -63,8 +63,8 @@ def _of_camera(camera: str, photographs: list[str], given: Any) -> dict[str, flo
         if not (good and 0 < given < np.inf):
             raise InputError(f"times of camera {camera!r}: got {show(given)}; {HOW}")
         found = {name: _number(camera, name) / float(given) for name in photographs}
-    # two poses of one target at one instant contradict each other: IMG_7 beside copies of it, or
-    # numbers that begin again in another folder
+    # Two poses of one target at one instant contradict each other: IMG_7 beside copies of it, or
+    # numbers that begin again in another folder.
     seconds, count = np.unique([*found.values()], return_counts=True)
     if (count > 1).any():
         at = float(seconds[count > 1][0])

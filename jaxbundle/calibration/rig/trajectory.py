@@ -101,9 +101,9 @@ class TargetMotion:
         fields = [(r.first, r.start, r.spacing, r.intervals) for r in self.runs]
         first, start, spacing, size = np.array(fields).T[:, number]
         common = self.clocks.common(camera, time, line)
-        # before the first knot and behind the last one the cubic of the outer interval goes on
+        # Before the first knot and behind the last one the cubic of the outer interval goes on.
         k = np.clip(np.floor((common - start) / spacing), 0, size - 1)
-        # by its own clock: offset, rate and read-out are added where they are unknowns
+        # By its own clock: offset, rate and read-out are added where they are unknowns.
         since = time - (start + k * spacing)
         instant = Instant(since, time - self.clocks.middle[camera], line, 1 / spacing)
         return (first + k).astype(int), instant
@@ -127,7 +127,7 @@ def _view_poses(controls: PoseValue, u: Float[AnyArray, " n"]) -> PoseValue:
     def one(four: PoseValue, u: Scalar) -> PoseValue:
         posed = [Pose().prepare(jax.tree.map(lambda x, k=k: x[k], four)) for k in range(CONTROLS)]
         place = lambda X: jnp.stack(place_on_spline(posed, u, X))
-        # by the function of the observations: a second formula could disagree with it
+        # By the function of the observations: a second formula could disagree with it.
         t = place((0.0, 0.0, 0.0))
         axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
         M = jnp.stack([place(axis) - t for axis in axes], 1)
@@ -154,7 +154,7 @@ def plan_runs(
         ends = np.flatnonzero(np.diff(common[rows]) > gap) + 1
         for part in np.split(rows, ends):
             t = common[part]
-            # photographs of two cameras at one time are one pose
+            # Photographs of two cameras at one time are one pose.
             different = 1 + int((np.diff(t) > gap / 100).sum())
             if different < 2 * CONTROLS:
                 continue
@@ -183,7 +183,7 @@ def control_poses(
     for number, one in enumerate(runs):
         rows = np.flatnonzero(run == number)
         rows = rows[np.argsort(common[rows], kind="stable")]
-        # control j is that of most weight at knot j − 1: 2/3 there, 1/6 for each neighbour
+        # Control j is that of most weight at knot j − 1: 2/3 there, 1/6 for each neighbour.
         at = one.start + one.spacing * (np.arange(one.controls) - 1)
         at = np.clip(at, common[rows[0]], common[rows[-1]])
         k = np.clip(np.searchsorted(common[rows], at, side="right") - 1, 0, len(rows) - 2)

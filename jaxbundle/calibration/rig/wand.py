@@ -210,7 +210,7 @@ def calibrate_wand(
     if sigma_image is not None:
         positive("sigma_image", sigma_image)
     if not isinstance(markers, Mapping) or len(markers) < 2:
-        raise InputError("markers: those of two cameras at least are expected, by their names")
+        raise InputError("markers: expected those of two cameras at least, by their names")
     for name in markers:
         if name not in cameras:
             raise InputError(
@@ -241,7 +241,7 @@ def calibrate_wand(
         result = adjust(declare(marks)[0], **options)
         said += [f"σ of markers in images: {factor:.2f} times what the noise says, by residuals"]
     longest = max(pairs.values())
-    # nobody waves a wand of ten metres; in millimetres it would be one of a centimetre at least
+    # Nobody waves a wand of ten metres; in millimetres it would be one of a centimetre at least.
     if object_unit == "m" and longest > 10:
         said += [f"the wand is {longest:g} m long: is this in mm? Lengths and σ are of one unit"]
     scale = sigma_length / float(np.sqrt(np.sum(np.square([*pairs.values()]))))
@@ -256,7 +256,7 @@ def _residuals_over_sigma(result: Adjustment, cameras: Collection[str]) -> float
     ratio, r = (table["v"] / table["sigma"])[rows], table["r"][rows]
     taken = np.isfinite(ratio) & (r > 0)
     size = float(np.sqrt((ratio[taken] ** 2).sum() / max(r[taken].sum(), 1.0)))
-    # exact images leave nothing
+    # Exact images leave nothing.
     return size if size > 0 else 1.0
 
 
@@ -318,7 +318,7 @@ def _pairs(
     """The known lengths by their markers."""
     names = sorted({mark.marker for own in marks.values() for mark in own} - {""})
     if not isinstance(lengths, Mapping):
-        # the markers of a wand of two need no names
+        # The markers of a wand of two need no names.
         names = names or ["A", "B"]
         if len(names) != 2:
             raise InputError(
@@ -354,8 +354,8 @@ def _network(
         for mark in own:
             point = f"{mark.frame}:{mark.marker}"
             rays[point] = rays.get(point, 0) + 1
-    # one ray and one known distance are as many observations as a point has unknowns: such a point
-    # would be met exactly, and on either of two places along its ray
+    # One ray and one known distance are as many observations as a point has unknowns: such a point
+    # would be met exactly, and on either of two places along its ray.
     seen = {point for point, number in rays.items() if number > 1}
     rows = [
         (camera, f"{frame}:{name}", x, y, *(s if np.isfinite(s) else None for s in sigma))

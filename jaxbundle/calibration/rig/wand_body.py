@@ -37,7 +37,7 @@ from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.measure.moving_blobs import BlobSettings
 from jaxbundle.network.tables import Camera
-from jaxbundle.types import Progress, present
+from jaxbundle.types import Progress, not_none
 
 BODY = "wand"
 
@@ -62,7 +62,7 @@ class Wand:
     def __post_init__(self):
         positive("sigma_length", self.sigma_length)
         if not isinstance(self.markers, Mapping) or len(self.markers) < 2:
-            raise InputError("markers: those of two cameras at least are expected, by their names")
+            raise InputError("markers: expected those of two cameras at least, by their names")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -169,7 +169,7 @@ def _ends(
     names = {name for pair in lengths for name in pair}
     for middle in names:
         of = {next(iter({*pair} - {middle})): x for pair, x in lengths.items() if middle in pair}
-        # three in a line: of the third length, if it is not given, the other two are the parts
+        # Three in a line: of the third length, if it is not given, the other two are the parts.
         if len(names) == 3 and len(lengths) == 2 and len(of) == 2:
             (one, a), (other, b) = of.items()
             found[one, other] = a + b, sigma * np.sqrt(2)
@@ -218,12 +218,12 @@ def add_wand(
         sigma=np.concatenate([rig.sigma, sigma]),
         boards=(*rig.boards, BODY),
         board=np.concatenate([rig.board_of_points, [number, number]]),
-        centroids=np.concatenate([present(rig.centroids), np.zeros((1, 3))]),
+        centroids=np.concatenate([not_none(rig.centroids), np.zeros((1, 3))]),
         place=place,
         body=(*rig.body, number),
         wand=RigWand(
             wand.length,
-            # all σ are multiplied by σ0 in the end
+            # All σ are multiplied by σ0 in the end.
             wand.sigma_length / _sigma0(calibrations),
             len(rig.epochs),
             poses[:, :3, 2],
@@ -258,7 +258,7 @@ def _in_units(
     boards."""
     uv = np.array([(mark.x, mark.y) for mark in marks])
     own = np.array([(mark.sx, mark.sy) for mark in marks])
-    # as large as the residuals of the wand's network say
+    # As large as the residuals of the wand's network say.
     sigma = np.where(np.isfinite(own), own, wand.sigma_image)
     sigma = sigma * wand.found.adjustment.sigma0 / _sigma0(calibrations)
     xy = np.empty_like(uv)

@@ -109,7 +109,7 @@ def name_three(
             f"markers of camera {camera!r} have no names (marker): only two, or three in a line, "
             "whose distances are given, can be told apart"
         )
-    # the pair that is not given, or the longest, are the ends
+    # The pair that is not given, or the longest, are the ends.
     others = [frozenset(n for n in names if n != one) for one in names]
     middle = max(range(3), key=lambda k: size.get(others[k], np.inf))
     ends = [name for name in names if name != names[middle]]
@@ -275,7 +275,7 @@ def _turns_of_pair(
         return {}
     a = np.array([one[frame] for frame in common])
     b = np.array([other[frame] for frame in common])
-    # straight pairings, and crossed ones
+    # Straight pairings, and crossed ones.
     first, second = np.concatenate([a, a]), np.concatenate([b, b[:, ::-1]])
     # Mixed, since a search with gross errors may take the first ones for good.
     mixed = np.random.default_rng(0).permutation(4 * len(common))

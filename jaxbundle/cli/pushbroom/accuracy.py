@@ -101,7 +101,7 @@ def _check_map(path: Path, table: str | None) -> None:
     if table:
         raise InputError("--map: not available with --table; omit one of them")
     if path.suffix.lower() not in (".tif", ".tiff", ".png"):
-        raise InputError(f"--map {path}: a name that ends in .tif or .png is expected")
+        raise InputError(f"--map {path}: expected a name that ends in .tif or .png")
     if not path.absolute().parent.is_dir():
         raise InputError(f"--map {path}: there is no folder {path.parent}")
 

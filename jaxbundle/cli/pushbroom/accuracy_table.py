@@ -23,7 +23,7 @@ def table_of(
             raise ValueError
     except ValueError:
         raise InputError(
-            f"--levels {levels!r}: positive numbers are expected, such as 0.01,0.1"
+            f"--levels {levels!r}: expected positive numbers, such as 0.01,0.1"
         ) from None
     given = read_flight(path)
     surface = surface_of(given.earth, height, None)

@@ -126,6 +126,6 @@ def _errors(given: list[str]) -> dict[str, float]:
             found[name] = float(value)
         except ValueError:
             raise InputError(
-                f"--error {text}: NAME=SIGMA is expected, such as {MAP_ERRORS[0]}=0.001"
+                f"--error {text}: expected NAME=SIGMA, such as {MAP_ERRORS[0]}=0.001"
             ) from None
     return found

@@ -13,5 +13,5 @@ def grid_of(grid: str) -> tuple[int, int]:
         if min(rows, columns) < 1:
             raise ValueError
     except ValueError:
-        raise InputError(f"--grid {grid!r}: two numbers are expected, such as 11x11") from None
+        raise InputError(f"--grid {grid!r}: expected two numbers, such as 11x11") from None
     return rows, columns

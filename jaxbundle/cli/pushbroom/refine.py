@@ -55,7 +55,7 @@ def refine(
     from jaxbundle.report.page import UNKNOWN, head_line
     from jaxbundle.report.page.refinement import compose_refinement
     from jaxbundle.report.refinement_verdict import conclude_refinement
-    from jaxbundle.types import present
+    from jaxbundle.types import not_none
 
     check_accept(accept, "pushbroom refine")
     file = read_refinement(input)
@@ -89,7 +89,7 @@ def refine(
         if new is not None:
             for said in describe_states(write_images(new, file, result)):
                 warn(said)
-            write_refined_orientations(new, present(out), file, result)
+            write_refined_orientations(new, not_none(out), file, result)
             rows = point_rows(result)
             write_csv(new / "points.csv", list(rows[0]), [list(row.values()) for row in rows])
             photographs = adjusted_photographs(result)

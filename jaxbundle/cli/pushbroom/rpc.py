@@ -114,7 +114,7 @@ def compensate(  # noqa: PLR0913 - the options of the command
     from jaxbundle.io.scanner.rpc import RASTERS
 
     check_accept(accept, "pushbroom rpc compensate")
-    # the tags of a raster may be replaced in place
+    # The tags of a raster may be replaced in place.
     keep_inputs([control], out=out, csv=csv, json=json)
     keep_inputs([coefficients], csv=csv, json=json, out=None if out.suffix in RASTERS else out)
     found = line_scanners.rpc.compensate(
@@ -143,6 +143,6 @@ def _heights(text: str) -> tuple[float, float]:
     # nan is not below
     if not (low < high and abs(low) != float("inf") and high != float("inf")):
         raise InputError(
-            f"--heights {text!r}: two numbers, the lower first, are expected, such as 0:3000"
+            f"--heights {text!r}: expected two numbers, the lower first, such as 0:3000"
         )
     return low, high

@@ -46,12 +46,10 @@ def read_corners(path: str | Path, board: Board, image_size: Sequence[int]) -> B
             if legend is None and not row.text.startswith(("##", "#!")):
                 legend = row.text.lstrip("#").split()
                 if not {*COLUMNS} <= {*legend}:
-                    raise row.error(
-                        f"columns {' '.join(legend)}; {', '.join(COLUMNS)} are expected"
-                    )
+                    raise row.error(f"columns {' '.join(legend)}; expected {', '.join(COLUMNS)}")
             continue
         if legend is None:
-            raise row.error("a line '# filename x y …' is expected before the first point")
+            raise row.error("expected a line '# filename x y …' before the first point")
         if len(row) != len(legend):
             raise row.error(
                 f"{len(row)} values where {len(legend)} are expected ({', '.join(legend)})"
@@ -95,7 +93,7 @@ def _point(row: TextRow, cells: dict[str, str]) -> tuple[float, float]:
     """A point; NaN if it was not found, or is ignored."""
     if NO_COORDINATE in (cells["x"], cells["y"]):
         return np.nan, np.nan
-    # the columns may stand in any order and apart: as a row of their own they get its messages
+    # The columns may stand in any order and apart: as a row of their own they get its messages.
     x, y = TextRow(row.path, row.number, f"{cells['x']} {cells['y']}").numbers(("x", "y"))
     for name in QUALITY:
         if cells.get(name, NO_COORDINATE) != NO_COORDINATE:

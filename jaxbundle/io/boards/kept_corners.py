@@ -70,11 +70,11 @@ class KeptCorners:
             state = os.stat(photograph)
         except OSError:
             return ""
-        # a name of bytes that are not UTF-8 has no text that SQLite would take
+        # A name of bytes that are not UTF-8 has no text that SQLite would take.
         path = os.fsencode(os.path.abspath(photograph)).decode(errors="backslashreplace")
         now = state.st_size, state.st_mtime_ns
         known = self._first("SELECT size, changed, content FROM photographs WHERE path = ?", path)
-        # reading thousands of photographs again would take minutes
+        # Reading thousands of photographs again would take minutes.
         if known is not None and known[:2] == now:
             return known[2]
         try:
@@ -97,7 +97,7 @@ class KeptCorners:
         columns, rows, xy, why = result
         if xy is None and isinstance(why, str):
             return why
-        # of a damaged file a cell may hold anything: the photograph is searched again
+        # Of a damaged file a cell may hold anything: the photograph is searched again.
         if isinstance(xy, bytes) and isinstance(columns, int) and isinstance(rows, int):
             if len(xy) == 16 * len(require_board(board).ids):
                 return (columns, rows), np.frombuffer(xy, "<f8").reshape(-1, 2)

@@ -47,12 +47,12 @@ def _board(path: str | Path, fields: JsonFields) -> Board:
     if fields.integer("codeOffset", 0):
         raise InputError(f"{path}: codeOffset is not 0; expected a board whose first tag is tag 0")
     if kind not in TYPES:
-        raise InputError(f"{path}: target_type {kind}: {' or '.join(TYPES)} is expected")
+        raise InputError(f"{path}: target_type {kind}: expected {' or '.join(TYPES)}")
     if kind == "aprilgrid":
         columns, rows = (fields.integer(key, least=1) for key in ("tagCols", "tagRows"))
         side, gap = fields.number("tagSize"), fields.number("tagSpacing")
         if not gap > 0:
-            raise InputError(f"{path}: tagSpacing {gap:g}: a positive part of tagSize is expected")
+            raise InputError(f"{path}: tagSpacing {gap:g}: expected a positive part of tagSize")
         return Board(columns, rows, side * (1 + gap), kind, marker=side)
     columns, rows = (fields.integer(key, least=1) for key in ("targetCols", "targetRows"))
     if kind == "circlegrid":
@@ -74,7 +74,10 @@ def write_target(board: Board, path: str | Path) -> None:
     if board.kind == "charuco":
         raise InputError(f"{path}: Kalibr has no board of kind charuco")
     if board.first_marker:
-        raise InputError(f"{path}: Kalibr's tags begin at 0, not {board.first_marker}")
+        raise InputError(
+            f"{path}: Kalibr's tags begin at 0, those of the board at {board.first_marker}; write "
+            "another format"
+        )
     if board.row_spacing not in (None, board.square) and board.kind != "chessboard":
         raise InputError(f"{path}: Kalibr has one spacing for a board of kind {board.kind}")
     if board.kind == "aprilgrid" and board.marker:

@@ -49,7 +49,7 @@ def _is_colmap_cameras(path: Path) -> bool:
 
 
 def _is_toml_cameras(path: Path) -> bool:
-    # a project and a column map are TOML with cameras too, but hold a network
+    # A project and a column map are TOML with cameras too, but hold a network.
     if not _is_toml(path) or is_column_map(path) or is_anipose(path):
         return False
     return "project" not in read_toml(path)

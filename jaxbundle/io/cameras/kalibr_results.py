@@ -86,10 +86,10 @@ def _values(
     for part in found.groups():
         words = part.replace(",", " ").split()
         if len(words) != len(names):
-            raise InputError(f"{where}: {what} has {len(words)} numbers; {len(names)} are expected")
+            raise InputError(f"{where}: {what} has {len(words)} numbers; expected {len(names)}")
         row = TextRow(Path(where), 0, " ".join(words))
         try:
             numbers.append(dict(zip(names, row.numbers(names).tolist())))
         except InputError:
-            raise InputError(f"{where}: {what}: finite numbers are expected") from None
+            raise InputError(f"{where}: {what}: expected finite numbers") from None
     return numbers[0], numbers[1]

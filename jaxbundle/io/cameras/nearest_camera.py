@@ -210,7 +210,7 @@ def _rays(
         for _ in range(settings.max_iterations):
             step = np.nan_to_num(newton(m)[0], posinf=0.0, neginf=0.0)
             m = m + step
-            # some 50 eps of an angle of about 1 rad: nothing is left but rounding
+            # Some 50 eps of an angle of about 1 rad: nothing is left but rounding.
             if np.abs(step).max() < 1e-14:
                 break
         _, miss, det = map(np.asarray, newton(m))

@@ -107,18 +107,18 @@ def find_cameras(path: Path) -> list[tuple[str, Mapping[str, Any]]]:
     head = beginning(path, 1_000_000) if path.suffix.lower() in READ_SUFFIXES else b""
     if _is_xml(head) and FILE_STORAGE not in head:
         return []
-    # every spelling of a camera has one of these
+    # Every spelling of a camera has one of these.
     if not re.search(rb"(?i)[km]\b|intrinsic|matri|mat\b|mtx|fx\b|focal_?length", head):
         return []
     if path.stat().st_size > LARGEST_FILE or is_kalibr(path):
         return []
-    # a result of ours has cameras with their covariance: `io/cameras/result_json.py` reads it
+    # A result of ours has cameras with their covariance: `io/cameras/result_json.py` reads it.
     if b'"converged"' in head and b'"termination"' in head:
         return []
     try:
         return list(cameras_within(read_document(path)))
     except InputError:
-        # a damaged file is reported by its reader
+        # A damaged file is reported by its reader.
         return [("", {})] if re.search(rb"(?i)\bcamera_?matrix\b", head) else []
 
 
@@ -142,9 +142,9 @@ def read_entries(path: Path) -> dict[str, Any]:
     **Raises:** `InputError`."""
     document = read_document(path)
     if document is None:
-        raise InputError(f"{path}: the file is empty; keys and values are expected")
+        raise InputError(f"{path}: the file is empty; expected keys and values")
     if not isinstance(document, dict):
-        raise InputError(f"{path}: an object with camera_matrix is expected")
+        raise InputError(f"{path}: expected an object with camera_matrix")
     return document
 
 
@@ -228,12 +228,12 @@ def _core(path: str | Path, found: Found) -> tuple[dict[str, float], float]:
     if "camera_matrix" not in found:
         raise InputError(f"{path}: camera_matrix is missing")
     name, value = found["camera_matrix"]
-    # as Kalibr and ROS write `intrinsics`
+    # As Kalibr and ROS write `intrinsics`.
     if "intrinsic" in name.lower() and isinstance(value, list) and len(value) == 4:
         four = matrix_of(path, name, value, None).tolist()
         return dict(zip(CORE, four)), extra
     K = matrix_of(path, name, value, (3, 3))
-    # its last column can be no principal point
+    # Its last column can be no principal point.
     if not K[:2, 2].any() and K[2, :2].all():
         # Open3D writes nine numbers column by column
         if not isinstance(value, list) or isinstance(value[0], list):
@@ -245,11 +245,11 @@ def _core(path: str | Path, found: Found) -> tuple[dict[str, float], float]:
     for row, column, wanted in ((1, 0, 0), (2, 0, 0), (2, 1, 0), (2, 2, 1)):
         if K[row, column] != wanted:
             raise InputError(
-                f"{path}: {name}[{row}][{column}] is {K[row, column]:g}; {wanted} is expected"
+                f"{path}: {name}[{row}][{column}] is {K[row, column]:g}; expected {wanted}"
             )
     core: dict[str, float] = dict(zip(CORE, map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))))
     for key in CORE:
-        # programs that write both round one of them
+        # Programs that write both round one of them.
         if key in found and abs(_number(path, found, key) - core[key]) > 1e-3:
             raise InputError(
                 f"{path}: {found[key][0]} is {found[key][1]:g}, but {name} has {core[key]:g}; "
@@ -277,7 +277,7 @@ def _mirror(path: str | Path, found: Found) -> dict[str, float]:
     name, value = found["xi"]
     values = [value] if _is_number(value) else matrix_of(path, name, value, None).tolist()
     if len(values) != 1:
-        raise InputError(f"{path}: {name} has {len(values)} values; a finite number is expected")
+        raise InputError(f"{path}: {name} has {len(values)} values; expected a finite number")
     return {"xi": float(values[0])}
 
 
@@ -288,7 +288,7 @@ def _number(path: str | Path, found: Found, kind: str, default: float | None = N
         raise InputError(f"{path}: {kind} is missing")
     name, value = found[kind]
     if not _is_number(value):
-        raise InputError(f"{path}: {name} is {show(value)}; a finite number is expected")
+        raise InputError(f"{path}: {name} is {show(value)}; expected a finite number")
     return float(value)
 
 
@@ -420,7 +420,7 @@ def _count(path: str | Path, name: str, value: object) -> int:
         return 0
     number = _whole(value)
     if number is None:
-        raise InputError(f"{path}: {name} is {show(value)}; a whole number is expected")
+        raise InputError(f"{path}: {name} is {show(value)}; expected a whole number")
     return number
 
 
@@ -492,7 +492,7 @@ def matrix_of(
         while isinstance(data, list) and data and all(isinstance(row, list) for row in data):
             data = [x for row in data for x in row]
     if not isinstance(data, list) or not all(_is_number(x) for x in data):
-        raise InputError(f"{path}: {name}: a list of finite numbers is expected")
+        raise InputError(f"{path}: {name}: expected a list of finite numbers")
     if shape is not None and (stated not in (None, shape) or len(data) != shape[0] * shape[1]):
         raise InputError(f"{path}: {name} must have {shape[0]} rows and {shape[1]} columns")
     array = np.array(data, float)

@@ -65,12 +65,12 @@ def _calibrate(
     """The camera of an entry of `cameras`; `settings`: those of its calibration, in the JSON."""
     parameters = entry["parameters"]
     row = {"id": id, "model": entry["model"]} | {n: p["value"] for n, p in parameters.items()}
-    # results of before 0.3 have the size of images with the calibration only
+    # Results of before 0.3 have the size of images with the calibration only.
     sizes = {"image_size": settings.get("image_size"), **entry}
     row |= {name: sizes[name] for name in ("image_size", "pixel_size") if sizes.get(name)}
     (camera,) = make_cameras([row], f"{path}, ")
     free = [name for name, p in parameters.items() if p["free"]]
-    # both or none: σ and correlations of one covariance
+    # Both or none: σ and correlations of one covariance.
     kind = "_correlated" if "correlations_correlated" in entry else ""
     sigma = np.array([float(parameters[name][f"sigma{kind}"]) for name in free])
     known = entry[f"correlations{kind}"]

@@ -237,7 +237,7 @@ def _scaramuzza(path: Path, fields: JsonFields) -> Camera:
     unknown.check(fields.child(AFFINE).document, Keys(AFFINE_KEYS.values()), f"{path}, {AFFINE}")
     if a[1]:
         raise InputError(
-            f"{path}: {POLYNOMIAL}.p1 is {a[1]:g}; 0 is expected: rays have no cusp on the axis"
+            f"{path}: {POLYNOMIAL}.p1 is {a[1]:g}; expected 0: rays have no cusp on the axis"
         )
     parameters = {f"a{i}": -a[i] for i in (0, 2, 3, 4)}
     parameters |= {name: fields.number(f"{AFFINE}.{key}") for name, key in AFFINE_KEYS.items()}
@@ -248,7 +248,7 @@ def orb_cameras(path: Path, fields: JsonFields, unknown: UnknownKeys) -> list[Ca
     """One camera of ORB-SLAM or two."""
     document = fields.document
     given = [str(document[k]) for k in ("Camera.type", "Camera.model") if document.get(k)]
-    # some files have the arrangement of the cameras as their type, and the lens as their model
+    # Some files have the arrangement of the cameras as their type, and the lens as their model.
     lenses = [text for text in given if text.lower() not in ARRANGEMENTS]
     text = next(iter(lenses or given), "")
     kind = re.sub(r"[\W_]+", "", text).lower() or "pinhole"
@@ -265,7 +265,7 @@ def orb_cameras(path: Path, fields: JsonFields, unknown: UnknownKeys) -> list[Ca
         raise InputError(f"{path}: Camera.fx and Camera1.fx; expected one of them")
     own = [f"{p}.{name}" for p in prefixes for name in f"{CORE} {names}".split()]
     unknown.check(document, ORB_KEYS | Keys(own), path)
-    # a dot leads into an object; these keys have dots themselves
+    # A dot leads into an object; these keys have dots themselves.
     raw = JsonFields(path, {key.replace(".", " "): value for key, value in document.items()})
     sides = [("Camera width", "Camera height"), ("Camera cols", "Camera rows")]
     size = next((s for w, h in sides if (s := _size(raw, w, h))), None)

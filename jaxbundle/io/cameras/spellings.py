@@ -148,7 +148,7 @@ def camera_entries(
     rest = []
     for name, value in entries.items():
         kind = meaning_of(name, value)
-        # what is null, or an empty list, says nothing
+        # What is null, or an empty list, says nothing.
         if value is None or value == [] or value == "":
             continue
         if kind == "distortion_coefficients" and isinstance(value, str):
@@ -187,7 +187,7 @@ def camera_entries(
 
 
 def _put(found: Found, kind: str, entry: tuple[str, Any], where: object) -> None:
-    # of several names, the first: none of them concerns rays
+    # Of several names, the first: none of them concerns rays.
     if kind != "camera_name" and kind in found and found[kind][1] != entry[1]:
         raise InputError(
             f"{where}: {found[kind][0]} and {entry[0]} are both the {kind.replace('_', ' ')}, and "

@@ -197,7 +197,7 @@ def _camera(row: JsonFields, id: str, version: tuple[int, ...]) -> dict[str, Any
     w, h = (int(_number(row, key)) for key in ("width", "height"))
     kind = row.text("type", "pinhole").lower()
     distortion = row.text("distortionType", kind).lower()
-    # since the kinds and the distortions are apart, a kind is pinhole or equidistant
+    # Since the kinds and the distortions are apart, a kind is pinhole or equidistant.
     name = distortion if kind in ("pinhole", *KINDS) else kind
     if name not in KINDS:
         raise InputError(
@@ -229,13 +229,13 @@ def _camera(row: JsonFields, id: str, version: tuple[int, ...]) -> dict[str, Any
         ratio, width = _number(row, "pixelRatio", 1.0), _number(row, "sensorWidth")
         if ratio <= 0 or width <= 0:
             raise InputError(
-                f"{row.path}: sensorWidth is {width:g}, pixelRatio {ratio:g}; positive numbers are "
-                "expected"
+                f"{row.path}: sensorWidth is {width:g}, pixelRatio {ratio:g}; expected positive "
+                "numbers"
             )
         fx = _number(row, "focalLength") / width * w
         f = np.array([fx, fx * ratio if version >= (1, 2, 5) else fx / ratio])
     if len(f) != 2 or not (f > 0).all():
-        raise InputError(f"{row.path}: the focal length is {f}; positive numbers are expected")
+        raise InputError(f"{row.path}: the focal length is {f}; expected positive numbers")
     c = _numbers(row, "principalPoint", 2) + (0 if version < (1, 2, 1) else np.array([w, h]) / 2)
     core = dict(zip(("fx", "fy", "cx", "cy"), (*f.tolist(), *c.tolist())))
     tie = {"tie": [["fx", "fy"]]} if f[0] == f[1] else {}

@@ -43,7 +43,7 @@ def write_alicevision(network: Network, path: str | Path) -> tuple[str, ...]:
         w, h = size_of(network.cameras[c], "AliceVision")
         numbers = {"viewId": str(i), "poseId": str(i), "intrinsicId": str(cameras[c])}
         views.append(numbers | {"path": id, "width": str(w), "height": str(h)})
-        # by columns
+        # By columns.
         transform = {"rotation": _texts(R[i].T.ravel()), "center": _texts(images.position[i])}
         poses.append({"poseId": str(i), "pose": {"transform": transform | {"locked": "0"}}})
     seen: list[list[dict]] = [[] for _ in points.id]
@@ -51,7 +51,7 @@ def write_alicevision(network: Network, path: str | Path) -> tuple[str, ...]:
     for i, p, xy in zip(rays.image.tolist(), rays.point.tolist(), rays.xy):
         seen[p].append({"observationId": str(i), "featureId": str(features[i]), "x": _texts(xy)})
         features[i] += 1
-    # a landmark without a colour is grey, as the program has it
+    # A landmark without a colour is grey, as the program has it.
     colours = points.colour_or_grey().tolist()
     structure = [
         {
@@ -81,7 +81,7 @@ def _intrinsic(camera: Camera, number: int) -> dict[str, Any]:
     p = check_others_zero(camera, "AliceVision", [*kinds.values()][-1])
     w, h = size_of(camera, "AliceVision")
     kind = next(k for k, names in kinds.items() if not any(p[n] for n in {*p} - {*CORE, *names}))
-    # any sensor will do: the focal length is stated in the same millimetres
+    # Any sensor will do: the focal length is stated in the same millimetres.
     sensor = w * (camera.pixel_size[0] if camera.pixel_size is not None else 1e-3)
     return {
         "intrinsicId": str(number),

@@ -80,7 +80,7 @@ def read_anipose(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     }
     unknown.check((key for key in document if key not in tables), FILE, path)
     if not tables:
-        raise InputError(f"{path}: there is no camera; [cam_0] with matrix, … is expected")
+        raise InputError(f"{path}: there is no camera; expected [cam_0] with matrix, …")
     fields = [JsonFields(f"{path}, [{key}]", table) for key, table in tables.items()]
     for one in fields:
         unknown.check(one.document, KEYS, one.path)
@@ -99,7 +99,7 @@ def _camera(id: str, fields: JsonFields) -> Camera:
         if K[row, column] != wanted:
             raise InputError(
                 f"{fields.path}: matrix has {K[row, column]:g} in row {row + 1}, column "
-                f"{column + 1}; {wanted} is expected"
+                f"{column + 1}; expected {wanted}"
             )
     if fields.get("rotation_count") not in (None, 0):
         raise InputError(
@@ -110,9 +110,7 @@ def _camera(id: str, fields: JsonFields) -> Camera:
     number = len(fields.get("distortions") or ())
     if number not in ((4,) if fisheye else LENGTHS):
         expected = "4" if fisheye else "none, 4, 5 or 8"
-        raise InputError(
-            f"{fields.path}: distortions has {number} numbers; {expected} are expected"
-        )
+        raise InputError(f"{fields.path}: distortions has {number} numbers; expected {expected}")
     values = fields.array("distortions", (number,)) if number else np.zeros(0)
     named = dict(zip(EQUI if fisheye else OPENCV, values.tolist()))
     core = dict(zip(CORE, (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))

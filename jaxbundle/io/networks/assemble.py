@@ -86,7 +86,7 @@ def assemble(
     document = apply_overrides(document, overrides, keys)
     project = dict(document["project"])
     check_project_settings(project, f"{path}: ")
-    # the tables are in radians; the unit is one of the output
+    # The tables are in radians; the unit is one of the output.
     angle_unit = project.pop("angle_unit", "rad")
     cameras = make_cameras(document["camera"], f"{path}, ")
     if points is not None and len(points):
@@ -105,7 +105,7 @@ def _without_points(cameras: Sequence[Camera], images: Columns, project: Mapping
     index = {camera.id: c for c, camera in enumerate(cameras)}
     exterior = np.stack([images.numbers(name) for name in EXTERIOR], 1)
     none = np.zeros(0, np.int64)
-    # these settings concern observations and points, of which there are none
+    # These settings concern observations and points, of which there are none.
     unused = ("sigma_image", "sigma_origin", "datum_points")
     settings = {k: v for k, v in project.items() if k not in unused}
     return Network(
@@ -154,7 +154,7 @@ def rig_network(
     M, X0 = exterior_from_cv(np.stack(R), np.stack(t))
     known = np.asarray(np.isfinite(np.concatenate([X0, M.reshape(-1, 9)], 1)).all(axis=1))
     if known.sum() < 2 and len(names) > 1:
-        # a pose relative to nothing
+        # A pose relative to nothing.
         known[:] = False
     M[~known], X0[~known] = np.nan, np.nan
     apart = [name for name, there in zip(names, known) if not there]

@@ -175,9 +175,9 @@ def _counts(path: Path, first: Sequence[bytes]) -> tuple[int, ...]:
     """The numbers of cameras, points and observations in the first line."""
     if not _are_counts(first):
         raise InputError(
-            f"{path}, line 1: three whole numbers are expected: cameras, points, observations"
+            f"{path}, line 1: expected three whole numbers: cameras, points, observations"
         )
-    # the largest size of a file is 2⁶³ − 1 bytes, a number of 19 digits
+    # The largest size of a file is 2⁶³ − 1 bytes, a number of 19 digits.
     if max(map(len, first)) > 18:
         raise InputError(
             f"{path}, line 1: {b' '.join(first)[:60].decode()}: more cameras, points, observations "
@@ -204,20 +204,20 @@ def _numbers(path: Path) -> tuple[tuple[int, ...], Float[np.ndarray, " n"]]:
             text = file.read(most + 1)
     except UNREADABLE as error:
         raise InputError(f"{path}: cannot be read: {error}") from None
-    # a file that goes on is read no further
+    # A file that goes on is read no further.
     if len(text) > most:
         raise InputError(
             f"{path}: holds more than {most} characters, too many for the {expected} numbers that "
             f"line 1 announces, in a file of {size} bytes"
         )
     try:
-        # without a list of words, which would take several times the memory of the numbers
+        # Without a list of words, which would take several times the memory of the numbers.
         numbers = parse_numbers(text.decode("ascii"))
     except ValueError:
         raise _not_a_number(path, text) from None
     if len(numbers) != expected:
         raise InputError(
-            f"{path}: {len(numbers)} numbers follow the first line; {expected} are expected "
+            f"{path}: {len(numbers)} numbers follow the first line; expected {expected} "
             f"(4 for each of {rows} observations, 9 for each of {cameras} cameras, 3 for each of "
             f"{points} points)"
         )

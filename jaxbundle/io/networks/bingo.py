@@ -76,7 +76,7 @@ def read_bingo(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     )
     ids = dict.fromkeys(rays.values["point"])
     known = {row["id"]: row for row in points}
-    # new points are only in image.dat: tie points, without start values
+    # New points are only in image.dat: tie points, without start values.
     tie = [{"id": id, "role": "tie"} for id in ids if id not in known]
     table = [*(row for row in points if row["id"] in ids), *tie]
     network = assemble(
@@ -171,7 +171,7 @@ def _geo_input(path: Path) -> tuple[dict[str, dict[str, Any]], list[dict[str, An
             cameras[camera["id"]] = camera
         elif keyword in ROLES:
             if len(row) < 2:
-                raise row.error(f"{keyword}: POINT X Y Z are expected")
+                raise row.error(f"{keyword}: expected POINT X Y Z")
             X, Y, Z = row.numbers("XYZ", 2).tolist()
             points.append(
                 {
@@ -197,7 +197,7 @@ def _geo_input(path: Path) -> tuple[dict[str, dict[str, Any]], list[dict[str, An
 def _camera(row: TextRow) -> dict[str, Any]:
     key = row.integer(1, "the key of CAPA")
     if len(row) not in (6, 9):
-        raise row.error("CAPA key CAMERA c xH yH [σc σx σy] is expected")
+        raise row.error("expected CAPA key CAMERA c xH yH [σc σx σy]")
     values = row.numbers(INTERIOR, 3, more=True).tolist()
     camera = {"id": row.words[2], "model": "bingo", **dict(zip(INTERIOR, values))}
     if key == 3:  # all three are adjusted; other keys: none

@@ -69,7 +69,7 @@ def read_bundler(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     rows = TextRows(path)
     head = rows.take(f"{HEAD!r}")
     if " ".join(head.words) != HEAD:
-        raise head.error(f"{HEAD!r} is expected; other versions are not known")
+        raise head.error(f"expected {HEAD!r}; other versions are not known")
     counts = rows.take("the numbers of cameras and points")
     cameras, points = (counts.integer(k, what) for k, what in ((0, "cameras"), (1, "points")))
     interior, R, t, places = _cameras(rows, cameras)
@@ -174,7 +174,7 @@ def _names(path: Path, number: int) -> list[str]:
     if path.is_file():
         lines = [line.split() for line in read_text(path).splitlines() if line.strip()]
         names = [words[0].removeprefix("./") for words in lines]
-        # a list of other photographs, or with one twice, names nothing
+        # A list of other photographs, or with one twice, names nothing.
         if len(names) == number and len(set(names)) == number:
             return names
     return [str(k) for k in range(number)]
@@ -208,7 +208,7 @@ def write_bundler(network: Network, path: str | Path) -> tuple[str, ...]:
         for row in ([*all_parameters(network.cameras[c]).values()], *R[i], t[i]):
             lines.append(join_numbers(row))
     key = np.zeros(len(images), int)
-    # the key of a ray is its number in the image, as that of a feature
+    # The key of a ray is its number in the image, as that of a feature.
     of_point: list[list[str]] = [[] for _ in points.id]
     for image, point, (x, y) in zip(rays.image.tolist(), rays.point.tolist(), rays.xy.tolist()):
         of_point[point].append(f"{image} {key[image]} {x!r} {y!r}")
@@ -220,7 +220,9 @@ def write_bundler(network: Network, path: str | Path) -> tuple[str, ...]:
     names = path.parent / LIST
     if not numbered:
         if any(character.isspace() for id in images.id for character in id):
-            raise InputError(f"{path.parent / LIST}: names of images cannot have blanks")
+            raise InputError(
+                f"{path.parent / LIST}: names of images cannot contain blanks; rename the images"
+            )
     content: dict[Path, Sequence[str]] = {path: lines}
     if not numbered or names.is_file():  # an existing list would name the images
         content[names] = images.id

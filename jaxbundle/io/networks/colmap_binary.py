@@ -162,7 +162,7 @@ def _points(path: Path, images: Sequence[ColmapImage]) -> ColmapPoints:
     points."""
     file = BinaryFile(path)
     rays = _track_lengths(file, file.count("points", POINT.itemsize), images)
-    # points and tracks alternate
+    # Points and tracks alternate.
     lengths = np.stack([np.full(len(rays), POINT.itemsize), 8 * rays], 1).ravel()
     is_point = np.repeat(np.arange(len(lengths)) % 2 == 0, lengths)
     data = np.frombuffer(file.data, np.uint8)[8:]
@@ -225,7 +225,7 @@ def _expected_lengths(
         return
     seen = np.concatenate([image.point for image in images])
     seen = seen[seen != NO_POINT]
-    # numbers with few gaps, as usual, are counted in a table
+    # Numbers with few gaps, as usual, are counted in a table.
     if len(seen) and seen.max() < 8 * (len(seen) + number):
         counts = np.bincount(seen)
         yield counts[counts > 0]

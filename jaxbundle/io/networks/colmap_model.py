@@ -106,7 +106,7 @@ def to_network(path: Path, model: ColmapModel, overrides: Sequence[str]) -> Netw
                 f"{image.place}: image {image.name!r} has the camera {image.camera}, which is "
                 "not in cameras"
             )
-        # of any other length, it is normalised
+        # Of any other length, it is normalised.
         if not np.any(image.q):
             raise InputError(f"{image.place}: image {image.name!r}: the quaternion is 0")
     names = [image.name for image in images]
@@ -175,7 +175,7 @@ def find_rows(ids: Int[np.ndarray, " n"], wanted: Int[np.ndarray, " m"]) -> Int[
     """The rows of numbers in a column of different ones; −1 where there is none."""
     if not len(ids) or not len(wanted):
         return np.full(len(wanted), -1)
-    # numbers with few gaps, as usual, are looked up in a table: a tenth of the time of a search
+    # Numbers with few gaps, as usual, are looked up in a table: a tenth of the time of a search.
     if ids.min() >= 0 and ids.max() < 8 * len(ids):
         table = np.full(ids.max() + 1, -1)
         table[ids] = np.arange(len(ids))
@@ -213,7 +213,7 @@ def from_network(network: Network) -> ColmapModel:
     camera_numbers = list(cameras)
     point_numbers = np.array(numbers_of(points.id), np.int64)
     made = []
-    # the rays image by image, in one pass: masks of every image would be quadratic
+    # The rays image by image, in one pass: masks of every image would be quadratic.
     order = np.argsort(rays.image, kind="stable")
     parts = np.split(order, np.searchsorted(rays.image[order], np.arange(1, len(images))))
     for i, (number, mine) in enumerate(zip(numbers_of(images.id), parts)):
@@ -242,7 +242,7 @@ def from_network(network: Network) -> ColmapModel:
 
 def numbers_of(ids: Sequence[str]) -> list[int]:
     """The ids if all are whole numbers from 1, else 1, 2, 3, …"""
-    # nine digits: COLMAP's ids have 32 bits
+    # Nine digits: COLMAP's ids have 32 bits.
     good = all(id.isascii() and id.isdigit() and len(id) < 10 and id[0] != "0" for id in ids)
     return [int(id) for id in ids] if good else list(range(1, len(ids) + 1))
 

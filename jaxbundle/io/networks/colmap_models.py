@@ -123,7 +123,7 @@ def to_colmap(camera: Camera) -> tuple[str, list[float]]:
         needed = needed - {"fx", "fy"} | {"f"}
         p["f"] = p["fx"]
     for name, names in candidates:
-        # a model of two focal lengths holds equal ones too
+        # A model of two focal lengths holds equal ones too.
         if needed <= {*names, *(("f",) if "fx" in names else ())}:
             return name, [p[key] for key in names]
     raise InputError(f"{where}: COLMAP has no thin prism (s1 to s4); convert it without them")

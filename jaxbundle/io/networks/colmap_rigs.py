@@ -85,7 +85,7 @@ def rigs_of_frames(
                     f"{frame.place}: image {image} is in frame {seen[image]} as well; expected one"
                 )
             seen[image] = frame.id
-        # images without a pose are in a frame, but not in the model
+        # Images without a pose are in a frame, but not in the model.
         images = [image for image in frame.images if image in names]
         if len(images) > 1:
             rows += [(str(frame.rig), str(frame.id), names[image]) for image in images]
@@ -108,7 +108,7 @@ class _Words:
 
     def word(self, what: str) -> str:
         if self.position >= len(self.row):
-            raise self.row.error(f"the line ends; {what} is expected")
+            raise self.row.error(f"the line ends; expected {what}")
         self.position += 1
         return self.row.words[self.position - 1]
 
@@ -129,7 +129,7 @@ def _text_rigs(path: Path) -> set[int]:
         for k in range(words.integer("NUM_SENSORS")):
             words.word("SENSOR_TYPE")
             words.integer("SENSOR_ID")
-            # the first is the reference, whose pose is that of the rig
+            # The first is the reference, whose pose is that of the rig.
             if k and words.integer("HAS_POSE"):
                 words.pose()
         words.end()
@@ -223,7 +223,7 @@ def rigs_and_frames(
     of one epoch.
     """
     R, t = cv_pose(matrices_of(network.images.angles), network.images.position)
-    # names are kept if they are numbers
+    # Names are kept if they are numbers.
     named = {
         name: rig
         for kind in network.further
@@ -313,7 +313,7 @@ def _changed(R: np.ndarray, t: np.ndarray, made_R: np.ndarray, made_t: np.ndarra
     axis = np.stack([D[:, 1, 2] - D[:, 2, 1], D[:, 2, 0] - D[:, 0, 2], D[:, 0, 1] - D[:, 1, 0]])
     turn = np.arctan2(np.linalg.norm(axis, axis=0), np.trace(D, axis1=1, axis2=2) - 1).max()
     shift = np.linalg.norm(made_t - t, axis=1).max()
-    # products of three matrices in double precision, and coordinates of 1e6
+    # Products of three matrices in double precision, and coordinates of 1e6.
     if turn <= 1e-9 and shift <= 1e-9 * max(abs(t).max(), 1.0):
         return []
     return [

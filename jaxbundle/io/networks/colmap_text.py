@@ -64,7 +64,7 @@ def read_text_cameras(path: Path) -> dict[int, Camera]:
 
 
 def _images(path: Path) -> list[ColmapImage]:
-    # comments are skipped only before heads: the line of image points may be empty
+    # Comments are skipped only before heads: the line of image points may be empty.
     rows = TextRows(path, "#", blank=True)
     heads, points = [], []
     while rows.more():
@@ -80,17 +80,17 @@ def _images(path: Path) -> list[ColmapImage]:
         points.append(
             rows.take("the image points of an image") if rows.more() else TextRow(path, 0, "")
         )
-    # all lines at once; one by one if there is a fault in any
+    # All lines at once; one by one if there is a fault in any.
     parsed = parse_lines(row.text for row in points)
     images = []
     for k, ((head, pose), row) in enumerate(zip(heads, points)):
         numbers = row.all_numbers("an image point") if parsed is None else parsed[k]
         if len(numbers) % 3:
             raise row.error(
-                f"{len(numbers)} numbers; X, Y, POINT3D_ID are expected for each image point"
+                f"{len(numbers)} numbers; expected X, Y, POINT3D_ID for each image point"
             )
         numbers = numbers.reshape(-1, 3)
-        # beyond 2⁵² floats are all whole: a number there has lost digits
+        # Beyond 2⁵² floats are all whole: a number there has lost digits.
         if (numbers[:, 2] != np.floor(numbers[:, 2])).any() or (abs(numbers) > 2**52).any():
             raise row.error("a POINT3D_ID is not a whole number")
         images.append(
@@ -140,7 +140,7 @@ def _plain_points(
         return None
     ends = np.flatnonzero(np.isnan(numbers))
     number = np.diff(ends, prepend=-1) - 1  # of every line
-    # beyond 2⁵² floats are all whole: a number there has lost digits
+    # Beyond 2⁵² floats are all whole: a number there has lost digits.
     plain = len(ends) == len(lines) and (number >= 8).all() and (number % 2 == 0).all()
     if not plain or not (np.abs(numbers) < 2**52).sum() == len(numbers) - len(ends):
         return None
@@ -148,7 +148,7 @@ def _plain_points(
     is_track = np.ones(len(numbers), bool)
     is_track[ends] = False
     is_track[first[:, None] + np.arange(8)] = False
-    # pairs of an image and the index of its image point
+    # Pairs of an image and the index of its image point.
     track, ids = numbers[is_track][::2], numbers[first]
     image = track.astype(np.int64)  # whole numbers are looked up in a table, others sorted
     if (image != track).any() or not np.isin(image, [*images]).all():
@@ -156,7 +156,7 @@ def _plain_points(
     if (ids < 0).any() or (ids % 1).any():
         return None
     ids = ids.astype(np.int64)
-    # the line of every point
+    # The line of every point.
     source = Source(str(path), np.array([number for number, _ in lines], np.int64), "line")
     check_unique(ids, source, "point")
     values = numbers[first[:, None] + np.arange(1, 7)]

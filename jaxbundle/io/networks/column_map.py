@@ -102,7 +102,7 @@ def read_column_map(
         refuse_unknown(key, ("project", "camera", "table"), f"{path}: ")
     maps, cameras = document.get("table"), document.get("camera", [])
     if not isinstance(maps, dict) or not all(isinstance(m, dict) for m in maps.values()):
-        raise InputError(f"{path}: sections [table.images] and so on are expected")
+        raise InputError(f"{path}: expected sections [table.images] and so on")
     if not isinstance(cameras, list) or not all(isinstance(c, dict) for c in cameras):
         raise InputError(f"{path}: write [[camera]] in double brackets, one for each camera")
     project = document.get("project", {})
@@ -135,7 +135,7 @@ def _read(folder: Path, where: str, entry: Mapping) -> Columns:
         refuse_unknown(key, KEYS, f"{where}: ")
     file, names = entry.get("file"), entry.get("columns")
     if not isinstance(file, str):
-        raise InputError(f"{where}: file is {show(file)}; the name of a file is expected")
+        raise InputError(f"{where}: file is {show(file)}; expected the name of a file")
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise InputError(f"{where}: columns must be a list of names")
     more = bool(names) and names[-1] == ANY_FURTHER
@@ -148,15 +148,15 @@ def _read(folder: Path, where: str, entry: Mapping) -> Columns:
         if name not in used or name in IDS:
             raise InputError(f"{where}: scale of {name!r}: no such column of numbers")
         if isinstance(factor, bool) or not isinstance(factor, int | float) or factor == 0:
-            raise InputError(f"{where}: scale of {name} is {show(factor)}; a number is expected")
+            raise InputError(f"{where}: scale of {name} is {show(factor)}; expected a number")
     skip, decimal = entry.get("skip", 0), entry.get("decimal", ".")
     if isinstance(skip, bool) or not isinstance(skip, int) or skip < 0:
-        raise InputError(f"{where}: skip is {show(skip)}; a number of lines is expected")
+        raise InputError(f"{where}: skip is {show(skip)}; expected a number of lines")
     if decimal not in (".", ","):
-        raise InputError(f'{where}: decimal is {show(decimal)}; "." or "," is expected')
+        raise InputError(f'{where}: decimal is {show(decimal)}; expected "." or ","')
     comment = entry.get("comment", "")
     if not isinstance(comment, str):
-        raise InputError(f"{where}: comment is {show(comment)}; text is expected")
+        raise InputError(f"{where}: comment is {show(comment)}; expected text")
     texts: dict[str, list[str]] = {name: [] for name in used}
     lines = []
     for row in TextRows(folder / file, comment, separator=_separator(where, entry)):
@@ -174,7 +174,7 @@ def _read(folder: Path, where: str, entry: Mapping) -> Columns:
     source = Source(str(folder / file), np.array(lines, np.int64), "line")
     columns = Columns({**texts, **{k: [v] * len(lines) for k, v in constant.items()}}, source)
     scaled = {name: columns.numbers(name) * factor for name, factor in scale.items()}
-    # a σ has no sign, even if its axis is reversed
+    # A σ has no sign, even if its axis is reversed.
     scaled = {name: abs(x) if name.startswith("s") else x for name, x in scaled.items()}
     return Columns({**columns.values, **scaled}, source)
 
@@ -192,7 +192,7 @@ def _separator(where: str, entry: Mapping) -> str | None:
         return SEPARATORS[separator]
     if not isinstance(separator, str) or len(separator) != 1:
         raise InputError(
-            f"{where}: separator is {show(separator)}; blanks, tab or one character is expected"
+            f"{where}: separator is {show(separator)}; expected blanks, tab or one character"
         )
     return separator
 

@@ -78,7 +78,7 @@ def read_control(path: str | Path) -> Points:
     ]
     if not lines:
         raise InputError(
-            f"{path}: the file is empty; rows of {', '.join(BARE_COLUMNS[:4])} are expected"
+            f"{path}: the file is empty; expected rows of {', '.join(BARE_COLUMNS[:4])}"
         )
     separator = _separator(lines[0][1])
     try:
@@ -91,7 +91,7 @@ def read_control(path: str | Path) -> Points:
     elif len(rows[0]) not in (4, 7):
         raise InputError(
             f"{path}, line {lines[0][0]}: {len(rows[0])} columns without a header; "
-            f"{', '.join(BARE_COLUMNS[:4])}, or these and {', '.join(POINT_SIGMAS)}, are expected"
+            f"expected {', '.join(BARE_COLUMNS[:4])}, or these and {', '.join(POINT_SIGMAS)}"
             f"{_split_name(rows[0], separator)}"
         )
     header = header or BARE_COLUMNS[: len(rows[0])]
@@ -103,7 +103,7 @@ def read_control(path: str | Path) -> Points:
             )
     source = Source(str(path), np.array([number for number, _ in lines]), "line")
     columns = dict(zip(header, zip(*rows))) if rows else {name: () for name in header}
-    # then a comma is the decimal sign; ids and names keep theirs
+    # Then a comma is the decimal sign; ids and names keep theirs.
     if separator != ",":
         columns = {
             name: column
@@ -142,7 +142,7 @@ def _header(path: Path, number: int, cells: list[str]) -> list[str] | None:
     """The names of the columns; None if the first line is not a header."""
     if not {"x", "y", "z"} <= {cell.lower() for cell in cells}:
         return None
-    # other programs call a σ by these names
+    # Other programs call a σ by these names.
     names = [re.sub("^(σ|sigma_?|std_?)", "s", cell.lower()) for cell in cells]
     for name, cell in zip(names, cells):
         if name not in NAMES:
@@ -172,8 +172,8 @@ def _points(table: Columns) -> Points:
     sigma = np.stack([table.numbers(name, words=words) for name in POINT_SIGMAS], 1)
     for row, axis in np.argwhere(~(sigma > 0) & ~np.isnan(sigma))[:1]:
         raise InputError(
-            f"{table.source(row)}: {POINT_SIGMAS[axis]} is {show(sigma[row, axis])}; a positive "
-            "number is expected, or nothing for a point that is held"
+            f"{table.source(row)}: {POINT_SIGMAS[axis]} is {show(sigma[row, axis])}; expected a "
+            "positive number, or nothing for a point that is held"
         )
     return Points(ids, roles, position, sigma, table.source)
 
@@ -280,12 +280,12 @@ def _transform_into_frame(
         source = _intersect(network, places)
     known = np.isfinite(source).all(1)
     source, target = source[known], target[known]
-    # seven parameters of a similarity: three points give nine coordinates
+    # Seven parameters of a similarity: three points give nine coordinates.
     transformation = similarity(source, target) if len(source) >= 3 else None
     extent = np.ptp(target, axis=0).max() if len(target) else 0.0
     if transformation is None:
         return network
-    # the median, here and below: some control points may be misnamed
+    # The median, here and below: some control points may be misnamed.
     if np.median(np.linalg.norm(source - target, axis=1)) <= settings.max_offset * extent:
         return network
     A, t = transformation

@@ -119,7 +119,7 @@ def read_csm_frame(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         centre, turn, warnings = pose_at_centre(isd)
         X0, R, names = centre[None], turn.as_matrix()[None], [path.stem]
     camera = _camera(id, isd, plane)
-    # from the body into our frame, of which the plane has the axes in the frame of the ISD
+    # From the body into our frame, of which the plane has the axes in the frame of the ISD.
     M = plane.axes @ np.swapaxes(R, 1, 2)
     source = Source(str(path), None, "photograph")
     images = image_columns(source, names, [id] * len(names), M, X0)
@@ -134,7 +134,7 @@ def _support_data(path: Path) -> tuple[JsonFields, UnknownKeys]:
     if not text.lstrip().startswith("{"):
         from jaxbundle.io.scanner.csm_state import frame_support_data_of
 
-        # a state: the name of its model, then an object
+        # A state: the name of its model, then an object.
         name, _, rest = text.lstrip().partition("\n")
         if name.strip() != MODEL:
             raise InputError(
@@ -146,8 +146,8 @@ def _support_data(path: Path) -> tuple[JsonFields, UnknownKeys]:
     isd = JsonFields(path, read_object(path, text, "an ISD"))
     if isd.get("name_model") not in (MODEL, PUSH_FRAME):
         raise InputError(
-            f"{path}: name_model is {show(isd.get('name_model'))}; {MODEL} or {PUSH_FRAME} is "
-            "expected: give the support data (ISD) of a frame or push-frame camera"
+            f"{path}: name_model is {show(isd.get('name_model'))}; expected {MODEL} or "
+            f"{PUSH_FRAME}: give the support data (ISD) of a frame or push-frame camera"
         )
     unknown.check(isd.document, KEYS, path)
     return isd, unknown
@@ -168,7 +168,7 @@ def _framelets(
     }
     for name, value in flags.items():
         if not isinstance(value, bool):
-            raise InputError(f"{isd.path}: {name} is {show(value)}; true or false is expected")
+            raise InputError(f"{isd.path}: {name} is {show(value)}; expected true or false")
     if flags["framelets_flipped"]:
         raise InputError(
             f"{isd.path}: framelets_flipped: the lines of every framelet are in reverse order, a "
@@ -185,7 +185,7 @@ def _framelets(
         raise InputError(f"{isd.path}: {lines} lines are less than a framelet of {height}")
     delay = isd.number("interframe_delay")
     if not delay > 0:
-        raise InputError(f"{isd.path}: interframe_delay is {delay:g}; seconds above 0 are expected")
+        raise InputError(f"{isd.path}: interframe_delay is {delay:g}; expected seconds above 0")
     k = np.arange(number)
     k = k[::-1] if flags["framelet_order_reversed"] else k
     first = isd.number("starting_ephemeris_time") + isd.number("exposure_duration") / 2
@@ -225,7 +225,7 @@ def _focal_plane(isd: JsonFields) -> FocalPlane:
             f"{summing[1]:g}; expected a focal length in mm, and summing above 0"
         )
     A = np.stack([along_sample[1:], along_line[1:]])
-    # parallel but for the rounding of numbers of 12 digits
+    # Parallel but for the rounding of numbers of 12 digits.
     if abs(np.linalg.det(A)) < 1e-12 * np.abs(A).max() ** 2 or not A.any():
         raise InputError(f"{isd.path}: focal2pixel_lines and focal2pixel_samples are dependent")
     to_mm = np.linalg.inv(A) * summing
@@ -248,11 +248,11 @@ def _focal_plane(isd: JsonFields) -> FocalPlane:
 def _camera(id: str, isd: JsonFields, plane: FocalPlane) -> Camera:
     kinds = isd.get("optical_distortion", {"radial": {"coefficients": [0.0]}})
     if not isinstance(kinds, dict) or len(kinds) != 1:
-        raise InputError(f"{isd.path}: optical_distortion {show(kinds)}; one kind is expected")
+        raise InputError(f"{isd.path}: optical_distortion {show(kinds)}; expected one kind")
     (kind,) = kinds
     where = f"optical_distortion.{kind}"
     numbers = lambda n: isd.array(f"{where}.coefficients", (n,))
-    # the images of the axes of the plane in ours: the rows of `axes` without the third
+    # The images of the axes of the plane in ours: the rows of `axes` without the third.
     Q, f = plane.axes[:2, :2], plane.focal_length
     skewed = abs(plane.to_mm[:, 0] @ plane.to_mm[:, 1]) > 1e-9 * np.prod(plane.pixel_size)
     focal: Mapping[str, float] = dict(
@@ -288,8 +288,8 @@ def _camera(id: str, isd: JsonFields, plane: FocalPlane) -> Camera:
             why = "has the distortion transverse"
             return _fit(id, isd, plane, focal, image_of_transverse, p, why)
     raise InputError(
-        f"{isd.path}: optical_distortion {show(kind)} of a frame camera is not supported; radial, "
-        "transverse, radtan, dawnfc or cahvor is expected"
+        f"{isd.path}: optical_distortion {show(kind)} of a frame camera is not supported; "
+        "expected radial, transverse, radtan, dawnfc or cahvor"
     )
 
 
@@ -369,6 +369,6 @@ def image_of_transverse(p: Mapping, X: Scalar, Y: Scalar, Z: Scalar) -> Float[Ar
 
 
 def _image(distort: Callable, p: Mapping, X: Scalar, Y: Scalar, Z: Scalar) -> Float[Array, "2"]:
-    # our axes are x right, y up: a ray (X, Y) has −Y along the second
+    # Our axes are x right, y up: a ray (X, Y) has −Y along the second.
     u = p["f"] / Z * (X * p["axes"][0] - Y * p["axes"][1])
     return p["to_pixel"] @ distort(p["distortion"], u) + p["centre"]

@@ -141,7 +141,7 @@ def _images(
         if entry["active"] == 0:
             continue
         _number_row(row, images, "image")
-        # order 0: ω, φ, κ; state 1: not oriented, 2: approximately, 3: by bundle adjustment
+        # Order 0: ω, φ, κ; state 1: not oriented, 2: approximately, 3: by bundle adjustment.
         good = entry["order"] == 0 and entry["state"] != 1
         if entry["order"] != 0:
             other.append(row.words[0])
@@ -166,7 +166,7 @@ def _points(file: Path) -> tuple[dict[str, int], Float[np.ndarray, "n 3"], list[
     coordinates, datum = [], []
     for row in TextRows(file, comment="#") if file.is_file() else ():
         values = row.numbers(("X", "Y", "Z"), 1, more=True)
-        # short rows, of coordinates alone or with σ, are active points outside the datum
+        # Short rows, of coordinates alone or with σ, are active points outside the datum.
         if len(row) >= 11 and row.words[8] == "0":
             continue
         _number_row(row, points, "point")
@@ -212,14 +212,14 @@ def _with_distances(network: Network, file: Path) -> Network:
     index, lines = {id: k for k, id in enumerate(network.points.id)}, []
     ends, values = [], []
     for row in TextRows(file, comment="#") if file.is_file() else ():
-        # the name stands in quotes and may have blanks
+        # The name stands in quotes and may have blanks.
         rest = TextRow(
             row.path,
             row.number,
             row.text.rpartition('"')[2] if '"' in row.text else " ".join(row.words[1:]),
         )
         length, sigma, active = rest.numbers(("length", "σ", "active"), 2, more=True)
-        # an end that was left out above leaves nothing to measure
+        # An end that was left out above leaves nothing to measure.
         if active == 0 or not {*rest.words[:2]} <= {*index}:
             continue
         if not (length > 0 and sigma > 0):
@@ -248,7 +248,7 @@ def write_jaicov(network: Network, path: str | Path) -> tuple[str, ...]:
     if any(character.isspace() or character in '"#' for id in points.id for character in id):
         raise InputError(f"{path}: names of points cannot have blanks, quotes or #")
     image_ids, camera_ids = _numbers(images.id), _numbers([c.id for c in network.cameras])
-    # without a choice the inner datum is that of all tie points
+    # Without a choice the inner datum is that of all tie points.
     datum = {*network.datum_points} or {id for id, r in zip(points.id, points.role) if r == "tie"}
     number = np.bincount(rays.point, minlength=len(points)).tolist()
     content = {
@@ -260,7 +260,7 @@ def write_jaicov(network: Network, path: str | Path) -> tuple[str, ...]:
             line for id, c in zip(camera_ids, network.cameras) for line in _interior(id, c)
         ],
         path.with_suffix(".eor"): [
-            # order 0, active, state 3: by bundle adjustment
+            # Order 0, active, state 3: by bundle adjustment.
             f"{id} {camera_ids[c]} {join_numbers(X0)} {join_numbers(angles)} 0 1 3"
             for id, c, X0, angles in zip(image_ids, images.camera, images.position, images.angles)
         ],
@@ -306,7 +306,7 @@ def _interior(id: str, camera: Camera) -> list[str]:
     p, (w, h) = all_parameters(camera), size_of(camera, "AICON")
     if camera.pixel_size is None:
         raise InputError(f"camera {camera.id!r}: AICON needs the sensor's size; give pixel_size")
-    # in files of AICON c is negative
+    # In files of AICON c is negative.
     values = p | {"c": -p["c"]}
     lines = [join_numbers(values[name] for name in names if name in p) for names in INTERIOR[:4]]
     sensor = join_numbers((w * camera.pixel_size[0], h * camera.pixel_size[1]))

@@ -128,7 +128,7 @@ def read_kalibr(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     unknown.check((key for key in document if not CAMERA_KEY.fullmatch(key)), FILE, path)
     chain = {
         id: JsonFields(f"{path}, {id}", document[id])
-        # by number: cam10 after cam9
+        # By number: cam10 after cam9.
         for id in sorted(filter(CAMERA_KEY.fullmatch, document), key=_number)
         if isinstance(document[id], dict)
     }
@@ -158,7 +158,7 @@ def _poses(chain: Sequence[JsonFields]) -> tuple[Float[np.ndarray, "cameras 4 4"
         return poses, []
     poses[0] = np.eye(4)
     for k, fields in enumerate(chain[1:], 1):
-        # a chain may be broken and go on through the body
+        # A chain may be broken and go on through the body.
         if fields.get("T_cn_cnm1") is not None:
             poses[k] = _transform(fields, "T_cn_cnm1") @ poses[k - 1]
     for k, mine in enumerate(body):
@@ -197,7 +197,7 @@ def _body_pose(fields: JsonFields) -> Float[np.ndarray, "4 4"] | None:
 def _transform(fields: JsonFields, key: str) -> Float[np.ndarray, "4 4"]:
     value = fields.get(key)
     if isinstance(value, dict):
-        # rows, cols, data, as in EuRoC's files
+        # Rows, cols, data, as in EuRoC's files.
         value = JsonFields(f"{fields.path}: {key}", value).array("data", (16,)).reshape(4, 4)
         value = value.tolist()
     T = JsonFields(fields.path, {key: value}).array(key, (4, 4))
@@ -216,8 +216,8 @@ def _camera(id: str, fields: JsonFields) -> Camera:
     if kind not in READ_MODELS:
         known = ", ".join("-".join(names) for names in READ_MODELS)
         raise InputError(
-            f"{fields.path}: camera_model {kind[0]} with distortion_model {kind[1]}; one of "
-            f"{known} is expected"
+            f"{fields.path}: camera_model {kind[0]} with distortion_model {kind[1]}; expected one "
+            f"of {known}"
         )
     model, core, coefficients = READ_MODELS[kind]
     values = fields.array("intrinsics", (len(core),))
@@ -327,7 +327,7 @@ def mountings_of(
         row = {id: i for i, id in enumerate(images.id)}
         for rig, epoch, image in zip(rigs.rig, rigs.epoch, rigs.image):
             moments.setdefault((rig, epoch), []).append(row[image])
-    # one image of every camera, as a file of cameras is read, is a moment too
+    # One image of every camera, as a file of cameras is read, is a moment too.
     if not moments and len(images) == number:
         moments = {0: list(range(number))}
     whole = [
@@ -337,7 +337,7 @@ def mountings_of(
     ]
     if not whole or not np.isfinite(images.position[whole[0]]).all():
         return None
-    # only the orientations that are written must be there
+    # Only the orientations that are written must be there.
     need_values(network.replace(images=images.take(np.array(whole[0]))), points=False)
     rows = np.array(whole[0])[np.argsort(images.camera[whole[0]])]
     R, t = cv_pose(matrices_of(images.angles[rows]), images.position[rows])

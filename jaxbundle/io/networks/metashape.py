@@ -219,7 +219,7 @@ def _chunk(path: Path, unknown: UnknownKeys) -> ChunkArchive:
         chunks = root.findall("chunk")
         if root.tag != "document" or len(chunks) != 1:
             raise InputError(
-                f"{path}: one <chunk> in a <document> is expected; there are {len(chunks)}"
+                f"{path}: expected one <chunk> in a <document>; there are {len(chunks)}"
             )
         unknown.check_element(root, DOCUMENT_KEYS, path)
         found = ChunkArchive(chunks[0])
@@ -325,7 +325,7 @@ def _markers(
             seen[id] = None
     if not rows:
         return None, None, None
-    # labels may repeat, ids may not
+    # Labels may repeat, ids may not.
     names = dict(zip(seen, unique_labels([label_of(markers[id]) for id in seen], list(seen))))
     none = [None] * len(seen)
     image, point, x, y = zip(*rows)
@@ -368,7 +368,7 @@ def _references(path: Path, chunk: ET.Element, markers: Mapping[str, ET.Element]
                 for k in ("sx", "sy", "sz")
             ]
         )
-    # fewer than three points do not determine the seven parameters of a datum
+    # Fewer than three points do not determine the seven parameters of a datum.
     if roles.count("control") < 3:
         return None
     sigma = np.where(np.array(sigma) > 0, sigma, _accuracy(chunk))
@@ -392,7 +392,7 @@ def _about_references(chunk: ET.Element, control: Points | None) -> Iterator[str
 
 
 def _is_local(chunk: ET.Element) -> bool:
-    # a chunk without a reference is in a local frame
+    # A chunk without a reference is in a local frame.
     return (chunk.findtext("reference") or LOCAL).strip().upper().startswith(LOCAL)
 
 

@@ -69,7 +69,7 @@ def read_archive(path: Path) -> ChunkArchive:
     **Raises:** `InputError` naming the file: an archive is missing or damaged, there is no
     chunk."""
     root = read_xml(path)
-    # the name of the project is that of the file, however it was renamed
+    # The name of the project is that of the file, however it was renamed.
     place = root.get("path") or "{projectname}.files/project.zip"
     project = path.parent / place.replace("{projectname}", path.stem)
     document = document_of(project, _members(project, path), PROJECT)
@@ -86,10 +86,10 @@ def read_archive(path: Path) -> ChunkArchive:
             f"chunk {chosen}, the active one, is read; not read: {list_some(others, as_text=str)}"
         )
     archive = project.parent / str(chunks[chosen])
-    # its frames are changed below
+    # Its frames are changed below.
     chunk = copy.deepcopy(document_of(archive, _members(archive, path), PROJECT))
     if chunk.tag != "chunk":
-        raise InputError(f"{archive}: <chunk> is expected in its doc.xml, not <{chunk.tag}>")
+        raise InputError(f"{archive}: expected <chunk> in its doc.xml, got <{chunk.tag}>")
     frames = chunk.findall("frames/frame")
     if len(frames) > 1:
         told.append(f"the first of {len(frames)} frames is read")
@@ -101,7 +101,7 @@ def read_archive(path: Path) -> ChunkArchive:
     if frames and frames[0].get("path"):
         inside = archive.parent / str(frames[0].get("path"))
         found = document_of(inside, _members(inside, path), PROJECT)
-        # as an export has it: the markers with their image points
+        # As an export has it: the markers with their image points.
         frames[0].extend(found.findall("markers"))
         ties = _ties(inside.parent / "point_cloud" / "point_cloud.zip", path)
     return ChunkArchive(chunk, ties, tuple(told))
@@ -136,7 +136,7 @@ def _ties(archive: Path, project: Path) -> TieTable | None:
         camera.append(np.full(len(table), entry.get("camera_id"), dtype=object))
     if not id or not track:
         return None
-    # the id of a point is the row of its track, where the colours are
+    # The id of a point is the row of its track, where the colours are.
     ids = np.concatenate(id)
     colour = np.full((len(ids), 3), np.nan)
     entry = document.find("tracks")

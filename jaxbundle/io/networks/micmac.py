@@ -86,7 +86,7 @@ def read_micmac(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         where, root = _calibration(file, xml)
         if where not in cameras:
             id = where.stem.removeprefix(CALIBRATION if where != file else ORIENTATION)
-            # once for all images that share it
+            # Once for all images that share it.
             cameras[where] = calibration(where, root, id)
         C2W, X0 = _pose(xml)
         names.append(file.stem.removeprefix(ORIENTATION))
@@ -132,7 +132,7 @@ def _pose(xml: XmlFields) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "
         ("KnownConv", convention, (*M2C, *C2M)),
     ):
         if value not in known:
-            raise InputError(f"{xml.path}: {name} is {value}; {', '.join(known)} is expected")
+            raise InputError(f"{xml.path}: {name} is {value}; expected {', '.join(known)}")
     if xml.find("OrIntImaM2C") is not None:
         for name, wanted in IDENTITY.items():
             if tuple(xml.numbers(f"OrIntImaM2C/{name}", 2)) != wanted:
@@ -164,7 +164,7 @@ def fill_micmac(network: Network, folder: Path) -> tuple[str, ...]:
     need_values(network, points=False)
     images = network.images
     for id in (*images.id, *(camera.id for camera in network.cameras)):
-        # names of files are made of them
+        # Names of files are made of them.
         if "/" in id or not id.strip("."):
             raise InputError(f"{folder}: {id!r} cannot be part of the name of a file")
     calibrations = {camera.id: document(calibration_lines(camera)) for camera in network.cameras}

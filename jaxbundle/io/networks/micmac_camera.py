@@ -131,7 +131,7 @@ def _calibrated(path: Path, xml: XmlFields, id: str, pixel_size: float) -> Camer
     direction = xml.text("KnownConv", M2C[0])
     if direction not in (*M2C, *C2M):
         known = ", ".join((*M2C, *C2M))
-        raise InputError(f"{path}: KnownConv is {direction}; one of {known} is expected")
+        raise InputError(f"{path}: KnownConv is {direction}; expected one of {known}")
     if xml.find("OrIntGlob") is not None:
         raise InputError(f"{path}: OrIntGlob, a separate affine part, is not supported")
     f, (cx, cy), (w, h) = xml.number("F"), xml.numbers("PP", 2), xml.numbers("SzIm", 2)
@@ -142,7 +142,7 @@ def _calibrated(path: Path, xml: XmlFields, id: str, pixel_size: float) -> Camer
     if [kind.tag for kind in kinds if kind.tag != "ModNoDist"] == ["ModUnif"]:
         if direction in C2M:
             raise InputError(
-                f"{path}: ModUnif with KnownConv {direction} is not supported; {M2C[0]} is expected"
+                f"{path}: ModUnif with KnownConv {direction} is not supported; expected {M2C[0]}"
             )
         unified = next(kind for kind in kinds if kind.tag == "ModUnif")
         return unified_camera(id, xml, unified, core, (int(w), int(h)), pixel_size)
@@ -151,7 +151,7 @@ def _calibrated(path: Path, xml: XmlFields, id: str, pixel_size: float) -> Camer
     start |= {"p1": p["P2"] * f, "p2": p["P1"] * f}
     odd = {
         "more than three coefficients": p["R4"] or p["R5"],
-        # equal to the last bit: MicMac writes one number twice (PPaEqPPs)
+        # Equal to the last bit: MicMac writes one number twice (PPaEqPPs).
         "a separate centre of distortion": (p["x"], p["y"]) != (p["cx"], p["cy"]),
     }
     has = " and ".join(what for what, there in odd.items() if there)
@@ -159,7 +159,7 @@ def _calibrated(path: Path, xml: XmlFields, id: str, pixel_size: float) -> Camer
     if has:
         foreign = Foreign(FORMULAS[direction in C2M], p, start, size, (pixel_size, pixel_size))
         return fit_camera(id, foreign, str(path), f"has {has}")
-    # without affinity, or any distortion of the other direction, the formulas are the same
+    # Without affinity, or any distortion of the other direction, the formulas are the same.
     if not (p["b1"] or p["b2"] or (direction in C2M and any(p[name] for name in COEFFICIENTS))):
         return Camera(id, "opencv", start, image_size=size, tie=(("fx", "fy"),))
     model, told = MODELS[1 + (direction in C2M)], f"the pixel size is taken as {pixel_size:g} mm"
@@ -201,7 +201,7 @@ def _distortion(xml: XmlFields, core: Mapping[str, float]) -> dict[str, float]:
             name = kind.findtext("TypeModele", "").strip()
             raise InputError(
                 f"{xml.path}: CalibDistortion {kind.tag} {name}".rstrip()
-                + f" of {len(kinds)}; one of ModNoDist, ModRad, ModPhgrStd, ModUnif is expected"
+                + f" of {len(kinds)}; expected one of ModNoDist, ModRad, ModPhgrStd, ModUnif"
             )
     if not kinds:
         return none | {"x": core["cx"], "y": core["cy"]}
@@ -283,7 +283,7 @@ def _from_opencv(camera: Camera) -> dict[str, float]:
         raise InputError(f"camera {camera.id!r}: a fisheye is not written for MicMac")
     f = one_focal_length(camera, "MicMac")
     radial = {f"R{i}": p[f"k{i}"] / f ** (2 * i) for i in (1, 2, 3)}
-    # the decentring terms of OpenCV have their names the other way round
+    # The decentring terms of OpenCV have their names the other way round.
     return p | radial | {"P1": p["p2"] / f, "P2": p["p1"] / f, "b1": 0.0, "b2": 0.0}
 
 

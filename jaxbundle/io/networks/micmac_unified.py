@@ -54,9 +54,8 @@ def unified_camera(
     )
     if kind not in FORMULAS:
         raise InputError(
-            f"{xml.path}: ModUnif {kind or 'without TypeModele'} is not supported; "
-            f"one of {', '.join(FORMULAS)} is expected: calibrate again with one of "
-            "them, or with Fraser"
+            f"{xml.path}: ModUnif {kind or 'without TypeModele'} is not supported; expected one "
+            f"of {', '.join(FORMULAS)}: calibrate again with one of them, or with Fraser"
         )
     formula, states, most = FORMULAS[kind]
     if len(S) < states:
@@ -67,7 +66,7 @@ def unified_camera(
         )
     if states and not S[0] > 0:
         raise InputError(f"{xml.path}: {kind}: the first of Etats must be positive, not {S[0]:g}")
-    # coefficients that are missing are 0
+    # Coefficients that are missing are 0.
     V = (V + [0.0] * most)[:most]
     fisheye, start = "FishEye" in kind, dict(core)
     if fisheye:

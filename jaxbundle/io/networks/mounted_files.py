@@ -59,7 +59,7 @@ def read_vins(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     keys = sorted(filter(CALIB.fullmatch, fields.document))
     if not keys:  # within another object, or in another file of the same name
         raise InputError(f"{path}: cam0_calib is missing at the first level; it is expected there")
-    # a monocular setting may still name the second camera, without its place
+    # A monocular setting may still name the second camera, without its place.
     for key in keys[: fields.integer("num_of_cam", len(keys), 1)]:
         file = path.parent / fields.text(key)
         if not file.is_file():

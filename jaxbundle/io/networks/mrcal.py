@@ -138,7 +138,7 @@ def _fields(file: Path) -> JsonFields:
     except (ValueError, SyntaxError, MemoryError, RecursionError, TypeError):
         document = None
     if not isinstance(document, dict) or not all(isinstance(key, str) for key in document):
-        raise InputError(f"{file}: a dictionary of Python, {{'lensmodel': …, …}}, is expected")
+        raise InputError(f"{file}: expected a Python dictionary, {{'lensmodel': …, …}}")
     return JsonFields(
         file,
         {
@@ -182,7 +182,7 @@ def _camera(id: str, fields: JsonFields) -> Camera:
     )
     if not exact:
         raise InputError(f"{fields.path}: r0 of the intrinsics is {p['r0']:g}; 1 + r0 must be > 0")
-    # with the axis along z the terms of CAHVOR are those of `opencv` (the module's docstring)
+    # With the axis along z the terms of CAHVOR are those of `opencv` (the module's docstring).
     if p["alpha"] == 0 == p["beta"]:
         return Camera(id, "opencv", exact, image_size=(w, h))
     foreign = Foreign(cahvor, p, exact, (w, h))

@@ -84,7 +84,7 @@ def read_nvm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
             )
     models = []
     while rows.more() and (row := rows.take("the number of cameras")).words:
-        # after the models: comments about PLY files
+        # After the models: comments about PLY files.
         if not row.words[0].isdigit() or not row.integer(0, "the number of cameras"):
             break
         models.append(_Model(rows, row.integer(0, "the number of cameras")))
@@ -98,10 +98,10 @@ def read_nvm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
 def _network(path: Path, model: _Model, overrides: Sequence[str], told: Sequence[str]) -> Network:
     names, values, lines = [], [], []
     for row in model.cameras:
-        # a name may have blanks; ten numbers follow it
+        # A name may have blanks; ten numbers follow it.
         names.append(" ".join(row.words[:-10]) if len(row) > 10 else "")
         if not names[-1]:
-            raise row.error(f"{len(row)} values; a name and {', '.join(NUMBERS)}, 0 are expected")
+            raise row.error(f"{len(row)} values; expected a name and {', '.join(NUMBERS)}, 0")
         numbers = row.numbers((*NUMBERS, "0"), len(row) - 10)
         if numbers[-1] != 0:
             raise row.error(
@@ -111,9 +111,7 @@ def _network(path: Path, model: _Model, overrides: Sequence[str], told: Sequence
         values.append(numbers[:-1])
         lines.append(row.number)
         if not values[-1][0] > 0 or not values[-1][1:5].any():
-            raise row.error(
-                f"f is {values[-1][0]:g}; a positive number and a rotation are expected"
-            )
+            raise row.error(f"f is {values[-1][0]:g}; expected a positive number and a rotation")
     names = unique_labels(names, range(len(names)))
     p = np.array(values)
     M = flip_rows(matrices_of_quaternions(p[:, 1:5]))

@@ -99,7 +99,7 @@ def _is_pair(path: Path) -> bool:
     if path.suffix.lower() not in READ_SUFFIXES or not is_plain(path):
         return False
     head = beginning(path, 1_000_000)
-    # the second side of each of the `SIDES`, at the beginning or the end of a name
+    # The second side of each of the `SIDES`, at the beginning or the end of a name.
     if path.stat().st_size > LARGEST_FILE or not re.search(
         rb"(?i)\w(2|1|r|right|b)\b|\b(2|1|r|right|b)[_.]?\w", head
     ):
@@ -107,7 +107,7 @@ def _is_pair(path: Path) -> bool:
     try:
         document = read_document(path)
     except InputError:
-        # a damaged file of this kind is reported by its reader
+        # A damaged file of this kind is reported by its reader.
         return re.search(rb"(?m)^\s*\"?[MK]1\"?\s*:", head) is not None
     return isinstance(document, Mapping) and _sides(document) is not None
 
@@ -215,7 +215,7 @@ def _read_nested(
             poses = [CameraFromRig(np.eye(3), np.zeros(3)), shared]
         around = {fold(key): key for key, value in left.items() if not _holds(value, inside)}
         unknown.check((around[key] for key in RECTIFIED.unknown(around)), Keys(POSES), path)
-    # with the first as reference, which many files leave out
+    # With the first as reference, which many files leave out.
     if any(poses[1:]) and poses[0] is None:
         poses[0] = CameraFromRig(np.eye(3), np.zeros(3))
     return cameras, [pose or CameraFromRig(*UNKNOWN) for pose in poses]

@@ -127,7 +127,7 @@ def read_openmvg(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     poses = {key: pose for key, pose in _entries(scene, "extrinsics").items()}
     tie, rays = _structure(scene, "structure", views)
     control, clicks = _structure(scene, "control_points", views)
-    # numbers of control points and of structure are counted apart, and may be equal
+    # Numbers of control points and of structure are counted apart, and may be equal.
     names = {key: f"control {key}" if key in tie else str(key) for key in control}
     seen = {view for view, *_ in (*rays, *clicks)}
     posed = {key for key, view in views.items() if view.get("id_pose") in poses}
@@ -174,7 +174,7 @@ def _check_keys(scene: JsonFields, unknown: UnknownKeys) -> None:
             unknown.check(data.document, keys, data.path)
     for pose in _entries(scene, "extrinsics").values():
         unknown.check(pose.document, POSE_KEYS, pose.path)
-    # millions of points and image points: plain dictionaries, looked at once
+    # Millions of points and image points: plain dictionaries, looked at once.
     for name in ("structure", "control_points"):
         for value in _plain_values(scene.get(name)):
             unknown.check(value, POINT_KEYS, f"{scene.path}, {name}")
@@ -243,8 +243,8 @@ def _cameras(scene: JsonFields) -> tuple[dict[int, dict[str, Any]], dict[int, Js
             continue
         if name not in KINDS:
             raise InputError(
-                f"{value.path}: the kind of camera is {name or 'not named'}; one of "
-                f"{', '.join((*KINDS, SPHERICAL))} is expected"
+                f"{value.path}: the kind of camera is {name or 'not named'}; expected one of "
+                f"{', '.join((*KINDS, SPHERICAL))}"
             )
         model, field, coefficients = KINDS[name]
         data = _data(value)

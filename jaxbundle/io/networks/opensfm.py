@@ -80,7 +80,7 @@ from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.kinds import Antennas
 from jaxbundle.network.tables import GREY, Camera, Network, Source
 from jaxbundle.system.file_content import beginning, parse_json
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 RECONSTRUCTION, TRACKS, MODELS, REFERENCE = (
     "reconstruction.json",
@@ -163,7 +163,7 @@ def _has_cameras(path: Path, begin: bytes) -> bool:
     head = beginning(path, 1_000_000).lstrip() if path.suffix.lower() == ".json" else b""
     if not head.startswith(begin) or b'"transform_matrix"' in head or b'"viewId"' in head:
         return False
-    # models of 2015 and before have no projection_type: all were perspective
+    # Models of 2015 and before have no projection_type: all were perspective.
     old = b'"focal_prior"' in head or (begin == b"[" and b'"shots"' in head)
     return b'"projection_type"' in head or old
 
@@ -278,7 +278,7 @@ def _add_control(
     unknown = np.full((len(added), 3), np.nan)
     source = Source(str(file.parent / CONTROL), None, "observation")
     if rays is not None and rays.source.numbers is not None:
-        # lines of the tracks; the image points of control have none
+        # Lines of the tracks; the image points of control have none.
         lines = np.r_[rays.source.numbers, np.zeros(len(control.rays), np.int64)]
         source = dataclasses.replace(rays.source, numbers=lines)
     return [*names, *added], np.concatenate([at, unknown]), Columns(columns, source)
@@ -322,7 +322,7 @@ def _camera(id: str, fields: JsonFields) -> Camera:
         return Camera(id, "equirectangular", {"fx": f, "fy": f} | middle, image_size=size)
     if kind not in (*KINDS, *FITTED_KINDS):
         known = ", ".join((*KINDS, *FITTED_KINDS, *SPHERICAL))
-        raise InputError(f"{fields.path}: projection_type is {kind}; one of {known} is expected")
+        raise InputError(f"{fields.path}: projection_type is {kind}; expected one of {known}")
     single = kind in ("perspective", "fisheye", "dual")  # one focal length, centred
     f = [
         max(size) * fields.number(name)
@@ -428,16 +428,16 @@ def _tracks(
                 raise row.error(f"tracks of version {version[:20]}; 0, 1, 2 and 3 are known")
             continue
         if len(row) < 5:
-            raise row.error(f"{len(row)} columns; image, track, feature, x, y, … are expected")
+            raise row.error(f"{len(row)} columns; expected image, track, feature, x, y, …")
         image, point = row.words[:2]
-        # of a photograph without orientation, or of a camera that was refused
+        # Of a photograph without orientation, or of a camera that was refused.
         if image not in shots:
             continue
         if point not in points:
             missing += 1
             continue
         x, y = row.numbers(("x", "y"), 3, more=True)
-        w, h = present(cameras[shots[image].text("camera")].image_size)
+        w, h = not_none(cameras[shots[image].text("camera")].image_size)
         values = (image, point, max(w, h) * x + (w - 1) / 2, max(w, h) * y + (h - 1) / 2)
         for column, value in zip(columns.values(), values):
             column.append(value)

@@ -31,7 +31,7 @@ from jaxbundle.io.text.json_fields import JsonFields, read_object
 from jaxbundle.io.text.known_keys import Keys, UnknownKeys
 from jaxbundle.network.columns import count
 from jaxbundle.network.tables import Camera, Points, Source
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 CONTROL = "ground_control_points.json"
 HORIZONTAL_SIGMA, VERTICAL_SIGMA = 0.01, 0.1
@@ -95,7 +95,7 @@ def read_ground_control(
             image = ray.text("shot_id")
             if image in cameras:
                 x, y = ray.array("projection", (2,)).tolist()
-                w, h = present(cameras[image].image_size)
+                w, h = not_none(cameras[image].image_size)
                 side = max(w, h)
                 rays.append((image, id, side * x + (w - 1) / 2, side * y + (h - 1) / 2))
     seen = {point for _, point, *_ in rays}

@@ -30,10 +30,10 @@ def from_opensfm(reconstruction: Any, tracks: Any = None, overrides: Sequence[st
     """
     if not all(hasattr(reconstruction, name) for name in ("cameras", "shots", "points")):
         raise InputError(
-            f"an opensfm.types.Reconstruction is expected, not {type(reconstruction).__name__}"
+            f"expected an opensfm.types.Reconstruction, got {type(reconstruction).__name__}"
         )
     if tracks is not None and not hasattr(tracks, "as_string"):
-        raise InputError(f"an opensfm.pymap.TracksManager is expected, not {type(tracks).__name__}")
+        raise InputError(f"expected an opensfm.pymap.TracksManager, got {type(tracks).__name__}")
     try:
         opensfm_io = importlib.import_module("opensfm.io")
     except ImportError:

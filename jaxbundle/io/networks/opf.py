@@ -180,19 +180,19 @@ def _resources(path: Path, unknown: UnknownKeys) -> Resources:
 
 def _place(path: Path, uri: str) -> Path:
     """The file of a resource, relative to the project."""
-    # a project from the network would be read from anywhere
+    # A project from the network would be read from anywhere.
     parts = urlparse(uri)
     if parts.scheme not in ("", "file"):
-        raise InputError(f"{path}: {uri!r}: a file beside the project is expected")
+        raise InputError(f"{path}: {uri!r}: expected a file beside the project")
     return path.parent / unquote(parts.path)
 
 
 def _id(row: JsonFields, key: str) -> str:
     """A whole number of 64 bits, as text."""
-    # not `integer`, which a float beyond 2⁵³ would not reach: identifiers have 64 bits
+    # Not `integer`, which a float beyond 2⁵³ would not reach: identifiers have 64 bits.
     value = row.get(key)
     if isinstance(value, bool) or not isinstance(value, int):
-        said = "missing" if value is None else f"{value!r}; a whole number is expected"
+        said = "missing" if value is None else f"{value!r}; expected a whole number"
         raise InputError(f"{row.path}: {key} is {said}")
     return str(value)
 
@@ -239,7 +239,7 @@ def _camera(
         R = internals.array("radial_distortion", (3,))
         T = internals.array("tangential_distortion", (2,))
         if not f > 0:
-            raise InputError(f"{internals.path}: focal_length_px is {f:g}; above 0 is expected")
+            raise InputError(f"{internals.path}: focal_length_px is {f:g}; expected a positive one")
         core = {"fx": f, "fy": f, "cx": float(cx), "cy": float(cy)}
         terms = dict(zip(("k1", "k2", "k3", "p1", "p2"), map(float, (*R, *T))))
         return {"model": "opencv", "tie": [["fx", "fy"]], **core, **terms}, ""
@@ -263,7 +263,7 @@ def _camera(
 def _project_fisheye(p: Mapping[str, Any], X: Scalar, Y: Scalar, Z: Scalar) -> Float[Array, "2"]:
     """The formula of the specification, from the centre of the first pixel."""
     off = root(X * X + Y * Y)
-    # the angle to the axis, 1 at 90°
+    # The angle to the axis, 1 at 90°.
     theta = 2 / np.pi * jnp.arctan2(off, Z)
     rho = sum(p["p"][i] * theta**i for i in range(len(p["p"])))
     x, y = (jnp.where(off > 0, rho * a / jnp.where(off > 0, off, 1.0), 0.0) for a in (X, Y))
@@ -298,7 +298,7 @@ def _control(
 ) -> tuple[dict[str, Any], dict[str, Any], Points | None]:
     """Columns of the points with marks, and of their image points; control and check points."""
     given, projected = resources.document(INPUT_POINTS), resources.document(PROJECTED_POINTS)
-    # manual tie points have marks as control points have, but no coordinates
+    # Manual tie points have marks as control points have, but no coordinates.
     rows = [] if given is None else [*given.rows("gcps"), *given.rows("mtps")]
     ids, checks, marks = [], {}, []
     for row in rows:
@@ -332,7 +332,7 @@ def _control(
         np.array([row.array("sigmas", (3,)) for row in known]),
         Source(str(resources.path)),
     )
-    # fewer than three points do not determine the seven parameters of a datum
+    # Fewer than three points do not determine the seven parameters of a datum.
     if control.role.count("control") < 3:
         told.append(
             f"{resources.path}: {control.role.count('control')} control points with marks; they "
@@ -360,7 +360,7 @@ def _tracks(
             raise InputError(f"{node.path}: a matrix for its children; expected one for its mesh")
         if node.get("mesh") is None:
             continue
-        # the specification has one primitive a mesh
+        # The specification has one primitive a mesh.
         primitive = _of(_of(file, "meshes", node.integer("mesh")), "primitives", 0)
         if primitive.get("extensions") is None or MATCHES not in primitive.get("extensions"):
             continue
@@ -382,10 +382,12 @@ def _tracks(
         xy = _accessor(file, matches.child("imagePoints").integer("pixelCoordinates"), "VEC2")
         if len(xy) != len(camera) or (camera >= len(uids)).any():
             raise InputError(f"{path}: cameras and image points of its matches do not agree")
-        # before room is made for them: of damaged ranges 2²⁴ matches for every point
+        # Before room is made for them: of damaged ranges 2²⁴ matches for every point.
         if (begin + number > len(camera)).any() or number.sum() > len(camera):
-            raise InputError(f"{path}: ranges of matches beyond the last match")
-        # the rows of the matches of the first point, the second, …: ranges may be in any order
+            raise InputError(
+                f"{path}: ranges of matches extend beyond the last match; the file is damaged"
+            )
+        # The rows of the matches of the first point, the second, …: ranges may be in any order.
         point = np.repeat(np.arange(len(X)), number)
         at = np.repeat(begin - np.cumsum(number) + number, number) + np.arange(number.sum())
         seen_in = [images.get(uid) for uid in uids]
@@ -405,7 +407,7 @@ def _positions(
 ) -> Float[np.ndarray, "n 3"]:
     """The points of a mesh in the processing system."""
     own = _accessor(file, primitive.child("attributes").integer("POSITION"), "VEC3").astype(float)
-    # by columns, in double precision: it holds the offset of single-precision positions
+    # By columns, in double precision: it holds the offset of single-precision positions.
     T = node.array("matrix", (16,), np.eye(4).ravel().tolist()).reshape(4, 4).T
     x, y, z = (own @ T[:3, :3].T + T[:3, 3]).T
     return np.stack([x, -z, y], 1)
@@ -460,7 +462,7 @@ def _accessor(file: JsonFields, index: int, kind: str | None) -> np.ndarray:
     check_plain(place)
     begin = view.integer("byteOffset", 0) + accessor.integer("byteOffset", 0)
     try:
-        # before anything is allocated for a count in a damaged header
+        # Before anything is allocated for a count in a damaged header.
         there = place.stat().st_size
         if begin + number * dtype.itemsize > there:
             raise InputError(

@@ -99,7 +99,7 @@ def read_orientation_covariance(path: str | Path, radians: float) -> Orientation
                 f"{table.source(seen[unknown])}"
             )
         seen[unknown] = k
-    # correlations are written with all digits: what is below 0 is rounding of them, or edited
+    # Correlations are written with all digits: what is below 0 is rounding of them, or edited.
     if n and np.linalg.eigvalsh(R)[0] < -1e-6 * n:
         raise InputError(
             f"{path}: the correlations are not those of any errors (an eigenvalue of "
@@ -121,5 +121,5 @@ def _number(where: str, name: str, text: str) -> float:
     # 1e-9: a correlation of 1 may be rounded above it
     if not np.isfinite(value) or (value <= 0 if name == "sigma" else abs(value) > 1 + 1e-9):
         what = "a σ above 0" if name == "sigma" else "a correlation"
-        raise InputError(f"{where}: {name} is {text!r}; {what} is expected")
+        raise InputError(f"{where}: {name} is {text!r}; expected {what}")
     return value

@@ -175,7 +175,7 @@ class _Parser:
         if not self._more():
             raise self._error(photo.line, f"the file ends after {photo}")
         number, words = self.lines[self.next]
-        # nine digits: int() of a longer text is no count, and may take minutes
+        # Nine digits: int() of a longer text is no count, and may take minutes.
         if len(words) != 1 or not words[0].isdecimal() or len(words[0]) > 9:
             raise self._error(
                 number,
@@ -216,7 +216,7 @@ class _Parser:
             number = None
         # float() reads 1_0 as ten
         if number is None or "_" in word or (finite and not math.isfinite(number)):
-            raise self._error(line, f"{what} is {word!r}; a number is expected")
+            raise self._error(line, f"{what} is {word!r}; expected a number")
         return number
 
     def _more(self) -> bool:

@@ -92,7 +92,7 @@ def read_photomodeler(path: str | Path, overrides: Sequence[str] = ()) -> Networ
     """
     path = Path(path)
     rows = TextRows(path, blank=True, fallback="latin-1")
-    # exports differ in the empty lines before the title
+    # Exports differ in the empty lines before the title.
     while rows.more() and not rows.next_words():
         rows.take("the title")
     rows.take("the title")
@@ -150,7 +150,7 @@ def _document(
         object_unit="m",
         residuals="corrected",
     )
-    # the pixel size follows from an image size that may come from the command line
+    # The pixel size follows from an image size that may come from the command line.
     of_camera = [override for override in overrides if override.startswith("camera.")]
     document = apply_overrides(document, of_camera)
     for entry, values in zip(document["camera"], distinct):
@@ -208,9 +208,9 @@ def _photos(rows: TextRows, header: tuple[Inner, Inner] | None) -> list[Photo]:
 
 def _read_numbered(rows: TextRows, number: int, what: str) -> TextRow:
     row = _take(rows, f"{what} of photograph {number}")
-    # a line that was lost would shift all values after it
+    # A line that was lost would shift all values after it.
     if row.integer(0, f"the number of the photograph before {what}") != number:
-        raise row.error(f"{what} of photograph {number} is expected, not of {row.words[0]}")
+        raise row.error(f"expected {what} of photograph {number}, not of {row.words[0]}")
     return row
 
 

@@ -84,7 +84,7 @@ def rounding_warnings(
     for camera, open in zip(cameras, half):
         size, pixel = np.array(camera.image_size, float), np.array(camera.pixel_size)
         r = float(np.linalg.norm(size * pixel)) / 2
-        # derivatives of the image in the corner by the parameters, mm: ∂x/∂c = r/c, ∂Δr/∂K1 = r³ …
+        # Derivatives of the image in the corner by the parameters, mm: ∂x/∂c = r/c, ∂Δr/∂K1 = r³ ….
         slopes = {
             "c": r / camera.parameters["c"],
             "K1": r**3,

@@ -70,7 +70,7 @@ def check_rotations(R: Float[np.ndarray, "*images 3 3"], where: str) -> None:
     good = are_rotations(R)
     if not good.all():
         (first, *_) = np.reshape(R, (-1, 3, 3))[~np.ravel(good)]
-        # minus a reflection is a rotation
+        # Minus a reflection is a rotation.
         mirror = are_rotations(-first).all()
         raise InputError(
             f"{where} is not a rotation matrix{', but one that mirrors' if mirror else ''}"

@@ -120,7 +120,7 @@ def read_project(
         if found is None:
             found = Columns(dict.fromkeys(columns, ()), Source(table))
         tables[table] = dataclasses.replace(found, may_be_empty=True)
-    # points of a model without image points can be written for other programs
+    # Points of a model without image points can be written for other programs.
     if (rays := tables.get("observations")) is not None:
         tables["observations"] = dataclasses.replace(rays, may_be_empty=True)
     return network_of(
@@ -187,7 +187,7 @@ def _read_table(document: Document, table: str, path: Path) -> Columns | None:
             f"[[{INLINE[table]}]] entries"
         )
     if not isinstance(file, str):
-        raise InputError(f"{path}, [project]: {table} is {file!r}; the name of a file is expected")
+        raise InputError(f"{path}, [project]: {table} is {file!r}; expected the name of a file")
     check_plain(path.parent / file)
     if not os.path.isfile(path.parent / file):
         raise InputError(
@@ -304,7 +304,7 @@ def _cells(
 def _document_text(network: Network, origin: str) -> str:
     said = (*network.warnings, *network.notes)
     lines = [f"# {' '.join(line.split())}" for line in said]
-    # every σ stands in observations.csv
+    # Every σ stands in observations.csv.
     in_tables = "sigma_image", "sigma_origin"
     settings = {key: getattr(network, key) for key in SETTINGS if key not in in_tables}
     if origin != STATED:

@@ -26,9 +26,7 @@ def from_pycolmap(reconstruction: Any, overrides: Sequence[str] = ()) -> Network
     """
     write = getattr(reconstruction, "write_binary", None)
     if write is None:
-        raise InputError(
-            f"a pycolmap.Reconstruction is expected, not {type(reconstruction).__name__}"
-        )
+        raise InputError(f"expected a pycolmap.Reconstruction, got {type(reconstruction).__name__}")
     with tempfile.TemporaryDirectory() as folder:
         write(folder)
         try:

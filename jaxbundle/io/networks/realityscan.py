@@ -115,7 +115,7 @@ def is_realityscan(path: Path) -> bool:
         return first is not None and NAMESPACE.encode() in beginning(first, 10_000)
     if path.suffix.lower() != ".csv":
         return False
-    # the table may begin with the number of cameras, and its columns may be chosen by the user
+    # The table may begin with the number of cameras, and its columns may be chosen by the user.
     for line in beginning(path, 10_000).decode("utf-8", errors="replace").splitlines():
         if not line.strip() or line.startswith("#cameras"):
             continue
@@ -142,7 +142,7 @@ def read_realityscan(
     rows = list(read(path, unknown, image_size))
     if not rows:
         raise InputError(f"{path}: there are no cameras")
-    # each photograph states its own numbers: equal ones are of one camera
+    # Each photograph states its own numbers: equal ones are of one camera.
     cameras: dict[tuple, Camera] = {}
     used = []
     for row in rows:
@@ -170,7 +170,7 @@ def _camera(id: str, row: Row) -> Camera:
     side = max(w, h)
     f = p["f"] * side / SMALL_FORMAT[0]
     if not f > 0:
-        raise InputError(f"{row.where}: the focal length is {p['f']:g}; above 0 is expected")
+        raise InputError(f"{row.where}: the focal length is {p['f']:g}; expected a number above 0")
     core = {"fx": f, "fy": f}
     core |= {"cx": w / 2 + p["px"] * side - PIXEL_CENTRE}
     core |= {"cy": h / 2 + p["py"] * side - PIXEL_CENTRE}
@@ -220,7 +220,7 @@ def _fields(path: Path) -> dict[str, str]:
     if NAMESPACE not in text:
         return {}
     fields = {}
-    # the namespaces of elements are removed by the reader: their names are those of the file
+    # The namespaces of elements are removed by the reader: their names are those of the file.
     own = {*re.findall(r"<xcr:(\w+)", text)}
     for element in read_xml(path).iter():
         for key, value in element.attrib.items():
@@ -234,7 +234,7 @@ def _fields(path: Path) -> dict[str, str]:
 def _numbers(path: Path, fields: Mapping[str, str], key: str, n: int) -> np.ndarray:
     words = fields[key].split()
     if len(words) != n:
-        raise InputError(f"{path}: {key} has {len(words)} numbers; {n} are expected")
+        raise InputError(f"{path}: {key} has {len(words)} numbers; expected {n}")
     return np.array([number_in(word, f"{path}: {key}") for word in words])
 
 
@@ -249,8 +249,8 @@ def _interior(path: Path, fields: Mapping[str, str]) -> dict[str, float]:
         )
     number = lambda key, default: number_in(fields.get(key, default), f"{path}: {key}")
     if number("Skew", "0") != 0 or number("AspectRatio", "1") != 1:
-        raise InputError(f"{path}: Skew and AspectRatio are not read; 0 and 1 are expected")
-    # the six coefficients are there for every model, those it does not have as 0
+        raise InputError(f"{path}: Skew and AspectRatio are not read; expected 0 and 1")
+    # The six coefficients are there for every model, those it does not have as 0.
     k = np.zeros(6)
     if model != "perspective" and "DistortionCoeficients" in fields:
         k = _numbers(path, fields, "DistortionCoeficients", 6)
@@ -260,7 +260,7 @@ def _interior(path: Path, fields: Mapping[str, str]) -> dict[str, float]:
 
 
 def _pose(path: Path, fields: Mapping[str, str]) -> tuple[np.ndarray, np.ndarray]:
-    # a calibration alone has no pose: unknown, never the identity
+    # A calibration alone has no pose: unknown, never the identity.
     if "Rotation" not in fields or "Position" not in fields:
         return np.full((3, 3), np.nan), np.full(3, np.nan)
     R = _numbers(path, fields, "Rotation", 9).reshape(3, 3)
@@ -276,7 +276,7 @@ def _names(line: str) -> list[str]:
 
 
 def _read_table(path: Path, unknown: UnknownKeys, given: Sequence[float] | None) -> Iterator[Row]:
-    # its header begins with #, as comments of our tables do
+    # Its header begins with #, as comments of our tables do.
     text = re.sub(r"^\s*#\s*(?=name\s*,)", "", read_text(path), count=1, flags=re.M | re.I)
     table = parse_csv(path, text)
     columns = {_names(name)[0]: name for name in table.values}
@@ -325,7 +325,7 @@ def _written(camera: Camera, largest_difference: float = 0.5) -> dict[str, float
     length instead of two may change, pixels: rounding to whole ones does as much."""
     p = check_others_zero(camera, "RealityScan", ("k1", "k2", "k3", "p1", "p2"))
     w, h = size_of(camera, "RealityScan")
-    # an adjusted camera has two focal lengths that differ by their σ
+    # An adjusted camera has two focal lengths that differ by their σ.
     f, off = math.sqrt(p["fx"] * p["fy"]), _focal_difference(camera)
     if off > largest_difference:
         raise InputError(
@@ -371,7 +371,7 @@ def write_realityscan_csv(network: Network, path: str | Path) -> tuple[str, ...]
         )
     ]
     text = io.StringIO()
-    # a comma in the name of a photograph is quoted
+    # A comma in the name of a photograph is quoted.
     csv.writer(text, lineterminator="\n").writerows(rows)
     write_text(Path(path), f"#{','.join(HEADER)}\n{text.getvalue()}")
     return _losses(network)
@@ -418,7 +418,7 @@ def fill_realityscan(network: Network, folder: Path) -> tuple[str, ...]:
 def _xmp(id: str, p: Mapping[str, float], R: np.ndarray, X0: np.ndarray, group: int) -> str:
     numbers = lambda values: " ".join(repr(float(v)) for v in values)
     coefficients = [p[name] for name in (*RADIAL, *TANGENTIAL)]
-    # a model without tangential terms would drop them
+    # A model without tangential terms would drop them.
     model = "brown3t2" if any(coefficients[4:]) else "brown3"
     model = model if any(coefficients) else "perspective"
     rdf = "http://www.w3.org/1999/02/22-rdf-syntax-ns#"

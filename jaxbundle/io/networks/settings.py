@@ -10,6 +10,7 @@ from typing import Any
 
 from jaxbundle.arguments import show
 from jaxbundle.cameras import CameraModel
+from jaxbundle.cameras.names import closest_name
 from jaxbundle.errors import InputError
 from jaxbundle.network.build import CAMERA_FIELDS, make_cameras, make_network
 from jaxbundle.network.columns import Columns, list_some, refuse_unknown
@@ -45,7 +46,7 @@ def apply_overrides(
     cameras, `free`, which is `camera.*.free`, and `SECTION.…` of a further kind of
     observations.
     """
-    # the document of the caller stays as the file has it
+    # The document of the caller stays as the file has it.
     document = copy.deepcopy(document)
     for override in overrides:
         key, equals, text = (part.strip() for part in override.partition("="))
@@ -61,16 +62,24 @@ def apply_overrides(
             value = _words(text) if key == "datum_points" else text
             document["project"][key] = _number(key, text) if key == "sigma_image" else value
         else:
-            known = (*keys, "free", *CAMERA_KEYS, *(f"{name}.KEY" for name in SECTIONS))
-            raise InputError(f"--set {key}: unknown key; known: {', '.join(known)}")
+            raise InputError(f"--set {key}: unknown key{_known_keys(key, keys)}")
     return document
+
+
+def _known_keys(key: str, keys: Sequence[str]) -> str:
+    """The end of a message about an unknown key: all of them, and the probable one."""
+    section, dot, rest = key.partition(".")
+    known = (*keys, "free", *CAMERA_KEYS, *(f"{name}.KEY" for name in SECTIONS))
+    close = closest_name(section, ("camera", *SECTIONS) if dot else (*keys, "free"))
+    meant = "" if close is None else f"; did you mean {f'{close}{dot}{rest}'!r}?"
+    return f"; known: {', '.join(known)}{meant}"
 
 
 def _override_cameras(cameras: list[dict], key: str, text: str) -> None:
     """Apply a setting to the camera named by the key, or to all cameras."""
     rest = key.removeprefix("camera.")
     ids = [str(camera.get("id", "")).strip() for camera in cameras]
-    # the longest id first: "a.b" may be an id beside "a"
+    # The longest id first: "a.b" may be an id beside "a".
     for c in sorted(range(len(ids)), key=lambda c: -len(ids[c])):
         if rest.startswith(f"{ids[c]}."):
             _override_camera(cameras[c], key, rest.removeprefix(f"{ids[c]}."), text)
@@ -114,13 +123,13 @@ def _override_section(document: Document, key: str, text: str) -> None:
     for section in sections:
         settings = settings.setdefault(section, {})
         if not isinstance(settings, dict):
-            raise InputError(f"--set {key}: {section} is {show(settings)}; a table is expected")
+            raise InputError(f"--set {key}: {section} is {show(settings)}; expected a table")
     words = _words(text)
     try:
         values = [float(word) for word in words]
     except ValueError:
         values = words
-    # a list of one is still a list
+    # A list of one is still a list.
     several = name == "free" or text.startswith("[") or len(values) != 1
     settings[name] = values if several else values[0]
 
@@ -157,7 +166,7 @@ def check_project_settings(project: Mapping[str, Any], where: str) -> None:
     for key, value in project.items():
         refuse_unknown(key, (*SETTINGS, *TABLES), where)
         if key in (*TEXT, *TABLES) and not isinstance(value, str):
-            raise InputError(f"{where}{key} is {value!r}; text in quotes is expected")
+            raise InputError(f"{where}{key} is {value!r}; expected text in quotes")
         if key in CHOICES:
             check_choice(key, value, CHOICES[key], where)
     check_sigma_image(project.get("sigma_image", 1.0), where)

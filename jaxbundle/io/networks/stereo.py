@@ -118,7 +118,7 @@ def rectify(
     P1 = np.array([[f, 0, c[0], 0], [0, f, c[1], 0], [0, 0, 1, 0]])
     P2 = P1.copy()
     P2[:, 3] = P1[:, :3] @ np.where(np.arange(3) == k, R2 @ T, 0)
-    # the shift along z is zero, so that P[:, 3] has no part of the principal point
+    # The shift along z is zero, so that P[:, 3] has no part of the principal point.
     return Rectification(R1, R2, P1, P2)
 
 
@@ -127,7 +127,7 @@ def _file_names(cameras: Sequence[Camera]) -> list[str]:
 
     **Raises:** `InputError` if two are equal."""
     names = [re.sub(r"[^\w.-]+", "_", camera.id) or "camera" for camera in cameras]
-    # some systems do not distinguish capital letters
+    # Some systems do not distinguish capital letters.
     folded = [name.casefold() for name in names]
     for k, name in enumerate(folded):
         if name in folded[:k]:
@@ -146,7 +146,7 @@ def _pairs(network: Network, what: str) -> list[StereoPair]:
     mountings = mountings_of(network)
     if mountings is None:
         raise InputError(
-            f"{what} holds the mounting of two cameras; a rig, or one image of each, is expected"
+            f"{what} holds the mounting of two cameras; expected a rig, or one image of each"
         )
     names, T, pairs = _file_names(cameras), np.eye(4), []
     for camera, name, step in zip(cameras[1:], names[1:], mountings):
@@ -286,7 +286,7 @@ def read_ros_stereo(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         parts.append((camera, R, shift))
     if len(parts) != 2:
         raise InputError(f"{path}: {len(parts)} cameras; expected two")
-    # the one without a shift is the first, whatever the files are called
+    # The one without a shift is the first, whatever the files are called.
     parts.sort(key=lambda part: bool(part[2].any()))
     (left, R1, none), (right, R2, shift) = parts
     if none.any() or not shift.any():

@@ -134,7 +134,7 @@ def read_transforms(
     for frame in file.rows("frames"):
         unknown.check(frame.document, FRAME_KEYS, frame.path)
         name, fields = frame.text("file_path"), _intrinsics(file, frame)
-        # frames may repeat the intrinsics, in any order of the keys
+        # Frames may repeat the intrinsics, in any order of the keys.
         key = json.dumps(fields.document, sort_keys=True)
         try:
             if key not in cameras:
@@ -144,11 +144,11 @@ def read_transforms(
             continue
         T = frame.array("transform_matrix", (None, 4))
         if len(T) not in (3, 4):
-            raise InputError(f"{frame.path}: transform_matrix has {len(T)} rows; 4 are expected")
+            raise InputError(f"{frame.path}: transform_matrix has {len(T)} rows; expected 4")
         check_rotations(T[:3, :3], f"{frame.path}: transform_matrix")
         names.append(name)
         used.append(cameras[key].id)
-        # the file has camera → world, M world → camera
+        # The file has camera → world, M world → camera.
         M.append(T[:3, :3].T)
         X0.append(T[:3, 3])
     if not names:
@@ -191,7 +191,7 @@ def _camera(id: str, fields: JsonFields) -> Camera:
     size = None
     if fields.get("w") is not None or fields.get("h") is not None:
         size = fields.integer("w", least=1), fields.integer("h", least=1)
-    # either axis may be the one that is given
+    # Either axis may be the one that is given.
     first, other = "xy" if any(fields.get(f"{n}_x") is not None for n in FOCAL) else "yx"
     side = dict(zip("xy", size or (None, None)))
     f = {first: _focal_length(fields, first, side[first], None)}

@@ -107,7 +107,7 @@ def map_of(
     if size is None:
         rows = np.hypot(np.diff(x, axis=0), np.diff(y, axis=0)) / np.diff(inner)[:, None]
         columns = np.hypot(np.diff(x, axis=1), np.diff(y, axis=1)) / np.diff(pixels)
-        # two digits: a round size that a reader can repeat
+        # Two digits: a round size that a reader can repeat.
         size = float(f"{min(np.nanmedian(rows), np.nanmedian(columns)):.2g}")
     elif size > (extent := max(np.nanmax(v) - np.nanmin(v) for v in (x, y))):
         raise InputError(
@@ -115,7 +115,7 @@ def map_of(
             "smaller one, in the unit of the map, or another --crs"
         )
     grid = grid_around(x, y, size, max_pixels * image.lines * image.pixels)
-    # a line beyond the outermost centres, outside the border
+    # A line beyond the outermost centres, outside the border.
     return MapGrid(grid.x - size, grid.y + size, size, grid.columns + 2, grid.rows + 2)
 
 
@@ -193,9 +193,9 @@ class _SourcePixels:
         dtype = np.dtype(raster.dtypes[0])
         if dtype.kind not in "uif" or len(set(raster.dtypes)) > 1:
             raise InputError(
-                f"{path}: bands of {', '.join(dict.fromkeys(raster.dtypes))}; all of one type, of "
-                "whole or floating point numbers, are expected: convert them with gdal_translate "
-                "-ot, or correct each band alone"
+                f"{path}: bands of {', '.join(dict.fromkeys(raster.dtypes))}; expected all of one "
+                "type, of whole or floating point numbers: convert them with gdal_translate -ot, "
+                "or correct each band alone"
             )
         flags = raster.mask_flag_enums
         values = set(raster.nodatavals)
@@ -250,7 +250,7 @@ class _SourcePixels:
 
         Widened to a multiple of 128, or of an eighth of the size: the compiled program is one for
         every shape, and there are only a few shapes then."""
-        # only reading is locked, the other worker computes meanwhile
+        # Only reading is locked, the other worker computes meanwhile.
         with self._reading:
             if self._masked:
                 values = read_values(self._path, self._raster, None, window)
@@ -279,7 +279,7 @@ def _resample(
     lacking = pixels == jnp.asarray(source_missing).astype(pixels.dtype)
     lacking &= ~jnp.isnan(source_missing)
     has_gaps = jnp.any(lacking)
-    # a copy in floating point only where it is needed
+    # A copy in floating point only where it is needed.
     values = jax.lax.cond(
         has_gaps,
         lambda: resample_pixels(jnp.where(lacking, jnp.nan, pixels.astype(working)), *place, kind),
@@ -312,7 +312,7 @@ def _parts(
     seen = line[part], pixel[part]
     if not np.isfinite(seen[0]).any():
         return
-    # one pixel more than the kernel reaches, for rounding
+    # One pixel more than the kernel reaches, for rounding.
     margin = reach + 1
     lines, pixels = (
         (max(int(np.nanmin(v)) - margin, 0), min(int(np.nanmax(v)) + margin + 1, size))
@@ -320,7 +320,7 @@ def _parts(
     )
     window = lines, pixels
     side = part[0].stop - part[0].start
-    # a single place cannot be halved, whatever it needs
+    # A single place cannot be halved, whatever it needs.
     if side == 1 or (lines[1] - lines[0]) * (pixels[1] - pixels[0]) <= most:
         yield part, window
         return

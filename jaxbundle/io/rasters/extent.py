@@ -50,7 +50,7 @@ def image_extent(image: PushbroomImage, earth: Ellipsoid, places: int = 17) -> E
     )
     if not np.isfinite(low).all():
         return None
-    # below the highest height rays begin at the camera
+    # Below the highest height rays begin at the camera.
     P = np.asarray(_positions(image, image.times.time(lines))).T[:, :, None]
     high = np.where(np.isfinite(high), high, P)
     X = np.stack([low, high], axis=1)
@@ -92,7 +92,7 @@ def joint_extent(extents: Sequence[Extent | None]) -> Extent | None:
     known = [extent for extent in extents if extent is not None]
     if len(known) < len(extents) or not known:
         return None
-    # the turn that brings each nearest to the first
+    # The turn that brings each nearest to the first.
     turns = [360 * round((known[0].west - extent.west) / 360) for extent in known]
     return Extent(
         min(extent.west + turn for extent, turn in zip(known, turns)),
@@ -106,7 +106,7 @@ def _around(
     longitude: Float[np.ndarray, "..."], latitude: Float[np.ndarray, "..."]
 ) -> Extent | None:
     """The extent of points with a margin; None at a pole, where all longitudes may be visible."""
-    # within 5° (560 km) of a pole an image may contain it
+    # Within 5° (560 km) of a pole an image may contain it.
     if np.abs(latitude).max() > 85 or np.ptp(longitude) > 180:
         return None
     wider = 0.03 * np.ptp(longitude), 0.03 * np.ptp(latitude)  # the bends between the rays

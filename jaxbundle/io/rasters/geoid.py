@@ -84,7 +84,7 @@ def _in_parts(
     rows = max(1, together // (out.size // shape[0]))
     for first in range(0, shape[0], rows):
         part = slice(first, first + rows)
-        # an axis of one stands for all rows
+        # An axis of one stands for all rows.
         x, y = (
             a[part] if a.ndim == len(shape) and len(a) > 1 else a for a in (longitude, latitude)
         )
@@ -107,7 +107,7 @@ def _bilinear(
         for p, n in zip(map(inside, (row, column), values.shape), values.shape)
     )
     u, v = u - i, v - k
-    # a NaN beside a point that lies on a line of the grid has the weight 0, but 0·NaN is NaN
+    # A NaN beside a point that lies on a line of the grid has the weight 0, but 0·NaN is NaN.
     between = lambda w, low, high: (
         np.where(w == 0, 0, w * high) + np.where(w == 1, 0, (1 - w) * low)
     )
@@ -128,7 +128,7 @@ def _grid_of_proj(name: Path) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
             f"+grids={name} +multiplier=1 +step +proj=unitconvert +xy_in=rad +xy_out=deg"
         )
     except pyproj.exceptions.ProjError:
-        # public in the documentation, though not in the stub
+        # Public in the documentation, though not in the stub.
         folder = pyproj.datadir.get_user_data_dir()  # pyright: ignore[reportPrivateImportUsage]
         raise InputError(
             f"--geoid {name}: there is no such file, and PROJ has no grid of this name (its folder "

@@ -121,7 +121,7 @@ def write_map(
         interleave="pixel",
         transform=rasterio().transform.Affine(grid.size, 0, grid.x, 0, -grid.size, grid.y),
         **bands.photometric,
-        # a COG is compressed when it is made from the file
+        # A COG is compressed when it is made from the file.
         **({} if format.cog else _compression(format.compress, bands.dtype)),
     ) as map_:
         if any(bands.names):

@@ -123,7 +123,7 @@ def describe_distance(
     area = None if target is None else target.area_of_use
     if target is None or area is None:
         return ""
-    # an area across the date line has its east smaller than its west
+    # An area across the date line has its east smaller than its west.
     width = (area.east - area.west) % 360 or 360
     beyond = (longitude - area.west + margin) % 360 > width + 2 * margin and width < 360
     if not beyond and area.south - margin <= latitude <= area.north + margin:
@@ -166,7 +166,7 @@ def contiguous(system: MapSystem, x: Float[np.ndarray, "r c"]) -> Float[np.ndarr
     seen = np.flatnonzero(np.isfinite(x))
     if not len(seen):
         return x
-    # the one nearest to the middle of the lattice that has a place
+    # The one nearest to the middle of the lattice that has a place.
     middle = x.ravel()[seen[np.abs(seen - x.size // 2).argmin()]]
     x = system.unwrap(x, float(middle))
     if system.transformer and system.turn is None:

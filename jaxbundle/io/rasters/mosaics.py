@@ -98,7 +98,7 @@ def _check_alike(
     todo = "; make one raster of the tiles, such as with gdalwarp, and give that"
     if source.crs != crs:
         raise InputError(f"{tile}: its coordinate system is not that of {first.name}{todo}")
-    # a hundredth of a pixel over the length of a tile
+    # A hundredth of a pixel over the length of a tile.
     length = max(source.shape)
     odd = max(abs(a / s - 1) * length for a, s in zip((place.a, place.e), step))
     if place.b or place.d or odd > 0.01 or max(abs(v - round(v)) for v in at) > 0.01:

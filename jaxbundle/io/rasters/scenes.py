@@ -78,7 +78,7 @@ def write_taken(
     with write_raster(path, image.pixels, image.lines, len(bands), dtype) as target:
         for first in range(0, image.lines, portion):
             lines = np.arange(first, first + portion, dtype=float)
-            # the last portion is as long as the others, so that it needs no program of its own
+            # The last portion is as long as the others, so that it needs no program of its own.
             inside = np.minimum(lines, image.lines - 1)
             values = take_image(image, surface, bands, place, inside, resampling)
             values = values[:, : image.lines - first]

@@ -166,11 +166,11 @@ def _cut(
     (dx, dy), (x0, y0) = (source.transform.a, source.transform.e), source.transform[2:6:3]
     rows, columns = source.shape
     bounds = source.bounds
-    # rows count from the north, or from the south
+    # Rows count from the north, or from the south.
     y = np.sort([(v - y0) / dy for v in (extent.south, extent.north)])
     top, bottom = max(int(np.floor(y[0])) - 2, 0), min(int(np.ceil(y[1])) + 2, rows)
     turn = 360 / abs(dx)
-    # the turn that brings the extent nearest to the raster
+    # The turn that brings the extent nearest to the raster.
     middle = ((extent.west + extent.east) / 2 - x0) / dx
     shift = turn * np.round((columns / 2 - middle) / turn)
     x = np.sort([(v - x0) / dx + shift for v in (extent.west, extent.east)])
@@ -185,7 +185,7 @@ def _cut(
             f"{path}: the model has {covered}; the image looks at {extent}: give a model that "
             "covers the image"
         )
-    # the last column of a model of the whole Earth is beside its first
+    # The last column of a model of the whole Earth is beside its first.
     parts = [(left % columns, columns), (0, right % columns)] if seam else [(left, right)]
     heights = [_heights(path, source, ((top, bottom), part), height) for part in parts]
     return np.concatenate(heights, axis=1), (top, left)

@@ -76,6 +76,6 @@ DXF_LOSSES = losing(
 def _write_name(
     space: "Modelspace", name: str, place: tuple[float, ...], height: float, layer: str
 ) -> None:
-    # control characters would break the lines of the file
+    # Control characters would break the lines of the file.
     safe = "".join(c if c.isprintable() else "_" for c in name)
     space.add_text(safe, height=height, dxfattribs={"layer": layer, "insert": place})

@@ -85,7 +85,7 @@ def write_geojson(
 def _geometry(
     lonlat: Float[np.ndarray, "n 2"], place: Float[np.ndarray, "n d"], layer: str
 ) -> dict[str, Any]:
-    # nine digits: a tenth of a millimetre
+    # Nine digits: a tenth of a millimetre.
     rounded = np.round(lonlat, 9).tolist()
     if layer != "ellipses":
         return {"type": "Point", "coordinates": [*rounded[0], float(place[0, 2])]}
@@ -95,7 +95,7 @@ def _geometry(
 
 
 def _is_counterclockwise(ring: Float[np.ndarray, "n 2"]) -> bool:
-    # about its centre: of map coordinates the area is in the last digits
+    # About its centre: of map coordinates the area is in the last digits.
     x, y = (ring - ring.mean(0)).T
     return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) > 0
 
@@ -129,7 +129,7 @@ def check_crs(crs: str) -> int | None:
         return None
     found = re.fullmatch(r"(?i)epsg:(\d{4,6})", crs.strip())
     if found is None:
-        raise InputError(f"crs {crs!r}: EPSG:NUMBER is expected, such as EPSG:25832")
+        raise InputError(f"crs {crs!r}: expected EPSG:NUMBER, such as EPSG:25832")
     return int(found[1])
 
 

@@ -40,7 +40,7 @@ class JsonLines:
         for number, line in enumerate(self._lines() if regular else (), 1):
             row, whole = _row(line), line.endswith(b"\n")
             if row is None:
-                # zero bytes: what a crash of the system may leave at the end of a file
+                # Zero bytes: what a crash of the system may leave at the end of a file.
                 if not whole and _is_torn(line.rstrip(b"\0")):
                     break
                 raise InputError(
@@ -130,7 +130,7 @@ class JsonLines:
 
 
 def _json_text(row: dict[str, Any]) -> str:
-    # first as it is: few rows have a NaN, and the others need no copy without it
+    # First as it is: few rows have a NaN, and the others need no copy without it.
     try:
         return json.dumps(row, ensure_ascii=False, allow_nan=False)
     except ValueError:

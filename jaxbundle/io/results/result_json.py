@@ -17,7 +17,7 @@ from jaxbundle.cameras import get_model
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.io.text.csv_tables import table_rows, take_portions
 from jaxbundle.network.tables import EXTERIOR
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 if TYPE_CHECKING:
     from jaxbundle.adjustment.result import Adjustment
@@ -114,7 +114,7 @@ def result_text(
 ) -> Iterator[str]:
     """The result as JSON text, one line that ends with a line feed, in pieces: 2 000 000
     image points take 1 GB. `also`: further entries."""
-    # without the long tables, which would need their memory at once
+    # Without the long tables, which would need their memory at once.
     head = result_dict(adjustment, brief=True) | dict(also)
     if brief or not adjustment.converged:
         yield _text(head) + "\n"
@@ -209,6 +209,7 @@ def _components(adjustment: "Adjustment") -> dict:
             "sigma": c.sigma,
             "factor": c.factor,
             "estimated": list(c.estimated),
+            "unit": c.unit,
         }
         for name, c in adjustment.variance_components.items()
     }
@@ -288,7 +289,7 @@ def _checks(adjustment: "Adjustment") -> dict:
     table = {name: column.tolist() for name, column in adjustment.table("checks").items()}
     if not table:
         return {}
-    rms = present(adjustment.check_points).rms.tolist()
+    rms = not_none(adjustment.check_points).rms.tolist()
     return {
         "rms": dict(zip("XYZ", rms)),
         "points": {

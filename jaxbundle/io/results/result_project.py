@@ -11,8 +11,8 @@ from jaxbundle.network.camera_tables import with_start
 from jaxbundle.network.kinds import (
     CameraParameters,
     ExteriorPriors,
-    Further,
     Interfaces,
+    ObservationTable,
     RobotPoses,
 )
 from jaxbundle.network.kinds.base import among
@@ -127,7 +127,7 @@ def readjustable_network(adjustment: "Adjustment") -> Network:
     return keep_points(adjusted, np.asarray(np.isfinite(adjustment.point_values).all(1)))
 
 
-def _interfaces_at_solution(adjustment: "Adjustment") -> tuple[Further, ...]:
+def _interfaces_at_solution(adjustment: "Adjustment") -> tuple[ObservationTable, ...]:
     """The interfaces of a network as they were estimated: without them rays would be straight."""
     found = adjustment.further_unknowns
     radians = 1 / adjustment.angle_scale
@@ -170,17 +170,17 @@ def _given_points(adjustment: "Adjustment") -> Points:
     position[control] = np.where(weight > 0, given, position[control])
     roles = np.array(points.role, dtype=object)
     roles[control[~(weight > 0).any(1)]] = "tie"
-    # a tie point has no observed coordinates
+    # A tie point has no observed coordinates.
     sigma[roles == "tie"] = np.nan
     return dataclasses.replace(points, role=tuple(roles.tolist()), position=position, sigma=sigma)
 
 
-def _priors(adjustment: "Adjustment") -> list[Further]:
+def _priors(adjustment: "Adjustment") -> list[ObservationTable]:
     """What was observed of orientations and cameras."""
     problem = adjustment.problem
     network, measured = problem.network, problem.data.measured
     known = {o.name: o for o in problem.observations}
-    tables: list[Further] = []
+    tables: list[ObservationTable] = []
     if "exterior" in known:
         value = np.asarray(measured["exterior"]) + np.concatenate([problem.origin, np.zeros(3)])
         image = tuple(network.images.id[k] for k in known["exterior"].rows[0])
@@ -209,9 +209,9 @@ def _priors(adjustment: "Adjustment") -> list[Further]:
     return tables
 
 
-def _join_tables(*further: Further) -> tuple[Further, ...]:
+def _join_tables(*further: ObservationTable) -> tuple[ObservationTable, ...]:
     """One table of each kind: priors follow the rows of the same kind that the network had."""
-    tables: dict[str, Further] = {}
+    tables: dict[str, ObservationTable] = {}
     for table in further:
         first = tables.get(table.TABLE)
         if first is None:
@@ -224,12 +224,12 @@ def _join_tables(*further: Further) -> tuple[Further, ...]:
     return tuple(tables.values())
 
 
-def _further(adjustment: "Adjustment") -> list[Further]:
+def _further(adjustment: "Adjustment") -> list[ObservationTable]:
     """The observations of further kinds without those removed by data snooping, with their final σ:
     a kind with one observation per row of its table is followed row by row."""
     problem = adjustment.problem
     network = problem.network
-    # the engine's sets in the order of declaration, the user's own before those of the network
+    # The engine's sets in the order of declaration, the user's own before those of the network.
     kinds = sorted(among(network), key=lambda table: not table.CHANGES_IMAGE_POINTS)
     numbers = [len(table.declare(network, problem.origin).observations) for table in kinds]
     own = len(problem.further_sets) - sum(numbers)

@@ -45,7 +45,7 @@ def read_tree(path: str | Path, classes: Sequence[type], what: str) -> Any:
     try:
         return _restore(document, arrays, {one.__name__: one for one in classes})
     except (ValueError, TypeError, LookupError, AttributeError):
-        # classes refuse what does not fit their fields by errors of their own
+        # Classes refuse what does not fit their fields by errors of their own.
         raise damaged from None
 
 

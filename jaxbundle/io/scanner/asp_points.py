@@ -78,13 +78,13 @@ def read_gcp(path: str | Path) -> ControlFile:
         values = [number_in(word, where) for word in words[1:FIELDS_OF_POINT]]
         if not abs(values[0]) <= 90:
             raise InputError(f"{where}: latitude {values[0]:g} is beyond the pole; it comes first")
-        # longitude first, as in our tables
+        # Longitude first, as in our tables.
         points.append((words[0], (values[1], values[0], values[2]), values[3:], number))
         for k in range(FIELDS_OF_POINT, len(words), FIELDS_OF_IMAGE):
             column, row, *sigma = (number_in(w, where) for w in words[k + 1 : k + FIELDS_OF_IMAGE])
             rays.append((words[k], len(points) - 1, (row, column), sigma[::-1]))
     if not points:
-        raise InputError(f"{path}: no control point; expected one a line")
+        raise InputError(f"{path}: no control point; expected one per line")
     id, place, sigma, row = zip(*points)
     image, point, xy, xy_sigma = zip(*rays) if rays else ((), (), (), ())
     table = lambda rows, width: np.array(rows, float).reshape(-1, width)
@@ -163,14 +163,14 @@ def join_matches(
 
     ends = [np.c_[np.full(len(xy), i), xy] for i, j, a, b in pairs for i, xy in ((i, a), (j, b))]
     places, at = np.unique(np.concatenate(ends), axis=0, return_inverse=True)
-    # the same numbers of both ends of every pair
+    # The same numbers of both ends of every pair.
     sides = np.split(at.ravel(), np.cumsum([len(rows) for rows in ends])[:-1])
     first, second = (np.concatenate(sides[k::2]) for k in (0, 1))
     shape = (len(places), len(places))
     graph = coo_array((np.ones(len(first)), (first, second)), shape)
     _, point = connected_components(graph, directed=False)
     image = places[:, 0].astype(int)
-    # two places in one image are not one point
+    # Two places in one image are not one point.
     _, counts = np.unique(np.c_[point, image], axis=0, return_counts=True)
     twice = np.unique(np.c_[point, image], axis=0)[counts > 1, 0]
     kept = ~np.isin(point, twice)

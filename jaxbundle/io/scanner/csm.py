@@ -107,7 +107,7 @@ def read_csm(
         settings = dataclasses.replace(settings, **limits)
     states = states_of(isd, -when if backwards else when, interpolation, settings)
     if backwards:
-        # the same poses in the same lines; only corrections depend on the direction of time
+        # The same poses in the same lines; only corrections depend on the direction of time.
         t, P, rows, R = states[:4]
         states = states._replace(t=-t[::-1], P=P[::-1], rows=-rows[::-1], R=R[::-1])
     middle = view_directions(states.t, states.P, states.rows, states.R, ends.mean())
@@ -131,10 +131,10 @@ def _read_support_data(path: Path, unknown: UnknownKeys) -> tuple[JsonFields, in
     text = read_text(path)
     name, brace, _ = text.partition("{")
     name = name.strip()
-    # a state has the name of its model before the braces
+    # A state has the name of its model before the braces.
     if name and brace and name.replace("_", "").isalnum():
         if name != MODEL:
-            raise InputError(f"{path}: a model state of {show(name)}; {MODEL} is expected")
+            raise InputError(f"{path}: a model state of {show(name)}; expected {MODEL}")
         text = text[text.index("{") : text.rfind("}") + 1 or len(text)]
     isd, order = (
         JsonFields(path, read_object(path, text, "an ISD or a model state")),
@@ -153,7 +153,7 @@ def _read_support_data(path: Path, unknown: UnknownKeys) -> tuple[JsonFields, in
     if model != MODEL:
         kind = FRAME_MODELS.get(str(model))
         hint = "" if kind is None else f" (`jaxbundle convert` reads it as {kind})"
-        raise InputError(f"{path}: name_model is {show(model)}{hint}; {MODEL} is expected")
+        raise InputError(f"{path}: name_model is {show(model)}{hint}; expected {MODEL}")
     unknown.check(isd.document, KEYS, path)
     return isd, order
 
@@ -200,11 +200,11 @@ def _line_times(isd: JsonFields, lines: int) -> tuple[LineTimes, bool]:
             f"{isd.path}: line_scan_rate needs rows of a positive period, or all of a negative one"
         )
     first, start, period = (rates * np.array([1, -1, -1]) if backwards else rates).T
-    # the centre of line l is l + ½ in the coordinates of the ISD
+    # The centre of line l is l + ½ in the coordinates of the ISD.
     l = np.arange(lines)
     row = np.clip(np.searchsorted(first, l + 0.5, side="right") - 1, 0, None)
     t = start[row] + period[row] * (l + 1 - first[row])
-    # one rate: times follow from it, and need no table
+    # One rate: times follow from it, and need no table.
     if (row == row[0]).all():
         return LineTimes(jnp.asarray(t[0]), jnp.asarray(period[row[0]])), backwards
     check_times(t, Source(f"{isd.path}, line_scan_rate", None, "line"))

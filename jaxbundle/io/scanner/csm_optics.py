@@ -30,9 +30,7 @@ def optics_of(
     """
     f = isd.number("focal_length_model.focal_length")
     if f == 0:
-        raise InputError(
-            f"{isd.path}: focal_length_model.focal_length is 0; millimetres are expected"
-        )
+        raise InputError(f"{isd.path}: focal_length_model.focal_length is 0; expected millimetres")
     x, y = _focal_plane(isd, np.arange(pixels))
     kind, undistorted = _distortion(isd, x, y)
     sights = np.stack([x / f, y / f])
@@ -59,7 +57,7 @@ def _focal_plane(isd: JsonFields, u: Float[np.ndarray, " pixels"]) -> Float[np.n
     sample = (u + 0.5) * summing + isd.number("starting_detector_sample", 0)
     line = isd.number("starting_detector_line", 0)
     A = np.stack([to_line[1:], to_sample[1:]])
-    # parallel but for the rounding of numbers of 12 digits
+    # Parallel but for the rounding of numbers of 12 digits.
     if abs(np.linalg.det(A)) < 1e-12 * np.abs(A).max() ** 2 or not A.any():
         raise InputError(f"{isd.path}: focal2pixel_lines and focal2pixel_samples are dependent")
     offset = np.stack(
@@ -80,7 +78,7 @@ def _distortion(
     if isinstance(kinds, dict) and len(kinds) > 1:
         raise InputError(
             f"{isd.path}: optical_distortion has {len(kinds)} kinds ({list_some(kinds)}); "
-            "one is expected"
+            "expected one"
         )
     where = f"optical_distortion.{kind}"
     coefficients = lambda n: isd.array(f"{where}.coefficients", (n,))
@@ -107,7 +105,7 @@ def _distortion(
             return kind, _transverse(isd, a, b, x, y)
     known = f"{', '.join(DISTORTIONS[:-1])} or {DISTORTIONS[-1]}"
     raise InputError(
-        f"{isd.path}: optical_distortion {show(kind)} is not supported; {known} is expected"
+        f"{isd.path}: optical_distortion {show(kind)} is not supported; expected {known}"
     )
 
 
@@ -127,7 +125,7 @@ def _transverse(
         terms = np.stack([u**0, u, v, uu, uv, vv, u**3, uu * v, uv * v, v**3])
         du, dv = x - a @ terms, y - b @ terms
         u, v = u + du, v + dv
-        # some 500 eps of the largest coordinate
+        # Some 500 eps of the largest coordinate.
         if max(np.abs(du).max(), np.abs(dv).max()) < 1e-13 * (1 + np.abs(x).max()):
             return u, v
     raise InputError(f"{isd.path}: optical_distortion.transverse cannot be inverted; check it")

@@ -53,11 +53,11 @@ def support_data_of(state: JsonFields) -> tuple[dict[str, Any], int]:
     if len({len(r) for r in rates}) > 1:
         raise InputError(
             f"{state.path}: {', '.join(names)} have {', '.join(str(len(r)) for r in rates)} "
-            "numbers; as many of each are expected"
+            "numbers; expected the same number of each"
         )
     flag = number("m_platformFlag", 1)
     if flag not in PLATFORM_ORDERS:
-        raise InputError(f"{state.path}: m_platformFlag is {flag:g}; 0 or 1 is expected")
+        raise InputError(f"{state.path}: m_platformFlag is {flag:g}; expected 0 or 1")
     isd = {
         "name_sensor": state.get("m_sensorName") or "",
         "name_model": MODEL,
@@ -70,7 +70,7 @@ def support_data_of(state: JsonFields) -> tuple[dict[str, Any], int]:
         "sensor_orientation": {"quaternions": _rows(state, "m_quaternions", 4)},
         "t0_quaternion": number("m_t0Quat"),
         "dt_quaternion": number("m_dtQuat"),
-        # the camera looks along (z·x, z·y, f), which for z = −1 is (x, y, −f) turned round
+        # The camera looks along (z·x, z·y, f), which for z = −1 is (x, y, −f) turned round.
         "focal_length_model": {
             "focal_length": number("m_focalLength") * np.sign(number("m_zDirection", 1))
         },
@@ -125,7 +125,7 @@ def frame_support_data_of(state: JsonFields) -> dict[str, Any]:
 def _check_unadjusted(state: JsonFields) -> None:
     name = state.get("m_modelName", MODEL)
     if name != MODEL:
-        raise InputError(f"{state.path}: m_modelName is {show(name)}; {MODEL} is expected")
+        raise InputError(f"{state.path}: m_modelName is {show(name)}; expected {MODEL}")
     adjusted = state.array("m_currentParameterValue", (None,), [])
     if adjusted.any():
         raise InputError(
@@ -137,7 +137,7 @@ def _check_unadjusted(state: JsonFields) -> None:
 def _rows(state: JsonFields, key: str, n: int) -> list[list[float]]:
     values = state.array(key, (None,))
     if not len(values) or len(values) % n:
-        raise InputError(f"{state.path}: {key} has {len(values)} numbers; {n} a row are expected")
+        raise InputError(f"{state.path}: {key} has {len(values)} numbers; expected {n} a row")
     return values.reshape(-1, n).tolist()
 
 

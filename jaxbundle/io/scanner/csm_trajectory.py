@@ -73,7 +73,7 @@ def unit_of(isd: JsonFields, key: str, default: str) -> float:
     """Metres in the unit of a field."""
     unit = isd.get(f"{key}.unit", default)
     if unit not in UNITS:
-        raise InputError(f"{isd.path}: {key}.unit is {show(unit)}; m or km is expected")
+        raise InputError(f"{isd.path}: {key}.unit is {show(unit)}; expected m or km")
     return UNITS[unit]
 
 
@@ -273,7 +273,7 @@ def _positions(
     if isd.get("instrument_position.velocities") is not None:
         V = scale * isd.array("instrument_position.velocities", (len(t), 3))
         wrong = contradiction(t, P, V, isd.source("instrument_position.velocities"))
-        # orbits are known to better than 100 m; a smaller error is interpolated as usgscsm does
+        # Orbits are known to better than 100 m; a smaller error is interpolated as usgscsm does.
         used = wrong is None or wrong.shift < 100
         if wrong is not None:
             todo = "used all the same" if used else "not used; positions are interpolated alone"
@@ -298,8 +298,8 @@ def _turns(isd: JsonFields, key: str) -> tuple[Float[np.ndarray, " n"], Turns, t
     fixed = isd.array(f"{key}.constant_rotation", (9,), np.eye(3).ravel()).reshape(3, 3)
     if not are_rotations(fixed):
         raise InputError(
-            f"{isd.path}: {key}.constant_rotation is not a rotation; nine numbers of an orthogonal "
-            "matrix are expected, row by row"
+            f"{isd.path}: {key}.constant_rotation is not a rotation; expected nine numbers of an "
+            "orthogonal matrix, row by row"
         )
     constant = Rotation.from_matrix(fixed)
     if len(t) == 1:
@@ -314,6 +314,6 @@ def _rotations(
     isd: JsonFields, key: str, scalar_last: Float[np.ndarray, "n 4"]
 ) -> tuple[Rotation, tuple[str, ...]]:
     if not len(scalar_last):
-        raise InputError(f"{isd.path}: {key}.quaternions is empty; a row for each time is expected")
+        raise InputError(f"{isd.path}: {key}.quaternions is empty; expected a row for each time")
     values, lengths = normalise_quaternions(scalar_last, isd.source(f"{key}.quaternions"))
     return Rotation.from_quat(values), lengths

@@ -97,7 +97,7 @@ def write_csm_state(
         t, P, R = _tables(given, first, last, intervals)
         between = first + (last - first) * (np.arange(intervals) + 0.5) / intervals
         truth = _poses(given, between)
-        # of the middles of intervals, in which the error is largest
+        # Of the middles of intervals, in which the error is largest.
         P_found = _between(t, P - P[0], between) + P[0]
         R_found = Rotation.from_quat(_between(t, R.as_quat(), between))
         wrong = np.linalg.norm(P_found - truth[0], axis=1).max()
@@ -135,12 +135,12 @@ def _tables(
     step = (last - first) / n
     t = first + step * np.arange(-BEYOND, n + BEYOND + 1)
     low, high = _covered(given.image)
-    # rounding of the ends
+    # Rounding of the ends.
     inside = (t >= low - 1e-9 * step) & (t <= high + 1e-9 * step)
     P, R = np.full((len(t), 3), np.nan), np.full((len(t), 3, 3), np.nan)
     P[inside], R[inside] = _poses(given, np.clip(t[inside], low, high))
     q = Rotation.from_matrix(np.where(inside[:, None, None], R, np.eye(3))).as_quat()
-    # one sign along the table: q and −q are the same rotation
+    # One sign along the table: q and −q are the same rotation.
     for k in np.flatnonzero(inside)[1:]:
         q[k] *= np.sign(q[k] @ q[k - 1]) or 1.0
     known = np.flatnonzero(inside)
@@ -148,7 +148,7 @@ def _tables(
         origin = values[known[0]].copy()
         for k in np.flatnonzero(~inside):
             near = known[:5] if k < known[0] else known[-5:]
-            # of degree 4: a row of the tables is a thousandth of an orbit or of a jitter
+            # Of degree 4: a row of the tables is a thousandth of an orbit or of a jitter.
             values[k] = origin + _lagrange(t[near], values[near] - origin, t[k])
     return t, P, Rotation.from_quat(q)
 
@@ -188,7 +188,7 @@ def _poses(
     given: _Source, times: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
     """P and R, camera → Earth-fixed, that a model without corrections needs."""
-    # of few shapes, so that few programs are compiled
+    # Of few shapes, so that few programs are compiled.
     size = 256 << max(int(np.ceil(np.log2(len(times) / 256))), 0)
     padded = np.asarray(times)[np.minimum(np.arange(size), len(times) - 1)]
     u = _some_pixels(given.image)
@@ -310,7 +310,7 @@ def _optics(sights: Float[np.ndarray, "2 pixels"]) -> tuple[dict[str, Any], floa
     if straight < 1e-9:
         fields = {"m_detectorLineOrigin": -row, "m_distortionType": 0}
         return common | fields | {"m_opticalDistCoeffs": [0.0, 0.0, 0.0]}, straight / f
-    # distorted x = a(x), y = y − b(x) = 0: cubics of the undistorted x, in units of the half line
+    # Distorted x = a(x), y = y − b(x) = 0: cubics of the undistorted x, in units of the half line.
     half = max(np.abs(x).max(), 1.0)
     powers = np.stack([(x / half) ** k for k in range(4)], 1)
     scale = half ** np.arange(4)
@@ -378,7 +378,7 @@ def _line_times(image: PushbroomImage) -> tuple[list[float], list[float], list[f
     t = np.asarray(image.times.table)
     steps = np.diff(t)
     steps = np.r_[steps, steps[-1:]]
-    # parts end where the time of a line is not that of its part, to a nanosecond: 8 µm of a track
+    # Parts end where the time of a line is not that of its part, to a nanosecond: 8 µm of a track.
     lines, k = [0], 0
     while k < len(t):
         off = np.abs(t[k:] - t[k] - steps[k] * np.arange(len(t) - k)) > 1e-9

@@ -65,7 +65,7 @@ def read_dimap(file: XmlFields) -> ScannerInput:
     centre = file.number(f"{setting}SCENE_CENTER_LINE") - 1
     epoch = file.time(f"{setting}SCENE_CENTER_TIME")
     if period <= 0:
-        raise InputError(f"{path}: LINE_PERIOD is {period:g} s; a positive number is expected")
+        raise InputError(f"{path}: LINE_PERIOD is {period:g} s; expected a positive number")
     times = LineTimes(jnp.asarray(-period * centre), jnp.asarray(period))
 
     key = "Ephemeris/Points/Point"
@@ -83,7 +83,7 @@ def read_dimap(file: XmlFields) -> ScannerInput:
     when = np.asarray(times.time(jnp.arange(lines, dtype=float)))
     warnings = warn_of_extrapolation(rows, when, source)
     rows, angles = _extrapolate(rows, angles, when[0], when[-1])
-    # the frame of an attitude is that of the orbit at its time
+    # The frame of an attitude is that of the orbit at its time.
     check_covered(position, rows, points, "attitude row")
     state = np.asarray(jax.vmap(lambda at: interpolate(both, at))(rows))
     frame = np.asarray(jax.vmap(orbital_frame)(state[:, :3], state[:, 3:]))

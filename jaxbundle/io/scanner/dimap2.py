@@ -120,7 +120,7 @@ def read_dimap2(file: XmlFields) -> ScannerInput:
     tables = Tables(t, P, rows, R, positions, attitude)
     x, y, warnings = _look_angles(file, names)
     u = np.arange(pixels)
-    # the optics are polynomials about a mean direction in the middle of the image
+    # The optics are polynomials about a mean direction in the middle of the image.
     frame = sight_frame(
         np.stack([np.polyval(p[::-1], u) for p in (y, -x)]), *tables.directions(last / 2)
     )
@@ -177,13 +177,13 @@ def _period(file: XmlFields, names: Names, lines: int, epoch: np.datetime64) -> 
     for unit in (*known, 1.0, 1e-3, 1e-6):
         if fits(unit):
             return unit * period
-    # where START and END contradict it: the unit documented for the product
+    # Where START and END contradict it: the unit documented for the product.
     if known and period > 0:
         return known[0] * period
     name = names.period.rpartition("/")[2]
     raise InputError(
-        f"{file.path}: {name} is {period:g} and START to END {span:g} s for {lines} lines; a "
-        "period in seconds, milliseconds or microseconds that fits is expected"
+        f"{file.path}: {name} is {period:g} and START to END {span:g} s for {lines} lines; "
+        "expected a period in seconds, milliseconds or microseconds that fits"
     )
 
 
@@ -193,7 +193,7 @@ def _read_location(file: XmlFields, name: str, element: ET.Element, k: int) -> l
     _unit(file, element.find(name), {"m": 1.0})
     words = element.findtext(name, "").replace(",", " ").split()
     if len(words) != 3:
-        raise InputError(f"{where} has {len(words)} numbers; 3 are expected")
+        raise InputError(f"{where} has {len(words)} numbers; expected 3")
     return [number_in(word, where) for word in words]
 
 

@@ -21,9 +21,9 @@ WITH_UNIT = Keys(("unit",))
 DIMAP2_DOCUMENT = Keys(
     (
         *("Metadata_Identification", "Dataset_Identification", "Raster_Data", "Geometric_Data"),
-        # what is used of these decides whether the image has the geometry of the camera
+        # What is used of these decides whether the image has the geometry of the camera.
         *("Geoposition", "Processing_Information"),
-        # of the first products of Pléiades
+        # Of the first products of Pléiades.
         *("Raster_Dimensions", "Product_Characteristics"),
     ),
     {

@@ -88,7 +88,7 @@ def read_flight(path: str | Path) -> FlightFile:
     earth = earth_of(scanner)
     period = times.number("period")
     if period <= 0:
-        raise InputError(f"{times.where}period is {period}; a positive number is expected")
+        raise InputError(f"{times.where}period is {period}; expected a positive number")
     pixels = scanner.integer("pixels")
     instruments = file.section("instruments")
     options: dict[str, Any] = {k: instruments.number(k) for k in RATES if k in instruments}
@@ -140,22 +140,22 @@ def _place(track: TomlSection, key: str, radians: float, earth: Ellipsoid) -> np
     longitude, latitude, height = track.numbers(key, 3)
     if not abs(radians * latitude) <= np.pi / 2:
         raise InputError(
-            f"{track.where}{key} has a latitude of {latitude:g}; longitude, latitude, height are "
-            "expected, in the unit of angles and metres"
+            f"{track.where}{key} has a latitude of {latitude:g}; expected longitude, latitude, "
+            "height, in the unit of angles and metres"
         )
     place = radians * longitude, radians * latitude, height
     return np.array([float(v) for v in earth_fixed(earth, place)])
 
 
 def _sigma(section: TomlSection, name: str, radians: float) -> Sigma:
-    # attitudes are given in the unit of angles, positions in metres
+    # Attitudes are given in the unit of angles, positions in metres.
     unit = radians if name.startswith("attitude") else 1.0
     if isinstance(section.values.get(name), list):
         sigma = section.numbers(name, 3)
     else:
         sigma = section.number(name, 0.0)
     if np.any(np.asarray(sigma) < 0):
-        raise InputError(f"{section.where}{name} is negative; a standard deviation is expected")
+        raise InputError(f"{section.where}{name} is negative; expected a standard deviation")
     return unit * sigma
 
 
@@ -166,7 +166,7 @@ def _signal(value: Any, unit: float, where: str) -> float | dict[str, Any] | lis
     if isinstance(value, int | float) and not isinstance(value, bool):
         return unit * value
     if not isinstance(value, Mapping):
-        raise InputError(f'{where}a number or a table such as {{ kind = "sine", … }} is expected')
+        raise InputError(f'{where}expected a number, or a table such as {{ kind = "sine", … }}')
     kind = value.get("kind", "constant")
     if kind not in KEYS:
         raise InputError(f"{where}unknown signal {kind!r}{did_you_mean(str(kind), KEYS)}")
@@ -177,6 +177,6 @@ def _signal(value: Any, unit: float, where: str) -> float | dict[str, Any] | lis
         if key in ("times", "values"):
             scaled[key] = (unit if key == "values" else 1.0) * section.numbers(key)
         elif key != "kind":
-            # times are no angles
+            # Times are no angles.
             scaled[key] = (1.0 if key in ("period", "step") else unit) * section.number(key)
     return scaled

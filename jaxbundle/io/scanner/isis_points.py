@@ -141,7 +141,7 @@ def read_jigsaw_residuals(path: str | Path) -> IsisPoints:
     """
     path, points, rays, residuals, rejected = Path(path), {}, [], [], 0
     for number, text in enumerate(read_text(path).splitlines(), 1):
-        # three lines of head
+        # Three lines of head.
         if number <= 3 or not text.strip():
             continue
         fields, where = [field.strip() for field in text.split(",")], f"{path}, line {number}"
@@ -156,7 +156,9 @@ def read_jigsaw_residuals(path: str | Path) -> IsisPoints:
         rays.append((point, names, (line - 1, sample - 1), (np.nan, np.nan), number))
         residuals.append((dy, dx))
     if not rays:
-        raise InputError(f"{path}: no measurement; expected one a line, after three lines of head")
+        raise InputError(
+            f"{path}: no measurement; expected one per line, after three lines of head"
+        )
     said = [f"{path}: {count(rejected, 'measurement')} rejected by jigsaw, left out"]
     said = (said if rejected else []) + _describe_residuals(path, np.array(residuals))
     unknown = (np.full(3, np.nan), np.zeros((3, 3)))
@@ -222,7 +224,7 @@ def _points_of(path: Path) -> Iterator[tuple[Fields, list[Fields]]]:
             if blocks.pop()[1] == "CONTROLPOINT":
                 yield fields, measures
         elif entry.value.partition("<")[0].strip().upper() == "NULL":
-            # a value that the network does not have, as if its line were missing
+            # A value that the network does not have, as if its line were missing.
             continue
         elif blocks and blocks[-1][1] == "CONTROLPOINT":
             fields[entry.name] = entry
@@ -254,9 +256,7 @@ def _statements(path: Path) -> Iterator[_Entry]:
             if match is None and line.upper() in ("END_OBJECT", "END_GROUP"):
                 match = re.match(r"(\w+)(.*)$", line)
             if match is None:
-                raise InputError(
-                    f"{path}, line {number}: {show(line[:60])}; NAME = value is expected"
-                )
+                raise InputError(f"{path}, line {number}: {show(line[:60])}; expected NAME = value")
             name, value, first = match[1].upper(), match[2].strip(), number
         open_list = value.startswith("(") and ")" not in value
         open_text = value.count('"') % 2 == 1
@@ -286,7 +286,7 @@ def _length(path: Path, fields: Fields, name: str) -> float:
         unit = fields[name].value.partition("<")[2].rstrip("> ").lower()
         if unit not in METRES:
             line = fields[name].line
-            raise InputError(f"{path}, line {line}: {name} in {show(unit)}; meters are expected")
+            raise InputError(f"{path}, line {line}: {name} in {show(unit)}; expected meters")
         value *= METRES[unit]
     return value
 
@@ -300,11 +300,11 @@ def _point(path: Path, fields: Fields) -> tuple[str, str, np.ndarray, np.ndarray
     role = ROLES.get(kind.value.lower())
     if role is None:
         raise InputError(
-            f"{path}, line {kind.line}: PointType {show(kind.value)}; Free, Fixed or Constrained "
-            "is expected"
+            f"{path}, line {kind.line}: PointType {show(kind.value)}; expected Free, Fixed or "
+            "Constrained"
         )
     X = np.full(3, np.nan)
-    # what a network knew before it was adjusted is the observation
+    # What a network knew before it was adjusted is the observation.
     for source in ("APRIORI", "ADJUSTED"):
         if not np.isfinite(X).all():
             X = np.array([_length(path, fields, f"{source}{axis}") for axis in "XYZ"])
@@ -331,16 +331,14 @@ def _covariance(path: Path, fields: Fields, id: _Entry) -> Float[np.ndarray, "3 
     where = f"{path}, line {entry.line}: AprioriCovarianceMatrix"
     words = re.sub(r"<[^>]*>|[()]", " ", entry.value).replace(",", " ").split()
     if len(words) != 6:
-        raise InputError(
-            f"{where} has {len(words)} numbers; six of its upper triangle are expected"
-        )
+        raise InputError(f"{where} has {len(words)} numbers; expected six of its upper triangle")
     C = np.zeros((3, 3))
     C[np.triu_indices(3)] = [number_in(word, where) for word in words]
     C = C + np.triu(C, 1).T
     least = np.linalg.eigvalsh(C)[0]
     if least < -1e-9 * np.trace(C):
         raise InputError(f"{where} is no covariance: it has a negative eigenvalue")
-    # below this eigenvalues are rounding: it would hold the point along an axis of chance
+    # Below this eigenvalues are rounding: it would hold the point along an axis of chance.
     if least <= 1e-14 * np.trace(C):
         raise InputError(
             f"{where} has no error in one direction; give σ above 0 for all, or make the point "

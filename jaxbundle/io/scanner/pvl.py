@@ -34,7 +34,7 @@ def read_support_data(path: Path) -> ET.Element:
         file = beside.get(f".{name}")
         if file is None:
             raise InputError(
-                f"{path}: {path.stem}.{name} is not beside it; {', '.join(GROUPS)} belong together"
+                f"{path}: {path.stem}.{name} is not next to it; {', '.join(GROUPS)} belong together"
             )
         _read(file, ET.SubElement(root, name))
     return root
@@ -48,7 +48,7 @@ def _read(path: Path, root: ET.Element) -> None:
         begin = len(text) - len(text[begin:].lstrip())
         match = STATEMENT.match(text, begin)
         if match is None:
-            raise wrong("NAME = value; is expected")
+            raise wrong("expected NAME = value;")
         name = match[1].upper()
         if name in ("BEGIN_GROUP", "END_GROUP"):
             line = text.find("\n", match.end())
@@ -57,7 +57,7 @@ def _read(path: Path, root: ET.Element) -> None:
             tag = re.sub(r"_\d+$", "", text[match.end() : line].strip(" \t\r;").upper())
             if name == "BEGIN_GROUP":
                 if not re.fullmatch(r"\w+", tag):
-                    raise wrong("the name of a group is expected")
+                    raise wrong("expected the name of a group")
                 groups.append(ET.SubElement(groups[-1], tag))
             elif len(groups) == 1 or groups.pop().tag != tag:
                 raise wrong(f"the group {tag} ends without a beginning")
@@ -65,7 +65,7 @@ def _read(path: Path, root: ET.Element) -> None:
             continue
         end = text.find(";", match.end())
         if end < 0 or not re.fullmatch(r"\w+", name):
-            raise wrong("NAME = value; is expected")
+            raise wrong("expected NAME = value;")
         _put(groups[-1], name, text[match.end() : end].strip())
         begin = end + 1
     if len(groups) > 1:

@@ -45,7 +45,7 @@ def read_scanner(path: str | Path) -> ScannerInput:
             f"{path}: a flight file, of an image still to be simulated; simulate it (jaxbundle "
             "pushbroom simulate), and give the scanner.toml of its folder"
         )
-    # a file with a source needs no other section
+    # A file with a source needs no other section.
     file = read_sections(path, SECTIONS, REQUIRED_FIELDS[:1])
     scanner = file.section("scanner")
     if "source" in scanner:
@@ -68,14 +68,14 @@ def _read_source(file: TomlFile, scanner: TomlSection) -> ScannerInput:
     automatic = scanner.text("corrections", "") if "corrections" in scanner else None
     if automatic not in (None, "auto"):
         raise InputError(
-            f'{scanner.where}corrections = {show(automatic)}; "auto" is expected, or the section '
+            f'{scanner.where}corrections = {show(automatic)}; expected "auto", or the section '
             "[corrections] with light_time, aberration, refraction"
         )
     for name in file.document:
         if name not in ("scanner", "corrections"):
             raise InputError(
                 f"{file.path}, [{name}]: this is read from the source; only [scanner] and "
-                "[corrections] can stand beside it"
+                "[corrections] can be given with it"
             )
     choice = scanner.text("interpolation") if "interpolation" in scanner else None
     source = scanner.path("source", EXPECTED_PRODUCTS)
@@ -86,7 +86,7 @@ def _read_source(file: TomlFile, scanner: TomlSection) -> ScannerInput:
         )
     seconds = scanner.number("extrapolate") if "extrapolate" in scanner else None
     if seconds is not None and seconds < 0:
-        raise InputError(f"{scanner.where}extrapolate is {seconds:g}; seconds are expected")
+        raise InputError(f"{scanner.where}extrapolate is {seconds:g}; expected seconds")
     product = _read_product(source, choice, seconds)
     switches = file.section("corrections")
     switched = {name: switches.switch(name) for name in switches.values}
@@ -97,12 +97,12 @@ def _read_source(file: TomlFile, scanner: TomlSection) -> ScannerInput:
     corrections = product.image.corrections._replace(**switched)
     if corrections.any and product.backwards:
         raise InputError(
-            f"{switches.where}the lines of {source.name} were taken in reverse order, which "
-            "corrections do not know; omit them"
+            f"{switches.where}the lines of {source.name} were taken in reverse order, for "
+            "which there are no corrections; omit them"
         )
     image = dataclasses.replace(product.image, corrections=corrections)
     product = dataclasses.replace(product, image=image, name=scanner.text("name", product.name))
-    # what the user switched is compared, but not replaced
+    # What the user switched is compared, but not replaced.
     return check_against_rpc(product, source, not switched, automatic is not None)
 
 
@@ -126,7 +126,7 @@ def _read_xml(path: Path) -> ScannerInput:
     """The image of a product in XML, by the name of its root and the groups in it."""
     root = read_xml(path)
     has = lambda key: root.find(f".//{key}") is not None
-    # early products of Pléiades have PHR_DIMAP_Document or PHR_Dimap_Document
+    # Early products of Pléiades have PHR_DIMAP_Document or PHR_Dimap_Document.
     if root.tag.lower().endswith("dimap_document"):
         if has(MODEL) or has(EARLY_MODEL):
             return read_dimap2(XmlFields(path, root, "DIMAP 2 of sensor level"))
@@ -149,6 +149,6 @@ def _read_xml(path: Path) -> ScannerInput:
     if has("GEO") and has("EPH") and has("ATT"):
         return read_worldview(XmlFields(path, root, WORLDVIEW))
     raise InputError(
-        f"{path}: XML of another kind, <{root.tag[:60]}>; DIMAP of SPOT 5, Pléiades, SPOT 6 or 7, "
-        "or DigitalGlobe's with the groups GEO, EPH, ATT is expected"
+        f"{path}: XML of another kind, <{root.tag[:60]}>; expected DIMAP of SPOT 5, Pléiades, "
+        "SPOT 6 or 7, or DigitalGlobe's with the groups GEO, EPH, ATT"
     )

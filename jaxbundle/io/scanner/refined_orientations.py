@@ -95,7 +95,7 @@ def write_refined_orientations(
     rows = []
     for one in file.images:
         raster = find_raster(file.sources[one.id])
-        # from where the folder will be: now it has a temporary name
+        # From where the folder will be: now it has a temporary name.
         known = "" if raster is None else relative_path(raster, place)
         if isinstance(one, RpcScannerImage):
             domain = domain_of_bias(one.image.rpc)
@@ -126,9 +126,9 @@ def read_refined_orientations(folder: Path) -> RefinedBlock | None:
         refined = folder / file
         if not file or not refined.is_file():
             raise InputError(f"{table.source(k)}: no such file {refined}; refine again with --out")
-        # images may have been moved since: a raster is needed for matching only, not for change
+        # Images may have been moved since: a raster is needed for matching only, not for change.
         pixels = folder / raster if raster and (folder / raster).is_file() else None
-        # empty with RPC, which has no jitter: the number is not used
+        # Empty with RPC, which has no jitter: the number is not used.
         knots = float(spacing[k]) if spacing[k] == spacing[k] else 1.0
         if not knots > 0:
             raise InputError(f"{table.source(k)}: knot_spacing is {knots:g}; seconds above 0")

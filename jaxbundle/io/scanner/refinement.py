@@ -138,7 +138,7 @@ def read_refinement(path: str | Path) -> RefineFile:
     frames = None
     if "frames" in section:
         frames = read_network(section.path("frames", "a project of photographs", folder=True))
-    # other programs name an image by its file, without folder and suffix
+    # Other programs name an image by its file, without folder and suffix.
     sources = {one.id: file.section("images").path(one.id, "an image") for one in images}
     names = {re.sub("(?i)_rpc$", "", sources[one.id].stem): one.id for one in images}
     names |= {one.id: one.id for one in images}
@@ -161,7 +161,7 @@ def read_refinement(path: str | Path) -> RefineFile:
     significance = section.number("significance", 0.001)
     if not 0 < significance < 1:
         raise InputError(
-            f"{section.where}significance is {significance}; a number between 0 and 1 is expected"
+            f"{section.where}significance is {significance}; expected a number between 0 and 1"
         )
     rpc_format = section.text("rpc_format", "text")
     if rpc_format not in RPC_ENDINGS:
@@ -187,7 +187,7 @@ def _wants_states(section: TomlSection, images: Sequence[AnyScannerImage]) -> bo
     """Whether rigorous images are written as model states."""
     wanted = section.values.get("csm_states", False)
     if not isinstance(wanted, bool):
-        raise InputError(f"{section.where}csm_states is {wanted!r}; true or false is expected")
+        raise InputError(f"{section.where}csm_states is {wanted!r}; expected true or false")
     local = [one.id for one in images if isinstance(one, ScannerImage) and one.earth is None]
     if wanted and local:
         raise InputError(
@@ -211,7 +211,7 @@ def _read_terrain(section: TomlSection, images: Sequence[AnyScannerImage]) -> He
         )
     if "dem_sigma" not in section:
         raise InputError(
-            f"{section.where}dem_sigma is missing; the σ of a height of {path.name} is expected, "
+            f"{section.where}dem_sigma is missing; expected the σ of a height of {path.name}, "
             "metres: the LE90 of its producer, divided by 1.645"
         )
     sigma = section.number("dem_sigma")
@@ -224,7 +224,7 @@ def _read_terrain(section: TomlSection, images: Sequence[AnyScannerImage]) -> He
     ]  # fmt: skip
     terrain = read_terrain(path, earth, joint_extent(extents), above_geoid="geoid" in section)
     if "geoid" in section:
-        # a file beside this one, or the name of a grid of PROJ
+        # A file beside this one, or the name of a grid of PROJ.
         name = section.text("geoid")
         beside = section.beside(name)
         terrain = add_geoid(terrain, beside if beside.exists() else Path(name))

@@ -56,7 +56,7 @@ def read_images(file: TomlFile, radians: float) -> tuple[list[AnyScannerImage], 
         mine, name = own.get(id, {}), f"unknowns.{id}" if id in own else "unknowns"
         is_rpc = _is_rpc(source, models, id)
         known = OF_RPC if is_rpc else fields
-        # what is common to all images is for those that have it
+        # What is common to all images is for those that have it.
         chosen = {k: v for k, v in common.items() if k in known} | mine
         unknowns_of_image = section(name, chosen)
         _check_own_keys(unknowns_of_image, mine, known, is_rpc)
@@ -68,7 +68,7 @@ def read_images(file: TomlFile, radians: float) -> tuple[list[AnyScannerImage], 
         scanner = read_scanner(source)
         warnings += scanner.warnings
         freedom = _read_freedom(unknowns_of_image, radians)
-        # without an entry an image is a sensor of its own
+        # Without an entry an image is a sensor of its own.
         images.append(ScannerImage(id, scanner.image, scanner.earth, freedom, sensors.text(id, id)))
     if all(isinstance(one, ScannerImage) for one in images):
         file.require(("unknowns",))
@@ -115,7 +115,7 @@ def _read_rpc_image(
     found = read_rpc_image(path)
     degree = section.values.get("bias_degree", 0)
     if type(degree) is not int or degree not in range(len(BIAS_TERMS)):
-        raise InputError(f"{section.where}bias_degree is {show(degree)}; 0, 1 or 2 is expected")
+        raise InputError(f"{section.where}bias_degree is {show(degree)}; expected 0, 1 or 2")
     given, warnings = section.values.get("bias"), found.warnings
     if given in (None, STATED_BIAS):
         source = find_coefficients(path)
@@ -136,8 +136,8 @@ def _read_rpc_image(
     values = given if isinstance(given, list) else [given, given]
     if len(values) != 2:
         raise InputError(
-            f"{section.where}bias is {show(given)}; one σ, or two, of the shift and of the other "
-            "terms, is expected, in pixels"
+            f"{section.where}bias is {show(given)}; expected one σ, or two, of the shift and of "
+            "the other terms, in pixels"
         )
     shift, variation = (_sigma(section, "bias", value) for value in values)
     return RpcScannerImage(id, found.image, prior_of_bias(degree, shift, variation)), warnings
@@ -169,6 +169,4 @@ def _sigma(section: TomlSection, key: str, value: Any) -> float:
         return WORDS[value]
     if isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < math.inf:
         return float(value)
-    raise InputError(
-        f'{section.where}{key} is {show(value)}; "free", "held" or a prior σ is expected'
-    )
+    raise InputError(f'{section.where}{key} is {show(value)}; expected "free", "held" or a prior σ')

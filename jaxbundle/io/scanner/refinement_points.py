@@ -90,11 +90,11 @@ def read_points(
             given |= set(new)
             parts.append(_tie_points(new, Source(str(path))))
     points = _join_points(parts)
-    # checked first: the ids of observations are looked up in it
+    # Checked first: the ids of observations are looked up in it.
     check_points_table(points)
     ids = {id: k for k, id in enumerate(points.id)}
     if frames is not None:
-        # points that only photographs show follow those of the table
+        # Points that only photographs show follow those of the table.
         more = (id for id in frames.points.id if id not in ids)
         ids |= {id: k for k, id in enumerate(more, len(ids))}
     known = [image.id for image in images]
@@ -162,7 +162,7 @@ def _points_of_isis(found: IsisPoints, path: Path, given: set[str]) -> GroundPoi
     variances, vectors = np.linalg.eigh(found.covariance[kept])
     X = found.X[kept].copy()
     roles = [found.role[k] for k in kept]
-    # tie points begin at the intersection of their rays
+    # Tie points begin at the intersection of their rays.
     X[np.array(roles, object) == "tie"] = np.nan
     return GroundPoints(
         tuple(found.id[k] for k in kept),
@@ -293,8 +293,8 @@ def _points_of(table: Columns, earth: Ellipsoid | None, radians: float) -> Groun
         if beyond.any():
             row = int(beyond.argmax())
             raise InputError(
-                f"{table.source(row)}: latitude {X[row, 1]:g} is beyond the pole; look at the "
-                "order of columns and at angle_unit"
+                f"{table.source(row)}: latitude {X[row, 1]:g} is beyond the pole; check the "
+                "order of columns and angle_unit"
             )
         X = np.stack(
             [
@@ -304,7 +304,7 @@ def _points_of(table: Columns, earth: Ellipsoid | None, radians: float) -> Groun
             1,
         )
         known = np.isfinite(X).all(1)
-        # an unknown place has no east and north: its σ are of the axes
+        # An unknown place has no east and north: its σ are of the axes.
         axes[known] = east_north_up(earth, X[known])
     return GroundPoints(
         table.ids("id"),

@@ -127,10 +127,12 @@ def read_rpc(path: str | Path, unknown: UnknownKeys | None = None) -> Rpc:
             values = read(path, text, unknown)
     for axis in OFFSETS:
         if values[f"{axis}_scale"] == 0:
-            raise InputError(f"{path}: the scale of {axis} is 0; another number is expected")
+            raise InputError(f"{path}: the scale of {axis} is 0; expected another number")
     for name in ("line_denominator", "sample_denominator"):
         if values[name][0] == 0:
-            raise InputError(f"{path}: the {name.replace('_', ' ')} begins with 0; 1 is usual")
+            raise InputError(
+                f"{path}: the {name.replace('_', ' ')} begins with 0; expected 1, as usual"
+            )
     return Rpc(**{name: jnp.asarray(value, float) for name, value in values.items()})
 
 
@@ -148,7 +150,7 @@ def read_stated_errors(path: str | Path) -> StatedErrors:
         text = read_text(path, fallback="latin-1")
         found = {name: pattern.search(text) for name, pattern in ERRORS.items()}
         said = {name: match and match[1] for name, match in found.items()}
-    # a negative number stands for an unknown one in RPC00B
+    # A negative number stands for an unknown one in RPC00B.
     number = lambda word: max(number_in(str(word), f"{path}: its stated error"), 0.0)
     return StatedErrors(**{name: number(word) for name, word in said.items() if word is not None})
 
@@ -176,24 +178,24 @@ def _from_text(path: Path, text: str, unknown: UnknownKeys) -> dict[str, Any]:
         name, colon, value = line.partition(":")
         if not colon:
             raise InputError(
-                f"{path}, line {number}: {show(line.strip())}; NAME: value is expected, such as "
+                f"{path}, line {number}: {show(line.strip())}; expected NAME: value, such as "
                 "LINE_OFF: 3000.5"
             )
         written, name = name.strip(), name.strip().upper()
         if name in entries:
             raise InputError(f"{path}, line {number}: {name} occurs twice")
         entries[name] = value.split(), number
-        # as it is written: capitals show where the words of an unknown name begin
+        # As it is written: capitals show where the words of an unknown name begin.
         if TEXT_KEYS.unknown((name,)):
             unknown.check((written,), TEXT_KEYS, f"{path}, line {number}")
 
     def number_of(name: str, unit: str | None = None) -> float:
         if name not in entries:
-            raise InputError(f"{path}: {name} is missing; an RPC00B text file is expected")
+            raise InputError(f"{path}: {name} is missing; expected an RPC00B text file")
         words, line = entries[name]
         value = number_in(words[0] if words else "", f"{path}, line {line}: {name}")
         if unit and len(words) > 1 and words[1].lower() not in UNIT_WORDS[unit]:
-            raise InputError(f"{path}, line {line}: {name} is in {words[1]}; {unit} are expected")
+            raise InputError(f"{path}, line {line}: {name} is in {words[1]}; expected {unit}")
         return value
 
     values = {}
@@ -231,7 +233,7 @@ def _from_rpb(path: Path, text: str, unknown: UnknownKeys) -> dict[str, Any]:
 
     def value_of(key: str) -> tuple[str, str]:
         if key not in entries:
-            raise InputError(f"{path}: {key} is missing; an RPB file of RPC00B is expected")
+            raise InputError(f"{path}: {key} is missing; expected an RPB file of RPC00B")
         return entries[key][0], f"{path}, line {entries[key][1]}: {key}"
 
     values = {}
@@ -241,9 +243,9 @@ def _from_rpb(path: Path, text: str, unknown: UnknownKeys) -> dict[str, Any]:
     for field, (_, key) in FIELDS.items():
         value, where = value_of(key)
         numbers = [part for part in value.strip("() \t").split(",") if part.strip()]
-        # a bracket that was cut off gives fewer
+        # A bracket that was cut off gives fewer.
         if len(numbers) != TERMS:
-            raise InputError(f"{where} has {len(numbers)} coefficients; {TERMS} are expected")
+            raise InputError(f"{where} has {len(numbers)} coefficients; expected {TERMS}")
         values[field] = [number_in(part, where) for part in numbers]
     return values
 
@@ -260,7 +262,7 @@ def _from_raster(path: Path) -> dict[str, Any]:
     for field, (name, _) in FIELDS.items():
         values[field] = getattr(tags, name.lower())
         if len(values[field]) != TERMS or not np.isfinite(values[field]).all():
-            raise InputError(f"{path}: {name} of the RPC tags: {TERMS} finite numbers are expected")
+            raise InputError(f"{path}: {name} of the RPC tags: expected {TERMS} finite numbers")
     return values
 
 
@@ -278,7 +280,7 @@ def _to_raster(path: Path, rpc: Rpc) -> None:
         raise InputError(f"{path}: no such file; RPC tags are written into a raster that exists")
     try:
         with replace_file(path) as temporary:
-            # the tags of the copy change: after a failure the raster is as it was
+            # The tags of the copy change: after a failure the raster is as it was.
             shutil.copyfile(path, temporary)
             with open_plain(temporary, "r+") as target:
                 target.rpcs = RPC(**given)

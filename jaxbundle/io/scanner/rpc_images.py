@@ -85,7 +85,7 @@ def find_coefficients(path: Path) -> Path:
     beside = (path.with_name(path.stem + end) for end in COMPANION_ENDINGS)
     found = next((p for p in beside if p.is_file()), path)
     if found is path and path.suffix.lower() not in RASTERS:
-        raise InputError(f"{path}: no coefficients beside it: {path.stem}_RPC.TXT is expected")
+        raise InputError(f"{path}: no coefficients beside it: expected {path.stem}_RPC.TXT")
     return found
 
 

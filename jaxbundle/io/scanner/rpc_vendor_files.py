@@ -20,7 +20,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.text.known_keys import Keys, UnknownKeys
 from jaxbundle.io.text.xml_fields import XmlFields, number_in, read_xml
 from jaxbundle.pushbroom.rpc.polynomials import TERMS
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 AXES = {
     "line": "line",
@@ -106,7 +106,7 @@ def from_xml(path: Path, unknown: UnknownKeys) -> dict[str, Any]:
             "RPC_….XML. `pushbroom` commands read the rigorous model from this file"
         )
     if root.find(".//RPB") is not None:
-        unknown.check_tree(present(root.find(".//RPB")), DIGITALGLOBE_KEYS, path)
+        unknown.check_tree(not_none(root.find(".//RPB")), DIGITALGLOBE_KEYS, path)
         return _from_digitalglobe(XmlFields(path, root, DIGITALGLOBE))
     raise InputError(
         f"{path}: XML of another kind, <{root.tag[:60]}>: no RPC of DIMAP (RFM_Validity) and none "
@@ -123,7 +123,7 @@ def from_geom(path: Path, text: str) -> dict[str, Any]:
     for number, line in enumerate(text.splitlines(), 1):
         name, colon, value = line.partition(":")
         if colon:
-            # keywords may be prefixed by the image or the projection
+            # Keywords may be prefixed by the image or the projection.
             found[name.strip()] = found[name.strip().rpartition(".")[2]] = value.strip(), number
     kind, line = found.get("polynomial_format", ("B", 0))
     if kind != "B":
@@ -157,7 +157,7 @@ def from_geom(path: Path, text: str) -> dict[str, Any]:
 def number_of(path: Path, found: dict[str, tuple[str, int]], name: str) -> float:
     """The number of a keyword."""
     if name not in found:
-        raise InputError(f"{path}: {name} is missing; a keyword list of an OSSIM RPC is expected")
+        raise InputError(f"{path}: {name} is missing; expected a keyword list of an OSSIM RPC")
     value, line = found[name]
     return number_in(value, f"{path}, line {line}: {name}")
 
@@ -167,14 +167,14 @@ def _from_dimap(file: XmlFields, root: ET.Element, unknown: UnknownKeys) -> dict
     if inverse is None:
         raise file.missing("Inverse_Model")
     for name in ("RFM_Validity", inverse):
-        unknown.check_element(present(root.find(f".//{name}")), DIMAP_KEYS, f"{file.path}: {name}")
+        unknown.check_element(not_none(root.find(f".//{name}")), DIMAP_KEYS, f"{file.path}: {name}")
     values = {}
     for axis, name in AXES.items():
         for part, short in (("offset", "OFF"), ("scale", "SCALE")):
             values[f"{axis}_{part}"] = file.number(f"RFM_Validity/{name.upper()}_{short}")
     profile = file.text("Metadata_Identification/METADATA_PROFILE", "").partition("_")[0]
     for axis in ("line", "sample"):
-        # the first pixel is (1, 1) or (0, 0) by the profile of the product
+        # The first pixel is (1, 1) or (0, 0) by the profile of the product.
         values[f"{axis}_offset"] -= DIMAP_ORIGIN.get(profile, DIMAP_OTHER[inverse])
     for field, (axis, part) in FIELDS.items():
         names = [f"{axis}_{part}_coeff_{k}".upper() for k in range(1, TERMS + 1)]

@@ -166,8 +166,8 @@ def _options(section: TomlSection, method: str) -> dict[str, Any]:
         options["gap"] = section.number("gap")
         if options["gap"] <= 0:
             raise InputError(
-                f"{section.where}gap is {options['gap']:g}; the longest step that is "
-                "interpolated, in seconds, is expected, a positive number"
+                f"{section.where}gap is {options['gap']:g}; expected the longest step that "
+                "is interpolated, a positive number of seconds"
             )
     if "extrapolate" in section:
         options["extrapolate"] = section.number("extrapolate")
@@ -191,7 +191,7 @@ def earth_of(scanner: TomlSection) -> Ellipsoid | None:
         return Ellipsoid(*axes.tolist())
     if value not in ("WGS84", "local"):
         raise InputError(
-            f'{scanner.where}earth is {show(value)}; "WGS84", "local" or [a, b, c] is expected'
+            f'{scanner.where}earth is {show(value)}; expected "WGS84", "local" or [a, b, c]'
         )
     return WGS84 if value == "WGS84" else None
 
@@ -201,7 +201,7 @@ def _times(file: TomlFile, lines: int) -> LineTimes:
     if "table" not in section:
         period = section.number("period")
         if period <= 0:
-            raise InputError(f"{section.where}period is {period}; a positive number is expected")
+            raise InputError(f"{section.where}period is {period}; expected a positive number")
         return LineTimes(jnp.asarray(section.number("first", 0.0)), jnp.asarray(period))
     columns = section.table()
     columns.check_names(("t",), ("line",))
@@ -211,7 +211,7 @@ def _times(file: TomlFile, lines: int) -> LineTimes:
         raise InputError(f"{section.where}table: one line has no period; give first and period")
     if len(t) != lines:
         raise InputError(
-            f"{columns.source.name}: {len(t)} times for {lines} lines; one row a line is expected"
+            f"{columns.source.name}: {len(t)} times for {lines} lines; expected one row a line"
         )
     return LineTimes(jnp.zeros(()), jnp.zeros(()), jnp.asarray(t))
 
@@ -220,7 +220,7 @@ def _frame(section: TomlSection, earth: Ellipsoid | None, known: Sequence[str]) 
     frame = section.text("frame", "local" if earth is None else "ITRF")
     if frame not in known:
         raise InputError(f"{section.where}unknown frame {frame!r}{did_you_mean(frame, known)}")
-    # attitudes against the orbit are given without an Earth, too
+    # Attitudes against the orbit are given without an Earth, too.
     if (earth is None) != (frame == "local") and frame != "orbit":
         raise InputError(
             f"{section.where}frame is {frame!r}, earth is {'local' if earth is None else 'given'}; "
@@ -256,7 +256,7 @@ def _position(file: TomlFile, earth: Ellipsoid | None) -> tuple[TimeTable, Sourc
 def _check_outside(P: Float[np.ndarray, "n 3"], earth: Ellipsoid, source: Source) -> None:
     """Refuse positions deep inside the Earth, such as in kilometres."""
     distance = np.linalg.norm(P, axis=1)
-    # a hundredth of the axis, 64 km: no camera is so deep
+    # A hundredth of the axis, 64 km: no camera is so deep.
     least = 0.99 * min(float(earth.a), float(earth.b), float(earth.c))
     if (bad := distance < least).any():
         row = int(bad.argmax())
@@ -276,14 +276,14 @@ def _orbit(
     most = 1_000_000  # 50 MB of states: more is a mistake in the span or the step
     if not (step > 0 and 0 < (end - start) / step <= most):
         raise InputError(
-            f"{section.where}span from {start:g} to {end:g} s in steps of {step:g} s; 1 to "
-            f"{most} steps forward are expected"
+            f"{section.where}span from {start:g} to {end:g} s in steps of {step:g} s; expected 1 "
+            f"to {most} steps forward"
         )
     t = np.arange(start, end, step)
     if kind == "tle":
         lines = section.values["tle"]
         if not (isinstance(lines, list) and len(lines) == 2):
-            raise InputError(f"{section.where}tle: a list of the two lines is expected")
+            raise InputError(f"{section.where}tle: expected a list of the two lines")
         first, second = lines
         P, V = frames.two_line_orbit(first, second, _epoch(file), t, _orientation(file))
     elif kind == "state":
@@ -374,7 +374,7 @@ def optics_of(file: TomlFile, pixels: int) -> Optics:
         raise InputError(f"{section.where}{error}") from None
     values = default_parameters(model) | parameters
     pitch = section.number("pitch")
-    # a negative one counts the pixels the other way
+    # A negative one counts the pixels the other way.
     if pitch == 0:
         raise InputError(f"{section.where}pitch is 0; the size of a pixel in {model.unit}, please")
     return FocalLine(

@@ -30,7 +30,7 @@ def sight_frame(
     planet and of flight, in the frame of the product.
     """
     look = np.array([*sights[:, sights.shape[1] // 2], 1.0])
-    # the camera frame here looks along −z: rotated about x, or unchanged and seen from behind
+    # The camera frame here looks along −z: rotated about x, or unchanged and seen from behind.
     ahead = look @ down > 0
     turn = Rotation.from_matrix(np.diag([1.0, -1, -1]) if ahead else np.eye(3))
     signs = np.array([1.0, -1.0]) if ahead else np.array([-1.0, -1.0])

@@ -147,13 +147,13 @@ def read_worldview(file: XmlFields) -> ScannerInput:
     lines, pixels = int(lines), int(pixels)
     epoch = file.time("IMD/IMAGE/TLCTIME")
     times = _line_times(file, lines)
-    # of a row are used: index, position, velocity; index, quaternion. Covariances follow.
+    # Of a row are used: index, position, velocity; index, quaternion. Covariances follow.
     t, P, _ = _table(file, "EPH", "EPHEMLIST", 7, epoch)
     rows, values, source = _table(file, "ATT", "ATTLIST", 5, epoch)
     values, lengths = normalise_quaternions(values, source)
     R = Rotation.from_quat(values)
     centre = [file.number(f"GEO/PERSPECTIVE_CENTER/C{axis}") for axis in "XYZ"]
-    # ephemerides are those of the satellite, lines of sight begin in its camera
+    # Ephemerides are those of the satellite, lines of sight begin in its camera.
     P = P[:, :3] + slerp(rows, R, t).apply(centre)
     lens = np.array([file.number(f"GEO/CAMERA_ATTITUDE/QCS{k}") for k in range(1, 5)])
     (lens,), odd = normalise_quaternions(lens[None], Source(f"{path}, QCS1 to QCS4", None, "row"))
@@ -182,7 +182,7 @@ def read_worldview(file: XmlFields) -> ScannerInput:
 def _line_times(file: XmlFields, lines: int) -> LineTimes:
     pairs = file.elements("IMD/IMAGE/TLCLISTList/TLCLIST")
     pairs = np.array([_numbers(file, e, "TLCLIST", 2) for e in pairs])
-    # one pair gives only where the lines begin
+    # One pair gives only where the lines begin.
     if len(pairs) == 1:
         rate = file.number("IMD/IMAGE/AVGLINERATE")
         if file.text("IMD/IMAGE/SCANDIRECTION", "Forward").lower() != "forward":
@@ -226,7 +226,7 @@ def _numbers(file: XmlFields, element: ET.Element, name: str, used: int) -> list
     """The first numbers of an element with more numbers."""
     words = (element.text or "").replace(",", " ").split()
     if len(words) < used:
-        raise InputError(f"{file.path}: {name} has {len(words)} numbers; {used} are expected")
+        raise InputError(f"{file.path}: {name} has {len(words)} numbers; expected {used}")
     return [number_in(word, f"{file.path}: {name}") for word in words[:used]]
 
 
@@ -235,7 +235,7 @@ def _detectors(
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"], tuple[str, ...]]:
     """x/c and y/c as polynomials of the pixel, and a warning if bands differ."""
     for name in ("ALIST", "BLIST"):
-        # early files have the coefficients without a list around them
+        # Early files have the coefficients without a list around them.
         found = file.root.findall(f".//GEO/OPTICAL_DISTORTION//{name}")
         text = " ".join(word for e in found for word in e.itertext()).replace(",", " ")
         if any(number_in(word, f"{file.path}: {name}") != 0 for word in text.split()):

@@ -83,11 +83,9 @@ def open_archive(
         yield archive, {n: _member(path, expected, archive, n, i) for n, i in infos.items()}
 
 
-def read_arrays(
-    path: str | Path, expected: str, names: Sequence[str] | None = None
-) -> dict[str, np.ndarray]:
-    """All arrays of an archive, or those of `names` that it has; raises as `open_archive`."""
-    with open_archive(path, expected, names) as (archive, members):
+def read_arrays(path: str | Path, expected: str) -> dict[str, np.ndarray]:
+    """All arrays of an archive; raises as `open_archive`."""
+    with open_archive(path, expected) as (archive, members):
         return {
             name: read_member(path, expected, archive, name, member)
             for name, member in members.items()
@@ -102,7 +100,7 @@ def read_member(
     **Raises:** `InputError` if it is damaged."""
     content = bytearray(member.info.file_size)
     with foreign_parser(f"{path}, array {name!r}", expected), archive.open(member.info) as stream:
-        # a megabyte at a time: read at once, the array would be in memory twice
+        # A megabyte at a time: read at once, the array would be in memory twice.
         for begin in range(0, len(content), 2**20):
             content[begin : begin + 2**20] = stream.read(2**20)
         stream.read(1)  # at its end zipfile compares the checksum
@@ -127,7 +125,7 @@ def _member(
         begin = stream.tell()
     if dtype.hasobject or dtype.names or dtype.subdtype:
         raise InputError(f"{where}: holds {dtype}; expected plain numbers or texts")
-    # of whole numbers of Python, which cannot overflow as NumPy's do
+    # Of whole numbers of Python, which cannot overflow as NumPy's do.
     if any(n < 0 for n in shape) or begin + math.prod(shape) * dtype.itemsize != info.file_size:
         raise InputError(
             f"{where}: damaged: its header states {shape} of {dtype}, its size is "

@@ -63,7 +63,7 @@ def parse_csv(path: Path, text: str) -> Columns:
     except csv.Error as error:
         raise InputError(f"{path}: not a CSV table: {error}") from None
     if not rows:
-        raise InputError(f"{path}: the file is empty; a header line and rows are expected")
+        raise InputError(f"{path}: the file is empty; expected a header line and rows")
     if len(rows) != len(lines):
         raise InputError(f"{path}: a quoted cell runs over several lines; close its quotes")
     header, numbers = [name.strip() for name in rows[0]], [number for number, _ in lines]

@@ -51,16 +51,16 @@ class JsonFields:
         if not fits or not np.isfinite(array).all():
             size = " × ".join("n" if n is None else str(n) for n in shape)
             kind = f"an array {size} of finite numbers" if shape else "a finite number"
-            raise InputError(f"{self.path}: {key} is {show(value)}; {kind} is expected")
+            raise InputError(f"{self.path}: {key} is {show(value)}; expected {kind}")
         return array
 
     def integer(self, key: str, default: int | None = None, least: int = 0) -> int:
         """A whole number that is not less than `least`."""
         value = self.number(key, default)
-        # beyond 2⁵³ floats are all whole: a number there has lost digits
+        # Beyond 2⁵³ floats are all whole: a number there has lost digits.
         if not (value.is_integer() and least <= value < 2**53):
             raise InputError(
-                f"{self.path}: {key} is {value:g}; a whole number from {least} is expected"
+                f"{self.path}: {key} is {value:g}; expected a whole number from {least}"
             )
         return int(value)
 
@@ -68,7 +68,7 @@ class JsonFields:
         """A text; a number is converted to text."""
         value = self.get(key, default)
         if isinstance(value, bool) or not isinstance(value, str | int | float) or value == "":
-            said = "missing" if value in (None, "") else f"{show(value)}; a text is expected"
+            said = "missing" if value in (None, "") else f"{show(value)}; expected a text"
             raise InputError(f"{self.path}: {key} is {said}")
         return str(value)
 
@@ -76,7 +76,7 @@ class JsonFields:
         """The object in a field."""
         value = self.get(key)
         if not isinstance(value, dict):
-            said = "missing" if value is None else f"{show(value)}; an object is expected"
+            said = "missing" if value is None else f"{show(value)}; expected an object"
             raise InputError(f"{self.path}: {key} is {said}")
         return JsonFields(f"{self.path}, {key}", value)
 
@@ -91,10 +91,10 @@ class JsonFields:
     def rows(self, key: str) -> list["JsonFields"]:
         """The objects in a list, counted from 0 in messages; none if it is missing."""
         value = self.get(key, [])
-        # the property trees of Boost write an empty list as an empty text
+        # The property trees of Boost write an empty list as an empty text.
         value = [] if value == "" else value
         if not isinstance(value, list):
-            raise InputError(f"{self.path}: {key} is {show(value)}; a list is expected")
+            raise InputError(f"{self.path}: {key} is {show(value)}; expected a list")
         return [_object(f"{self.path}, {key}[{k}]", row) for k, row in enumerate(value)]
 
     def source(self, key: str) -> Source:
@@ -104,7 +104,7 @@ class JsonFields:
 
 def _object(where: str, value: Any) -> JsonFields:
     if not isinstance(value, dict):
-        raise InputError(f"{where} is {show(value)}; an object is expected")
+        raise InputError(f"{where} is {show(value)}; expected an object")
     return JsonFields(where, value)
 
 
@@ -131,5 +131,5 @@ def read_object(path: str | Path, text: str, kind: str) -> dict[str, Any]:
     """The JSON object in a text; `kind` names the expected content in messages."""
     document = parse_json(path, text)
     if not isinstance(document, dict):
-        raise InputError(f"{path}: an object with the fields of {kind} is expected")
+        raise InputError(f"{path}: expected an object with the fields of {kind}")
     return document

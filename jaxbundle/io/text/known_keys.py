@@ -117,7 +117,7 @@ class UnknownKeys:
             self._places.setdefault((name, keys.warned[name]), []).append(str(where))
         for name in keys.unknown(names):
             if may_change_geometry(name):
-                # a name of the list is near enough to be meant: "Distortion" for "distortion"
+                # A name of the list is near enough to be meant: "Distortion" for "distortion".
                 close = closest_name(name, keys.used)
                 hint = f" (did you mean {close!r}?)" if close else ""
                 raise InputError(
@@ -150,7 +150,7 @@ class UnknownKeys:
             own = keys.get(tag, LEAF)
             self.check_element(element, own, place)
             used = [c for c in element if isinstance(c.tag, str) and own.uses(c.tag)]
-            # from the end of the list: the first of the document is the first to be refused
+            # From the end of the list: the first of the document is the first to be refused.
             places += [(child, f"{place}/{child.tag[:60]}") for child in reversed(used)]
 
     def check_objects(
@@ -171,11 +171,11 @@ class UnknownKeys:
                     continue
                 rows = enumerate(inner) if isinstance(inner, list) else [(None, inner)]
                 for k, row in rows:
-                    # what is no object is for its reader to refuse
+                    # What is no object is for its reader to refuse.
                     if isinstance(row, Mapping):
                         number = "" if k is None else f"[{k}]"
                         below.append((inside, row, f"{place}, {name}{number}"))
-            # from the end of the list: the first of the document is the first to be refused
+            # From the end of the list: the first of the document is the first to be refused.
             places += reversed(below)
 
     def messages(self) -> tuple[str, ...]:

@@ -63,7 +63,7 @@ def _parse_by_arrow(text: str) -> Float[np.ndarray, " n"] | None:
     except ImportError:
         return None
     try:
-        # one column: a number a line
+        # One column: a number a line.
         content = text.encode("ascii").translate(BLANK_TO_LINE)
         table = csv.read_csv(
             pa.BufferReader(content),
@@ -86,7 +86,7 @@ def parse_lines(lines: Iterable[str]) -> list[Float[np.ndarray, " n"]] | None:
     ends = np.flatnonzero(np.isnan(numbers))
     if len(ends) != len(lines) or np.isinf(numbers).any():
         return None
-    # views of one array
+    # Views of one array.
     return [numbers[a:b] for a, b in zip([0, *(ends[:-1] + 1).tolist()], ends.tolist())]
 
 
@@ -101,7 +101,7 @@ class TextRow:
     def words(self) -> list[str]:
         """The words; not split before they are needed: rows of numbers have many."""
         words = self.text.split(self.separator)
-        # blanks as separators leave none in the words
+        # Blanks as separators leave none in the words.
         return words if self.separator is None else [word.strip() for word in words]
 
     def __len__(self) -> int:
@@ -148,7 +148,7 @@ class TextRow:
         digits = word.removeprefix("-")
         # 18 digits fit in 64 bits; isascii, because digits of other scripts count as digits
         if not (digits.isascii() and digits.isdigit() and len(digits) < 19) or int(word) < least:
-            raise self.error(f"{what} is {show(word)}; a whole number from {least} is expected")
+            raise self.error(f"{what} is {show(word)}; expected a whole number from {least}")
         return int(word)
 
     def rays(self, k: int, thing: str, images: int, image: str) -> Float[np.ndarray, "n 4"]:
@@ -172,7 +172,7 @@ class TextRow:
         except ValueError:
             number = math.nan
         if not math.isfinite(number) or "_" in word:
-            raise self.error(f"{what} is {show(word)}; a number is expected")
+            raise self.error(f"{what} is {show(word)}; expected a number")
         return number
 
 
@@ -196,7 +196,7 @@ class TextRows:
             (number, line)
             for number, line in enumerate(read_text(path, fallback).splitlines(), 1)
             if (blank or (line and not line.isspace()))
-            # most lines have none of it, and need not be copied without their blanks
+            # Most lines have none of it, and need not be copied without their blanks.
             and not (comment and comment in line and line.lstrip().startswith(comment))
         ]
         self.separator = separator
@@ -217,7 +217,7 @@ class TextRows:
         """
         if not self.more():
             last = self.lines[-1][0] if self.lines else 0
-            raise InputError(f"{self.path}: the file ends after line {last}; {what} is expected")
+            raise InputError(f"{self.path}: the file ends after line {last}; expected {what}")
         number, text = self.lines[self.position]
         self.position += 1
         return TextRow(self.path, number, text, self.separator)

@@ -76,10 +76,10 @@ class TomlSection:
     def _get(self, key: str, default: Any, expected: str, kinds: tuple[type, ...]) -> Any:
         value = self.values.get(key, default)
         if value is None:
-            raise InputError(f"{self.where}{key} is missing; {expected} is expected")
+            raise InputError(f"{self.where}{key} is missing; expected {expected}")
         # True and False are whole numbers in Python, but not where a file needs a number
         if not isinstance(value, kinds) or isinstance(value, bool) and bool not in kinds:
-            raise InputError(f"{self.where}{key} is {show(value)}; {expected} is expected")
+            raise InputError(f"{self.where}{key} is {show(value)}; expected {expected}")
         return value
 
     def check_keys(self, known: Sequence[str]) -> None:
@@ -91,14 +91,14 @@ class TomlSection:
         """A finite number."""
         value = float(self._get(key, default, "a number", (int, float)))
         if not np.isfinite(value):
-            raise InputError(f"{self.where}{key} is {value}; a finite number is expected")
+            raise InputError(f"{self.where}{key} is {value}; expected a finite number")
         return value
 
     def integer(self, key: str) -> int:
         """A whole number, 2 or more."""
         value = self._get(key, None, "a whole number, 2 or more,", (int,))
         if value < 2:
-            raise InputError(f"{self.where}{key} is {value}; 2 or more are expected")
+            raise InputError(f"{self.where}{key} is {value}; expected 2 or more")
         return value
 
     def text(self, key: str, default: str | None = None) -> str:
@@ -115,10 +115,10 @@ class TomlSection:
         values = self._get(key, None, expected, (list,))
         good = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
         if not good or not values or count not in (None, len(values)):
-            raise InputError(f"{self.where}{key} is {show(values)}; {expected} is expected")
+            raise InputError(f"{self.where}{key} is {show(values)}; expected {expected}")
         found = np.array(values, float)
         if not np.isfinite(found).all():
-            raise InputError(f"{self.where}{key} is {show(values)}; finite numbers are expected")
+            raise InputError(f"{self.where}{key} is {show(values)}; expected finite numbers")
         return found
 
     def path(self, key: str, expected: str, folder: bool = False) -> Path:
@@ -140,7 +140,7 @@ class TomlSection:
         if not isinstance(given, list):
             return [self.path(key, expected)]
         if not given:
-            raise InputError(f"{self.where}{key} is an empty list; {expected} is expected")
+            raise InputError(f"{self.where}{key} is an empty list; expected {expected}")
         one = lambda name: TomlSection(self.file, self.where, {key: name})
         return [one(name).path(key, expected) for name in given]
 

@@ -48,10 +48,10 @@ class StoredRows:
     def __getitem__(self, rows: int | Sequence[int] | Int[np.ndarray, "..."]) -> np.ndarray:
         """A row, or the rows of a list of numbers."""
         wanted = np.atleast_1d(np.asarray(rows, int))
-        # one array: a list of rows would be copied once more
+        # One array: a list of rows would be copied once more.
         found = np.empty((len(wanted), *self.shape[1:]), self.dtype)
         size = int(np.prod(self.shape[1:]))
-        # consecutive rows are read together
+        # Consecutive rows are read together.
         ends = [0, *(np.flatnonzero(np.diff(wanted) != 1) + 1), len(wanted)]
         there = self.path.open("rb") if self.unpacked is None else nullcontext(self.unpacked)
         with there as stream:
@@ -79,7 +79,7 @@ def find_stored_rows(
 
     **Raises:** `InputError` if it is damaged."""
     info, shape, dtype = member.info, member.shape, member.dtype
-    # rows that do not lie in one piece, texts
+    # Rows that do not lie in one piece, texts.
     if info.file_size < smallest or member.by_columns or dtype.kind not in "biuf" or not shape:
         return None
     with foreign_parser(f"{path}, array {name!r}", expected), archive.open(info) as stream:

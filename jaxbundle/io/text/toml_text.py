@@ -22,7 +22,7 @@ def toml_value(value: Any) -> str:
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, bool | str):
-        # a basic string of TOML is one of JSON, but for DEL, which TOML does not allow
+        # A basic string of TOML is one of JSON, but for DEL, which TOML does not allow.
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, Mapping):
         return f"{{ {', '.join(assignments(value))} }}"

@@ -28,17 +28,17 @@ def read_vertices(where: str, content: bytes, names: tuple[str, ...]) -> np.ndar
     missing properties."""
     found = re.match(rb"ply\r?\nformat (\S+) 1\.0\r?\n(.*?)end_header\r?\n", content, re.DOTALL)
     if found is None or found[1] not in ORDER:
-        raise InputError(f"{where}: a binary PLY is expected")
-    # properties belong to the element above them
+        raise InputError(f"{where}: expected a binary PLY")
+    # Properties belong to the element above them.
     fields, number, current = [], 0, ""
     for line in found[2].decode("ascii", errors="replace").splitlines():
         match line.split():
             case ["element", current, many] if many.isdigit():
                 if current == "vertex":
                     number = int(many)
-                # their rows would have to be skipped, and may have lists
+                # Their rows would have to be skipped, and may have lists.
                 elif not fields:
-                    raise InputError(f"{where}: its vertices are expected first")
+                    raise InputError(f"{where}: expected its vertices first")
             case ["property", kind, name] if current == "vertex" and kind in TYPES:
                 fields.append((name, ORDER[found[1]] + TYPES[kind]))
             case ["property", *_] if current == "vertex":
@@ -55,5 +55,5 @@ def read_vertices(where: str, content: bytes, names: tuple[str, ...]) -> np.ndar
     table = np.frombuffer(content, dtype, number, found.end())
     for name in names:
         if not np.isfinite(table[name]).all():
-            raise InputError(f"{where}: a finite {name} is expected of every vertex")
+            raise InputError(f"{where}: expected a finite {name} of every vertex")
     return table

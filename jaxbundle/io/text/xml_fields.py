@@ -49,7 +49,7 @@ class XmlFields:
         """The numbers in the text of an element, separated by blanks or commas."""
         words = self.text(key).replace(",", " ").split()
         if count is not None and len(words) != count:
-            raise InputError(f"{self.path}: {key} has {len(words)} numbers; {count} are expected")
+            raise InputError(f"{self.path}: {key} has {len(words)} numbers; expected {count}")
         return np.array([number_in(word, f"{self.path}: {key}") for word in words])
 
     def time(self, key: str) -> np.datetime64:
@@ -91,7 +91,7 @@ class XmlFields:
 
     def missing(self, key: str) -> InputError:
         """The error for a missing element."""
-        return InputError(f"{self.path}: {key} is missing; {self.kind} is expected")
+        return InputError(f"{self.path}: {key} is missing; expected {self.kind}")
 
 
 def read_xml(path: str | Path) -> ET.Element:
@@ -132,7 +132,7 @@ def number_in(text: str, where: str) -> float:
     except ValueError:
         good = False
     if not good:
-        raise InputError(f"{where} is {show(text)}; a finite number is expected")
+        raise InputError(f"{where} is {show(text)}; expected a finite number")
     return value
 
 
@@ -143,12 +143,10 @@ def time_in(text: str, where: str) -> np.datetime64:
             return np.datetime64("T".join(match.groups()), "ns")
     except ValueError:  # a 13th month
         pass
-    raise InputError(
-        f"{where} is {show(text)}; a time such as 2008-03-04T12:31:03.081912 is expected"
-    )
+    raise InputError(f"{where} is {show(text)}; expected a time such as 2008-03-04T12:31:03.081912")
 
 
 def seconds(time: np.datetime64, epoch: np.datetime64) -> float:
     """The seconds from an epoch to a time."""
-    # through whole nanoseconds: a float of seconds since 1970 has some tenths of a microsecond
+    # Through whole nanoseconds: a float of seconds since 1970 has some tenths of a microsecond.
     return float((time - epoch) / np.timedelta64(1, "ns") * 1e-9)

@@ -47,9 +47,9 @@ def parse_yaml(path: str | Path, text: str) -> dict[str, Any]:
     """
     document = parse_document(path, text)
     if document is None:
-        raise InputError(f"{path}: the file is empty; keys and values are expected")
+        raise InputError(f"{path}: the file is empty; expected keys and values")
     if not isinstance(document, dict):
-        raise InputError(f"{path}: keys and values are expected")
+        raise InputError(f"{path}: expected keys and values")
     return document
 
 
@@ -59,7 +59,7 @@ def parse_document(path: str | Path, text: str) -> Any:
     **Raises:** `InputError` naming the line."""
     import yaml
 
-    # as many lines as before, so that messages name the right one
+    # As many lines as before, so that messages name the right one.
     opencv = re.match(r"\s*%YAML:", text) is not None
     text = DIRECTIVE.sub("", text, count=1)
     if opencv:
@@ -110,7 +110,7 @@ def _look_through(path: str | Path, text: str) -> None:
         elif isinstance(event, yaml.ScalarEvent):
             size += 1
             sizes |= {event.anchor: 1} if event.anchor else {}
-            # a message of ROS ends with --- and nothing after it
+            # A message of ROS ends with --- and nothing after it.
             if documents > 1 and event.value:
                 raise error("a second document is not expected")
         if documents > 1 and open_nodes:
@@ -136,7 +136,7 @@ def _loader() -> Any:
 
     class Loader(_base_loader()):
         yaml_implicit_resolvers: dict = {}
-        # others, such as dates, stay as they are written
+        # Others, such as dates, stay as they are written.
         yaml_constructors = {tag: yaml.SafeLoader.yaml_constructors[tag] for tag in tags}
 
         def construct_mapping(self, node: Any, deep: bool = False) -> dict[str, Any]:
@@ -155,11 +155,11 @@ def _loader() -> Any:
                     )
                 seen.add(key.value)
             self.flatten_mapping(node)
-            # the keys as texts, as in JSON: 0 and on are names
+            # The keys as texts, as in JSON: 0 and on are names.
             return {key.value: self.construct_object(value, deep=True) for key, value in node.value}
 
         def get_single_data(self) -> Any:
-            # the second document, if there is one, is empty (_look_through)
+            # The second document, if there is one, is empty (_look_through).
             node = self.get_node() if self.check_node() else None
             return None if node is None else self.construct_document(node)
 

@@ -19,7 +19,7 @@ def read_zip(path: Path, expected: str) -> Mapping[str, bytes]:
     implausible size (`largest_unpacked_size`)."""
     check_plain(path)
     with foreign_parser(path, expected), zipfile.ZipFile(path) as archive:
-        # an archive of some kilobytes may unpack to gigabytes
+        # An archive of some kilobytes may unpack to gigabytes.
         unpacked = sum(info.file_size for info in archive.infolist())
         if unpacked > largest_unpacked_size(path.stat().st_size):
             raise InputError(

@@ -99,7 +99,7 @@ def replace_folder(
             with defer_interrupts():
                 work = until.enter_context(temporary(_make_work(real), content=False))
             new = work / NEW
-            # from here on a second command on this folder is refused
+            # From here on a second command on this folder is refused.
             until.enter_context(_hold_work(folder, work))
             until.enter_context(temporary(new)).mkdir()
             yield new
@@ -149,7 +149,7 @@ def _is_inside(folder: Path, name: str) -> bool:
 def _check_place(folder: Path, said: str) -> None:
     """Refuse paths that are not folders, or cannot be created or written."""
     there = next((p for p in (folder, *folder.absolute().parents) if os.path.lexists(p)), folder)
-    # a link to nothing is not followed: the folder is made where it points
+    # A link to nothing is not followed: the folder is made where it points.
     dangling = there == folder and os.path.islink(there) and not os.path.exists(there)
     if not os.path.isdir(there) and not dangling:
         raise InputError(f"{said}: cannot be made: {there} is not a folder")
@@ -176,8 +176,8 @@ def _refuse_others(folder: Path, real: Path, by: str, names: Sequence[str], said
         )
     if marker is None:
         raise InputError(
-            f"{said}: not a folder of jaxbundle {by}: there is {list_some(entries, 3, str)} in it; "
-            f"{way} write beside that"
+            f"{said}: not a folder of jaxbundle {by}: it contains {list_some(entries, 3, str)}; "
+            f"{way} write into it all the same"
         )
     if marker.by != by:
         there = [str(folder / name) for name in own if os.path.lexists(real / name)]
@@ -213,7 +213,7 @@ def _digest(path: Path) -> str | None:
     """Digest of the content of a file; None if it is missing, empty for anything else."""
     if not os.path.lexists(path):
         return None
-    # equal to no digest of a marker: whoever put it there did not mean to lose it
+    # Equal to no digest of a marker: whoever put it there did not mean to lose it.
     if path.is_symlink() or not path.is_file():
         return ""
     with path.open("rb") as file:
@@ -229,7 +229,7 @@ def _make_work(real: Path) -> Path:
     to the folder, which may be on another disk; else inside."""
     beside, inside = _works(real)
     if not real.is_dir():
-        # there is nothing yet that could be inside it
+        # There is nothing yet that could be inside it.
         beside.mkdir(exist_ok=True)
         return beside
     inside.mkdir(exist_ok=True)
@@ -241,7 +241,7 @@ def _make_work(real: Path) -> Path:
 
 
 def _hold_work(folder: str | Path, work: Path) -> AbstractContextManager[None]:
-    # without locks (some network disks) two commands on one folder are the user's risk
+    # Without locks (some network disks) two commands on one folder are the user's risk.
     return hold_lock(work / "run", folder, needed=False)
 
 
@@ -293,7 +293,7 @@ def _exchange(real: Path, work: Path, files: Iterable[str], going: Sequence[str]
         _move_back(work, real)
         raise
     for name in going:
-        # folders that the old result needed, if nothing else is in them
+        # Folders that the old result needed, if nothing else is in them.
         for parent in [*PurePosixPath(name).parents][:-1]:
             with suppress(OSError):
                 (real / parent).rmdir()
@@ -335,7 +335,7 @@ def _files(folder: Path) -> list[str]:
         for root, _, names in os.walk(folder)
         for name in names
     ]
-    # the marker declares the others to be there, so that it must not come before them
+    # The marker declares the others to be there, so that it must not come before them.
     return sorted(found, key=lambda name: (name == MARKER, name))
 
 

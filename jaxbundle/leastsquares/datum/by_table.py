@@ -19,7 +19,7 @@ from jaxbundle.leastsquares.indexing.plan import Plan, Tangent
 from jaxbundle.leastsquares.indexing.rows import Declared, Values
 from jaxbundle.leastsquares.spaces import Space
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray, present
+from jaxbundle.types import AnyArray, not_none
 
 # The name of a table treated alone.
 TABLE_ALONE = "table"
@@ -27,7 +27,7 @@ TABLE_ALONE = "table"
 
 def directions_of_motions(declared: Declared, values: Values) -> Tangent:
     """`datum.generators` of all tables: [rows, width, motions]."""
-    found, given = {}, present(declared.motions)
+    found, given = {}, not_none(declared.motions)
     for name, value in values.items():
         action = tuple((TABLE_ALONE, act) for table, act in given.actions if table == name)
         if not action:
@@ -54,8 +54,8 @@ def move_into_datum(
     if plan.datum.held:
         held = directions_of_motions(declared, {name: values[name] for name in plan.datum.held})
         plan = _keep_held_fixed(declared, plan, values, held)
-    host_datum = jax.tree.map(np.asarray, present(plan.datum))
-    curved, free = present(declared.motions).curved, _free(declared, plan, values)
+    host_datum = jax.tree.map(np.asarray, not_none(plan.datum))
+    curved, free = not_none(declared.motions).curved, _free(declared, plan, values)
     size = float(datum.largest(host_datum.weight, start))
 
     def one_step(values: Values) -> tuple[Values, float]:
@@ -93,7 +93,7 @@ def _move_tables(
 ) -> Values:
     """All tables moved, except held values."""
     moved = dict(values)
-    for name, act in present(declared.motions).actions:
+    for name, act in not_none(declared.motions).actions:
         by = motion
         if isinstance(act, JointMotion):
             act, by = act.move, _move_at_once(act.transform, motion, act.size)

@@ -39,7 +39,7 @@ from jaxbundle.leastsquares.equations.normal import total
 from jaxbundle.leastsquares.indexing.plan import Datum, Plan, Tangent
 from jaxbundle.leastsquares.indexing.rows import Declared, Values
 from jaxbundle.leastsquares.spaces import PoseValue
-from jaxbundle.types import AnyArray, Scalar, present
+from jaxbundle.types import AnyArray, Scalar, not_none
 
 # Smallest relative motion of datum unknowns that fix the datum. Below about 1e-8, √ε, the Gram
 # matrix BᵀG of `s_transform` has lost all digits; at 1e-7 a datum still has two, at 1e-4 (a datum
@@ -73,7 +73,7 @@ DATUM_MOTION = MotionSettings()
 
 def generators(declared: Declared, values: Values) -> Tangent:
     """The derivative of every table along each motion, [rows, width, motions]."""
-    given = present(declared.motions)
+    given = not_none(declared.motions)
     motions, actions = len(given.names), dict(given.actions)
 
     def of_table(name: str) -> Float[Array, "rows width motions"]:
@@ -115,7 +115,7 @@ def open_directions(
     """G: the directions of the open motions, [rows, w, defect]; `moves`: the `generators`, if
     known."""
     moves = generators(declared, values) if moves is None else moves
-    gauge = present(keep_held_fixed(declared, plan, values, moves).datum).gauge
+    gauge = not_none(keep_held_fixed(declared, plan, values, moves).datum).gauge
     return {name: rows @ gauge for name, rows in of_groups(plan, moves).items()}
 
 
@@ -124,7 +124,7 @@ def keep_held_fixed(
 ) -> Plan:
     """The plan with the smallest correction of its open motions that leaves held unknowns as they
     are: a rotation about a held point follows the point. `moves`: the `generators`, if known."""
-    datum = present(plan.datum)
+    datum = not_none(plan.datum)
     held, gauge = datum.held, datum.gauge
     if not held:
         return plan
@@ -177,7 +177,7 @@ def datum_directions(
 ) -> tuple[Tangent, Tangent]:
     """G and B of all groups, [rows, w, defect]; `moves`: the `generators`, if known."""
     G = open_directions(declared, plan, values, moves)
-    weight = of_groups(plan, zeros_of_tables(declared, values) | present(plan.datum).weight)
+    weight = of_groups(plan, zeros_of_tables(declared, values) | not_none(plan.datum).weight)
     return G, {name: g * weight[name][..., None] for name, g in G.items()}
 
 
@@ -194,8 +194,8 @@ def move_to_datum(
         return values, jnp.asarray(True)
     start = turn_start(declared, plan, values, start)
     plan = keep_held_fixed(declared, plan, values)
-    datum = present(plan.datum)
-    still, curved = jnp.zeros(datum.gauge.shape[1]), present(declared.motions).curved
+    datum = not_none(plan.datum)
+    still, curved = jnp.zeros(datum.gauge.shape[1]), not_none(declared.motions).curved
     size = largest(datum.weight, start)
 
     def moving(state: tuple) -> bool | Bool[AnyArray, ""]:
@@ -228,7 +228,7 @@ def turn_start(declared: Declared, plan: Plan, values: Values, start: Values) ->
     problem that is turned by θ, and to one turned by more than a right angle the size 0. The turn
     is the best one, Σ x × (R·x_start) = 0 (Arun, Huang and Blostein 1987); a function of both that
     is differentiable to any order."""
-    datum = present(plan.datum)
+    datum = not_none(plan.datum)
     if not datum.turned:
         return start
     X, X0, p = (jnp.concatenate(parts) for parts in zip(*_datum_places(datum, values, start)))
@@ -253,7 +253,7 @@ def turn_start(declared: Declared, plan: Plan, values: Values, start: Values) ->
     shift = to - matrix_from_rotation_vector(turn) @ centre0
     motion = jnp.concatenate([shift, turn, jnp.zeros(1)])
     turned = dict(start)
-    for name, act in present(declared.motions).actions:
+    for name, act in not_none(declared.motions).actions:
         if name in start:
             move = act.move if isinstance(act, JointMotion) else act
             turned[name] = jax.vmap(partial(move, motion))(start[name])
@@ -323,7 +323,7 @@ def _conditions_of_tables(
     declared: Declared, plan: Plan, values: Values, start: Values
 ) -> tuple[Float[AnyArray, " defect"], Float[AnyArray, "defect defect"]]:
     """Bᵀ(x − x_start) and BᵀG of the tables at these values, differentiable."""
-    datum = present(plan.datum)
+    datum = not_none(plan.datum)
     moves = generators(declared, {name: values[name] for name in datum.weight})
     away = {
         name: jax.vmap(declared.spaces[name].difference)(values[name], start[name])
@@ -338,7 +338,7 @@ def _datum_misclosure(
     """Bᵀ(x − x_start) after a motion along the open directions."""
     (declared, plan), (values, start) = fixed, given
     plan = keep_held_fixed(declared, plan, values)
-    datum = present(plan.datum)
+    datum = not_none(plan.datum)
     tables = {name: values[name] for name in datum.weight}
     moved = _move(declared, plan, datum.gauge @ tau, tables)
     return _conditions_of_tables(declared, plan, moved, start)[0]
@@ -353,7 +353,7 @@ def attach_motion(declared: Declared, plan: Plan, values: Values, start: Values)
     still, fixed = jnp.zeros(plan.datum.gauge.shape[1]), (declared, plan)
 
     def along(tau: Float[Array, " defect"], of: Values, values: Values) -> Values:
-        datum = present(keep_held_fixed(declared, plan, of).datum)
+        datum = not_none(keep_held_fixed(declared, plan, of).datum)
         return _move(declared, plan, datum.gauge @ tau, values)
 
     # First remove the remaining motion, so that derivatives are taken at zero motion.
@@ -373,7 +373,7 @@ def _move(
 ) -> Values:
     """All tables moved, except held values."""
     moved, free = dict(values), free_of_tables(declared, plan, values)
-    for name, act in present(declared.motions).actions:
+    for name, act in not_none(declared.motions).actions:
         if name not in values:
             continue
         space = declared.spaces[name]

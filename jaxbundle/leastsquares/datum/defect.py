@@ -22,7 +22,7 @@ from jaxbundle.leastsquares.equations.linearise import differentiate
 from jaxbundle.leastsquares.indexing.plan import Datum, Plan, Tangent
 from jaxbundle.leastsquares.indexing.rows import Data, Declared, lay_out_data, prepare
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 # Relative size of J·G below which a direction counts as open. Rounding gives about 1e-14, more if
 # coordinates are much larger than the network; what fixes a datum by less than 1e-10 of its
@@ -72,7 +72,7 @@ def _survey(
     moves: Tangent,
 ) -> Survey:
     laid, prepared = lay_out_data(plan, data), prepare(declared, data.start)
-    motions = len(present(declared.motions).names)
+    motions = len(not_none(declared.motions).names)
     everywhere = {
         name: jnp.concatenate(
             [moves[m.table] if m.rows is None else moves[m.table][m.rows] for m in group.members], 1
@@ -89,7 +89,7 @@ def _survey(
             for t, J in zip(part.touches, touches)
         ]
         if E is not None:
-            blocks.append((E, everywhere[present(plan.eliminated)][part.eliminated]))
+            blocks.append((E, everywhere[not_none(plan.eliminated)][part.eliminated]))
         if not blocks:  # Held tables only: it determines nothing.
             continue
         # |J|·|G|: the size of the terms that cancel, for the scale of what remains.

@@ -121,5 +121,16 @@ def move_at_once(
     return still.at[:size].set(WEIGHTS / 2 @ moved)
 
 
+def scale_length(motion: Float[Array, "7"], value: Float[AnyArray, "*n"]) -> Float[Array, "*n"]:
+    """Lengths after a similarity of object space."""
+    return jnp.exp(motion[6]) * value
+
+
+def scale_position(motion: Float[Array, "7"], value: PoseValue) -> PoseValue:
+    """A pose relative to a frame that moves with space, such as a mounting: its position is a
+    length."""
+    return PoseValue(scale_length(motion, value.position), value.rotation)
+
+
 def _shift(motion: Float[Array, " motions"], value: Float[Array, ""]) -> Float[Array, ""]:
     return value + motion[0]

@@ -28,7 +28,7 @@ from jaxbundle.leastsquares.equations.reduced import (
     split,
 )
 from jaxbundle.leastsquares.indexing.plan import Plan, Tangent
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 
 class BandFactor(eqx.Module):
@@ -112,7 +112,7 @@ class BandFactor(eqx.Module):
 def factorise_band(plan: Plan, S: Reduced) -> BandFactor:
     """The factor of a banded S; NaN if it is not positive definite."""
     g, others = _groups(plan)
-    band = present(plan.band)
+    band = not_none(plan.band)
     place, width, blocks = band.place, band.width, band.blocks
     w = plan.groups[g].width
     m = width * w
@@ -160,19 +160,19 @@ def factorise_band(plan: Plan, S: Reduced) -> BandFactor:
 
 def _groups(plan: Plan) -> tuple[str, tuple[str, ...]]:
     """The group of the band, and those of the border."""
-    group = present(plan.band).group
+    group = not_none(plan.band).group
     return group, tuple(g for g in plan.kept if g != group)
 
 
 def _into_band(plan: Plan, rows: Float[Array, "rows w *q"]) -> Float[Array, "blocks m *q"]:
     """Rows of the group at their positions in the band; zero for padding."""
-    band, (_, w, *q) = present(plan.band), rows.shape
+    band, (_, w, *q) = not_none(plan.band), rows.shape
     whole = jnp.zeros((band.blocks * band.width, w, *q)).at[band.place].set(rows)
     return whole.reshape(band.blocks, band.width * w, *q)
 
 
 def _from_band(plan: Plan, x: Float[Array, "blocks m *q"]) -> Float[Array, "rows w *q"]:
-    band = present(plan.band)
+    band = not_none(plan.band)
     w = plan.groups[band.group].width
     return x.reshape(band.blocks * band.width, w, *x.shape[2:])[band.place]
 
@@ -185,7 +185,7 @@ def _blocks(
     column: Int[Array, " n"],
 ) -> Float[Array, "blocks w w"]:
     """The blocks of two rows each, from the blocks on (D) and above (E) the diagonal."""
-    band = present(plan.band)
+    band = not_none(plan.band)
     w, width = plan.groups[band.group].width, band.width
     a, b = band.place[row], band.place[column]
     low, high = jnp.minimum(a, b), jnp.maximum(a, b)

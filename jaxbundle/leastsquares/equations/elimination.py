@@ -32,7 +32,7 @@ from jaxbundle.leastsquares.equations.normal import (
 from jaxbundle.leastsquares.equations.reduced import DenseFactor, Reduced, factorise_dense
 from jaxbundle.leastsquares.indexing.plan import IncidencePairs, Plan, Tangent
 from jaxbundle.leastsquares.indexing.rows import look_up
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 # Relative residual of a reduced system solved iteratively to full precision: what one refinement
 # reaches after a run to 1e-10 (`ConjugateGradients.reachable`). A smaller one may be unreachable
@@ -72,7 +72,7 @@ def damp(normal: Normal, damping: Float[Array, ""]) -> Normal:
     N, e = normal.blocks, normal.plan.eliminated
     added = {name: damping * d for name, d in matrices(N.damping_matrix).items()}
     diagonal = {name: B + added[name] for name, B in N.diagonal_blocks.items()}
-    eliminated = None if e is None else present(N.eliminated) + added[e]
+    eliminated = None if e is None else not_none(N.eliminated) + added[e]
     return Normal(
         normal.plan, dataclasses.replace(N, diagonal_blocks=diagonal, eliminated=eliminated)
     )
@@ -150,7 +150,7 @@ def eliminate(normal: Normal) -> tuple[Reduced, Float[Array, "rows w w"] | None,
         return Reduced(diagonal, off_diagonal), None, {}
     # Held directions have zero rows in W: with a one on the diagonal they take no part.
     held = (1.0 - plan.groups[e].free)[:, :, None] * jnp.eye(plan.groups[e].width)
-    lower_inverse = inverse_cholesky(present(N.eliminated) + held)
+    lower_inverse = inverse_cholesky(not_none(N.eliminated) + held)
     # L⁻¹ itself and not L: it is used for every incidence, for right-hand sides and for cofactors,
     # and a product of 3×3 vectorises where a substitution does not.
     Z, ZtZ, ZtZ_off = {}, {}, {}

@@ -30,7 +30,7 @@ from jaxbundle.leastsquares.indexing.rows import (
     residual_of,
 )
 from jaxbundle.leastsquares.spaces import Block
-from jaxbundle.types import Scalar, present
+from jaxbundle.types import Scalar, not_none
 
 
 class SecondOrder(eqx.Module):
@@ -133,7 +133,7 @@ def _blocks(
     if part.slot is not None:
         e = columns(((part.slot, 0),), 0, widths[part.slot])
         # V and W of observations, as in Gauss–Newton, from H instead of JᵀJ.
-        of_row = e, plan.groups[present(plan.eliminated)].free[part.eliminated]
+        of_row = e, plan.groups[not_none(plan.eliminated)].free[part.eliminated]
         flat = lambda x: x.reshape(-1, *x.shape[2:])
         beside = (g[..., e] * of_row[1])[..., None]
         eliminated = flat(jnp.concatenate([block(H, of_row, of_row), beside], -1))

@@ -28,7 +28,7 @@ from jaxbundle.leastsquares.indexing.rows import (
     residual_of,
 )
 from jaxbundle.leastsquares.spaces import Block, Change
-from jaxbundle.types import Scalar, present
+from jaxbundle.types import Scalar, not_none
 
 
 def widths_of(declared: Declared, part: ObservationPart) -> tuple[int, ...]:
@@ -94,7 +94,7 @@ def zero_held_columns_of_eliminated(
     plan: Plan, part: ObservationPart, E: Float[Array, "chunks length r w"]
 ) -> Float[Array, "chunks length r w"]:
     """The block of the eliminated rows of a part with zeros in the columns of held unknowns."""
-    group = plan.groups[present(plan.eliminated)]
+    group = plan.groups[not_none(plan.eliminated)]
     return E if group.all_free else E * group.free[part.eliminated][:, :, None, :]
 
 

@@ -37,7 +37,7 @@ from jaxbundle.leastsquares.indexing.plan import (
     TouchedRows,
 )
 from jaxbundle.leastsquares.indexing.rows import ChunkedData, Declared, Values, prepare
-from jaxbundle.types import AnyArray, present
+from jaxbundle.types import AnyArray, not_none
 
 Rows = Float[AnyArray, "rows width"]
 AnyTangent = Mapping[str, Rows]
@@ -77,7 +77,7 @@ class Normal(lx.AbstractLinearOperator):
     def diagonal(self) -> Tangent:
         """The diagonal of N."""
         N, e = self.blocks, self.plan.eliminated
-        blocks = N.diagonal_blocks if e is None else N.diagonal_blocks | {e: present(N.eliminated)}
+        blocks = N.diagonal_blocks if e is None else N.diagonal_blocks | {e: not_none(N.eliminated)}
         return {g: jnp.diagonal(B, axis1=1, axis2=2) for g, B in blocks.items()}
 
     def as_matrix(self) -> Float[Array, "n n"]:
@@ -156,7 +156,7 @@ def scatter(plan: Plan, W: dict[str, Array], x: Tangent) -> Float[Array, "..."]:
         found = found + jax.ops.segment_sum(
             moved.reshape(-1, blocks.shape[-2]),
             at.eliminated.ravel(),
-            plan.groups[present(plan.eliminated)].rows,
+            plan.groups[not_none(plan.eliminated)].rows,
         )
     return found
 
@@ -250,7 +250,7 @@ class Sums:
             self._add_coupling(part, coupling, N)
         if eliminated is not None:
             # Positions of padding point at the last, empty row.
-            at, e = present(part.eliminated).ravel(), present(self.plan.eliminated)
+            at, e = not_none(part.eliminated).ravel(), not_none(self.plan.eliminated)
             both = jax.ops.segment_sum(eliminated, at, self.diagonal_blocks[e].shape[0])
             self.diagonal_blocks[e] += both[..., :-1]
             self.gradient[e] += both[..., -1]

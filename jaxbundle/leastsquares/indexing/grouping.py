@@ -13,7 +13,7 @@ from jaxbundle.leastsquares.declarations import ObservationSet, Table
 from jaxbundle.leastsquares.indexing.indices import as_column, as_index
 from jaxbundle.leastsquares.indexing.plan import Member, UnknownGroup
 from jaxbundle.leastsquares.indexing.settings import PlanningSettings
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 
 @dataclasses.dataclass
@@ -95,7 +95,7 @@ class Grouping:
             # −1: the observation touches no eliminated row; it adds to the reduced system directly.
             slot_of = np.full(given.number, -1)
             for s in slots:
-                slot_of[~present(self.coupled_rows)[given.rows[s]]] = s
+                slot_of[~not_none(self.coupled_rows)[given.rows[s]]] = s
             # An observation may touch two held rows of the table: the last one counts as
             # eliminated.
             # A set without observations is an empty subset.
@@ -126,7 +126,7 @@ class Grouping:
                 self.group_of[name] = host, start, np.arange(table.rows)
         self.row_in, name = {}, self.eliminate
         if name is not None:
-            coupled = present(self.coupled_rows)
+            coupled = not_none(self.coupled_rows)
             # Kept rows and eliminated ones are numbered separately.
             place = lambda mask: np.where(mask, np.cumsum(mask) - 1, -1)
             if coupled.any():

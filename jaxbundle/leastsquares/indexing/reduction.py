@@ -21,7 +21,7 @@ from jaxtyping import Array, Int
 
 from jaxbundle.leastsquares.indexing.indices import as_column
 from jaxbundle.leastsquares.indexing.settings import PLANNING, PlanningSettings
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 FACTORS = ("dense", "banded")
 Rows = Int[np.ndarray, " n"]
@@ -112,6 +112,6 @@ def choose_reduction(
     least = min(fits, key=fits.__getitem__, default=None)
     return (
         "dense"
-        if "dense" in fits and fits["dense"] < settings.required_gain * fits[present(least)]
+        if "dense" in fits and fits["dense"] < settings.required_gain * fits[not_none(least)]
         else least
     )

@@ -23,8 +23,8 @@ from jaxbundle.types import AnyArray, Scalar
 
 # Kinds of arrays with more residuals per observation, as the priors of a spline camera have, are
 # differentiated as arrays. Scalar by scalar XLA compiles them for minutes: the program grows with
-# residuals × columns, 64² statements at this limit. Not critical: kinds of the package have a few
-# residuals, or hundreds.
+# residuals × columns, 64² statements at this limit. Half and double make no difference: kinds of
+# the package have a few residuals, or hundreds.
 SCALAR_RESIDUALS_UP_TO = 64
 
 # Of one observation: 1/σ of every residual, or the rows of L⁻¹ as tuples.

@@ -30,7 +30,7 @@ from jaxbundle.leastsquares.equations.elimination import (
 from jaxbundle.leastsquares.equations.reduced import Reduced
 from jaxbundle.leastsquares.indexing.plan import IncidencePairs, Plan, Tangent
 from jaxbundle.leastsquares.indexing.rows import Declared, Values
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 
 class Cofactors(eqx.Module):
@@ -64,7 +64,7 @@ def cofactors(
     eliminated, coupled = None, {}
     diagonal = dict(Q.diagonal_blocks)
     if plan.eliminated is not None:
-        K, L = _couplings(factor, Q), present(factor.lower_inverse)
+        K, L = _couplings(factor, Q), not_none(factor.lower_inverse)
         # L⁻ᵀ·(1 + K·Zᵀ)·L⁻¹: V⁻¹, and what the uncertainty of the kept rows adds.
         inner = jnp.broadcast_to(jnp.eye(L.shape[1]), L.shape)
         for g, k in K.items():

@@ -51,7 +51,7 @@ from jaxbundle.leastsquares.iterations.stopping import converged
 from jaxbundle.leastsquares.problem import Problem, complete_data, make_solver, without_filling
 from jaxbundle.leastsquares.quality.hessian_products import multiply
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 Sensitivity = Literal["exact", "gauss-newton"]
 
@@ -137,7 +137,7 @@ class LinearisedSolution(eqx.Module):
 
     def times(self, change: Tangent) -> Tangent:
         """H·δ of ½vᵀPv and of the penalty on the pins, from `terms`."""
-        product = multiply(self.declared, self.plan, self.values, present(self.terms), change)
+        product = multiply(self.declared, self.plan, self.values, not_none(self.terms), change)
         penalty = {g: pins**2 * change[g] for g, pins in self.pins.items()}
         return {g: x + penalty[g] if g in penalty else x for g, x in product.items()}
 

@@ -69,7 +69,7 @@ class SizeEquations:
         T, onto = self.reduced
         forms = onto @ q
         cubes = self.cubes
-        # else the matrix is 1, and the product the largest part of the time
+        # Else the matrix is 1, and the product the largest part of the time.
         if cubes is not None and self.has_others:
             cubes = np.einsum("ia,jb,kc,abc->ijk", onto, onto, onto, cubes)
         theta = _significant(T, forms, self.critical, cubes)
@@ -107,7 +107,7 @@ def widenings(
         some = np.flatnonzero(pattern)
         if not (some > 0).any():
             continue  # independent errors alone
-        # of the θ that are not zero, in the system of these alone
+        # Of the θ that are not zero, in the system of these alone.
         inverse = np.linalg.pinv(T[np.ix_(some, some)], 1e-10, hermitian=True)
         spread = inverse @ forms[np.ix_(some, some)] @ inverse
         sigma = np.sqrt(np.diag(spread))
@@ -162,7 +162,7 @@ def _nonnegative(
     A = T / scale[:, None] / scale
     # T is symmetric and positive semidefinite: T = L·Lᵀ, and ‖Lᵀθ − L⁻¹q‖ is the least-squares form
     w, E = np.linalg.eigh(A)
-    # components that are combinations of others leave eigenvalues of rounding
+    # Components that are combinations of others leave eigenvalues of rounding.
     some = w > 1e-10 * w.max()
     L = E[:, some] * np.sqrt(w[some])
     right = (E[:, some].T @ (q / scale)) / np.sqrt(w[some])
@@ -177,13 +177,13 @@ def _significant(
 ) -> Float[np.ndarray, " k"]:
     """θ ≥ 0 of the components whose θ is beyond the quantile that it has in the system of all that
     are left, if errors are independent; the least significant is left out first."""
-    # the mean square of all residuals: θ_0 may be zero, where others are in every observation
+    # The mean square of all residuals: θ_0 may be zero, where others are in every observation.
     kept, white = np.arange(len(q)), max(q[0] / T[0, 0], 0.0)
     while True:
         part = T[np.ix_(kept, kept)]
         theta = _nonnegative(part, q[kept])
         inverse = np.linalg.pinv(part, 1e-10, hermitian=True)
-        # the covariance of q is 2·T·σ0⁴ for independent errors
+        # The covariance of q is 2·T·σ0⁴ for independent errors.
         sigma = np.sqrt(2 * np.diag(inverse))
         limit = np.full(len(kept), critical)
         if cubes is not None:
@@ -207,7 +207,7 @@ def _scores(T: Float[np.ndarray, "k k"], q: Float[np.ndarray, " k"]) -> Float[np
     white = q[0] / T[0, 0]
     variance = np.diag(T) - T[:, 0] ** 2 / T[0, 0]
     away = q - T[:, 0] * white
-    # the form of the independent part determines its size: it exceeds nothing
-    # (a difference of two numbers of the size of T: smaller ones are rounding)
+    # The form of the independent part determines its size: it exceeds nothing
+    # (a difference of two numbers of the size of T: smaller ones are rounding).
     good = variance > 1e-9 * np.diag(T)
     return np.where(good, away / np.sqrt(2 * np.where(good, variance, 1.0)) / white, 0.0)

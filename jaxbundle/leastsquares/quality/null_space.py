@@ -15,7 +15,7 @@ from jaxbundle.leastsquares.indexing.rows import Data, Declared, Values, lay_out
 from jaxbundle.leastsquares.problem import Problem, pad_data, pad_values
 from jaxbundle.leastsquares.quality.names import kept_unknowns, name_of
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 # Scaled eigenvalues of the normal matrix below this are rounding: undetermined directions. Ten
 # times `elimination.PIVOT`: an eigenvalue is at most the smallest pivot, and a problem that failed
@@ -95,7 +95,7 @@ def _scale(
 
 def _name_singular(problem: Problem, V: Float[np.ndarray, "rows w w"]) -> list[str]:
     """The unknowns of eliminated rows with a singular block V."""
-    e = present(problem.plan.eliminated)
+    e = not_none(problem.plan.eliminated)
     group, table = problem.plan.groups[e], problem.table(e)
     finite = np.asarray(np.isfinite(V).all((1, 2)))
     V = np.where(finite[:, None, None], V, np.eye(V.shape[1]))

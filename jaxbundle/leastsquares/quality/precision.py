@@ -27,7 +27,7 @@ from jaxbundle.leastsquares.problem import Problem, complete_data, with_factor, 
 from jaxbundle.leastsquares.quality.cofactors import blocks_of_tables, cofactors, propagate
 from jaxbundle.leastsquares.quality.reliability import reliability
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray, present
+from jaxbundle.types import AnyArray, not_none
 
 
 class TablePrecision(eqx.Module):
@@ -62,7 +62,7 @@ def precision(
 
     def functions(change: Tangent) -> Float[Array, " functions"]:
         return jnp.ravel(
-            present(of)(without_filling(problem, retract(declared, plan, data.start, change)))
+            not_none(of)(without_filling(problem, retract(declared, plan, data.start, change)))
         )
 
     still = zero_tangent(plan)

@@ -39,7 +39,7 @@ from jaxbundle.leastsquares.indexing.rows import (
 )
 from jaxbundle.leastsquares.quality.cofactors import Cofactors
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray, present
+from jaxbundle.types import AnyArray, not_none
 
 # Redundancy numbers below this are rounding: the observation is uncontrolled. 1 − h of a number h
 # near 1 has an error of 1e-16 times the condition of N, 1e4 to 1e6 in common networks; above it w
@@ -185,9 +185,9 @@ def _hat_of_chunk(
         hat = form(J @ _kept_cofactors(part, Q), J)
     if E is not None:
         # E·V⁻¹·Eᵀ: h if everything else were known.
-        root = jnp.einsum("lri,lji->lrj", E, present(Q.lower_inverse)[part.eliminated])
+        root = jnp.einsum("lri,lji->lrj", E, not_none(Q.lower_inverse)[part.eliminated])
         eliminated_leverage = form(root, root)
-        hat = hat + form(E @ present(Q.eliminated)[part.eliminated], E)
+        hat = hat + form(E @ not_none(Q.eliminated)[part.eliminated], E)
         for touch, J in zip(part.touches, touches):
             coupled = Q.coupled[touch.group]
             of_row = coupled.reshape(-1, *coupled.shape[2:])[touch.incidence]

@@ -51,7 +51,7 @@ class Traces:
     def add_cubes(self, k: int, remaining: Columns, again: Columns, times: float) -> None:
         """Cubes of the root k with itself, from some combinations of its columns, of which M·F·ξ is
         `remaining` and M·F·(FᵀM·F·ξ) is `again`; `times` as many there are."""
-        # with S = FᵀM·F, ‖M·F·S·ξ‖² = ξᵀ·S³·ξ, whose expectation is tr S³
+        # With S = FᵀM·F, ‖M·F·S·ξ‖² = ξᵀ·S³·ξ, whose expectation is tr S³.
         self.cubes[1 + k, 1 + k, 1 + k] = times * np.sum(again**2)
         for j in self.products:
             y = [np.asarray(self.F[j].T @ rows.T) for rows in (again, remaining)]
@@ -70,7 +70,7 @@ class Traces:
 
     def of_all(self) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, "k k k"]]:
         """T and the cubes."""
-        # random combinations, on one side of the traces, make it unsymmetric
+        # Random combinations, on one side of the traces, make it unsymmetric.
         T = self.T
         T[1:, 0] = T[0, 1:]
         T[1:, 1:] = (T[1:, 1:] + T[1:, 1:].T) / 2

@@ -36,7 +36,7 @@ from jaxbundle.leastsquares.quality.names import eliminated_rows
 from jaxbundle.leastsquares.quality.separability import choose_together, find_alternatives
 from jaxbundle.leastsquares.solution import Solution, take_step
 from jaxbundle.leastsquares.whitening import used, without_residual
-from jaxbundle.types import AnyArray, present
+from jaxbundle.types import AnyArray, not_none
 
 # Observations are removed together with the worst if their test is at least this fraction of its.
 # Larger: more rounds of adjustments; smaller: good observations are removed for the blunders of
@@ -449,4 +449,4 @@ def without(
             weight[o][np.isin(eliminated, undetermined)] = 0.0
     data = dataclasses.replace(problem.data, weight=weight)
     problem = with_data(problem, data)
-    return hold(problem, present(e), undetermined) if undetermined else problem
+    return hold(problem, not_none(e), undetermined) if undetermined else problem

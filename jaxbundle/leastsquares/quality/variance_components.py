@@ -22,18 +22,21 @@ ROUNDS = 20
 
 
 class VarianceGroup(NamedTuple):
-    """Observations whose σ are estimated together: sets, and which [rows, residuals] of each."""
+    """Observations whose σ are estimated together: sets, and which [rows, residuals] of each.
+
+    `unit`: the factor from the unit of computation to that of the group, and `word` its name."""
 
     name: str
     parts: Sequence[tuple[str, Any]]
     unit: float = 1.0
+    word: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
 class Component:
     """A group of observations: number, redundancy, vᵀPv.
 
-    `given`: the smallest and the largest given a priori σ (in the unit of the group; NaN
+    `given`: the smallest and the largest given a priori σ (in the `unit` of the group; NaN
     if units differ). `factor`: applied to them before the adjustment, 1 unless
     components are estimated.
     """
@@ -43,6 +46,7 @@ class Component:
     vtpv: float
     given: tuple[float, float]
     factor: float = 1.0
+    unit: str = ""
 
     @property
     def ratio(self) -> float:
@@ -94,6 +98,7 @@ def variance_components(
                 float(square.sum()),
                 (float(unit / used.max()), float(unit / used.min())),
                 factor,
+                group.word,
             )
     return components
 

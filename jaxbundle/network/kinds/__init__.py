@@ -1,10 +1,10 @@
 """Further kinds of observations of a network: one file per kind, with a common interface
-(`base.Further`)."""
+(`base.ObservationTable`)."""
 
 from jaxbundle.network.kinds.antennas import Antennas as Antennas
 from jaxbundle.network.kinds.attitudes import Attitudes as Attitudes
 from jaxbundle.network.kinds.azimuths import Azimuths as Azimuths
-from jaxbundle.network.kinds.base import Further as Further
+from jaxbundle.network.kinds.base import ObservationTable as ObservationTable
 from jaxbundle.network.kinds.camera_parameters import CameraParameters as CameraParameters
 from jaxbundle.network.kinds.differences import Angles as Angles
 from jaxbundle.network.kinds.differences import Differences as Differences

@@ -34,7 +34,7 @@ from jaxbundle.leastsquares.spaces import Change, Posed, Triple, Vector
 from jaxbundle.network.columns import Columns
 from jaxbundle.network.kinds.base import (
     Contribution,
-    Further,
+    ObservationTable,
     Parameters,
     check_settings,
     positive_sigma,
@@ -76,7 +76,7 @@ POSITION = Kind(
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Antennas(Further):
+class Antennas(ObservationTable):
     """Positions of antennas; `covariance` in the square of the object unit."""
 
     image: tuple[str, ...]

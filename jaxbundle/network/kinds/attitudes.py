@@ -27,7 +27,7 @@ from jaxbundle.leastsquares.spaces import Posed, Rotation, Turned
 from jaxbundle.network.columns import Columns
 from jaxbundle.network.kinds.base import (
     Contribution,
-    Further,
+    ObservationTable,
     Parameters,
     check_settings,
     positive_sigma,
@@ -62,7 +62,7 @@ PRIOR = Kind(
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Attitudes(Further):
+class Attitudes(ObservationTable):
     """Attitudes and their σ, radians; `settings` in the unit of the table."""
 
     image: tuple[str, ...]

@@ -26,7 +26,7 @@ from jaxbundle.leastsquares.spaces import Posed
 from jaxbundle.network.columns import Columns, did_you_mean
 from jaxbundle.network.kinds.base import (
     Contribution,
-    Further,
+    ObservationTable,
     Parameters,
     check_settings,
     positive_sigma,
@@ -48,14 +48,14 @@ class AxisAzimuth:
 
     def __call__(self, pose: Posed, declination: Scalar, measured: Scalar) -> Scalar:
         X, Y, _ = pose.rotation.apply_inverse(self.axis)
-        # turned to where the measured direction is north: 359° and 1° differ by 2°
+        # Turned to where the measured direction is north: 359° and 1° differ by 2°.
         north = measured + declination
         c, s = jnp.cos(north), jnp.sin(north)
         return jnp.arctan2(X * c - Y * s, X * s + Y * c)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Azimuths(Further):
+class Azimuths(ObservationTable):
     """Azimuths and their σ, radians."""
 
     image: tuple[str, ...]

@@ -55,7 +55,7 @@ class Contribution(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Further(abc.ABC):
+class ObservationTable(abc.ABC):
     """Rows of one further kind. A subclass has a column (a tuple or an array) for each field except
     `settings` and `source`, and declares what its id columns refer to.
 
@@ -160,7 +160,7 @@ COLUMNS_OF_FIELDS = {"start": "from"}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class SingleValues(Further):
+class SingleValues(ObservationTable):
     """Rows of one measured value each, with its σ. A subclass has its id columns, `TABLE`, `IMAGES`
     or `POINTS`, and `KIND`: one residual, of the tables "image" and "point", in the order of the
     id columns. Angles (`Kind.units`) are in radians here, and in the project's unit in a table."""
@@ -185,9 +185,7 @@ class SingleValues(Further):
         )
         for row, objects in enumerate(zip(*(getattr(made, field) for field in cls.POINTS))):
             if len({*objects}) < len(objects):
-                raise InputError(
-                    f"{table.source(row)}: {len(objects)} different points are expected"
-                )
+                raise InputError(f"{table.source(row)}: expected {len(objects)} different points")
         made.check_values(radians)
         return made
 
@@ -218,7 +216,7 @@ def rows_of(ids: Sequence[str], table: Images | Points) -> Int[np.ndarray, " n"]
     return np.array([row[id] for id in ids], int)
 
 
-def among(network: Network) -> list[Further]:
+def among(network: Network) -> list[ObservationTable]:
     """The observations of further kinds of a network whose images and points are all included."""
     present = (one.among(network) for one in network.further)
     return [one for one in present if len(one)]
@@ -239,7 +237,7 @@ def positive_sigma(
 def check_settings(section: str, given: Mapping[str, Any], known: Sequence[str]) -> None:
     """Refuse settings of a section that are not known."""
     if not isinstance(given, Mapping):
-        raise InputError(f"[{section}]: a section of settings is expected, not {show(given)}")
+        raise InputError(f"[{section}]: expected a section of settings, got {show(given)}")
     for key in given:
         refuse_unknown(key, known, f"[{section}]: ")
 
@@ -253,7 +251,7 @@ def numbers(section: str, key: str, value: Any, length: int) -> Float[np.ndarray
     except (TypeError, ValueError):
         found = np.zeros(0)
     if found.shape != (length,) or not np.isfinite(found).all():
-        raise InputError(f"[{section}]: {key} is {show(value)}; {length} numbers are expected")
+        raise InputError(f"[{section}]: {key} is {show(value)}; expected {length} numbers")
     return found
 
 
@@ -288,10 +286,10 @@ class Parameters:
         **Raises:** `InputError`."""
         free, sigma = settings.get("free", ()), settings.get("sigma", {})
         if isinstance(free, str) or not isinstance(free, Sequence):
-            raise InputError(f"[{section}]: free is {show(free)}; a list of names is expected")
+            raise InputError(f"[{section}]: free is {show(free)}; expected a list of names")
         if not isinstance(sigma, Mapping):
             raise InputError(
-                f"[{section}]: sigma is {show(sigma)}; a table of names and numbers is expected"
+                f"[{section}]: sigma is {show(sigma)}; expected a table of names and numbers"
             )
         for name in (*free, *sigma):
             if name not in names:

@@ -18,7 +18,7 @@ from jaxbundle.leastsquares.declarations import Kind
 from jaxbundle.leastsquares.spaces import Change
 from jaxbundle.network.camera_tables import camera_tables
 from jaxbundle.network.columns import Columns, did_you_mean
-from jaxbundle.network.kinds.base import Contribution, Further, positive_sigma
+from jaxbundle.network.kinds.base import Contribution, ObservationTable, positive_sigma
 from jaxbundle.network.tables import Network
 from jaxbundle.types import Scalar
 
@@ -39,7 +39,7 @@ class ObservedParameter:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class CameraParameters(Further):
+class CameraParameters(ObservationTable):
     """Observed values of camera parameters, or of their ratios, and their σ, in the units of the
     camera models."""
 

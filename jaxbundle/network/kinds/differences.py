@@ -18,7 +18,7 @@ from jaxbundle.leastsquares.declarations import Kind
 from jaxbundle.network.columns import Columns
 from jaxbundle.network.kinds.base import (
     Contribution,
-    Further,
+    ObservationTable,
     SingleValues,
     positive_sigma,
     rows_of,
@@ -53,7 +53,7 @@ ANGLE = Kind("angles", angle, ("point", "point", "point"), ("angle",), "angle")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Differences(Further):
+class Differences(ObservationTable):
     """Coordinates of `to` minus those of `start`; σ infinite if not measured."""
 
     start: tuple[str, ...]
@@ -74,8 +74,8 @@ class Differences(Further):
         given = ~np.isnan(value)
         for row in np.flatnonzero((given != ~np.isnan(sigma)).any(1) | ~given.any(1))[:1]:
             raise InputError(
-                f"{table.source(row)}: a difference dX, dY or dZ with its σ sdX, sdY "
-                "or sdZ is expected, both or neither"
+                f"{table.source(row)}: expected a difference dX, dY or dZ with its σ sdX, sdY or "
+                "sdZ, both or neither"
             )
         return cls(
             start=table.ids("from"),
@@ -110,6 +110,6 @@ class Angles(SingleValues):
     def check_values(self, radians: float) -> None:
         for row in np.flatnonzero(~((self.value > 0) & (self.value < np.pi)))[:1]:
             raise InputError(
-                f"{self.source(row)}: an angle between 0 and half a turn is "
-                f"expected, not {self.value[row] / radians:g}"
+                f"{self.source(row)}: expected an angle between 0 and half a turn, got "
+                f"{self.value[row] / radians:g}"
             )

@@ -20,7 +20,13 @@ from jaxbundle.geometry import omega_phi_kappa_near
 from jaxbundle.leastsquares.declarations import Kind, ObservationSet
 from jaxbundle.leastsquares.spaces import Posed
 from jaxbundle.network.columns import Columns
-from jaxbundle.network.kinds.base import POSE_UNITS, Contribution, Further, positive_sigma, rows_of
+from jaxbundle.network.kinds.base import (
+    POSE_UNITS,
+    Contribution,
+    ObservationTable,
+    positive_sigma,
+    rows_of,
+)
 from jaxbundle.network.kinds.control_points import infinite_where_none
 from jaxbundle.network.tables import EXTERIOR
 
@@ -55,7 +61,7 @@ def declare_exterior_orientation(
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ExteriorPriors(Further):
+class ExteriorPriors(ObservationTable):
     """Given exterior orientations [n, 6], angles in radians; σ is infinite where none is given."""
 
     image: tuple[str, ...]

@@ -31,11 +31,11 @@ from jaxbundle.arguments import show
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import quaternion_from_matrix
-from jaxbundle.leastsquares.datum.motions import move_pose
+from jaxbundle.leastsquares.datum.motions import move_pose, scale_length
 from jaxbundle.leastsquares.declarations import Kind, ObservationSet, Table
 from jaxbundle.leastsquares.spaces import Frame, Posed, PoseValue, Triple
 from jaxbundle.network.columns import Columns, did_you_mean
-from jaxbundle.network.kinds.base import Contribution, Further, positive_sigma, rows_of
+from jaxbundle.network.kinds.base import Contribution, ObservationTable, positive_sigma, rows_of
 from jaxbundle.network.kinds.fit_figures import FEWEST, TYPES, fit
 from jaxbundle.network.tables import Network
 from jaxbundle.types import Scalar
@@ -97,12 +97,8 @@ RESIDUALS = {
 }
 
 
-def _move_radius(motion: Float[Array, "7"], radius: Float[Array, ""]) -> Float[Array, ""]:
-    return jnp.exp(motion[6]) * radius
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Figures(Further):
+class Figures(ObservationTable):
     """Points of planes, lines, circles, spheres, cylinders; σ 0: exact; `radius` NaN: unknown."""
 
     figure: tuple[str, ...]
@@ -212,7 +208,7 @@ class Figures(Further):
                 tables, touched = (type, size.name), (figure[those],) * 2
                 of, own_sigma = point[rows[those]], sigma[those]
                 seen.append(self._observe_points(type, tables, touched, of, own_sigma, not given))
-        actions = (type, move_pose), (size.name, _move_radius)
+        actions = (type, move_pose), (size.name, scale_length)
         return Contribution((frame, size), tuple(seen), actions)
 
     @staticmethod
@@ -234,7 +230,7 @@ class Figures(Further):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Shapes(Further):
+class Shapes(ObservationTable):
     """Points of known shapes, each in its placement; σ 0: exact."""
 
     shape: tuple[str, ...]

@@ -16,7 +16,7 @@ from jaxtyping import Float
 # Rotations of more than this, in radians, are no motions for the start: near π noise may turn the
 # axis around.
 LARGEST_TURN = 3.0
-# Every pose is combined with at most so many others: of 200 poses all pairs, 20 000; of more
+# The most others with which a pose is combined: of 200 poses all pairs, 20 000; of more
 # poses pairs in equal steps, whose number grows with that of the poses only.
 MOST_PARTNERS = 200
 
@@ -99,7 +99,7 @@ def other_side(A: Rigid, X: Rigid, B: Rigid) -> Rigid:
     """Y of A·X = Y·B, the mean over all poses."""
     Y = A.of(X).of(B.inverse)
     R = nearest_rotation(Y.R.sum(0))
-    # of the places of B, not of its far origin
+    # Of the places of B, not of its far origin.
     t = (A.of(X).t - B.t @ R.T).mean(0)
     return Rigid(R, t)
 

@@ -17,7 +17,7 @@ from jaxbundle.leastsquares.declarations import Kind, Local, ObservationSet
 from jaxbundle.leastsquares.spaces import Change, Posed, Triple, turn_by
 from jaxbundle.network.kinds.interfaces import MEDIA, Interfaces, RefractedImagePoint, Refraction
 from jaxbundle.network.kinds.rolling_shutter import READ_OUT, VELOCITIES, RollingShutter
-from jaxbundle.types import Scalar, present
+from jaxbundle.types import Scalar, not_none
 
 if TYPE_CHECKING:
     from jaxbundle.network.camera_tables import CameraTable
@@ -49,7 +49,7 @@ class ColumnsOfImagePoint:
     def __call__(self, *touched: Any) -> Change:
         *poses, p, ray, _ = touched
         model = cameras.get_model(self.model)
-        return present(model.local).columns(p, *model.ideal(p, *_transform_ray(poses, ray)))
+        return not_none(model.local).columns(p, *model.ideal(p, *_transform_ray(poses, ray)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +62,7 @@ class LocalImagePoint:
         *poses, p, ray, columns, values, xy = touched
         model = cameras.get_model(self.model)
         at = model.ideal(p, *_transform_ray(poses, ray))
-        x, y = present(model.local).distort(p, columns, values, *at)
+        x, y = not_none(model.local).distort(p, columns, values, *at)
         return x - xy[0], y - xy[1]
 
 

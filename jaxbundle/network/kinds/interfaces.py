@@ -37,11 +37,11 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.quaternions import quaternion_from_matrix
 from jaxbundle.geometry.refraction import refract_dome, refract_flat
 from jaxbundle.geometry.rotations import matrix_from_omega_phi_kappa
-from jaxbundle.leastsquares.datum.motions import move_pose
+from jaxbundle.leastsquares.datum.motions import move_pose, scale_length, scale_position
 from jaxbundle.leastsquares.declarations import Kind, ObservationSet, Table
 from jaxbundle.leastsquares.spaces import Change, Frame, Posed, PoseValue, Triple, Vector
 from jaxbundle.network.columns import Columns, did_you_mean, is_missing
-from jaxbundle.network.kinds.base import Contribution, Further, computed_minus_given
+from jaxbundle.network.kinds.base import Contribution, ObservationTable, computed_minus_given
 from jaxbundle.network.rules import check_unique
 from jaxbundle.network.tables import Network
 
@@ -97,7 +97,7 @@ PLANE_PRIOR = ("length", "angle", "angle")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Interfaces(Further):
+class Interfaces(ObservationTable):
     """Interfaces: values and σ of `COLUMNS`, radians; σ NaN: held, infinite: free; a camera "": in
     object space."""
 
@@ -253,7 +253,7 @@ class Interfaces(Further):
         for row, table in enumerate(tables):
             if table != tables[0]:
                 raise InputError(
-                    f"{self.source(row)}: a {table} beside the {tables[0]} of {self.source(0)}: "
+                    f"{self.source(row)}: a {table}, but a {tables[0]} in {self.source(0)}: "
                     "expected all interfaces of a network of one type"
                 )
         own = [id for id in self.camera if id] if tables[0] != SURFACE else [*self.camera]
@@ -322,17 +322,17 @@ class Interfaces(Further):
             geometry = Table(
                 name, value[:, :3], Vector(3), ~np.isnan(sigma[:, :3]), labels, PLACE, name
             )
-            sets, action = _observe(geometry, sigma[:, :3], "length"), _scale_lengths
+            sets, action = _observe(geometry, sigma[:, :3], "length"), scale_length
         else:
             geometry, sets = _planes(name, value, sigma, labels)
-            action = move_pose if name == SURFACE else _scale_position
+            action = move_pose if name == SURFACE else scale_position
         # A plane has no radius: one that is held would hold the scale.
         names = MEDIUM if name == DOME else MEDIUM[:-1]
         value, sigma = (x[:, 5 : 5 + len(names)] for x in (value, sigma))
         free = ~np.isnan(sigma)
         media = Table(MEDIA, value, Vector(len(names)), free, labels, names, "medium of")
         sets = (*sets, *_observe(media, sigma, ("", "", "", "length", "length")[: len(names)]))
-        return Contribution((geometry, media), sets, ((name, action), (MEDIA, _scale_medium)))
+        return Contribution((geometry, media), sets, ((name, action), (MEDIA, _scale_thicknesses)))
 
 
 def _refract(
@@ -389,16 +389,9 @@ def _planes(
     return table, (kind((rows,), (X0[rows], M[rows]), sigma=spread),)
 
 
-def _scale_lengths(motion: Float[Array, "7"], value: Float[Array, "3"]) -> Float[Array, "3"]:
-    return jnp.exp(motion[6]) * value
-
-
-def _scale_position(motion: Float[Array, "7"], value: PoseValue) -> PoseValue:
-    return PoseValue(jnp.exp(motion[6]) * value.position, value.rotation)
-
-
-def _scale_medium(motion: Float[Array, "7"], value: Float[Array, " n"]) -> Float[Array, " n"]:
-    return value.at[3:].multiply(jnp.exp(motion[6]))
+def _scale_thicknesses(motion: Float[Array, "7"], value: Float[Array, " n"]) -> Float[Array, " n"]:
+    # The three refractive indices before them have no unit.
+    return value.at[3:].set(scale_length(motion, value[3:]))
 
 
 @dataclasses.dataclass(frozen=True)

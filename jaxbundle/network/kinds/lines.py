@@ -31,7 +31,7 @@ from jaxbundle.leastsquares.declarations import Kind, Table
 from jaxbundle.leastsquares.spaces import Change, Frame, Posed, PoseValue
 from jaxbundle.network.camera_tables import camera_tables, start_of
 from jaxbundle.network.columns import Columns
-from jaxbundle.network.kinds.base import Contribution, Further, positive_sigma, rows_of
+from jaxbundle.network.kinds.base import Contribution, ObservationTable, positive_sigma, rows_of
 from jaxbundle.network.tables import Network
 from jaxbundle.network.units import from_image_unit
 
@@ -58,7 +58,7 @@ class OnLine:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Edges(Further):
+class Edges(ObservationTable):
     """Image points of lines, in the unit of the network's image coordinates; σ NaN: that of image
     points."""
 

@@ -87,8 +87,8 @@ def read_mountings(section: str, given: Any, radians: float) -> dict[str, GivenM
     **Raises:** `InputError`."""
     if not isinstance(given, Mapping):
         raise InputError(
-            f"[{section}]: mounting is {show(given)}; for each camera what is known of its "
-            "mounting is expected, such as mounting.right = { position = [0.5, 0, 0] }"
+            f"[{section}]: mounting is {show(given)}; expected what is known of the "
+            "mounting of each camera, such as mounting.right = { position = [0.5, 0, 0] }"
         )
     return {
         name: _read_mounting(f"{section}.mounting.{name}", one, radians)
@@ -132,7 +132,7 @@ def _sigmas(section: str, key: str, given: Any) -> Float[np.ndarray, "3"]:
     # NaN is not positive either
     if not (found > 0).all():
         raise InputError(
-            f"[{section}]: {key} is {show(given)}; a positive number or three are expected (inf: "
+            f"[{section}]: {key} is {show(given)}; expected a positive number, or three (inf: "
             "nothing is known of an axis)"
         )
     return found
@@ -149,8 +149,8 @@ def _covariance(section: str, given: Any) -> Float[np.ndarray, "6 6"]:
         good = False
     if not good:
         raise InputError(
-            f"[{section}]: covariance: six rows of six numbers are expected, symmetric and "
-            "positive definite: of position and ω, φ, κ"
+            f"[{section}]: covariance: expected six rows of six numbers, symmetric and positive "
+            "definite: of position and ω, φ, κ"
         )
     return C
 
@@ -171,7 +171,7 @@ def read_bases(section: str, given: Any) -> tuple[Base, ...]:
     **Raises:** `InputError`."""
     if not isinstance(given, Sequence) or isinstance(given, str):
         raise InputError(
-            f"[{section}]: bases is {show(given)}; a list is expected, such as "
+            f"[{section}]: bases is {show(given)}; expected a list, such as "
             '[{ cameras = ["left", "right"], length = 0.5, sigma = 0.001 }]'
         )
     found = []
@@ -181,7 +181,7 @@ def read_bases(section: str, given: Any) -> tuple[Base, ...]:
         cameras = one.get("cameras")
         pair = isinstance(cameras, list | tuple) and len(cameras) == 2
         if not pair or not all(isinstance(c, str) for c in cameras) or cameras[0] == cameras[1]:
-            raise InputError(f"[{where}]: cameras is {show(cameras)}; two names are expected")
+            raise InputError(f"[{where}]: cameras is {show(cameras)}; expected two names")
         length, sigma = (
             positive(f"[{where}]: {key}", one.get(key, np.nan)) for key in ("length", "sigma")
         )
@@ -211,6 +211,6 @@ def observe_mountings(rows: Sequence[int], given: Sequence[GivenMounting]) -> li
 
 
 def _as_measured(one: GivenMounting) -> Float[np.ndarray, "6"]:
-    # what is not given has an infinite σ
+    # What is not given has an infinite σ.
     parts = (np.zeros(3) if part is None else part for part in (one.position, one.angles))
     return np.concatenate([*parts])

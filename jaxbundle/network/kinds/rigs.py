@@ -25,10 +25,11 @@ from jaxbundle.arguments import positive
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import quaternion_from_matrix
 from jaxbundle.geometry.rotations import matrix_from_omega_phi_kappa
+from jaxbundle.leastsquares.datum.motions import scale_position
 from jaxbundle.leastsquares.declarations import Kind, Table
 from jaxbundle.leastsquares.spaces import Pose, Posed, PoseValue
 from jaxbundle.network.columns import Columns, did_you_mean
-from jaxbundle.network.kinds.base import POSE_UNITS, Contribution, Further, check_settings
+from jaxbundle.network.kinds.base import POSE_UNITS, Contribution, ObservationTable, check_settings
 from jaxbundle.network.kinds.figures import EXACT_SIGMA, across_rays
 from jaxbundle.network.kinds.mountings import (
     AXES,
@@ -103,7 +104,7 @@ class MountedCameras(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Rigs(Further):
+class Rigs(ObservationTable):
     """Images taken simultaneously."""
 
     rig: tuple[str, ...]
@@ -236,7 +237,7 @@ class Rigs(Further):
             one, other, base = zip(*between)
             length, spread = (np.array([getattr(b, n) for b in base]) for n in ("length", "sigma"))
             sets.append(BASES((np.array(one), np.array(other)), length, sigma=spread))
-        return Contribution((mounting,), sets, ((MOUNTING, _move_mounting),))
+        return Contribution((mounting,), sets, ((MOUNTING, scale_position),))
 
     def scales(self, network: Network) -> list[float]:
         """The given bases, by those of the orientations of the images."""
@@ -346,8 +347,3 @@ def _between(
     # mean of rotations from poor start values is none of them.
     t = np.array([t for t, _ in found])
     return found[np.linalg.norm(t - np.median(t, axis=0), axis=1).argmin()]
-
-
-def _move_mounting(motion: Float[Array, "7"], value: PoseValue) -> PoseValue:
-    """Only the scale of object space affects it."""
-    return PoseValue(jnp.exp(motion[6]) * value.position, value.rotation)

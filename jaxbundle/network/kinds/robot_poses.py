@@ -37,14 +37,14 @@ from jaxbundle.geometry.quaternions import (
     quaternion_from_matrix,
 )
 from jaxbundle.geometry.rotations import matrix_from_omega_phi_kappa
-from jaxbundle.leastsquares.datum.motions import move_pose
+from jaxbundle.leastsquares.datum.motions import move_pose, scale_position
 from jaxbundle.leastsquares.declarations import Kind, ObservationSet, Table
 from jaxbundle.leastsquares.spaces import Pose, Posed, PoseValue
 from jaxbundle.network.columns import Columns
 from jaxbundle.network.kinds.base import (
     POSE_UNITS,
     Contribution,
-    Further,
+    ObservationTable,
     check_settings,
     positive_sigma,
     rows_of,
@@ -73,7 +73,7 @@ PARTS = ("robot positions", "robot rotations")
 FEWEST = 3
 # Of half of a rotation of 180°, whose axis is undetermined: no division by 0 there.
 SMALLEST_COSINE = 1e-12
-# Within so many σ of a rotation the axes of the motions of a robot are parallel.
+# Axes of the motions of a robot that differ by fewer σ of a rotation than this are parallel.
 PARALLEL = 3.0
 
 
@@ -126,7 +126,7 @@ TABLES = {IN_HAND: HandEyeTables(ON_HAND, BASE), TO_HAND: HandEyeTables(ON_BASE,
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class RobotPoses(Further):
+class RobotPoses(ObservationTable):
     """Poses of the hand: position and rotation hand → base; σ along and about the axes of the base,
     radians, NaN where a covariance is given, which is NaN where σ are."""
 
@@ -238,7 +238,7 @@ class RobotPoses(Further):
         frame = _pose_table(names.frame, frames[:1], ["robot"], None)
         rows = (image, of_camera, np.zeros(len(image), int))
         sets = [*self._observe(names, rows), *_observe_camera(eye, known)]
-        actions = ((names.eye, _scale_pose), (names.frame, move_pose))
+        actions = ((names.eye, scale_position), (names.frame, move_pose))
         return Contribution((eye, frame), sets, actions)
 
     def _observe(self, names: HandEyeTables, rows: tuple[Any, ...]) -> list[ObservationSet]:
@@ -268,7 +268,7 @@ class RobotPoses(Further):
         else:
             X, Y, _ = solve(A, B)
             eye, frame = (X, Y) if self.type == IN_HAND else (Y, X)
-        # object space → base or hand, as its pose: M and the place where x is 0
+        # Object space → base or hand, as its pose: M and the place where x is 0.
         centre = frame.inverse.t
         return Rigid(eye.R.T, eye.t), Rigid(frame.R, centre)
 
@@ -336,10 +336,6 @@ def _observe_camera(eye: Table, known: GivenMounting | None) -> list[Observation
     return [kind((np.arange(eye.rows),), np.tile(measured, (eye.rows, 1)), **spread)]
 
 
-def _scale_pose(motion: Float[Array, "7"], value: PoseValue) -> PoseValue:
-    return PoseValue(jnp.exp(motion[6]) * value.position, value.rotation)
-
-
 def _attitude_names(table: Columns) -> tuple[str, ...]:
     found = [names for names in ATTITUDES if {*names} & {*table.values}]
     if len(found) != 1:
@@ -357,7 +353,7 @@ def _rotations(
     """Rotation matrices hand → base."""
     if names == QUATERNION:
         length = np.linalg.norm(given, axis=1)
-        # a part in a hundred: printed with two digits
+        # A part in a hundred: printed with two digits.
         for row in np.flatnonzero(abs(length - 1) > 0.01)[:1]:
             raise InputError(
                 f"{table.source(row)}: the quaternion has the length {length[row]:.4g}; expected 1"

@@ -38,7 +38,7 @@ from jaxbundle.leastsquares.spaces import Posed, Vector
 from jaxbundle.network.columns import Columns, did_you_mean
 from jaxbundle.network.kinds.base import (
     Contribution,
-    Further,
+    ObservationTable,
     Parameters,
     check_settings,
     computed_minus_given,
@@ -57,7 +57,7 @@ VELOCITIES, READ_OUT = "velocity", "read-out"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class RollingShutter(Further):
+class RollingShutter(ObservationTable):
     """Velocities of images; σ NaN: no individual prior."""
 
     image: tuple[str, ...]
@@ -118,7 +118,7 @@ class RollingShutter(Further):
         by_camera = given if isinstance(given, Mapping) else {id: given for id in ids}
         for value in by_camera.values():
             if isinstance(value, bool) or not isinstance(value, int | float):
-                raise InputError(f"[{SECTION}]: line_time is {show(value)}; a number is expected")
+                raise InputError(f"[{SECTION}]: line_time is {show(value)}; expected a number")
         return np.array([float(by_camera.get(id, 0.0)) for id in ids])
 
     def lines(self, network: Network) -> Float[np.ndarray, " rays"]:
@@ -208,8 +208,8 @@ def between_neighbours(
 def _check_neighbours(given: Any, table: Columns) -> None:
     if not isinstance(given, Mapping) or set(given) - {"v", "w"}:
         raise InputError(
-            f"[{SECTION}]: neighbours is {show(given)}; the σ of velocities and "
-            "turns are expected, { v = 0.5, w = 0.02 }"
+            f"[{SECTION}]: neighbours is {show(given)}; expected the σ of velocities and turns, "
+            f"{{ v = 0.5, w = 0.02 }}"
         )
     for name, value in given.items():
         positive(f"[{SECTION}]: neighbours, σ of {name}", value)

@@ -30,7 +30,13 @@ from jaxbundle.geometry.surfaces import (
 )
 from jaxbundle.leastsquares.declarations import Kind, ObservationSet
 from jaxbundle.network.columns import Columns, did_you_mean
-from jaxbundle.network.kinds.base import Contribution, Further, check_settings, numbers, rows_of
+from jaxbundle.network.kinds.base import (
+    Contribution,
+    ObservationTable,
+    check_settings,
+    numbers,
+    rows_of,
+)
 from jaxbundle.network.kinds.figures import EXACT_SIGMA, across_rays, sigma_or_exact
 from jaxbundle.network.surface_models import have_common_point, surface_near
 from jaxbundle.network.tables import Network
@@ -64,7 +70,7 @@ KINDS = {
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class SurfacePoints(Further):
+class SurfacePoints(ObservationTable):
     """Points of known surfaces; σ 0: exact."""
 
     surface: tuple[str, ...]

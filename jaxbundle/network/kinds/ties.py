@@ -21,7 +21,7 @@ from jaxbundle.leastsquares.declarations import Kind
 from jaxbundle.leastsquares.spaces import Change
 from jaxbundle.network.camera_tables import camera_tables, start_of
 from jaxbundle.network.columns import Columns, did_you_mean
-from jaxbundle.network.kinds.base import Contribution, Further
+from jaxbundle.network.kinds.base import Contribution, ObservationTable
 from jaxbundle.network.kinds.figures import EXACT_SIGMA, sigma_or_exact
 from jaxbundle.network.tables import Network
 from jaxbundle.system.programs import compile_once
@@ -40,7 +40,7 @@ class SameParameter:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Ties(Further):
+class Ties(ObservationTable):
     """Equal parameters of two cameras; σ 0: exactly."""
 
     camera: tuple[str, ...]
@@ -92,7 +92,7 @@ class Ties(Further):
                         f"{did_you_mean(name, known)}"
                     )
             if ids[0] == ids[1]:
-                raise InputError(f"{self.source(row)}: two different cameras are expected")
+                raise InputError(f"{self.source(row)}: expected two different cameras")
             units = [get_model(cameras[id].model).unit for id in ids]
             if units[0] != units[1]:
                 raise InputError(

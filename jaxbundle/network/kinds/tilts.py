@@ -25,7 +25,7 @@ from jaxbundle.leastsquares.spaces import Posed, Vector
 from jaxbundle.network.columns import Columns
 from jaxbundle.network.kinds.base import (
     Contribution,
-    Further,
+    ObservationTable,
     Parameters,
     check_settings,
     positive_sigma,
@@ -45,7 +45,7 @@ STEEPEST = np.deg2rad(80.0)
 def elevations(pose: Posed, zero: Float[Array, "3"], read: Float[Array, "3"]) -> Float[Array, "3"]:
     """Elevations of the axes of a camera minus the readings."""
     along = [pose.rotation.apply_inverse(axis) for axis in CAMERA_AXES.values()]
-    # the root has no derivative at 0: an axis that is exactly vertical, which is not read
+    # The root has no derivative at 0: an axis that is exactly vertical, which is not read.
     level = [jnp.sqrt(jnp.maximum(x * x + y * y, 1e-30)) for x, y, _ in along]
     found = [jnp.arctan2(z, h) for (_, _, z), h in zip(along, level)]
     return jnp.stack(found) + zero - read
@@ -55,7 +55,7 @@ TILT = Kind("tilts", elevations, ("image", "clinometer"), AXES, "angle")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Tilts(Further):
+class Tilts(ObservationTable):
     """Elevations of camera axes and their σ, radians; σ infinite: not read."""
 
     image: tuple[str, ...]

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from jaxbundle.adjustment.result import Adjustment
 
 SIGMA_NOTE = (
-    "Standard deviations are a posteriori, σ0 times those of the a priori weights, unless they are "
-    "said to be a priori."
+    "Standard deviations are a posteriori, σ0 times those of the a priori weights, unless "
+    "called a priori."
 )
 
 
@@ -95,7 +95,7 @@ def describe(
     name = clean(also.name or adjustment.network.name) or "network"
     title = f"{name}: {also.kind}" if also.kind else name
     settings = head.setting_facts(adjustment)
-    warnings = (*also.warnings, *adjustment.warnings)
+    warnings = (*also.warnings, *head.warnings(adjustment))
     if not adjustment.converged:
         first = explain_failure(head.failure_facts(adjustment), warnings, also.overview)
         return Page(title, [first, *also.sections], origin, settings, also.tables)

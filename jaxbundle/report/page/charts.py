@@ -193,7 +193,7 @@ def _scale(values: np.ndarray, start: float, end: float, margin: float = 0.0) ->
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
     spread = high - low or abs(high) or 1.0
     low, high = low - margin * spread, high + margin * spread
-    # less than this of the value is its rounding, for which ticks have no digits
+    # Less than this of the value is its rounding, for which ticks have no digits.
     least = 1e-9 * max(abs(low), abs(high))
     if high - low < least:
         low, high = low - least / 2, high + least / 2

@@ -60,7 +60,7 @@ def encode_values(values: np.ndarray, exact: bool = False) -> dict[str, Any]:
     if values.dtype == bool:
         values = np.where(values, "yes", "no").astype(object)
     if values.dtype.kind in "OU":
-        # ids repeat in every row of an image or a point
+        # Ids repeat in every row of an image or a point.
         codes: dict[str, int] = {}
         found = [codes.setdefault(str(value), len(codes)) for value in values]
         return {"names": list(codes)} | _pack(np.array(found, int))
@@ -74,7 +74,7 @@ def _pack(values: np.ndarray, exact: bool = False) -> dict[str, Any]:
         kind = next((k for k, of in ranges if of.min <= low and high <= of.max), "<f8")
     else:
         kind = "<f8" if exact else "<f4"
-    # the page decodes little-endian bytes, whatever this machine has
+    # The page decodes little-endian bytes, whatever this machine has.
     packed = np.ascontiguousarray(values, kind)
     if len(packed) > 1 and np.isfinite(packed[0]) and (packed == packed[0]).all():
         return {"type": kind[1:], "same": packed[0].item()}

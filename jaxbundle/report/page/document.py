@@ -77,11 +77,11 @@ def write(page: Page, date: str | None = None) -> Iterator[str]:
         for id, table in page.tables.items()
         if any(len(column.values) for column in table.columns.values())
     }
-    # the verdict stands before the contents, on the first screen
+    # The verdict stands before the contents, on the first screen.
     first, *sections = page.sections
     listed = [_listing(id, table) for id, table in tables.items()]
     if listed:
-        # one link leads to all tables
+        # One link leads to all tables.
         listed[0] = listed[0]._replace(link="Tables")
     last = _origin(page)
     yield _beginning(page, date or page.origin.computed or in_words(now()))

@@ -18,7 +18,7 @@ from jaxbundle.report.page.overview import give_verdict
 from jaxbundle.report.page.sections import photographs, show_correlations, show_residuals
 from jaxbundle.report.page.tables import Columns
 from jaxbundle.report.refinement_verdict import conclude_refinement
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 KIND = "refinement of scanner images"
 SCANNER_AXES = ("line", "pixel")
@@ -66,9 +66,9 @@ def _image_points(result: Refinement) -> list[ImagePoint]:
     """The rows of `Refinement.image_points`, with what was measured and the names of the axes."""
     declared, given = result.inspection.declared, result.inspection.declared.inputs
     xy = lambda table: np.asarray(
-        present(given.frames).observations.xy if table == PHOTOGRAPH else given.observations.xy
+        not_none(given.frames).observations.xy if table == PHOTOGRAPH else given.observations.xy
     )
-    # the parts of the equations are in another order than the images
+    # The parts of the equations are in another order than the images.
     measured = declared.image_by_image(xy(p.table)[p.rows] for p in declared.parts)
     scanners = {one.id for one in result.images}
     return [

@@ -34,7 +34,7 @@ def describe_network(adjustment: "Adjustment") -> dict[str, Any]:
     ellipsoids = choose_ellipses(adjustment, size, SCENE)
     largest = np.sqrt(np.trace(adjustment.image_covariance[:, :3, :3], axis1=1, axis2=2))
     if not ellipsoids.total and largest.max(initial=0.0) > 0:
-        # no point has one: the largest of the stations is a twentieth of the network
+        # No point has one: the largest of the stations is a twentieth of the network.
         factor = round_number(0.05 * size / largest.max())
         ellipsoids = ellipsoids._replace(factor=factor)
     return {
@@ -53,7 +53,7 @@ def describe_network(adjustment: "Adjustment") -> dict[str, Any]:
                 ellipsoids.selection,
             ]
         ).rstrip(),
-        # wider than this part of the network they hide it: drawn on request
+        # Wider than this part of the network they hide it: drawn on request.
         "wide": bool(ellipsoids.factor * largest.max(initial=0.0) > 0.15 * size),
         "pyramids": encode_values(pyramids.ravel()),
     }

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 def collect(adjustment: "Adjustment") -> Iterator[Section]:
     """All sections of a solved adjustment between its verdict and its tables."""
-    # a picture soon after the verdict, numbers behind it
+    # A picture soon after the verdict, numbers behind it.
     yield network()
     yield variance_factor(adjustment)
     yield photographs()
@@ -163,11 +163,13 @@ def residuals(adjustment: "Adjustment") -> Section:
             fixed(c.redundancy, 2),
             significant(c.vtpv, 5),
             significant(c.sigma, 4),
+            head.span(c.estimated, 3),
+            c.unit,
         )
         for name, c in adjustment.variance_components.items()
     ]
-    header = ("group", "observations", "Σr", "vᵀPv", "σ̂/σ given")
-    more = "<h3>Variance components</h3>\n" + grid(header, components)
+    header = ("group", "observations", "Σr", "vᵀPv", "σ̂/σ given", "σ̂", "unit")
+    more = "<h3>Variance components</h3>\n" + grid(header, components, "remarks")
     return show_residuals(adjustment.residuals["tau"], more=more)
 
 

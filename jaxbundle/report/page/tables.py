@@ -186,7 +186,7 @@ def choose_largest(tau: np.ndarray, most: int) -> np.ndarray:
     """The rows with the largest |τ|, limited in number, in their order."""
     if len(tau) <= most:
         return np.arange(len(tau))
-    # a partition needs no order among the largest
+    # A partition needs no order among the largest.
     return np.sort(np.argpartition(-np.abs(np.nan_to_num(tau)), most)[:most])
 
 
