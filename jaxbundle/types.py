@@ -26,6 +26,3 @@ def not_none(value: T | None) -> T:
     """A value that cannot be None because of earlier checks, although its type allows it."""
     assert value is not None
     return value
-
-
-present = not_none

@@ -98,7 +98,7 @@ from jaxbundle.pushbroom.trajectory import (
 from jaxbundle.report.layout import clean
 from jaxbundle.report.page import UNKNOWN, Origin, Page, Section
 from jaxbundle.report.page.markup import paragraph
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 # Ends of the keys of values that are not negative: of σ, and of walks; the height of an orbit.
 POSITIVE_KEYS = ("white", "walk")
@@ -287,7 +287,7 @@ class FlightView:
             flight,
             noise=noise,
             track=choose_track(tracks, values),
-            angles=choose_angles(present(self.forms), values),
+            angles=choose_angles(not_none(self.forms), values),
             **{n: values[n] for n in names},
         )
 

@@ -30,7 +30,7 @@ import numpy as np
 from jax.lax.linalg import tridiagonal_solve
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxbundle.types import AnyArray, Scalar, present
+from jaxbundle.types import AnyArray, Scalar, not_none
 
 Method = Literal["linear", "lagrange", "usgscsm", "hermite", "spline"]
 METHODS: tuple[str, ...] = get_args(Method)
@@ -69,7 +69,7 @@ def interpolate(table: TimeTable, t: Scalar) -> Float[Array, " k"]:
         case "usgscsm":
             value = _usgscsm(table, i, t)
         case "hermite":
-            value = _hermite(table, present(table.rates), i, t)
+            value = _hermite(table, not_none(table.rates), i, t)
         case "spline":
             value = _hermite(table, spline_rates(table.times, table.values, table.gap), i, t)
         case _:
@@ -203,7 +203,7 @@ def _chebyshev(nodes: int) -> np.ndarray:
 
 def _evaluate_piece(table: TimeTable, i: Int[AnyArray, ""], t: Scalar) -> Float[Array, " k"]:
     """Lagrange's formula through the nodes of Chebyshev, which are the same in every interval."""
-    pieces = present(table.pieces)
+    pieces = not_none(table.pieces)
     nodes = _chebyshev(pieces.shape[1])
     same = np.eye(len(nodes), dtype=bool)
     spans = nodes[:, None] - nodes + same

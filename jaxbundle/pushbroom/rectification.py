@@ -40,7 +40,7 @@ from jaxbundle.pushbroom.rpc.polynomials import Rpc
 from jaxbundle.pushbroom.surfaces import GroundSurface, Height, Plane
 from jaxbundle.pushbroom.terrain import Terrain, bilinear
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray, Scalar, present
+from jaxbundle.types import AnyArray, Scalar, not_none
 
 BLOCK_SIZE = 256
 """Pixels of a block of the map along each side: a usual tile of GeoTIFF, in which maps are written,
@@ -109,12 +109,12 @@ def block_places(
         project = lambda X: _project_by_rpc(image.rpc, surface, X)
         exact = lambda: _rpc_places(image.rpc, surface, nodes, heights.height)
     else:
-        starts = _find_starts(image, present(search), surface, nodes)
+        starts = _find_starts(image, not_none(search), surface, nodes)
         if starts is None:
             return None
         scanner = scanner_of(image)
         project = lambda X: _project_near(scanner, search, X, starts)
-        exact = lambda: _scanner_places(image, present(search), nodes, heights.height, starts)
+        exact = lambda: _scanner_places(image, not_none(search), nodes, heights.height, starts)
     places = _interpolated_places(image, project, nodes, heights, tolerance)
     if places is None:
         return None
@@ -252,7 +252,7 @@ def _hidden(
     if isinstance(image, RpcImage):
         return _are_occluded_in_rpc(image.rpc, surface, *places, ground, _half_pixel(nodes))
     positions = *places, ground, _half_pixel(nodes)
-    return _are_occluded(scanner_of(image), present(search), surface, *positions)
+    return _are_occluded(scanner_of(image), not_none(search), surface, *positions)
 
 
 def _keep_inside(

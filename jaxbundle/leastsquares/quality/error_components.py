@@ -49,7 +49,7 @@ from jaxbundle.leastsquares.quality.error_products import ErrorProducts, error_p
 from jaxbundle.leastsquares.quality.estimated_sizes import SizeEquations, widening
 from jaxbundle.leastsquares.quality.size_traces import Traces
 from jaxbundle.leastsquares.solution import Solution
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 
 class ErrorComponent(NamedTuple):
@@ -299,7 +299,7 @@ class ErrorModel:
                 z = rng.standard_normal((component.columns, number))
                 errors += np.sqrt(t) * component.combine(z).T
         forms = quadratic_forms(self.components, remove_fit(self.found, errors)[0])
-        return errors, np.array([present(self.equations).solve(q)[0] for q in forms])
+        return errors, np.array([not_none(self.equations).solve(q)[0] for q in forms])
 
     def covariances_of_residuals(self, rows: Int[np.ndarray, "n k"]) -> Float[np.ndarray, "n k k"]:
         """The covariance M·Σ·M of the residuals of groups of rows (`first_rows`), in units of their

@@ -37,7 +37,7 @@ from jaxbundle.leastsquares.indexing.rows import (
 )
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 # Columns a call: half and double take the same time a column, and the last call is filled up.
 AT_ONCE = 16
@@ -185,7 +185,7 @@ def _jacobian(declared: Declared, plan: Plan, values: Values, data: Data) -> tup
                 x = change[touch.group][touch.row, touch.start : touch.stop]
                 rows = rows + (J * x[:, None, None, :]).sum(-1)
             if E is not None:
-                x = change[present(plan.eliminated)][part.eliminated]
+                x = change[not_none(plan.eliminated)][part.eliminated]
                 rows = rows + (E * x[:, :, None, :]).sum(-1)
             found.append(rows)
         return restore_order(plan, found)

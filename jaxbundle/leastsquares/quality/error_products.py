@@ -40,7 +40,7 @@ from jaxbundle.leastsquares.quality.error_linearisation import (
 )
 from jaxbundle.leastsquares.quality.reduced_traces import Powers, ReducedTraces
 from jaxbundle.leastsquares.solution import Solution
-from jaxbundle.types import present
+from jaxbundle.types import not_none
 
 Matrix = Float[np.ndarray, "n m"]
 
@@ -193,7 +193,7 @@ def share_of_many(
     part, of_white, like, white = np.zeros(w), np.zeros(w), 0.0, 0.0
     for c in _chosen(clusters, chosen, w):
         W = c.without_fit(roots.mix(roots.wide_rows(c.rows)))
-        V = present(c.V)
+        V = not_none(c.V)
         part += np.sum(V @ W * W, (0, 1))
         of_white += np.sum(W * W, (0, 1))
         like += np.trace(V, axis1=1, axis2=2).sum()
@@ -223,7 +223,7 @@ def _tall(x: Batch) -> Matrix:
 
 def _powers(c: Clusters) -> Float[np.ndarray, "4"]:
     """Sums of tr((P·V)ⁿ)."""
-    PV = c.without_fit(present(c.V))
+    PV = c.without_fit(not_none(c.V))
     square = PV @ PV
     product = lambda x, y: np.sum(x * y.transpose(0, 2, 1))
     traces = product(PV, square), product(square, square)
@@ -341,7 +341,7 @@ class ErrorProducts:
                 L = np.asarray(self.found.factor.lower_inverse)[c.eliminated]
                 alpha = L.transpose(0, 2, 1) @ c.Q.transpose(0, 2, 1)
                 beta = np.concatenate([alpha @ c.A, datum.motions_eliminated[c.eliminated]], 2)
-                Va = present(c.V) @ alpha.transpose(0, 2, 1)
+                Va = not_none(c.V) @ alpha.transpose(0, 2, 1)
                 h = datum.effects(c.Q, c.eliminated)
                 onto = np.concatenate([c.without_fit(c.A), h], 2).transpose(0, 2, 1) @ Va
                 blocks = alpha @ Va
@@ -381,7 +381,7 @@ class ErrorProducts:
         like = t1 / max(self.found.problem.counts.redundancy, 1)
         for c in _chosen(self.clusters, chosen, p + q):
             x0 = np.concatenate(self._dense(c), 2)
-            V = present(c.V)
+            V = not_none(c.V)
             x1 = V @ x0
             x2 = c.without_fit(x1)
             x3 = V @ x2
