@@ -166,9 +166,9 @@ def _most_translated(
     settings: MarkSettings,
 ) -> float:
     """The share of matches that the best of some trial translations explains."""
-    rays = (np.pad(xy, ((0, 0), (0, 1)), constant_values=-1.0) for xy in (xy1, xy2))
+    one, other = (np.pad(xy, ((0, 0), (0, 1)), constant_values=-1.0) for xy in (xy1, xy2))
     # A base is coplanar with both rays of a match, so it is normal to the normals of two matches.
-    normals, share = np.cross(*rays), 0.0
+    normals, share = np.cross(one, other), 0.0
     rng = np.random.default_rng(0)
     for _ in range(settings.translation_trials):
         base = np.cross(*normals[rng.choice(len(normals), 2, replace=False)])
