@@ -194,7 +194,7 @@ def surface_near(
     heights, first = heights_near(grid, X)
     middle = heights.shape[1] // 2
     cells = heights[:, middle - 1 : middle + 1, middle - 1 : middle + 1]
-    void = np.isnan(cells).reshape(len(X), -1).any(1)
+    void = np.array([np.isnan(cell).any() for cell in cells], bool)
     # Beyond a void or an edge the surface goes on level. A point over a void has no mean.
     near = np.nanmean(np.where(void[:, None, None], 0.0, heights), (1, 2), keepdims=True)
     heights = np.where(np.isfinite(heights), heights, near) - origin[2]
