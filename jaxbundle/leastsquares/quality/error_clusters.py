@@ -76,12 +76,14 @@ def lay_out_clusters(linear: LinearisedRows, F: Any, many: Any | None) -> list[C
     of different clusters."""
     cluster = linear.eliminated.copy()
     alone = cluster < 0
+    # A row without an eliminated row is a cluster of its own: P is 1 there.
     cluster[alone] = cluster.max(initial=-1) + 1 + np.arange(alone.sum())
-    # rows without weight have neither
+    # Rows without weight have neither.
     some = (np.diff(linear.A.indptr) + np.diff(F.indptr) > 0) | (linear.Q != 0).any(1)
     if many is not None:
         of_column = np.zeros(many.shape[1], int)
         row = np.repeat(cluster, np.diff(many.indptr))
+        # The last row of a column wins; a column whose other rows differ from it joins clusters.
         of_column[many.indices] = row
         if (of_column[many.indices] != row).any():
             return None
@@ -91,12 +93,14 @@ def lay_out_clusters(linear: LinearisedRows, F: Any, many: Any | None) -> list[C
     _, start, count = np.unique(cluster[order], return_index=True, return_counts=True)
     roots = [linear.A, F] if many is None else [linear.A, F, many]
     padded, found = [_padded(matrix) for matrix in roots], []
-    # sorted by a random number of their columns, clusters of equal ones are neighbours
+    # Sorted by a random number of their columns, clusters of equal ones are neighbours: points of
+    # the same photographs, whose sums are one product.
     rng = np.random.default_rng(0)
     of_columns = [rng.integers(1, 1 << 40, none + 1) for *_, none in padded[:2]]
     key = np.zeros(len(cluster), int)
     for number, (at, *_) in zip(of_columns, padded):
         key += number[at].sum(1)
+    # Batches of equal numbers of rows: padding to the longest track would square its length.
     kinds = np.stack([count, alone[order[start]]], 1)
     for kind in np.unique(kinds, axis=0):
         rows = order[start[(kinds == kind).all(1)][:, None] + np.arange(kind[0])]
@@ -142,7 +146,7 @@ def _local(
     m, k, s = at.shape
     if m * k * s == 0:
         return np.zeros((m, k, 0)), np.zeros((m, 0), int)
-    # columns are sorted once for all neighbours that have the same in every row
+    # Columns are sorted once for all neighbours that have the same in every row.
     new = np.ones(m, bool)
     new[1:] = (at[1:] != at[:-1]).any((1, 2))
     run = np.cumsum(new) - 1

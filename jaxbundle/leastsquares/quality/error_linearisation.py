@@ -43,7 +43,7 @@ def linearise_rows(found: Solution) -> LinearisedRows:
     for g in plan.kept:
         first[g] = unknowns
         unknowns += plan.groups[g].free.size
-    # indices of 32 bits: half the memory, and what sparse matrices have
+    # Indices of 32 bits: half the memory, and what sparse matrices have.
     none = np.zeros(0, np.int32)
     entries: list[tuple[np.ndarray, ...]] = [(none, none, np.zeros(0))]
     width = 0 if plan.eliminated is None else plan.groups[plan.eliminated].width
@@ -52,7 +52,7 @@ def linearise_rows(found: Solution) -> LinearisedRows:
     for part, (touches, E) in zip(plan.parts, _derivatives(*found.arguments)):
         n, (_, length) = numbers[part.set_name], part.source.shape
         place, source = np.asarray(part.place)[:n], np.asarray(part.source).ravel()
-        # observations of other parts of the set have an empty place
+        # Observations of other parts of the set have an empty place.
         own = np.flatnonzero(source[np.minimum(place, len(source) - 1)] == np.arange(n))
         own = own[place[own] < len(source)]
         place = place[own]
@@ -68,6 +68,7 @@ def linearise_rows(found: Solution) -> LinearisedRows:
             entries.append((spread(rows, J.shape), spread(columns, J.shape), J.ravel()))
         if E is not None:
             at = np.asarray(part.eliminated).ravel()[place]
+            # Q = E·L⁻ᵀ: with it P·x needs no solution of a point's equations.
             L = np.asarray(found.factor.lower_inverse)[at]
             J = np.asarray(E).reshape(-1, *E.shape[2:])[place]
             Q[row] = J @ L.transpose(0, 2, 1)
@@ -75,7 +76,7 @@ def linearise_rows(found: Solution) -> LinearisedRows:
     rows, columns, values = (np.concatenate(x) for x in zip(*entries))
     del entries
     A = sp.csr_matrix((values, (rows, columns)), shape=(total, unknowns))
-    # of held unknowns, and of observations without weight
+    # Zeros are of held unknowns, and of observations without weight.
     A.eliminate_zeros()
     return LinearisedRows(A, Q, eliminated)
 
@@ -132,7 +133,7 @@ def datum_of(found: Solution, linear: LinearisedRows) -> DatumDirections:
     if e is not None:
         motions = G[e]
         of_eliminated = np.asarray(found.factor.lower_inverse) @ B[e]
-        # Q is zero where no row is eliminated
+        # Q is zero where no row is eliminated.
         h = np.einsum("rw,rwd->rd", linear.Q, of_eliminated[linear.eliminated])
         conditions = conditions - linear.A.T @ h
     return DatumDirections(kept(G), motions, conditions, of_eliminated, np.linalg.inv(gram))

@@ -103,7 +103,8 @@ def sum_products(
     clusters: Sequence[Clusters], roots: RootColumns, unknowns: int, datum: DatumDirections
 ) -> ClusterSums:
     """The sums over all clusters."""
-    # the place behind the last of each stands for none
+    # The place behind the last of each stands for none: clusters have as many places as the largest
+    # of their batch needs, and what those left over add is cut away at the end.
     p, n, w = unknowns + 1, roots.narrow.shape[1] + 1, roots.wide.shape[1]
     d = datum.number
     both, with_wide, wide = np.zeros((p + n, p + n)), np.zeros((p + n, w)), gram(roots.wide)
@@ -115,6 +116,7 @@ def sum_products(
             a = c.A.shape[2]
             at = np.concatenate([c.A_at, p + c.F_at], 1)
             W = roots.wide_rows(c.rows)
+            # WᵀPW = WᵀW − (QᵀW)ᵀ·QᵀW: three rows of QᵀW for a point instead of all of its rays.
             QW = _tall(c.Q.transpose(0, 2, 1) @ W)
             wide -= QW.T @ QW
             X = c.without_fit(np.concatenate([c.A, c.F], 2))
@@ -130,6 +132,7 @@ def sum_products(
                 powers += _powers(c)
                 hVh += _tall(h).T @ _tall(Vh)
             joint = np.concatenate(left, 2)
+            # Clusters of the same photographs add to the same places: one product for all of them.
             for some in c.by_columns():
                 to, x, y = at[some.start], _tall(X[some]), _tall(joint[some])
                 to_A, of_wide = to[:a], y.T @ _tall(W[some])
@@ -164,10 +167,13 @@ def gram(F: Any) -> Matrix:
     """FᵀF of a sparse matrix, by dense products of the rows with values in the same columns."""
     count = np.diff(F.indptr)
     rows = np.flatnonzero(count)
+    # Rows with values in the same columns have equal sums of the columns' random numbers; that
+    # others have the same sum has a probability of 2⁻⁴⁰ a pair.
     key = np.random.default_rng(0).integers(1, 1 << 40, F.shape[1])[F.indices]
     pattern = np.add.reduceat(key, F.indptr[rows]) if len(rows) else rows
     order = np.argsort(pattern, kind="stable")
     first = np.flatnonzero(np.diff(pattern[order], prepend=-1))
+    # Fewer than four rows of a pattern: the call costs more than a sparse product saves.
     if 4 * len(first) > len(rows):
         return (F.T @ F).toarray()
     found, rows = np.zeros((F.shape[1],) * 2), rows[order]
@@ -198,6 +204,8 @@ def share_of_many(
         of_white += np.sum(W * W, (0, 1))
         like += np.trace(V, axis1=1, axis2=2).sum()
         white += V.shape[0] * V.shape[1]
+    # V = f·1 + (V − f·1), f its mean: the first part gives f·diag(FᵀPF), which is known exactly;
+    # the second is small, and its error with it.
     factor = like / max(white, 1.0)
     share = len(chosen) / max(chosen.sum(), 1)
     return factor * np.diag(FF) + share * (part - factor * of_white)
@@ -246,6 +254,8 @@ class ErrorProducts:
         self.datum = datum_of(found, linear)
         self.sums = sum_products(clusters, roots, linear.A.shape[1], self.datum)
         factor = found.factor
+        # The factor of the reduced system that the solution has anyway; Y = L⁻¹·D·AᵀPF, so that
+        # (AᵀPF)ᵀ·S⁻¹·AᵀPF = YᵀY.
         self.lower = np.asarray(reduced.lower)
         kept = [np.asarray(factor.scale[g]).ravel() for g in found.problem.plan.kept]
         self.scale = np.concatenate([np.zeros(0), *kept])[:, None]
@@ -312,7 +322,8 @@ class ErrorProducts:
         """`blocks_of_few` of the component with a block for every cluster."""
         plan, datum, p = self.found.problem.plan, self.datum, self.linear.A.shape[1]
         d = datum.number
-        # z = (x, a) = T·(Aᵀ·P·e, hᵀ·e)
+        # Errors e change the kept unknowns by x and the datum by a, both linear in two sums over
+        # clusters, z = (x, a) = T·(Aᵀ·P·e, hᵀ·e), whose covariance is that of the sums.
         inverse = self._back(self._forth(np.eye(p)))
         onto = datum.inverse @ datum.conditions.T @ inverse
         T = np.block([[inverse, np.zeros((p, d))], [onto, datum.inverse]])
@@ -350,6 +361,7 @@ class ErrorProducts:
                     square = at[:, None], at
                     b = beta[some]
                     cross = b @ (T[square] @ onto[some])
+                    # cov(α·e − β·z) = α·V·αᵀ + β·C·βᵀ − β·cov(z, e)·αᵀ − its transpose
                     blocks[some] += b @ C[square] @ b.transpose(0, 2, 1)
                     blocks[some] -= cross + cross.transpose(0, 2, 1)
                 found[c.eliminated] = blocks
@@ -360,8 +372,10 @@ class ErrorProducts:
         what is not exact from `at_most` clusters."""
         s, q = self.sums, self.roots.number
         U = lambda x: self._forth(self._forth(x).T)
+        # U = P·A·D·L⁻ᵀ, with UᵀU = 1: products with U are those with A, solved forth on both sides.
         a1, a2, b1 = U(s.AVA), U(s.AVPVA), self._forth(s.AVF) - U(s.AVA) @ self.Y
-        # tr(F̃ᵀVF̃) by column
+        # tr(F̃ᵀVF̃) by column, which T needs: from ten times as many clusters as what only the
+        # skewness and the uncertainty of sizes need.
         number = sum(len(c.rows) for c in self.clusters)
         order, n = rng.permutation(number), self.roots.narrow.shape[1]
         chosen, near = np.zeros(number, bool), np.zeros(number, bool)
@@ -369,6 +383,7 @@ class ErrorProducts:
         exact = share_of_many(self.clusters, self.roots, s.FF[n:, n:], near)
         exact = np.concatenate([s.FVF, exact]) - 2 * np.sum(self.Y * self._forth(s.AVF), 0)
         exact = exact + np.sum(self.Y * (a1 @ self.Y), 0)
+        # The identities of the module; none of these matrices is larger than kept unknowns.
         l = s.powers
         trace = np.trace
         t1 = l[0] - trace(a1)
@@ -377,11 +392,14 @@ class ErrorProducts:
         a3, a4, b2, near, R2, R3 = (
             np.zeros(shape) for shape in (*[(p, p)] * 2, (p, q), *[(q, q)] * 3)
         )
-        # errors along a track are nearly independent ones: only the difference is from some
+        # Errors along a track are nearly independent ones, V ≈ f·1 with F̃ᵀVF̃ ≈ f·S: only the
+        # difference is from some clusters.
         like = t1 / max(self.found.problem.counts.redundancy, 1)
         for c in _chosen(self.clusters, chosen, p + q):
             x0 = np.concatenate(self._dense(c), 2)
             V = not_none(c.V)
+            # x0 = (U, F̃); V·x0, P·V·x0, V·P·V·x0, P·V·P·V·x0: products of two of them are all
+            # powers up to the fourth.
             x1 = V @ x0
             x2 = c.without_fit(x1)
             x3 = V @ x2
@@ -396,6 +414,7 @@ class ErrorProducts:
             R3 += f2.T @ x3[:, p:]
         share = number / max(chosen.sum(), 1)
         a3, a4, b2, near, R2, R3 = (share * x for x in (a3, a4, b2, near, R2, R3))
+        # From powers of P·V between F̃ to those of M·V: what the kept unknowns take is subtracted.
         R1 = like * self.few + near
         R2 = R2 - b1.T @ b1
         cross = b1.T @ b2
@@ -488,7 +507,7 @@ def _sort_roots(
     of_components: list[slice | None] = [None] * len(roots)
     dense = lambda root: root.nnz > max_narrow * np.count_nonzero(np.diff(root.indptr))
     few = [k for k in range(len(roots)) if k not in many]
-    # narrow ones first
+    # Narrow ones first: they are laid out by clusters, wide ones read from their sparse matrix.
     few.sort(key=lambda k: dense(roots[k][0]))
     none = sp.csr_matrix((roots[0][0].shape[0], 0))
     narrow, wide, mixed, first = [none], [none], [], 0

@@ -53,12 +53,14 @@ class ReducedTraces:
         self.many = next((k for k, c in enumerate(columns, 1) if c is None), None)
         number = len(columns) + 1
         self.T, cubes = np.zeros((number, number)), np.zeros((number,) * 3)
+        # tr(M·M) = tr(M): M is a projector, and its trace the redundancy.
         self.T[0, 0] = redundancy
         for i, a in self.few:
             self.T[0, i] = np.trace(S[a, a])
             for j, b in self.few:
                 self.T[i, j] = np.sum(S[a, b] ** 2)
                 for k, c in self.few:
+                    # tr(S_ab·S_bc·S_ca) does not depend on the order.
                     if i <= j <= k:
                         cubes[i, j, k] = np.sum((S[a, b] @ S[b, c]) * S[a, c])
         if powers is not None:
@@ -69,7 +71,7 @@ class ReducedTraces:
                 cubes[i, t, t] = np.trace(powers.R2[a, a])
                 for j, b in self.few:
                     cubes[i, j, t] = np.sum(S[a, b] * powers.R1[a, b])
-        # those of one order are filled, and none is negative
+        # Those of one order are filled, and none is negative.
         self.T = np.maximum(self.T, self.T.T)
         self.cubes = with_traces(cubes, self.T)
 
@@ -79,6 +81,7 @@ class ReducedTraces:
         for k, a in self.few:
             sizes[a] = theta[k]
         by_column, found = S * sizes, np.zeros(self.T.shape)
+        # K = F̃ᵀΣF̃: what the errors of all components give in the columns of the roots.
         K = theta[0] * S + by_column @ S
         if self.powers is not None:
             t, R1, R2, R3 = self.many, *self.powers[2:]
@@ -87,6 +90,7 @@ class ReducedTraces:
             B = theta[0] * np.eye(len(S)) + by_column
             BR = B @ R2
             both = B @ R1 @ B.T + of_t * (BR + BR.T) + of_t**2 * R3
+            # V between the columns of a component, through both Σ.
             for k, a in self.few:
                 found[k, t] = found[t, k] = np.trace(both[a, a])
             R = R1 * sizes
