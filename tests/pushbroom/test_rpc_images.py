@@ -245,7 +245,7 @@ def test_a_raster_without_coefficients_is_refused(tmp_path):
     with pytest.raises(InputError, match="no RPC tags"):
         pushbroom.locate(tmp_path / "plain.tif")
     (tmp_path / "plain.png").write_bytes(b"")
-    with pytest.raises(InputError, match=r"no coefficients beside it: plain_RPC\.TXT"):
+    with pytest.raises(InputError, match=r"no coefficients beside it: expected plain_RPC\.TXT"):
         pushbroom.info(tmp_path / "plain.png")
     with pytest.raises(InputError, match="give the image as well"):
         pushbroom.correct(tmp_path / "a_RPC.TXT", None, tmp_path / "map.tif")
