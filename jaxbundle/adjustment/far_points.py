@@ -90,6 +90,7 @@ def minimise_with_far_points(
     # First only points whose rays are parallel; if that does not converge, all narrow points. The
     # other parametrisation costs little, but points at any distance carry no datum. Evaluations of
     # a first attempt that fails are forgotten: the second one has all of `max_steps` again.
+    # If these are half of all, none: straight to the second attempt.
     for chosen in (parallel & ~are_half(parallel), None):
         if chosen is None:
             patience = settings.evaluations_before_release * (2 if are_half(narrow) else 1)
@@ -266,8 +267,9 @@ def _are_pulled_outward(problem: NetworkProblem, values: Values) -> Bool[np.ndar
 
 
 def _unit(problem: NetworkProblem) -> float:
-    """RMS distance of the projection centres from the origin that a problem with points at any
-    distance has: their centroid, in whole units (`make_problem`)."""
+    """The unit in which inverse distances are of order 1: the RMS distance of the projection
+    centres from the origin that a problem with points at any distance has, their centroid in whole
+    units (`make_problem`)."""
     centres = problem.network.images.position
     return float(np.sqrt(((centres - np.round(centres.mean(0))) ** 2).sum(1).mean()))
 

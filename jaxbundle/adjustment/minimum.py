@@ -61,7 +61,8 @@ def name_inseparable(
     """Why the iterations may have reached their limit: unknowns that the observations hardly
     separate, in words; empty if there are none, or in a large network.
 
-    `inseparable`: scaled eigenvalues of the normal matrix below this: along such a vector one σ of
+    `inseparable`: eigenvalues of the reduced normal matrix, scaled by the diagonal before the
+    elimination (`quality.null_space`), below this: along such a vector one σ of
     a single unknown becomes 1/√1e-7 = 3000, so that hardly an observation changes and the
     iterations take long."""
     if int(minimum.termination) != LIMIT or problem.plan.reduction != "dense":
@@ -117,6 +118,7 @@ def require_solved(problem: NetworkProblem, minimum: Minimum[Values], when: str)
     if not found:
         names = names_of_defects(problem, minimum)
         reason = int(minimum.termination)
+        # Converged, but no solution: some unknowns are undetermined there.
         why = TERMINATIONS[SINGULAR if bool(converged(reason)) else reason]
         if names:
             why = f"the network is no longer determined: {list_some(names, 8, str)}"

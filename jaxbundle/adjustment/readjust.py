@@ -111,7 +111,7 @@ def adjust_robustly(
     # Weights of start values are poor, but where blunders prevent a solution there are no others.
     first = minimum.values if inspect_solution(problem, minimum) else problem.data.start
     reweighted = reweight(problem, first, repeat, estimator)
-    if not reweighted.rests:
+    if not reweighted.converged:
         raise NotSolvedError(
             f"not solved by robust estimation: the weights of {estimator} do not converge; use "
             f"{'' if estimator == 'huber' else 'huber, or '}data snooping"

@@ -1,10 +1,10 @@
 """Minimisation on several devices: eliminated rows are distributed with their observations.
 
 Every device eliminates its own rows. Kept rows are on all devices: their sums, the reduced
-matrix and its right-hand side are added up over the devices (`normal.total`), and every device
-solves the reduced system and updates its rows. Observations without an eliminated row belong to the
-first device. The same program runs on the cores of a processor (`jax_num_cpu_devices`), on several
-GPUs, and in several processes after `jax.distributed.initialize`.
+matrix and its right-hand side are added up over the devices (`normal.sum_over_devices`), and every
+device solves the reduced system and updates its rows. Observations without an eliminated row belong
+to the first device. The same program runs on the cores of a processor (`jax_num_cpu_devices`), on
+several GPUs, and in several processes after `jax.distributed.initialize`.
 """
 
 import dataclasses

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbundle.geometry import matrix_from_quaternion
-from jaxbundle.leastsquares.equations.normal import total
+from jaxbundle.leastsquares.equations.normal import sum_over_devices
 from jaxbundle.leastsquares.indexing.plan import Plan, Tangent
 from jaxbundle.leastsquares.indexing.rows import Declared, Values
 from jaxbundle.leastsquares.iterations.retraction import changes_of_tables, retract
@@ -74,5 +74,5 @@ class TurnAboutSeen:
             rows = rows if part.by_row[0] else rows.sum(1)
             rows = rows.reshape(-1, 4)
             seen = seen + jax.ops.segment_sum(rows, image.ravel(), position.shape[0])
-        seen = total(plan, seen)
+        seen = sum_over_devices(plan, seen)
         return seen[:, :3] / jnp.where(seen[:, 3:] > 0, seen[:, 3:], 1.0)

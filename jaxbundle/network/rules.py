@@ -172,7 +172,8 @@ def _check_ties(camera: Camera, values: Mapping[str, float], where: str) -> None
 
 
 def _check_pair(where: str, name: str, pair: Any, meaning: str) -> None:
-    numbers = np.shape(pair) == (2,) and not isinstance(pair, str | np.ma.MaskedArray)
+    # The number under a mask is no size.
+    numbers = np.shape(pair) == (2,) and not isinstance(pair, np.ma.MaskedArray)
     if pair is not None and not (numbers and all(map(_positive, pair))):
         raise InputError(f"{where}{name} is {show(pair)}; expected {meaning}, both positive")
 

@@ -30,8 +30,9 @@ GOOD, NOTED, DOUBTFUL, BAD = "met", "noted", "doubtful", "not met"
 # done by convention (Baarda, 1968: α₀ = 0.1 %), so that the verdict and the removal of blunders
 # agree.
 LEVEL = 0.001
-# A larger fraction of removed image points, beyond chance, is reported.
-LARGEST_REMOVED = 0.05
+# A larger fraction of removed image points, beyond chance, is reported: with one of twenty removed,
+# every fifth point of four rays has lost one, and the network is not the one that was planned.
+LARGEST_FRACTION_REMOVED = 0.05
 
 
 class Finding(NamedTuple):
@@ -353,7 +354,7 @@ def judge_blunders(
     if largest > limit:
         left = int((size > limit).sum())
         return Finding("Blunders", DOUBTFUL, words, f"{count(left, 'blunder')} likely")
-    if removed > max(LARGEST_REMOVED * rays, explained_by_chance(rays)):
+    if removed > max(LARGEST_FRACTION_REMOVED * rays, explained_by_chance(rays)):
         brief = f"{removed} of {rays:.0f} image points removed as blunders"
         return Finding("Blunders", DOUBTFUL, words, brief)
     # More than chance explains, but none that stands out: σ of some are too small.

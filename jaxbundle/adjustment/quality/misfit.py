@@ -4,10 +4,8 @@ A few blunders do not change the robust scale of the residuals (`leastsquares/qu
 too small σ do; σ0 is changed by both, which separates the two causes.
 """
 
-import math
-
 from jaxbundle.leastsquares.quality.global_test import CONTRADICTING_RATIO, contradicts
-from jaxbundle.report.verdict import LARGEST_REMOVED
+from jaxbundle.report.verdict import LARGEST_FRACTION_REMOVED, explained_by_chance
 
 
 def doubt_of_baarda(
@@ -31,9 +29,7 @@ def doubt_of_baarda(
             f"Baarda's test trusts the a priori σ, but most residuals are {scale:.3g} times as "
             f"large as they imply: it has {done} ({took}). {_remedy(scale)}, or {pope}"
         )
-    # Three standard deviations of the binomial number n·p·(1 − p) ≈ n·p of removals by chance.
-    chance = 3 * math.sqrt(rays * by_chance)
-    if removed - by_chance * rays > max(LARGEST_REMOVED * rays, chance):
+    if removed > max(LARGEST_FRACTION_REMOVED * rays, explained_by_chance(rays, by_chance)):
         return (
             f"Baarda's test has removed many observations ({took}): there are as many blunders, or "
             f"the a priori σ are a little too small. Look at what was removed, or {pope}"
@@ -75,6 +71,7 @@ def doubt_of_fit(
     missing = "a camera parameter that is missing or held"
     mirrored = "image coordinates with a mirrored axis or in another unit"
     # The median does not see a few blunders, σ0 does: a large σ0 of good residuals are blunders.
+    # Half: blunders then make three quarters of the sum of squares.
     if scale < CONTRADICTING_RATIO or scale < sigma0 / 2:
         causes = [blunders, missing, sigma]
     elif scale > unrecognisable:

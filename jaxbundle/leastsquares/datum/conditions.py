@@ -35,7 +35,7 @@ from jaxbundle.geometry.quaternions import (
 )
 from jaxbundle.implicit import implicit_root, solve_dense
 from jaxbundle.leastsquares.datum.motions import JointMotion
-from jaxbundle.leastsquares.equations.normal import total
+from jaxbundle.leastsquares.equations.normal import sum_over_devices
 from jaxbundle.leastsquares.indexing.plan import Datum, Plan, Tangent
 from jaxbundle.leastsquares.indexing.rows import Declared, Values
 from jaxbundle.leastsquares.spaces import PoseValue
@@ -405,4 +405,4 @@ def contract(plan: Plan, B: Tangent, x: Tangent) -> Float[Array, "defect ..."]:
     e = plan.eliminated
     # Kept rows are on all devices, eliminated ones on one each.
     kept: Any = sum(part for name, part in parts.items() if name != e)
-    return kept if e is None else kept + total(plan, parts[e])
+    return kept if e is None else kept + sum_over_devices(plan, parts[e])

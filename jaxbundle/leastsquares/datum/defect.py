@@ -184,12 +184,12 @@ def make_datum(
     pins = _choose_pins(plan, along({name: survey.of_groups[name] for name in plan.kept}))
     held = {t: (1 - free[t]) * real[t][:, None] for t, rows in moves.items() if rows.any()}
     held = {t: mask for t, mask in held.items() if mask.any()}
-    turned = _leaves_scale_only(survey.moves, gauge, weight)
+    turned = _leaves_scale_but_no_rotation(survey.moves, gauge, weight)
     datum = Datum(*jax.device_put((gauge, weight, pins, held)))
     return dataclasses.replace(datum, turned=turned)
 
 
-def _leaves_scale_only(
+def _leaves_scale_but_no_rotation(
     moves: Tangent, gauge: Float[np.ndarray, "motions defect"], weight: dict[str, np.ndarray]
 ) -> bool:
     """Whether the open motions of a similarity scale the datum unknowns, and turn none of them."""

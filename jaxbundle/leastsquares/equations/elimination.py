@@ -27,7 +27,7 @@ from jaxbundle.leastsquares.equations.normal import (
     average_over_devices,
     gather,
     scatter,
-    total,
+    sum_over_devices,
 )
 from jaxbundle.leastsquares.equations.reduced import DenseFactor, Reduced, factorise_dense
 from jaxbundle.leastsquares.indexing.plan import IncidencePairs, Plan, Tangent
@@ -169,7 +169,7 @@ def eliminate(normal: Normal) -> tuple[Reduced, Float[Array, "rows w w"] | None,
             ZtZ_off[key] = sum_pairs(at.pairs, at.row.shape[0], Z[key[0]], Z[key[1]])
     # The only exchange between devices in a factorisation: every one has eliminated rows of its
     # own, and then the whole S.
-    ZtZ, ZtZ_off = total(plan, (ZtZ, ZtZ_off))
+    ZtZ, ZtZ_off = sum_over_devices(plan, (ZtZ, ZtZ_off))
     diagonal = {g: B - ZtZ[g] if g in ZtZ else B for g, B in diagonal.items()}
     for key, B in ZtZ_off.items():
         off_diagonal[key] = off_diagonal[key] - B if key in off_diagonal else -B

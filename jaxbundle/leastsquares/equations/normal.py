@@ -113,7 +113,7 @@ for _same in (lx.linearise, lx.materialise, lx.conj):
 lx.diagonal.register(Normal)(lambda operator: operator.diagonal())
 
 
-def total(plan: Plan, parts: Sum) -> Sum:
+def sum_over_devices(plan: Plan, parts: Sum) -> Sum:
     """The sum over the devices of the contributions of their eliminated rows."""
     return parts if plan.axis is None else jax.lax.psum(parts, plan.axis)
 
@@ -144,7 +144,7 @@ def gather(plan: Plan, W: dict[str, Array], h: Float[Array, "rows w"]) -> Tangen
         at, rows = plan.incidences[g], _tall(blocks)
         of_chunks = jnp.einsum("cki,ck->ci", rows, h[at.eliminated].reshape(rows.shape[:2]))
         found[g] = jax.ops.segment_sum(of_chunks, at.row, plan.groups[g].rows)
-    return total(plan, found)
+    return sum_over_devices(plan, found)
 
 
 def scatter(plan: Plan, W: dict[str, Array], x: Tangent) -> Float[Array, "..."]:
@@ -182,11 +182,11 @@ def normal_equations(
             )
             continue
         r, touches, E = differentiate(declared, plan, number, prepared, laid)
-        sums.add_part(part, 0.5 * jnp.vdot(r, r), *_products_of(part, r, touches, E))
+        sums.add_part(part, 0.5 * jnp.vdot(r, r), *_gauss_newton_products(part, r, touches, E))
     return sums.total(declared, values)
 
 
-def _products_of(
+def _gauss_newton_products(
     part: ObservationPart,
     r: Float[Array, "chunks length r"],
     touches: Sequence[Float[Array, "chunks length r w"]],
@@ -203,8 +203,8 @@ def _products_of(
         J = flat(E)
         # Eliminated rows differ from observation to observation: their blocks are summed
         # afterwards, block and gradient in one array, one pass.
-        eliminated = products(J, jnp.concatenate([J, flat(r)[..., None]], -1))
-        W = [products(J, flat(K)) for K in touches]
+        eliminated = transposed_products(J, jnp.concatenate([J, flat(r)[..., None]], -1))
+        W = [transposed_products(J, flat(K)) for K in touches]
     diagonal = [jnp.einsum("cki,ckj->cij", J, J) for J in tall]
     gradient = [jnp.einsum("cki,ck->ci", J, right) for J in tall]
     couplings = [jnp.einsum("cki,ckj->cij", tall[c.first], tall[c.second]) for c in part.couplings]
@@ -273,7 +273,7 @@ class Sums:
         )
         r, E = found.r, found.eliminated
         kept = tuple(found.touches[k] for k in others)
-        self.add_part(rest, 0.5 * jnp.vdot(r, r), *_products_of(rest, r, kept, E))
+        self.add_part(rest, 0.5 * jnp.vdot(r, r), *_gauss_newton_products(rest, r, kept, E))
         self.diagonal_blocks[touch.group] += products_of(
             self.diagonal_blocks[touch.group], touch.row, J, at
         )
@@ -304,6 +304,7 @@ class Sums:
         plan = self.plan.incidences[touch.group]
         n, shape = plan.eliminated.size, W.shape[:2]
         at = jnp.arange(n).reshape(shape) if touch.incidence is None else touch.incidence
+        # Held elements have a column beyond the width, where `mode="drop"` leaves them out.
         found = jnp.zeros((n, width, W.shape[-1])).at[at[..., None], columns].add(W, mode="drop")
         self.W[touch.group] = self.W.get(touch.group, 0.0) + found.mT.reshape(
             *plan.eliminated.shape, W.shape[-1], width
@@ -316,7 +317,8 @@ class Sums:
         first, second = part.touches[coupling.first], part.touches[coupling.second]
         key = first.group, second.group
         columns, others = slice(first.start, first.stop), slice(second.start, second.stop)
-        # v touches one row twice (two slots): J = J₁ + J₂ there, and JᵀJ has the two mixed terms.
+        # The observation touches one row twice (two slots): J = J₁ + J₂ there, and JᵀJ has the two
+        # mixed terms.
         if coupling.same is not None:
             on = N * coupling.same[:, None, None]
             block = self.diagonal_blocks[first.group].at[first.row, columns, others].add(on)
@@ -354,7 +356,7 @@ class Sums:
         plan, e = self.plan, self.plan.eliminated
         kept = lambda tree: {name: x for name, x in tree.items() if name != e}
         # Everything that belongs to kept rows is added up over the devices, in one exchange.
-        diagonal, off_diagonal, cost, gradient = total(
+        diagonal, off_diagonal, cost, gradient = sum_over_devices(
             plan,
             (kept(self.diagonal_blocks), self.off_diagonal_blocks, self.cost, kept(self.gradient)),
         )
@@ -367,7 +369,9 @@ class Sums:
         return cost, gradient, NormalBlocks(diagonal, off_diagonal, eliminated, self.W, D)
 
 
-def products(a: Float[Array, "n r w"], b: Float[Array, "n r v"]) -> Float[Array, "n w v"]:
+def transposed_products(
+    a: Float[Array, "n r w"], b: Float[Array, "n r v"]
+) -> Float[Array, "n w v"]:
     """aᵀb of every row, written out: a batched product of tiny matrices takes three times as
     long."""
     return reduce(jnp.add, (a[:, i, :, None] * b[:, i, None, :] for i in range(a.shape[1])))
@@ -378,7 +382,7 @@ def dot(plan: Plan, a: Tangent, b: Tangent) -> Float[Array, ""]:
     e = plan.eliminated
     # Kept rows are the same on all devices, so they count once.
     kept = sum((jnp.vdot(a[g], b[g]) for g in plan.kept), jnp.zeros(()))
-    return kept if e is None else kept + total(plan, jnp.vdot(a[e], b[e]))
+    return kept if e is None else kept + sum_over_devices(plan, jnp.vdot(a[e], b[e]))
 
 
 def zero_tangent(plan: Plan) -> Tangent:

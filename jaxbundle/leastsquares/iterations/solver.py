@@ -23,7 +23,7 @@ from jaxbundle.leastsquares.equations.normal import (
     NormalBlocks,
     dot,
     normal_equations,
-    total,
+    sum_over_devices,
     zero_tangent,
 )
 from jaxbundle.leastsquares.indexing.plan import Plan, Tangent
@@ -259,7 +259,7 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
         asked = self.descent.query(zero_tangent(self.plan), self._info(known), descent_state)
         change, _ = self.descent.step(step_size, asked)
         # All devices must agree, or they take different branches and wait for each other forever.
-        finite = total(self.plan, 1 - _all_finite(change).astype(int)) == 0
+        finite = sum_over_devices(self.plan, 1 - _all_finite(change).astype(int)) == 0
         return jax.tree.map(lambda d: jnp.where(finite, d, 0.0), change), finite
 
 
@@ -306,7 +306,7 @@ minimise_compiled = compile_once(minimise)
 
 def half_square(plan: Plan, residual: Iterable[Float[Array, "..."]]) -> Float[Array, ""]:
     """½·vᵀPv of all devices."""
-    return total(plan, 0.5 * sum((jnp.vdot(r, r) for r in residual), jnp.zeros(())))
+    return sum_over_devices(plan, 0.5 * sum((jnp.vdot(r, r) for r in residual), jnp.zeros(())))
 
 
 def _all_finite(tree: PyTree) -> Bool[Array, ""]:

@@ -1,4 +1,5 @@
-"""Error components: how large errors are that observations share, and the covariance they give.
+"""Error components (random effects): how large errors are that observations share, and the
+covariance they give.
 
 Residuals of real measurements are not white: they hold a field fixed on the sensor, a principal
 point that moves between photographs, errors along a track. In units of the a priori σ

@@ -13,7 +13,9 @@ from jaxbundle.choices import ESTIMATED, STATED
 from jaxbundle.leastsquares.quality.distributions import chi2_quantile
 
 LEVEL = 0.05
-# A scale beyond this factor contradicts the a priori σ, if it is also significant.
+# A scale beyond this factor contradicts the a priori σ, if it is also significant. With σ that are
+# too small by 1.2, a test at 0.1 % removes 0.6 % of good observations, 2Φ(−3.29/1.2): no result
+# changes by it.
 CONTRADICTING_RATIO = 1.2
 SIGNIFICANCE = 0.001
 

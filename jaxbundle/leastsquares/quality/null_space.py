@@ -1,5 +1,5 @@
-"""The unknowns that observations do not determine: null vectors of the scaled normal matrix, and
-singular blocks of eliminated rows."""
+"""The unknowns that observations do not determine: null vectors of the reduced normal matrix,
+scaled by the diagonal before the elimination, and singular blocks of eliminated rows."""
 
 import jax
 import jax.numpy as jnp

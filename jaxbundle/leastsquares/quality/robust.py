@@ -92,7 +92,7 @@ class Reweighted:
     found: Solution
     weights: dict[str, Float[np.ndarray, " n"]]
     scale: float
-    rests: bool
+    converged: bool
     lengths: dict[str, Float[np.ndarray, " n"]]
 
     def suspects(self, significance: float = 0.001) -> list[SuspectRow]:
@@ -109,7 +109,8 @@ class Reweighted:
 
 
 def residual_lengths(found: Solution) -> dict[str, Float[np.ndarray, " n"]]:
-    """|v/σ| of the observations that are removed or weighted as a whole, by set."""
+    """|v/σ| of the observations that are removed or weighted as a whole, by set; not of those
+    tested residual by residual, or never, like priors (`Kind.snooped`)."""
     return {
         o.name: np.sqrt((found.residuals[o.name] ** 2).sum(1))
         for o in found.problem.observations
@@ -149,7 +150,7 @@ def reweight(
     """
     if not any(x.kind.snooped == "whole" and x.number for x in problem.observations):
         raise InputError("robust estimation: no kind of observation is weighted as a whole")
-    given, scale, rests = problem.data.weight, 1.0, False
+    given, scale, converged = problem.data.weight, 1.0, False
     t = residual_lengths(Solution(problem, values))
     weighted, w = problem, {o: np.ones(len(x)) for o, x in t.items()}
     move = lambda problem, values, adjust_from: adjust_from(problem, values)
@@ -163,8 +164,8 @@ def reweight(
             least = settings.min_weight
             w = {o: np.maximum(_WEIGHT[name](x / scale), least) for o, x in t.items()}
             change = np.concatenate([w[o] - before[o] for o in w])
-            rests = bool(np.sqrt(np.mean(change**2)) < small)
-            if rests:
+            converged = bool(np.sqrt(np.mean(change**2)) < small)
+            if converged:
                 break
             # `weight` is 1/σ, or L⁻¹ [n, r, r]: both times √w of the observation.
             root = lambda o, p, w=w: np.sqrt(w[o]).reshape(-1, *(1,) * (np.ndim(p) - 1))
@@ -175,4 +176,4 @@ def reweight(
             move, t = readjust, residual_lengths(Solution(problem, values))
     # Single steps on the way; the last solution is iterated to the end.
     found = adjust_from(weighted, values)
-    return Reweighted(found, w, scale, rests, {o: x / scale for o, x in t.items()})
+    return Reweighted(found, w, scale, converged, {o: x / scale for o, x in t.items()})

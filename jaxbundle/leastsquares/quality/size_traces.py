@@ -4,7 +4,7 @@ quadratic forms are made of.
     T_kj = tr(M·V_k·M·V_j),    tr(M·V_i·M·V_j·M·V_l),    V = F·Fᵀ
 
 Roots F of few columns have the products S_kj = F_kᵀ·M·F_j, and traces are sums over these. Of the
-others random combinations F·ξ, E ξξᵀ = 1, are on one side of a trace.
+others one factor of a trace is replaced by random combinations F·ξ, E ξξᵀ = 1.
 """
 
 from collections.abc import Iterator, Sequence
@@ -50,7 +50,7 @@ class Traces:
 
     def add_cubes(self, k: int, remaining: Columns, again: Columns, times: float) -> None:
         """Cubes of the root k with itself, from some combinations of its columns, of which M·F·ξ is
-        `remaining` and M·F·(FᵀM·F·ξ) is `again`; `times` as many there are."""
+        `remaining` and M·F·(FᵀM·F·ξ) is `again`; `times`: all draws by those given here."""
         # With S = FᵀM·F, ‖M·F·S·ξ‖² = ξᵀ·S³·ξ, whose expectation is tr S³.
         self.cubes[1 + k, 1 + k, 1 + k] = times * np.sum(again**2)
         for j in self.products:

@@ -1,8 +1,9 @@
 """Image points: x and y, which touch image, camera and point (collinearity equations, distortion).
 
-Residuals are computed minus observed. Only this module defines how an image coordinate depends on
-the unknowns. Measurements in rows of lines exposed one after the other have the line beside them
-(`rolling_shutter`); through refracting interfaces the ray is that of `interfaces`.
+Residuals are computed minus observed. Only this module says what an image coordinate depends on:
+the ray of `Posed.ray`, imaged by `cameras.residual`. Measurements in rows of lines exposed one
+after the other have the line beside them (`rolling_shutter`); through refracting interfaces the ray
+is that of `interfaces`.
 """
 
 import dataclasses

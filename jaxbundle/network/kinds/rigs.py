@@ -136,6 +136,8 @@ class Rigs(ObservationTable):
 
     @property
     def needs_scale(self) -> bool:
+        # Without a scale the network shrinks until all cameras are in one place, where every length
+        # agrees.
         return "sigma_position" in self.settings
 
     def number_of_equations(self) -> int:
@@ -229,6 +231,7 @@ class Rigs(ObservationTable):
                 axis=1,
             )
         )
+        # The setting is in the unit of angles, its default in radians.
         angle = self.settings.get("sigma_angle", EXACT_SIGMA * across / depth / radians) * radians
         sigma = np.repeat([length, angle], 3) * np.ones((len(pairs), 1))
         seen = MOUNTED(tuple(np.array(pairs).T), np.zeros((len(pairs), 6)), sigma=sigma)
