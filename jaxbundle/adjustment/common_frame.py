@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxbundle.adjustment.problem import NEGLIGIBLE_MOTION, NetworkProblem, coordinates
+from jaxbundle.adjustment.problem import NetworkProblem, coordinates, is_scale_open
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.adjustment.unknowns import angles_near
 from jaxbundle.cameras import get_model
@@ -132,7 +132,11 @@ _move = compile_once(jax.vmap(transform_point, (None, 0)), ())
 
 def _scale_is_open(problem: NetworkProblem) -> bool:
     datum = problem.plan.datum
-    return datum is not None and np.abs(np.asarray(datum.gauge)[SCALE]).max() > NEGLIGIBLE_MOTION
+    if datum is None:
+        return False
+    return is_scale_open(
+        np.asarray(datum.gauge), problem.network.points.position - np.asarray(problem.origin)
+    )
 
 
 class UnknownsInFrame(eqx.Module):

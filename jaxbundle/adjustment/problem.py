@@ -18,7 +18,6 @@ from jaxbundle.float64 import require_x64
 from jaxbundle.leastsquares import problem as engine
 from jaxbundle.leastsquares.any_distance import derivative
 from jaxbundle.leastsquares.datum.defect import CannotHold
-from jaxbundle.leastsquares.datum.motions import SIMILARITY_PARAMETERS
 from jaxbundle.leastsquares.declarations import ObservationSet, Table
 from jaxbundle.leastsquares.indexing.rows import Data, Values
 from jaxbundle.network.camera_tables import CameraTable
@@ -32,8 +31,8 @@ from jaxbundle.network.tables import Network, require_network
 from jaxbundle.types import AnyArray, not_none
 
 NEGLIGIBLE_MOTION = 1e-6
-"""A datum direction with a smaller part of a motion does not contain it. The directions are unit
-vectors: a motion that is open has a part of the size of one, a determined one rounding."""
+"""A datum direction contains a motion whose displacement of the points is at least this part of the
+largest one: that of an open motion is of its size, that of a determined one rounding."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -266,7 +265,8 @@ def make_problem(
     require_network(network)
     network = order_cameras(split_check_points(network)[0])
     chosen, origin = _datum_points(network), None
-    # Points at any distance are directions from the origin, which is then among the stations; their
+    # Points at any distance are directions from the origin, which is then the mean of the
+    # projection centres (in whole units, by which printed coordinates lose no digit); their
     # distance is uncertain by its own size, so that they would carry a datum of no precision.
     if lengths is not None:
         chosen, origin = chosen & (lengths == 0), np.round(network.images.position.mean(0))
@@ -339,12 +339,20 @@ def _datum(
     # With the scale open, all distances shrink to fit a σ that is a length (1 mm from a plane): the
     # minimum would be a network of size 0.
     sized = [one for one in among(network) if one.needs_scale]
-    if sized and np.abs(gauge[SIMILARITY_PARAMETERS.index("scale")]).max() > NEGLIGIBLE_MOTION:
+    if sized and is_scale_open(gauge, network.points.position - origin):
         raise InputError(
             f"{sized[0].source.name}: a σ of {sized[0].TABLE} is a length, but nothing gives the "
             'network a scale: add a distance or control points, or write "exact" (no σ)'
         )
     return {"point": np.repeat(chosen[:, None].astype(float), 3, 1)}, network.datum == "minimal"
+
+
+def is_scale_open(gauge: Float[np.ndarray, "7 defect"], X: Float[np.ndarray, "points 3"]) -> bool:
+    """Whether an open direction of the datum scales points X, whatever its length and the units."""
+    size = np.sqrt(np.nanmean((X**2).sum(1)))
+    # Shifts move points by 1, rotations and the scale by their distance from the origin.
+    moved = np.abs(gauge) * np.repeat([1.0, size, size], [3, 3, 1])[:, None]
+    return bool((moved[-1] > NEGLIGIBLE_MOTION * moved.max(0)).any())
 
 
 def shifted_problem(network: Network, like: NetworkProblem, values: Values) -> NetworkProblem:

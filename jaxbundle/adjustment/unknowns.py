@@ -46,7 +46,8 @@ def find_unknowns(problem: NetworkProblem, names: Sequence[tuple[str, str, str]]
 
 
 def require_located(problem: NetworkProblem, name: Name) -> None:
-    """Refuse an unknown of a point that data snooping excluded.
+    """Refuse an unknown of a point that data snooping excluded; apart from `find_unknowns`, which
+    serves designs too, where nothing is excluded.
 
     **Raises:** `InputError`."""
     if name.kind == "point" and problem.excluded[problem.network.points.id.index(name.id)]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxbundle.batches.population import Population
 from jaxbundle.network.columns import count
-from jaxbundle.report.layout import WITHOUT_SIGMA, digits_of, estimate, fixed, significant
+from jaxbundle.report.layout import DIGITS_WITHOUT_SIGMA, digits_of, estimate, fixed, significant
 from jaxbundle.report.page import (
     UNKNOWN,
     Addition,
@@ -202,6 +202,6 @@ def _columns(found: Population, against: Mapping[str, np.ndarray]) -> dict[str, 
     if np.isfinite(found.farthest).any():
         columns["farthest"] = Column(found.farthest, "largest deviation [robust σ]", 1)
     columns |= {
-        f"with {n}": Column(values, n, -WITHOUT_SIGMA, True) for n, values in against.items()
+        f"with {n}": Column(values, n, -DIGITS_WITHOUT_SIGMA, True) for n, values in against.items()
     }
     return columns | {"remark": Column(found.remark, "remark")}

@@ -39,7 +39,8 @@ class PopulationSettings:
     - `min_cameras`: below it a median deviation says little; not critical.
     - `outlier_limit`: in robust standard deviations. Cameras are not normally distributed (lots,
       focus): 5 lists what anybody would look at, not the tails.
-    - `level`: joint level of all correlations of a batch (Bonferroni), as of other tests here.
+    - `level`: joint level of all correlations of a batch (Bonferroni): one batch in a hundred
+      without any relation shows one.
     - `classes`, `half_width`: of a histogram: their number, and half its width in robust standard
       deviations, so that a class is a third of one.
     """
@@ -115,7 +116,8 @@ class Population:
 
     def _apart(self, values: np.ndarray, sigma: np.ndarray) -> np.ndarray:
         middle, deviation = self.spread(values)
-        if np.isfinite(values).sum() < self.settings.min_cameras or not deviation > 0:
+        number = (self.fit & np.isfinite(values)).sum()
+        if number < self.settings.min_cameras or not deviation > 0:
             return np.full(len(values), np.nan)
         # s contains the usual σ already; only what a camera has on top of it widens its limit
         usual = np.nan_to_num(self.spread(sigma)[0])
@@ -145,8 +147,8 @@ class Population:
         return "; ".join(said)
 
     def outlying(self) -> list[tuple[int, str]]:
-        """Rows that need attention, with the reason: without a result first, then misfits, then the
-        farthest."""
+        """Rows that need attention, with the reason: without a result first, then weak ones and
+        misfits, then the farthest."""
         said = [(i, self.why_outlying(i)) for i in range(len(self))]
         far, rms = np.nan_to_num(self.farthest), np.nan_to_num(self.numbers["rms"])
         said = [(i, words) for i, words in said if words]

@@ -99,7 +99,7 @@ def _first_cameras(
     rigs: Sequence[RigViews], settings: RigSettings
 ) -> list[list[FirstCamera | None]]:
     """The cameras of every rig, those of one image size calibrated together; None for one without
-    finite measurements."""
+    finite measurements, or with one beyond LARGEST_NUMBER, which counts as infinite."""
     found: list[list[FirstCamera | None]] = [[None] * len(rig.cameras) for rig in rigs]
     places: dict[tuple, list[tuple[int, int]]] = {}
     for i, rig in enumerate(rigs):
@@ -198,6 +198,7 @@ def _residual_lengths(result: Adjustment | None, settings: RigSettings) -> Float
     if result is None:
         return np.zeros(0)
     used = (result.problem.image_weights > 0).all(1)
+    # v/σ times σ in pixels: pixels, also of a model in mm.
     v = settings.sigma * result.inspection.image_residuals
     return np.hypot(*v.T)[used]
 
@@ -228,7 +229,7 @@ def declare_rig(
     sigma = settings.sigma * np.array(size_of_pixel if model.unit == "mm" else (1.0, 1.0))
     for c, (name, first) in enumerate(zip(rig.cameras, firsts)):
         if first is None or not first.solved:
-            why = "no finite image points" if first is None else first.status
+            why = "no finite image points, or one above 1e100" if first is None else first.status
             where = f"camera {name}: " if len(rig.cameras) > 1 else ""
             raise NotSolvedError(f"{where}its views do not determine it ({why})")
         there = np.isfinite(rig.points).all(1)

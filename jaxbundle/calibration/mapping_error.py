@@ -57,7 +57,7 @@ class MappingError:
 
     @property
     def rms(self) -> float:
-        """√EME: the RMS image error over the whole image, pixels."""
+        """√EME: the RMS image error over `share` of the image, pixels."""
         return float(np.sqrt(self.expected))
 
     def quantile(self, probability: float = 0.95) -> float:

@@ -23,7 +23,7 @@ from jaxbundle.calibration.rig.report import (
     rig_parameter_rows,
 )
 from jaxbundle.calibration.verdict import (
-    WITHOUT,
+    NOT_FOR_BOARDS,
     conclude_calibrations,
     coverage_in_words,
     cross_validation_in_words,
@@ -106,7 +106,7 @@ def _describe_one(calibration: "Calibration", choice: "ModelComparison | None" =
     return Addition(
         "",
         tuple(find_own(calibration)),
-        WITHOUT,
+        NOT_FOR_BOARDS,
         tuple(calibration.shortcomings),
         overview,
         tuple(sections),
@@ -205,10 +205,9 @@ def _describe_several(found: "Calibrations", origin: Origin, also: Addition) -> 
         listed = table_of_residuals(rig.residuals, rig.sigma0)
         tables["observations"] = Listing("Observations of the rig", listed, "result.json")
     else:
-        for number, (name, one) in enumerate(found.cameras.items()):
-            if one.converged:
-                maps = one.reported_maps
-                sections.append(_quality(one.coverage, maps, _unit(one), name, number))
+        solved = {name: one for name, one in found.cameras.items() if one.converged}
+        for number, (name, one) in enumerate(solved.items()):
+            sections.append(_quality(one.coverage, one.reported_maps, _unit(one), name, number))
     more = paragraph("Every camera has its own page in its folder of --out.")
     title = f"{KIND.capitalize()} {', '.join(map(clean, found.cameras))}"
     findings = [*conclude_calibrations(found).findings, *also.findings]

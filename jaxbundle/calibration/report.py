@@ -16,7 +16,7 @@ from jaxbundle.measure.views import BoardViews
 from jaxbundle.network.columns import count
 from jaxbundle.report.head import first_facts
 from jaxbundle.report.layout import (
-    WITHOUT_SIGMA,
+    DIGITS_WITHOUT_SIGMA,
     clean,
     cut_lines,
     estimate,
@@ -97,7 +97,7 @@ def _camera(calibration: "Calibration") -> list[str]:
         if name in free:
             rows.append((name, *estimate(value, free[name])))
         elif value != 0:
-            rows.append((name, significant(value, WITHOUT_SIGMA), "held"))
+            rows.append((name, significant(value, DIGITS_WITHOUT_SIGMA), "held"))
     lines += table(("parameter", "value", "σ"), rows, "lrr")
     rms = calibration.rms
     removed = len(calibration.adjustment.removed)
@@ -369,6 +369,7 @@ def _mapping_error_dict(error: "MappingError | None") -> dict | None:
         None
         if error is None
         else {
+            # Pixels², the others pixels.
             "expected": error.expected,
             "rms": error.rms,
             "quantile_95": error.quantile(),

@@ -83,8 +83,9 @@ def calibrate_cameras(
     **Arguments:** `photographs` by the name of the camera; `rig`: rigidly mounted cameras with
     simultaneous photographs (`calibration.rig`), the first is the reference; epochs that contradict
     the mounting are excluded, then single points (`snooping`, also if the cameras were estimated
-    robustly); with `snooping=None` such epochs are only listed; `progress(stage, done, total)`:
-    photographs searched, a stage for every camera; `options`: those of `calibrate`.
+    robustly); with `snooping=None`, and not robustly, such epochs are only listed;
+    `progress(stage, done, total)`: photographs searched, a stage for every camera; `options`: those
+    of `calibrate`.
 
     **Raises:** `InputError`, `NotSolvedError`, naming the camera if there are several.
     """

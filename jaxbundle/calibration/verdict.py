@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     from jaxbundle.calibration.several import Calibrations
 
 # Findings of the adjustment that do not apply to a board.
-WITHOUT = ("Control",)
+NOT_FOR_BOARDS = ("Control",)
 
 
 def conclude_calibration(calibration: "Calibration") -> Verdict:
     """The verdict on a solved `Calibration`."""
     return conclude(
-        calibration.adjustment, find(calibration), WITHOUT, len(calibration.shortcomings)
+        calibration.adjustment, find(calibration), NOT_FOR_BOARDS, len(calibration.shortcomings)
     )
 
 

@@ -29,7 +29,9 @@ from jaxbundle.choices import BOARDS, DICTIONARIES
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import did_you_mean
 
-# Minimum columns and rows of a board.
+# Minimum columns and rows of a board, counted as users state them: a chessboard has as many inner
+# corners as OpenCV's detection needs, the others the four points that a pose needs (three squares
+# of a ChArUco board have two corners between them).
 SMALLEST_SIDE = {
     "chessboard": 3,
     "circles": 2,
@@ -79,7 +81,12 @@ class Board:
         least = SMALLEST_SIDE[self.kind]
         for name in ("columns", "rows"):
             integer(f"board: {name}", getattr(self, name), least=0)
-        if min(self.columns, self.rows) < least or self.columns * self.rows > 100_000:
+        # 300 × 300 is more than any camera resolves; more is a slip that would fill the memory.
+        if self.columns * self.rows > 100_000:
+            raise InputError(
+                f"board {self.columns}x{self.rows}: expected at most 100 000 of its fields"
+            )
+        if min(self.columns, self.rows) < least:
             raise InputError(
                 f"board {self.columns}x{self.rows}: a {self.kind} board needs at least "
                 f"{least} columns and rows"

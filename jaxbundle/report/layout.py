@@ -16,7 +16,7 @@ from jaxbundle.types import Numbers
 WIDTH = 100
 MISSING = "–"
 # Significant digits of a value whose precision is not known: a camera of 6000 pixels to 0.01 pixel.
-WITHOUT_SIGMA = 6
+DIGITS_WITHOUT_SIGMA = 6
 
 
 # --- numbers --------------------------------------------------------------------------------
@@ -30,9 +30,9 @@ def decimals_of(sigma: float, digits: int = 3) -> int:
 
 def digits_of(value: float, sigma: float | None = None, digits: int = 3) -> int:
     """Significant digits of a value: to the decimal place where its σ has `digits` digits, at least
-    one; without σ `WITHOUT_SIGMA`."""
+    one; without σ `DIGITS_WITHOUT_SIGMA`."""
     if sigma is None or not (math.isfinite(sigma) and sigma > 0 and math.isfinite(value)):
-        return WITHOUT_SIGMA
+        return DIGITS_WITHOUT_SIGMA
     if value == 0:
         return 1
     return max(decimals_of(sigma, digits) + math.floor(math.log10(abs(value))) + 1, 1)
@@ -46,7 +46,7 @@ def estimate(value: float, sigma: float | None, digits: int = 3) -> tuple[str, s
     if not math.isfinite(value):
         return MISSING, MISSING
     if sigma is None or not math.isfinite(sigma) or sigma <= 0:
-        return significant(value, WITHOUT_SIGMA), MISSING
+        return significant(value, DIGITS_WITHOUT_SIGMA), MISSING
     places = decimals_of(sigma, digits)
     # Beyond seven decimals, or three zeros after the point, exponents are easier to read.
     if 0 <= places <= 7 and max(abs(value), sigma) >= 1e-3:
@@ -76,7 +76,9 @@ def significant(value: float | None, digits: int = 3) -> str:
     if 1e-5 <= abs(value) < 10.0 ** max(digits, 6):
         places = decimals_of(abs(value), digits)
         text = f"{value:.{max(places, 0)}f}"
-        return text.rstrip("0").rstrip(".") if digits >= WITHOUT_SIGMA and "." in text else text
+        return (
+            text.rstrip("0").rstrip(".") if digits >= DIGITS_WITHOUT_SIGMA and "." in text else text
+        )
     return f"{value:.{digits - 1}e}"
 
 

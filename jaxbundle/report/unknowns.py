@@ -12,7 +12,7 @@ from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.report.camera_equations import camera_equations
 from jaxbundle.report.correlated import stated_sigma, stated_sigma_of
 from jaxbundle.report.layout import (
-    WITHOUT_SIGMA,
+    DIGITS_WITHOUT_SIGMA,
     bar,
     clean,
     column_decimals,
@@ -63,7 +63,7 @@ def _one_camera(entry: Mapping[str, Any], model: CameraModel) -> list[str]:
     for name, found in entry["parameters"].items():
         # Held ones follow in one line.
         if not found["free"]:
-            held.append(f"{name} {significant(found['value'], WITHOUT_SIGMA)}")
+            held.append(f"{name} {significant(found['value'], DIGITS_WITHOUT_SIGMA)}")
             continue
         value, sigma = estimate(found["value"], stated_sigma_of(found))
         t, total = found["t"], found["total_correlation"]

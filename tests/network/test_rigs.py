@@ -1,5 +1,7 @@
 """Cameras mounted together, in a network of targets with other images."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from further_checks import check_jacobians, sample
@@ -126,6 +128,15 @@ def test_a_mounting_that_works_loose(simulated):
     component = loose.variance_components["mountings"]
     assert component.observations == 6 * EPOCHS and component.redundancy > 10
     assert component.sigma < 1.0  # they do not differ, in truth
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-6])
+def test_an_open_scale_is_seen_in_any_unit(simulated, unit):
+    network = simulated.truth
+    scaled = lambda table: dataclasses.replace(table, position=table.position / unit)
+    network = network.replace(points=scaled(network.points), images=scaled(network.images))
+    with pytest.raises(InputError, match="a σ of rigs is a length, but nothing gives the"):
+        jaxbundle.make_problem(mounted(network, sigma_position=1e-3))
 
 
 @pytest.mark.parametrize("rows, section, message", [

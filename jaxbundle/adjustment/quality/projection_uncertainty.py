@@ -11,7 +11,8 @@ is uncertain:
                A' = A − B·(BᵀB)⁻¹·BᵀA over the image, B = ∂x/∂θ.
     "scene"    of the object points the camera was calibrated from: a point at a distance d along
                the ray is held in the object frame of every view, and projected through the view's
-               pose as it varies together with p; the mean over the views. It depends on d: small
+               pose as it varies together with p; the covariance of the mean of its images over
+               the views. It depends on d: small
                where the object was, larger in front of it and beyond.
 
 Source of the last: Kogan, mrcal documentation, "Projection uncertainty" (mean of the boards'
@@ -112,7 +113,7 @@ def interior_covariance_of_images(
 def images_through_scene(
     model: CameraModel,
     camera: tuple[str, int],
-    views: Float[np.ndarray, " views"],
+    views: Int[np.ndarray, " views"],
     estimate: Values,
     xy: Float[np.ndarray, "n 2"],
     distance: float,
@@ -130,9 +131,11 @@ def images_through_scene(
     directions = _directions(
         model, np.asarray(estimate[table])[row], rotation, np.asarray(xy, float)
     )
-    # The inverse distance: infinity is 0, and points move smoothly through it.
-    near = np.asarray(1.0 / distance)
-    return eqx.Partial(_images_through_scene, model, camera, views, X0, directions, near)
+    # Of the inverse distance images are smooth, infinity is 0.
+    inverse_distance = np.asarray(1.0 / distance)
+    return eqx.Partial(
+        _images_through_scene, model, camera, views, X0, directions, inverse_distance
+    )
 
 
 def _images_through_scene(
@@ -141,15 +144,15 @@ def _images_through_scene(
     views: Int[AnyArray, " views"],
     X0: Float[AnyArray, "views 3"],
     directions: Float[AnyArray, "views n 3"],
-    near: Float[AnyArray, ""],
+    inverse_distance: Float[AnyArray, ""],
     values: Values,
 ) -> Float[Array, " 2*n"]:
-    """The images [2n] of the directions [views, n, 3] from X0 to points at the distance 1/near."""
+    """The images [2n] of points in the directions [views, n, 3] from X0, at a distance."""
     # A point that was in the direction of the pixel is seen again from the changed pose: X − X0 is
     # d·direction + (X0_before − X0), of which only the direction matters.
     table, row = camera
     q, (position, rotation) = tuple(values[table][row]), values["image"]
-    change = near * (X0 - position[views])
+    change = inverse_distance * (X0 - position[views])
     turned = jnp.einsum(
         "vij,vnj->vni",
         jax.vmap(matrix_from_quaternion)(rotation[views]),

@@ -86,7 +86,9 @@ class Connections:
 
 
 class _Groups:
-    """Members with their transformations from or to the frame of their group."""
+    """Cameras or boards in groups that hang together. `of`: the group of every member; `place`: of
+    a camera from the frame of its group to its own, of a board from its own to that of its group.
+    """
 
     def __init__(self, number: int):
         self.of = np.arange(number)
@@ -141,7 +143,7 @@ def connect(
         _merge_cameras(rigs, g1, g2, np.linalg.inv(motion.X))
         _merge_boards(walls, h1, h2, np.linalg.inv(motion.Z))
     if len(rigs.all()) > 1:
-        raise _describe_separate(cameras, boards, body, views, rigs, open_motions)
+        raise _separate_error(cameras, boards, body, views, rigs, open_motions)
     groups = walls.all()
     separate = [
         tuple(boards[group[0]] for group in groups if body[group[0]] == one)
@@ -189,6 +191,7 @@ def _join_cameras(poses: Poses, views: Sequence[BoardView], rigs: _Groups) -> bo
     epochs = defaultdict(set)
     for view in views:
         epochs[int(rigs.of[view.camera])].add(view.epoch)
+    # A group with fewer epochs in all can share no more: then all of them suffice.
     enough = {
         pair: relations
         for pair, relations in shared.items()
@@ -240,8 +243,8 @@ class _OpenMotion(NamedTuple):
 def _find_motion(
     poses: Poses, body: np.ndarray, rigs: _Groups, given: Mapping[int, Float[np.ndarray, "3"]]
 ) -> tuple[tuple | None, list[_OpenMotion]]:
-    """The motion over most epochs that ties two groups of cameras, if with what is given; those
-    that do not."""
+    """The motion over most epochs that ties two groups of cameras, alone or with a given position,
+    None without one; and the motions tried that do not."""
     candidates = []
     for one, other in combinations(sorted(poses), 2):
         if one[0] == other[0] or one[1] == other[1] or body[one[1]] != body[other[1]]:
@@ -272,7 +275,7 @@ def _shift_to(
     return motion.shifted(rigs.place[0][:3, :3].T @ (position - now[:3]))
 
 
-def _describe_separate(
+def _separate_error(
     cameras: Sequence[str],
     boards: Sequence[str],
     body: np.ndarray,

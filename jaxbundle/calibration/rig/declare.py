@@ -87,7 +87,8 @@ class RigWand:
     """A wand as the last body of a rig, whose two points are its last.
 
     **Fields:** `length` of it and `sigma`; `first`: the row of the pose of its first frame, all
-    later ones are its own; `across`: z₀ by frame."""
+    later ones are its own; `across`: by frame an axis at right angles to the wand, which stops its
+    rotation about itself (z₀ of `wand_body`)."""
 
     length: float
     sigma: float

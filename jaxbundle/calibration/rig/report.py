@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxbundle.calibration.report import coverage_dict, map_rows, maps_dict
+from jaxbundle.calibration.report import MAPS_HEADER, coverage_dict, map_rows, maps_dict
 from jaxbundle.calibration.verdict import (
     coverage_in_words,
 )
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from jaxbundle.calibration.rig.result import RigCalibration
     from jaxbundle.leastsquares.quality.error_components import ErrorModel
 
-MAPS_HEADER = ("point held in", "middle", "corners")
 
 # Base and angles of a mounting.
 MOUNTED = ("bx", "by", "bz", "ω", "φ", "κ")

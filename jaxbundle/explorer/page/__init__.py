@@ -5,7 +5,7 @@ from importlib.resources import files
 from typing import Any, NamedTuple
 
 from jaxbundle.io.results.result_json import without_nan
-from jaxbundle.report.layout import WITHOUT_SIGMA
+from jaxbundle.report.layout import DIGITS_WITHOUT_SIGMA
 from jaxbundle.report.page import Listing, Origin, Page, Section
 from jaxbundle.report.page.markup import text
 
@@ -54,7 +54,7 @@ def draw_controls(controls: Iterable[Control], live: bool) -> str:
 def _control(one: Control, dead: str) -> str:
     key = f'data-key="{text(one.key)}"{dead}'
     if isinstance(one, Number):
-        shown = f"{one.value:.{WITHOUT_SIGMA}g}"
+        shown = f"{one.value:.{DIGITS_WITHOUT_SIGMA}g}"
         exact = f' data-exact="{one.value!r}"' if float(shown) != one.value else ""
         field = f'<input type="number" step="any" value="{shown}"{exact} {key}>'
         slider = (

@@ -134,7 +134,7 @@ def factorise_band(plan: Plan, S: Reduced) -> BandFactor:
     unused = 1.0 - _into_band(plan, jnp.ones(plan.groups[g].free.shape))
     D = D + unused[:, :, None] * jnp.eye(m)
     border = [S.block(plan, g, other) for other in others]
-    # The empty columns: of a band without a border nothing else is joined.
+    # No columns first: without a border there would be nothing to join.
     border = jnp.concatenate([jnp.zeros((plan.groups[g].free.size, 0)), *border], 1)
     # All other groups (shared cameras, mostly): q columns beside the band, dense.
     border = _into_band(plan, border.reshape(plan.groups[g].rows, w, border.shape[1]))

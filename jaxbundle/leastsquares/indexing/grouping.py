@@ -94,10 +94,10 @@ class Grouping:
             slots = [s for s, name in enumerate(given.kind.of) if name == self.eliminate]
             # −1: the observation touches no eliminated row; it adds to the reduced system directly.
             slot_of = np.full(given.number, -1)
-            for s in slots:
-                slot_of[~not_none(self.coupled_rows)[given.rows[s]]] = s
             # An observation may touch two held rows of the table: the last one counts as
             # eliminated.
+            for s in slots:
+                slot_of[~not_none(self.coupled_rows)[given.rows[s]]] = s
             # A set without observations is an empty subset.
             for slot in self.choose("slots", o, default=np.unique(slot_of).tolist() or [-1]):
                 rows = np.flatnonzero(slot_of == slot)
@@ -136,7 +136,8 @@ class Grouping:
             rows = np.flatnonzero(~coupled) if coupled.any() else None
             self.members[name] = [(name, 0, rows)]
             self.row_in = place(~coupled)
-        # In the order of JAX's pytrees.
+        # JAX sorts the keys of a dict: `ravel_pytree` and the pairs of `plan.blocks` rely on the
+        # same order.
         self.kept = sorted(g for g in self.members if g != name)
 
     def _meet_always(self, group: str, name: str) -> bool:
@@ -173,7 +174,8 @@ class Grouping:
         free = np.concatenate(free, 1)
         # A slot of the eliminated table may touch a row that is not in this group: it is masked.
         partial = any(rows is not None for *_, rows in self.members[name])
-        # Small problems are snooped: the program of the whole then serves for every subset.
+        # Data snooping of small problems holds points one by one: with the mask as an array the
+        # compiled program of the whole serves whichever are held.
         may_be_held = name == self.eliminate and len(free) < self.settings.masked_below
         may_be_held |= partial and name != self.eliminate
         all_free = bool(free.all()) and not may_be_held

@@ -70,7 +70,7 @@ def pull_back(
     observation, by set.
 
     An observation with a covariance changes by a column of its root L. If the measurement does not
-    have one number per residual, the residual is changed.
+    have one number per residual, the residual is changed by −1, as by a measurement larger by σ.
 
     **Raises:** `NotSolvedError` if the values are not a minimum."""
     declared, plan, values, data = found.arguments

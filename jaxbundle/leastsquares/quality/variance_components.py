@@ -69,16 +69,16 @@ class Component:
     @property
     def usable(self) -> bool:
         """Whether the σ of the group can be estimated from its residuals."""
-        # With a redundancy of 1 an estimated σ is right to 70 % (1/√2r), with less it says nothing;
-        # residuals of 1e-9 σ are rounding errors of the adjustment.
+        # With a redundancy of 1 an estimated σ is right to 70 % (1/√(2r)), with less it says
+        # nothing; residuals of 1e-9 σ are rounding errors of the adjustment.
         return self.redundancy >= 1.0 and self.sigma > 1e-9
 
 
 def variance_components(
     found: Solution, groups: Sequence[VarianceGroup], factors: Mapping[str, float]
 ) -> dict[str, Component]:
-    """The components of groups of observations; `factors`: by group, the divisor of the weights (1
-    if absent)."""
+    """The components of groups of observations; `factors`: by group, the factor of σ that is
+    applied already (1 if absent)."""
     problem, tested, components = found.problem, found.reliability, {}
     for group in groups:
         take = lambda by_set, group=group: np.concatenate(
@@ -87,7 +87,8 @@ def variance_components(
         weight = take(problem.weights)
         used = weight[weight > 0]
         if used.size:
-            # v·(P·v), of which the expectation is the redundancy number (with covariances too).
+            # v·(P·v), of which the expectation is the redundancy number (with covariances too). P·v
+            # is gain · standard (`Reliability`); standard is not yet divided by √r.
             v, r = take(tested.residual.get), take(tested.redundancy.get)
             square = v * take(tested.gain.get) * take(tested.standard.get)
             factor = factors.get(group.name, 1.0)

@@ -76,7 +76,8 @@ class ObservationTable(abc.ABC):
     CHANGES_IMAGE_POINTS: ClassVar[bool] = False
     """Whether image points depend on the tables of this kind."""
     ANGLES_IN_SETTINGS: ClassVar[bool] = False
-    """Whether `settings` hold angles, which are in the unit of the network."""
+    """Whether `settings` hold angles, which are in the unit of the network: a table in another unit
+    of angles cannot be added (`add_further`)."""
 
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     source: Source = Source("table")

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxbundle.report.layout import WITHOUT_SIGMA, digits_of
+from jaxbundle.report.layout import DIGITS_WITHOUT_SIGMA, digits_of
 
 INTEGERS = ("<u1", "<u2", "<i4")
 
@@ -34,7 +34,7 @@ def estimates(values: np.ndarray, sigma: np.ndarray, label: str) -> Column:
     return Column(
         values,
         label,
-        -WITHOUT_SIGMA,
+        -DIGITS_WITHOUT_SIGMA,
         True,
         np.array([digits_of(value, s) for value, s in zip(values, sigma)], int),
     )
