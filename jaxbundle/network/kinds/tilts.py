@@ -93,9 +93,8 @@ class Tilts(ObservationTable):
 
     def columns(self, radians: float) -> dict:
         gone = np.isinf(self.sigma)
-        read, sigma = (np.where(gone, np.nan, x / radians) for x in (self.elevation, self.sigma))
-        columns = {axis: read[:, k] for k, axis in enumerate(AXES)}
-        columns |= {f"s{axis}": sigma[:, k] for k, axis in enumerate(AXES)}
+        read, sigma = (np.where(gone, np.nan, x / radians).T for x in (self.elevation, self.sigma))
+        columns = dict(zip(AXES, read)) | {f"s{a}": s for a, s in zip(AXES, sigma)}
         return {"image": self.image} | columns
 
     def number_of_equations(self) -> int:
@@ -106,7 +105,7 @@ class Tilts(ObservationTable):
         camera, of_camera = np.unique(network.images.camera[image], return_inverse=True)
         parameters = Parameters.from_settings(self.SECTION, self.settings, AXES)
         unit = ANGLE_UNITS[network.angle_unit]
-        radians = {name: unit * sigma for name, sigma in parameters.sigma.items()}
+        radians = {name: unit * s for name, s in parameters.sigma.items()}
         zero = Table(
             "clinometer",
             np.zeros((len(camera), 3)),
