@@ -138,7 +138,7 @@ class NetworkView:
             )
         ):
             raise InputError(
-                f"image {id!r}: six numbers {', '.join(EXTERIOR)} are expected, not {show(values)}"
+                f"image {id!r}: expected six numbers {', '.join(EXTERIOR)}, got {show(values)}"
             )
         row = self.ids.index(id)
         pose = np.array(values, float) / self.units

@@ -224,9 +224,11 @@ class FlightView:
                 positive = one.key.endswith(POSITIVE_KEYS) or one.key == "height"
                 found[one.key] = number(given, one.key, one.value, 0.0 if positive else -np.inf)
                 if one.key.endswith("period") and not found[one.key] > 0:
-                    raise InputError(f"{one.key} is {found[one.key]:g}; above 0 is expected")
+                    raise InputError(f"{one.key} is {found[one.key]:g}; expected a number above 0")
                 if one.key.endswith("latitude") and not abs(found[one.key]) <= 90:
-                    raise InputError(f"{one.key} is {found[one.key]:g}; from -90 to 90 is expected")
+                    raise InputError(
+                        f"{one.key} is {found[one.key]:g}; expected a number from -90 to 90"
+                    )
                 if one.key.endswith("rate") and not 0 < found[one.key] <= 1000:
                     raise InputError(f"{one.key} is {found[one.key]:g}; above 0, to 1000 Hz")
             elif isinstance(one, Switch):

@@ -131,11 +131,11 @@ class Handler(BaseHTTPRequestHandler):
         try:
             action = self._action()
             if body is None:
-                raise Refused(HTTPStatus.LENGTH_REQUIRED, "a body with its length is expected")
+                raise Refused(HTTPStatus.LENGTH_REQUIRED, "expected a body with its length")
             if len(body) > MOST_BYTES:
                 raise Refused(
                     HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
-                    f"a body of at most {MOST_BYTES} bytes is expected",
+                    f"expected a body of at most {MOST_BYTES} bytes",
                 )
             # a view has caches, and JAX uses all cores for one
             with self.server.computing:

@@ -35,7 +35,7 @@ def reply(view: ExplorerView, asked: Any) -> tuple[dict[str, Any], list[bytes]]:
     try:
         given = asked["given"]
         if not isinstance(given, dict):
-            raise InputError("values by name are expected")
+            raise InputError("expected values by name")
         file = respond(view, str(asked["action"]), given)
     except (InputError, NotSolvedError, Refused) as error:
         return {"number": number, "error": str(error)}, []

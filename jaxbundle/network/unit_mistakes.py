@@ -159,7 +159,7 @@ def name_degrees(points: Points) -> str:
     return (
         f"X and Y of the {count(int(known.sum()), 'known point')} look like longitude and latitude "
         f"in degrees (X {low[0]:.8g} to {high[0]:.8g}, Y {low[1]:.8g} to {high[1]:.8g}, Z "
-        f"{low[2]:.4g} to {high[2]:.4g}): expected are coordinates in one unit of length; convert "
+        f"{low[2]:.4g} to {high[2]:.4g}): expected coordinates in one unit of length; convert "
         "them to a map projection, such as UTM, or to a local system"
     )
 

@@ -109,7 +109,7 @@ def open_cells(path: str | Path) -> RasterCells:
     # 1e-6: over 10 000 cells a hundredth of a cell, which `place_of` allows
     if place.a <= 0 or abs(place.a + place.e) > 1e-6 * place.a:
         raise InputError(
-            f"{path}: square cells, north up, are expected; it has {place.a:g} × {place.e:g}: "
+            f"{path}: expected square cells, north up, got {place.a:g} × {place.e:g}: "
             "make them with gdalwarp -tr"
         )
     if crs is not None and crs.is_geographic:

@@ -10,7 +10,9 @@ from scipy.ndimage import gaussian_filter
 
 import jaxbundle
 from jaxbundle.errors import InputError
-from jaxbundle.surfaces.change import ChangeSettings, correlation_of, find_change
+from jaxbundle.surfaces.change import find_change
+from jaxbundle.surfaces.change_scatter import correlation_of
+from jaxbundle.surfaces.change_settings import ChangeSettings
 from jaxbundle.surfaces.height_cells import HeightGrid, UncertainCells, align, stated_modes
 from jaxbundle.surfaces.orientation import orientation_covariance, orientation_modes
 from jaxbundle.surfaces.views import FrameView
