@@ -113,7 +113,7 @@ def solve_camera(
         max_steps,
         ~few,
     )
-    # undamped: damping would make singular equations look determined
+    # Undamped: damping would make singular equations look determined.
     factor = factorise(loop.equations, views, 0.0)
     Q_interior, Q_pose, weakest = cofactors(factor)
     meaning = jnp.array([MEANING[code] for code in range(len(MEANING))])

@@ -47,7 +47,7 @@ def mean_square_of_octaves(
     total = jnp.zeros(())
     for octave in settings.octaves_of_knots:
         intervals = place * (np.asarray(octave) - 3)
-        # sums of four arrays: a sum over an axis of four is not vectorised
+        # Sums of four arrays: a sum over an axis of four is not vectorised.
         four = cubic_splines(intervals - jnp.floor(intervals), 4) ** 2
         square = four[..., 0] + four[..., 1] + four[..., 2] + four[..., 3]
         total += jnp.sum(used * square[..., 0] * square[..., 1])
@@ -66,7 +66,7 @@ def fields_of_camera(
     """The finest splines B on the sensor and the root R of all octaves in them, of a mean square of
     one, with (BR)ᵀBR."""
     x, y = (cubic_splines(place[..., k], settings.knots[k]) for k in (0, 1))
-    # not computed again for every product
+    # Not computed again for every product.
     x, y = jax.lax.optimization_barrier((x, y * used[..., None]))
     B = y[..., :, None].astype(jnp.float32) * x[..., None, :].astype(jnp.float32)
     B = B.reshape(*used.shape, -1)
@@ -194,7 +194,7 @@ def _median(x: Float[Array, "*axes"], among: Bool[Array, "*axes"]) -> Float[Arra
         return jnp.where(below, low, middle + 1), jnp.where(below, middle, high)
 
     first = jax.lax.fori_loop(0, 63, halve, (jnp.zeros_like(highest), highest))[1]
-    # of an even number the mean of the two in the middle
+    # Of an even number the mean of the two in the middle.
     last = jnp.where(bits > first, bits, highest).min()
     last = jnp.where(jnp.sum(bits <= first) > number // 2, first, last)
     numbers = jax.lax.bitcast_convert_type(jnp.stack([first, last]), float)

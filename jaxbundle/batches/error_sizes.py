@@ -73,7 +73,7 @@ def batch_errors(
     critical = settings.estimation.critical(len(COMPONENTS) - 1)
     find = _common_sizes if together else _sizes_of_each
     theta, parts = find(sums, shown, critical, programs)
-    # a camera without sizes has no σ: zero would read as without any error
+    # A camera without sizes has no σ: zero would read as without any error.
     none = np.isnan(theta).all(1, keepdims=True)
     used = np.where(none, np.nan, np.nan_to_num(theta))
     covariance = np.einsum("nk,nkij->nij", parts.factor * used, parts.interior)
@@ -163,7 +163,7 @@ def _common_sizes(
     # E q_0 = Σ θ_k·tr(M·V_k): what the common sizes leave of a camera's own vᵀv
     white = lambda shared: np.clip((q[known, 0] - shared) / sums.redundancy[known], 0, None)
     if not (shown[:, 0] & sums.traced).any():
-        # without any traces independent errors alone
+        # Without any traces independent errors alone.
         theta[known, 0] = white(0.0)
         return theta, SizedParts.of(sums, None)
     of = np.flatnonzero(shown[np.argmax(shown.sum(1) * sums.traced)])

@@ -159,7 +159,7 @@ def spans_of_camera(
     W, L = _orthonormal(E, jnp.asarray(seen.weight))
     WJ = products_of_rows(W, J)
     Z, R = _orthonormal_of_all(J - jnp.einsum("vek,veap->vkap", WJ, W))
-    # ray = M·X + t: of a point as of the shift, turned
+    # ray = M·X + t: of a point as of the shift, turned.
     turns = jax.vmap(matrix_from_quaternion)(at.rotation)
     by_point = [sum(turns[:, i, j, None, None] * E[:, i] for i in range(3)) for j in range(3)]
     return Spans(W, Z, L, R, WJ, v, jnp.stack(by_point, -1))

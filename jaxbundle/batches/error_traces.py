@@ -118,7 +118,7 @@ def traces_of_components(spans: Spans, roots: Roots, signs: tuple[Array, Array])
         field, by_view = S.mixed[some], S.by_view[some]
         through = FewColumns(field.T @ field, by_view.T @ field, by_view.T @ by_view)
         cubes = cubes.at[k].set(S.sums(through))
-    # of random combinations of the columns of the others
+    # Of random combinations of the columns of the others.
     masks = [jnp.zeros((3, 1)).at[axes].set(1.0) for axes in GIVEN_AXES]
     errors = [roots.along_tracks(signs[0]), *(roots.of_points(signs[1] * one) for one in masks)]
     remaining = jnp.stack([c.remaining for c in covariances(spans, roots, projected)])
@@ -131,7 +131,7 @@ def traces_of_components(spans: Spans, roots: Roots, signs: tuple[Array, Array])
         flat = [x.reshape(SUMS.probes, -1) / jnp.sqrt(SUMS.probes) for x in products[:2]]
         pairs = FewColumns(flat[0].T @ flat[0], flat[1].T @ flat[0], flat[1].T @ flat[1])
         cubes = cubes.at[k].set(S.sums(pairs))
-        # half of them again: M·F·(Fᵀ·M·F·ξ)
+        # Half of them again: M·F·(Fᵀ·M·F·ξ).
         half = [x[: SUMS.probes // 2] for x in products]
         e = (
             roots.along_tracks(half[2])
@@ -144,7 +144,7 @@ def traces_of_components(spans: Spans, roots: Roots, signs: tuple[Array, Array])
         for j, columns in enumerate(BY_VIEW, FIELD + 1):
             own = own.at[j].set(jnp.sum(more[1][..., columns]))
         cubes = cubes.at[k, k].set(own / (SUMS.probes // 2))
-    # of two of them from the combinations of both
+    # Of two of them from the combinations of both.
     both = (T[TRACKS:, TRACKS:] + T[TRACKS:, TRACKS:].T) / 2
     T = T.at[:, TRACKS:].set(T[TRACKS:].T).at[TRACKS:, TRACKS:].set(both)
     T = T.astype(float).at[0].set(remaining).at[:, 0].set(remaining)

@@ -119,7 +119,7 @@ def run_batch(  # noqa: PLR0913 keyword arguments of a public function
         if again:
             lines.drop(again)
         counts, done, networks = Counter(), 0, 0
-        # by key, not by position, so that inputs may be added, left out, and reordered between runs
+        # By key, not by position, so that inputs may be added, left out, and reordered between runs
         have = {*lines.heads} | ({*JsonLines(known).heads} if known is not None else set())
         for work, share in zip(works, ours) if compute else ():
             chosen = np.array([i for i in share if work.keys[i] not in have], int)

@@ -128,7 +128,7 @@ def calibrate(  # noqa: PLR0913 keyword arguments of a public function
     )
     result = adjust(network, **options)
     if views.board.diameters.any() and result.converged:
-        # twice: the shifts depend on the poses, and these change by the shifts, by a small part
+        # Twice: the shifts depend on the poses, and these change by the shifts, by a small part.
         for _ in range(2):
             centred = _without_eccentricity(start, result, made)
             network = board_network(
@@ -180,7 +180,7 @@ def board_network(
     board = views.board
     view, point = np.nonzero(views.visible)
     xy = in_model_units(views.xy[view, point], model, views.image_size, camera.pixel_size)
-    # image coordinates in the unit of the model, σ in pixels: a pixel is not square in every camera
+    # Image coordinates in the unit of the model, σ in pixels: a pixel is not square in every camera
     sx, sy = (sigma_image or UNSTATED_BOARD_SIGMA) * np.array(unit_size(model, camera.pixel_size))
     role = "tie" if board_free else "fixed" if board_sigma is None else "control"
     X, Y, Z = board.points.T
@@ -204,7 +204,7 @@ def board_network(
         },
         sigma_origin=UNIT if sigma_image is None else STATED,
         datum="inner" if board_free else "control",
-        # residuals where noise arises: in the photograph, not in the ideal image without distortion
+        # Residuals where noise arises: in the photograph, not in the ideal image without distortion
         residuals="measured",
         angle_unit="deg",
         image_unit=model.unit,

@@ -44,7 +44,7 @@ def add_common_options(function: Callable) -> Callable:
         for name, kind in added.items()
     ]
     whole = given.replace(parameters=[*given.parameters.values(), *parameters])
-    # typer reads options from here, not from **values
+    # Typer reads options from here, not from **values.
     command.__dict__["__signature__"] = whole
     return command
 

@@ -135,7 +135,7 @@ def recognise(input: Explored) -> str:
         return SCANNER
     if path.suffix.lower() in (".dim", ".imd"):
         return SCANNER
-    # before the networks, since its folder contains one
+    # Before the networks, since its folder contains one.
     if is_of_calibrate(path):
         return CAMERA
     if recognise_format(path) is not None:
@@ -210,7 +210,7 @@ def _view_camera(
     pixels = None if size is None else (int(size[0]), int(size[1]))
     pitch = pixel_size or camera.pixel_size
     camera = dataclasses.replace(camera, image_size=pixels, pixel_size=pitch)
-    # of the free parameters only: sliders of the others have none
+    # Of the free parameters only: sliders of the others have none.
     sigma = None
     if covariance is not None:
         sigma = dict(zip(covariance[0], np.sqrt(np.diag(covariance[1]))))

@@ -251,7 +251,7 @@ def _read_mask(path: str | Path, cells: CellSource) -> Int[np.ndarray, "rows col
         there = slice(part.start - row, part.stop - row)
         across = slice(columns.start - column, columns.stop - column)
         values = np.nan_to_num(mask.window(there, across).height)
-        # a fraction would be cut to another region, or a stable cell to none
+        # A fraction would be cut to another region, or a stable cell to none.
         strange = (values != np.rint(values)) | (np.abs(values) >= 2**31)
         if strange.any():
             raise InputError(
@@ -316,7 +316,7 @@ def _orientations(
             continue
         others = [one.names for one in chosen if one is not None] if same else []
         errors = oriented_errors(mine, set().union(*others), cells.system)
-        # of another project all columns of L would be 0, and the errors missing in silence
+        # Of another project all columns of L would be 0, and the errors missing in silence.
         seen = errors.share_seen(cells)
         if seen == 0:
             raise InputError(

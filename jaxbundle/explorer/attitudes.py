@@ -81,7 +81,7 @@ def choose_angles(forms: AttitudeForms, values: Mapping[str, Any]) -> Mapping[st
             if form["amplitude"] != known["amplitude"] or form["period"] != known["period"]:
                 _change(parts, "sine", sine, {})
             if form["walk"] != known["walk"]:
-                # ten steps in the image, where the file says nothing
+                # Ten steps in the image, where the file says nothing.
                 _change(
                     parts,
                     "walk",

@@ -106,14 +106,14 @@ class CameraView:
     @cached_property
     def _controls(self) -> list[Number]:
         """A slider for every parameter, as long as it takes to move a corner visibly."""
-        # near a corner, where distortion is large, but inside what most lenses image
+        # Near a corner, where distortion is large, but inside what most lenses image.
         place = (self.low + self.high) / 2 + np.array([0.7, 0.6]) * (self.high - self.low) / 2
         p = jnp.array([*self.values.values()])
         slopes = np.hypot(*np.asarray(_slopes(self.model, p, place)))
         controls = []
         for name, slope in zip(self.values, slopes):
             value, ranges = self.values[name], dict(self.model.ranges)
-            # a full slider moves that place by 4 % of the half diagonal: seen, and undone, at once
+            # A full slider moves that place by 4 % of the half diagonal: seen, and undone, at once.
             length = 0.04 * self.reach / slope if slope > 0 and np.isfinite(slope) else 1.0
             low, high = value - length, value + length
             if name in self.model.principal_distance:
@@ -309,7 +309,7 @@ class CameraView:
             borderMode=cv2.BORDER_CONSTANT,
             borderValue=(255, 255, 255),
         )
-        # straight edges are judged: few artefacts of the coding may be beside them
+        # Straight edges are judged: few artefacts of the coding may be beside them.
         options = [cv2.IMWRITE_JPEG_QUALITY, 85]
         _, coded = cv2.imencode(".jpg", picture[..., ::-1], options)
         data = base64.b64encode(coded.tobytes()).decode("ascii")
@@ -335,7 +335,7 @@ class CameraView:
         rays = _plain_rays(self.model, values, xy)
         found = images_of(self.model, values, rays.reshape(-1, 3)).reshape(xy.shape)
         found = self.origin_of_pixels + self.step * found
-        # a place without image is looked up far outside, where OpenCV leaves white
+        # A place without image is looked up far outside, where OpenCV leaves white.
         return tuple(np.nan_to_num(np.moveaxis(found, -1, 0), nan=-1e6))
 
 

@@ -104,7 +104,7 @@ class NetworkView:
         model = self.adjustment.error_model
         if model is None:
             return found
-        # the same sizes in the moved network: they are of cameras and pictures, not of geometry
+        # The same sizes in the moved network: they are of cameras and pictures, not of geometry.
         sigma0 = self.adjustment.sigma0
         errors = precision(self.problem, data, sigma0=sigma0, errors=model.widened_sizes)
         return _larger(found, jax.tree.map(np.asarray, errors))
@@ -170,7 +170,7 @@ class NetworkView:
         """The adjusted values with the stations at their new places."""
         values = self.adjustment.values
         position, rotation = map(np.array, values["image"])
-        # positions of the engine are relative to the origin of the network
+        # Positions of the engine are relative to the origin of the network.
         for row, centre, M in moves:
             position[row] = centre - self.problem.origin
             rotation[row] = np.asarray(quaternion_from_matrix(jnp.asarray(M)))
@@ -277,7 +277,7 @@ class NetworkView:
         """The σ before and after: of all points together, cameras, moved stations, and of the
         points that change most."""
         network, unit = self.problem.network, clean(self.adjustment.network.object_unit)
-        # held points have σ 0 before and after
+        # Held points have σ 0 before and after.
         near = self.adjustment.located & (before.points > 0).any(1)
         root = lambda s: np.sqrt(np.mean(s[near] ** 2, 0))
         rows = (

@@ -112,7 +112,7 @@ def frame_around(
     low, high = (np.array([f(x), f(y)]) for f in (np.min, np.max))
     side = float((high - low).max())
     low, high = low - margin * side, high + margin * side
-    # no finer than the pixels of the picture, no more than a block of a map
+    # No finer than the pixels of the picture, no more than a block of a map.
     finest = side / max(
         -(-n // step) for n, step in zip((image.lines, image.pixels), _steps(image))
     )
@@ -173,7 +173,7 @@ def scene_of_raster(
     bands = raster.bands[: 3 if len(raster.bands) >= 3 else 1]
     X = _ground_below(frame, surface, *np.indices((frame.rows, frame.columns), float))
     row, column = raster.place(X)
-    # means of as many pixels as fit into one of the scene: single ones would be noise
+    # Means of as many pixels as fit into one of the scene: single ones would be noise.
     steps = [_pixels_between(v) for v in (row, column)]
     bands = _means(bands, steps)
     row, column = ((v + 0.5) / k - 0.5 for v, k in zip((row, column), steps))
@@ -219,7 +219,7 @@ def _steps(image: PushbroomImage) -> tuple[int, int]:
 
 def _nodes_of(frame: GroundFrame, surface: GroundSurface) -> MapNodes:
     """The nodes of the block of a map that the frame is."""
-    # rows and columns of the nodes: the first is in the centre of the first pixel
+    # Rows and columns of the nodes: the first is in the centre of the first pixel.
     along_side = NODE_STEP * np.arange(-(-(BLOCK_SIZE - 1) // NODE_STEP) + 1.0)
     X = _ground_below(frame, surface, *np.meshgrid(along_side, along_side, indexing="ij"))
     if surface.earth is None:
@@ -236,7 +236,7 @@ def _ground_below(
 ) -> Float[np.ndarray, "3 *shape"]:
     """The points of the surface on the verticals of the plane."""
     x, y = frame.left + (column + 0.5) * frame.size, frame.top - (row + 0.5) * frame.size
-    # from 1000 km above: the ground is below it, and nothing of the vertical is on the far side
+    # From 1000 km above: the ground is below it, and nothing of the vertical is on the far side.
     above = np.full(x.size, 1e6)
     start = frame.origin[:, None] + frame.axes.T @ np.stack([x.ravel(), y.ravel(), above])
     X = np.asarray(_drop(surface, jnp.asarray(start), jnp.asarray(-frame.axes[2])))

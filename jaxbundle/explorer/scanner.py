@@ -421,7 +421,7 @@ class FlightView:
         """RMS and CE90 of attitudes with given σ about every axis, degrees, one error an image."""
         image, surface = chosen.image, chosen.surface
         altitude, view = altitude_and_view(image, surface)
-        # a constant error has no structure that a few positions could miss
+        # A constant error has no structure that a few positions could miss.
         spread = spread_positions(image.lines, image.pixels, self.cells, 1)
         line, pixel = (v.ravel() for v in spread)
         rows = []

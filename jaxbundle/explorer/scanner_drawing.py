@@ -86,7 +86,7 @@ def draw_ground(
             (np.asarray(_locate(image, surface, *border)), "footprint", "first"),
         )
     ]
-    # as many places as the border has
+    # As many places as the border has.
     lines = np.linspace(0, image.lines - 1, len(border[0]) - 1)
     P = np.array(_positions(image, jnp.asarray(lines))).T
     if earth is None:
@@ -163,7 +163,7 @@ def _angles(image: PushbroomImage, lines: Float[Array, " n"], orbital: bool) -> 
 
     def of_line(line: Array) -> Float[Array, "3"]:
         P, R, V = recorded_pose(image, image.times.time(line))
-        # angles are those of the transpose, as of ω, φ, κ
+        # Angles are those of the transpose, as of ω, φ, κ.
         return omega_phi_kappa_from_matrix((orbital_frame(P, V).T @ R if orbital else R).T)
 
     return jax.vmap(of_line, out_axes=1)(lines)

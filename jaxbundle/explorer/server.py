@@ -137,7 +137,7 @@ class Handler(BaseHTTPRequestHandler):
                     HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
                     f"expected a body of at most {MOST_BYTES} bytes",
                 )
-            # a view has caches, and JAX uses all cores for one
+            # A view has caches, and JAX uses all cores for one.
             with self.server.computing:
                 file = act(action, body)
             status = HTTPStatus.OK
@@ -174,7 +174,7 @@ class Handler(BaseHTTPRequestHandler):
         if any(origin not in [f"http://{host}" for host in hosts] for origin in origins):
             raise Refused(HTTPStatus.FORBIDDEN, "a page of another site may not ask")
         _, token, *rest = [*self.path.partition("?")[0].split("/"), ""]
-        # in constant time: how long it takes tells nothing about the token
+        # In constant time: how long it takes tells nothing about the token.
         if not secrets.compare_digest(token.encode(), self.server.token.encode()):
             raise Refused(
                 HTTPStatus.FORBIDDEN, "the address is incomplete: copy all of it from the terminal"

@@ -63,7 +63,7 @@ def tracks_of(track: Mapping[str, Any], image: PushbroomImage, earth: Ellipsoid 
     orbit = {name: shorten_number(np.degrees(track.get(name, 0.0))) for name in USUAL}
     orbit = {**orbit, "height": float(track["height"])} if "height" in track else {}
     if "end" in track:
-        # as high over the middle of the track's ends
+        # As high over the middle of the track's ends.
         orbit = {
             **USUAL,
             "height": shorten_number(np.linalg.norm(ends, axis=1).mean() - earth.a, 6),
@@ -91,7 +91,7 @@ def track_controls(tracks: Tracks) -> list[Number]:
         reach = _reach(values, kind)
         for key, value in values.items():
             end, axis = key.split("_")
-            # half the track to either side, and half the height
+            # Half the track to either side, and half the height.
             half = abs(value) / 2 if axis in ("height", "Z") else reach[axis] / 2
             controls.append(
                 Number(key, f"{ENDS[end]}: {axis}", value, units[axis], value - half, value + half)
@@ -152,7 +152,7 @@ def _reach(values: Mapping[str, float], kind: str) -> dict[str, float]:
     x, y = (values[f"end_{axis}"] - values[f"start_{axis}"] for axis in axes)
     stretch = 1.0
     if kind == PLACES:
-        # degrees of longitude are shorter by the cosine of the latitude; not at a pole
+        # Degrees of longitude are shorter by the cosine of the latitude; not at a pole.
         stretch = max(float(np.cos(np.radians(values["start_latitude"]))), 1e-3)
         x = (x + 180) % 360 - 180
     length = float(np.hypot(x * stretch, y))

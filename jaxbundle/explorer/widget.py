@@ -21,7 +21,7 @@ def show(view: ExplorerView, *, height: int = 800) -> Any:
     controls; `height` of the frame in pixels.
 
     **Raises:** `ImportError` without anywidget (extra `widgets`)."""
-    # lower than its controls, or higher than any screen, a frame is of no use
+    # Lower than its controls, or higher than any screen, a frame is of no use.
     height = integer("height", height, 200, 4000)
     page = page_file(view, {}, live=True).content.decode()
     widget = _widget_class()(page=page, height=height)
@@ -53,5 +53,5 @@ def _widget_class() -> Any:
         raise ImportError("widgets need anywidget: pip install 'jaxbundle[widgets]'") from error
     script = files("jaxbundle.explorer.page").joinpath("widget.js").read_text(encoding="utf-8")
     traits = {"page": traitlets.Unicode().tag(sync=True), "height": traitlets.Int().tag(sync=True)}
-    # made here, not at the top: its base class may not be installed
+    # Made here, not at the top: its base class may not be installed.
     return type("Explorer", (anywidget.AnyWidget,), {"_esm": script, **traits})

@@ -394,7 +394,7 @@ def _minimise(
     """
 
     def normal_equations(p: Unknowns) -> tuple[Normal, Unknowns, Scalar]:
-        # forward, and stored: in reverse, or within the products, grey values are looked up again
+        # Forward, and stored: in reverse, or within the products, grey values are looked up again.
         J, v = jax.lax.optimization_barrier((jax.jacfwd(computed)(p), computed(p) - grey))
         return J.T @ J, J.T @ v, v @ v
 

@@ -385,7 +385,7 @@ def _sides_of(
             )
 
         for widths, depth in ((inner, border), (outer, -1)):
-            # a line of the marker is a line in the image: its distance from the side is linear in t
+            # A line of the marker is a line in the image: its distance from the side is linear in t
             t, s = along_and_inside(np.array([0.0, n]), depth)
             slope = (s[:, 1] - s[:, 0]) / (t[:, 1] - t[:, 0])
             ends = s[:, :1] + slope[:, None] * (np.array([-1.0, 1.0]) - t[:, :1])

@@ -74,7 +74,7 @@ def map_positions(
     turn = np.full(len(places), np.nan)
     factors = _need_pyproj().Proj(system).get_factors(longitude, latitude)
     turn[rows] = factors.meridian_convergence
-    # over 8 σ three positions determine the direction to √2·σ/8σ = 10 degrees and the scale to 18 %
+    # Over 8 σ three positions determine the direction to √2·σ/8σ = 10 degrees and the scale to 18 %
     wide = bool(spread > 8 * np.median(sigma))
     return MapPositions(X, s, turn, system, wide)
 

@@ -171,7 +171,7 @@ def contradiction(
     speed = np.linalg.norm(mean, axis=1)
     change = np.linalg.norm(np.diff(velocities, axis=0), axis=1)
     off = np.linalg.norm(mean - trapezoid, axis=1)
-    # velocities that are much too large excuse nothing
+    # Velocities that are much too large excuse nothing.
     allowed = tolerance * np.median(speed) + np.minimum(change, speed) / 2
     if not (bad := off > allowed).any():
         return None
@@ -272,7 +272,7 @@ def check_covered(
     """
     rows, times = np.asarray(table.times), np.asarray(times, float)
     check_span(rows, table.extrapolate, times, source, thing)
-    # as in `interpolation.interval`, which decides for the image
+    # As in `interpolation.interval`, which decides for the image.
     i = np.clip(np.searchsorted(rows, times, side="right") - 1, 0, len(rows) - 2)
     wide = rows[i + 1] - rows[i] > table.gap
     if wide.any():
@@ -303,7 +303,7 @@ def _table(
     what: str,
     source: Source,
 ) -> TimeTable:
-    # masked values are NaN, and refused with their row
+    # Masked values are NaN, and refused with their row.
     plain = lambda array: numeric_array(source.name, array, "numbers").astype(float)
     times, values = plain(times), plain(values)
     if values.ndim != 2 or times.shape != values.shape[:1]:

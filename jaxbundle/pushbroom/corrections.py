@@ -127,7 +127,7 @@ def refract(earth: Ellipsoid | None, height: Scalar, o: Vector, d: Vector) -> tu
         n = normal(border, X)
         change = weight * step
         ratio = (1 + index) / (1 + index + change)
-        # ratio² − 1, without cancellation
+        # ratio² − 1, without cancellation.
         zeta = -change * (2 + 2 * index + change) / (1 + index + change) ** 2
         k = ratio * dot(d, n)
         bent = along(scale_vector(ratio, d), n, zeta / (jnp.sqrt(k * k - zeta) - k))
@@ -155,10 +155,10 @@ def apparent_point(
     if not corrections.any:
         x, y, z = X
         return x, y, z
-    # the corrections of `ground_point` in the opposite order: here the point is known
+    # The corrections of `ground_point` in the opposite order: here the point is known.
     o, distance = P, length(difference(X, P))
     if corrections.light_time:
-        # the distance changes by 1e-6 of itself in the first round, by 1e-12 in the second
+        # The distance changes by 1e-6 of itself in the first round, by 1e-12 in the second.
         for _ in range(2):
             o = earlier_earth(P, distance)
             distance = length(difference(X, o))

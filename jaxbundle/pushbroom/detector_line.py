@@ -36,7 +36,7 @@ def slope_ahead(
     """(F, ξ) of a sight D from the origin of the pieces; NaN behind the camera."""
     r, s, q = (sum(numbers[3 * i + k] * D[k] for k in range(3)) + numbers[9 + i] for i in range(3))
     front = q < 0
-    # a divisor for the branch that is not chosen: NaN there would spread to derivatives
+    # A divisor for the branch that is not chosen: NaN there would spread to derivatives.
     q = jnp.where(front, q, -1.0)
     xi = -r / q
     return jnp.where(front, -s / q - value(line, xi), jnp.nan), xi

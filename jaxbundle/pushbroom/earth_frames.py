@@ -78,7 +78,7 @@ def to_earth(
         return erfa.pom00(*pole, 0.0) @ _about("z", -erfa.gmst82(*ut1)).as_matrix()
     matrices = erfa.c2t06a(*tt, *ut1, *pole)
     if frame == "J2000":
-        # at the epoch J2000.0, as the frame is fixed
+        # At the epoch J2000.0, as the frame is fixed.
         bias, _, _ = erfa.bp06(2451545.0, 0.0)
         matrices = matrices @ bias.T
     return matrices
@@ -141,7 +141,7 @@ def two_line_orbit(
         raise InputError("two-line elements need sgp4: pip install 'jaxbundle[geo]'") from None
     first, second = first.strip(), second.strip()
     for number, line in enumerate((first, second), 1):
-        # modulo 10 of the digits, a minus sign counting 1
+        # Modulo 10 of the digits, a minus sign counting 1.
         checksum = str(sum(int(c) if c.isdigit() else c == "-" for c in line[:68]) % 10)
         if not (len(line) == 69 and line[:2] == f"{number} " and checksum == line[68]):
             raise InputError(

@@ -51,7 +51,7 @@ def spread_positions(
     rows, columns = cells
     n = -(-least // (rows * columns))
     rng = np.random.default_rng(0)
-    # each row of cells deals its parts of the lines to its columns at random
+    # Each row of cells deals its parts of the lines to its columns at random.
     turns = rng.permuted(np.tile(np.arange(columns), (rows, n, 1)), axis=2)
     part = np.moveaxis(columns * np.arange(n)[:, None] + turns, 2, 1)
     down = (part + rng.random(part.shape)) / (columns * n)
@@ -93,7 +93,7 @@ def propagate_accuracy(
         for name, values in sigmas(image, noise)._asdict().items()
         if np.any(getattr(noise, name))
     }
-    # without errors: one kind of σ 0, so that accuracies are 0 where rays meet the surface
+    # Without errors: one kind of σ 0, so that accuracies are 0 where rays meet the surface.
     sigma = sigma or {"position_bias": np.zeros(3)}
     covariance = np.asarray(_covariances(image, surface, lines, pixels, sigma))
     rms = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
@@ -165,7 +165,7 @@ def circular_error(covariance: Float[np.ndarray, "*n 2 2"], part: float = 0.9) -
     stretch = great * np.cos(angle) ** 2 + small * np.sin(angle) ** 2
     # λ₂ = 0 leaves directions without extent; r²/1e-300 does not overflow and its exponential is 0
     stretch = np.maximum(stretch, 1e-300)
-    # ten times the largest σ is outside any fraction that double precision tells from 1
+    # Ten times the largest σ is outside any fraction that double precision tells from 1.
     outside = lambda r: np.mean(np.exp(-(r**2) / (2 * stretch))) - (1 - part)
     return float(np.sqrt(large) * brentq(outside, 0.0, 10.0))
 
@@ -198,11 +198,11 @@ def _covariances(
         J = jax.jacrev(move)(zero)
         parts = [(J[name] * sigma[name]).reshape(2, -1) for name in sigma]
         covariance = sum((part @ part.T for part in parts), jnp.zeros((2, 2)))
-        # a ray that misses has no point; the derivative of "not a number" may still be 0
+        # A ray that misses has no point; the derivative of "not a number" may still be 0.
         return jnp.where(jnp.isnan(jnp.stack([*X0])).any(), jnp.nan, covariance)
 
     places = jnp.asarray(lines), jnp.asarray(pixels)
-    # each position of a batch needs its own copy of the tables and of their derivatives
+    # Each position of a batch needs its own copy of the tables and of their derivatives.
     return jax.lax.map(lambda place: covariance_at(*place), places, batch_size=128)
 
 
@@ -219,7 +219,7 @@ def _draws(
         wrong = add_errors(image, draw(sigma, key))
         return _differences(wrong, image, surface, lines, pixels)
 
-    # one draw after the other: a batch of draws would be as many copies of image and positions
+    # One draw after the other: a batch of draws would be as many copies of image and positions.
     return jax.lax.map(errors_of_draw, keys)
 
 

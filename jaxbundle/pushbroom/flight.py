@@ -67,7 +67,7 @@ class Flight:
 
 def true_image(flight: Flight) -> PushbroomImage:
     """The image with the true trajectory."""
-    # so dense that its own interpolation is not seen beside that of the instrument's rows
+    # So dense that its own interpolation is not seen beside that of the instrument's rows.
     rate = max(20.0, 5 * flight.attitude_rate)
     return _image(flight, _position(flight, 2.0, "lagrange"), _attitude(flight, rate, "spline"))
 
@@ -175,7 +175,7 @@ def _position(flight: Flight, rate: float, method: str) -> TimeTable:
             return position_table(t, P, V, method=method)
         track["velocity"] = (end - start) / duration
     if "start" in track:
-        # a straight line is interpolated exactly
+        # A straight line is interpolated exactly.
         start, velocity = (np.asarray(track[k], float) for k in ("start", "velocity"))
         return position_table(
             t, start + t[:, None] * velocity, np.tile(velocity, (len(t), 1)), method="linear"
@@ -227,7 +227,7 @@ def arc_between(
     r = np.linalg.norm(towards, axis=1)
     u, v = towards / r[:, None]
     across = np.linalg.norm(np.cross(u, v))
-    # below this the direction of w is lost in the rounding of coordinates
+    # Below this the direction of w is lost in the rounding of coordinates.
     if across < 1e-12:
         where = "opposite places of the Earth" if u @ v < 0 else "above one place of the Earth"
         raise InputError(f"track: start and end are {where}, which gives no direction; give others")

@@ -84,7 +84,7 @@ def make_footprint(
     levels = np.linspace(heights[0], heights[1], layers)
     speeds = partial(_speeds_at, pieces, levels, line, earth, settings.times_at_once)
     D, _ = speeds(k, tau, xi, eta)
-    # a sight that misses the ground at some height: the footprint has no edge there
+    # A sight that misses the ground at some height: the footprint has no edge there.
     if not np.isfinite(D).all():
         return None
     footprint, errors = _fit(D, times, u, heights)
@@ -94,7 +94,7 @@ def make_footprint(
     reach = _slope_range(pieces, np.asarray(samples), D.reshape(-1, 3), settings.slope_margin)
     if reach is None:
         return None
-    # slopes of points of the footprint at all times, not only when they are seen
+    # Slopes of points of the footprint at all times, not only when they are seen.
     xi = np.linspace(*reach, across)
     eta = np.polynomial.polynomial.polyval(xi, np.asarray(line))
     k, within = np.indices((len(pieces.ends) - 1, len(TESTED_POSITIONS))).reshape(2, -1)
@@ -113,7 +113,7 @@ def _heights(
     if earth is None:
         above = P[:, 2].min()
     else:
-        # the residual of a point scaled from the surface by 1 + a is (1 + a)² − 1
+        # The residual of a point scaled from the surface by 1 + a is (1 + a)² − 1.
         above = (np.sqrt(1 + np.asarray(residual(earth, tuple(P.T)))).min() - 1) * earth.c
     return np.clip(limits, -above / 2, above / 2) if above > 0 else None
 

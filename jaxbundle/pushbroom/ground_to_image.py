@@ -283,7 +283,7 @@ def _search(
         starts, count, *where = find_passages(image, search, X, most, margin, tried)
         wanted = found[2] < most
         there = (count > tried + jnp.arange(most)[:, None]) & wanted
-        # a loop: all passages share one compiled Newton's method
+        # A loop: all passages share one compiled Newton's method.
         found, _ = jax.lax.scan(refine_passage, tuple(found), (starts, there))
         return *found, jnp.where(wanted, tried + most, tried), count, *where
 
@@ -298,9 +298,9 @@ def _search(
     state = unknown, unknown, none, never, none, none + 1, never, never, never
     state = jax.lax.while_loop(is_open, search_on, state)
     line, pixel, number, lost, tried, count, ahead, behind, hidden = state
-    # passages after the last place were not refined: they may be outside the image
+    # Passages after the last place were not refined: they may be outside the image.
     number = number + jnp.maximum(count - tried, 0)
-    # in the order of what explains most: hidden before lost, lost before beside
+    # In the order of what explains most: hidden before lost, lost before beside.
     status = jnp.select(
         [number > 0, hidden, lost, count > 0, ahead, behind],
         [

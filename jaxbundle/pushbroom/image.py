@@ -108,7 +108,7 @@ def make_image(
 def check_size(lines: float, pixels: float, where: str) -> None:
     """Refuse an image size that is not integer, without lines, with fewer than 2 pixels, or
     impossibly large."""
-    # ten million lines are 7000 km of pixels of 0.7 m: more is a slip of the pen
+    # Ten million lines are 7000 km of pixels of 0.7 m: more is a slip of the pen.
     largest = 10_000_000
     for size, name, least in ((lines, "lines", 1), (pixels, "pixels", 2)):
         if not least <= size <= largest or size != int(size):

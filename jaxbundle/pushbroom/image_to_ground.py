@@ -42,7 +42,7 @@ def ground_point(
     X = along(o, d, surface.distance(o, d))
     if corrections.light_time:
         start, direction = o, d
-        # the distance changes by 1e-6 of itself in the first round, by 1e-12 in the second
+        # The distance changes by 1e-6 of itself in the first round, by 1e-12 in the second.
         for _ in range(2):
             distance = length(difference(X, o))
             o, d = earlier_earth(start, distance), earlier_earth(direction, distance)
@@ -69,7 +69,7 @@ def locate_lines(
         return jax.vmap(point)(slopes)
 
     if surface.iterative:
-        # the state of a loop over 8000 pixels stays in the cache, that of many lines does not
+        # The state of a loop over 8000 pixels stays in the cache, that of many lines does not.
         return jnp.stack(jax.lax.map(locate_line, lines), axis=0)
     return jnp.stack(jax.vmap(locate_line)(lines))
 

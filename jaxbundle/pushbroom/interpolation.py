@@ -149,7 +149,7 @@ def spline_rates(
     # that it can be differentiated and compiled.
     ends = jnp.concatenate([jnp.array([True]), step > gap, jnp.array([True])])
     forward = _end_rows(step, slope, ends[1:])
-    # seen from behind, steps and slopes keep their signs
+    # Seen from behind, steps and slopes keep their signs.
     back = _end_rows(step[::-1], slope[::-1], ends[-2::-1])
     back = tuple(v[::-1] for v in back)
     zero, nothing = jnp.zeros(1), jnp.zeros((1, values.shape[1]))

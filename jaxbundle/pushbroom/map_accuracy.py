@@ -65,7 +65,7 @@ def covariance_lattice(
     swath by a few percent: linear interpolation over a sixteenth of it leaves 1e-4 of σ.
     """
     low, high = heights
-    # a metre on flat ground, so that there is something to interpolate
+    # A metre on flat ground, so that there is something to interpolate.
     levels = np.linspace(low, max(high, low + 1.0), size[0])
     lines = np.linspace(0, image.lines - 1, size[1])
     pixels = np.linspace(0, image.pixels - 1, size[2])
@@ -140,6 +140,6 @@ def _interpolate(
     places = [
         (value - axis[0]) / (axis[1] - axis[0]) for value, axis in zip((height, line, pixel), axes)
     ]
-    # of order 1: multilinear; half a pixel beyond the outer centres they are extended
+    # Of order 1: multilinear; half a pixel beyond the outer centres they are extended.
     of = lambda part: jax.scipy.ndimage.map_coordinates(part, places, order=1, mode="nearest")
     return jnp.stack([of(part) for part in lattice.values])

@@ -23,7 +23,7 @@ from jaxbundle.pushbroom.prepared import ScannerGeometry, Search
 from jaxbundle.system.devices import batch_size
 from jaxbundle.types import AnyArray, Scalar
 
-# of points [n]: time, pixel, whether they have settled, rounds made
+# Of points [n]: time, pixel, whether they have settled, rounds made.
 RefinementState = tuple[AnyArray, AnyArray, Array, Array]
 
 
@@ -107,13 +107,13 @@ def _make_round(
     start, end = in_piece(pieces.ends[:-1]), in_piece(pieces.ends[1:])
     middle, half = (start + end) / 2, (end - start) / 2
     tau = first = (t - middle) / half
-    # one vector of each coefficient: a gather that goes into the arithmetic
+    # One vector of each coefficient: a gather that goes into the arithmetic.
     c = [[in_piece(a) for a in power] for power in pieces.coefficients.transpose(1, 2, 0)]
     if image.corrections.any:
         numbers, rates = zip(*(value_and_rate(p, tau) for p in zip(*c)))
         moved = motion(numbers, [r / half for r in rates], pieces.origin)
         X = image.apparent_position(search.earth, moved, X)
-        # otherwise XLA recomputes it for each of the twelve sums below
+        # Otherwise XLA recomputes it for each of the twelve sums below.
         X = jax.lax.optimization_barrier(X)
     D = difference(X, pieces.origin)
     rsq = [[_component(n, D, i) for n in c] for i in range(3)]
@@ -136,9 +136,9 @@ def _make_round(
     tolerance = settings.position_tolerance
     settled = (step * step <= tolerance * (before + tolerance)) & (q < 0)
     if image.corrections.any:
-        # the sight refers to the time at the start of the round
+        # The sight refers to the time at the start of the round.
         settled &= jnp.abs(tau - first) < settings.sight_tolerance * line
-    # a root exactly at the end of a piece would alternate
+    # A root exactly at the end of a piece would alternate.
     reach = 1 + settings.piece_overlap * line
     settled &= ((tau >= -reach) | (piece == 0)) & ((tau <= reach) | (piece == last))
     return middle + tau * half, v, settled

@@ -118,6 +118,6 @@ def add_errors(image: PushbroomImage, errors: Errors) -> PushbroomImage:
 
 def _rotate_angles(angles: Float[AnyArray, "3"], error: Float[AnyArray, "3"]) -> Float[Array, "3"]:
     """The angles of R·exp([ε]×), nearest to the given ones."""
-    # angles give Rᵀ, and (R·exp([ε]×))ᵀ = exp([ε]×)ᵀ·Rᵀ
+    # Angles give Rᵀ, and (R·exp([ε]×))ᵀ = exp([ε]×)ᵀ·Rᵀ.
     M = matrix_from_rotation_vector(error).T @ matrix_from_omega_phi_kappa(angles)
     return omega_phi_kappa_near(M, angles)

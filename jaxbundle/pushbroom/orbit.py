@@ -47,7 +47,7 @@ def state_orbit(
         )
     states = np.empty((len(times), 6))
     tolerance = 1e-12  # relative: 1e-5 m in a revolution
-    # forward and backward from the epoch: `solve_ivp` integrates in one direction
+    # Forward and backward from the epoch: `solve_ivp` integrates in one direction.
     for part, order in ((times >= at, 1), (times < at, -1)):
         when = np.sort(times[part])[::order]
         if not len(when):
@@ -67,9 +67,9 @@ def state_orbit(
                 f"state: the orbit reaches the ground at {found.t_events[0][0]:.6g} s; check the "
                 "velocity, its unit and frame"
             )
-        # times need not be sorted, but those of the integration are
+        # Times need not be sorted, but those of the integration are.
         states[part] = found.y.T[np.searchsorted(order * when, order * times[part])]
-    # from the axes at the epoch to those that have turned since
+    # From the axes at the epoch to those that have turned since.
     back = Rotation.from_euler("z", -EARTH_RATE * (times - at)[:, None])
     P = back.apply(states[:, :3])
     return P, back.apply(states[:, 3:]) - np.cross(spin, P)

@@ -18,13 +18,13 @@ from jaxbundle.pushbroom.detector_line import slope_ahead
 from jaxbundle.pushbroom.pieces import sample
 from jaxbundle.pushbroom.prepared import ScannerGeometry, Search
 
-# start times [most, n]; their number, and whether the point is ahead of the last line, behind the
-# first, never above the horizon [n]
+# Start times [most, n]; their number, and whether the point is ahead of the last line, behind the
+# first, never above the horizon [n].
 Passages = tuple[Array, Array, Array, Array, Array]
 # F, its rate and the time of the previous step; the number of passages, less those passed over, and
 # their start times; F of the first step; whether the camera has been above the horizon
 PassagesState = tuple[Array, Array, Array, Array, tuple[Array, ...], Array, Array]
-# number and time of a step, twelve numbers and their rates there, (P, V)
+# Number and time of a step, twelve numbers and their rates there, (P, V).
 SearchStep = tuple[Array, Array, Array, Array, tuple[Vector, Vector]]
 
 
@@ -109,7 +109,7 @@ def _find_zeros(
     s = jnp.where((s > 0) & (s < 1), s, q / jnp.where(turns & (k != 0), k, 1.0))
     turn = a + s * (da + s * (h + s * k / 3))
     twice = turns & ((turn >= 0) != (a >= 0))
-    # a parabola on each side of the turn
+    # A parabola on each side of the turn.
     part = lambda end: jnp.sqrt(turn / jnp.where(twice, turn - end, 1.0))
     before, after = s * (1 - part(a)), s + (1 - s) * part(b)
     return once, twice, (jnp.where(once, straight, before), after)

@@ -47,7 +47,7 @@ TO_HALVES = np.array(
 )
 
 
-# start, end, coefficients
+# Start, end, coefficients.
 Piece = tuple[float, float, Float[np.ndarray, "4 12"]]
 # M (rows first) and m
 TwelveNumbers = Sequence[Scalar] | Float[AnyArray, "12 ..."]
@@ -86,11 +86,11 @@ def make_pieces(
             image, origin, left, right, (first, last), settings.times_at_once
         )
         wrong = np.abs(TO_CHECKS @ values - checks)
-        # turns act on the whole sight, shifts over its length
+        # Turns act on the whole sight, shifts over its length.
         error = per_radian * (wrong[..., :9].max((1, 2)) + wrong[..., 9:].max((1, 2)) / reach)
         good = error <= settings.piece_tolerance
         found += zip(left[good], right[good], TO_COEFFICIENTS @ values[good])
-        # a rough trajectory, or a wrong row, would be halved for ever
+        # A rough trajectory, or a wrong row, would be halved for ever.
         left, right = left[~good], right[~good]
         if len(left) and (right - left).min() < settings.min_piece * line:
             raise InputError(
@@ -101,7 +101,7 @@ def make_pieces(
         left, right = np.r_[left, middle], np.r_[middle, right]
     shared = len(found) <= settings.max_shared_pieces
     more = round_up(len(found)) - len(found) if shared else 0
-    # a half has the same polynomial: pieces that only fill up move no position
+    # A half has the same polynomial: pieces that only fill up move no position.
     found = _halve_some(found, more)
     coefficients = jnp.asarray(np.stack([piece[2] for piece in found]))
     return Pieces(
@@ -194,6 +194,6 @@ def _middle_sight(
     # Looking at the sky or into the ground: a kilometre serves to weigh turns against shifts.
     reach = s if np.isfinite(s) and s > 0 else 1e3
     period = float(image.times.time(1.0) - image.times.time(0.0))
-    # not zero: a camera may stand still
+    # Not zero: a camera may stand still.
     advance = max(float(np.linalg.norm(V)) * period / reach, 1e-12)
     return P + reach * np.array(d), reach, max(1 / float(per_pixel), 1 / advance)

@@ -148,7 +148,7 @@ def _interpolated_places(
     """Interpolated positions; none if they are not within the tolerance; None if the block is
     beside the image."""
     h = np.asarray(heights.middle) + HEIGHTS * np.asarray(heights.half)
-    # a terrain model without a height here
+    # A terrain model without a height here.
     if not np.isfinite(h).all():
         return None
     for every in (2, 1):
@@ -212,7 +212,7 @@ def _find_starts(
     image: PushbroomImage, search: Search, surface: GroundSurface, nodes: MapNodes
 ) -> Float[np.ndarray, "2 n n"] | None:
     """Positions of the nodes in a rigorous image; None if it sees none of them."""
-    # start values only: between the heights of terrain an image position moves by pixels
+    # Start values only: between the heights of terrain an image position moves by pixels.
     raised = nodes.X + np.asarray(_level(surface)) * nodes.up
     # Nodes up to 512 lines and pixels outside have positions too, so that they enclose its edges.
     found = project_points(image, search, raised.reshape(3, -1), margin=2.0 * BLOCK_SIZE)
@@ -233,7 +233,7 @@ def _scanner_places(
     line, pixel, ground = map(np.asarray, _places(scanner_of(image), search, nodes, height, starts))
     lost = np.isnan(line) & np.isfinite(ground[0])
     if lost.any():
-        # on a rough trajectory the interpolated start may not converge
+        # On a rough trajectory the interpolated start may not converge.
         line, pixel = line.copy(), pixel.copy()
         line[lost], pixel[lost] = _search(image, search, ground[:, lost], starts[0].size)
     return line, pixel
@@ -300,7 +300,7 @@ def _search(
         few = X[:, k : k + portion]
         n = few.shape[1]
         full = np.pad(few, ((0, 0), (0, portion - n)), mode="edge")
-        # of one shape, so that one program serves any number of points
+        # Of one shape, so that one program serves any number of points.
         found = project_points(image, search, full, margin=0.0)
         places[:, k : k + n] = np.asarray(found.line)[0, :n], np.asarray(found.pixel)[0, :n]
     return places
@@ -328,7 +328,7 @@ def _errors(
         true = _locate(truth, search, surface, line, pixel)
         return horizontal(east_north(surface, true), true, tuple(X))
 
-    # row by row: the state of a ray's traversal of terrain stays in the cache
+    # Row by row: the state of a ray's traversal of terrain stays in the cache.
     errors_of_row = lambda row: jax.vmap(error)(*row)
     return jnp.moveaxis(jax.lax.map(errors_of_row, (*places, ground)), -1, 0)
 
@@ -416,7 +416,7 @@ def _heights(surface: GroundSurface, nodes: MapNodes) -> BlockHeights:
     """Heights of the pixels of a block, NaN where the terrain has none."""
     height = _heights_of(surface, nodes)
     low, high = jnp.nanmin(height), jnp.nanmax(height)
-    # a metre on flat ground, whose position no range describes
+    # A metre on flat ground, whose position no range describes.
     return BlockHeights(height, (low + high) / 2, jnp.maximum((high - low) / 2, 1.0))
 
 

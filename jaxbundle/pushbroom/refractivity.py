@@ -55,7 +55,7 @@ def _pressure(
     """T and p at H in the layer that begins at `base`, with `numbers` jax.numpy or numpy."""
     exponent = GRAVITY / GAS_CONSTANT
     T = temperature + lapse * (H - base)
-    # both branches are computed, so that the one not chosen must not divide by zero
+    # Both branches are computed, so that the one not chosen must not divide by zero.
     power = -exponent / numbers.where(lapse == 0, 1.0, lapse)
     return T, pressure * numbers.where(
         lapse == 0, numbers.exp(-exponent * (H - base) / temperature), (T / temperature) ** power
@@ -81,7 +81,7 @@ def refractivity(height: Scalar) -> tuple[Scalar, Scalar]:
     From −5 km on. The ellipsoid stands for mean sea level: a geoid height of 50 m changes the
     refractivity by half a percent."""
     H = EARTH_RADIUS * height / (EARTH_RADIUS + height)
-    # comparisons: half the compilation of a search in the table
+    # Comparisons: half the compilation of a search in the table.
     layer = sum((H >= base).astype(int) for base in BASES[1:])
     T, p = _pressure(H, *(jnp.asarray(a)[layer] for a in (BASES, TEMPERATURES, LAPSES, PRESSURES)))
     density = p / (GAS_CONSTANT * T)

@@ -48,7 +48,7 @@ def resample_pixels(
     inside = (row >= -0.5) & (row <= rows - 0.5) & (column >= -0.5) & (column <= columns - 0.5)
     match kind:
         case "nearest":
-            # half to even: on the border of two pixels either serves
+            # Half to even: on the border of two pixels either serves.
             i, j = jnp.round(row).astype(int), jnp.round(column).astype(int)
             value = pixels[jnp.clip(i, 0, rows - 1), jnp.clip(j, 0, columns - 1)]
             value = value.astype(working_type(pixels.dtype))
@@ -82,7 +82,7 @@ def _convolve(
     i, j = jnp.floor(row), jnp.floor(column)
     of = lambda place: [jnp.asarray(w)[..., None] for w in weights(place.astype(working))]
     down, right = of(jnp.asarray(row - i)), of(jnp.asarray(column - j))
-    # the index of a position that is NaN must be valid; its weights keep the value NaN
+    # The index of a position that is NaN must be valid; its weights keep the value NaN.
     i, j = (jnp.nan_to_num(v).astype(jnp.int32) - before for v in (i, j))
     flat = pixels.reshape(-1, bands)
     lines = [jnp.clip(i + k, 0, rows - 1) * columns for k in range(len(down))]

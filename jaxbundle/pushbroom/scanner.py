@@ -42,7 +42,7 @@ class LineTimes(eqx.Module):
         """The line of a time."""
         if self.table is None:
             return (t - self.first) / self.period
-        # the inverse of `_interpolate`, continued in the same way beyond the ends
+        # The inverse of `_interpolate`, continued in the same way beyond the ends.
         rows = jnp.searchsorted(self.table, t, side="right") - 1
         row = jnp.clip(rows, 0, len(self.table) - 2)
         start, end = self.table[row], self.table[row + 1]

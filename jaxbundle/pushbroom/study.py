@@ -174,12 +174,12 @@ def accuracy_table(
         angles = {axis: flight.angles[axis] for axis in axes if axis in flight.angles}
         varied = dataclasses.replace(quiet, angles=angles)
         truth = true_image(varied)
-        # without noise only the interpolation of the samples errs
+        # Without noise only the interpolation of the samples errs.
         for method in FLOORS:
             image = measured_image(dataclasses.replace(varied, attitude_interpolation=method))
             errors = ground_errors(image, truth, surface, all_lines, all_pixels)
             length = np.linalg.norm(errors, axis=1)
-            # where a ray meets the surface, as of `GroundAccuracy`
+            # Where a ray meets the surface, as of `GroundAccuracy`.
             known = length[np.isfinite(length)]
             rms, ce90 = np.nan, np.nan
             if len(known):
@@ -191,7 +191,7 @@ def accuracy_table(
             counted = simulate_accuracy(image, surface, line, pixel, noise, draws, seed)
             exact = propagate_accuracy(image, surface, line, pixel, noise)
             level = closed_form(altitude, view, sigma, sigma, sigma)
-            # above a plane, near the nadir, errors along and across are almost alike
+            # Above a plane, near the nadir, errors along and across are almost alike.
             round_ = circular_error(np.eye(2) * level**2 / 2)
             erring.append(
                 Erring(

@@ -39,9 +39,9 @@ from jaxbundle.pushbroom.polynomial import value, value_and_rate
 from jaxbundle.pushbroom.surfaces import GroundSurface
 from jaxbundle.types import AnyArray, Numbers
 
-# column and row at which a cell begins, the heights of its corners z₀₀, z₀₁, z₁₀, z₁₁
+# Column and row at which a cell begins, the heights of its corners z₀₀, z₀₁, z₁₀, z₁₁.
 Cell = tuple[AnyArray, AnyArray, tuple[Array, ...]]
-# the coefficients of one coordinate in τ, from the constant upwards
+# The coefficients of one coordinate in τ, from the constant upwards.
 Parabola = Triple
 Path = tuple[Parabola, Parabola, Parabola]
 # τ, that of the hit (NaN: none), whether the last cell had no heights, whether the traversal ends
@@ -83,8 +83,8 @@ class Terrain(GroundSurface):
 
     def _slab(self, o: Vector, d: Vector) -> tuple[Scalar, Scalar]:
         """Where the ray enters and leaves the slab of all heights."""
-        # a metre wider: more than the 6e-6·h by which an ellipsoid with longer axes leaves the
-        # surface of height h
+        # A metre wider: more than the 6e-6·h by which an ellipsoid with longer axes leaves the
+        # surface of height h.
         highest, lowest = self.highest + 1.0, self.lowest - 1.0
         if self.earth is None:
             top = (highest - o[2]) / d[2]
@@ -92,7 +92,7 @@ class Terrain(GroundSurface):
             return jnp.maximum(top, 0), jnp.where(bottom > 0, bottom, jnp.nan)
         top = ray_to_ellipsoid(at_height(self.earth, highest), o, d)
         bottom = ray_to_ellipsoid(at_height(self.earth, lowest), o, d)
-        # a camera within the slab sees its top only behind the bottom
+        # A camera within the slab sees its top only behind the bottom.
         return jnp.where(top < bottom, top, 0.0), bottom
 
     def _path(self, o: Vector, d: Vector, top: Scalar, bottom: Scalar) -> Path:
@@ -109,7 +109,7 @@ def grid_place(
     x, y, h = X if earth is None else geodetic(earth, X)
     dx = x - origin[0]
     if earth is not None:
-        # a turn more or less: the grid may cross the date line
+        # A turn more or less: the grid may cross the date line.
         middle = step[0] * (columns - 1) / 2
         dx = dx - 2 * np.pi * jnp.round((dx - middle) / (2 * np.pi))
     return dx / step[0], (y - origin[1]) / step[1], h
@@ -137,7 +137,7 @@ def make_terrain(
     if not np.isfinite(heights).any():
         raise InputError("terrain: no valid height; give a model that covers the image")
     low, high = float(np.nanmin(heights)), float(np.nanmax(heights))
-    # infinite heights, as some files mark voids, would pass for terrain
+    # Infinite heights, as some files mark voids, would pass for terrain.
     heights = np.where(np.isfinite(heights), heights, np.nan)
     (x, y), (dx, dy) = origin, step
     return Terrain(
@@ -218,9 +218,9 @@ def _first_hit(path: Path, heights: Float[AnyArray, "rows columns"], over_voids:
             for t in (tau, middle, out)
         ]
         part = _first_root(*f)
-        # below the terrain where heights begin again: it was met in the void
+        # Below the terrain where heights begin again: it was met in the void.
         under = void & (f[0] < 0)
-        # a corner without height makes all of the cell NaN, so that the middle decides
+        # A corner without height makes all of the cell NaN, so that the middle decides.
         void = jnp.isnan(f[1])
         found = (part <= 1) & ~under
         done = found | under | (out >= 1) | _leaves(px, x, columns) | _leaves(py, y, rows)
@@ -259,7 +259,7 @@ def _first_root(f0: Scalar, fm: Scalar, f1: Scalar) -> Scalar:
     b = f1 - f0 - a
     discriminant = b * b - 4 * a * f0
     root = jnp.sqrt(jnp.maximum(discriminant, 0))
-    # of the two forms of a root the one without cancellation (Press et al., 2007, section 5.6)
+    # Of the two forms of a root the one without cancellation (Press et al., 2007, section 5.6).
     q = -(b + jnp.where(b < 0, -root, root)) / 2
     first = q / jnp.where(a == 0, jnp.nan, a)
     second = f0 / jnp.where(q == 0, jnp.nan, q)

@@ -197,7 +197,7 @@ class OrientedBlock:
             for point in first.values()
             if point.good.sum() > 1
         ]
-        # the median of a Rayleigh distribution (the length of two errors) is √(2·ln 2)·σ = 1.1774 σ
+        # The median of a Rayleigh distribution (the length of two errors) is √(2·ln 2)·σ = 1.1774 σ
         scale = max(1.0, float(np.median(np.concatenate(off))) / 1.1774) if off else 1.0
         if scale == 1.0:
             return first

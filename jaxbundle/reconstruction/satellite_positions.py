@@ -42,7 +42,7 @@ def find_positions(
             f"satellite positions of {there} photographs are not used: they need "
             "heights, three photographs, and a system of control in metres",
         ]
-    # a system without a name is taken for the UTM zone of the positions, unless it is far from them
+    # A system without a name is taken for the UTM zone of the positions, unless it is far from them
     if not control.system:
         away = np.nanmedian(positions.X, 0) - np.median(control.points.position, axis=0)
         distance = float(np.hypot(*away[:2]))

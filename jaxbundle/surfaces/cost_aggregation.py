@@ -46,7 +46,7 @@ def _sweep(
             path = np.minimum(came, least + large)
             np.minimum(path[:, 1:], came[:, :-1] + small, out=path[:, 1:])
             np.minimum(path[:, :-1], came[:, 1:] + small, out=path[:, :-1])
-            # min L(p') is subtracted: it changes no decision, and without it L grows with the path
+            # Min L(p') is subtracted: it changes no decision, and without it L grows with the path.
             path += line - least
         out += path
         before = path

@@ -99,7 +99,7 @@ def _match_piece(
     u0, v0, u1, v1 = window
     row, column, uv = guide.good_nodes()
     inside = (uv >= [u0, v0]).all(1) & (uv <= [u1, v1]).all(1)
-    # fewer nodes do not determine a direction of epipolar lines and a range: the corner of an image
+    # Fewer nodes do not determine a direction of epipolar lines and a range: the corner of an image
     if inside.sum() < 5:
         return None
     uv = uv[inside]

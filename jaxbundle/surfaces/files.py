@@ -36,7 +36,7 @@ def write_cloud_csv(cloud: Cloud, path: str | Path) -> None:
 
 def _format_rows(cloud: Cloud, names: np.ndarray, part: slice) -> str:
     """Some points as lines of text: much faster than the csv library."""
-    # repr is the shortest text that reads back as the same number; σ need no more than 8 digits
+    # Repr is the shortest text that reads back as the same number; σ need no more than 8 digits.
     exact = lambda a: ("" if x != x else repr(x) for x in a.tolist())
     short = lambda a: ("" if x != x else f"{x:.8g}" for x in a.tolist())
     C = cloud.covariance[part]

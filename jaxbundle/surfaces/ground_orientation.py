@@ -87,7 +87,7 @@ def scanner_orientation(
     jitter = any(" jitter " in name for name in of("image", id))
     look = {"across": 0, "along": 0}
     for word in look:
-        # coefficients are counted by their largest exponent: lower ones may be held, and not listed
+        # Coefficients are counted by their largest exponent: lower ones may be held, and not listed
         named = [name for name in of("sensor", sensor) if f"look angle {word}" in name]
         # One without a number is refused below, like all that is not known.
         exponents = [text for name in named if (text := name.rpartition("^")[2]).isdecimal()]

@@ -32,7 +32,7 @@ class HeightGrid:
     def __post_init__(self) -> None:
         for name in ("height", "sigma"):
             if isinstance(values := getattr(self, name), np.ma.MaskedArray):
-                # a masked cell has no height
+                # A masked cell has no height.
                 object.__setattr__(self, name, numeric_array(name, values, "numbers"))
 
     @property
@@ -72,8 +72,8 @@ class HeightGrid:
             else np.zeros_like(self.height)
             for axis in (0, 1)
         )
-        # rows go south. Beside a gap the slope is unknown: taken as level, since NaN would make all
-        # shared errors of the cell NaN
+        # Rows go south. Beside a gap the slope is unknown: taken as level, since NaN would make all
+        # shared errors of the cell NaN.
         return np.nan_to_num(np.stack([right, -down]))
 
 
@@ -144,11 +144,11 @@ class StatedSurfaceErrors:
         if self.vertical:
             modes.append(np.full((rows, columns), self.vertical))
         if self.horizontal:
-            # a surface moved by dx has at a place the height z(x − dx) = z − ∂z/∂x·dx
+            # A surface moved by dx has at a place the height z(x − dx) = z − ∂z/∂x·dx.
             modes += [-self.horizontal * slope for slope in grid.slopes()]
         if self.tilt:
-            # about the middle: about the origin of a map, 5000 km away, a tilt of 1e-6 would be a
-            # shift of 5 m
+            # About the middle: about the origin of a map, 5000 km away, a tilt of 1e-6 would be a
+            # shift of 5 m.
             east = grid.x + (np.arange(columns) + 0.5) * grid.size - self.middle[0]
             north = grid.y - (np.arange(rows) + 0.5) * grid.size - self.middle[1]
             both = (east, north[:, None])
@@ -202,7 +202,7 @@ class UncertainCells:
 
     def window(self, rows: slice, columns: slice) -> HeightGrid:
         """The cells of a part; slopes at its edges are those of the whole."""
-        # one cell more on each side, of which the differences at the edges are
+        # One cell more on each side, of which the differences at the edges are.
         wide = [
             slice(max(part.start - 1, 0), min(part.stop + 1, n))
             for part, n in zip((rows, columns), self.shape)
@@ -245,7 +245,7 @@ def place_of(grid: CellSource, lattice: CellSource) -> tuple[int, int]:
     **Raises:** `InputError` if they are not on one lattice.
     """
     at = (lattice.y - grid.y) / lattice.size, (grid.x - lattice.x) / lattice.size
-    # a hundredth of a cell over the whole grid
+    # A hundredth of a cell over the whole grid.
     longer = abs(grid.size / lattice.size - 1) * max(grid.shape)
     if longer > 0.01 or max(abs(v - round(v)) for v in at) > 0.01:
         raise InputError(

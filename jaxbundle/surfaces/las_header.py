@@ -121,7 +121,7 @@ def _check_compression(
     known = all(k in ITEMS and ITEMS[k][0] in (None, length) for k, length, _ in items)
     if not known or sum(length for _, length, _ in items) != row or not chunk:
         raise InputError(f"{path}: damaged: its compression does not fit points of {row} bytes")
-    # lazrs makes room for a whole chunk, of 50 000 points unless a program was told otherwise
+    # Lazrs makes room for a whole chunk, of 50 000 points unless a program was told otherwise.
     room = largest_unpacked_size(size, harmless=2**28)
     if chunk != VARIABLE_CHUNKS and chunk * row > room:
         raise InputError(f"{path}: damaged: chunks of {chunk} points in a file of {size} bytes")

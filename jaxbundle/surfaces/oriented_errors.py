@@ -92,7 +92,7 @@ class OrientedErrors:
             return False
         if one.root.shape != two.root.shape:
             return False
-        # unknowns have different units; W of the same covariance differs by roundings at most
+        # Unknowns have different units; W of the same covariance differs by roundings at most.
         scale = np.maximum(np.abs(one.root).max(1, initial=0.0), 1e-300)[:, None]
         return bool(np.allclose(one.root / scale, two.root / scale, rtol=0.0, atol=1e-6))
 
@@ -118,7 +118,7 @@ class OrientedErrors:
         for k, (view, mine) in enumerate(zip(self.errors.views, self.uses)):
             if mine:
                 used[:, k] = is_inside(view, view.project(X))
-        # a cell of one image has no height from it
+        # A cell of one image has no height from it.
         return used & (used.sum(1, keepdims=True) > 1)
 
     def _to_images(
@@ -152,8 +152,8 @@ def oriented_errors(chosen: ChosenImages, others: Set[str], system: str | None) 
             f"{chosen.path}: its images are on the Earth, the surface has no coordinate system; "
             "give it one (gdal_edit.py -a_srs)"
         )
-    # in the order of the project, and with those of the other surface: L of both then have the same
-    # columns, and the common part of an error leaves their difference
+    # In the order of the project, and with those of the other surface: L of both then have the same
+    # columns, and the common part of an error leaves their difference.
     kept = [view for view in chosen.views if view.name in (chosen.names | others)]
     errors = orientation_errors(kept)
     if not errors.uncertain:
@@ -162,5 +162,5 @@ def oriented_errors(chosen: ChosenImages, others: Set[str], system: str | None) 
             "scanners and RPC: pushbroom refine --out) and give the folder"
         )
     uses = tuple(view.name in chosen.names for view in kept)
-    # heights above a geoid are taken as they are: 100 m at 500 km change the effects by 2e-4
+    # Heights above a geoid are taken as they are: 100 m at 500 km change the effects by 2e-4.
     return OrientedErrors(errors, uses, chosen.around, horizontal_system(system))

@@ -46,7 +46,7 @@ class RasterCells:
         if self.sigma is not None:
             sigma = self.sigma.values(rows, columns)
         if self.more_sigma > 0:
-            # also of cells without σ of their own, which would else be unknown
+            # Also of cells without σ of their own, which would else be unknown.
             sigma = np.hypot(np.nan_to_num(sigma), self.more_sigma)
         x, y = self.x + columns.start * self.size, self.y - rows.start * self.size
         return HeightGrid(values, sigma, x, y, self.size, self.system)
@@ -57,7 +57,7 @@ class RasterCells:
         window = (top + rows.start, top + rows.stop), (left + columns.start, left + columns.stop)
         with open_raster(self.path) as source:
             values = read_values(self.path, source, band, window)
-            # whole numbers of decimetres are common: without scale and offset ten times as high
+            # Whole numbers of decimetres are common: without scale and offset ten times as high.
             return source.scales[band - 1] * values + source.offsets[band - 1]
 
     def part(self, rows: slice, columns: slice) -> "RasterCells":
@@ -80,7 +80,7 @@ class RasterCells:
         if own:
             with open_raster(path) as source:
                 names = list(source.descriptions)
-            # the first band contains the errors that the columns of L carry: they would count twice
+            # The first band contains the errors that the columns of L carry: they would count twice
             if OWN_SIGMA in names:
                 band = names.index(OWN_SIGMA) + 1
                 found = dataclasses.replace(found, band=band, without_orientation=True)

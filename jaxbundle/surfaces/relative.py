@@ -87,7 +87,7 @@ def align(
         step /= 2
         tries = best + step * np.arange(-2, 3)
     other.shift = tuple(first + best * across)
-    # twice: the first matches may start a pixel beside
+    # Twice: the first matches may start a pixel beside.
     for _ in range(2):
         rest = _median_offset(base, other, both, uv, q, across, settings)
         if rest is None:

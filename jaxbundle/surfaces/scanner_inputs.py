@@ -239,7 +239,7 @@ def read_grey(path: Path, pixels_at_once: int = 1 << 23) -> Grey:
     with open_raster(path) as source:
         bands = list(range(1, min(source.count, 3) + 1))
         plain = len(bands) < 3 and source.dtypes[0] in ("uint8", "uint16")
-        # red, green and blue in the luminance (ITU-R BT.601, two digits)
+        # Red, green and blue in the luminance (ITU-R BT.601, two digits).
         weights = np.array([0.3, 0.59, 0.11], np.float32)
         rows = max(1, pixels_at_once // source.width)
         check_pixels(path, source, bands)

@@ -341,7 +341,7 @@ def _match(
     bend: Float32[Array, " lanes"],
     correlation_length: int,
 ) -> tuple[Array, Array, Array, Array]:
-    # float32 at twice the speed: grey values have 8 bits, positions are needed to 1e-3 pixels
+    # float32 at twice the speed: grey values have 8 bits, positions are needed to 1e-3 pixels.
     match = lambda window, piece, start, bend: match_least_squares(
         window.astype(np.float32),
         piece.astype(np.float32),

@@ -184,7 +184,7 @@ def with_given_points_and_others(
     free[np.concatenate([rays.row, rays.row + 1])] = False
     others = np.flatnonzero(free)
     if components and len(others):
-        # control, priors, positions: their σ are not those of image points
+        # Control, priors, positions: their σ are not those of image points.
         shape = (rays.number, len(others))
         one = sp.csr_matrix((np.ones(len(others)), (others, np.arange(len(others)))), shape=shape)
         return [*components, ErrorComponent(OTHERS, "σ", one)]
@@ -249,7 +249,7 @@ def components_of(
         at = (rays.xy[here] - middle) / half
         if len(here) >= settings.min_points_of_field:
             components.append(_field(rays, here, at, f"field on the sensor{name}", settings))
-        # displacements at the edge of the measured area, x or y = 1, of size 1
+        # Displacements at the edge of the measured area, x or y = 1, of size 1.
         used, image = np.unique(rays.image[here], return_inverse=True)
         number, (x, y), one = len(used), at.T, np.ones(len(at))
         first, second = image, number + image
@@ -295,7 +295,7 @@ def stated_errors(
 
     **Raises:** `InputError` for an unknown name, or a size that is no number from 0 on.
     """
-    # nothing is estimated: any number of photographs will do
+    # Nothing is estimated: any number of photographs will do.
     settings = dataclasses.replace(settings, min_images=1, min_points_of_knot=0)
     components = error_components(found, problem, settings)
     theta, unknown = np.zeros(len(components) + 1), dict(sizes)
@@ -345,7 +345,7 @@ def root_of_octaves(settings: CorrelationSettings) -> Float[np.ndarray, "splines
     """R with B·R·(B·R)ᵀ the sum of all octaves, B: the finest splines, of which those of octaves
     with half as many intervals are sums."""
     finest, *coarser = settings.octaves_of_knots
-    # a cubic spline between two knots is determined by four places
+    # A cubic spline between two knots is determined by four places.
     places = [np.linspace(0, 1, 4 * n) for n in finest]
     total = np.eye(finest[0] * finest[1])
     for octave in coarser:
@@ -388,7 +388,7 @@ def splines_of_point(
     are."""
     interval = np.clip(np.floor(place * (number - 3)), 0, number - 4)
     within = (place * (number - 3) - interval)[:, None]
-    # the first begins an interval before
+    # The first begins an interval before.
     values = np.asarray(cubic_splines(within, 4))[:, 0]
     return values, interval.astype(np.int32)[:, None] + np.arange(4, dtype=np.int32)
 
@@ -412,7 +412,7 @@ def _along_tracks(rays: ImageRows, scene: StationsAndPoints, reach: float) -> Er
     for k in np.unique(count[count > 1]):
         of = order[start[count == k][:, None] + np.arange(k)]
         image = rays.image[of]
-        # a root of each block by its eigenvalues: two images of one station are one
+        # A root of each block by its eigenvalues: two images of one station are one.
         apart = np.linalg.norm(station[image][:, :, None] - station[image][:, None], axis=3)
         w, E = np.linalg.eigh(wendland(apart / (reach * depth)))
         root = E * np.sqrt(np.clip(w, 0, None))[:, None, :]

@@ -148,7 +148,7 @@ def _rotations_of_any_axes(
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]]:
     """R_X and R_Zᵀ of rotations about two axes or more."""
     one = np.eye(3)
-    # vec of rows: vec(R_A·W) = (R_A ⊗ 1)·vec W,  vec(R_X·R_B) = (1 ⊗ R_Bᵀ)·vec R_X
+    # vec of rows: vec(R_A·W) = (R_A ⊗ 1)·vec W,  vec(R_X·R_B) = (1 ⊗ R_Bᵀ)·vec R_X.
     rows = [
         w * np.hstack([np.kron(a[:3, :3], one), -np.kron(one, b[:3, :3].T)])
         for w, a, b in zip(np.sqrt(weight), A, B)

@@ -140,7 +140,7 @@ def _heights(text: str) -> tuple[float, float]:
         low, high = (float(part) for part in text.split(":"))
     except ValueError:
         low, high = 0.0, 0.0
-    # nan is not below
+    # NaN is not below.
     if not (low < high and abs(low) != float("inf") and high != float("inf")):
         raise InputError(
             f"--heights {text!r}: expected two numbers, the lower first, such as 0:3000"

@@ -41,7 +41,7 @@ def read_corners(path: str | Path, board: Board, image_size: Sequence[int]) -> B
     path, number = Path(path), len(require_board(board).ids)
     legend, views, reduced = None, {}, {}
     for row in TextRows(path):
-        # vnlog: the first line of one # is the legend, those of ## and #! are comments
+        # Vnlog: the first line of one # is the legend, those of ## and #! are comments.
         if row.text.startswith("#"):
             if legend is None and not row.text.startswith(("##", "#!")):
                 legend = row.text.lstrip("#").split()

@@ -52,7 +52,7 @@ class KeptCorners:
     def __init__(self, path: str | Path):
         self.path = path
         try:
-            # autocommit: a search result is on the disk before the next photograph is opened
+            # Autocommit: a search result is on the disk before the next photograph is opened.
             self._file = sqlite3.connect(path, isolation_level=None)
             self._file.executescript(TABLES)
         except SQLITE_ERRORS as error:

@@ -163,7 +163,7 @@ def _camera_section(camera: Camera) -> dict[str, Any]:
             "--model opencv"
         )
     fisheye = camera.model == "kannala-brandt"
-    # anipose itself reads five; the rational terms only where they are needed
+    # Anipose itself reads five; the rational terms only where they are needed.
     number = 4 if fisheye else len(OPENCV) if any(p[name] for name in OPENCV[5:]) else 5
     names = (EQUI if fisheye else OPENCV)[:number]
     return {

@@ -135,7 +135,7 @@ def _fisheye(
     equisolid: bool, p: UnifiedParameters, X: Scalar, Y: Scalar, Z: Scalar
 ) -> Float[Array, "2"]:
     V, F = p["V"], p["S"][0]
-    # homogeneous: a ray of 90° and beyond has Z ≤ 0
+    # Homogeneous: a ray of 90° and beyond has Z ≤ 0.
     a = p["fx"] * X + (p["cx"] - V[0]) * Z
     b = p["fy"] * Y + (p["cy"] - V[1]) * Z
     tangent = root(a * a + b * b)

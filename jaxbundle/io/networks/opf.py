@@ -71,7 +71,7 @@ from jaxbundle.system.file_content import beginning, check_plain
 
 SUFFIX = ".opf"
 
-# glTF: component types and the numbers of an element.
+# GlTF: component types and the numbers of an element.
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 LENGTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
@@ -278,7 +278,7 @@ def _shift(frame: JsonFields | None, told: list[str]) -> Float[np.ndarray, "3"]:
     """What positions have on top of the canonical coordinates."""
     if frame is None:
         return np.zeros(3)
-    # canonical = base·scale, exchanged where it is left-handed; positions have the shift on top
+    # Canonical = base·scale, exchanged where it is left-handed; positions have the shift on top.
     base = frame.child("base_to_canonical")
     scale = base.array("scale", (3,))
     if (scale != 1).any() or base.get("swap_xy"):
@@ -426,7 +426,7 @@ def _ranges(file: JsonFields, matches: JsonFields, n: int) -> tuple[np.ndarray, 
     pair = _accessor(file, matches.integer("pointIndexRanges"), "VEC2").astype(np.uint64)
     if len(pair) != n:
         raise InputError(f"{file.path}: {len(pair)} ranges of matches of {n} points")
-    # little-endian: the first of the two numbers of 32 bits is the low one
+    # Little-endian: the first of the two numbers of 32 bits is the low one.
     packed = pair[:, 0] | (pair[:, 1] << np.uint64(32))
     first = packed & np.uint64(2**40 - 1)
     return first.astype(np.int64), (packed >> np.uint64(40)).astype(np.int64)

@@ -108,7 +108,7 @@ def rectify(
             "rectified image"
         )
     z = z / np.linalg.norm(z)
-    # right-handed: x × y = z, whichever of both lies along the base
+    # Right-handed: x × y = z, whichever of both lies along the base.
     rows = [first, np.cross(z, first)] if k == 0 else [np.cross(first, z), first]
     R1 = np.stack([*rows, z])
     R2 = R1 @ R.T

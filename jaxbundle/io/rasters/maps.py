@@ -52,7 +52,7 @@ class MapSystem:
         if not self.transformer:
             return degrees
         x, y = (np.asarray(v) for v in self.transformer.transform(*degrees))
-        # pyproj gives infinity
+        # Pyproj gives infinity.
         return np.where(np.isfinite(x), x, np.nan), np.where(np.isfinite(y), y, np.nan)
 
     def unwrap(self, x: np.ndarray, middle: float) -> np.ndarray:

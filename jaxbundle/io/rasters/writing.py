@@ -172,7 +172,7 @@ class _Silence:
             self._blocks += 1
             if self._blocks == 1:
                 with suppress(OSError), open(os.devnull, "wb") as nowhere:
-                    # libtiff writes to the descriptor itself, past Python's sys.stderr
+                    # Libtiff writes to the descriptor itself, past Python's sys.stderr.
                     self._kept = os.dup(2)
                     os.dup2(nowhere.fileno(), 2)
 

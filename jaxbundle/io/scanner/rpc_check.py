@@ -121,7 +121,7 @@ def _compare(image: PushbroomImage, rpc: Rpc, sets: tuple[Corrections, ...]) -> 
 
 
 def _agree(found: Agreement, random_error: float) -> bool:
-    # the random error is per axis, the RMS of the length of both
+    # The random error is per axis, the RMS of the length of both.
     return found.rms_pixels <= SUBPIXEL or found.rms <= np.sqrt(2) * random_error
 
 

@@ -103,7 +103,7 @@ def _unpack(stream: IO[bytes]) -> BinaryIO:
     unpacked = tempfile.TemporaryFile()
     try:
         shutil.copyfileobj(stream, unpacked, 2**20)  # a megabyte at a time
-        # fromfile reads by the descriptor, past the buffer of Python
+        # Fromfile reads by the descriptor, past the buffer of Python.
         unpacked.flush()
     except BaseException:
         unpacked.close()

@@ -116,7 +116,7 @@ def parse_xml(path: str | Path, text: str) -> ET.Element:
     except DefusedXmlException:
         raise InputError(f"{path}: entities are not expected in this file") from None
     except (ParseError, ValueError) as error:
-        # expat's errors 3 and 5, no element found and unclosed token, are of an end too early
+        # Expat's errors 3 and 5, no element found and unclosed token, are of an end too early.
         early = ENDS_EARLY if text.strip() and getattr(error, "code", 0) in (3, 5) else ""
         raise InputError(f"{path}: not valid XML: {error}{early}") from None
     except RecursionError:

@@ -68,7 +68,7 @@ class ConjugateGradients(eqx.Module):
             y: Tangent, left: Tangent, tolerance: float, steps: int
         ) -> tuple[Tangent, Tangent]:
             """y refined with the residual `left`, if that decreases it; and the new residual."""
-            # lineax annotates a float, but accepts an array. 1e-300: a right-hand side of zeros
+            # Lineax annotates a float, but accepts an array. 1e-300: a right-hand side of zeros
             # has its solution at once, instead of 0/0.
             limit: Any = jnp.maximum(tolerance * optx.two_norm(left), 1e-300)
             method = lx.CG(rtol=0.0, atol=limit, norm=optx.two_norm, max_steps=steps)

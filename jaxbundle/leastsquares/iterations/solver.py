@@ -234,7 +234,7 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
         tags: frozenset[object],
         result: optx.RESULTS,
     ) -> tuple[Values, Any, dict[str, Any]]:
-        # optimistix ends the loop at non-finite unknowns before any step.
+        # Optimistix ends the loop at non-finite unknowns before any step.
         termination = jnp.where(_all_finite(y), state.termination, NOT_FINITE)
         stats = {
             "termination": termination,
@@ -269,7 +269,7 @@ class NoAdjoint(optx.AbstractAdjoint):
     def apply(
         self, primal_fn: Callable, rewrite_fn: Callable, inputs: tuple, tags: frozenset[object]
     ) -> Any:
-        # optimistix passes its own loop, which is bounded so that it can be differentiated.
+        # Optimistix passes its own loop, which is bounded so that it can be differentiated.
         loop = lambda cond, body, init, max_steps: jax.lax.while_loop(cond, body, init)
         return primal_fn((*inputs, loop))
 

@@ -169,7 +169,7 @@ def _products(
     at: Int[np.ndarray, "m k s"], values: Float[np.ndarray, "m k s"], none: int
 ) -> Float[np.ndarray, "m k k"]:
     """G·Gᵀ of sparse rows G of every cluster."""
-    # columns differ from cluster to cluster, but hardly so if counted from their first
+    # Columns differ from cluster to cluster, but hardly so if counted from their first.
     relative = np.where(at == none, none, at - at.min((1, 2), initial=none)[:, None, None])
     G, _ = _local(relative, values, none)
     return G @ G.transpose(0, 2, 1)

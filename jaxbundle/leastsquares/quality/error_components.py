@@ -307,7 +307,7 @@ class ErrorModel:
         a priori σ."""
         size = len(stack_rows(self.found, self.found.residuals))
         (n, k), found = rows.shape, np.zeros((*rows.shape, rows.shape[1]))
-        # so many columns have 80 MB for 100 000 rows
+        # So many columns have 80 MB for 100 000 rows.
         together = max(100 // k, 1)
         for first in range(0, n, together):
             some = rows[first : first + together]
@@ -393,7 +393,7 @@ def _traces(
     traces = Traces(F, found.problem.counts.redundancy)
     own: list[dict[str, np.ndarray]] = [{} for _ in F]
     exact = [root.shape[1] <= settings.max_columns for root in F]
-    # cubes of random combinations need the products of the others
+    # Cubes of random combinations need the products of the others.
     for k in sorted(range(len(F)), key=lambda k: not exact[k]):
         for n, columns in enumerate(_columns(F[k], settings, rng)):
             remaining, changes = remove_fit(found, columns)
@@ -506,5 +506,5 @@ def _covariance_of_forms(
     b = [remove_fit(found, V(u))[0] for V in of_parts]
     Sb = [sigma(x) for x in b]
     G = np.array([[np.sum(x * y) / draws for y in Sb] for x in b])
-    # twice the symmetric part: the factor 2 of the covariance
+    # Twice the symmetric part: the factor 2 of the covariance.
     return G + G.T

@@ -72,7 +72,7 @@ def effects(
     D = R·N⁻¹Aᵀ, of the rows R of the functions."""
     number = len(next(iter(rows.values())))
     size = sum(np.asarray(found.residuals[o.name]).size for o in found.problem.observations)
-    # without errors the residuals are −A·N⁻¹Rᵀ
+    # Without errors the residuals are −A·N⁻¹Rᵀ.
     return -_solve_columns(found, number, np.zeros((0, size)), rows)[0]
 
 
@@ -111,7 +111,7 @@ def _solve_columns(
     tables = [(t.name, t.rows, found.problem.sizes["table", t.name]) for t in found.problem.tables]
     none = {t.name: np.zeros((0, t.rows, t.space.width)) for t in found.problem.tables}
     for first in range(0, number, AT_ONCE):
-        # the last call is filled up, and tables to the sizes of the plan
+        # The last call is filled up, and tables to the sizes of the plan.
         some = lambda x, first=first: _fill(np.asarray(x)[first : first + AT_ONCE], AT_ONCE)
         given = {t: _fill(some(rows.get(t, none[t])), size, 1) for t, _, size in tables}
         left, changed = _solve(*found.arguments, found.factor, _unstack(found, some(errors)), given)

@@ -122,7 +122,7 @@ def sum_products(
             X = c.without_fit(np.concatenate([c.A, c.F], 2))
             A, F = X[:, :, :a], X[:, :, a:]
             h = datum.effects(c.Q, c.eliminated)
-            # rows of AᵀPW, FᵀPW and hᵀW, and of AᵀPVPW, in one product
+            # Rows of AᵀPW, FᵀPW and hᵀW, and of AᵀPVPW, in one product.
             left = [X, h]
             if c.V is not None:
                 VA, Vh = c.V @ A, c.V @ h
@@ -342,7 +342,7 @@ class ErrorProducts:
         """The blocks of eliminated rows, whose changes are α·e − β·z."""
         datum, p = self.datum, self.linear.A.shape[1]
         found = np.zeros((*datum.motions_eliminated.shape[:2], self.linear.Q.shape[1]))
-        # the last of A's places stands for none
+        # The last of A's places stands for none.
         T, C = (np.insert(np.insert(x, p, 0.0, 0), p, 0.0, 1) for x in (T, C))
         of_datum = np.arange(p + 1, len(T))
         for of in self.clusters:

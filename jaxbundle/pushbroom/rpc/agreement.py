@@ -53,16 +53,16 @@ def compare_with_rpc(
     lines and pixels, is the distance on the ground. NaN if no position has a point.
     """
     corner = (np.linspace(0, max(n - 2, 0), 5) for n in (image.lines, image.pixels))
-    # well inside the domain: towards its ends vendors' polynomials may be extrapolated
+    # Well inside the domain: towards its ends vendors' polynomials may be extrapolated.
     height = float(rpc.height_offset) + float(rpc.height_scale) * np.array([-0.5, 0.0, 0.5])
     line, pixel, h = (v.ravel() for v in np.meshgrid(*corner, height, indexing="ij"))
-    # each position, the next line, the next pixel
+    # Each position, the next line, the next pixel.
     lines = np.concatenate([line, line + 1, line])
     pixels = np.concatenate([pixel, pixel, pixel + 1])
     sights = _poses(image, lines), slopes_of(image.optics, pixels), np.tile(h, 3)
     agreements = []
     for corrections in sets:
-        # without `jit`: a program of two hundred points would be compiled for each set
+        # Without `jit`: a program of two hundred points would be compiled for each set.
         point = lambda pose, slopes, h, on=corrections: ground_point(
             pose, slopes, Height(level=h, earth=WGS84), on
         )

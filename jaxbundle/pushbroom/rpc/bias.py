@@ -72,7 +72,7 @@ def project_compensated(
     """Line and sample of one point, radians and metres, with the bias."""
     line, sample = project(rpc, longitude, latitude, height)
     terms = bias_terms(rpc, line, sample)
-    # scalars, as in `rpc`: `terms` are more than the coefficients of a lower degree
+    # Scalars, as in `rpc`: `terms` are more than the coefficients of a lower degree.
     return (
         line + sum(a * term for a, term in zip(bias.line, terms)),
         sample + sum(b * term for b, term in zip(bias.sample, terms)),
@@ -110,7 +110,7 @@ def fit_bias(
     sigma = np.broadcast_to(np.asarray(sigma, float), (n, 2))
     if (bad := ~(sigma > 0).all(1)).any():
         raise InputError(f"{source(int(bad.argmax()))}: σ must be positive, in pixels")
-    # snooping leaves out one point after the other: the next number of a program stays the same
+    # Snooping leaves out one point after the other: the next number of a program stays the same.
     more = round_up(n) - n
     padded = (np.pad(column, (0, more), mode="edge") for column in control[:3])
     computed, G = (np.asarray(a)[:n] for a in images_and_slopes(rpc, earth, *padded))
@@ -120,7 +120,7 @@ def fit_bias(
             "longitude, latitude, height and their order"
         )
     check_domain(rpc, control, source)
-    # with numbers of NumPy: JAX would compile every operation for each number of points
+    # With numbers of NumPy: JAX would compile every operation for each number of points.
     terms = np.stack(bias_terms(domain_of_bias(rpc), *computed.T), 1)[:, :k]
     singular = np.linalg.svd(terms, compute_uv=False)
     # 1e-6 of 10 000 pixels is a hundredth of a pixel: points so near a line do not fix its sides
@@ -197,9 +197,9 @@ def apply_bias(rpc: Rpc, bias: RpcBias) -> tuple[Rpc, RpcCheck | None]:
     line, sample = (np.asarray(a) for a in _compensated(rpc, bias, *place))
     _, l_hat, s_hat, *_ = bias_terms(rpc, l, s)
     reach = 1 + DOMAIN_MARGIN
-    # corners of the box of ground coordinates may be outside the image
+    # Corners of the box of ground coordinates may be outside the image.
     inside = np.flatnonzero((abs(l_hat) <= reach) & (abs(s_hat) <= reach))
-    # a multiple of 128 of the 1000 to 1728 points: most images share a compiled fit
+    # A multiple of 128 of the 1000 to 1728 points: most images share a compiled fit.
     number = max(len(inside) // 128 * 128, min(len(inside), 128))
     rows = inside[np.linspace(0, len(inside) - 1, number).astype(int)]
     table = RpcTable(*(np.asarray(column)[rows] for column in (*place, line, sample)))

@@ -257,7 +257,7 @@ def _check_table(table: RpcTable, source: Source) -> None:
 def _check_ranges(offsets: dict[str, float], source: Source) -> None:
     for name in RpcTable._fields:
         middle, half_range = offsets[f"{name}_offset"], offsets[f"{name}_scale"]
-        # of equal numbers no more than rounding is left, as of longitudes by whole turns
+        # Of equal numbers no more than rounding is left, as of longitudes by whole turns.
         if half_range <= 1e-12 * max(abs(middle), 1.0):
             degrees = "°" if name in ("longitude", "latitude") else ""
             raise InputError(
@@ -268,7 +268,7 @@ def _check_ranges(offsets: dict[str, float], source: Source) -> None:
 
 def _offsets(table: RpcTable) -> dict[str, float]:
     """Middle and half range of each column; longitudes and latitudes in degrees."""
-    # the mean direction: an area may cross the date line
+    # The mean direction: an area may cross the date line.
     mean = np.angle(np.mean(np.exp(1j * table.longitude)))
     east = np.degrees(mean + np.angle(np.exp(1j * (table.longitude - mean))))
     columns = {
@@ -311,12 +311,12 @@ def _fit_axis(
     """c [39], its covariance, σ in pixels, redundancy, τ, settled; y in units of `scale` pixels."""
     D = np.r_[np.full(4, settings.linear_damping), np.ones(UNKNOWNS - 4)]
     U, s, Vt = np.linalg.svd(np.hstack([T, -y[:, None] * T[:, 1:]]) / D, full_matrices=False)
-    # strongly damped: the linear equations weigh points by their denominators and may be far off
+    # Strongly damped: the linear equations weigh points by their denominators and may be far off.
     start_tau = max(s[0] * settings.start_ridge, ridge or 0.0)
     start = _solve_with_ridge(U, s, Vt, D, y, start_tau)
     c, tau, settled = found = _iterate(start, T, y, D, scale, ridge, settings)
     while ridge is None and not settled and tau < s[0] * CANDIDATE_RIDGES[0]:
-        # chosen by its linear prediction, it may be too small for the iteration to come to an end
+        # Chosen by its linear prediction, it may be too small for the iteration to come to an end.
         tau *= CANDIDATE_RIDGES[0] / CANDIDATE_RIDGES[1]
         c, _, settled = _iterate(start, T, y, D, scale, tau, settings)
     if not settled:
@@ -376,7 +376,7 @@ def _shorten(
 
     now = square(c)
     for _ in range(halvings):
-        # at the minimum the sum changes by rounding only: relative, and absolute of an exact fit
+        # At the minimum the sum changes by rounding only: relative, and absolute of an exact fit.
         after = square(c + step)
         if after < np.inf and after <= now * (1 + 1e-12) + 1e-28:
             return step

@@ -60,7 +60,7 @@ def locate_rpc_lines(
 ) -> Float[Array, "3 lines pixels"]:
     """The points of all pixels of all lines, Earth-fixed; NaN where a ray misses the surface."""
     at = _point_at(image.rpc, surface)
-    # row by row, like `locate_lines`
+    # Row by row, like `locate_lines`.
     of_line = lambda line: jax.vmap(lambda pixel: at(line, pixel)[0])(pixels)
     return jnp.moveaxis(jax.lax.map(of_line, lines), -1, 0)
 

@@ -126,7 +126,7 @@ def fit_inverse(rpc: Rpc, points: int = 6) -> InversePolynomial:
     L, P, H = (x.ravel() for x in jnp.meshgrid(*3 * [jnp.linspace(-1.0, 1.0, points)]))
     line, sample = jax.vmap(partial(_ratios, fixed))(L, P, H)
     A = jnp.stack(jnp.broadcast_arrays(*monomials(line, sample, H)), 1)
-    # a place where a denominator vanishes says nothing
+    # A place where a denominator vanishes says nothing.
     good = jnp.isfinite(A).all(1, keepdims=True)
     right = jnp.where(good, jnp.stack([L, P], 1), 0.0)
     coefficients, *_ = jnp.linalg.lstsq(jnp.where(good, A, 0.0), right)
@@ -172,7 +172,7 @@ def locate(
         one, nil = jnp.ones_like(place[0]), jnp.zeros_like(place[0])
         v, by_L = jax.jvp(misclosure, place, (one, nil))
         _, by_P = jax.jvp(misclosure, place, (nil, one))
-        # both with the Jacobian of the first
+        # Both with the Jacobian of the first.
         step = _solve(by_L, by_P, v)
         there = place[0] - step[0], place[1] - step[1]
         rest = _solve(by_L, by_P, misclosure(*there))
@@ -246,7 +246,7 @@ def locate_on(
         return (along(o, difference(seen, X), 1.0), (longitude, latitude, h, status)), None
 
     nothing = (jnp.zeros(()), jnp.zeros(()), jnp.zeros(()), jnp.zeros((), int))
-    # also of a surface that rises above the heights of the domain the first point is met
+    # Also of a surface that rises above the heights of the domain the first point is met.
     start = (along(top, d, -ABOVE_DOMAIN), nothing)
     # The ray is nearly parallel to the line of sight: a round leaves of the distance between both
     # only its product with the angle between them.
