@@ -247,7 +247,8 @@ def test_a_walk_grows_with_the_root_of_time_and_does_not_depend_on_the_times_ask
 
 
 @pytest.mark.parametrize("given, words", [
-    ({"roll_period": 0.0}, "roll_period is 0; expected a number above 0"), ({"roll_walk": -1}, "at least 0"),
+    ({"roll_period": 0.0}, "roll_period is 0; expected a number above 0"),
+    ({"roll_walk": -1}, "at least 0"),
     ({"end_latitude": 91.0, "track": PLACES}, "from -90 to 90"),
     ({"resampling": "spline"}, "resampling is 'spline'"), ({"start_x": 1.0}, "start_X"),
     ({"end_X": 300.0, "end_Y": 200.0}, "same place"),
