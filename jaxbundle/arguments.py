@@ -40,9 +40,9 @@ def integer(name: str, value: Any, least: int = 1, most: int = LARGEST_INTEGER) 
     except TypeError:
         number = least - 1
     if not least <= number <= most:
-        last = "10⁹" if most == LARGEST_INTEGER else most
+        upper = "10⁹" if most == LARGEST_INTEGER else most
         raise InputError(
-            f"{name} must be a whole number from {least} to {last}, but is {show(value)}"
+            f"{name} must be a whole number from {least} to {upper}, but is {show(value)}"
         )
     return number
 
@@ -130,7 +130,7 @@ def numeric_array(name: str, values: Any, expected: str, truths: bool = False) -
     except (ValueError, TypeError):
         raise InputError(f"{name} must be {expected}, but its rows differ in length") from None
     if array.dtype.kind not in "biuf" or (array.dtype.kind == "b" and not truths):
-        raise InputError(f"{name} must be {expected}, but {_found(array)}")
+        raise InputError(f"{name} must be {expected}, but {_got(array)}")
     if isinstance(array, np.ma.MaskedArray):
         truth = array.dtype.kind == "b"
         array = np.ma.filled(array, False) if truth else np.ma.filled(array.astype(float), np.nan)
@@ -189,7 +189,7 @@ def _stacked_masks(values: Any) -> np.ma.MaskedArray | None:
     return None
 
 
-def _found(array: np.ndarray) -> str:
+def _got(array: np.ndarray) -> str:
     if array.shape == ():
         return f"is {show(array.item())}"
     kinds = {"U": "text", "S": "text", "c": "complex numbers", "b": "truth values"}

@@ -53,13 +53,13 @@ def describe(value: Any) -> str:
 def abbreviate(value: Any, depth: int = 0) -> str:
     """A value in less than a line."""
     if hasattr(value, "shape") and hasattr(value, "dtype"):
-        few = value.size <= SHOWN_ENTRIES and isinstance(value, np.ndarray | np.generic)
-        text = " ".join(str(value).split()) if few else f"{value.dtype}{[*value.shape]}"
+        short = value.size <= SHOWN_ENTRIES and isinstance(value, np.ndarray | np.generic)
+        text = " ".join(str(value).split()) if short else f"{value.dtype}{[*value.shape]}"
     elif isinstance(value, Mapping) and type(value).__repr__ is not describe:
         parts = [f"{k!r}: {abbreviate(value[k], depth + 1)}" for k in [*value][:SHOWN_ENTRIES]]
         text = f"{{{', '.join(_more(parts, len(value), depth))}}}"
     elif isinstance(value, tuple | list):
-        parts = [abbreviate(one, depth + 1) for one in value[:SHOWN_ENTRIES]]
+        parts = [abbreviate(name, depth + 1) for name in value[:SHOWN_ENTRIES]]
         text = "({})" if isinstance(value, tuple) else "[{}]"
         text = text.format(", ".join(_more(parts, len(value), depth)))
     elif dataclasses.is_dataclass(value) and not isinstance(value, type):

@@ -52,8 +52,8 @@ def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]):
 
 def derivative_along(function: Callable, data: PyTree, change: PyTree) -> PyTree:
     """The derivative of a function along a change of its data, None if there is no change."""
-    value, moved = eqx.filter_jvp(function, (data,), (change,))
-    return jax.tree.map(lambda x, d: jnp.zeros_like(x) if d is None else d, value, moved)
+    value, displaced = eqx.filter_jvp(function, (data,), (change,))
+    return jax.tree.map(lambda x, d: jnp.zeros_like(x) if d is None else d, value, displaced)
 
 
 def solve_dense(times: Callable, fixed: PyTree, b: PyTree) -> PyTree:

@@ -31,7 +31,7 @@ def import_on_use(package: dict, homes: dict[str, tuple[str, ...]]) -> tuple:
     def list_names() -> list[str]:
         from pkgutil import iter_modules  # likewise
 
-        rooms = {found.name for found in iter_modules(package["__path__"]) if found.ispkg}
+        rooms = {names.name for names in iter_modules(package["__path__"]) if names.ispkg}
         return sorted({*package, *module, *rooms})
 
     return get, list_names, [*module]

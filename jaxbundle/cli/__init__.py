@@ -55,7 +55,7 @@ def main(prepare: Callable[[], object] | None = None) -> None:
 
     `prepare`: called after parsing the arguments, before JAX computes anything.
     """
-    asked = sys.argv[1:2]
-    for command in asked if asked and asked[0] in COMMANDS else COMMANDS:
+    typed = sys.argv[1:2]
+    for command in typed if typed and typed[0] in COMMANDS else COMMANDS:
         import_command(command)
     run(prepare)

@@ -32,11 +32,11 @@ def accept_result(result: Any, criteria: Sequence[str] | None) -> "Acceptance | 
     return accept_known(result, criteria)
 
 
-def end_unmet(accepted: "Acceptance | None") -> None:
+def end_unmet(acceptance: "Acceptance | None") -> None:
     """End the command with a line for each criterion that is not met.
 
     **Raises:** `typer.Exit` with status 4 if there are any."""
-    if accepted is not None and not accepted.met:
-        for line in accepted.unmet:
+    if acceptance is not None and not acceptance.met:
+        for line in acceptance.unmet:
             print(f"jaxbundle: {line}", file=sys.stderr)
         raise typer.Exit(NOT_ACCEPTED)

@@ -134,15 +134,15 @@ def adjust(  # noqa: PLR0913 - the options of the command
 
     jaxbundle.use_cores(cores)
     judged = CertificateOptions(accept, certificate, details, lengths)
-    written = is_in_file(json, out, html, save, certificate, gis)
-    print_report = json != "-" and not (quiet and written)
+    has_file = is_in_file(json, out, html, save, certificate, gis)
+    print_report = json != "-" and not (quiet and has_file)
     if join or cluster:
         if json in ("-", "/dev/stdout", "/dev/fd/1"):
             raise InputError(
                 f"--json {json} with --join or --cluster: give a file; the connection "
                 "of the processes is reported on standard output"
             )
-        first = join_for_one_task(
+        is_first_process = join_for_one_task(
             join,
             cluster,
             quiet,
@@ -163,7 +163,7 @@ def adjust(  # noqa: PLR0913 - the options of the command
             budget,
             check,
         )
-        if not first:
+        if not is_first_process:
             # Only the first process writes, though all compute.
             json, out, html, save, quiet, print_report = "", None, "", "", True, False
             judged, gis, crs = CertificateOptions(), "", ""
@@ -173,7 +173,7 @@ def adjust(  # noqa: PLR0913 - the options of the command
     check_test(snooping, significance, "--")
     if correlated is None:
         correlated = network.observations.sigma_origin == ESTIMATED
-    held = held_of(budget, network)
+    held_sigma = held_of(budget, network)
     # Before an adjustment that may take hours.
     check_targets(input, network, json, out, control, force, html, save)
     files = network_files(input, network, control)
@@ -228,17 +228,17 @@ def adjust(  # noqa: PLR0913 - the options of the command
     except NotSolvedError as error:
         write_targets(error, json, out, brief, plots, force, html, origin)
         raise
-    found = sensitivity(result, held) if held and result.converged else None
+    effects = sensitivity(result, held_sigma) if held_sigma and result.converged else None
     judgement = judge.judge(result, origin)
-    more = BudgetSupplement(found, judgement)
+    supplement = BudgetSupplement(effects, judgement)
     with staging(quiet or json == "-") as show:
-        write_targets(result, json, out, brief, plots, force, html, origin, more, show)
+        write_targets(result, json, out, brief, plots, force, html, origin, supplement, show)
         judge.write(judgement)
         write_gis(result, gis, crs)
     if save and result.converged:
         result.save(save)
     if print_report and result.converged:
-        print(report_with(result, more, origin.computed))
+        print(report_with(result, supplement, origin.computed))
         for doubt in result.doubts:
             print(f"warning: {doubt}")
     if not result.converged:

@@ -185,11 +185,11 @@ def choice(
         mean = f"; did you mean {folded[close[0]]!r}?" if close else ""
         raise InputError(f"{option.opts[0]} {value!r}: expected one of {listed}{mean}")
 
-    told = (f"{about}: {listed}" if about else listed) if listing else about
+    help_text = (f"{about}: {listed}" if about else listed) if listing else about
     complete = lambda: [word for word in words if word not in forms]
     if argument:
-        return typer.Argument(help=told, callback=check, autocompletion=complete)
-    return typer.Option(*names, help=told, callback=check, autocompletion=complete)
+        return typer.Argument(help=help_text, callback=check, autocompletion=complete)
+    return typer.Option(*names, help=help_text, callback=check, autocompletion=complete)
 
 
 Format = Annotated[str | None, choice(FORMATS, "input format, if not recognised")]
@@ -200,8 +200,8 @@ def model_choice(about: str) -> Any:
     return choice(CAMERA_MODELS, about, forms=MODEL_FAMILIES, listing=False)
 
 
-def _version(asked: bool) -> None:
-    if asked:
+def _version(is_wanted: bool) -> None:
+    if is_wanted:
         print(f"jaxbundle {jaxbundle.__version__}")
         raise typer.Exit
 
@@ -252,8 +252,10 @@ def run(prepare: Callable[[], object] | None = None) -> None:
         # Usage errors of the command line itself (unknown option, missing argument).
         if message := getattr(error, "format_message", None):
             context = getattr(error, "ctx", None)
-            said = message() if message().endswith((".", "?")) else f"{message()}."
-            _end(f"{said} See {context.command_path} --help." if context else said, BAD_INPUT)
+            sentence = message() if message().endswith((".", "?")) else f"{message()}."
+            _end(
+                f"{sentence} See {context.command_path} --help." if context else sentence, BAD_INPUT
+            )
         traceback.print_exc()
         leave(1)
     sys.exit(status)
@@ -279,12 +281,12 @@ def _describe_system_error(error: OSError) -> str:
 
 
 def _describe_shortage(error: BaseException) -> str:
-    said = " ".join(str(error).split()).partition(" in function")[0]
-    if "not enough memory" in said:
-        return said
+    reason = " ".join(str(error).split()).partition(" in function")[0]
+    if "not enough memory" in reason:
+        return reason
     return (
         "not enough memory"
-        + (f" ({said})" if said else "")
+        + (f" ({reason})" if reason else "")
         + (
             f", {free_memory() / 1e9:.1f} GB are free: raise the limit (ulimit -v, that of the "
             "container), end other programs, or make the input smaller"

@@ -145,26 +145,29 @@ def batch(  # noqa: PLR0913 - the options of the command
 
     if not board and (square or marker is not None):
         raise InputError("--board is missing: COLUMNSxROWS, inner corners of a chessboard, as 9x6")
-    known = (
+    board_of_photographs = (
         board_given(board, square, kind, None, marker, dictionary, first_marker) if board else None
     )
     check_accept(accept, "batch")
     check_page(html, None, [*inputs, json_lines], force)
-    given = [*inputs, json_lines, *filter(None, (html, against and str(against)))]
-    check_outputs(table, summary, given, force)
-    asked = _made_of_lines(
+    files = [*inputs, json_lines, *filter(None, (html, against and str(against)))]
+    check_outputs(table, summary, files, force)
+    summary_options = _made_of_lines(
         {"--html": html, "--table": table, "--summary": summary, "--accept": accept}, json_lines
     )
-    columns = None if against is None else _read_against(against, bool(asked))
-    if not all(is_camera_stack(one) or known and is_photograph_folder(one) for one in inputs):
+    columns = None if against is None else _read_against(against, bool(summary_options))
+    if not all(
+        is_camera_stack(input_path) or board_of_photographs and is_photograph_folder(input_path)
+        for input_path in inputs
+    ):
         # Cameras already use the cores by threads; devices gain nothing.
         jaxbundle.use_cores()
-    compute, first = partial(run_batch, part=_part(part)), True
+    compute, is_first_process = partial(run_batch, part=_part(part)), True
     if join or cluster:
         if part:
             raise InputError("--part with --join or --cluster: each process computes its part")
         compute = run_joined
-        first = join_for_one_task(
+        is_first_process = join_for_one_task(
             join,
             cluster,
             quiet,
@@ -186,9 +189,9 @@ def batch(  # noqa: PLR0913 - the options of the command
             pixel_size,
             set,
         )
-        if not first:
+        if not is_first_process:
             # Only the first process writes, though all compute.
-            html, table, summary, accept, asked, quiet = "", None, None, None, [], True
+            html, table, summary, accept, summary_options, quiet = "", None, None, None, [], True
     elif not part:
         add_parts(json_lines)  # left by joined processes that were ended
     advise("run the same command again to resume")
@@ -203,7 +206,7 @@ def batch(  # noqa: PLR0913 - the options of the command
             snooping=None if snooping == "none" else snooping,
             significance=significance,
             correlated=correlated,
-            board=known,
+            board=board_of_photographs,
             rig=rig,
             pixel_size=pixel_size,
             settings=set or (),
@@ -214,13 +217,13 @@ def batch(  # noqa: PLR0913 - the options of the command
             progress=lambda _, done, total: bar.update(task, completed=done, total=total),
         )
     done = BatchRun(tuple(inputs), json_lines, counts)
-    accepted = None
-    if asked:
-        found = done.population
+    acceptance = None
+    if summary_options:
+        population = done.population
         # Read again, for the keys that now have results.
-        beside = {} if columns is None else read_against(columns, found.keys, str(against))
-        accepted = accept_result(found, accept)
-        write_outputs(found, beside, table, summary, accepted)
+        beside = {} if columns is None else read_against(columns, population.keys, str(against))
+        acceptance = accept_result(population, accept)
+        write_outputs(population, beside, table, summary, acceptance)
     if html:
         origin = trace_files(
             inputs,
@@ -242,38 +245,41 @@ def batch(  # noqa: PLR0913 - the options of the command
                 "--accept": "; ".join(accept or ()),
             },
         )
-        write_text(Path(html), compose_batch(found, origin, beside, addition_of(accepted)))
+        write_text(Path(html), compose_batch(population, origin, beside, addition_of(acceptance)))
     total, solved = done.statuses.total(), done.solved
-    said = ", ".join(f"{n} {status}" for status, n in done.statuses.most_common() if n)
+    counts_in_words = ", ".join(f"{n} {status}" for status, n in done.statuses.most_common() if n)
     if not quiet:
         print(done.report())
-        if accepted is not None:
-            print(f"\n{accepted}")
+        if acceptance is not None:
+            print(f"\n{acceptance}")
         if any(counts[status] for status in STATUSES_WITH_REASON):
             _print_reasons(inputs, json_lines)
-    if first and known:
+    if is_first_process and board_of_photographs:
         _name_unsearched(inputs, json_lines)
-    if first and total and not solved:
-        raise NotSolvedError(f"{json_lines}: none of {count(total, 'input')} has a result: {said}")
-    if first and quiet and solved < total:
+    if is_first_process and total and not solved:
+        raise NotSolvedError(
+            f"{json_lines}: none of {count(total, 'input')} has a result: {counts_in_words}"
+        )
+    if is_first_process and quiet and solved < total:
         print(
             f"jaxbundle: {json_lines}: {total - solved} of {count(total, 'input')} without a "
-            f"result: {said}",
+            f"result: {counts_in_words}",
             file=sys.stderr,
         )
-    end_unmet(accepted)
+    end_unmet(acceptance)
 
 
 def _made_of_lines(outputs: Mapping[str, object], json_lines: str) -> list[str]:
     """The options asked for whose files are made from the lines of results.
 
     **Raises:** `InputError` if these go to a pipe or a device, which cannot be read again."""
-    asked = [name for name, value in outputs.items() if value]
-    if asked and os.path.exists(json_lines) and not os.path.isfile(json_lines):
+    wanted_options = [name for name, value in outputs.items() if value]
+    if wanted_options and os.path.exists(json_lines) and not os.path.isfile(json_lines):
         raise InputError(
-            f"{asked[0]}: is made from the lines of --json-lines, but {json_lines} is no file"
+            f"{wanted_options[0]}: is made from the lines of --json-lines, but {json_lines} is no "
+            "file"
         )
-    return asked
+    return wanted_options
 
 
 def _print_reasons(inputs: Sequence[str], json_lines: str, max_reasons: int = 5) -> None:
@@ -288,25 +294,25 @@ def _print_reasons(inputs: Sequence[str], json_lines: str, max_reasons: int = 5)
         print(f'and {len(reasons) - max_reasons} more: see "error" in {json_lines}')
 
 
-def _name_unsearched(inputs: Sequence[str], json_lines: str, most: int = 5) -> None:
+def _name_unsearched(inputs: Sequence[str], json_lines: str, limit: int = 5) -> None:
     """Warn of photographs that results lack by a fault of the machine, with the reason."""
     from jaxbundle.batches.photographs import NOT_SEARCHED
     from jaxbundle.batches.run_on_files import result_rows
 
     rows = result_rows(inputs, json_lines) if os.path.isfile(json_lines) else ()
-    lost = [
+    unsearched = [
         f"{row['key']}/{name}: {row['photographs_not_used'][name]}"
         for row in rows
         for name in row.get(NOT_SEARCHED, ())
     ]
-    if lost:
-        were = "photograph was" if len(lost) == 1 else "photographs were"
-        more = [f"and {len(lost) - most} more: see {NOT_SEARCHED!r} in {json_lines}"]
+    if unsearched:
+        were = "photograph was" if len(unsearched) == 1 else "photographs were"
+        rest_of_list = [f"and {len(unsearched) - limit} more: see {NOT_SEARCHED!r} in {json_lines}"]
         print(
-            f"warning: {len(lost)} {were} not searched and missing from the results; run the "
+            f"warning: {len(unsearched)} {were} not searched and missing from the results; run the "
             "command again with --retry to search again",
-            *lost[:most],
-            *(more if len(lost) > most else []),
+            *unsearched[:limit],
+            *(rest_of_list if len(unsearched) > limit else []),
             sep="\n",
             file=sys.stderr,
         )
@@ -315,24 +321,24 @@ def _name_unsearched(inputs: Sequence[str], json_lines: str, most: int = 5) -> N
 def _reason(row: dict) -> str:
     """The error of a line, with its key unless it begins with the file."""
     key, error = row["key"], row["error"]
-    named = key.rpartition("/")[2] in error.partition(":")[0]
-    return error if named else f"{key}: {error}"
+    names_key = key.rpartition("/")[2] in error.partition(":")[0]
+    return error if names_key else f"{key}: {error}"
 
 
-def _read_against(path: Path, asked: bool) -> "Columns":
+def _read_against(path: Path, has_use: bool) -> "Columns":
     """The table of `--against`, read whole before the run, for its errors."""
     from jaxbundle.batches.population import read_against
     from jaxbundle.io.text.csv_tables import read_csv
 
     table = read_csv(path)
-    if not asked:
+    if not has_use:
         raise InputError("--against: give --html, --table or --summary as well")
     read_against(table, table.ids("id") if "id" in table.values else (), str(path))
     return table
 
 
 def _part(text: str) -> tuple[int, int]:
-    found = re.fullmatch(r"\s*(\d{1,9})\s*/\s*(\d{1,9})\s*", text or "1/1")
-    if not found or not 1 <= int(found[1]) <= int(found[2]):
+    match = re.fullmatch(r"\s*(\d{1,9})\s*/\s*(\d{1,9})\s*", text or "1/1")
+    if not match or not 1 <= int(match[1]) <= int(match[2]):
         raise InputError(f"--part {text}: expected I/N, the I-th of N parts, such as 1/4")
-    return int(found[1]), int(found[2])
+    return int(match[1]), int(match[2])

@@ -45,37 +45,37 @@ def check_outputs(
 
 
 def write_outputs(
-    found: Population,
+    population: Population,
     against: Mapping[str, np.ndarray],
     table: Path | None,
     summary: Path | None,
-    accepted: "Acceptance | None" = None,
+    acceptance: "Acceptance | None" = None,
 ) -> None:
     """Write the requested files; with criteria, whether each input meets them."""
     if table is not None:
-        columns = found.table(against)
-        if accepted is not None:
-            columns["accepted"] = accepted.meets_all(found.keys.tolist())
+        columns = population.table(against)
+        if acceptance is not None:
+            columns["accepted"] = acceptance.meets_all(population.keys.tolist())
         if is_parquet(table):
             write_parquet(table, columns)
         else:
             empty = lambda x: "" if isinstance(x, float) and np.isnan(x) else x
             write_csv(table, list(columns), (tuple(map(empty, row)) for row in table_rows(columns)))
     if summary is not None:
-        document = found.summary(against)
-        if accepted is not None:
-            good = accepted.meets_all(found.keys.tolist())
-            document["acceptance"] = accepted.to_dict()
-            document["not_accepted"] = found.keys[~good].tolist()
+        document = population.summary(against)
+        if acceptance is not None:
+            good = acceptance.meets_all(population.keys.tolist())
+            document["acceptance"] = acceptance.to_dict()
+            document["not_accepted"] = population.keys[~good].tolist()
         text = json.dumps(without_nan(document), ensure_ascii=False, indent=1)
         write_text(summary, text + "\n")
 
 
-def addition_of(accepted: "Acceptance | None") -> Addition:
+def addition_of(acceptance: "Acceptance | None") -> Addition:
     """What criteria add to the page."""
-    if accepted is None:
+    if acceptance is None:
         return NO_ADDITION
     from jaxbundle.certificates.page import acceptance_section
 
-    finding = Finding("Acceptance", GOOD if accepted.met else BAD, accepted.sentence)
-    return NO_ADDITION._replace(findings=(finding,), sections=(acceptance_section(accepted),))
+    finding = Finding("Acceptance", GOOD if acceptance.met else BAD, acceptance.sentence)
+    return NO_ADDITION._replace(findings=(finding,), sections=(acceptance_section(acceptance),))

@@ -26,7 +26,7 @@ def board_given(
     columns, rows = _size(board)
     if not square:
         raise InputError("--square is missing: the side of a square, or the spacing of circles")
-    across, down = _spacing(square)
+    column_spacing, row_spacing = _spacing(square)
     circles = ("circles", "asymmetric-circles")
     for value, option, kinds in (
         (diameter, "--diameter", circles),
@@ -36,14 +36,16 @@ def board_given(
             raise InputError(f"{option} is not for --kind {kind}, but for {' and '.join(kinds)}")
     if first_marker and kind not in ("charuco", "aprilgrid"):
         raise InputError(f"--first-marker is not for --kind {kind}, but for charuco and aprilgrid")
-    return Board(columns, rows, across, kind, diameter, marker, dictionary, down, first_marker)
+    return Board(
+        columns, rows, column_spacing, kind, diameter, marker, dictionary, row_spacing, first_marker
+    )
 
 
 def _size(text: str) -> tuple[int, int]:
-    found = re.fullmatch(r"\s*(\d{1,4})\s*[x×X,]\s*(\d{1,4})\s*", text)
-    if not found:
+    match = re.fullmatch(r"\s*(\d{1,4})\s*[x×X,]\s*(\d{1,4})\s*", text)
+    if not match:
         raise InputError(f"--board {text!r}: expected COLUMNSxROWS, such as 9x6")
-    return int(found[1]), int(found[2])
+    return int(match[1]), int(match[2])
 
 
 def _spacing(text: str) -> tuple[float, float | None]:

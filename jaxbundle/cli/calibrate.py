@@ -83,7 +83,9 @@ def calibrate(  # noqa: PLR0913 - the options of the command
 
     test = None if snooping == "none" else snooping
     check_test(test, significance, "--")
-    known = board_given(board, square, kind, diameter, marker, dictionary, first_marker)
+    board_of_photographs = board_given(
+        board, square, kind, diameter, marker, dictionary, first_marker
+    )
     cameras = _cameras(photos, camera)
     need_opencv()
     files = [path for paths in cameras.values() for path in photographs(paths)]
@@ -124,19 +126,19 @@ def calibrate(  # noqa: PLR0913 - the options of the command
     def compute(progress: Callable) -> tuple[Calibrations, Any]:
         if compared:
             ((name, photographed),) = cameras.items()
-            chosen = compare_models(
+            comparison = compare_models(
                 photographed,
-                known,
+                board_of_photographs,
                 models=compared,
                 folds=folds,
                 camera=name,
                 progress=progress,
                 **common,
             )
-            return Calibrations({name: chosen.suffices.calibration}), chosen
-        found = calibrate_cameras(
+            return Calibrations({name: comparison.suffices.calibration}), comparison
+        calibrations = calibrate_cameras(
             cameras,
-            known,
+            board_of_photographs,
             rig=rig,
             model=model,
             free=words(free) or None,
@@ -145,7 +147,7 @@ def calibrate(  # noqa: PLR0913 - the options of the command
             progress=progress,
             **common,
         )
-        return found, None
+        return calibrations, None
 
     CalibrationOutputs(
         COMMAND, [*cameras], files, settings, json, out, html, force, brief, quiet, plots,
@@ -158,8 +160,8 @@ def _check_compared(
     models: Sequence[str], cameras: Mapping[str, Sequence[str]], free: object, rig: bool
 ) -> None:
     """Refuse options that are incompatible with --models."""
-    for given, option in ((rig, "--rig"), (free, "--free"), (len(cameras) > 1, "--camera")):
-        if given:
+    for is_given, option in ((rig, "--rig"), (free, "--free"), (len(cameras) > 1, "--camera")):
+        if is_given:
             raise InputError(
                 f"--models compares the standard parameters of one camera: omit {option}"
             )
@@ -167,16 +169,18 @@ def _check_compared(
         raise InputError("--models: give at least two different models, such as opencv,brown")
 
 
-def _cameras(photos: Sequence[str] | None, named: Sequence[str] | None) -> dict[str, list[str]]:
+def _cameras(
+    photos: Sequence[str] | None, named_folders: Sequence[str] | None
+) -> dict[str, list[str]]:
     """Photographs by camera name, or all of one camera."""
-    if photos and named:
+    if photos and named_folders:
         raise InputError("give photographs either as arguments or by --camera NAME=PATTERN")
-    if not photos and not named:
+    if not photos and not named_folders:
         raise InputError(
             "no photographs: give files, patterns or folders, or --camera NAME=PATTERN"
         )
     cameras: dict[str, list[str]] = {}
-    for item in named or ():
+    for item in named_folders or ():
         name, equals, pattern = (part.strip() for part in item.partition("="))
         if not (name and equals and pattern):
             raise InputError(f"--camera {item}: expected NAME=PATTERN, such as left=left/*.jpg")

@@ -137,12 +137,14 @@ def calibrate_rig(  # noqa: PLR0913 - the options of the command
 
     test = None if snooping == "none" else snooping
     check_test(test, significance, "--")
-    known: Any = board
+    board_of_photographs: Any = board
     if board.endswith(".toml"):
         _check_alone(square, diameter, marker, first_marker, board)
     else:
-        known = board_given(board, square, kind, diameter, marker, dictionary, first_marker)
-    cameras = name_cameras(folders, alone=bool(wand))
+        board_of_photographs = board_given(
+            board, square, kind, diameter, marker, dictionary, first_marker
+        )
+    cameras = name_cameras(folders, allow_one=bool(wand))
     waved = wand_given(wand, wand_length, wand_sigma, wand_camera, cameras, unit, sigma_image)
     when = times_given(times, cameras) if times or synchronize else None
     need_opencv()
@@ -174,7 +176,7 @@ def calibrate_rig(  # noqa: PLR0913 - the options of the command
     def compute(progress: Callable) -> tuple[Calibrations, None]:
         rig = calibrate_together(
             {name: [folder] for name, folder in cameras.items()},
-            known,
+            board_of_photographs,
             fixed=fixed,
             mountings=mountings or None,
             wand=waved,
@@ -197,9 +199,12 @@ def calibrate_rig(  # noqa: PLR0913 - the options of the command
         )
         return Calibrations(rig.cameras, rig), None
 
-    others = [] if waved is None else [name for name in waved.markers if name not in cameras]
+    cameras_without_board = (
+        [] if waved is None else [name for name in waved.markers if name not in cameras]
+    )
     CalibrationOutputs(
-        COMMAND, [*cameras, *others], files, settings, json, out, html, force, brief, quiet, plots,
+        COMMAND, [*cameras, *cameras_without_board], files, settings, json, out, html, force, brief,
+        quiet, plots,
         judged=CertificateOptions(accept, certificate, details, lengths), models=[model],
     ).compute(compute)  # fmt: skip
 
@@ -225,63 +230,67 @@ def wand_given(
     )
 
     if not sources:
-        given = {"--wand-length": lengths, "--wand-sigma": sigma, "--wand-camera": files}
-        for option, value in given.items():
+        options_of_wand = {"--wand-length": lengths, "--wand-sigma": sigma, "--wand-camera": files}
+        for option, value in options_of_wand.items():
             if value:
                 raise InputError(f"{option}: is of a wand; give --wand NAME=VIDEO, too")
         return None
     if not lengths:
         raise InputError("--wand-length: the length of the wand is missing")
-    markers = dict(split_named(one, "NAME=VIDEO, NAME=FOLDER or NAME=FILE.csv") for one in sources)
+    markers = dict(
+        split_named(source, "NAME=VIDEO, NAME=FOLDER or NAME=FILE.csv") for source in sources
+    )
     if len(markers) < len(sources):
         raise InputError("--wand: two sources are given for one camera; expected one for each")
-    others = [name for name in markers if name not in cameras]
-    if others and not files:
+    cameras_without_board = [name for name in markers if name not in cameras]
+    if cameras_without_board and not files:
         raise InputError(
-            f"--wand-camera: there is no folder of camera {others[0]!r}, so that it sees no board; "
+            f"--wand-camera: there is no folder of camera {cameras_without_board[0]!r}, so that "
+            "it sees no board; "
             "expected its interior orientation, NAME=FILE"
         )
     return Wand(
         markers,
         lengths_given(lengths),
         sigma_of_length(sigma, unit, "--wand-sigma"),
-        cameras_by_name(files or (), others, "--wand-camera"),
+        cameras_by_name(files or (), cameras_without_board, "--wand-camera"),
         sigma_image,
     )
 
 
-def name_cameras(folders: Sequence[str], alone: bool = False) -> dict[str, str]:
+def name_cameras(folders: Sequence[str], allow_one: bool = False) -> dict[str, str]:
     """Folders by the name of the camera: that given, or that of the folder, with as many of the
-    folders above it as make the names unique; `alone`: one camera is enough."""
-    given: list[tuple[str, str]] = []
+    folders above it as make the names unique; `allow_one`: one camera is enough."""
+    names_and_folders: list[tuple[str, str]] = []
     for item in folders:
         name, equals, folder = item.partition("=")
-        named = equals and name and folder and not Path(item).exists()
-        given.append((name, folder) if named else ("", item))
-    for _, folder in given:
+        has_name = equals and name and folder and not Path(item).exists()
+        names_and_folders.append((name, folder) if has_name else ("", item))
+    for _, folder in names_and_folders:
         if not Path(folder).exists():
             raise InputError(
                 f"{folder}: no such folder; expected a folder of photographs for each camera"
             )
-    if len(given) < 2 and not alone:
+    if len(names_and_folders) < 2 and not allow_one:
         raise InputError(
             "a rig has at least two cameras: give a folder of photographs for each; for one camera "
             "use jaxbundle calibrate"
         )
-    paths = [Path(folder).resolve() for name, folder in given if not name]
+    paths = [Path(folder).resolve() for name, folder in names_and_folders if not name]
     parts = next(
         (n for n in range(1, 100) if len({p.parts[-n:] for p in paths}) == len({*paths})), 1
     )
-    found: dict[str, str] = {}
-    for name, folder in given:
-        own = name or "_".join(Path(folder).resolve().parts[-parts:])
-        if own in found:
+    folder_of: dict[str, str] = {}
+    for name, folder in names_and_folders:
+        unique_name = name or "_".join(Path(folder).resolve().parts[-parts:])
+        if unique_name in folder_of:
             raise InputError(
-                f"{folder}: camera {own!r} is given twice, the other is {found[own]}; expected a "
+                f"{folder}: camera {unique_name!r} is given twice, the other is "
+                f"{folder_of[unique_name]}; expected a "
                 "folder and a name of its own for each camera"
             )
-        found[own] = folder
-    return found
+        folder_of[unique_name] = folder
+    return folder_of
 
 
 def times_given(times: str, cameras: Mapping[str, str]) -> float | dict[str, float] | Path:
@@ -289,13 +298,13 @@ def times_given(times: str, cameras: Mapping[str, str]) -> float | dict[str, flo
     if not times:
         # Where `jaxbundle frames` writes it.
         tables = [Path(folder).parent / "frames.csv" for folder in cameras.values()]
-        found = next((table for table in tables if table.is_file()), None)
-        if found is None:
+        existing_table = next((table for table in tables if table.is_file()), None)
+        if existing_table is None:
             raise InputError(
                 f"--synchronize: there is no {tables[0]}; give --times: frames per second, or a "
                 "table with the columns camera, image, time"
             )
-        return found
+        return existing_table
     # First of all: the path of a table may have "=" or be a number.
     if Path(times).is_file():
         return Path(times)

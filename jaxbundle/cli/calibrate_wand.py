@@ -69,25 +69,31 @@ def calibrate_wand(  # noqa: PLR0913 - the options of the command
     # A video that is no video is reported by an error, not by messages of a codec.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    sources = dict(split_named(one, "NAME=VIDEO, NAME=FOLDER or NAME=FILE.csv") for one in markers)
+    sources = dict(
+        split_named(source, "NAME=VIDEO, NAME=FOLDER or NAME=FILE.csv") for source in markers
+    )
     if len(sources) < len(markers):
         raise InputError("two sources are given of one camera; expected one for each")
     check_json_target(json, [*sources.values(), *cameras])
-    known = cameras_by_name(cameras, list(sources))
+    known_cameras = cameras_by_name(cameras, list(sources))
     # What the files say is free was so in another adjustment: here it is given, unless asked for.
-    own = tuple(words(free))
-    for name, camera in known.items():
-        sigma = {parameter: s for parameter, s in camera.sigma.items() if parameter in own}
+    free_parameters = tuple(words(free))
+    for name, camera in known_cameras.items():
+        sigma = {
+            parameter: s for parameter, s in camera.sigma.items() if parameter in free_parameters
+        }
         observed = {
             parameter: camera.observed[parameter]
             for parameter in sigma
             if parameter in camera.observed
         }
-        known[name] = dataclasses.replace(camera, free=own, sigma=sigma, observed=observed)
+        known_cameras[name] = dataclasses.replace(
+            camera, free=free_parameters, sigma=sigma, observed=observed
+        )
     with staging(quiet or json == "-") as tell:
         result = jaxbundle.calibrate_wand(
             sources,
-            known,
+            known_cameras,
             lengths_given(length),
             sigma_length=sigma_of_length(sigma_length, unit),
             sigma_image=sigma_image,
@@ -110,22 +116,22 @@ def calibrate_wand(  # noqa: PLR0913 - the options of the command
         print_result(result, json, quiet)
 
 
-def sigma_of_length(given: float | None, unit: str, option: str = "--sigma-length") -> float:
+def sigma_of_length(sigma: float | None, unit: str, option: str = "--sigma-length") -> float:
     """σ of the lengths in their unit, 0.1 mm if not given.
 
     **Raises:** `InputError` if that is not known in this unit."""
     in_unit = {"m": 1e-4, "cm": 1e-2, "mm": 0.1}
-    if given is None and unit not in in_unit:
+    if sigma is None and unit not in in_unit:
         raise InputError(f"{option}: expected the σ of the lengths in {unit}")
-    return in_unit[unit] if given is None else given
+    return in_unit[unit] if sigma is None else sigma
 
 
-def split_named(given: str, expected: str) -> tuple[str, str]:
+def split_named(text: str, expected: str) -> tuple[str, str]:
     """A name and what is given of it."""
-    name, equals, rest = given.partition("=")
-    if not (name and equals and rest):
-        raise InputError(f"got {given!r}; expected {expected}")
-    return name, rest
+    name, equals, value = text.partition("=")
+    if not (name and equals and value):
+        raise InputError(f"got {text!r}; expected {expected}")
+    return name, value
 
 
 def cameras_by_name(files: Sequence[str], names: Sequence[str], option: str = "--cameras") -> dict:
@@ -133,41 +139,41 @@ def cameras_by_name(files: Sequence[str], names: Sequence[str], option: str = "-
     from jaxbundle.io import read_cameras
     from jaxbundle.network.columns import list_some
 
-    found = {}
-    for given in files:
-        name, equals, path = given.partition("=")
+    camera_of = {}
+    for text in files:
+        name, equals, path = text.partition("=")
         # A file whose path has "=" is meant as a whole.
-        if equals and not Path(given).exists():
+        if equals and not Path(text).exists():
             cameras = read_cameras(path)
             # The name in the file may be another one: which is meant must be clear.
             if len(cameras) != 1:
                 raise InputError(f"{path}: has {len(cameras)} cameras; expected one, {name!r}")
-            found[name] = cameras[0]
+            camera_of[name] = cameras[0]
         else:
-            found |= {camera.id: camera for camera in read_cameras(given)}
-    missing = [name for name in names if name not in found]
-    if missing:
+            camera_of |= {camera.id: camera for camera in read_cameras(text)}
+    missing_names = [name for name in names if name not in camera_of]
+    if missing_names:
         raise InputError(
-            f"{option}: no camera {missing[0]!r}; the files have "
-            f"{list_some(list(found)) or 'none'}; expected a camera of each name, or {option} "
-            f"{missing[0]}=FILE"
+            f"{option}: no camera {missing_names[0]!r}; the files have "
+            f"{list_some(list(camera_of)) or 'none'}; expected a camera of each name, or {option} "
+            f"{missing_names[0]}=FILE"
         )
-    return {name: found[name] for name in names}
+    return {name: camera_of[name] for name in names}
 
 
-def lengths_given(given: Sequence[str]) -> float | dict[tuple[str, str], float]:
+def lengths_given(texts: Sequence[str]) -> float | dict[tuple[str, str], float]:
     """A length, or lengths by their markers."""
     expected = "a length, or MARKER,MARKER=LENGTH for each"
     try:
-        if len(given) == 1 and "=" not in given[0]:
-            return float(given[0])
-        found = {}
-        for one in given:
-            pair, value = split_named(one, expected)
+        if len(texts) == 1 and "=" not in texts[0]:
+            return float(texts[0])
+        lengths = {}
+        for text in texts:
+            pair, value = split_named(text, expected)
             a, b = pair.split(",")
-            found[a.strip(), b.strip()] = float(value)
-        return found
+            lengths[a.strip(), b.strip()] = float(value)
+        return lengths
     except ValueError as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"--length: got {', '.join(given)}; expected {expected}") from None
+        raise InputError(f"--length: got {', '.join(texts)}; expected {expected}") from None

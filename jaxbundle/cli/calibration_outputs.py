@@ -113,11 +113,11 @@ class CalibrationOutputs:
                     bar.update(task, description="adjusting")
 
             with self._written_if_unsolved(origin):
-                found, compared = calibrate(tell)
+                calibrations, compared = calibrate(tell)
             bar.update(task, description="assessing accuracy")
-            judgement = judge.judge(found, origin)
+            judgement = judge.judge(calibrations, origin)
             report = self._write(
-                found,
+                calibrations,
                 compared,
                 origin,
                 judgement,
@@ -128,7 +128,7 @@ class CalibrationOutputs:
             judge.write(judgement)
         if report:
             print(report)
-        require_solved(found)
+        require_solved(calibrations)
         judge.end(judgement)
 
     @contextmanager
@@ -138,8 +138,8 @@ class CalibrationOutputs:
             yield
         except NotSolvedError as error:
             # A failure makes no folder, unless a file that was asked for belongs in it.
-            inside = name_inside(self.json, self.out) or name_inside(self.html, self.out)
-            place = self.out if inside else None
+            is_in_folder = name_inside(self.json, self.out) or name_inside(self.html, self.out)
+            place = self.out if is_in_folder else None
             page = partial(compose_failure, error, origin, KIND)
             with write_result(
                 self.json, unsolved_text(error), place, self.command, self.files, self.force,
@@ -150,68 +150,80 @@ class CalibrationOutputs:
 
     def _write(
         self,
-        found: Calibrations,
+        calibrations: Calibrations,
         compared: ModelComparison | None,
         origin: Origin,
         judgement: Any,
         show: Callable[[str, int, int], object],
     ) -> str:
         """Write the result; the report, unless nobody is to see it."""
-        document = calibrations_dict(found, self.brief) if self.json else {}
+        document = calibrations_dict(calibrations, self.brief) if self.json else {}
         if compared is not None and self.json:
             document["models"] = compared.to_dict()
         if judgement is not None and self.json:
             document |= judgement.json
         text = json_text(document) if self.json else ""
-        written = is_in_file(self.json, self.out, self.html, self.judged.certificate)
-        silent = self.json == "-" or (self.quiet and written)
+        has_file = is_in_file(self.json, self.out, self.html, self.judged.certificate)
+        is_silent = self.json == "-" or (self.quiet and has_file)
         # With a folder, the whole report is there: hundreds of lines.
-        whole = self.out is None or compared is not None
-        report = "" if silent else (compared or found).report() if whole else found.summary()
+        prints_report = self.out is None or compared is not None
+        report = (
+            ""
+            if is_silent
+            else (compared or calibrations).report()
+            if prints_report
+            else calibrations.summary()
+        )
         if report:
             report = head_line(origin) + report + ("" if judgement is None else judgement.text)
         if report and self.out is not None:
             report += f"\nReport: {self.out / REPORT}, as a page: {self.out / PAGE}"
         show("writing", 0, 1)
-        also = NO_ADDITION if judgement is None else judgement.addition
-        page = partial(compose_calibrations, found, origin, compared, also)
+        addition = NO_ADDITION if judgement is None else judgement.addition
+        page = partial(compose_calibrations, calibrations, origin, compared, addition)
         plots = self.plots and self.out is not None and can_plot()
         with write_result(
             self.json, text, self.out, self.command, self.files, self.force, self.html, page
         ) as new:
             if new is not None:
-                fill_calibrations(found, new, plots, origin, compared, show)
+                fill_calibrations(calibrations, new, plots, origin, compared, show)
                 if compared is not None:
                     fill_comparison(compared, new, plots, show)
                 if judgement is not None:
                     judgement.fill(new)
-                    _add_judgement(found, judgement, new, page())
+                    _add_judgement(calibrations, judgement, new, page())
         return report
 
 
-def _add_judgement(found: Calibrations, judgement: Any, folder: Path, page: Iterable[str]) -> None:
+def _add_judgement(
+    calibrations: Calibrations, judgement: Any, folder: Path, page: Iterable[str]
+) -> None:
     """The page, the numbers and the report of a folder with the judgement of the result."""
     write_text(folder / PAGE, page)
-    numbers = calibrations_dict(found) | judgement.json
+    numbers = calibrations_dict(calibrations) | judgement.json
     write_text(folder / RESULT, json_text(numbers))
     report = (folder / REPORT).read_text(encoding="utf-8")
     write_text(folder / REPORT, report + judgement.text)
 
 
-def require_solved(found: Calibrations) -> None:
+def require_solved(calibrations: Calibrations) -> None:
     """Refuse calibrations of which one has no solution.
 
     **Raises:** `NotSolvedError`."""
-    failed = [name for name, one in found.cameras.items() if not one.converged]
+    failed = [
+        name for name, calibration in calibrations.cameras.items() if not calibration.converged
+    ]
     if failed:
-        names = found.cameras[failed[0]].adjustment.undetermined
-        what = f"; not determined: {', '.join(names[:12])}" if names else ""
-        others = count(len(failed) - 1, "other camera")
-        more = f"; {others} not solved either: {', '.join(failed[1:])}"
+        names = calibrations.cameras[failed[0]].adjustment.undetermined
+        undetermined = f"; not determined: {', '.join(names[:12])}" if names else ""
+        number_of_others = count(len(failed) - 1, "other camera")
+        others_in_words = f"; {number_of_others} not solved either: {', '.join(failed[1:])}"
         raise NotSolvedError(
-            f"not solved: camera {failed[0]}: {found.cameras[failed[0]].adjustment.termination}"
-            f"{what}; free fewer parameters (--free), or take photographs from more directions"
-            f"{more if len(failed) > 1 else ''}"
+            f"not solved: camera {failed[0]}: "
+            f"{calibrations.cameras[failed[0]].adjustment.termination}"
+            f"{undetermined}; free fewer parameters (--free), or take photographs from more "
+            "directions"
+            f"{others_in_words if len(failed) > 1 else ''}"
         )
 
 
@@ -220,10 +232,11 @@ def check_names(cameras: Iterable[str]) -> None:
     folders: dict[str, str] = {}
     for name in cameras:
         # Some systems do not tell the letters of a name from capitals.
-        other = folders.setdefault(file_name(name).casefold(), name)
-        if other != name:
+        earlier = folders.setdefault(file_name(name).casefold(), name)
+        if earlier != name:
             raise InputError(
-                f"--camera: {other!r} and {name!r} would have the same folder {file_name(name)!r}; "
+                f"--camera: {earlier!r} and {name!r} would have the same folder "
+                f"{file_name(name)!r}; "
                 "choose other names"
             )
 
@@ -233,15 +246,15 @@ def words(text: str) -> list[str]:
     return [word.strip() for word in text.split(",") if word.strip()]
 
 
-def values(given: Sequence[str] | None) -> dict[str, float]:
+def values(assignments: Sequence[str] | None) -> dict[str, float]:
     """Values by name, of NAME=VALUE."""
-    found = {}
-    for item in given or ():
+    numbers = {}
+    for item in assignments or ():
         name, equals, text = (part.strip() for part in item.partition("="))
         try:
-            found[name] = float(text)
+            numbers[name] = float(text)
         except ValueError:
             equals = ""
         if not equals:
             raise InputError(f"--given {item}: expected NAME=VALUE, such as fx=1200")
-    return found
+    return numbers

@@ -40,7 +40,7 @@ def camera(
         "image_size": pair("--image-size", image_size),
         "pixel_size": pair("--pixel-size", pixel_size),
     }
-    found: dict[str, CameraDescription] = {}
+    descriptions: dict[str, CameraDescription] = {}
     for file in files:
         calibration_given(file, sizes["image_size"])  # its warnings
         described = jaxbundle.camera(file, step=step, about_origin=about_origin, **sizes)
@@ -48,18 +48,25 @@ def camera(
             print(described.report())
         # Two files may have cameras of one name.
         id = described.camera.id
-        found[id if id not in found else f"{id} ({file})"] = described
+        descriptions[id if id not in descriptions else f"{id} ({file})"] = described
     if json:
-        put_json(json, {"cameras": [one.to_dict() for one in found.values()]})
+        put_json(
+            json, {"cameras": [description.to_dict() for description in descriptions.values()]}
+        )
     if plot is not None:
-        units = {one.unit for one in found.values()}
+        units = {description.unit for description in descriptions.values()}
         if len(units) > 1:
             raise InputError("--plot: cameras in mm and in pixels cannot share one figure")
         from jaxbundle.plotting.calibrations import radial_curves
 
-        reach = {name: math.hypot(*one.extent) / 2 for name, one in found.items()}
-        curves = {name: one.table(reach[name] / smooth) for name, one in found.items()}
+        reach = {
+            name: math.hypot(*description.extent) / 2 for name, description in descriptions.items()
+        }
+        curves = {
+            name: description.table(reach[name] / smooth)
+            for name, description in descriptions.items()
+        }
         write_png(plot, (6.5, 4.2), lambda ax: radial_curves(curves, units.pop(), ax))
     if csv is not None:
-        table = next(iter(found.values())).table()
+        table = next(iter(descriptions.values())).table()
         write_csv(csv, list(table), table_rows(table))

@@ -34,10 +34,10 @@ def pair(option: str, text: str) -> tuple[float, float] | None:
     if not text:
         return None
     try:
-        first, second = (float(word) for word in text.split(","))
+        x, y = (float(word) for word in text.split(","))
     except ValueError:
         raise InputError(f"{option} {text}: expected two numbers A,B") from None
-    return first, second
+    return x, y
 
 
 def write_png(path: Path, size: tuple[float, float], draw: Callable) -> None:

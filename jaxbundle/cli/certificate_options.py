@@ -53,7 +53,7 @@ class CertificateOptions(NamedTuple):
     @property
     def files(self) -> list[Path]:
         """The files that are read."""
-        return [one for one in (self.details, self.lengths) if one is not None]
+        return [file for file in (self.details, self.lengths) if file is not None]
 
 
 NOT_JUDGED = CertificateOptions()

@@ -82,7 +82,7 @@ def change(  # noqa: PLR0913 - the options of the command
     ]
     check_accept(accept, "change")
     check_writable(json, out, COMMAND, FILES, inputs, force)
-    found = jaxbundle.change(
+    result = jaxbundle.change(
         before,
         after,
         before_sigma=before_sigma,
@@ -100,21 +100,21 @@ def change(  # noqa: PLR0913 - the options of the command
         size=size,
     )
     with replace_folder(out, COMMAND, FILES, force) as folder:
-        write_change(found.change, folder / FILES[0], folder / FILES[1])
-        write_text(folder / FILES[2], json_text(found.to_dict()))
-        write_text(folder / FILES[3], found.report() + "\n")
-    print_result(found, json, quiet, accept)
+        write_change(result.change, folder / FILES[0], folder / FILES[1])
+        write_text(folder / FILES[2], json_text(result.to_dict()))
+        write_text(folder / FILES[3], result.report() + "\n")
+    print_result(result, json, quiet, accept)
 
 
-def _errors(option: str, given: list[str] | None) -> dict[str, float]:
+def _errors(option: str, assignments: list[str] | None) -> dict[str, float]:
     """σ by name."""
-    found = {}
-    for text in given or []:
+    errors = {}
+    for text in assignments or []:
         name, _, value = text.partition("=")
         try:
-            found[name] = float(value)
+            errors[name] = float(value)
         except ValueError:
             raise InputError(
                 f"{option} {text}: expected NAME=SIGMA, such as vertical=0.2"
             ) from None
-    return found
+    return errors

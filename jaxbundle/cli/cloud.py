@@ -50,10 +50,10 @@ def cloud(  # noqa: PLR0913 - the options of the command
     if (dsm is None) != (size is None):
         raise InputError("--dsm and --size: give both")
     check_accept(accept, "cloud")
-    inputs = [given for given in (file, against, check) if given is not None]
+    inputs = [input_file for input_file in (file, against, check) if input_file is not None]
     check_writable(json, None, "cloud", (), inputs, force)
     _check_targets(inputs, out, dsm, force)
-    found = jaxbundle.cloud(
+    result = jaxbundle.cloud(
         file,
         cube=cube,
         least=least,
@@ -66,11 +66,11 @@ def cloud(  # noqa: PLR0913 - the options of the command
         check=check,
         plane=plane,
     )
-    if dsm is not None and found.dsm is not None:
-        write_dsm(found.dsm, dsm, dsm.with_name(f"{dsm.stem}_sigma{dsm.suffix}"))
+    if dsm is not None and result.dsm is not None:
+        write_dsm(result.dsm, dsm, dsm.with_name(f"{dsm.stem}_sigma{dsm.suffix}"))
     if out is not None:
-        write_cloud(found.cloud, out)
-    print_result(found, json, accept=accept)
+        write_cloud(result.cloud, out)
+    print_result(result, json, accept=accept)
 
 
 # The beginning of a cloud, by its suffix.

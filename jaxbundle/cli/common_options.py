@@ -26,26 +26,26 @@ def add_common_options(function: Callable) -> Callable:
     """The function of a command with the options `quiet` and `verbose`. A function without a
     `quiet` parameter is silenced as a whole: standard error, and standard output if its result is
     in a file (`RESULT_FILES`)."""
-    given = inspect.signature(function)
-    own = "quiet" in given.parameters
-    added = {"verbose": Verbose} if own else {"quiet": Quiet, "verbose": Verbose}
+    signature = inspect.signature(function)
+    has_quiet = "quiet" in signature.parameters
+    options = {"verbose": Verbose} if has_quiet else {"quiet": Quiet, "verbose": Verbose}
 
     @functools.wraps(function)
     def command(**values: Any) -> Any:
-        talk, quiet = values.pop("verbose"), values["quiet"] if own else values.pop("quiet")
+        talk, quiet = values.pop("verbose"), values["quiet"] if has_quiet else values.pop("quiet")
         if talk and quiet:
             raise InputError("--quiet and --verbose: give one of them")
-        with _silent(values) if quiet and not own else _talking() if talk else _nothing():
+        with _silent(values) if quiet and not has_quiet else _talking() if talk else _nothing():
             return function(**values)
 
-    command.__annotations__ = {**function.__annotations__, **added}
+    command.__annotations__ = {**function.__annotations__, **options}
     parameters = [
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=kind)
-        for name, kind in added.items()
+        for name, kind in options.items()
     ]
-    whole = given.replace(parameters=[*given.parameters.values(), *parameters])
+    extended = signature.replace(parameters=[*signature.parameters.values(), *parameters])
     # Typer reads options from here, not from **values.
-    command.__dict__["__signature__"] = whole
+    command.__dict__["__signature__"] = extended
     return command
 
 
@@ -65,10 +65,12 @@ def is_in_file(*files: object) -> bool:
 @contextlib.contextmanager
 def _silent(values: dict) -> Iterator[None]:
     """Discard what is not the result; errors are printed afterwards."""
-    written = is_in_file(*(values.get(name) for name in RESULT_FILES))
-    shown = any(str(values.get(name)) == "-" for name in ("json", "csv"))
+    has_file = is_in_file(*(values.get(name) for name in RESULT_FILES))
+    prints_result = any(str(values.get(name)) == "-" for name in ("json", "csv"))
     with open(os.devnull, "w", encoding="utf-8", errors="replace") as nowhere:
-        silent = contextlib.redirect_stdout(nowhere) if written and not shown else _nothing()
+        silent = (
+            contextlib.redirect_stdout(nowhere) if has_file and not prints_result else _nothing()
+        )
         with contextlib.redirect_stderr(nowhere), silent:
             yield
 

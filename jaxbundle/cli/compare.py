@@ -45,15 +45,15 @@ def compare(  # noqa: PLR0913 - the options of the command
     from jaxbundle.io.text.csv_tables import table_rows, write_csv
 
     check_accept(accept, "compare")
-    check_json_target(json, (one.partition("#")[0] for one in (a, b)))
+    check_json_target(json, (source.partition("#")[0] for source in (a, b)))
     if is_saved_adjustment(a) or is_saved_adjustment(b):
         if plot is not None:
             raise InputError("--plot: of calibrations only; --csv writes the table")
-        found = jaxbundle.compare(a, b)
+        comparison = jaxbundle.compare(a, b)
     else:
         for file in (a, b):
             calibration_given(file)  # its warnings
-        found = jaxbundle.compare(
+        comparison = jaxbundle.compare(
             a,
             b,
             step=step,
@@ -63,11 +63,11 @@ def compare(  # noqa: PLR0913 - the options of the command
             pixel_size=pair("--pixel-size", pixel_size),
         )
     if csv is not None:
-        table = found.table()
+        table = comparison.table()
         write_csv(csv, list(table), table_rows(table))
-    if plot is not None and isinstance(found, CalibrationComparison):
+    if plot is not None and isinstance(comparison, CalibrationComparison):
         from jaxbundle.plotting.calibrations import difference_maps
 
-        size = (7.5, 6) if found.covariance is None else (14, 6)
-        write_png(plot, size, partial(difference_maps, found.images, found.covariance))
-    print_result(found, json, accept=accept)
+        size = (7.5, 6) if comparison.covariance is None else (14, 6)
+        write_png(plot, size, partial(difference_maps, comparison.images, comparison.covariance))
+    print_result(comparison, json, accept=accept)

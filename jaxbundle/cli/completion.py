@@ -44,11 +44,13 @@ def walk(command: Any, context: Any, words: tuple[str, ...]) -> Iterator[Command
     """All commands, from the program down."""
     options: dict[str, tuple[str, ...]] = {}
     flags, helps = set(), {}
-    below = dict(getattr(command, "commands", {}))
-    named = list(below)
+    subcommands = dict(getattr(command, "commands", {}))
+    words_after = list(subcommands)
     for parameter in command.get_params(context):
         if parameter.param_type_name != "option":
-            named += [i.value for i in parameter.shell_complete(context, "") if i.type == "plain"]
+            words_after += [
+                i.value for i in parameter.shell_complete(context, "") if i.type == "plain"
+            ]
             continue
         for name in (*parameter.opts, *parameter.secondary_opts):
             words_of = () if parameter.is_flag else parameter.shell_complete(context, "")
@@ -56,9 +58,11 @@ def walk(command: Any, context: Any, words: tuple[str, ...]) -> Iterator[Command
             helps[name] = (parameter.help or "").split("; ")[0]
             if parameter.is_flag:
                 flags.add(name)
-    yield CommandNode(words, tuple(named), options, frozenset(flags), helps)
-    for name, one in below.items():
-        yield from walk(one, type(context)(one, parent=context, info_name=name), (*words, name))
+    yield CommandNode(words, tuple(words_after), options, frozenset(flags), helps)
+    for name, subcommand in subcommands.items():
+        yield from walk(
+            subcommand, type(context)(subcommand, parent=context, info_name=name), (*words, name)
+        )
 
 
 def for_bash(nodes: list[CommandNode], zsh: bool = False) -> str:
@@ -77,20 +81,22 @@ def for_bash(nodes: list[CommandNode], zsh: bool = False) -> str:
         '  case "$way:$before" in',
     ]
     for node in nodes:
-        way = " ".join(node.words)
+        typed = " ".join(node.words)
         for name, words in node.options.items():
             if words:
-                lines.append(f"    {_quoted(f'{way}:{name}')}) words={_quoted(' '.join(words))} ;;")
+                lines.append(
+                    f"    {_quoted(f'{typed}:{name}')}) words={_quoted(' '.join(words))} ;;"
+                )
             elif name not in node.flags:
-                lines.append(f"    {_quoted(f'{way}:{name}')}) return ;;")
+                lines.append(f"    {_quoted(f'{typed}:{name}')}) return ;;")
     lines += ["    *)", '      case "$way:$current" in']
     for node in nodes:
-        way = " ".join(node.words)
+        typed = " ".join(node.words)
         options = " ".join(node.options)
-        lines.append(f"        {_quoted(f'{way}:')}-*) words={_quoted(options)} ;;")
+        lines.append(f"        {_quoted(f'{typed}:')}-*) words={_quoted(options)} ;;")
         if node.below:
-            below = _quoted(" ".join(node.below))
-            lines.append(f"        {_quoted(f'{way}:')}*) words={below} ;;")
+            subcommands = _quoted(" ".join(node.below))
+            lines.append(f"        {_quoted(f'{typed}:')}*) words={subcommands} ;;")
     lines += [
         "      esac ;;",
         "  esac",
@@ -105,16 +111,16 @@ def for_fish(nodes: list[CommandNode]) -> str:
     """One line for each command and option."""
     lines = []
     for node in nodes:
-        seen = "; and ".join(f"__fish_seen_subcommand_from {word}" for word in node.words[1:])
+        is_under = "; and ".join(f"__fish_seen_subcommand_from {word}" for word in node.words[1:])
         if node.below:
-            first = f"{seen}; and not" if seen else "not"
-            when = f"{first} __fish_seen_subcommand_from {' '.join(node.below)}"
-            below = _quoted(" ".join(node.below))
-            lines.append(f"complete -c jaxbundle -f -n {_quoted(when)} -a {below}")
+            and_not = f"{is_under}; and not" if is_under else "not"
+            when = f"{and_not} __fish_seen_subcommand_from {' '.join(node.below)}"
+            subcommands = _quoted(" ".join(node.below))
+            lines.append(f"complete -c jaxbundle -f -n {_quoted(when)} -a {subcommands}")
         for name, words in node.options.items():
-            if not (seen and name.startswith("--")):
+            if not (is_under and name.startswith("--")):
                 continue
-            line = f"complete -c jaxbundle -n {_quoted(seen)} -l {name[2:]}"
+            line = f"complete -c jaxbundle -n {_quoted(is_under)} -l {name[2:]}"
             line += f" -x -a {_quoted(' '.join(words))}" if words else ""
             line += "" if words or name in node.flags else " -r"
             lines.append(f"{line} -d {_quoted(node.helps[name])}")

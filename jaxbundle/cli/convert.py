@@ -51,14 +51,14 @@ def convert(  # noqa: PLR0913 - the options of the command
     size = pair("--image-size", image_size)
     if size is not None and not all(number.is_integer() for number in size):
         raise InputError(f"--image-size {image_size}: expected whole numbers of pixels")
-    told: list[str] = []
+    losses_told: list[str] = []
 
-    def tell(lost: Sequence[str]) -> None:
-        told.extend(lost)
-        for line in () if quiet else describe_lost(lost):
+    def tell(losses: Sequence[str]) -> None:
+        losses_told.extend(losses)
+        for line in () if quiet else describe_lost(losses):
             print(f"warning: {line}", file=sys.stderr, flush=True)
 
-    done = convert_file(
+    conversion = convert_file(
         input,
         output,
         to=to,
@@ -75,7 +75,9 @@ def convert(  # noqa: PLR0913 - the options of the command
     )
     if not quiet:
         # Only what the writer has found beside.
-        done = dataclasses.replace(done, lost=tuple(what for what in done.lost if what not in told))
-        print(str(done).split("\n", 1)[0])
-        for line in str(done).splitlines()[1:]:
+        conversion = dataclasses.replace(
+            conversion, lost=tuple(loss for loss in conversion.lost if loss not in losses_told)
+        )
+        print(str(conversion).split("\n", 1)[0])
+        for line in str(conversion).splitlines()[1:]:
             print(line, file=sys.stderr if line.startswith("warning") else sys.stdout)

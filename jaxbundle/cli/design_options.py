@@ -12,19 +12,19 @@ from jaxbundle.network.tables import Network
 from jaxbundle.network_design.conditions import Box
 
 
-def parse_aim(given: list[str] | None):
+def parse_aim(words: list[str] | None):
     """The quantities of the aim.
 
     **Raises:** `InputError`.
     """
-    if not given:
+    if not words:
         return "points"
-    if len(given) == 1 and ":" not in given[0]:
-        return given[0]
+    if len(words) == 1 and ":" not in words[0]:
+        return words[0]
     names = []
-    for text in given:
-        kind, _, rest = text.partition(":")
-        id, mark, name = rest.rpartition(":")
+    for text in words:
+        kind, _, unknown = text.partition(":")
+        id, mark, name = unknown.rpartition(":")
         if not mark:
             raise InputError(
                 f"--of {text!r}: expected points, cameras, or KIND:ID:NAME, such "
@@ -55,12 +55,12 @@ def _numbers(option: str, text: str, size: int) -> np.ndarray:
 
     **Raises:** `InputError`."""
     try:
-        found = np.array([float(word) for word in text.split(",")])
+        numbers = np.array([float(word) for word in text.split(",")])
     except ValueError:
-        found = np.zeros(0)
-    if len(found) != size:
+        numbers = np.zeros(0)
+    if len(numbers) != size:
         raise InputError(f"{option} {text!r}: expected {size} numbers separated by commas")
-    return found
+    return numbers
 
 
 def normals_of(text: str, network: Network):
@@ -82,13 +82,13 @@ def normals_of(text: str, network: Network):
     rows = dict(zip(table.values["id"], zip(*(table.values[name] for name in columns[1:]))))
     points = network.points
     # Check points take no part in a design.
-    used = [id for id, role in zip(points.id, points.role) if role != "check"]
-    missing = [id for id in used if id not in rows]
-    if missing:
+    targets = [id for id, role in zip(points.id, points.role) if role != "check"]
+    missing_ids = [id for id in targets if id not in rows]
+    if missing_ids:
         raise InputError(
-            f"{text}: there is no row for point {missing[0]!r}; give the normal of every target"
+            f"{text}: there is no row for point {missing_ids[0]!r}; give the normal of every target"
         )
     try:
-        return np.array([[float(x) for x in rows[id]] for id in used])
+        return np.array([[float(x) for x in rows[id]] for id in targets])
     except ValueError as error:
         raise InputError(f"{text}: a normal is not a number: {show(str(error))}") from None

@@ -18,8 +18,8 @@ def example(
 ) -> None:
     """Write an example into a folder; without a name, list the examples."""
     if not name:
-        for one, (about, _) in EXAMPLES.items():
-            print(f"{one:14} {about}")
+        for example_name, (about, _) in EXAMPLES.items():
+            print(f"{example_name:14} {about}")
         return
     if folder is None:
         raise InputError(f"FOLDER is missing: jaxbundle example {name} {name}")

@@ -56,9 +56,11 @@ def hand_eye_command(  # noqa: PLR0913 - the options of the command
         "angle_unit": angle_unit,
     }
     if board:
-        known = board_given(board, square, kind, None, marker, dictionary)
-        found = jaxbundle.hand_eye(input, poses, board=known, model=model, **settings)
+        board_of_photographs = board_given(board, square, kind, None, marker, dictionary)
+        result = jaxbundle.hand_eye(
+            input, poses, board=board_of_photographs, model=model, **settings
+        )
     else:
         network = input[0] if len(input) == 1 else input
-        found = jaxbundle.hand_eye(network, poses, **settings)
-    print_result(found, json, accept=accept)
+        result = jaxbundle.hand_eye(network, poses, **settings)
+    print_result(result, json, accept=accept)

@@ -46,12 +46,12 @@ class Judgement:
     @property
     def json(self) -> dict[str, Any]:
         """Entries of the JSON."""
-        found: dict[str, Any] = {}
+        entries: dict[str, Any] = {}
         if self.acceptance is not None:
-            found["acceptance"] = self.acceptance.to_dict()
+            entries["acceptance"] = self.acceptance.to_dict()
         if self.lengths is not None:
-            found["length_errors"] = self.lengths.to_dict()
-        return found
+            entries["length_errors"] = self.lengths.to_dict()
+        return entries
 
     @property
     def text(self) -> str:
@@ -98,15 +98,15 @@ class Judge:
             return WITHOUT_RESULT
         test = None
         if self.lengths is not None:
-            known = self.details
-            options = {"mpe": known.mpe or None, "rule": known.rule, "volume": known.volume}
+            details = self.details
+            options = {"mpe": details.mpe or None, "rule": details.rule, "volume": details.volume}
             test = length_test_of(result, self.lengths, **options)
-        accepted = accept(result, self.criteria, lengths=test) if self.criteria else None
+        acceptance = accept(result, self.criteria, lengths=test) if self.criteria else None
         document = None
         if self.certificate:
             document = certificate(result, details=self.details, lengths=test, origin=origin)
-            document = dataclasses.replace(document, acceptance=accepted)
-        return Judgement(accepted, test, document)
+            document = dataclasses.replace(document, acceptance=acceptance)
+        return Judgement(acceptance, test, document)
 
     def write(self, judgement: Judgement) -> None:
         """Write the certificate."""
@@ -138,18 +138,20 @@ def make_judge(
     **Raises:** `InputError`."""
     check_criteria(options.accept, command, network, models)
     details = read_details(options.details)
-    known = None if options.lengths is None else read_lengths(options.lengths)
-    if known is not None and network is not None:
-        require_points(known, network.points.id)
+    known_lengths = None if options.lengths is None else read_lengths(options.lengths)
+    if known_lengths is not None and network is not None:
+        require_points(known_lengths, network.points.id)
     if details.mpe:
         read_mpe(details.mpe, "m" if network is None else network.object_unit)
-    if options.details is not None and not options.certificate and known is None:
+    if options.details is not None and not options.certificate and known_lengths is None:
         raise InputError("--details: it is for --certificate or --lengths; give one of them")
     target = options.certificate
     if target == "-":
         raise InputError("--certificate -: a page cannot be written to standard output")
-    given = [one for one in (options.details, options.lengths) if one is not None]
-    check_file("--certificate", target, None, [*inputs, *given])
+    certificate_inputs = [
+        source for source in (options.details, options.lengths) if source is not None
+    ]
+    check_file("--certificate", target, None, [*inputs, *certificate_inputs])
     if not force:
         check_content("--certificate", target, HTML, "HTML", "")
     for option, file in outputs.items():
@@ -160,4 +162,4 @@ def make_judge(
             f"--certificate {target}: is inside --out, which is replaced as a whole; give a file "
             "beside it"
         )
-    return Judge(tuple(options.accept or ()), target, details, known)
+    return Judge(tuple(options.accept or ()), target, details, known_lengths)

@@ -31,9 +31,11 @@ def orient(
     network = read_network(input, format=format, overrides=tuple(set or ()), control=control)
     if out is not None:
         check_folder(out, "orient", FILES, network_files(input, network, control), force)
-    found = jaxbundle.orient(network)
-    path = None if out is None else write_project(found.network, out, force=force, by="orient")
+    orientation = jaxbundle.orient(network)
+    path = (
+        None if out is None else write_project(orientation.network, out, force=force, by="orient")
+    )
     if not (quiet and is_in_file(out)):
-        print(found)
+        print(orientation)
         if path is not None:
             print(path)

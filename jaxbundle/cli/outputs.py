@@ -91,18 +91,22 @@ class BudgetSupplement:
 
     @property
     def json(self) -> Mapping[str, Any]:
-        own = NOTHING if self.budget is None else {BUDGET: budget_dict(self.budget)}
-        return {**own, **(NOTHING if self.rest is None else self.rest.json)}
+        budget_entry = NOTHING if self.budget is None else {BUDGET: budget_dict(self.budget)}
+        return {**budget_entry, **(NOTHING if self.rest is None else self.rest.json)}
 
     @property
     def text(self) -> str:
-        own = "" if self.budget is None else "\n".join([*budget_lines(self.budget), ""])
-        return own + ("" if self.rest is None else self.rest.text)
+        budget_text = "" if self.budget is None else "\n".join([*budget_lines(self.budget), ""])
+        return budget_text + ("" if self.rest is None else self.rest.text)
 
     @property
     def addition(self) -> Addition:
-        own = describe_budget(self.budget)
-        return own if self.rest is None else own.followed_by(self.rest.addition)
+        budget_addition = describe_budget(self.budget)
+        return (
+            budget_addition
+            if self.rest is None
+            else budget_addition.followed_by(self.rest.addition)
+        )
 
     def fill(self, folder: Path) -> None:
         if self.budget is not None:
@@ -124,18 +128,18 @@ FORCE_ADVICE = ", or --force to replace it"
 def check_writable(
     json: str,
     out: Path | None,
-    by: str,
+    command: str,
     names: Iterable[str],
     inputs: Iterable[str | Path],
     force: bool = False,
     html: str = "",
 ) -> None:
-    """Refuse a JSON file, a page, or a folder for files of these names, that the command `by`
+    """Refuse a JSON file, a page, or a folder for files of these names, that the command `command`
     cannot or may not write (`io.writing.folders`, `check_json`), or that would replace one of the
     inputs."""
     inputs = tuple(inputs)
     if out is not None:
-        check_folder(out, by, names, inputs, force)
+        check_folder(out, command, names, inputs, force)
     check_file("--json", json, out, inputs)
     if not force:
         check_json(json, FORCE_ADVICE)
@@ -172,7 +176,7 @@ def check_file(option: str, file: str, out: Path | None, inputs: Iterable[str | 
         if not os.access(path.parent, os.W_OK | os.X_OK):
             raise InputError(f"{option} {file}: cannot be written: no permission in {path.parent}")
     # By real paths: an input may be named through a link.
-    if any(str(real) == os.path.realpath(given) for given in inputs):
+    if any(str(real) == os.path.realpath(input_file) for input_file in inputs):
         raise InputError(
             f"{option} {file}: is part of the input and would be overwritten; give another"
         )
@@ -191,15 +195,15 @@ def print_result(
     report beside a file; `accept`: criteria, whose verdict follows.
 
     **Raises:** `typer.Exit` with status 4 if a criterion is not met."""
-    accepted = accept_result(result, accept)
+    acceptance = accept_result(result, accept)
     if json:
-        more = NOTHING if accepted is None else {"acceptance": accepted.to_dict()}
-        put_json(json, {**result.to_dict(), **more})
+        entries = NOTHING if acceptance is None else {"acceptance": acceptance.to_dict()}
+        put_json(json, {**result.to_dict(), **entries})
     if json != "-" and not (quiet and json):
         print(result.report())
-        if accepted is not None:
-            print(f"\n{accepted}")
-    end_unmet(accepted)
+        if acceptance is not None:
+            print(f"\n{acceptance}")
+    end_unmet(acceptance)
 
 
 def put_json(json: str, document: Mapping) -> None:
@@ -211,14 +215,16 @@ def put_json(json: str, document: Mapping) -> None:
         write_text(Path(json), text)
 
 
-def check_json(json: str, way: str = "", option: str = "--json") -> None:
+def check_json(json: str, alternative: str = "", option: str = "--json") -> None:
     """Refuse to replace a file that is not JSON, unless it is empty: it was probably named by
-    mistake. `way`: an alternative to another name, for the message.
+    mistake. `alternative`: an alternative to another name, for the message.
     """
-    check_content(option, json, JSON, "JSON", way)
+    check_content(option, json, JSON, "JSON", alternative)
 
 
-def check_content(option: str, file: str, like: re.Pattern[bytes], noun: str, way: str) -> None:
+def check_content(
+    option: str, file: str, pattern: re.Pattern[bytes], noun: str, alternative: str
+) -> None:
     """Refuse to replace a file that is not empty and does not begin like the new one."""
     path = Path(file)
     if file in ("", "-") or not path.is_file():
@@ -229,8 +235,10 @@ def check_content(option: str, file: str, like: re.Pattern[bytes], noun: str, wa
             head = stream.read(4096)
     except OSError as error:
         raise InputError(f"{option} {file}: cannot be read: {error.strerror}") from None
-    if head and not like.match(head):
-        raise InputError(f"{option} {file}: exists and is not {noun}; give another name{way}")
+    if head and not pattern.match(head):
+        raise InputError(
+            f"{option} {file}: exists and is not {noun}; give another name{alternative}"
+        )
 
 
 def check_targets(
@@ -266,7 +274,7 @@ def write_result(
     json: str,
     text: str | Iterable[str],
     out: Path | None,
-    by: str,
+    command: str,
     names: Iterable[str],
     force: bool,
     html: str = "",
@@ -283,7 +291,7 @@ def write_result(
     if out is None:
         yield None
     else:
-        with replace_folder(out, by, names, force) as new:
+        with replace_folder(out, command, names, force) as new:
             yield new
             if (name := name_inside(json, out)) is not None:
                 write_text(new / name, text)
@@ -313,29 +321,31 @@ def write_targets(
     force: bool = False,
     html: str = "",
     origin: Origin = UNKNOWN,
-    more: Supplement | None = None,
+    supplement: Supplement | None = None,
     progress: Progress | None = None,
 ) -> None:
-    """Write JSON (`-`: standard output), page and folder of a result with what `more` options add,
-    or the reason for a failure."""
+    """Write JSON (`-`: standard output), page and folder of a result with what options add
+    (`supplement`), or the reason for a failure."""
     solved = isinstance(result, Adjustment)
-    also = NOTHING if more is None else more.json
+    entries = NOTHING if supplement is None else supplement.json
 
     def text(brief: bool) -> str | Iterable[str]:
         if isinstance(result, Adjustment):
-            return result_text(result, brief, also)
+            return result_text(result, brief, entries)
         return unsolved_text(result)
 
     def page() -> Iterable[str]:
         if isinstance(result, Adjustment):
-            return compose(result, origin, also=NO_ADDITION if more is None else more.addition)
+            return compose(
+                result, origin, also=NO_ADDITION if supplement is None else supplement.addition
+            )
         return compose_failure(result, origin)
 
     plots = plots and out is not None and solved and result.converged and can_plot()
     with write_result(json, text(brief), out, "adjust", FILES, force, html, page) as new:
         if new is not None:
             if isinstance(result, Adjustment):
-                fill_results(result, new, plots, "", also, more, progress, origin.computed)
+                fill_results(result, new, plots, "", entries, supplement, progress, origin.computed)
             else:
                 write_text(new / REPORT, f"{result}\n")
                 write_text(new / RESULT, text(False))
@@ -346,44 +356,54 @@ def fill_results(
     folder: Path,
     plots: bool,
     note: str = "",
-    also: Mapping = NOTHING,
-    more: Supplement | None = None,
+    entries: Mapping = NOTHING,
+    supplement: Supplement | None = None,
     progress: Progress | None = None,
     date: str = "",
     verdict: Verdict | None = None,
 ) -> None:
     """Write report, JSON, tables, the adjusted network and plots of a result into a folder.
 
-    `note`: text before the report; `also`: further JSON entries; `more`: what options add;
+    `note`: text before the report; `entries`: further JSON entries; `supplement`: what options add;
     `date` of the computation, for the report; `verdict`: that of the command, if it has further
     tests."""
     tell = progress or (lambda *_: None)
     tell("writing the report", 0, 2)
-    told = report_with(result, more, date, verdict)
-    write_text(folder / REPORT, note + told)
-    write_text(folder / RESULT, result_text(result, False, also))
+    report_text = report_with(result, supplement, date, verdict)
+    write_text(folder / REPORT, note + report_text)
+    write_text(folder / RESULT, result_text(result, False, entries))
     tell("writing the report", 1, 2)
     if result.converged:
         _write_tables(result, folder)
-        if more is not None:
-            more.fill(folder)
+        if supplement is not None:
+            supplement.fill(folder)
         fill_project(readjustable_network(result), folder / ADJUSTED)
-        if (found := orientation_covariance(result)) is not None:
+        if (covariance := orientation_covariance(result)) is not None:
             unit = ANGLE_UNITS[result.network.angle_unit]
-            write_orientation_covariance(found, folder / ADJUSTED / PRECISION, unit)
+            write_orientation_covariance(covariance, folder / ADJUSTED / PRECISION, unit)
     tell("writing the report", 2, 2)
     if plots:
         draw_figures(result, folder, progress)
 
 
 def report_with(
-    result: Adjustment, more: Supplement | None, date: str = "", verdict: Verdict | None = None
+    result: Adjustment,
+    supplement: Supplement | None,
+    date: str = "",
+    verdict: Verdict | None = None,
 ) -> str:
     """The report of a result, with what options add: findings in its verdict, text after it."""
-    if more is not None and result.converged and verdict is None and more.addition.findings:
-        verdict = more.addition.conclude(result)
-    told = report.text(result, date=date, verdict=verdict)
-    return told if more is None or not result.converged else told + more.text
+    if (
+        supplement is not None
+        and result.converged
+        and verdict is None
+        and supplement.addition.findings
+    ):
+        verdict = supplement.addition.conclude(result)
+    report_text = report.text(result, date=date, verdict=verdict)
+    return (
+        report_text if supplement is None or not result.converged else report_text + supplement.text
+    )
 
 
 def why_not(result: Adjustment) -> str:

@@ -55,7 +55,7 @@ def plan(  # noqa: PLR0913 - the options of the command
     check_writable(json, out, "plan", FILES, (), force)
     if sum(value is not None for value in (height, scale, ground_pixel)) != 1:
         raise InputError("give one of --height, --scale, --ground-pixel (with --pixel)")
-    found = jaxbundle.plan(
+    planned = jaxbundle.plan(
         c,
         _require_pair("--image", image),
         _require_pair("--area", area),
@@ -72,30 +72,30 @@ def plan(  # noqa: PLR0913 - the options of the command
         errors=_sizes(errors or ()),
     )
     if out is not None:
-        written = write_project(found.network, out, force=force, by="plan")
+        project_file = write_project(planned.network, out, force=force, by="plan")
         if json != "-":
-            print(f"{'written':22}{written}")
-    print_result(found, json, accept=accept)
+            print(f"{'written':22}{project_file}")
+    print_result(planned, json, accept=accept)
 
 
-def _sizes(given: Sequence[str]) -> dict[str, float]:
+def _sizes(assignments: Sequence[str]) -> dict[str, float]:
     """The sizes of error components, by name."""
-    found = {}
-    for text in given:
+    sizes = {}
+    for text in assignments:
         name, mark, size = text.rpartition("=")
         try:
-            found[name.strip()] = float(size)
+            sizes[name.strip()] = float(size)
         except ValueError:
             mark = ""
         if not mark:
             raise InputError(f"--errors {text!r}: expected NAME=SIZE, a size in mm")
-    return found
+    return sizes
 
 
 def _require_pair(option: str, text: str) -> tuple[float, float]:
     from jaxbundle.cli.camera_inputs import pair
 
-    found = pair(option, text)
-    if found is None:
+    numbers = pair(option, text)
+    if numbers is None:
         raise InputError(f"{option}: expected two numbers A,B")
-    return found
+    return numbers

@@ -96,8 +96,8 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
     # Read here, before --out becomes this command's: their errors leave nothing behind.
     if targets is not None:
         check_kind(targets)
-    given = None if camera is None else calibration_given(camera)[0]
-    known = open_control(control, control_sigma, check or ())
+    opened_camera = None if camera is None else calibration_given(camera)[0]
+    opened_control = open_control(control, control_sigma, check or ())
     bars = () if distances is None else read_distances(distances)
     files = [p for p in (*photos, control, distances) if p is not None and p.is_file()]
     # Before the search, which opens every photograph; after it the photographs are inputs, too.
@@ -106,17 +106,17 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
     judge = judge_of(
         COMMAND, judged, {"--json": json, "--html": html}, out, files, models=["opencv"]
     )
-    found, _ = find_photographs(photos)
-    check_writable(json, out, COMMAND, FILES, [*files, *(p.path for p in found)], force, html)
+    photographs, _ = find_photographs(photos)
+    check_writable(json, out, COMMAND, FILES, [*files, *(p.path for p in photographs)], force, html)
     # Targets are found again in seconds.
-    kept = nullcontext() if features == "none" else keep_matches(out, force)
-    with kept as store, staging(quiet or json == "-") as tell:
+    kept_matches = nullcontext() if features == "none" else keep_matches(out, force)
+    with kept_matches as store, staging(quiet or json == "-") as tell:
         if store is not None:
             advise(f"run the same command again to resume; matches are kept in {store}")
         result = jaxbundle.reconstruct(
             photos,
-            camera=given,
-            control=known,
+            camera=opened_camera,
+            control=opened_control,
             name=name,
             targets=targets,
             uncoded=uncoded,
@@ -132,7 +132,7 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
             progress=tell,
         )
     origin = trace_files(
-        [*files, *(p.path for p in found)],
+        [*files, *(p.path for p in photographs)],
         {
             "--camera": camera,
             "--control-sigma": control_sigma,

@@ -40,7 +40,7 @@ def keep_matches(out: Path, force: bool) -> Iterator[Path]:
     input leaves no trace of a new one, unless features of the photographs are in it already, which
     the next run uses."""
     store, new = out / STORE, read_marker(out) is None
-    made = [p for p in (out, *out.absolute().parents) if not p.exists()]
+    new_folders = [p for p in (out, *out.absolute().parents) if not p.exists()]
     if new:
         with replace_folder(out, COMMAND, (), force):
             pass
@@ -49,14 +49,14 @@ def keep_matches(out: Path, force: bool) -> Iterator[Path]:
     except InputError:
         if new and not any(store.glob("*.npz")):
             (out / MARKER).unlink(missing_ok=True)
-            for folder in (store, *made):
+            for folder in (store, *new_folders):
                 with suppress(OSError):  # not there yet, or somebody has put a file into it
                     folder.rmdir()
         raise
 
 
 def write_reconstruction(
-    found: Reconstruction,
+    reconstruction: Reconstruction,
     json: str,
     out: Path,
     brief: bool,
@@ -65,65 +65,96 @@ def write_reconstruction(
     html: str = "",
     origin: Origin = UNKNOWN,
     progress: Progress | None = None,
-    more: Supplement | None = None,
+    supplement: Supplement | None = None,
 ) -> None:
-    """Write JSON and page, and the folder with each part, its pairs and figures, and what `more`
-    options add."""
-    first, plots = found.parts[0], plots and can_plot()
-    also = {"reconstruction": found.to_dict(), "verdict": verdict_dict(conclude_part(found, first))}
-    also |= {} if more is None else more.json
-    text = result_text(first.adjustment, brief, also)
+    """Write JSON and page, and the folder with each part, its pairs and figures, and what options
+    add (`supplement`)."""
+    main_part, plots = reconstruction.parts[0], plots and can_plot()
+    entries_of_main = {
+        "reconstruction": reconstruction.to_dict(),
+        "verdict": verdict_dict(conclude_part(reconstruction, main_part)),
+    }
+    entries_of_main |= {} if supplement is None else supplement.json
+    text = result_text(main_part.adjustment, brief, entries_of_main)
     page = partial(
-        compose_part, found, first, origin, NO_ADDITION if more is None else more.addition
+        compose_part,
+        reconstruction,
+        main_part,
+        origin,
+        NO_ADDITION if supplement is None else supplement.addition,
     )
     with write_result(json, text, out, COMMAND, FILES, force, html, page) as new:
         if new is None:
             return
-        verdict = f"{found.prefix(first)}{conclude_part(found, first).words}"
-        told = f"{verdict}\n{found}\n\n{describe_part(found, first)}"
-        _write_part(found, first, new, plots, told, also, progress, origin.computed, more)
-        for number, part in enumerate(found.parts[1:], 2):
+        verdict = (
+            f"{reconstruction.prefix(main_part)}{conclude_part(reconstruction, main_part).words}"
+        )
+        report_text = f"{verdict}\n{reconstruction}\n\n{describe_part(reconstruction, main_part)}"
+        _write_part(
+            reconstruction,
+            main_part,
+            new,
+            plots,
+            report_text,
+            entries_of_main,
+            progress,
+            origin.computed,
+            supplement,
+        )
+        for number, part in enumerate(reconstruction.parts[1:], 2):
             folder = new / f"part_{number}"
             folder.mkdir()
-            own = (
-                f"warning: {said}" for said in found.warnings if said.startswith(f"{part.name}:")
+            warnings = (
+                f"warning: {warning}"
+                for warning in reconstruction.warnings
+                if warning.startswith(f"{part.name}:")
             )
-            verdict = conclude_part(found, part)
-            note = "\n".join([verdict.words, *own, describe_part(found, part)])
+            verdict = conclude_part(reconstruction, part)
+            note = "\n".join([verdict.words, *warnings, describe_part(reconstruction, part)])
             entries = {"verdict": verdict_dict(verdict)}
-            _write_part(found, part, folder, plots, note, entries, progress, origin.computed)
-            write_text(folder / PAGE, compose_part(found, part, origin))
+            _write_part(
+                reconstruction, part, folder, plots, note, entries, progress, origin.computed
+            )
+            write_text(folder / PAGE, compose_part(reconstruction, part, origin))
         if plots:
-            draw_pairs(list(found.photographs), found.pairs, list(found.left_out), new, progress)
-        write_csv(new / PAIRS, ["image", "other", "matches", "verified", "kind"], found.pairs)
+            draw_pairs(
+                list(reconstruction.photographs),
+                reconstruction.pairs,
+                list(reconstruction.left_out),
+                new,
+                progress,
+            )
+        write_csv(
+            new / PAIRS, ["image", "other", "matches", "verified", "kind"], reconstruction.pairs
+        )
 
 
 def _write_part(
-    found: Reconstruction,
+    reconstruction: Reconstruction,
     part: ReconstructedPart,
     folder: Path,
     plots: bool,
     note: str,
-    also: Mapping[str, Any],
+    entries: Mapping[str, Any],
     progress: Progress | None,
     date: str,
-    more: Supplement | None = None,
+    supplement: Supplement | None = None,
 ) -> None:
     fill_results(
         part.adjustment,
         folder,
         plots,
         note,
-        also,
-        more,
+        entries,
+        supplement,
         progress=progress,
         date=date,
-        verdict=conclude_part(found, part),
+        verdict=conclude_part(reconstruction, part),
     )
     _write_tables(part, folder)
     if plots:
-        read = lambda name: _thumbnail(found.photographs[name])
-        draw_tracks(part.adjustment, read, folder, progress)
+        read_thumbnail = lambda name: _thumbnail(reconstruction.photographs[name])
+        draw_tracks(part.adjustment, read_thumbnail, folder, progress)
     network = adjusted_network(part.adjustment)
     write_ply(network, folder / CLOUD)
     try:

@@ -43,7 +43,7 @@ def replicate(  # noqa: PLR0913 - the options of the command
     jaxbundle.use_cores()
     check_writable(json, None, "replicate", (), [input, *(more or ())], force)
     with staging(quiet or json == "-") as show:
-        found = jaxbundle.replicate(
+        replication = jaxbundle.replicate(
             [input, *more] if more else input,
             by=by,
             repeat=repeat,
@@ -54,4 +54,4 @@ def replicate(  # noqa: PLR0913 - the options of the command
             snooping=snooping,
             progress=show,
         )
-    print_result(found, json, quiet, accept)
+    print_result(replication, json, quiet, accept)

@@ -110,7 +110,7 @@ def surface(  # noqa: PLR0913 - the options of the command
     check_json(json)
     check_folder(out, "surface", FILES, input, force)
     with staging(quiet or json == "-") as show:
-        found = jaxbundle.surface(
+        result = jaxbundle.surface(
             input,
             photos=photos,
             pairs=pairs,
@@ -129,24 +129,24 @@ def surface(  # noqa: PLR0913 - the options of the command
             progress=show,
             tell=lambda message: typer.echo(f"jaxbundle: {message}", err=True),
         )
-    files = [str(file) for one in input for file in input_files(one)]
-    told = f"{', '.join(stamp(files, in_words(now())))}\n{found.report()}"
-    accepted, document = accept_result(found, accept), found.to_dict()
-    if accepted is not None:
-        told += f"\n\n{accepted}"
-        document = {**document, "acceptance": accepted.to_dict()}
+    files = [str(file) for source in input for file in input_files(source)]
+    report_text = f"{', '.join(stamp(files, in_words(now())))}\n{result.report()}"
+    acceptance, document = accept_result(result, accept), result.to_dict()
+    if acceptance is not None:
+        report_text += f"\n\n{acceptance}"
+        document = {**document, "acceptance": acceptance.to_dict()}
     with replace_folder(out, "surface", FILES, force) as folder:
         if csv:
-            write_cloud_csv(found.cloud, folder / "cloud.csv")
-        write_cloud(found.cloud, folder / "cloud.ply")
-        if found.dsm is not None:
-            write_dsm(found.dsm, folder / "dsm.tif", folder / "dsm_sigma.tif")
-            if found.orthophoto is not None:
-                write_orthophoto(found.orthophoto, found.dsm, folder / "orthophoto.tif")
+            write_cloud_csv(result.cloud, folder / "cloud.csv")
+        write_cloud(result.cloud, folder / "cloud.ply")
+        if result.dsm is not None:
+            write_dsm(result.dsm, folder / "dsm.tif", folder / "dsm_sigma.tif")
+            if result.orthophoto is not None:
+                write_orthophoto(result.orthophoto, result.dsm, folder / "orthophoto.tif")
         write_text(folder / "surface.json", json_text(document))
-        write_text(folder / "report.txt", told + "\n")
+        write_text(folder / "report.txt", report_text + "\n")
     if json:
         put_json(json, document)
     if not quiet and json != "-":
-        print(told)
-    end_unmet(accepted)
+        print(report_text)
+    end_unmet(acceptance)

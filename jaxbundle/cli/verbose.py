@@ -24,16 +24,16 @@ def say(words: str) -> None:
 def report_times() -> Iterator[None]:
     """Print versions, and at the end the elapsed time."""
     say(", ".join(f"{name} {version}" for name, version in software_versions()))
-    made: list[float] = []
-    found: list[str] = []
+    seconds: list[float] = []
+    cache_events: list[str] = []
 
     def hear_time(event: str, duration_secs: float, **_: str | int) -> None:
         if event == COMPILED_EVENT:
-            made.append(duration_secs)
+            seconds.append(duration_secs)
 
     def hear(event: str, **_: str | int) -> None:
         if event == CACHE_HIT_EVENT:
-            found.append(event)
+            cache_events.append(event)
 
     monitoring.register_event_duration_secs_listener(hear_time)
     monitoring.register_event_listener(hear)
@@ -47,8 +47,8 @@ def report_times() -> Iterator[None]:
         devices = jax.devices()  # only now: the command sets their number
         say(
             f"{time.perf_counter() - begun:.2f} s in all, on {len(devices)} devices of JAX "
-            f"({devices[0].platform}); {len(made)} programs prepared in {sum(made):.2f} s, "
-            f"{len(found)} of them from the cache"
+            f"({devices[0].platform}); {len(seconds)} programs prepared in {sum(seconds):.2f} s, "
+            f"{len(cache_events)} of them from the cache"
         )
 
 

@@ -62,9 +62,9 @@ class BatchRun(TableMethods):
 
     def __str__(self) -> str:
         """Counts by status in a line."""
-        said = ", ".join(f"{n} {status}" for status, n in self.statuses.most_common() if n)
+        counts = ", ".join(f"{n} {status}" for status, n in self.statuses.most_common() if n)
         skipped = self.counts.get(SKIPPED, 0)
-        return f"{self.json_lines}: {said}" + (
+        return f"{self.json_lines}: {counts}" + (
             f" ({skipped} skipped, already computed)" if skipped else ""
         )
 

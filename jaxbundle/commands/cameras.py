@@ -46,39 +46,39 @@ TABLE_ROWS = 12
 MAX_ROWS = 100_000
 
 
-def open_camera(given: CameraSource, image_size: Pair | None = None) -> Camera:
+def open_camera(source: CameraSource, image_size: Pair | None = None) -> Camera:
     """The camera of a source; `image_size`: pixels, where a file needs it and has none.
 
     **Raises:** `InputError`.
     """
-    return open_calibration(given, image_size)[0]
+    return open_calibration(source, image_size)[0]
 
 
 def open_calibration(
-    given: CameraSource, image_size: Pair | None = None
+    source: CameraSource, image_size: Pair | None = None
 ) -> tuple[Camera, Covariance | None]:
     """The camera of a source, with the covariance of its free parameters where the source has it: a
     calibration, or a JSON result. `image_size`: as of `open_camera`.
 
     **Raises:** `InputError`.
     """
-    if isinstance(given, Camera):
-        return given, None
-    if isinstance(given, Calibration):
-        return given.camera, given.adjustment.camera_covariance(given.camera.id)
-    if isinstance(given, tuple) and len(given) == 2 and isinstance(given[0], Camera):
-        return given
-    if not isinstance(given, str | Path):
-        raise InputError(f"camera: expected a Camera, a Calibration or a file, got {show(given)}")
-    text = str(given)
+    if isinstance(source, Camera):
+        return source, None
+    if isinstance(source, Calibration):
+        return source.camera, source.adjustment.camera_covariance(source.camera.id)
+    if isinstance(source, tuple) and len(source) == 2 and isinstance(source[0], Camera):
+        return source
+    if not isinstance(source, str | Path):
+        raise InputError(f"camera: expected a Camera, a Calibration or a file, got {show(source)}")
+    text = str(source)
     file, mark, id = text.rpartition("#")
     if not mark or Path(text).exists():
         file, id = text, None
     path = Path(file)
     covariances = {}
-    known = describe_incomplete(path)
-    if known and not is_camera_file(path) and recognise_format(path) is None:
-        raise InputError(f"{path}: {known}")
+    fault = describe_incomplete(path)
+    if fault and not is_camera_file(path) and recognise_format(path) is None:
+        raise InputError(f"{path}: {fault}")
     if is_result(path):
         results = read_calibrated(path)
         cameras, covariances = [c for c, _ in results], {c.id: C for c, C in results}
@@ -170,16 +170,19 @@ class CameraDescription(TableMethods):
 
     def __str__(self) -> str:
         """Parameters, field of view and the whole table, in lines."""
-        given, unit, extent = self.camera, self.unit, self.extent
-        lines = [f"camera {given.id!r}, model {given.model}, {extent[0]:g} × {extent[1]:g} {unit}"]
-        for name, value in all_parameters(given).items():
+        described, unit, extent = self.camera, self.unit, self.extent
+        lines = [
+            f"camera {described.id!r}, model {described.model}, {extent[0]:g} × {extent[1]:g} "
+            f"{unit}"
+        ]
+        for name, value in all_parameters(described).items():
             if value:
                 lines.append(f"{name:22}{value:.8g}")
         views = {"2·atan(d/2c)": self.field_of_view, "by the rays": self.field_of_view_of_rays}
         for name, view in views.items():
             angles = ", ".join(f"{np.degrees(angle):.3f}°" for angle in view)
-            said = f"{angles} (horizontal, vertical, diagonal), {name}"
-            lines.append(f"{'field of view':22}{said}")
+            text = f"{angles} (horizontal, vertical, diagonal), {name}"
+            lines.append(f"{'field of view':22}{text}")
         lines.append(f"{'':22}{angle_class(self.field_of_view.diagonal)}")
         lines.append(
             f"{'35 mm equivalent':22}{equivalent_35mm(self.focal, extent):.2f} mm by the diagonal, "
@@ -210,14 +213,14 @@ def camera(
 
     **Raises:** `InputError`, for a missing size too.
     """
-    found = open_camera(camera, image_size)
-    size, pitch = image_size or found.image_size, pixel_size or found.pixel_size
-    unit = get_model(found.model).unit
+    opened = open_camera(camera, image_size)
+    size, pitch = image_size or opened.image_size, pixel_size or opened.pixel_size
+    unit = get_model(opened.model).unit
     if size is None or (unit == "mm" and pitch is None):
-        missing = "image_size" if size is None else "pixel_size"
+        missing_size = "image_size" if size is None else "pixel_size"
         where = f"{camera}: " if isinstance(camera, str | Path) else ""
         raise InputError(
-            f"{where}camera {found.id!r} has no {missing}; see --image-size and --pixel-size"
+            f"{where}camera {opened.id!r} has no {missing_size}; see --image-size and --pixel-size"
         )
     scale = (1.0, 1.0) if unit == "px" or pitch is None else pitch
     extent = size[0] * scale[0], size[1] * scale[1]
@@ -228,6 +231,6 @@ def camera(
             f"--step {width:g}: more than {MAX_ROWS} rows to a radius of {reach:.4g} {unit}"
         )
     about = "origin" if about_origin else "principal point"
-    described = CameraDescription(found, size, pitch, extent, width, about)
+    described = CameraDescription(opened, size, pitch, extent, width, about)
     described.table()  # an impossible step is refused here, not when the result is shown
     return described

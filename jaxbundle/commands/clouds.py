@@ -79,24 +79,24 @@ def cloud(  # noqa: PLR0913 - the options of the command
 
     **Raises:** `InputError`.
     """
-    opened = _open(cloud)
-    other = None if against is None else _open(against)
-    kept = drop_weak(opened, max_sigma, min_rays)
+    opened = _open_cloud(cloud)
+    reference = None if against is None else _open_cloud(against)
+    filtered = drop_weak(opened, max_sigma, min_rays)
     if statistical is not None:
-        kept = drop_isolated(kept, limit=statistical)
+        filtered = drop_isolated(filtered, limit=statistical)
     if cube is not None:
-        kept = thin(kept, cube, least, place)
+        filtered = thin(filtered, cube, least, place)
     figures = {}
     if plane:
-        figures["plane"] = to_plane(kept.X)
+        figures["plane"] = to_plane(filtered.X)
     if check is not None:
-        X = _open(check).X if isinstance(check, str | Path) else np.asarray(check, float)
-        figures["check_points"] = at_check_points(kept, X)
-    if other is not None:
-        figures["comparison"] = compare(kept, other)
-    dsm = None if size is None else make_dsm(kept, size)
-    return CloudResult(kept, len(opened), figures, dsm)
+        X = _open_cloud(check).X if isinstance(check, str | Path) else np.asarray(check, float)
+        figures["check_points"] = at_check_points(filtered, X)
+    if reference is not None:
+        figures["comparison"] = compare(filtered, reference)
+    dsm = None if size is None else make_dsm(filtered, size)
+    return CloudResult(filtered, len(opened), figures, dsm)
 
 
-def _open(cloud: Cloud | str | Path) -> Cloud:
+def _open_cloud(cloud: Cloud | str | Path) -> Cloud:
     return cloud if isinstance(cloud, Cloud) else read_cloud(cloud)

@@ -190,48 +190,48 @@ def compare(
         "image_size": image_size,
         "pixel_size": pixel_size,
     }
-    is_adjusted = lambda one: isinstance(one, Adjustment) or is_saved_adjustment(one)
+    is_adjusted = lambda source: isinstance(source, Adjustment) or is_saved_adjustment(source)
     if is_adjusted(a) or is_adjusted(b):
         _require_adjustments(a, b)
         _refuse(of_cameras, "adjustments")
         return compare_adjustments(_open_adjustment(a), _open_adjustment(b), **of_adjustments)
-    for name, one in (("a", a), ("b", b)):
-        if not isinstance(one, Camera | Calibration | str | Path | tuple):
+    for name, source in (("a", a), ("b", b)):
+        if not isinstance(source, Camera | Calibration | str | Path | tuple):
             raise InputError(
-                f"{name} must be an Adjustment, a camera or a file of one, but is {show(one)}"
+                f"{name} must be an Adjustment, a camera or a file of one, but is {show(source)}"
             )
     _refuse(of_adjustments, "cameras")
     return _compare_calibrations(a, b, step, rotate, radius, image_size, pixel_size)
 
 
-def is_saved_adjustment(given: Any) -> bool:
+def is_saved_adjustment(source: Any) -> bool:
     """Whether this is a file that `Adjustment.save` has written."""
     # No camera file begins like an archive.
     return (
-        isinstance(given, str | Path)
-        and beginning(given, len(SAVED_ADJUSTMENT)) == SAVED_ADJUSTMENT
+        isinstance(source, str | Path)
+        and beginning(source, len(SAVED_ADJUSTMENT)) == SAVED_ADJUSTMENT
     )
 
 
-def _open_adjustment(given: Adjustment | str | Path) -> Adjustment:
-    return given if isinstance(given, Adjustment) else load_adjustment(given)
+def _open_adjustment(source: Adjustment | str | Path) -> Adjustment:
+    return source if isinstance(source, Adjustment) else load_adjustment(source)
 
 
 def _require_adjustments(a: Any, b: Any) -> None:
     """Refuse what cannot be compared with an adjustment."""
-    for name, one, other in (("a", a, b), ("b", b, a)):
-        if isinstance(one, Adjustment) or is_saved_adjustment(one):
+    for name, source, partner in (("a", a, b), ("b", b, a)):
+        if isinstance(source, Adjustment) or is_saved_adjustment(source):
             continue
-        if not isinstance(one, str | Path):
+        if not isinstance(source, str | Path):
             raise InputError(
-                f"{name} must be an Adjustment, but is {show(one)}: jaxbundle.adjust or "
+                f"{name} must be an Adjustment, but is {show(source)}: jaxbundle.adjust or "
                 "jaxbundle.load_adjustment gives one"
             )
-        if not Path(str(one).partition("#")[0]).exists():
-            raise InputError(f"{one}: no such file")
-        known = f"{other} is" if isinstance(other, str | Path) else "the other one is"
+        if not Path(str(source).partition("#")[0]).exists():
+            raise InputError(f"{source}: no such file")
+        partner_is = f"{partner} is" if isinstance(partner, str | Path) else "the other one is"
         raise InputError(
-            f"{one}: is not a saved adjustment, as {known}; give two files that jaxbundle "
+            f"{source}: is not a saved adjustment, as {partner_is}; give two files that jaxbundle "
             "adjust --save has written"
         )
 
@@ -254,34 +254,36 @@ def _compare_calibrations(
     image_size: Pair | None,
     pixel_size: Pair | None,
 ) -> CalibrationComparison:
-    (first, C_first), (second, C_second) = open_calibration(a), open_calibration(b)
-    named = [str(x) if isinstance(x, str | Path) else c.id for x, c in ((a, first), (b, second))]
-    sizes = [list(c.image_size) for c in (first, second) if c.image_size is not None]
+    (camera_a, C_a), (camera_b, C_b) = open_calibration(a), open_calibration(b)
+    names = [
+        str(x) if isinstance(x, str | Path) else c.id for x, c in ((a, camera_a), (b, camera_b))
+    ]
+    sizes = [list(c.image_size) for c in (camera_a, camera_b) if c.image_size is not None]
     if len(sizes) == 2 and sizes[0] != sizes[1]:
         raise InputError(
-            f"{', '.join(named)}: images of {sizes[0]} and {sizes[1]} pixels are not from one "
+            f"{', '.join(names)}: images of {sizes[0]} and {sizes[1]} pixels are not from one "
             "camera"
         )
-    one, other = ((get_model(c.model), c.parameters) for c in (first, second))
-    known = {
-        "image_size": image_size or first.image_size or second.image_size,
-        "pixel_size": pixel_size or first.pixel_size or second.pixel_size,
+    model_a, model_b = ((get_model(c.model), c.parameters) for c in (camera_a, camera_b))
+    sensor = {
+        "image_size": image_size or camera_a.image_size or camera_b.image_size,
+        "pixel_size": pixel_size or camera_a.pixel_size or camera_b.pixel_size,
         "rotate": rotate,
     }
     try:
-        found = compare_cameras(one, other, radius=radius, **known)
+        comparison = compare_cameras(model_a, model_b, radius=radius, **sensor)
         # A tenth of half the diagonal: ten rings.
-        width = np.hypot(np.ptp(found.x), np.ptp(found.y)) / 20 if step is None else step
-        rings = difference_rings(found, width)
+        width = np.hypot(np.ptp(comparison.x), np.ptp(comparison.y)) / 20 if step is None else step
+        rings = difference_rings(comparison, width)
     except ValueError as error:
         raise InputError(
-            f"{', '.join(named)}: {error}; see --image-size, --pixel-size, --step"
+            f"{', '.join(names)}: {error}; see --image-size, --pixel-size, --step"
         ) from None
-    if C_first is None or C_second is None:
-        return CalibrationComparison(first, second, found, rings)
-    C = expected_difference(found, one, other, (C_first, C_second), **known)
+    if C_a is None or C_b is None:
+        return CalibrationComparison(camera_a, camera_b, comparison, rings)
+    C = expected_difference(comparison, model_a, model_b, (C_a, C_b), **sensor)
     expected = np.sqrt(np.trace(C, axis1=2, axis2=3))
     # Rings of a difference that is σ everywhere: their RMS is what is expected.
-    as_map = dataclasses.replace(found, difference=expected[..., None] * [1.0, 0.0])
+    as_map = dataclasses.replace(comparison, difference=expected[..., None] * [1.0, 0.0])
     rings["expected"] = difference_rings(as_map, width)["rms"]
-    return CalibrationComparison(first, second, found, rings, C)
+    return CalibrationComparison(camera_a, camera_b, comparison, rings, C)

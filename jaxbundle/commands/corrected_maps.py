@@ -141,25 +141,27 @@ def correct(  # noqa: PLR0913 (public: the options of the command, all but three
     if occlusion and dem is None:
         raise InputError("--occlusion: needs terrain; give --dem")
     file = open_image(scanner, tell, picture)
-    given = None if sigma is None else _errors_of(errors or {}, file, Path(scanner))
+    map_errors = None if sigma is None else _errors_of(errors or {}, file, Path(scanner))
     surface = surface_under(file.image, file.earth, height, dem, geoid, tell)
     system = MapSystem(file.earth, crs)
     terrain = None if dem is None else Path(dem)
     grid = map_of(file.image, surface, system, spacing, terrain, tell=tell)
     if crs is not None and (place := system.degrees_of(grid)):
-        if said := describe_distance(crs, *place):
-            tell(said)
+        if warning := describe_distance(crs, *place):
+            tell(warning)
     search = None if isinstance(file.image, RpcImage) else make_search(file.image, file.earth)
     true = None if truth is None else _open_truth(Path(truth), file, tell)
     correction = Correction(cast(Resampling, resampling), occlusion, tolerance, nodata)
     format = MapFormat(cast(Compression, compress), overviews, cog, resampling == "nearest")
-    made = "" if checkpoint is None else _fingerprint(scanner, picture, dem, geoid, grid, crs)
+    fingerprint = (
+        "" if checkpoint is None else _fingerprint(scanner, picture, dem, geoid, grid, crs)
+    )
     stage = lambda name: lambda _, done, total: progress(name, done, total)
     with keep_blocks(
         None if checkpoint is None else Path(checkpoint),
-        of_words([made, repr(correction), repr(height)]),
-    ) as kept:
-        if kept is not None:
+        of_words([fingerprint, repr(correction), repr(height)]),
+    ) as resumed:
+        if resumed is not None:
             # No other process makes this map: the checkpoint is locked.
             remove_left_behind(out)
         write_corrected(
@@ -172,13 +174,13 @@ def correct(  # noqa: PLR0913 (public: the options of the command, all but three
             grid,
             correction,
             stage("blocks"),
-            (format, kept),
+            (format, resumed),
         )
     result = CorrectedImage(
         Path(out), grid.rows, grid.columns, grid.size, _describe_heights(surface, dem, geoid)
     )
-    if sigma is not None and given is not None:
-        rms = _write_sigma(sigma, file, (surface, given), system, grid, search, stage("σ"))
+    if sigma is not None and map_errors is not None:
+        rms = _write_sigma(sigma, file, (surface, map_errors), system, grid, search, stage("σ"))
         result = dataclasses.replace(result, sigma=Path(sigma), rms_sigma=rms)
     if true is not None and error_map is not None:
         rms = write_error_map(
@@ -199,14 +201,14 @@ def correct(  # noqa: PLR0913 (public: the options of the command, all but three
 def _write_sigma(
     path: str | Path,
     file: ScannerInput | RpcInput,
-    given: tuple[GroundSurface, MapErrors],
+    errors_on_surface: tuple[GroundSurface, MapErrors],
     system: MapSystem,
     grid: MapGrid,
     search: Any,
     progress: Progress,
 ) -> float:
     """Write the σ of a map; returns their RMS."""
-    surface, errors = given
+    surface, errors = errors_on_surface
     level = float(np.asarray(getattr(surface, "level", 0.0)))
     heights = (level, level)
     if isinstance(surface, Terrain):
@@ -225,25 +227,25 @@ def _errors_of(
         if not (np.isfinite(value) and value >= 0):
             raise InputError(f"--error {name}={value:g}: expected a number from 0 on")
     noise = {name: value for name, value in errors.items() if name in Noise._fields}
-    others = {name: value for name, value in errors.items() if name not in noise}
+    systematic = {name: value for name, value in errors.items() if name not in noise}
     if isinstance(file.image, RpcImage):
         if noise:
             raise InputError(
                 f"--error {next(iter(noise))}: {scanner} has rational polynomials only; give "
                 "ground (metres) or image (pixels)"
             )
-        if not {"ground", "image"} & set(others):
-            stated = read_stated_errors(find_coefficients(scanner))
-            if not stated.bias and not stated.random:
+        if not {"ground", "image"} & set(systematic):
+            stated_errors = read_stated_errors(find_coefficients(scanner))
+            if not stated_errors.bias and not stated_errors.random:
                 raise InputError(
                     f"--sigma: {scanner} states no error of its coefficients (ERR_BIAS, ERR_RAND); "
                     "give --error ground=METRES, for each horizontal axis"
                 )
-            others["ground"] = float(np.hypot(stated.bias, stated.random))
+            systematic["ground"] = float(np.hypot(stated_errors.bias, stated_errors.random))
     elif not errors:
         raise InputError(f"--sigma: give the σ, such as --error {MAP_ERRORS[0]}=0.001")
     scale = lambda name: np.pi / 180 if name.startswith("attitude") else 1.0
-    return MapErrors(Noise(**{n: v * scale(n) for n, v in noise.items()}), **others)
+    return MapErrors(Noise(**{n: v * scale(n) for n, v in noise.items()}), **systematic)
 
 
 def _describe_heights(
@@ -252,8 +254,8 @@ def _describe_heights(
     """What the heights of a map are."""
     if dem is None:
         return ""
-    above = "the plane Z = 0" if surface.earth is None else "the ellipsoid"
-    return f"{dem} above {above if geoid is None else f'the geoid {geoid}'}"
+    datum = "the plane Z = 0" if surface.earth is None else "the ellipsoid"
+    return f"{dem} above {datum if geoid is None else f'the geoid {geoid}'}"
 
 
 def _fingerprint(
@@ -267,9 +269,9 @@ def _fingerprint(
     """What the blocks of a map depend on, by names, sizes and times of the files: reading an image
     of gigabytes again takes as long as correcting a part of it."""
     files = [*files_read(scanner), picture]
-    for given in (dem, geoid):
-        if given is not None and os.path.exists(given):
-            folder = Path(given)
+    for source in (dem, geoid):
+        if source is not None and os.path.exists(source):
+            folder = Path(source)
             files += sorted(folder.iterdir()) if folder.is_dir() else [folder]
     words = [repr(grid), str(crs), str(geoid), jaxbundle.__version__]
     for path in files:
@@ -289,7 +291,7 @@ def _raster_of(scanner: str | Path, image: str | Path | None) -> Path:
 
 def _check_targets(targets: Mapping[str, Path], image: Path) -> None:
     """Refuse outputs that cannot be written, before computing."""
-    seen: dict[Path, str] = {}
+    option_of: dict[Path, str] = {}
     for option, path in targets.items():
         if not path.absolute().parent.is_dir():
             raise InputError(f"{option} {path}: there is no folder {path.parent}")
@@ -299,9 +301,9 @@ def _check_targets(targets: Mapping[str, Path], image: Path) -> None:
             )
         if path.exists() and path.samefile(image):
             raise InputError(f"{option} {path} is the image itself; give another name")
-        other = seen.setdefault(Path(os.path.realpath(path)), option)
-        if other != option:
-            raise InputError(f"{option} {path} is also {other}; give another name")
+        earlier_option = option_of.setdefault(Path(os.path.realpath(path)), option)
+        if earlier_option != option:
+            raise InputError(f"{option} {path} is also {earlier_option}; give another name")
 
 
 def _open_truth(path: Path, file: ScannerInput | RpcInput, tell: Message) -> PushbroomImage:
@@ -309,10 +311,11 @@ def _open_truth(path: Path, file: ScannerInput | RpcInput, tell: Message) -> Pus
     truth = open_scanner(path, tell)
     if truth.earth != file.earth:
         raise InputError(f"--truth {path}: its earth is not that of the scanner file")
-    size, own = ((i.lines, i.pixels) for i in (truth.image, file.image))
-    if size != own:
+    size, image_size = ((i.lines, i.pixels) for i in (truth.image, file.image))
+    if size != image_size:
         raise InputError(
-            f"--truth {path}: {size[0]} lines of {size[1]} pixels, the scanner file has {own[0]} "
-            f"of {own[1]}"
+            f"--truth {path}: {size[0]} lines of {size[1]} pixels, the scanner file has "
+            f"{image_size[0]} "
+            f"of {image_size[1]}"
         )
     return truth.image

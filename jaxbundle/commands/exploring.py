@@ -94,27 +94,27 @@ def explore(  # noqa: PLR0913 (public: the options of the command, all but one b
         SCANNER: {"--truth": truth, "--scene": scene},
     }
     path = input if isinstance(input, str | Path) else None
-    found = kind or (NETWORK if format else recognise(input))
-    for other, named in options.items():
-        for option, value in named.items():
-            if value and other != found:
+    content = kind or (NETWORK if format else recognise(input))
+    for kind_of_options, values in options.items():
+        for option, value in values.items():
+            if value and kind_of_options != content:
                 raise InputError(
-                    f"{option}: is for a {other}, but {_named(input)} is a {found}"
+                    f"{option}: is for a {kind_of_options}, but {_last_name(input)} is a {content}"
                     + ("" if kind or path is None else "; change this with --as")
                 )
-    if found == NETWORK:
+    if content == NETWORK:
         view: ExplorerView = _view_network(input, overrides, format, control, correlated, progress)
-    elif found == CAMERA:
+    elif content == CAMERA:
         view = _view_camera(input, Path(photo) if photo else None, image_size, pixel_size)
     elif path is None:
-        raise InputError(f"kind: {_named(input)} is no file of a scanner")
+        raise InputError(f"kind: {_last_name(input)} is no file of a scanner")
     else:
-        reference, shown = (Path(one) if one else None for one in (truth, scene))
-        view = _view_scanner(Path(path), reference, shown, tell)
+        reference, background = (Path(file) if file else None for file in (truth, scene))
+        view = _view_scanner(Path(path), reference, background, tell)
     return Server(view, port, tell)
 
 
-def _named(input: Explored) -> str:
+def _last_name(input: Explored) -> str:
     return str(input) if isinstance(input, str | Path) else f"the {type(input).__name__}"
 
 
@@ -188,7 +188,7 @@ def _view_network(
     elif isinstance(input, Network):
         network = input
     else:
-        raise InputError(f"kind: {_named(input)} is no network")
+        raise InputError(f"kind: {_last_name(input)} is no network")
     return NetworkView(adjust(network, correlated=correlated, progress=progress), origin)
 
 
@@ -197,11 +197,11 @@ def _view_camera(
 ) -> CameraView:
     """A camera, with its σ if it is the result of a calibration."""
     if isinstance(input, Adjustment | Network):
-        raise InputError(f"kind: {_named(input)} is no camera")
+        raise InputError(f"kind: {_last_name(input)} is no camera")
     files = [] if photo is None else [photo]
     if isinstance(input, str | Path):
-        whole = Path(input) / RESULT
-        input = str(whole if whole.is_file() else input)
+        result_file = Path(input) / RESULT
+        input = str(result_file if result_file.is_file() else input)
         files = [Path(input.rpartition("#")[0] or input), *files]
     camera, covariance = open_calibration(input)
     size = image_size or camera.image_size
@@ -222,25 +222,30 @@ def _view_scanner(
     path: Path, truth: Path | None, scene: Path | None, tell: Callable[[str], object]
 ) -> FlightView:
     """A scanner file, or a flight file, which has a track."""
-    known = None
+    true_image = None
     if truth is not None:
         opened = read_scanner(truth)
         for warning in opened.warnings:
             tell(warning)
-        known = opened.image
-    origin = trace_files([path, *(one for one in (truth, scene) if one is not None)], {})
-    shown = lambda earth: None if scene is None else read_scene(scene, earth)
+        true_image = opened.image
+    origin = trace_files([path, *(file for file in (truth, scene) if file is not None)], {})
+    scene_on = lambda earth: None if scene is None else read_scene(scene, earth)
     if path.suffix.lower() == ".toml" and "track" in read_toml(path):
-        if known is not None:
+        if true_image is not None:
             raise InputError("--truth: a flight file contains its truth; omit it")
         flight = read_flight(path)
         name = flight.file.section("scanner").text("name", path.stem)
         return FlightView(
-            name, flight.flight, flight.earth, origin=origin, scene=shown(flight.earth)
+            name, flight.flight, flight.earth, origin=origin, scene=scene_on(flight.earth)
         )
     scanner = read_scanner(path)
     for warning in scanner.warnings:
         tell(warning)
     return FlightView(
-        scanner.name, scanner.image, scanner.earth, known, origin, scene=shown(scanner.earth)
+        scanner.name,
+        scanner.image,
+        scanner.earth,
+        true_image,
+        origin,
+        scene=scene_on(scanner.earth),
     )

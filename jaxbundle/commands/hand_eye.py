@@ -39,8 +39,8 @@ class HandEye(TableMethods):
     @property
     def poses(self) -> RobotPoses:
         """The poses of the robot."""
-        further = self.adjustment.problem.network.further
-        return next(one for one in further if isinstance(one, RobotPoses))
+        kinds = self.adjustment.problem.network.further
+        return next(kind for kind in kinds if isinstance(kind, RobotPoses))
 
     def camera(self, name: str | None = None) -> Float[np.ndarray, "4 4"]:
         """Camera → hand (eye in hand) or camera → base (eye to hand): x' = T·x. The camera looks
@@ -76,13 +76,13 @@ class HandEye(TableMethods):
     def repeatability(self) -> dict[str, float]:
         """σ of a position of the hand (object unit) and of its attitude (unit of angles), estimated
         from the residuals; of those given the median."""
-        adjustment, found = self.adjustment, {}
-        for name, first in zip(PARTS, (0, 3)):
+        adjustment, repeatability = self.adjustment, {}
+        for name, column in zip(PARTS, (0, 3)):
             if name in adjustment.sigma_factors:
-                given = float(np.median(self.poses.sigma[:, first : first + 3]))
-                unit = adjustment.angle_scale if first else 1.0
-                found[name] = adjustment.sigma_factors[name] * given * unit
-        return found
+                stated_sigma = float(np.median(self.poses.sigma[:, column : column + 3]))
+                unit = adjustment.angle_scale if column else 1.0
+                repeatability[name] = adjustment.sigma_factors[name] * stated_sigma * unit
+        return repeatability
 
     @property
     def converged(self) -> bool:
@@ -91,15 +91,15 @@ class HandEye(TableMethods):
     def table(self) -> dict[str, np.ndarray]:
         """A row for every number of the two poses: columns of, unknown, value, sigma."""
         rows = [
-            (f"{table} {row}", name, one["value"], one["sigma"])
+            (f"{table} {row}", name, estimate["value"], estimate["sigma"])
             for table in TABLES[self.poses.type]
             for row, numbers in self.adjustment.further_unknowns[table].items()
-            for name, one in numbers.items()
+            for name, estimate in numbers.items()
         ]
-        of, unknown, value, sigma = zip(*rows)
+        pose, unknown, value, sigma = zip(*rows)
         words = lambda x: np.array(x, dtype=object)
         return {
-            "of": words(of),
+            "of": words(pose),
             "unknown": words(unknown),
             "value": np.array(value),
             "sigma": np.array(sigma),
@@ -134,12 +134,12 @@ class HandEye(TableMethods):
             f"{'base' if hand else 'hand'} ({network.object_unit}, {network.angle_unit}):",
         ]
         table = self.table()
-        for of, name, value, sigma in zip(*table.values()):
-            lines.append(f"  {of:28} {name:6} {value:14.6f}  σ {sigma:.2g}")
+        for pose, name, value, sigma in zip(*table.values()):
+            lines.append(f"  {pose:28} {name:6} {value:14.6f}  σ {sigma:.2g}")
         for name, value in self.repeatability.items():
             unit = network.object_unit if name == "robot positions" else network.angle_unit
             lines.append(f"repeatability, {name}: σ {value:.3g} {unit}")
-        return "\n".join([*lines, *(f"warning: {said}" for said in self.doubts)])
+        return "\n".join([*lines, *(f"warning: {doubt}" for doubt in self.doubts)])
 
     @property
     def doubts(self) -> list[str]:
@@ -148,11 +148,12 @@ class HandEye(TableMethods):
         worse = {name: factors[name] for name in PARTS if factors.get(name, 1) > WRONG_MISFIT}
         if not worse:
             return []
-        said = " and ".join(f"{name} {factor:.0f} times" for name, factor in worse.items())
-        other = HAND_EYE[HAND_EYE.index(self.poses.type) - 1]
+        excess = " and ".join(f"{name} {factor:.0f} times" for name, factor in worse.items())
+        other_mounting = HAND_EYE[HAND_EYE.index(self.poses.type) - 1]
         return [
-            f"{said} worse than their σ: is the camera mounted as said ({self.poses.type}, not "
-            f"{other}), do poses and photographs belong together, and are the units and the order "
+            f"{excess} worse than their σ: is the camera mounted as said ({self.poses.type}, not "
+            f"{other_mounting}), do poses and photographs belong together, and are the units and "
+            "the order "
             "of the rotations those of the robot?"
         ]
 
@@ -192,8 +193,12 @@ def hand_eye(
     network = _network_of(input, board, angle_unit, options)
     table = read_csv(Path(poses)) if isinstance(poses, str | os.PathLike) else poses
     section: dict[str, Any] = {"type": type}
-    given = {"sigma_position": sigma_position, "sigma_angle": sigma_angle, "camera": camera}
-    section |= {key: value for key, value in given.items() if value is not None}
+    options_of_section = {
+        "sigma_position": sigma_position,
+        "sigma_angle": sigma_angle,
+        "camera": camera,
+    }
+    section |= {key: value for key, value in options_of_section.items() if value is not None}
     network = add_further(network, robot_poses=table, hand_eye=section)
     of_calibration = board is not None
     result = adjust(
@@ -213,8 +218,8 @@ def _network_of(
             raise InputError("board: is for photographs; a network has its points")
         names = [input] if isinstance(input, str | os.PathLike) else list(input)
         plain: dict[str, Any] = {"cross_validation": False, "correlated": False}
-        found = calibrate(names, board, **(plain | dict(options)))
-        network = readjustable_network(found.adjustment)
+        calibration = calibrate(names, board, **(plain | dict(options)))
+        network = readjustable_network(calibration.adjustment)
         return network.replace(angle_unit=angle_unit or "deg")
     if isinstance(input, str | os.PathLike):
         input = read_network(input)

@@ -28,5 +28,7 @@ def trace_origin(
 
 def trace_files(files: Iterable[str | Path], settings: Mapping[str, object]) -> Origin:
     """The fingerprints of files, and the chosen settings."""
-    chosen = {name: value for name, value in settings.items() if value not in (None, False, "")}
-    return Origin(fingerprint_files(files), chosen, in_words(now()))
+    chosen_settings = {
+        name: value for name, value in settings.items() if value not in (None, False, "")
+    }
+    return Origin(fingerprint_files(files), chosen_settings, in_words(now()))

@@ -94,7 +94,8 @@ class PlannedBlock(TableMethods):
         if "precision" in self.__dict__:
             names = ("mean", "smallest", "largest")
             design["precision"] = {
-                axis: dict(zip(names, found)) for axis, found in self.precision.summary().items()
+                axis: dict(zip(names, statistics))
+                for axis, statistics in self.precision.summary().items()
             }
         return without_nan(design)
 

@@ -92,12 +92,12 @@ def reconstruct(  # noqa: PLR0913 (public: the options of the command, all but o
         settings = replace(settings, aspect_sigma=inf)
     if not truth("correlated", correlated):
         settings = replace(settings, correlated=False)
-    known = open_camera(camera) if camera is not None else None
+    opened_camera = open_camera(camera) if camera is not None else None
     measured = open_control(control, control_sigma, check)
     bars = read_distances(distances) if isinstance(distances, str | Path) else distances
     return reconstruct_photographs(
         [photos] if isinstance(photos, str | Path) else photos,
-        known,
+        opened_camera,
         settings,
         None if store is None else Path(store),
         progress,
@@ -119,7 +119,7 @@ def open_control(
         if control_sigma or check:
             raise InputError("--control-sigma and --check need --control")
         return None
-    known = control if isinstance(control, Control) else read_control_measurements(control)
+    opened = control if isinstance(control, Control) else read_control_measurements(control)
     if control_sigma:
-        known = with_sigma(known, str(control_sigma))
-    return replace(known, points=select_checks(known.points, check)) if check else known
+        opened = with_sigma(opened, str(control_sigma))
+    return replace(opened, points=select_checks(opened.points, check)) if check else opened

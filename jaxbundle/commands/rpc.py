@@ -94,7 +94,7 @@ def fit(
         raise InputError(f"heights {low:g}, {high:g}: expected two finite numbers, the lower first")
     if path.suffix.lower() == ".csv":
         table, columns = _read_points(path, tell=tell)
-        found = fit_rpc(table, ridge=ridge, source=columns.source)
+        fitted = fit_rpc(table, ridge=ridge, source=columns.source)
     else:
         file = open_scanner(path, tell)
         if file.earth is None:
@@ -102,14 +102,14 @@ def fit(
         check_spheroid(file.earth)
         if file.earth != WGS84:
             tell(f"{path}: the ellipsoid is not WGS84, as other programs assume")
-        found, check = fit_image(file.image, file.earth, (low, high), ridge=ridge)
+        fitted, check = fit_image(file.image, file.earth, (low, high), ridge=ridge)
         pole = pole_in_image(file.image, file.earth)
-    if not found.converged:
+    if not fitted.converged:
         raise NotSolvedError(
             f"{path}: the fit does not converge; give a larger --ridge than "
-            f"{found.ridge.max():.3g}, or points over more heights"
+            f"{fitted.ridge.max():.3g}, or points over more heights"
         )
-    checks = {"fit": found.check} | ({"check": check} if check is not None else {})
+    checks = {"fit": fitted.check} | ({"check": check} if check is not None else {})
     largest = max(c.largest.max() for c in checks.values())
     if largest > 0.5:  # pixel: places may then fall into the neighbouring one
         reason = "the coefficients do not follow jitter faster than a cubic over the image"
@@ -121,13 +121,13 @@ def fit(
             f"{path}: residuals up to {largest:.3g} pixel: {reason}; cut it into shorter pieces, "
             "or use the rigorous model"
         )
-    figures: dict[str, float] = {"points": len(found.check.residuals)}
-    for name, one in checks.items():
-        figures |= _figures(name, one)
-    figures |= {"ridge_line": float(found.ridge[0]), "ridge_sample": float(found.ridge[1])}
-    east, north, *rest = found.check.table
-    values = np.degrees(east), np.degrees(north), *rest, *found.check.residuals.T
-    return ScannerRpc(dict(zip((*COLUMNS, "v_line", "v_sample"), values)), figures, found.rpc)
+    figures: dict[str, float] = {"points": len(fitted.check.residuals)}
+    for name, check_of_fit in checks.items():
+        figures |= _figures(name, check_of_fit)
+    figures |= {"ridge_line": float(fitted.ridge[0]), "ridge_sample": float(fitted.ridge[1])}
+    east, north, *image_columns = fitted.check.table
+    values = np.degrees(east), np.degrees(north), *image_columns, *fitted.check.residuals.T
+    return ScannerRpc(dict(zip((*COLUMNS, "v_line", "v_sample"), values)), figures, fitted.rpc)
 
 
 def apply(
@@ -148,29 +148,29 @@ def apply(
     **Raises:** `InputError`, also if no point has a solution.
     """
     unknown = UnknownKeys()
-    given, table = read_rpc(Path(coefficients), unknown), read_csv(Path(points))
+    rpc, table = read_rpc(Path(coefficients), unknown), read_csv(Path(points))
     for message in unknown.messages():
         tell(message)
     if "line" in table.values:
         table.check_names(("line", "sample"), ("id",))
         place = [table.numbers(name, required=True) for name in ("line", "sample")]
-        surface = surface_of(WGS84, height, dem, given, geoid)
-        east, north, h, status = map(np.asarray, locate_points_on(given, surface, *place))
+        surface = surface_of(WGS84, height, dem, rpc, geoid)
+        east, north, h, status = map(np.asarray, locate_points_on(rpc, surface, *place))
         columns = dict(zip(COLUMNS, (np.degrees(east), np.degrees(north), h, *place)))
     else:
         table.check_names(COLUMNS[:3], ("id",))
         place = geographic(table)
-        line, sample, status = map(np.asarray, project_points(given, *place))
+        line, sample, status = map(np.asarray, project_points(rpc, *place))
         columns = dict(zip(COLUMNS, (*np.degrees(place[:2]), place[2], line, sample)))
     if (bad := status != RpcStatus.INSIDE).any():
         row = int(bad.argmax())
-        said = (
+        fault = (
             f"{table.source(row)}: {RpcStatus(int(status[row])).meaning} "
             f"({bad.sum()} of {len(status)} points)"
         )
         if (status == RpcStatus.NOT_CONVERGED).all():
-            raise InputError(f"{said}; check coordinates and units")
-        tell(said)
+            raise InputError(f"{fault}; check coordinates and units")
+        tell(fault)
     meaning = [RpcStatus(int(s)).meaning for s in status]
     return ScannerTable({"id": _ids(table), **columns, "status": meaning}, {})
 
@@ -209,7 +209,7 @@ def compensate(
         raise InputError(f"snooping {snooping!r}; expected one of none, {', '.join(TESTS)}")
     if not 0 < significance < 1:
         raise InputError(f"significance is {significance:g}; expected between 0 and 1")
-    given = read_rpc(Path(coefficients))
+    rpc = read_rpc(Path(coefficients))
     optional = ("id", "role", *GROUND_SIGMA)
     table, columns = _read_points(Path(control), optional, crs, geoid)
     ground = np.zeros((len(columns), 3))
@@ -218,53 +218,64 @@ def compensate(
     role = _roles(columns)
     # The others are checked by the fit.
     check = np.flatnonzero(role == "check")
-    taken = lambda rows: RpcTable(*(np.asarray(column)[rows] for column in table))
-    check_domain(given, taken(check), columns.source.take(check))
+    rows_of_table = lambda rows: RpcTable(*(np.asarray(column)[rows] for column in table))
+    check_domain(rpc, rows_of_table(check), columns.source.take(check))
     fit = lambda rows: fit_bias(
-        given,
-        taken(rows),
+        rpc,
+        rows_of_table(rows),
         model=model,
         sigma=sigma,
         ground_sigma=ground[rows],
         source=columns.source.take(rows),
     )
-    used = np.flatnonzero(role == "control")
-    if not len(used):
+    control_rows = np.flatnonzero(role == "control")
+    if not len(control_rows):
         raise InputError(f"{columns.source.name}: no control point; role is check in all rows")
-    found = fit(used)
-    while snooping != "none" and found.redundancy > 0:
-        w = np.nan_to_num(np.abs(found.w))
-        limit = critical_w(snooping, significance, w.size, found.redundancy, found.sigma0)
+    compensation = fit(control_rows)
+    while snooping != "none" and compensation.redundancy > 0:
+        w = np.nan_to_num(np.abs(compensation.w))
+        limit = critical_w(
+            snooping, significance, w.size, compensation.redundancy, compensation.sigma0
+        )
         # With one point less at least as many as the bias needs, and one that tests it.
-        least = len(found.cofactor) // 2 + 1
-        if w.max() <= limit or len(used) <= least:
+        min_points = len(compensation.cofactor) // 2 + 1
+        if w.max() <= limit or len(control_rows) <= min_points:
             break
         worst = int(w.max(1).argmax())
-        role[used[worst]] = "removed"
-        used = np.delete(used, worst)
-        found = fit(used)
-    changed, left = apply_bias(given, found.bias)
+        role[control_rows[worst]] = "removed"
+        control_rows = np.delete(control_rows, worst)
+        compensation = fit(control_rows)
+    changed, remainder = apply_bias(rpc, compensation.bias)
     # The same terms in lines and in samples.
-    k = len(found.cofactor) // 2
+    k = len(compensation.cofactor) // 2
     names = [f"{axis}_{term}" for axis in ("line", "sample") for term in TERMS[:k]]
-    values = [float(v) for axis in (found.bias.line, found.bias.sample) for v in axis[:k]]
-    figures = {"sigma0": found.sigma0, "redundancy": found.redundancy, **dict(zip(names, values))}
-    sigmas = np.sqrt(np.diag(found.covariance)).tolist()
+    values = [
+        float(v) for axis in (compensation.bias.line, compensation.bias.sample) for v in axis[:k]
+    ]
+    figures = {
+        "sigma0": compensation.sigma0,
+        "redundancy": compensation.redundancy,
+        **dict(zip(names, values)),
+    }
+    sigmas = np.sqrt(np.diag(compensation.covariance)).tolist()
     figures |= {f"s_{name}": s for name, s in zip(names, sigmas)}
-    residuals = _residuals_of_all(given, found.bias, table)
-    figures |= {"control_points": len(used), "removed_points": int((role == "removed").sum())}
+    residuals = _residuals_of_all(rpc, compensation.bias, table)
+    figures |= {
+        "control_points": len(control_rows),
+        "removed_points": int((role == "removed").sum()),
+    }
     if len(check):
         rms = np.sqrt(np.mean(residuals[check] ** 2, axis=0))
         figures |= {"check_points": len(check)}
         figures |= {f"check_rms_{a}": float(v) for a, v in zip(("line", "sample"), rms)}
-    if left is not None:
-        figures |= _figures("refit", left)
-    spread = lambda values: _in_rows(values, used, len(columns))
+    if remainder is not None:
+        figures |= _figures("refit", remainder)
+    in_all_rows = lambda values: _in_rows(values, control_rows, len(columns))
     rows: dict[str, Any] = {"id": _ids(columns), "role": role.tolist()}
     for i, axis in enumerate(("line", "sample")):
         rows |= {f"v_{axis}": residuals[:, i]}
-        rows |= {f"r_{axis}": spread(found.redundancy_numbers[:, i])}
-        rows |= {f"w_{axis}": spread(found.w[:, i])}
+        rows |= {f"r_{axis}": in_all_rows(compensation.redundancy_numbers[:, i])}
+        rows |= {f"w_{axis}": in_all_rows(compensation.w[:, i])}
     return ScannerRpc(rows, figures, changed)
 
 
@@ -292,9 +303,9 @@ _images = compile_once(jax.vmap(project_compensated, (None, None, 0, 0, 0)), ())
 
 def _in_rows(values: np.ndarray, rows: np.ndarray, number: int) -> np.ndarray:
     """Values of some rows among all, NaN for the others."""
-    out = np.full(number, np.nan)
-    out[rows] = values
-    return out
+    column = np.full(number, np.nan)
+    column[rows] = values
+    return column
 
 
 def _read_points(
@@ -328,8 +339,8 @@ def _read_points(
             )
     if geoid is not None:
         N = undulations_at(Path(geoid), np.degrees(east), np.degrees(north))
-        if (missing := ~np.isfinite(N)).any():
-            row = int(missing.argmax())
+        if (is_missing := ~np.isfinite(N)).any():
+            row = int(is_missing.argmax())
             raise InputError(f"{columns.source(row)}: {geoid} has no height of the geoid there")
         height = height + N
     measured = (columns.numbers(name, required=True) for name in COLUMNS[3:])
@@ -347,11 +358,11 @@ def _as_rpc_table(table: Columns, tell: Message) -> Columns:
 
 
 def _ids(columns: Columns) -> Sequence[str]:
-    given = "id" in columns.values
-    return columns.ids("id") if given else [str(k + 1) for k in range(len(columns))]
+    has_ids = "id" in columns.values
+    return columns.ids("id") if has_ids else [str(k + 1) for k in range(len(columns))]
 
 
 def _figures(name: str, check: RpcCheck) -> dict[str, float]:
     axes = ("line", "sample")
-    told = {f"{name}_rms_{axis}": float(v) for axis, v in zip(axes, check.rms)}
-    return told | {f"{name}_largest_{axis}": float(v) for axis, v in zip(axes, check.largest)}
+    figures = {f"{name}_rms_{axis}": float(v) for axis, v in zip(axes, check.rms)}
+    return figures | {f"{name}_largest_{axis}": float(v) for axis, v in zip(axes, check.largest)}

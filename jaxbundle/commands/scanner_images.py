@@ -53,28 +53,28 @@ def simulate(
     **Raises:** `InputError`.
     """
     one_of("resampling", resampling, RESAMPLINGS)
-    given, folder = read_flight(Path(flight)), Path(out)
+    flight_file, folder = read_flight(Path(flight)), Path(out)
     names = [IMAGE, *(f"{place}{n}" for place in ("", f"{TRUTH}/") for n in names_of(NAME, ""))]
     inputs = [path for path in (scene, dem, geoid) if path is not None]
     check_folder(folder, SIMULATE, names, [*files_read(Path(flight)), *inputs], force)
-    truth, measured = true_image(given.flight), measured_image(given.flight)
-    surface = surface_of(given.earth, height, dem, truth, geoid)
-    shown = None if scene is None else read_scene(Path(scene), given.earth)
-    unit = given.file.section("scanner").text("angle_unit", "deg")
+    truth, measured = true_image(flight_file.flight), measured_image(flight_file.flight)
+    surface = surface_of(flight_file.earth, height, dem, truth, geoid)
+    picture = None if scene is None else read_scene(Path(scene), flight_file.earth)
+    unit = flight_file.file.section("scanner").text("angle_unit", "deg")
     write = lambda folder, image: write_scanner_image(
-        folder, NAME, image, given.earth, prefix="", angle_unit=unit
+        folder, NAME, image, flight_file.earth, prefix="", angle_unit=unit
     )
     with replace_folder(folder, SIMULATE, names, force) as new:
         path = write(new, measured)
         write(new / TRUTH, truth)
-        if shown is not None:
+        if picture is not None:
             write_taken(
                 new / IMAGE,
                 truth,
                 surface,
-                jnp.asarray(shown.bands),
-                shown.place,
-                np.dtype(shown.dtype),
+                jnp.asarray(picture.bands),
+                picture.place,
+                np.dtype(picture.dtype),
                 cast(Resampling, resampling),
                 lambda _, done, total: progress("lines", done, total),
             )

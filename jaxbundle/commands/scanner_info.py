@@ -62,8 +62,10 @@ class ScannerInfo(TableMethods):
         return without_nan({**self.figures, "corners": rows_of(self.table())})
 
     def __str__(self) -> str:
-        told = [(name, value) for name, value in self.figures.items() if value is not None]
-        lines = [f"{name:24}{_in_words(value):>16}  {WORDS.get(name, '')}" for name, value in told]
+        figures = [(name, value) for name, value in self.figures.items() if value is not None]
+        lines = [
+            f"{name:24}{_in_words(value):>16}  {WORDS.get(name, '')}" for name, value in figures
+        ]
         names = [name for name in self.corners if name != "corner"]
         lines += ["", f"{'corner':26}" + "".join(f"{name:>14}" for name in names)]
         for row in rows_of(self.table()):
@@ -105,31 +107,31 @@ def info(
     }
     # The middle, the next line, the next pixel; the corners.
     line, pixel = (image.lines - 1) / 2, (image.pixels - 1) / 2
-    last = image.lines - 1.0, image.pixels - 1.0
+    last_corner = image.lines - 1.0, image.pixels - 1.0
     X = _locate(
         image,
         surface,
-        np.array([line, line + 1, line, 0.0, 0.0, last[0], last[0]]),
-        np.array([pixel, pixel, pixel + 1, 0.0, last[1], last[1], 0.0]),
+        np.array([line, line + 1, line, 0.0, 0.0, last_corner[0], last_corner[0]]),
+        np.array([pixel, pixel, pixel + 1, 0.0, last_corner[1], last_corner[1], 0.0]),
     )
-    middle, along, across = X[:, :3].T
+    middle, next_line, next_pixel = X[:, :3].T
     if not np.isfinite(middle).all():
-        what = "height, and the heights of the coefficients"
+        suspects = "height, and the heights of the coefficients"
         if not isinstance(image, RpcImage):
-            what = "attitude, mounting, positions and height"
-        tell(f"{scanner}: the ray of the middle of the image misses the ground; check {what}")
-    figures["ground_sampling_along"] = float(np.linalg.norm(along - middle))
-    figures["ground_sampling_across"] = float(np.linalg.norm(across - middle))
+            suspects = "attitude, mounting, positions and height"
+        tell(f"{scanner}: the ray of the middle of the image misses the ground; check {suspects}")
+    figures["ground_sampling_along"] = float(np.linalg.norm(next_line - middle))
+    figures["ground_sampling_across"] = float(np.linalg.norm(next_pixel - middle))
     figures["incidence"], figures["azimuth"] = _view(image, surface, middle, line, pixel)
     if isinstance(image, RpcImage):
         figures["heights"] = heights_in_words(image.rpc)
     else:
         figures |= _of_platform(image, file.earth)
-        on = [name for name, is_on in image.corrections._asdict().items() if is_on]
-        figures["corrections"] = ", ".join(on).replace("_", " ") or "none"
+        corrections = [name for name, is_on in image.corrections._asdict().items() if is_on]
+        figures["corrections"] = ", ".join(corrections).replace("_", " ") or "none"
         if isinstance(file, ScannerInput) and file.agreement is not None:
             figures["rpc_rms"], figures["rpc_largest"], figures["rpc_rms_pixels"] = file.agreement
-    return ScannerInfo(figures, _corners(X[:, 3:], last, file.earth))
+    return ScannerInfo(figures, _corners(X[:, 3:], last_corner, file.earth))
 
 
 def _locate(
@@ -157,10 +159,10 @@ def _view(
         ray = np.asarray(pose_at(image, image.times.time(line)).P) - X
     ray = ray / np.linalg.norm(ray)
     earth = surface.earth
-    up = np.array([0.0, 0.0, 1.0]) if earth is None else np.asarray(normal(earth, tuple(X)))
-    up = up / np.linalg.norm(up)
+    vertical = np.array([0.0, 0.0, 1.0]) if earth is None else np.asarray(normal(earth, tuple(X)))
+    vertical = vertical / np.linalg.norm(vertical)
     east, north = np.asarray(east_north(surface, tuple(X))) @ ray
-    incidence = np.degrees(np.arctan2(np.linalg.norm(np.cross(up, ray)), up @ ray))
+    incidence = np.degrees(np.arctan2(np.linalg.norm(np.cross(vertical, ray)), vertical @ ray))
     return float(incidence), float(np.degrees(np.arctan2(east, north)) % 360)
 
 
@@ -172,17 +174,17 @@ def _of_platform(image: PushbroomImage, earth: Ellipsoid | None) -> dict[str, fl
     altitude = float(P[2]) if earth is None else None
     if earth is not None and earth.a == earth.b:
         altitude = float(geodetic(earth, P)[2])
-    told = {"duration": abs(ends[1] - ends[0]), "altitude": altitude}
-    return {**told, "speed": float(np.linalg.norm(pose.V))}
+    figures = {"duration": abs(ends[1] - ends[0]), "altitude": altitude}
+    return {**figures, "speed": float(np.linalg.norm(pose.V))}
 
 
 def _corners(
-    X: Float[np.ndarray, "3 4"], last: tuple[float, float], earth: Ellipsoid | None
+    X: Float[np.ndarray, "3 4"], last_corner: tuple[float, float], earth: Ellipsoid | None
 ) -> dict[str, Column]:
     columns: dict[str, Column] = {
         "corner": list(CORNERS),
-        "line": np.array([0.0, 0.0, last[0], last[0]]),
-        "pixel": np.array([0.0, last[1], last[1], 0.0]),
+        "line": np.array([0.0, 0.0, last_corner[0], last_corner[0]]),
+        "pixel": np.array([0.0, last_corner[1], last_corner[1], 0.0]),
     }
     if earth is None or earth.a != earth.b:
         return columns | dict(zip("XYZ", X))

@@ -103,10 +103,10 @@ def open_image(
     **Raises:** `InputError`."""
     path = Path(path)
     if path.is_file() and has_rpc_only(path):
-        found = read_rpc_image(path, None if raster is None else Path(raster))
-        for warning in found.warnings:
+        rpc_input = read_rpc_image(path, None if raster is None else Path(raster))
+        for warning in rpc_input.warnings:
             tell(warning)
-        return found
+        return rpc_input
     if path.exists() and path.suffix.lower() not in (".toml", *PRODUCTS):
         raise InputError(
             f"{path}: expected a scanner file (.toml), {EXPECTED_PRODUCTS}; or an image with RPC: "
@@ -129,17 +129,17 @@ def surface_under(
     if not isinstance(image, RpcImage):
         return surface_of(earth, height, dem, image, geoid)
     low, high = heights_of(image.rpc)
-    held = f"the RPC holds for heights from {heights_in_words(image.rpc)} m"
+    domain = f"the RPC holds for heights from {heights_in_words(image.rpc)} m"
     if height is None and dem is None and not low <= 0 <= high:
         height = (low + high) / 2
-        tell(f"{held}, not for 0: the ground is taken at {height:.6g} m; give --height or --dem")
+        tell(f"{domain}, not for 0: the ground is taken at {height:.6g} m; give --height or --dem")
     surface = surface_of(earth, height, dem, image, geoid)
-    at = [height or 0.0]
+    ground_heights = [height or 0.0]
     if isinstance(surface, Terrain):
-        at = [float(surface.lowest), float(surface.highest)]
-    if min(at) < low or max(at) > high:
-        words = " to ".join(f"{h:.6g}" for h in at)
-        tell(f"{held}; the ground is at {words} m, where it is extrapolated")
+        ground_heights = [float(surface.lowest), float(surface.highest)]
+    if min(ground_heights) < low or max(ground_heights) > high:
+        words = " to ".join(f"{h:.6g}" for h in ground_heights)
+        tell(f"{domain}; the ground is at {words} m, where it is extrapolated")
     return surface
 
 
@@ -159,11 +159,11 @@ def geographic(table: Columns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     names = "longitude", "latitude", "height"
     longitude, latitude, height = (table.numbers(name, required=True) for name in names)
-    for name, values, most in ((names[0], longitude, 360), (names[1], latitude, 90)):
-        if (beyond := ~(np.abs(values) <= most)).any():
+    for name, values, limit in ((names[0], longitude, 360), (names[1], latitude, 90)):
+        if (beyond := ~(np.abs(values) <= limit)).any():
             row = int(beyond.argmax())
             raise InputError(
-                f"{table.source(row)}: {name} {values[row]:g} is beyond {most}°; expected "
+                f"{table.source(row)}: {name} {values[row]:g} is beyond {limit}°; expected "
                 "degrees: check their unit and the order of columns"
             )
     return np.radians(longitude), np.radians(latitude), height
@@ -200,39 +200,39 @@ def off_image(
 
     **Raises:** `InputError`.
     """
-    off = np.zeros(len(line), bool)
+    is_off = np.zeros(len(line), bool)
     if isinstance(image, RpcImage) and not image.sized:
-        return off
-    said = None
+        return is_off
+    message = None
     for name, values, size in (("line", line, image.lines), ("pixel", pixel, image.pixels)):
-        outside = ~((values >= -0.5) & (values <= size - 0.5))
-        if outside.any() and said is None:
-            row = int(outside.argmax())
-            said = (
+        is_outside = ~((values >= -0.5) & (values <= size - 0.5))
+        if is_outside.any() and message is None:
+            row = int(is_outside.argmax())
+            message = (
                 f"{source(row)}: {name} {values[row]:g} is {OFF_IMAGE}, which has {size}; "
                 f"expected -0.5 to {size - 0.5:g}"
             )
-        off |= outside
-    if said is not None:
-        said += f" ({off.sum()} of {len(off)} points)"
-        if off.all():
-            raise InputError(said)
-        tell(said)
-    return off
+        is_off |= is_outside
+    if message is not None:
+        message += f" ({is_off.sum()} of {len(is_off)} points)"
+        if is_off.all():
+            raise InputError(message)
+        tell(message)
+    return is_off
 
 
 def with_points(table: Columns, tell: Message) -> Columns:
     """The rows that have a point: `locate` leaves the others empty, with a status."""
     if "status" not in table.values:
         return table
-    given = [name for name in (*CARTESIAN, *GEOGRAPHIC) if name in table.values]
-    empty = np.all([np.isnan(table.numbers(name)) for name in given], axis=0)
+    coordinates = [name for name in (*CARTESIAN, *GEOGRAPHIC) if name in table.values]
+    empty = np.all([np.isnan(table.numbers(name)) for name in coordinates], axis=0)
     if not np.any(empty):
         return table
     tell(f"{table.source(int(empty.argmax()))}: no point ({empty.sum()} rows are skipped)")
-    kept = np.flatnonzero(~empty).tolist()
-    values = {name: [column[row] for row in kept] for name, column in table.values.items()}
-    return Columns(values, table.source.take(kept))
+    rows = np.flatnonzero(~empty).tolist()
+    values = {name: [column[row] for row in rows] for name, column in table.values.items()}
+    return Columns(values, table.source.take(rows))
 
 
 def points_of(table: Columns, earth: Ellipsoid | None) -> np.ndarray:

@@ -111,15 +111,17 @@ def locate(
     file = open_image(scanner, tell)
     surface = surface_under(file.image, file.earth, height, dem, geoid, tell)
     ids, line, pixel, source = places(file.image, points, grid)
-    off = off_image(file.image, line, pixel, source, tell)
+    is_off = off_image(file.image, line, pixel, source, tell)
     X, extrapolated = _locate(file.image, surface, line, pixel)
-    X[:, off] = np.nan
-    missed = np.isnan(X).any(0) & ~off
-    over = np.zeros_like(missed)
+    X[:, is_off] = np.nan
+    missed = np.isnan(X).any(0) & ~is_off
+    is_outside_terrain = np.zeros_like(missed)
     if isinstance(surface, Terrain):
         strict = dataclasses.replace(surface, over_voids=False)
-        over = ~(missed | off) & np.isnan(_locate(file.image, strict, line, pixel)[0]).any(0)
-    extrapolated &= ~off
+        is_outside_terrain = ~(missed | is_off) & np.isnan(
+            _locate(file.image, strict, line, pixel)[0]
+        ).any(0)
+    extrapolated &= ~is_off
     if extrapolated.any() and isinstance(file.image, RpcImage):
         tell(
             f"{source(int(extrapolated.argmax()))}: {_extrapolated(file.image)} "
@@ -133,13 +135,13 @@ def locate(
             if dem
             else "check attitude, mounting and height"
         )
-        said = (
+        message = (
             f"{source(row)}: the ray of line {line[row]:g}, pixel {pixel[row]:g}: {reason}; "
             f"{remedy} ({missed.sum()} of {len(line)} points)"
         )
-        if (missed | off).all():
-            raise InputError(said)
-        tell(said)
+        if (missed | is_off).all():
+            raise InputError(message)
+        tell(message)
     columns: dict[str, Column] = {"id": ids} if ids else {}
     columns |= {"line": line, "pixel": pixel, "X": X[0], "Y": X[1], "Z": X[2]}
     if file.earth is not None and file.earth.a == file.earth.b:
@@ -147,7 +149,9 @@ def locate(
         columns |= {"longitude": np.degrees(longitude), "latitude": np.degrees(latitude)}
         columns |= {"height": h}
     reasons = [OFF_IMAGE, reason, GAP_REASON, RpcStatus.OUTSIDE.meaning]
-    columns["status"] = np.select([off, missed, over, extrapolated], reasons, "found").tolist()
+    columns["status"] = np.select(
+        [is_off, missed, is_outside_terrain, extrapolated], reasons, "found"
+    ).tolist()
     return ScannerTable(columns, {"scanner": file.name})
 
 
@@ -165,8 +169,8 @@ def _locate(
 
 
 def _extrapolated(image: RpcImage) -> str:
-    held = heights_in_words(image.rpc)
-    return f"{RpcStatus.OUTSIDE.meaning}; they hold for heights from {held} m"
+    heights = heights_in_words(image.rpc)
+    return f"{RpcStatus.OUTSIDE.meaning}; they hold for heights from {heights} m"
 
 
 def project(scanner: str | Path, points: str | Path, *, tell: Message = ignore) -> ScannerTable:
@@ -186,9 +190,9 @@ def project(scanner: str | Path, points: str | Path, *, tell: Message = ignore) 
     if isinstance(file.image, RpcImage):
         return ScannerTable(_project_rpc(file.image, table, X, tell), {"scanner": file.name})
     search = make_search(file.image, file.earth)
-    found = project_points(file.image, search, X, most=MAX_IMAGES)
-    line, pixel = np.asarray(found.line), np.asarray(found.pixel)
-    status, count = np.asarray(found.status), np.asarray(found.count)
+    projected = project_points(file.image, search, X, most=MAX_IMAGES)
+    line, pixel = np.asarray(projected.line), np.asarray(projected.pixel)
+    status, count = np.asarray(projected.status), np.asarray(projected.count)
     if (status != ProjectionStatus.SEEN).all():
         raise InputError(
             f"{table.source(0)}: no point is in the image; this one is "
@@ -225,34 +229,39 @@ def _project_rpc(
     **Raises:** `InputError`, if no point is in the image."""
     place = jax.jit(geodetic)(WGS84, tuple(X))
     line, pixel, status = (np.array(v) for v in rpc_project_points(image.rpc, *place))
-    seen = (line >= -0.5) & (line <= image.lines - 0.5)
-    seen &= (pixel >= -0.5) & (pixel <= image.pixels - 0.5) & (status != RpcStatus.NOT_CONVERGED)
+    is_seen = (line >= -0.5) & (line <= image.lines - 0.5)
+    is_seen &= (pixel >= -0.5) & (pixel <= image.pixels - 0.5) & (status != RpcStatus.NOT_CONVERGED)
     extrapolated = status != RpcStatus.INSIDE
     if not image.sized:
-        seen = ~extrapolated
-    if not seen.any():
+        is_seen = ~extrapolated
+    if not is_seen.any():
         raise InputError(
             f"{table.source(0)}: no point is in the image; this one is at line {line[0]:.6g}, "
             f"pixel {pixel[0]:.6g} of {image.lines} × {image.pixels}: check coordinates, frame and "
             "units"
         )
-    outside = f"not in the image of {image.lines} × {image.pixels}"
+    outside_words = f"not in the image of {image.lines} × {image.pixels}"
     for rows, words in (
-        (~seen, outside if image.sized else RpcStatus.OUTSIDE.meaning),
-        (seen & extrapolated, _extrapolated(image)),
+        (~is_seen, outside_words if image.sized else RpcStatus.OUTSIDE.meaning),
+        (is_seen & extrapolated, _extrapolated(image)),
     ):
         if rows.any():
             tell(
-                f"{table.source(int(rows.argmax()))}: {words} ({rows.sum()} of {len(seen)} points)"
+                f"{table.source(int(rows.argmax()))}: {words} ({rows.sum()} of {len(is_seen)} "
+                "points)"
             )
-    line[~seen], pixel[~seen] = np.nan, np.nan
+    line[~is_seen], pixel[~is_seen] = np.nan, np.nan
     words = [OFF_IMAGE if image.sized else RpcStatus.OUTSIDE.meaning, RpcStatus.OUTSIDE.meaning]
     return {
-        "id": table.ids("id") if "id" in table.values else [str(k + 1) for k in range(len(seen))],
+        "id": table.ids("id")
+        if "id" in table.values
+        else [str(k + 1) for k in range(len(is_seen))],
         "line": line,
         "pixel": pixel,
-        "count": seen.astype(int),
-        "status": np.select([~seen, extrapolated], words, ProjectionStatus.SEEN.meaning).tolist(),
+        "count": is_seen.astype(int),
+        "status": np.select(
+            [~is_seen, extrapolated], words, ProjectionStatus.SEEN.meaning
+        ).tolist(),
     }
 
 
@@ -306,9 +315,11 @@ def accuracy(  # noqa: PLR0913 (public: the options of the command, all but one 
         "pixel": np.tile(column, len(row)),
     }
     by_cell = lambda values: np.asarray(values).reshape(len(row) * len(column), -1)
-    known = lambda values: np.isfinite(values).sum(1)
+    count_finite = lambda values: np.isfinite(values).sum(1)
     # A cell where every ray misses the surface has no mean.
-    mean = lambda values: np.nansum(values, 1) / np.where(known(values) > 0, known(values), np.nan)
+    mean = lambda values: (
+        np.nansum(values, 1) / np.where(count_finite(values) > 0, count_finite(values), np.nan)
+    )
     rms = lambda values: np.sqrt(mean(values**2))
     if truth is not None:
         true = open_scanner(truth, tell).image
@@ -339,20 +350,20 @@ def accuracy(  # noqa: PLR0913 (public: the options of the command, all but one 
             raise InputError("no σ is given: --attitude-white 0.01, for example, or --truth FILE")
         if isinstance(surface, Terrain):
             raise InputError("--dem: use --height with σ; terrain has no reverse mode")
-        found = propagate_accuracy(file.image, surface, line, pixel, noise)
-        columns |= {"rms": rms(by_cell(found.rms)), "ce90": mean(by_cell(found.ce90))}
-        figures = {"rms": found.overall, "ce90": found.overall_ce90}
-        if np.isnan(found.overall):
+        propagated = propagate_accuracy(file.image, surface, line, pixel, noise)
+        columns |= {"rms": rms(by_cell(propagated.rms)), "ce90": mean(by_cell(propagated.ce90))}
+        figures = {"rms": propagated.overall, "ce90": propagated.overall_ce90}
+        if np.isnan(propagated.overall):
             raise InputError(NO_RAY)
         if draws:
-            drawn = simulate_accuracy(file.image, surface, line, pixel, noise, draws, seed)
+            simulated = simulate_accuracy(file.image, surface, line, pixel, noise, draws, seed)
             columns |= {
-                "drawn_rms": rms(by_cell(drawn.rms)),
-                "drawn_ce90": mean(by_cell(drawn.ce90)),
+                "drawn_rms": rms(by_cell(simulated.rms)),
+                "drawn_ce90": mean(by_cell(simulated.ce90)),
             }
             figures |= {
-                "drawn_rms": drawn.overall,
-                "drawn_ce90": drawn.overall_ce90,
+                "drawn_rms": simulated.overall,
+                "drawn_ce90": simulated.overall_ce90,
                 "draws": draws,
             }
     return ScannerTable(columns, {"scanner": file.name, **figures, "positions": len(line)})

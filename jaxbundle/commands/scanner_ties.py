@@ -63,16 +63,17 @@ def tie(
     for warning in warnings:
         say(warning)
     rasters = []
-    for one in images:
-        source = file.section("images").path(one.id, "an image")
+    for image in images:
+        source = file.section("images").path(image.id, "an image")
         raster = find_raster(source)
         if raster is None:
             raise InputError(f"{source}: no raster {source.stem}.tif beside it")
         rasters.append(raster)
     orientations = [
-        (one.image, one.earth) if isinstance(one, ScannerImage) else one.image.rpc for one in images
+        (image.image, image.earth) if isinstance(image, ScannerImage) else image.image.rpc
+        for image in images
     ]
-    views = views_of_images([one.id for one in images], orientations, rasters)
+    views = views_of_images([image.id for image in images], orientations, rasters)
     heights = None if zmin is None or zmax is None else (zmin, zmax)
     bounds, messages = ground_bounds(views, heights)
     for message in messages:

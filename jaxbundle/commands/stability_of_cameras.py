@@ -22,12 +22,12 @@ def stability(
     **Raises:** `InputError` if they are not of one camera, or have no covariance.
     """
     opened = []
-    for given in calibrations:
-        camera, covariance = open_calibration(given)
+    for source in calibrations:
+        camera, covariance = open_calibration(source)
         if covariance is None:
-            named = given if isinstance(given, str | Path) else f"camera {camera.id!r}"
+            name = source if isinstance(source, str | Path) else f"camera {camera.id!r}"
             raise InputError(
-                f"{named}: has no covariance; give the result.json of calibrate or adjust"
+                f"{name}: has no covariance; give the result.json of calibrate or adjust"
             )
         opened.append((camera, covariance))
     numbers = [number_or_days(str(word), "--at") for word in at or ()]

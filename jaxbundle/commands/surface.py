@@ -153,15 +153,15 @@ def surface(  # noqa: PLR0913 (public: the options of the command, all but one b
     """
     inputs = [Path(input)] if isinstance(input, str | Path) else [Path(path) for path in input]
     folder = None if photos is None else Path(photos)
-    between = _heights(zmin, zmax)
+    height_range = _heights(zmin, zmax)
     if dsm is not None and not dsm > 0:
         raise InputError(f"--dsm {dsm}: expected a positive size")
     if (orthophoto or orthophoto_of) and dsm is None:
         raise InputError("--orthophoto: needs --dsm, the size of its pixels")
     # Read before matching, which takes minutes: its errors come at once.
-    given = read_cloud(check).X if isinstance(check, str | Path) else check
-    if given is not None:
-        given = numeric_array("check", given, "coordinates X, Y, Z [n, 3]")
+    known_points = read_cloud(check).X if isinstance(check, str | Path) else check
+    if known_points is not None:
+        known_points = numeric_array("check", known_points, "coordinates X, Y, Z [n, 3]")
     options = {"points": points, "step": step, "dense": dense, "settings": settings}
     say = tell or (lambda _: None)
     # Photographs come in one folder, scanner and RPC images one by one.
@@ -169,13 +169,15 @@ def surface(  # noqa: PLR0913 (public: the options of the command, all but one b
         match = _match_ground_images
     else:
         match = _match_photographs
-    wanted = _Wanted(crs, geoid, heights, dsm is not None)
-    made = match(inputs, folder, between, pairs, wanted, {**options, "progress": progress}, say)
-    views = choose_views(made.views, orthophoto_of) if orthophoto or orthophoto_of else []
-    model = None if dsm is None else make_dsm(made.surface.cloud, dsm)
-    picture = mosaic(views, model, made.to_views) if views and model is not None else None
-    known = made.check if given is None else np.asarray(given, float)
-    return Surface(made.surface, model, picture, known, made.heights)
+    reference = _Wanted(crs, geoid, heights, dsm is not None)
+    matched = match(
+        inputs, folder, height_range, pairs, reference, {**options, "progress": progress}, say
+    )
+    views = choose_views(matched.views, orthophoto_of) if orthophoto or orthophoto_of else []
+    model = None if dsm is None else make_dsm(matched.surface.cloud, dsm)
+    picture = mosaic(views, model, matched.to_views) if views and model is not None else None
+    true_points = matched.check if known_points is None else np.asarray(known_points, float)
+    return Surface(matched.surface, model, picture, true_points, matched.heights)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -195,14 +197,14 @@ def _match_photographs(
     photos: Path | None,
     heights: Heights | None,
     pairs: Sequence[str] | None,
-    wanted: _Wanted,
+    requested: _Wanted,
     options: Mapping[str, Any],
     say: Callable[[str], object],
 ) -> _Matched:
     if photos is None:
         raise InputError("--photos is missing: the folder of the photographs")
-    reference = heights_of_photographs(wanted.crs, wanted.geoid, wanted.heights)
-    if wanted.model:
+    reference = heights_of_photographs(requested.crs, requested.geoid, requested.heights)
+    if requested.model:
         check_cells(reference, metres=False)
     views, network, messages = read_views(inputs[0], photos)
     if reference.geoid is not None:
@@ -210,19 +212,19 @@ def _match_photographs(
             raise InputError(f"--geoid: the unit of the block is {network.object_unit}; expected m")
         # Also without heights: a grid that does not cover the block is refused before matching.
         x, y = np.stack([view.X0[:2] for view in views], 1)
-        inside = reference.as_computed(heights or (0.0, 0.0), x, y)
-        heights = heights and inside
-    bounds, more = find_bounds(views, tie_points(network), heights)
-    _say_all(messages + more, say)
-    found = reconstruct_surface(views, bounds, _partners(pairs, views), **options)
-    cloud = reference.apply(found.cloud)
-    _say_all(found.messages, say)
-    every = (*messages, *more, *found.messages)
-    found = dataclasses.replace(found, cloud=cloud, messages=every)
+        computed_heights = reference.as_computed(heights or (0.0, 0.0), x, y)
+        heights = heights and computed_heights
+    bounds, messages_of_bounds = find_bounds(views, tie_points(network), heights)
+    _say_all(messages + messages_of_bounds, say)
+    reconstructed = reconstruct_surface(views, bounds, _partners(pairs, views), **options)
+    cloud = reference.apply(reconstructed.cloud)
+    _say_all(reconstructed.messages, say)
+    all_messages = (*messages, *messages_of_bounds, *reconstructed.messages)
+    reconstructed = dataclasses.replace(reconstructed, cloud=cloud, messages=all_messages)
     to_views = lambda X: _with_height(X, -reference.correction(X[:, 0], X[:, 1]))
     check = check_points(network)
     check = _with_height(check, reference.correction(check[:, 0], check[:, 1]))
-    return _Matched(found, views, to_views, check, reference.words)
+    return _Matched(reconstructed, views, to_views, check, reference.words)
 
 
 def _match_ground_images(
@@ -230,7 +232,7 @@ def _match_ground_images(
     photos: Path | None,
     heights: Heights | None,
     pairs: Sequence[str] | None,
-    wanted: _Wanted,
+    requested: _Wanted,
     options: Mapping[str, Any],
     say: Callable[[str], object],
 ) -> _Matched:
@@ -238,32 +240,34 @@ def _match_ground_images(
     views, around = read_ground_views(inputs, photos)
     if len(views) < 2:
         raise InputError(f"{inputs[0]}: one image; a surface needs at least two")
-    crs, geoid, above, model = wanted
+    crs, geoid, height_system, model = requested
     if around is None:
-        no_height_reference(geoid, above)
+        no_height_reference(geoid, height_system)
         reference = HeightReference()
     else:
-        reference = heights_of_ground_images(system_of(around, crs), geoid, above)
+        reference = heights_of_ground_images(system_of(around, crs), geoid, height_system)
         if model:
             check_cells(reference, metres=True)
     if reference.geoid is not None and around is not None and reference.horizontal is not None:
         x, y = _corners(views, around, reference.horizontal)
-        inside = reference.as_computed(heights or (0.0, 0.0), x, y)
-        heights = heights and inside
+        computed_heights = reference.as_computed(heights or (0.0, 0.0), x, y)
+        heights = heights and computed_heights
     bounds, messages = ground_bounds(views, heights)
     messages = (*messages, *align_all(views, bounds))
     if around is not None and crs is not None:
         place = (float(np.degrees(float(a))) for a in (around.longitude, around.latitude))
         messages = (*messages, *filter(None, [describe_distance(crs, *place)]))
     _say_all(messages, say)
-    found = reconstruct_surface(views, bounds, _partners(pairs, views), **options)
-    _say_all(found.messages, say)
-    found = dataclasses.replace(found, messages=(*messages, *found.messages))
+    reconstructed = reconstruct_surface(views, bounds, _partners(pairs, views), **options)
+    _say_all(reconstructed.messages, say)
+    reconstructed = dataclasses.replace(
+        reconstructed, messages=(*messages, *reconstructed.messages)
+    )
     if around is None or reference.horizontal is None:
-        return _Matched(found, views, lambda X: X, np.zeros((0, 3)))
+        return _Matched(reconstructed, views, lambda X: X, np.zeros((0, 3)))
     horizontal = reference.horizontal
-    cloud = reference.apply(to_map(found.cloud, around, horizontal))
-    in_map = dataclasses.replace(found, cloud=cloud)
+    cloud = reference.apply(to_map(reconstructed.cloud, around, horizontal))
+    in_map = dataclasses.replace(reconstructed, cloud=cloud)
 
     def to_views(X: np.ndarray) -> np.ndarray:
         h = X[:, 2] - reference.correction(X[:, 0], X[:, 1])
@@ -272,22 +276,22 @@ def _match_ground_images(
     return _Matched(in_map, views, to_views, np.zeros((0, 3)), reference.words)
 
 
-def _with_height(X: np.ndarray, added: np.ndarray) -> np.ndarray:
+def _with_height(X: np.ndarray, shift: np.ndarray) -> np.ndarray:
     """Points [n, 3] with something added to their heights."""
-    return np.column_stack([X[:, :2], X[:, 2] + added])
+    return np.column_stack([X[:, :2], X[:, 2] + shift])
 
 
 def _corners(
     views: Sequence[GroundView], around: Neighbourhood, crs: str
 ) -> tuple[np.ndarray, np.ndarray]:
     """x and y of the corners of images on the ellipsoid, or at the middle of their heights."""
-    found = []
+    corners = []
     for view in views:
         columns, rows = view.size
         uv = np.array([[u, v] for u in (0.0, columns - 1.0) for v in (0.0, rows - 1.0)])
         h = sum(view.range()) / 2 if isinstance(view, RpcView) else 0.0
-        found.append(view.points(uv, np.full(len(uv), h)))
-    X = np.concatenate(found)
+        corners.append(view.points(uv, np.full(len(uv), h)))
+    X = np.concatenate(corners)
     x, y = map_coordinates(X[np.isfinite(X).all(1)], around, crs)
     return x, y
 
@@ -298,10 +302,12 @@ def choose_views(
     """The images with these names; all if none are given.
 
     **Raises:** `InputError`."""
-    known = [view.name for view in views]
+    known_names = [view.name for view in views]
     for name in names or ():
-        if name not in known:
-            raise InputError(f"--orthophoto-of {name!r}: no such image{did_you_mean(name, known)}")
+        if name not in known_names:
+            raise InputError(
+                f"--orthophoto-of {name!r}: no such image{did_you_mean(name, known_names)}"
+            )
     return [view for view in views if not names or view.name in names]
 
 

@@ -66,20 +66,21 @@ class ChangeResult(TableMethods):
 
     def __str__(self) -> str:
         """Shares and volumes in lines."""
-        found = self.figures
-        tail, at_level = found["tail_ratio"], ""
-        if tail != found["sigma_ratio"]:
+        figures = self.figures
+        tail, at_level = figures["tail_ratio"], ""
+        if tail != figures["sigma_ratio"]:
             at_level = f"; of single cells at this level {tail:.3g}"
         lines = [
-            f"{found['cells']} cells of both surfaces; at the level {100 * found['level']:g} % "
-            f"(|w| > {found['limit']:.3g}) {100 * found['risen']:.3g} % have risen, "
-            f"{100 * found['fallen']:.3g} % fallen",
-            f"mean σ of a difference {found['mean_sigma']:.4g}; scatter of the cells over their "
-            f"own σ {found['sigma_ratio']:.3g} (1 is right{at_level}), which are multiplied by it "
+            f"{figures['cells']} cells of both surfaces; at the level {100 * figures['level']:g} % "
+            f"(|w| > {figures['limit']:.3g}) {100 * figures['risen']:.3g} % have risen, "
+            f"{100 * figures['fallen']:.3g} % fallen",
+            f"mean σ of a difference {figures['mean_sigma']:.4g}; scatter of the cells over their "
+            f"own σ {figures['sigma_ratio']:.3g} (1 is right{at_level}), which are multiplied by "
+            "it "
             "if it is above 1",
-            f"of neighbouring cells {found['cells_that_count_as_one']:.3g} count as one; "
-            f"{count(found['shared_errors'], 'error')} common to cells"
-            + ("" if found["shared_errors"] else NOTHING_SHARED),
+            f"of neighbouring cells {figures['cells_that_count_as_one']:.3g} count as one; "
+            f"{count(figures['shared_errors'], 'error')} common to cells"
+            + ("" if figures["shared_errors"] else NOTHING_SHARED),
         ]
         for region in (self.change.total, *self.change.regions[:20]):
             name = "all cells" if region.label == 0 else f"region {region.label}"
@@ -129,15 +130,15 @@ def change(  # noqa: PLR0913 (public: the options of the command, all but two by
 
     **Raises:** `InputError`.
     """
-    first = _open(
+    cells_before = _open_surface(
         before, before_sigma, before_errors or {}, size, "before", before_orientation is not None
     )
-    second = _open(
+    cells_after = _open_surface(
         after, after_sigma, after_errors or {}, size, "after", after_orientation is not None
     )
-    _check_systems(first, second)
-    _check_heights(first, second)
-    first, second = align(first, second)
+    _check_systems(cells_before, cells_after)
+    _check_heights(cells_before, cells_after)
+    cells_before, cells_after = align(cells_before, cells_after)
     if same_adjustment:
         if before_orientation is None or after_orientation is None:
             raise InputError("--same-adjustment: give --before-orientation and --after-orientation")
@@ -146,25 +147,25 @@ def change(  # noqa: PLR0913 (public: the options of the command, all but two by
     oriented, warnings = _orientations(
         (before_orientation, after_orientation),
         (before_images, after_images),
-        (first, second),
+        (cells_before, cells_after),
         same_adjustment,
     )
-    for given, cells, errors, name in zip(
-        (before, after), (first, second), oriented, ("before", "after")
+    for source, cells, errors, name in zip(
+        (before, after), (cells_before, cells_after), oriented, ("before", "after")
     ):
-        if errors is not None and not isinstance(given, HeightGrid):
-            warnings += _doubled_sigma(Path(given), cells, name)
-    chosen = None if stable is None else _read_mask(stable, first) != 0
-    labels = None if regions is None else _read_mask(regions, first)
-    found = find_change(
-        _with_errors(first, oriented[0], before_errors or {}),
-        _with_errors(second, oriented[1], after_errors or {}),
+        if errors is not None and not isinstance(source, HeightGrid):
+            warnings += _doubled_sigma(Path(source), cells, name)
+    is_stable = None if stable is None else _read_mask(stable, cells_before) != 0
+    labels = None if regions is None else _read_mask(regions, cells_before)
+    found_change = find_change(
+        _with_errors(cells_before, oriented[0], before_errors or {}),
+        _with_errors(cells_after, oriented[1], after_errors or {}),
         level,
-        chosen,
+        is_stable,
         labels,
         same_adjustment,
     )
-    return ChangeResult(found, tuple(warnings))
+    return ChangeResult(found_change, tuple(warnings))
 
 
 def _doubled_sigma(path: Path, cells: CellSource, name: str) -> list[str]:
@@ -180,46 +181,46 @@ def _doubled_sigma(path: Path, cells: CellSource, name: str) -> list[str]:
     ]
 
 
-def _open(
-    given: HeightGrid | str | Path,
+def _open_surface(
+    source: HeightGrid | str | Path,
     sigma: str | Path | None,
     errors: Errors,
     size: float | None,
     name: str,
-    own: bool,
+    without_orientation: bool,
 ) -> HeightGrid | RasterCells:
-    """A surface with σ of its cells, no shared errors; `own`: σ without those of orientations, if
-    the file has them."""
+    """A surface with σ of its cells, no shared errors; `without_orientation`: σ without those of
+    orientations, if the file has them."""
     for key, value in errors.items():
         if key not in SURFACE_ERRORS:
             raise InputError(f"--{name}-error {key}{did_you_mean(key, SURFACE_ERRORS)}")
         if not (np.isfinite(value) and value >= 0):
             raise InputError(f"--{name}-error {key}={value:g}: a number from 0 on is expected")
     cell = errors.get("cell", 0.0)
-    if isinstance(given, HeightGrid):
-        return _with_cell_error(given, cell)
-    path = Path(given)
+    if isinstance(source, HeightGrid):
+        return _with_cell_error(source, cell)
+    path = Path(source)
     if path.suffix.lower() in CLOUD_FILES:
         if sigma is not None:
             raise InputError(f"{path}: is a cloud, whose points have σ; omit --{name}-sigma")
         if size is None:
             raise InputError(f"{path}: is a cloud; give the --size of the cells to compare")
         dsm = make_dsm(read_cloud(path), size)
-        found = HeightGrid(dsm.height, dsm.sigma, dsm.x, dsm.y, dsm.size, dsm.system)
-        found = _with_cell_error(found, cell)
-        has_sigma = bool(np.isfinite(found.sigma).any())
+        surface = HeightGrid(dsm.height, dsm.sigma, dsm.x, dsm.y, dsm.size, dsm.system)
+        surface = _with_cell_error(surface, cell)
+        has_sigma = bool(np.isfinite(surface.sigma).any())
     else:
-        found = dataclasses.replace(open_cells(path), more_sigma=cell)
+        surface = dataclasses.replace(open_cells(path), more_sigma=cell)
         beside = path.with_name(f"{path.stem}_sigma{path.suffix}")
         file = Path(sigma) if sigma is not None else beside if beside.is_file() else None
         if file is not None:
-            found = found.with_sigma(file, own)
-        has_sigma = found.has_sigma
+            surface = surface.with_sigma(file, without_orientation)
+        has_sigma = surface.has_sigma
     if not has_sigma:
         raise InputError(
             f"{path}: no σ of its cells; give --{name}-sigma FILE, or --{name}-error cell=METRES"
         )
-    return found
+    return surface
 
 
 def _with_cell_error(grid: HeightGrid, cell: float) -> HeightGrid:
@@ -233,24 +234,24 @@ def _read_mask(path: str | Path, cells: CellSource) -> Int[np.ndarray, "rows col
     """A raster of whole numbers on the lattice of some cells, 0 where there is nothing: it marks
     cells, and need not have all of them."""
     mask = open_cells(path)
-    found = np.zeros(cells.shape, np.int32)
+    numbers = np.zeros(cells.shape, np.int32)
     try:
         _check_systems(cells, mask)
         row, column = place_of(mask, cells)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     rows, columns = (
-        slice(max(at, 0), min(at + n, size))
-        for at, n, size in zip((row, column), mask.shape, cells.shape)
+        slice(max(offset, 0), min(offset + n, size))
+        for offset, n, size in zip((row, column), mask.shape, cells.shape)
     )
     if rows.start >= rows.stop or columns.start >= columns.stop:
         raise InputError(f"{path}: has no cell of the surfaces; check its coordinate system")
     # 512 rows of 10 000 cells are 40 MB
     for start in range(rows.start, rows.stop, 512):
         part = slice(start, min(start + 512, rows.stop))
-        there = slice(part.start - row, part.stop - row)
-        across = slice(columns.start - column, columns.stop - column)
-        values = np.nan_to_num(mask.window(there, across).height)
+        mask_rows = slice(part.start - row, part.stop - row)
+        mask_columns = slice(columns.start - column, columns.stop - column)
+        values = np.nan_to_num(mask.window(mask_rows, mask_columns).height)
         # A fraction would be cut to another region, or a stable cell to none.
         strange = (values != np.rint(values)) | (np.abs(values) >= 2**31)
         if strange.any():
@@ -258,30 +259,31 @@ def _read_mask(path: str | Path, cells: CellSource) -> Int[np.ndarray, "rows col
                 f"{path}: has a cell of {values[strange][0]:g}; whole numbers below 2³¹ are "
                 "expected, 0 for none"
             )
-        found[part, columns] = values
-    return found
+        numbers[part, columns] = values
+    return numbers
 
 
-def _check_systems(first: CellSource, second: CellSource) -> None:
+def _check_systems(before: CellSource, after: CellSource) -> None:
     """Refuse surfaces in different map systems."""
-    if first.system is None or second.system is None:
+    if before.system is None or after.system is None:
         return
     import pyproj
 
-    one, other = (
-        pyproj.CRS.from_user_input(horizontal_system(grid.system)) for grid in (first, second)
+    system_before, system_after = (
+        pyproj.CRS.from_user_input(horizontal_system(grid.system)) for grid in (before, after)
     )
-    if not one.equals(other, ignore_axis_order=True):
+    if not system_before.equals(system_after, ignore_axis_order=True):
         raise InputError(
-            f"two rasters are in different coordinate systems, {one.name} and {other.name}; "
+            f"two rasters are in different coordinate systems, {system_before.name} and "
+            f"{system_after.name}; "
             "transform one (gdalwarp -t_srs)"
         )
 
 
-def _check_heights(first: CellSource, second: CellSource) -> None:
+def _check_heights(before: CellSource, after: CellSource) -> None:
     """Refuse heights above different surfaces, by the systems of the files."""
-    systems = [split_system(grid.system) for grid in (first, second) if grid.system is not None]
-    names = ["none" if one.vertical is None else one.vertical.name for one in systems]
+    systems = [split_system(grid.system) for grid in (before, after) if grid.system is not None]
+    names = ["none" if system.vertical is None else system.vertical.name for system in systems]
     if len({*names}) > 1:
         raise InputError(
             f"the heights of both surfaces are of different systems: before {names[0]}, after "
@@ -294,46 +296,56 @@ def _with_errors(
     cells: CellSource, orientation: OrientedErrors | None, errors: Errors
 ) -> UncertainCells:
     """A surface with its shared errors: those of its orientations first."""
-    given = {key: value for key, value in errors.items() if key != "cell"}
-    stated = StatedSurfaceErrors(middle_of(cells), **given)
-    return UncertainCells(cells, (*(() if orientation is None else (orientation,)), stated))
+    systematic = {key: value for key, value in errors.items() if key != "cell"}
+    stated_errors = StatedSurfaceErrors(middle_of(cells), **systematic)
+    return UncertainCells(cells, (*(() if orientation is None else (orientation,)), stated_errors))
 
 
 def _orientations(
     paths: tuple[str | Path | None, str | Path | None],
     patterns: tuple[str, str],
     surfaces: tuple[CellSource, CellSource],
-    same: bool,
+    of_one_adjustment: bool,
 ) -> tuple[tuple[OrientedErrors | None, OrientedErrors | None], list[str]]:
-    """The errors of the orientations of both surfaces, and warnings. Of `same` adjustment they are
-    those of all its images that either was made of, in one order."""
+    """The errors of the orientations of both surfaces, and warnings. If both are of one adjustment,
+    they are those of all its images that either was made of, in one order."""
     warnings: list[str] = []
-    made: list[OrientedErrors | None] = []
-    chosen = [None if p is None else choose_images(p, text) for p, text in zip(paths, patterns)]
-    for path, mine, cells in zip(paths, chosen, surfaces):
-        if path is None or mine is None:
-            made.append(None)
+    both_errors: list[OrientedErrors | None] = []
+    chosen_images = [
+        None if p is None else choose_images(p, text) for p, text in zip(paths, patterns)
+    ]
+    for path, images, cells in zip(paths, chosen_images, surfaces):
+        if path is None or images is None:
+            both_errors.append(None)
             continue
-        others = [one.names for one in chosen if one is not None] if same else []
-        errors = oriented_errors(mine, set().union(*others), cells.system)
+        names_of_all = (
+            [part.names for part in chosen_images if part is not None] if of_one_adjustment else []
+        )
+        errors = oriented_errors(images, set().union(*names_of_all), cells.system)
         # Of another project all columns of L would be 0, and the errors missing in silence.
-        seen = errors.share_seen(cells)
-        if seen == 0:
+        share_seen = errors.share_seen(cells)
+        if share_seen == 0:
             raise InputError(
                 f"{path}: no cell of the surface is in two of its images; is it the project of "
                 "this surface, in its coordinate system?"
             )
-        if seen < 1:
+        if share_seen < 1:
             warnings.append(
-                f"{path}: {100 * (1 - seen):.3g} % of the cells with a height are in fewer than "
+                f"{path}: {100 * (1 - share_seen):.3g} % of the cells with a height are in fewer "
+                "than "
                 "two of its images: their σ have no errors of orientations, and are too small if "
                 "they were made of other images"
             )
-        made.append(errors)
-    one, other = made
-    if same and one is not None and other is not None and not one.are_those_of(other):
+        both_errors.append(errors)
+    before, after = both_errors
+    if (
+        of_one_adjustment
+        and before is not None
+        and after is not None
+        and not before.are_those_of(after)
+    ):
         raise InputError(
             "--same-adjustment: the orientations of both surfaces are not those of one adjustment; "
             "give its folder twice"
         )
-    return (one, other), warnings
+    return (before, after), warnings

@@ -129,15 +129,15 @@ def frames(
         looks = [look_at_video(path, settings, progress) for path in paths]
         if every is None:
             _check_together(looks, begin)
-            chosen = choose_frames(looks, begin, settings)
+            frame_numbers = choose_frames(looks, begin, settings)
         else:
             length = min(len(look) - skipped for look, skipped in zip(looks, begin))
-            chosen = np.arange(0, length, integer("every", every, least=1))
+            frame_numbers = np.arange(0, length, integer("every", every, least=1))
         for path, name, skipped in zip(paths, names, begin):
             # Equal numbers in the names are one instant.
-            write_frames(path, chosen + skipped, skipped, new / name)
+            write_frames(path, frame_numbers + skipped, skipped, new / name)
             progress(f"writing {name}", 1, 1)
-        numbers = np.stack([chosen + skipped for skipped in begin])
+        numbers = np.stack([frame_numbers + skipped for skipped in begin])
         result = VideoFrames(
             tuple(paths),
             tuple(Path(out) / name for name in names),
@@ -145,7 +145,7 @@ def frames(
             numbers,
             np.stack([n / look.rate for n, look in zip(numbers, looks)]),
             np.stack([look.sharpness[n] for n, look in zip(numbers, looks)]),
-            tuple(file_of_frame(k) for k in chosen.tolist()),
+            tuple(file_of_frame(k) for k in frame_numbers.tolist()),
         )
         table = result.table()
         rows = zip(*(column.tolist() for column in table.values()))

@@ -70,7 +70,7 @@ def accuracy(  # noqa: PLR0913 - the options of the command
         kind = cast(AttitudeError, table)
         write_table(table_of(scanner, kind, levels, draws, seed, height), csv, json)
         return
-    found = line_scanners.accuracy(
+    result = line_scanners.accuracy(
         scanner,
         truth=truth,
         attitude_bias=attitude_bias,
@@ -87,14 +87,14 @@ def accuracy(  # noqa: PLR0913 - the options of the command
         geoid=geoid,
         tell=warn,
     )
-    figures = {name: value for name, value in found.figures.items() if name != "scanner"}
+    figures = {name: value for name, value in result.figures.items() if name != "scanner"}
     if map_ is not None:
-        _write_map(map_, found.table(), figures)
-    accepted = accept_result(found, accept)
-    write_rows(found.columns, csv, json, found.figures, accepted)
+        _write_map(map_, result.table(), figures)
+    acceptance = accept_result(result, accept)
+    write_rows(result.columns, csv, json, result.figures, acceptance)
     if json != "-":
         typer.echo("; ".join(f"{k} {v:.6g}" for k, v in figures.items()), err=True)
-    end_unmet(accepted)
+    end_unmet(acceptance)
 
 
 def _check_map(path: Path, table: str | None) -> None:
@@ -124,9 +124,9 @@ def _write_map(path: Path, columns: dict, head: dict) -> None:
         write_image_raster(path, lines, pixels, bands)
         return
     name = "error" if "error" in columns else "rms"
-    told = f"RMS {head['rms']:.3g} m, CE90 {head['ce90']:.3g} m"
+    overall = f"RMS {head['rms']:.3g} m, CE90 {head['ce90']:.3g} m"
     title = "Error on the ground" if name == "error" else "RMS on the ground"
-    draw = lambda ax: image_map(lines, pixels, bands[f"{name} [m]"], title, "m", told, ax)
+    draw = lambda ax: image_map(lines, pixels, bands[f"{name} [m]"], title, "m", overall, ax)
     try:
         write_figures(path.parent, {path.stem: ((7.5, 6), None, draw)})
     except ImportError as error:

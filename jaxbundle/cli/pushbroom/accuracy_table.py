@@ -25,9 +25,11 @@ def table_of(
         raise InputError(
             f"--levels {levels!r}: expected positive numbers, such as 0.01,0.1"
         ) from None
-    given = read_flight(path)
-    surface = surface_of(given.earth, height, None)
-    return accuracy_table(given.flight, surface, np.radians(sigmas), kind, draws or 1000, seed)
+    flight_file = read_flight(path)
+    surface = surface_of(flight_file.earth, height, None)
+    return accuracy_table(
+        flight_file.flight, surface, np.radians(sigmas), kind, draws or 1000, seed
+    )
 
 
 def write_table(table: AccuracyTable, csv: Path | None, json: str) -> None:

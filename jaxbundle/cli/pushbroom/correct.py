@@ -89,7 +89,7 @@ def correct(  # noqa: PLR0913 - the options of the command
     if checkpoint is not None:
         advise(f"run the same command again to resume; finished blocks are kept in {checkpoint}")
     with staging(quiet) as show:
-        found = line_scanners.correct(
+        result = line_scanners.correct(
             scanner,
             image,
             out,
@@ -114,18 +114,18 @@ def correct(  # noqa: PLR0913 - the options of the command
             tell=warn,
         )
     if not quiet:
-        print(f"{found}{'' if truth is None else f' against {truth}'}")
+        print(f"{result}{'' if truth is None else f' against {truth}'}")
 
 
-def _errors(given: list[str]) -> dict[str, float]:
+def _errors(assignments: list[str]) -> dict[str, float]:
     """σ by name."""
-    found = {}
-    for text in given:
+    errors = {}
+    for text in assignments:
         name, _, value = text.partition("=")
         try:
-            found[name] = float(value)
+            errors[name] = float(value)
         except ValueError:
             raise InputError(
                 f"--error {text}: expected NAME=SIGMA, such as {MAP_ERRORS[0]}=0.001"
             ) from None
-    return found
+    return errors

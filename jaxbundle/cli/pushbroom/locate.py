@@ -27,7 +27,7 @@ def locate(
     from jaxbundle.cli.pushbroom.shared import keep_inputs, warn, write_rows
 
     keep_inputs([scanner, points, dem, geoid], csv=csv, json=json)
-    found = line_scanners.locate(
+    located = line_scanners.locate(
         scanner,
         points=points,
         grid=grid_of(grid),
@@ -36,4 +36,4 @@ def locate(
         geoid=geoid,
         tell=warn,
     )
-    write_rows(found.columns, csv, json, found.figures)
+    write_rows(located.columns, csv, json, located.figures)

@@ -22,5 +22,5 @@ def project(
     from jaxbundle.cli.pushbroom.shared import keep_inputs, warn, write_rows
 
     keep_inputs([scanner, points], csv=csv, json=json)
-    found = line_scanners.project(scanner, points, tell=warn)
-    write_rows(found.columns, csv, json, found.figures)
+    projected = line_scanners.project(scanner, points, tell=warn)
+    write_rows(projected.columns, csv, json, projected.figures)

@@ -78,17 +78,17 @@ def refine(
         result = dataclasses.replace(result, warnings=(*result.warnings, *refits))
     verdict = conclude_refinement(result)
     text = head_line(origin) + report(result, verdict.words)
-    accepted = accept_result(result, accept)
+    acceptance = accept_result(result, accept)
     document = without_nan({"verdict": verdict_dict(verdict), **to_json(result)})
-    if accepted is not None:
-        text += f"\n{accepted}\n"
-        document["acceptance"] = without_nan(accepted.to_dict())
+    if acceptance is not None:
+        text += f"\n{acceptance}\n"
+        document["acceptance"] = without_nan(acceptance.to_dict())
     as_json = json_.dumps(document, ensure_ascii=False) + "\n"
     page = partial(compose_refinement, result, origin)
     with write_result(json, as_json, out, "pushbroom refine", names, force, html, page) as new:
         if new is not None:
-            for said in describe_states(write_images(new, file, result)):
-                warn(said)
+            for state_warning in describe_states(write_images(new, file, result)):
+                warn(state_warning)
             write_refined_orientations(new, not_none(out), file, result)
             rows = point_rows(result)
             write_csv(new / "points.csv", list(rows[0]), [list(row.values()) for row in rows])
@@ -102,4 +102,4 @@ def refine(
     else:
         for warning in result.warnings:
             warn(warning)
-    end_unmet(accepted)
+    end_unmet(acceptance)

@@ -46,14 +46,14 @@ def fit(
 
     check_accept(accept, "pushbroom rpc fit")
     keep_inputs([source], out=out, json=json)
-    found = line_scanners.rpc.fit(source, heights=_heights(heights), ridge=ridge, tell=warn)
-    found.write(out)
-    accepted = accept_result(found, accept)
+    fitted = line_scanners.rpc.fit(source, heights=_heights(heights), ridge=ridge, tell=warn)
+    fitted.write(out)
+    acceptance = accept_result(fitted, accept)
     if json:
-        write_rows(found.columns, None, json, found.figures, accepted)
+        write_rows(fitted.columns, None, json, fitted.figures, acceptance)
     else:
-        print(found if accepted is None else f"{found}\n\n{accepted}")
-    end_unmet(accepted)
+        print(fitted if acceptance is None else f"{fitted}\n\n{acceptance}")
+    end_unmet(acceptance)
 
 
 @rpc.command(example="out/image_RPC.TXT --points points.csv")
@@ -74,10 +74,10 @@ def apply(
     from jaxbundle.cli.pushbroom.shared import keep_inputs, warn, write_rows
 
     keep_inputs([coefficients, points, dem], csv=csv, json=json)
-    found = line_scanners.rpc.apply(
+    applied = line_scanners.rpc.apply(
         coefficients, points, height=height, dem=dem, geoid=geoid, tell=warn
     )
-    write_rows(found.columns, csv, json)
+    write_rows(applied.columns, csv, json)
 
 
 @rpc.command(example="out/image_RPC.TXT --control control.csv --out out/shifted_RPC.TXT")
@@ -117,7 +117,7 @@ def compensate(  # noqa: PLR0913 - the options of the command
     # The tags of a raster may be replaced in place.
     keep_inputs([control], out=out, csv=csv, json=json)
     keep_inputs([coefficients], csv=csv, json=json, out=None if out.suffix in RASTERS else out)
-    found = line_scanners.rpc.compensate(
+    compensated = line_scanners.rpc.compensate(
         coefficients,
         control,
         model=model,
@@ -127,12 +127,12 @@ def compensate(  # noqa: PLR0913 - the options of the command
         crs=crs,
         geoid=geoid,
     )
-    found.write(out)
-    accepted = accept_result(found, accept)
-    write_rows(found.columns, csv, json, found.figures, accepted)
+    compensated.write(out)
+    acceptance = accept_result(compensated, accept)
+    write_rows(compensated.columns, csv, json, compensated.figures, acceptance)
     if json != "-":
-        typer.echo("; ".join(f"{k} {v:.6g}" for k, v in found.figures.items()), err=True)
-    end_unmet(accepted)
+        typer.echo("; ".join(f"{k} {v:.6g}" for k, v in compensated.figures.items()), err=True)
+    end_unmet(acceptance)
 
 
 def _heights(text: str) -> tuple[float, float]:

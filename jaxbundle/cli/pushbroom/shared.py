@@ -33,9 +33,9 @@ def open_scanner(path: Path) -> ScannerInput:
 
 def keep_inputs(inputs: Sequence[str | Path | None], **outputs: str | Path | None) -> None:
     """Refuse an output file, by option name, that is an input; for JSON, `check_json`."""
-    read = {os.path.realpath(file) for path in inputs if path for file in files_read(path)}
+    input_files = {os.path.realpath(file) for path in inputs if path for file in files_read(path)}
     for option, path in outputs.items():
-        if path and os.path.realpath(path) in read:
+        if path and os.path.realpath(path) in input_files:
             raise InputError(
                 f"--{option.replace('_', '-')} {path} is part of the input and would be "
                 "overwritten; give another"
@@ -48,11 +48,11 @@ def write_rows(
     csv: Path | None,
     json_: str,
     head: Mapping | None = None,
-    accepted: "Acceptance | None" = None,
+    acceptance: "Acceptance | None" = None,
 ) -> None:
     """A table as CSV or JSON, in a file or on standard output; with what was found of criteria."""
-    if accepted is not None:
-        head = {**(head or {}), "acceptance": accepted.to_dict()}
+    if acceptance is not None:
+        head = {**(head or {}), "acceptance": acceptance.to_dict()}
     columns = {
         name: values.tolist() if isinstance(values, np.ndarray) else list(values)
         for name, values in columns.items()

@@ -27,7 +27,7 @@ def simulate(
     from jaxbundle.cli.progress import staging
 
     with staging(quiet) as show:
-        found = line_scanners.simulate(
+        scanner_file = line_scanners.simulate(
             flight,
             out,
             scene=scene,
@@ -39,4 +39,4 @@ def simulate(
             progress=show,
         )
     if not quiet:
-        print(found)
+        print(scanner_file)

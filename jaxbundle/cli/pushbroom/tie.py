@@ -30,9 +30,9 @@ def tie(
 
     keep_inputs([input], out=out, json=json)
     with staging(quiet or json == "-") as show:
-        found = line_scanners.tie(
+        result = line_scanners.tie(
             input, spacing=spacing, zmin=zmin, zmax=zmax, progress=show, tell=warn
         )
-    table = found.table()
+    table = result.table()
     write_csv(out, list(table), table_rows(table))
-    print_result(found, json, quiet)
+    print_result(result, json, quiet)
