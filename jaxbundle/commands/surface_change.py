@@ -332,9 +332,8 @@ def _orientations(
         if share_seen < 1:
             warnings.append(
                 f"{path}: {100 * (1 - share_seen):.3g} % of the cells with a height are in fewer "
-                "than "
-                "two of its images: their σ have no errors of orientations, and are too small if "
-                "they were made of other images"
+                "than two of its images: their σ have no errors of orientations, and are too "
+                "small if they were made of other images"
             )
         both_errors.append(errors)
     before, after = both_errors
