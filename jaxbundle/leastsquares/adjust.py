@@ -57,10 +57,10 @@ class TableResult:
     covariance: Float[np.ndarray, "rows width width"]
 
 
-def table_result(found: Solution, table: str, sigma0: float) -> TableResult:
+def table_result(solution: Solution, table: str, sigma0: float) -> TableResult:
     """A table of a solution."""
-    value = jax.tree.map(np.asarray, found.values[table])
-    covariance = sigma0**2 * found.cofactor(table)
+    value = jax.tree.map(np.asarray, solution.values[table])
+    covariance = sigma0**2 * solution.cofactor(table)
     sigma = np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0, None))
     numbers = isinstance(value, np.ndarray) and value.ndim == 1
     return TableResult(value, sigma[:, 0] if numbers else sigma, covariance)
@@ -128,13 +128,13 @@ class Result:
     def _failure(self) -> str:
         """Why there is no solution: the undetermined unknowns, or observations without
         derivatives."""
-        what, names = "not determined", self.undetermined
+        fault, names = "not determined", self.undetermined
         if not names:
-            sets = [given.name for given in self.problem.observations]
+            sets = [observation_set.name for observation_set in self.problem.observations]
             names = tuple(without_derivatives(self.problem, self.minimum.values, sets))
-            what = "no finite residual or derivative of"
+            fault = "no finite residual or derivative of"
         return f"not solved: {self.termination}" + (
-            f"; {what}: {', '.join(names[:8])}" if names else ""
+            f"; {fault}: {', '.join(names[:8])}" if names else ""
         )
 
     @property
@@ -165,30 +165,33 @@ class Result:
         """For the observations of a kind, in the given order: v (computed − observed) and sigma (a
         priori) in the unit of the kind, r, w (Baarda), tau (Pope), mdb, external; v is NaN, sigma
         infinite for residuals without weight."""
-        names = {given.name: given.kind.name for given in self.problem.observations}
+        names = {
+            observation_set.name: observation_set.kind.name
+            for observation_set in self.problem.observations
+        }
         if kind not in names.values():
-            known = ", ".join(dict.fromkeys(names.values()))
-            raise KeyError(f"there is no kind {kind!r}; known: {known}")
+            kinds = ", ".join(dict.fromkeys(names.values()))
+            raise KeyError(f"there is no kind {kind!r}; known: {kinds}")
         parts = [self._residuals(o) for o, name in names.items() if name == kind]
         columns = {c: np.concatenate([part[c] for part in parts]) for c in parts[0]}
-        one = columns["v"].shape[1] == 1
-        return {c: x[:, 0] if one else x for c, x in columns.items()}
+        is_single = columns["v"].shape[1] == 1
+        return {c: x[:, 0] if is_single else x for c, x in columns.items()}
 
     def _residuals(self, o: str) -> dict[str, Float[AnyArray, "n r"]]:
-        found, weight = self.solution.reliability, self.problem.weights(o)
-        used = weight > 0
+        reliability, weight = self.solution.reliability, self.problem.weights(o)
+        has_weight = weight > 0
         # The inner `where` keeps 1/0 out of the unused branch.
-        sigma = np.where(used, 1 / np.where(used, weight, 1.0), np.inf)
-        w, gain = found.w[o], np.where(used, found.gain[o], 1.0)
-        free = np.where(used, np.clip(1 - found.hat[o], 0, 1), 0.0)
+        sigma = np.where(has_weight, 1 / np.where(has_weight, weight, 1.0), np.inf)
+        w, gain = reliability.w[o], np.where(has_weight, reliability.gain[o], 1.0)
+        redundancy = np.where(has_weight, np.clip(1 - reliability.hat[o], 0, 1), 0.0)
         return {
-            "v": found.residual[o] * np.where(used, sigma, np.nan),
+            "v": reliability.residual[o] * np.where(has_weight, sigma, np.nan),
             "sigma": sigma,
-            "r": found.redundancy[o],
+            "r": reliability.redundancy[o],
             "w": w,
             "tau": w / (self.sigma0 or np.nan),
-            "mdb": minimal_detectable(sigma / gain, free),
-            "external": external_reliability(free),
+            "mdb": minimal_detectable(sigma / gain, redundancy),
+            "external": external_reliability(redundancy),
         }
 
     @functools.cached_property
@@ -280,7 +283,7 @@ def adjust(  # noqa: PLR0913 - the options of an adjustment
     )
     minima: list[Minimum[Values]] = []
 
-    def again(problem: Problem, start: Values) -> Solution:
+    def minimise_again(problem: Problem, start: Values) -> Solution:
         minima.append(
             find_minimum(
                 problem,
@@ -290,37 +293,39 @@ def adjust(  # noqa: PLR0913 - the options of an adjustment
                 progress=progress,
             )
         )
-        found = Solution(problem, minima[-1].values)
+        solution = Solution(problem, minima[-1].values)
         # The first solution may fail: the result says so. Later ones start at a solution; if they
         # fail, the weights left unknowns undetermined, and no result would be true.
-        if len(minima) > 1 and not (converged(int(minima[-1].termination)) and found.determined):
+        if len(minima) > 1 and not (converged(int(minima[-1].termination)) and solution.determined):
             names = undetermined_unknowns(problem, minima[-1].values)
-            what = ", ".join(names[:8])
-            raise NotSolvedError(f"not solved after a change of weights: {what}", names)
-        return found
+            undetermined = ", ".join(names[:8])
+            raise NotSolvedError(f"not solved after a change of weights: {undetermined}", names)
+        return solution
 
-    found, removed, suspects, factors = again(problem, problem.data.start), [], [], {}
+    solution, removed, suspects, factors = minimise_again(problem, problem.data.start), [], [], {}
     # Iterations may have gone without a factor; statistics need one.
     problem = with_factor(problem)
-    first = Result(problem, minima[-1])
-    if not (first.converged and (robust or snooping or estimate_components)):
-        return first
+    unweighted = Result(problem, minima[-1])
+    if not (unweighted.converged and (robust or snooping or estimate_components)):
+        return unweighted
     if robust:
-        reweighted = reweight(problem, found.values, again, robust)
-        found, suspects = reweighted.found, reweighted.suspects(significance)
+        reweighted = reweight(problem, solution.values, minimise_again, robust)
+        solution, suspects = reweighted.found, reweighted.suspects(significance)
     if snooping:
-        found = Solution(problem, found.values)
-        found, removed = snoop(found, again, test=snooping, significance=significance)
+        solution = Solution(problem, solution.values)
+        solution, removed = snoop(
+            solution, minimise_again, test=snooping, significance=significance
+        )
     if estimate_components:
-        found, factors, _ = estimate(found, kinds_as_groups(problem), again)
-    return Result(found.problem, minima[-1], removed, suspects, factors)
+        solution, factors, _ = estimate(solution, kinds_as_groups(problem), minimise_again)
+    return Result(solution.problem, minima[-1], removed, suspects, factors)
 
 
 def kinds_as_groups(problem: Problem) -> list[VarianceGroup]:
     """Every kind of observations is a separate group."""
     sets: dict[str, list] = {}
-    for given in problem.observations:
-        sets.setdefault(given.kind.name, []).append((given.name, np.s_[:]))
+    for observation_set in problem.observations:
+        sets.setdefault(observation_set.kind.name, []).append((observation_set.name, np.s_[:]))
     return [VarianceGroup(name, parts) for name, parts in sets.items()]
 
 
@@ -333,8 +338,13 @@ def choose_eliminated(
     Below `min_unknowns` the dense equations take microseconds, and a program without elimination
     compiles faster; nor does it pay to eliminate a quarter of the unknowns or less, which leaves
     nearly half of the operations of a factorisation, (3/4)³. Neither limit is critical."""
-    twice = {t for given in observations for t in given.kind.of if given.kind.of.count(t) > 1}
-    size = {t.name: int(t.free.sum()) for t in tables if t.name not in twice}
+    touched_twice = {
+        t
+        for observation_set in observations
+        for t in observation_set.kind.of
+        if observation_set.kind.of.count(t) > 1
+    }
+    size = {t.name: int(t.free.sum()) for t in tables if t.name not in touched_twice}
     total = sum(int(t.free.sum()) for t in tables)
     largest = max(size, key=size.__getitem__, default=None)
     worth = largest is not None and total >= min_unknowns and size[largest] > total / 4
@@ -358,15 +368,15 @@ def _hold_datum(
     gauge: Float[np.ndarray, "motions defect"],
 ) -> tuple[dict[str, Float[np.ndarray, "rows width"]], bool]:
     """The datum unknowns by table, and whether the datum is minimal."""
-    every = {t.name: np.ones((t.rows, t.space.width)) for t in tables}
+    all_unknowns = {t.name: np.ones((t.rows, t.space.width)) for t in tables}
     if isinstance(datum, str):
         if datum == "given":
             raise InputError(f"the datum is open in {gauge.shape[1]} parameters: give `datum`")
-        return every, datum == "minimal"
-    chosen = {}
+        return all_unknowns, datum == "minimal"
+    datum_unknowns = {}
     for name, rows in datum.items():
-        if name not in every:
-            raise InputError(f"datum: there is no table {name!r}; known: {', '.join(every)}")
-        chosen[name] = np.zeros(every[name].shape)
-        chosen[name][np.asarray(rows)] = 1.0
-    return chosen, False
+        if name not in all_unknowns:
+            raise InputError(f"datum: there is no table {name!r}; known: {', '.join(all_unknowns)}")
+        datum_unknowns[name] = np.zeros(all_unknowns[name].shape)
+        datum_unknowns[name][np.asarray(rows)] = 1.0
+    return datum_unknowns, False

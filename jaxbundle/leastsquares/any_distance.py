@@ -51,25 +51,29 @@ class AnyDistance(WithoutChart):
         self, value: Float[Array, " 4"], change: Float[AnyArray, " 3"]
     ) -> Float[Array, " 4"]:
         A, c = _frame(value)
-        moved, s = value[:3] + A @ change, value[3]
+        displaced, s = value[:3] + A @ change, value[3]
         # 1 + c·δ₃ ≤ 0 would put the point behind the origin, through infinity: it stops there.
-        least = jnp.where(s > 0, length(moved) / jnp.where(s > 0, LARGEST_DISTANCE * s, 1.0), 0.0)
-        return value.at[:3].set(moved / jnp.maximum(1 + c * change[2], least))
+        smallest_divisor = jnp.where(
+            s > 0, length(displaced) / jnp.where(s > 0, LARGEST_DISTANCE * s, 1.0), 0.0
+        )
+        return value.at[:3].set(displaced / jnp.maximum(1 + c * change[2], smallest_divisor))
 
     def difference(
         self, value: Float[Array, " 4"], origin: Float[Array, " 4"]
     ) -> Float[Array, " 3"]:
         A, c = _frame(origin)
         u, X = origin[:3] / length(origin[:3]), value[:3]
-        along = (length(origin[:3]) - u @ X) / jnp.where(c > 0, origin[3] + c * (u @ X), 1.0)
-        shift = X * (1 + c * along) - origin[:3]
-        across = A.T @ shift / (A * A).sum(0)
-        return jnp.where(c > 0, across.at[2].set(along), X - origin[:3])
+        inverse_distance_change = (length(origin[:3]) - u @ X) / jnp.where(
+            c > 0, origin[3] + c * (u @ X), 1.0
+        )
+        shift = X * (1 + c * inverse_distance_change) - origin[:3]
+        direction_change = A.T @ shift / (A * A).sum(0)
+        return jnp.where(c > 0, direction_change.at[2].set(inverse_distance_change), X - origin[:3])
 
     def hold(
-        self, value: Float[Array, " 4"], given: Float[Array, " 4"], free: Float[Array, " 3"]
+        self, value: Float[Array, " 4"], start: Float[Array, " 4"], free: Float[Array, " 3"]
     ) -> Float[Array, " 4"]:
-        return hold_by_retraction(self, value, given, free)
+        return hold_by_retraction(self, value, start, free)
 
 
 def derivative(value: Float[Array, " 4"]) -> Float[Array, "3 3"]:
@@ -105,21 +109,21 @@ def _frame(value: Float[Array, " 4"]) -> tuple[Float[Array, "3 3"], Float[Array,
     """A [3, 3] and |X|/s; the unit matrix and 0 for points that move by coordinates."""
     X, s = value[:3], value[3]
     r = length(X)
-    across = jnp.sqrt(r * r + s * s) * tangent_basis(X / r)
-    A = jnp.concatenate([across, -s * X[:, None] / r], 1)
+    tangents = jnp.sqrt(r * r + s * s) * tangent_basis(X / r)
+    A = jnp.concatenate([tangents, -s * X[:, None] / r], 1)
     # One program for points of both kinds: which a point is, is data.
-    far = s > 0
-    return jnp.where(far, A, jnp.eye(3)), jnp.where(far, r / jnp.where(far, s, 1.0), 0.0)
+    is_far = s > 0
+    return jnp.where(is_far, A, jnp.eye(3)), jnp.where(is_far, r / jnp.where(is_far, s, 1.0), 0.0)
 
 
 def _transform(motion: Float[Array, " 7"], value: Float[Array, " 4"]) -> Float[Array, " 4"]:
     """A point that moves with space; at infinity only its direction rotates."""
-    moved = transform_point(motion, value[:3])
+    transformed = transform_point(motion, value[:3])
     # A point at infinity does not shift: a direction, kept at its distance.
-    turned = moved - transform_point(motion, jnp.zeros(3))
-    turned = turned * length(value[:3]) / length(turned)
-    far = jnp.sqrt(value[:3] @ value[:3]) > 0.99 * LARGEST_DISTANCE * value[3]
-    return value.at[:3].set(jnp.where(far & (value[3] > 0), turned, moved))
+    rotated = transformed - transform_point(motion, jnp.zeros(3))
+    rotated = rotated * length(value[:3]) / length(rotated)
+    moves_at_infinity = jnp.sqrt(value[:3] @ value[:3]) > 0.99 * LARGEST_DISTANCE * value[3]
+    return value.at[:3].set(jnp.where(moves_at_infinity & (value[3] > 0), rotated, transformed))
 
 
 move_at_any_distance = JointMotion(_transform, _transform, transform_point, 3)

@@ -59,14 +59,14 @@ class Chart(WithoutChart):
         return self.space.retract(start, scale * y)
 
     def prepare(self, value: tuple) -> tuple[Block, tuple[Change, ...]]:
-        here, (start, scale, y) = self.value(*value), value
-        change = lambda y: self.space.difference(self.value(start, scale, y), here)
-        return self.space.prepare(here), tuple(map(tuple, jax.jacfwd(change)(y)))
+        linearised_at, (start, scale, y) = self.value(*value), value
+        change = lambda y: self.space.difference(self.value(start, scale, y), linearised_at)
+        return self.space.prepare(linearised_at), tuple(map(tuple, jax.jacfwd(change)(y)))
 
     def move(self, block: tuple[Block, tuple[Change, ...]], change: Change) -> Block:
-        here, slope = block
+        prepared, slope = block
         moves = tuple(sum(a * d for a, d in zip(row, change)) for row in slope) if change else ()
-        return self.space.move(here, moves)
+        return self.space.move(prepared, moves)
 
 
 def stock_problem(
@@ -84,11 +84,11 @@ def stock_problem(
     def fn(y: tuple[Tangent, Float[Array, ""]], data: Data) -> dict[str, PyTree]:
         change, witness = y
         data = pad_data(problem, data)
-        values, laid = _values(problem, data, scale, change), lay_out_data(plan, data)
-        places, measured = fill_places(plan, laid)
+        values, chunked = _values(problem, data, scale, change), lay_out_data(plan, data)
+        places, measured = fill_places(plan, chunked)
         # ∂(witness·x)/∂witness = x: how the linear solver gets the values at which N is formed.
-        seen = jax.tree.map(lambda x: witness * x, (values, laid))
-        return {"residuals": residuals(declared, places, values, measured), "seen": seen}
+        witnessed = jax.tree.map(lambda x: witness * x, (values, chunked))
+        return {"residuals": residuals(declared, places, values, measured), "seen": witnessed}
 
     return fn, (zero_tangent(plan), jnp.zeros(())), EliminationOfJacobian(declared, plan)
 
@@ -130,12 +130,12 @@ class EliminationOfJacobian(lx.AbstractLinearSolver):
     def init(
         self, operator: lx.AbstractLinearOperator, options: dict[str, Any]
     ) -> tuple[NormalFactor, lx.AbstractLinearOperator]:
-        found, damping = operator.mv((zero_tangent(self.plan), jnp.ones(()))), jnp.zeros(())
+        product, damping = operator.mv((zero_tangent(self.plan), jnp.ones(()))), jnp.zeros(())
         # Stock damping stacks √λ·1 below J: its product with the witness column is √λ.
-        if isinstance(found, tuple):
-            found, (_, root) = found
+        if isinstance(product, tuple):
+            product, (_, root) = product
             damping = root**2
-        *_, blocks = normal_equations(self.declared, self.plan, *found["seen"])
+        *_, blocks = normal_equations(self.declared, self.plan, *product["seen"])
         ones = {g: jnp.ones(group.free.shape) for g, group in self.plan.groups.items()}
         normal = Normal(self.plan, dataclasses.replace(blocks, damping_matrix=ones))
         return factorise(damp(normal, damping)), operator

@@ -52,8 +52,8 @@ class Table:
     units: str | tuple[str, ...] = ""
 
     def __post_init__(self):
-        what = f"table {self.name!r}: the start values"
-        object.__setattr__(self, "value", _arrays(what, self.value))
+        description = f"table {self.name!r}: the start values"
+        object.__setattr__(self, "value", _arrays(description, self.value))
         leaves = jax.tree.leaves(self.value)
         if not leaves or any(np.ndim(x) == 0 for x in leaves):
             raise InputError(f"table {self.name!r}: the values must be arrays of rows")
@@ -99,9 +99,9 @@ class Table:
     def rows_of(self, labels: Sequence[str] | np.ndarray, kind: str) -> np.ndarray:
         """The rows with these labels, as touched by observations of a kind."""
         place = {self.label(row): row for row in range(self.rows)}
-        missing = next((name for name in labels if name not in place), None)
-        if missing is not None:
-            raise InputError(f"{kind}: there is no {self.title} {missing!r}")
+        missing_label = next((name for name in labels if name not in place), None)
+        if missing_label is not None:
+            raise InputError(f"{kind}: there is no {self.title} {missing_label!r}")
         return np.array([place[name] for name in labels], np.int64)
 
     def label(self, row: int) -> str:
@@ -244,23 +244,23 @@ class ObservationSet:
         """These observations with row numbers in place of labels.
 
         **Raises:** `InputError` for an unknown table or label."""
-        called = {t.name: t for t in tables}
-        unknown = next((name for name in self.kind.of if name not in called), None)
+        table_of = {t.name: t for t in tables}
+        unknown = next((name for name in self.kind.of if name not in table_of), None)
         if unknown is not None:
-            known = ", ".join(called)
-            raise InputError(f"{self.kind.name}: there is no table {unknown!r}; known: {known}")
+            names = ", ".join(table_of)
+            raise InputError(f"{self.kind.name}: there is no table {unknown!r}; known: {names}")
         rows = tuple(
-            called[name].rows_of(column, self.kind.name) if column.dtype == object else column
+            table_of[name].rows_of(column, self.kind.name) if column.dtype == object else column
             for name, column in zip(self.kind.of, self.rows)
         )
         return dataclasses.replace(self, rows=rows)
 
     def label(self, tables: Sequence[Table], row: int) -> str:
         """An observation in words: its kind and the rows it touches."""
-        called = {t.name: t for t in tables}
+        table_of = {t.name: t for t in tables}
         rows = zip(self.kind.of, self.rows)
-        touched = (f"{called[t].title} {called[t].label(int(r[row]))}" for t, r in rows)
-        return f"{self.kind.name} of {' and '.join(touched)}"
+        touched_rows = (f"{table_of[t].title} {table_of[t].label(int(r[row]))}" for t, r in rows)
+        return f"{self.kind.name} of {' and '.join(touched_rows)}"
 
     def weight(self, residuals: int) -> Float[np.ndarray, "n ..."]:
         """The weights, of observations of this number of `residuals` each."""
@@ -286,9 +286,9 @@ class ObservationSet:
         return 1 / sigma
 
 
-def _arrays(what: str, tree: PyTree) -> PyTree[np.ndarray]:
+def _arrays(description: str, tree: PyTree) -> PyTree[np.ndarray]:
     """A tree of arrays, or of lists of numbers, as arrays; masked values are NaN."""
-    number = lambda x: numeric_array(what, x, "arrays of numbers").astype(float)
+    number = lambda x: numeric_array(description, x, "arrays of numbers").astype(float)
     return jax.tree.map(number, tree, is_leaf=lambda x: isinstance(x, list))
 
 

@@ -46,35 +46,35 @@ def determine_excluded(solution: Solution, problem: Problem) -> DeterminedRows:
     """
     plan, e = problem.plan, not_none(problem.plan.eliminated)
     data = pad_data(problem, problem.data)
-    values, inverse, spread = _intersect(problem.declared, plan, data)
-    number, every = problem.table(e).rows, []
+    values, inverse, products = _intersect(problem.declared, plan, data)
+    number, functions_by_row = problem.table(e).rows, []
     blank = {t.name: np.zeros((t.rows, t.space.width)) for t in solution.problem.tables}
-    by_row = {g: _by_row(at, W) for (g, W), at in zip(spread.items(), plan.incidences.values())}
+    by_row = {g: _by_row(at, W) for (g, W), at in zip(products.items(), plan.incidences.values())}
     start = pad_values(problem, problem.data.start)
     for row in range(number):
         functions = []
         for i in range(inverse.shape[1]):
             change = {name: np.zeros(group.free.shape) for name, group in plan.groups.items()}
             for g, (eliminated, kept, W) in by_row.items():
-                mine = slice(*np.searchsorted(eliminated, [row, row + 1]))
-                np.add.at(change[g], kept[mine], W[mine, i])
+                incidences_of_row = slice(*np.searchsorted(eliminated, [row, row + 1]))
+                np.add.at(change[g], kept[incidences_of_row], W[incidences_of_row, i])
             tables = changes_of_tables(plan, start, change)
             tables.pop(e)
             functions.append(blank | {t: np.asarray(x)[: len(blank[t])] for t, x in tables.items()})
-        every.append({t: np.stack([f[t] for f in functions]) for t in blank})
+        functions_by_row.append({t: np.stack([f[t] for f in functions]) for t in blank})
     return DeterminedRows(
-        without_filling(problem, values), np.asarray(inverse)[:number], tuple(every)
+        without_filling(problem, values), np.asarray(inverse)[:number], tuple(functions_by_row)
     )
 
 
 def _by_row(
-    at: Incidences, W: Float[Array, "chunks length w v"]
+    incidences: Incidences, W: Float[Array, "chunks length w v"]
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, "n w v"]]:
     """The incidences of a group sorted by eliminated row: that, the row of the group, V⁻¹·Wᵀ."""
-    eliminated = np.asarray(at.eliminated).ravel()
-    kept = np.repeat(np.asarray(at.row), at.eliminated.shape[1])
+    eliminated = np.asarray(incidences.eliminated).ravel()
+    reduced_row = np.repeat(np.asarray(incidences.row), incidences.eliminated.shape[1])
     order = np.argsort(eliminated, kind="stable")
-    return eliminated[order], kept[order], np.asarray(W).reshape(-1, *W.shape[2:])[order]
+    return eliminated[order], reduced_row[order], np.asarray(W).reshape(-1, *W.shape[2:])[order]
 
 
 @compile_once
@@ -84,18 +84,22 @@ def _intersect(
     """The eliminated rows with all others given, by Gauss–Newton steps; V⁻¹, and V⁻¹·Wᵀ of every
     incidence. All steps are taken, more than converging rows need: one loop for all rows would
     wait for the slowest."""
-    laid, e = lay_out_data(plan, data), not_none(plan.eliminated)
+    chunked, e = lay_out_data(plan, data), not_none(plan.eliminated)
     group = plan.groups[e]
-    held = (1.0 - group.free)[:, :, None] * jnp.eye(group.width)
+    held_directions = (1.0 - group.free)[:, :, None] * jnp.eye(group.width)
     space = declared.spaces[e]
 
     def one_step(values: Values, _: None) -> tuple[Values, None]:
-        _, gradient, N = normal_equations(declared, plan, values, laid)
-        step = -jnp.linalg.solve(N.eliminated + held, gradient[e][..., None])[..., 0]
+        _, gradient, N = normal_equations(declared, plan, values, chunked)
+        step = -jnp.linalg.solve(N.eliminated + held_directions, gradient[e][..., None])[..., 0]
         return values | {e: jax.vmap(space.retract)(values[e], step)}, None
 
     values, _ = jax.lax.scan(one_step, data.start, None, steps)
-    *_, N = normal_equations(declared, plan, values, laid)
-    inverse = jnp.linalg.inv(N.eliminated + held)
-    of = lambda g: inverse[plan.incidences[g].eliminated]
-    return values, inverse, {g: jnp.einsum("clij,cljk->clik", of(g), W) for g, W in N.W.items()}
+    *_, N = normal_equations(declared, plan, values, chunked)
+    inverse = jnp.linalg.inv(N.eliminated + held_directions)
+    inverse_of = lambda g: inverse[plan.incidences[g].eliminated]
+    return (
+        values,
+        inverse,
+        {g: jnp.einsum("clij,cljk->clik", inverse_of(g), W) for g, W in N.W.items()},
+    )

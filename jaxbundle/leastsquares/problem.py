@@ -82,21 +82,21 @@ class Problem:
         """Unknowns of the reduced system, including held ones."""
         e = self.plan.eliminated
         # With held columns: the matrix has them, with ones on its diagonal.
-        kept = sum(t.rows * t.space.width for t in self.tables if t.free.any() and t.name != e)
-        return kept if e is None else kept + self.kept_rows.sum() * self.table(e).space.width
+        size = sum(t.rows * t.space.width for t in self.tables if t.free.any() and t.name != e)
+        return size if e is None else size + self.kept_rows.sum() * self.table(e).space.width
 
     @property
     def kept_rows(self) -> Bool[np.ndarray, " rows"]:
         """Rows of the eliminated table that are kept."""
         if self.plan.eliminated is None:
             return np.zeros(0, bool)
-        kept = np.zeros(self.table(self.plan.eliminated).rows, bool)
+        is_kept = np.zeros(self.table(self.plan.eliminated).rows, bool)
         for name, group in self.plan.groups.items():
             for m in group.members:
                 if m.table == self.plan.eliminated != name:
                     rows = np.asarray(m.rows)
-                    kept[rows[rows < len(kept)]] = True
-        return kept
+                    is_kept[rows[rows < len(is_kept)]] = True
+        return is_kept
 
 
 # A problem, or one that knows more, such as the network it is of.
@@ -138,7 +138,7 @@ def make_problem(
     require_x64()
     one_of("reduction", reduction, REDUCTIONS, none=True)
     tables = tuple(tables)
-    observations = tuple(given.resolve_labels(tables) for given in observations)
+    observations = tuple(observation_set.resolve_labels(tables) for observation_set in observations)
     observations = distinct_names(observations)
     check(tables, observations)
     spaces = tuple((t.name, t.space) for t in tables)
@@ -197,8 +197,8 @@ def with_factor(problem: AnyProblem) -> AnyProblem:
     factor fits into memory."""
     if problem.plan.reduction in FACTORS:
         return problem
-    given = problem.tables, problem.observations, problem.plan.eliminated
-    plan, sizes, choices = _make_plan(*given, FACTORS, problem.planning)
+    declared = problem.tables, problem.observations, problem.plan.eliminated
+    plan, sizes, choices = _make_plan(*declared, FACTORS, problem.planning)
     if plan.reduction not in FACTORS:
         return problem
     plan = dataclasses.replace(plan, datum=problem.plan.datum)
@@ -251,9 +251,9 @@ def hold(
 ) -> AnyProblem:
     """The problem with some unknowns held at their start values, removed from the datum
     unknowns."""
-    given = problem.table(table)
-    free = given.free.copy()
-    free[np.ix_(np.atleast_1d(rows), np.arange(given.space.width)[columns])] = 0.0
+    held_table = problem.table(table)
+    free = held_table.free.copy()
+    free[np.ix_(np.atleast_1d(rows), np.arange(held_table.space.width)[columns])] = 0.0
     return with_free(problem, table, free)
 
 
@@ -269,10 +269,10 @@ def with_free(problem: AnyProblem, table: str, free: Float[np.ndarray, "rows wid
         for m in group.members:
             if m.table == table:
                 part = wide if m.rows is None else wide[np.asarray(m.rows)]
-                now = np.array(group.free)
+                is_free = np.array(group.free)
                 # `all_free` off: the mask takes part from now on, in another program.
-                now[:, m.start : m.start + m.width] = part[: len(now)]
-                group = dataclasses.replace(group, free=jax.device_put(now), all_free=False)
+                is_free[:, m.start : m.start + m.width] = part[: len(is_free)]
+                group = dataclasses.replace(group, free=jax.device_put(is_free), all_free=False)
         groups[name] = group
     if plan.datum is not None and table in plan.datum.weight:
         weight = plan.datum.weight | {table: plan.datum.weight[table] * wide}
@@ -298,32 +298,35 @@ def count(tables: Sequence[Table], data: Data) -> SystemCounts:
 
 def check(tables: Sequence[Table], observations: Sequence[ObservationSet]) -> None:
     """Refuse duplicate table names, unknown tables, and rows that do not exist."""
-    known = {}
+    table_of = {}
     for table in tables:
-        if table.name in known:
+        if table.name in table_of:
             raise InputError(f"two tables are called {table.name!r}")
-        known[table.name] = table
-    for given in observations:
-        for name, rows in zip(given.kind.of, given.rows):
-            bad = (rows < 0) | (rows >= known[name].rows)
+        table_of[table.name] = table
+    for observation_set in observations:
+        for name, rows in zip(observation_set.kind.of, observation_set.rows):
+            bad = (rows < 0) | (rows >= table_of[name].rows)
             if bad.any():
                 row = int(np.argmax(bad))
                 raise InputError(
-                    f"{given.kind.name}: observation {row + 1} touches row {int(rows[row])} of "
-                    f"table {name!r}, which has rows 0 to {known[name].rows - 1}"
+                    f"{observation_set.kind.name}: observation {row + 1} touches row "
+                    f"{int(rows[row])} of "
+                    f"table {name!r}, which has rows 0 to {table_of[name].rows - 1}"
                 )
 
 
 def distinct_names(observations: Sequence[ObservationSet]) -> tuple[ObservationSet, ...]:
     """Sets of observations under names that differ: a second "distance" is "distance 2"."""
-    taken: set[str] = set()
-    found = []
-    for given in observations:
-        names = itertools.chain([given.name], (f"{given.name} {k}" for k in itertools.count(2)))
-        name = next(n for n in names if n not in taken)
-        taken.add(name)
-        found.append(dataclasses.replace(given, name=name))
-    return tuple(found)
+    taken_names: set[str] = set()
+    renamed = []
+    for observation_set in observations:
+        names = itertools.chain(
+            [observation_set.name], (f"{observation_set.name} {k}" for k in itertools.count(2))
+        )
+        name = next(n for n in names if n not in taken_names)
+        taken_names.add(name)
+        renamed.append(dataclasses.replace(observation_set, name=name))
+    return tuple(renamed)
 
 
 def check_numbers(
@@ -338,17 +341,18 @@ def check_numbers(
             if bad.any():
                 row = table.label(int(np.argwhere(bad)[0][0]))
                 raise InputError(f"{table.title} {row}: a start value is not a finite number")
-    for given in observations:
-        weight = weights[given.name]
-        for rows in jax.tree.leaves(given.measured):
-            bad = ~np.isfinite(rows).reshape(given.number, math.prod(np.shape(rows)[1:]))
+    for observation_set in observations:
+        weight = weights[observation_set.name]
+        for rows in jax.tree.leaves(observation_set.measured):
+            bad = ~np.isfinite(rows).reshape(observation_set.number, math.prod(np.shape(rows)[1:]))
             counts = used(weight)
             # Measured values without weight may be anything: excluded observations keep their rows.
             bad &= counts if counts.shape == bad.shape else counts.any(1, keepdims=True)
             if bad.any():
                 row = int(np.argwhere(bad)[0][0])
                 raise InputError(
-                    f"observation {row + 1}, {given.label(tables, row)}: a measured value is not a "
+                    f"observation {row + 1}, {observation_set.label(tables, row)}: a measured "
+                    "value is not a "
                     "finite number; an infinite sigma leaves an observation out"
                 )
 
@@ -367,15 +371,24 @@ def weights_of(
 ) -> dict[str, Float[np.ndarray, "n ..."]]:
     """The weights of sets of observations by name; the number of residuals of a kind is found from
     the shapes."""
-    called = {t.name: t for t in tables}
-    one = lambda tree: jax.tree.map(lambda x: jax.ShapeDtypeStruct(np.shape(x)[1:], float), tree)
+    table_of = {t.name: t for t in tables}
+    one_row = lambda tree: jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(np.shape(x)[1:], float), tree
+    )
 
-    def number(given: ObservationSet) -> int:
-        touched = [called[name] for name in given.kind.of]
-        values, spaces = [t.value for t in touched], tuple(t.space for t in touched)
-        return len(_evaluate.eval_shape(given.kind, spaces, one(values), one(given.measured)))
+    def number(observation_set: ObservationSet) -> int:
+        touched_tables = [table_of[name] for name in observation_set.kind.of]
+        values, spaces = [t.value for t in touched_tables], tuple(t.space for t in touched_tables)
+        return len(
+            _evaluate.eval_shape(
+                observation_set.kind, spaces, one_row(values), one_row(observation_set.measured)
+            )
+        )
 
-    return {given.name: given.weight(number(given)) for given in observations}
+    return {
+        observation_set.name: observation_set.weight(number(observation_set))
+        for observation_set in observations
+    }
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -385,8 +398,8 @@ def _evaluate(
     """The residuals of one observation."""
     blocks = [space.move(space.prepare(v), ()) for space, v in zip(spaces, values)]
     # Only shapes are computed (`eval_shape`): how many residuals a kind has is nowhere declared.
-    first = scalars(jax.tree.map(lambda x: x[None], measured))
-    return evaluate(kind, blocks, jax.tree.map(lambda x: x[0], first))
+    single = scalars(jax.tree.map(lambda x: x[None], measured))
+    return evaluate(kind, blocks, jax.tree.map(lambda x: x[0], single))
 
 
 def pad_data(problem: Problem, data: Data) -> Data:
@@ -418,9 +431,10 @@ def without_filling(problem: Problem, values: Values) -> Values:
     """The tables without padding."""
     traced = any(isinstance(x, Tracer) for x in jax.tree.leaves(values))
     # On the host, where nothing is compiled for it.
-    cut = lambda x, n: x[:n] if traced else jax.device_put(np.asarray(x)[:n])
+    first_rows = lambda x, n: x[:n] if traced else jax.device_put(np.asarray(x)[:n])
     return {
-        t.name: jax.tree.map(lambda x, n=t.rows: cut(x, n), values[t.name]) for t in problem.tables
+        t.name: jax.tree.map(lambda x, n=t.rows: first_rows(x, n), values[t.name])
+        for t in problem.tables
     }
 
 
@@ -435,9 +449,9 @@ def complete_data(problem: Problem, data: Data | None) -> Data:
     """The data in the sizes of the plan: those of the problem, or others of the same shapes.
 
     **Raises:** `InputError` if the shapes differ."""
-    known, data = problem.data, problem.data if data is None else data
+    planned, data = problem.data, problem.data if data is None else data
     shapes = lambda data: (jax.tree.structure(data), [jnp.shape(x) for x in jax.tree.leaves(data)])
-    if shapes(data) != shapes(known):
+    if shapes(data) != shapes(planned):
         raise InputError("data must be a Data with arrays of the shapes of problem.data")
     # Numbers of single precision are taken as they are, and adjusted in double precision.
     double = lambda x: x.astype(float) if isinstance(x, Tracer) else np.asarray(x, float)
@@ -449,8 +463,8 @@ def make_solver(
 ) -> LeastSquares:
     """The solver of a problem; `options` are those of `LeastSquares`. Different step limits share
     its program."""
-    given = problem.data
-    squares = sum(_measured_squares(w, given.measured[o]) for o, w in given.weight.items())
+    data = problem.data
+    squares = sum(_measured_squares(w, data.measured[o]) for o, w in data.weight.items())
     to_device = lambda x: jax.device_put(np.float64(x))
     tolerance = Tolerance(*map(to_device, (problem.counts.redundancy, squares, atol, rtol)))
     # The rows of the history are compiled in: all limits below 128 steps share a program. Steps

@@ -57,11 +57,11 @@ class Shards:
 @contextmanager
 def use_own_devices() -> Iterator[None]:
     """Problems solved in this context belong to this process only: its own devices share them."""
-    before = _ALONE.set(True)
+    token = _ALONE.set(True)
     try:
         yield
     finally:
-        _ALONE.reset(before)
+        _ALONE.reset(token)
 
 
 def sharing_devices() -> list:
@@ -74,18 +74,24 @@ def distribute(problem: Problem, devices: list | None = None) -> Shards:
     devices = sharing_devices() if devices is None else devices
     # Every part is planned as a problem of its own, with the choices of the whole: chunk lengths,
     # groups and blocks are the same on all devices, which run one program.
-    rows, seen = _cut(problem, len(devices))
-    planned = [_plan_part(problem, *part) for part in zip(rows, seen)]
+    rows, observed = _share_rows(problem, len(devices))
+    planned = [_plan_part(problem, *part) for part in zip(rows, observed)]
     sizes = common(
         (sizes for _, sizes in planned), choose_rounding(problem.observations, problem.planning)
     )
-    here, host = dataclasses.replace(problem, sizes=sizes), jax.tree.map(np.asarray, problem.data)
+    part_problem, host = (
+        dataclasses.replace(problem, sizes=sizes),
+        jax.tree.map(np.asarray, problem.data),
+    )
     take = lambda of_sets, at: {o: _take(of_sets[o], rows) for o, rows in at.items()}
-    data = [fill_data(here, Data({}, take(host.measured, m), take(host.weight, m))) for m in seen]
+    data = [
+        fill_data(part_problem, Data({}, take(host.measured, m), take(host.weight, m)))
+        for m in observed
+    ]
     datum = problem.plan.datum  # The datum is applied only at the end.
     datum = datum and jax.tree.map(np.asarray, Datum(datum.gauge, {}, datum.pins, {}))
-    whole = lambda plan: dataclasses.replace(finish(plan, sizes), datum=datum, axis=AXIS)
-    mesh, plans = Mesh(np.array(devices), (AXIS,)), [whole(plan) for plan, _ in planned]
+    complete = lambda plan: dataclasses.replace(finish(plan, sizes), datum=datum, axis=AXIS)
+    mesh, plans = Mesh(np.array(devices), (AXIS,)), [complete(plan) for plan, _ in planned]
     return Shards(problem, rows, sizes, _place(mesh, plans), _place(mesh, data), mesh)
 
 
@@ -97,9 +103,9 @@ def find_minimum_of_shards(
 
     **Raises:** `NotSolvedError` if one of several processes is lost."""
     problem, e = shards.problem, not_none(shards.problem.plan.eliminated)
-    here = dataclasses.replace(problem, sizes=shards.sizes)
-    given = jax.tree.map(np.asarray, problem.data.start if start is None else start)
-    part = lambda rows: pad_values(here, given | {e: _take(given[e], rows)})
+    part_problem = dataclasses.replace(problem, sizes=shards.sizes)
+    start_values = jax.tree.map(np.asarray, problem.data.start if start is None else start)
+    part = lambda rows: pad_values(part_problem, start_values | {e: _take(start_values[e], rows)})
     parts = _place(shards.mesh, [part(rows) for rows in shards.rows])
     solver = dataclasses.replace(solver, plan=shards.plan)
     try:
@@ -112,9 +118,11 @@ def find_minimum_of_shards(
             f"not solved: one of {number} processes ended, or cannot be reached ({why})"
         ) from None
     # Kept rows come from all devices, identical: the first one counts.
-    _, back = np.unique(np.concatenate(shards.rows), return_index=True)
-    own = lambda x: np.concatenate([x[d, : len(rows)] for d, rows in enumerate(shards.rows)])[back]
-    values = minimum.values | {e: jax.tree.map(own, minimum.values[e])}
+    _, positions = np.unique(np.concatenate(shards.rows), return_index=True)
+    unsharded = lambda x: np.concatenate([x[d, : len(rows)] for d, rows in enumerate(shards.rows)])[
+        positions
+    ]
+    values = minimum.values | {e: jax.tree.map(unsharded, minimum.values[e])}
     return dataclasses.replace(minimum, values=without_filling(problem, values))
 
 
@@ -131,50 +139,61 @@ def _minimise(mesh: Mesh, solver: LeastSquares, data: Data, start: Values) -> Mi
         values = values | {e: jax.lax.all_gather(values[e], AXIS)}
         return dataclasses.replace(minimum, values=values)
 
-    own, same = PartitionSpec(AXIS), PartitionSpec()
-    run = jax.shard_map(on_device, mesh=mesh, in_specs=own, out_specs=same, check_vma=False)
+    sharded, replicated = PartitionSpec(AXIS), PartitionSpec()
+    run = jax.shard_map(
+        on_device, mesh=mesh, in_specs=sharded, out_specs=replicated, check_vma=False
+    )
     return run(arrays)
 
 
 def _place(mesh: Mesh, parts: Sequence[PyTree]) -> Any:
     """The arrays of all parts with the device as first axis; every device holds its own."""
-    spread = NamedSharding(mesh, PartitionSpec(AXIS))
+    sharding = NamedSharding(mesh, PartitionSpec(AXIS))
 
     def make(*x: np.ndarray) -> jax.Array:
         # Every process makes the parts of its own devices only.
-        own = lambda at: x[0 if at is None else at[0].start or 0][None]
-        return jax.make_array_from_callback((len(x), *x[0].shape), spread, own)
+        part_of_device = lambda at: x[0 if at is None else at[0].start or 0][None]
+        return jax.make_array_from_callback((len(x), *x[0].shape), sharding, part_of_device)
 
     return jax.tree.map(make, *parts)
 
 
-def _cut(
+def _share_rows(
     problem: Problem, parts: int
 ) -> tuple[tuple[Int[np.ndarray, " n"], ...], list[dict[str, Int[np.ndarray, " n"]]]]:
     """For every device the eliminated rows, and the observations of every set: parts of equal work,
     in order. Kept rows, and rows that share an observation, belong to the first device."""
-    e, given = problem.plan.eliminated, problem.observations
-    touched = [[r for name, r in zip(o.kind.of, o.rows) if name == e] for o in given]
+    e, observation_sets = problem.plan.eliminated, problem.observations
+    touched_rows = [
+        [r for name, r in zip(o.kind.of, o.rows) if name == e] for o in observation_sets
+    ]
     stays = problem.choices["coupled rows",]
-    met, tied = np.zeros(len(stays)), stays.copy()
-    for slots in touched:
+    number_of_rays, is_coupled = np.zeros(len(stays)), stays.copy()
+    for slots in touched_rows:
         for rows in slots:
-            met += np.bincount(rows, minlength=len(stays))
-            tied[rows] |= len(slots) > 1
+            number_of_rays += np.bincount(rows, minlength=len(stays))
+            is_coupled[rows] |= len(slots) > 1
     # An observation costs as much as three to four pairs of incidences: BAL 16, one core, 24 ms for
     # the derivatives, sums and residuals of 83 718 observations, 14 ms for 170 046 pairs: 3.5.
-    work = np.where(tied, 0.0, met * (met - 1) / 2 + 3.0 * met)
+    work = np.where(
+        is_coupled, 0.0, number_of_rays * (number_of_rays - 1) / 2 + 3.0 * number_of_rays
+    )
     # A row belongs to the device in whose equal share of the work its middle lies: contiguous rows,
     # whose observations were laid out together.
     middle = (np.cumsum(work) - work / 2) / max(work.sum(), 1.0)
-    owner = np.where(tied, 0, np.minimum((parts * middle).astype(int), parts - 1))
-    owners = {o.name: owner[r[0]] if r else np.zeros(o.number, int) for o, r in zip(given, touched)}
-    found = [{o: np.flatnonzero(of == d) for o, of in owners.items()} for d in range(parts)]
-    return tuple(np.flatnonzero(stays | (owner == d)) for d in range(parts)), found
+    owner = np.where(is_coupled, 0, np.minimum((parts * middle).astype(int), parts - 1))
+    owners = {
+        o.name: owner[r[0]] if r else np.zeros(o.number, int)
+        for o, r in zip(observation_sets, touched_rows)
+    }
+    observations_of = [
+        {o: np.flatnonzero(of == d) for o, of in owners.items()} for d in range(parts)
+    ]
+    return tuple(np.flatnonzero(stays | (owner == d)) for d in range(parts)), observations_of
 
 
 def _plan_part(
-    problem: Problem, rows: Int[np.ndarray, " n"], seen: dict[str, Int[np.ndarray, " m"]]
+    problem: Problem, rows: Int[np.ndarray, " n"], observed: dict[str, Int[np.ndarray, " m"]]
 ) -> tuple[Plan, Sizes]:
     """The plan of some eliminated rows and observations, on the host, and its sizes."""
     e, groups = not_none(problem.plan.eliminated), problem.plan.groups.items()
@@ -185,10 +204,10 @@ def _plan_part(
     choices["coupled rows",] = choices["coupled rows",][rows]
     row = np.full(problem.table(e).rows, -1)
     row[rows] = np.arange(len(rows))
-    cut = lambda t: Table(t.name, _take(t.value, rows), t.space, t.free[rows])
-    tables = [cut(t) if t.name == e else t for t in problem.tables]
+    rows_of_table = lambda t: Table(t.name, _take(t.value, rows), t.space, t.free[rows])
+    tables = [rows_of_table(t) if t.name == e else t for t in problem.tables]
     rows_of = lambda o, at: [row[r[at]] if t == e else r[at] for t, r in zip(o.kind.of, o.rows)]
-    observations = [o.kind(rows_of(o, seen[o.name]), name=o.name) for o in problem.observations]
+    observations = [o.kind(rows_of(o, observed[o.name]), name=o.name) for o in problem.observations]
     return make_plan(tables, observations, e, choices)[:2]
 
 

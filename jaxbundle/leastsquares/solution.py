@@ -82,30 +82,30 @@ def find_minimum(
     large = is_large(problem.observations, problem.planning)
     if large and progress is not None:
         options["progress"] = progress
-    given = pad_values(problem, problem.data.start)
-    start = given if start is None else pad_values(problem, start)
+    planned_start = pad_values(problem, problem.data.start)
+    start = planned_start if start is None else pad_values(problem, start)
     minimise_from = _on_all_devices if _worth_sharing(problem, start) else _on_one_device
     minimise_from = minimise_from(problem, make_solver(problem, **options))
     if not large and progress is not None:
         minimise_from = _report_after(minimise_from, progress)
-    first = minimum = minimise_from(start)
+    undisplaced = minimum = minimise_from(start)
     # After ten returns the two do not agree: the last minimum is as good as the next.
     for _ in range(10):
-        moved = with_motions_at(problem, without_filling(problem, minimum.values))
-        values = _move_to_datum(moved, minimum.values, given)
+        moved_problem = with_motions_at(problem, without_filling(problem, minimum.values))
+        values = _move_to_datum(moved_problem, minimum.values, planned_start)
         # No weighted points: motions change no observation at all, and the minimum stays one.
-        if moved is problem or not bool(converged(minimum.termination)):
+        if moved_problem is problem or not bool(converged(minimum.termination)):
             break
         # Open combinations need not form a group (one open height of a point, say): the motion to
         # the datum may have left the minimum. 1e-12: of the digits that vᵀPv has after rounding.
-        before, after = (
+        cost_before, cost_after = (
             Solution(problem, without_filling(problem, v)).vtpv for v in (minimum.values, values)
         )
-        if after <= before * (1 + 1e-12) + 1e-12:
+        if cost_after <= cost_before * (1 + 1e-12) + 1e-12:
             break
         minimum = minimise_from(values)
     values = without_filling(problem, values)
-    return dataclasses.replace(first, termination=minimum.termination, values=values)
+    return dataclasses.replace(undisplaced, termination=minimum.termination, values=values)
 
 
 def _report_after(minimise_from: Callable, progress: Callable) -> Callable:
@@ -130,8 +130,8 @@ def _on_all_devices(problem: Problem, solver: LeastSquares) -> Callable[[Values]
     shards = distribute(problem)
 
     def minimise_from(start: Values) -> Minimum[Values]:
-        found = find_minimum_of_shards(shards, solver, start)
-        return dataclasses.replace(found, values=pad_values(problem, found.values))
+        minimum = find_minimum_of_shards(shards, solver, start)
+        return dataclasses.replace(minimum, values=pad_values(problem, minimum.values))
 
     return minimise_from
 
@@ -150,10 +150,10 @@ def _move_to_datum(problem: Problem, values: Values, start: Values) -> Values:
         return values
     # By programs per table, compiled once for all problems; the rare deformation that needs Newton
     # steps compiles a program for its own.
-    moved, reached = move_into_datum(problem.declared, problem.plan, values, start)
-    if not reached:
-        moved, _ = _move_by_newton(problem.declared, problem.plan, values, start)
-    return moved
+    values_in_datum, is_reached = move_into_datum(problem.declared, problem.plan, values, start)
+    if not is_reached:
+        values_in_datum, _ = _move_by_newton(problem.declared, problem.plan, values, start)
+    return values_in_datum
 
 
 _move_by_newton = compile_once(move_to_datum)
@@ -162,10 +162,10 @@ _move_by_newton = compile_once(move_to_datum)
 def take_step(problem: Problem, values: Values) -> Values:
     """The unknowns after one undamped Gauss–Newton step, near a solution; NaN if singular."""
     data = pad_data(problem, problem.data)
-    moved = _step(
+    stepped = _step(
         problem.declared, problem.plan, pad_values(problem, values), data, problem.retraction
     )
-    return without_filling(problem, moved)
+    return without_filling(problem, stepped)
 
 
 @compile_once
@@ -246,24 +246,24 @@ class Solution:
     def _own(self) -> dict[str, Float[np.ndarray, "rows width width"]]:
         """The cofactor blocks of all tables."""
         declared, plan, values = self.arguments[:3]
-        found = _of_tables(declared, plan, self.cofactors.diagonal_blocks, values)
-        return jax.tree.map(np.asarray, without_filling(self.problem, found))
+        blocks = _of_tables(declared, plan, self.cofactors.diagonal_blocks, values)
+        return jax.tree.map(np.asarray, without_filling(self.problem, blocks))
 
     @functools.cached_property
     def reliability(self) -> Reliability:
         """Redundancy numbers and w of all observations."""
-        found = reliability(*self.arguments, self.cofactors)
-        return Reliability(**{f: self._rows(rows) for f, rows in vars(found).items()})
+        by_part = reliability(*self.arguments, self.cofactors)
+        return Reliability(**{f: self._rows(rows) for f, rows in vars(by_part).items()})
 
     def predicted_tests(self, data: Data) -> Rows:
         """nᵀu/√(1 + h) of all observations with the weights of `data` (`Reliability`; v/σ/√(1 + h)
         if uncorrelated): the normalised residuals of excluded observations, predicted from those in
         the adjustment and from the other residuals of their row."""
-        given = (*self.arguments[:3], pad_data(self.problem, data))
-        found = reliability(*given, self.cofactors)  # a program that is there already
+        arguments = (*self.arguments[:3], pad_data(self.problem, data))
+        by_part = reliability(*arguments, self.cofactors)  # a program that is there already
         # v/σ of an observation that was not used has the variance 1 + h, not 1 − h: h from the
         # unknowns, 1 from itself.
-        v, h = self._rows(found.standard), self._rows(found.hat)
+        v, h = self._rows(by_part.standard), self._rows(by_part.hat)
         return {o: v[o] / np.sqrt(1 + h[o]) for o in v}
 
     @functools.cached_property
@@ -280,8 +280,8 @@ class Solution:
     def jacobian_of(self, function: Callable[[Values], Array]) -> dict[str, Array]:
         """The derivatives of a function of the unknowns with respect to the changes of tables,
         [n, rows, width] each."""
-        still = {t.name: np.zeros((t.rows, t.space.width)) for t in self.problem.tables}
-        return _rows_of(function, self.problem.declared, self.values, still)
+        zero_change = {t.name: np.zeros((t.rows, t.space.width)) for t in self.problem.tables}
+        return _rows_of(function, self.problem.declared, self.values, zero_change)
 
     def propagate_rows(
         self, rows: Mapping[str, Float[AnyArray, "n rows width"]]
@@ -306,8 +306,8 @@ class Solution:
             t.name: np.zeros((self.problem.sizes["table", t.name], t.space.width))
             for t in self.problem.tables
         }
-        given = (np.asarray(rows, int), blank, self.moves)
-        return np.asarray(_joint_cofactors(table, declared, values, self.factor, *given))
+        arguments = (np.asarray(rows, int), blank, self.moves)
+        return np.asarray(_joint_cofactors(table, declared, values, self.factor, *arguments))
 
     @property
     def arguments(self) -> tuple[Declared, Plan, Values, Data]:
@@ -352,28 +352,28 @@ _of_tables = compile_once(blocks_of_tables)
 def _jacobian_eliminated(
     declared: Declared, plan: Plan, values: Values, data: Data
 ) -> dict[str, Float[Array, "n r w"]]:
-    laid, prepared, found = lay_out_data(plan, data), prepare(declared, values), []
+    chunked, prepared, blocks = lay_out_data(plan, data), prepare(declared, values), []
     width = plan.groups[not_none(plan.eliminated)].width
     for number in range(len(plan.parts)):
-        r, _, E = differentiate(declared, plan, number, prepared, laid)
-        found.append(jnp.zeros((*r.shape, width)) if E is None else E)
-    return restore_order(plan, found)
+        r, _, E = differentiate(declared, plan, number, prepared, chunked)
+        blocks.append(jnp.zeros((*r.shape, width)) if E is None else E)
+    return restore_order(plan, blocks)
 
 
 @compile_once
 def _rows_of(
-    function: Callable[[Values], Array], declared: Declared, values: Values, still: Values
+    function: Callable[[Values], Array], declared: Declared, values: Values, zero_change: Values
 ) -> dict[str, Float[Array, "n rows width"]]:
     """The derivatives of a function of the tables with respect to their changes, [n, rows, width]
     each."""
 
     def of_change(change: Values) -> Float[Array, " n"]:
-        moved = dict(values)
+        changed = dict(values)
         for name, d in change.items():
-            moved[name] = jax.vmap(declared.spaces[name].retract)(values[name], d)
-        return jnp.atleast_1d(function(moved))
+            changed[name] = jax.vmap(declared.spaces[name].retract)(values[name], d)
+        return jnp.atleast_1d(function(changed))
 
-    return jax.jacrev(of_change)(still)
+    return jax.jacrev(of_change)(zero_change)
 
 
 @compile_once
@@ -390,8 +390,8 @@ def _joint_cofactors(
     plan, width = factor.plan, blank[table].shape[1]
 
     def column(row: Int[Array, ""], axis: Int[Array, ""]) -> Float[Array, "n width"]:
-        one = of_groups(plan, blank | {table: blank[table].at[row, axis].set(1.0)})
-        change = solve(factor, s_transform_transposed(declared, plan, values, one, moves))
+        unit_row = of_groups(plan, blank | {table: blank[table].at[row, axis].set(1.0)})
+        change = solve(factor, s_transform_transposed(declared, plan, values, unit_row, moves))
         change = s_transform(declared, plan, values, change, moves)
         return (blank | changes_of_tables(plan, values, change))[table][rows]
 

@@ -53,7 +53,7 @@ class Space(Protocol):
 
     def difference(self, value: Any, origin: Any) -> Float[Array, " width"]: ...
 
-    def hold(self, value: Any, given: Any, free: Float[Array, " width"]) -> Any: ...
+    def hold(self, value: Any, start: Any, free: Float[Array, " width"]) -> Any: ...
 
     def chart(self, value: Any) -> tuple[Matrix, Matrix] | None: ...
 
@@ -66,12 +66,12 @@ class WithoutChart:
 
 
 def hold_by_retraction(
-    space: Space, value: Value, given: Value, free: Float[Array, " width"]
+    space: Space, value: Value, start: Value, free: Float[Array, " width"]
 ) -> Value:
-    """`Space.hold` where directions are no numbers of the value: the change from `given` to it,
+    """`Space.hold` where directions are no numbers of the value: the change from `start` to it,
     without that along held directions."""
-    held = space.retract(given, jnp.where(free > 0, space.difference(value, given), 0.0))
-    return jax.tree.map(lambda x, y: jnp.where(free.min() > 0, x, y), value, held)
+    without_held = space.retract(start, jnp.where(free > 0, space.difference(value, start), 0.0))
+    return jax.tree.map(lambda x, y: jnp.where(free.min() > 0, x, y), value, without_held)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,15 +129,15 @@ class Vector(WithoutChart):
     def hold(
         self,
         value: Float[Array, " *size"],
-        given: Float[Array, " *size"],
+        start: Float[Array, " *size"],
         free: Float[Array, " width"],
     ) -> Float[Array, " *size"]:
         if not self.size:
-            return jnp.where(free[0] > 0, value, given) if self.width else given
+            return jnp.where(free[0] > 0, value, start) if self.width else start
         columns, of = (jnp.array(x, int) for x in self.moves)
         # A tied column is held with the one it follows.
         moves = jnp.zeros(self.size).at[columns].set(free[of])
-        return jnp.where(moves > 0, value, given)
+        return jnp.where(moves > 0, value, start)
 
 
 class Turned(NamedTuple):
@@ -153,9 +153,9 @@ class Turned(NamedTuple):
         if self.turn is None:
             return ray
         # exp([θ]×) ≈ 1 + [θ]× + ½[θ]×²: to second order, since Hessians are taken at θ = 0.
-        first = cross(self.turn, ray)
-        second = cross(self.turn, first)
-        return tuple(a + b + 0.5 * c for a, b, c in zip(ray, first, second))
+        first_order = cross(self.turn, ray)
+        second_order = cross(self.turn, first_order)
+        return tuple(a + b + 0.5 * c for a, b, c in zip(ray, first_order, second_order))
 
     def matrix(self) -> Float[Array, "3 3"]:
         """M as an array [3, 3]."""
@@ -166,9 +166,9 @@ class Turned(NamedTuple):
         """Mᵀ·x."""
         if self.turn is not None:
             # The inverse rotation: θ → −θ, by the order of the product.
-            first = cross(x, self.turn)
-            second = cross(first, self.turn)
-            x = tuple(a + b + 0.5 * c for a, b, c in zip(x, first, second))
+            first_order = cross(x, self.turn)
+            second_order = cross(first_order, self.turn)
+            x = tuple(a + b + 0.5 * c for a, b, c in zip(x, first_order, second_order))
         m = self.rows
         return tuple(m[i] * x[0] + m[3 + i] * x[1] + m[6 + i] * x[2] for i in range(3))
 
@@ -211,9 +211,9 @@ class Rotation(WithoutChart):
         return quaternion_difference(value, origin)
 
     def hold(
-        self, value: Float[Array, " 4"], given: Float[Array, " 4"], free: Float[Array, " width"]
+        self, value: Float[Array, " 4"], start: Float[Array, " 4"], free: Float[Array, " width"]
     ) -> Float[Array, " 4"]:
-        return jnp.where(free.max() > 0, value, given)
+        return jnp.where(free.max() > 0, value, start)
 
 
 class PoseValue(NamedTuple):
@@ -258,10 +258,10 @@ class Pose:
         turn = small_difference(value.rotation, origin.rotation)
         return jnp.concatenate([value.position - origin.position, turn])
 
-    def hold(self, value: PoseValue, given: PoseValue, free: Float[Array, " width"]) -> PoseValue:
+    def hold(self, value: PoseValue, start: PoseValue, free: Float[Array, " width"]) -> PoseValue:
         return PoseValue(
-            jnp.where(free[:3] > 0, value.position, given.position),
-            jnp.where(free[3:].max() > 0, value.rotation, given.rotation),
+            jnp.where(free[:3] > 0, value.position, start.position),
+            jnp.where(free[3:].max() > 0, value.rotation, start.rotation),
         )
 
     def chart(self, value: PoseValue) -> tuple[Matrix, Matrix]:
@@ -292,39 +292,44 @@ class Frame(WithoutChart):
     def move(self, block: Posed, change: Change) -> Posed:
         if not change:
             return block
-        every: list[Scalar] = [0.0] * 6
+        all_directions: list[Scalar] = [0.0] * 6
         for column, d in zip(self.columns, change):
-            every[column] = d
-        return Posed(block.rotation._replace(turn=tuple(every[3:])), block.place(tuple(every[:3])))
+            all_directions[column] = d
+        return Posed(
+            block.rotation._replace(turn=tuple(all_directions[3:])),
+            block.place(tuple(all_directions[:3])),
+        )
 
     def retract(self, value: PoseValue, change: Float[AnyArray, " width"]) -> PoseValue:
-        every = jnp.zeros(6).at[jnp.array(self.columns, int)].set(change)
+        all_directions = jnp.zeros(6).at[jnp.array(self.columns, int)].set(change)
         # The shift is along the axes of the frame as it is, not as it will be.
-        shift = matrix_from_quaternion(value.rotation).T @ every[:3]
-        return PoseValue(value.position + shift, retract_quaternion(value.rotation, every[3:]))
+        shift = matrix_from_quaternion(value.rotation).T @ all_directions[:3]
+        return PoseValue(
+            value.position + shift, retract_quaternion(value.rotation, all_directions[3:])
+        )
 
     def difference(self, value: PoseValue, origin: PoseValue) -> Float[Array, " width"]:
         shift = matrix_from_quaternion(origin.rotation) @ (value.position - origin.position)
         turn = quaternion_difference(value.rotation, origin.rotation)
         return jnp.concatenate([shift, turn])[jnp.array(self.columns, int)]
 
-    def hold(self, value: PoseValue, given: PoseValue, free: Float[Array, " width"]) -> PoseValue:
-        return hold_by_retraction(self, value, given, free)
+    def hold(self, value: PoseValue, start: PoseValue, free: Float[Array, " width"]) -> PoseValue:
+        return hold_by_retraction(self, value, start, free)
 
-    def representative(self, value: PoseValue, given: PoseValue) -> PoseValue:
-        """Of all frames of the same figure the one nearest to `given`: its position is that of
-        `given` projected onto the figure, its rotation that of `given` turned as little as the
-        figure asks for. Iterations leave these to their path, which has no derivative."""
+    def representative(self, value: PoseValue, reference: PoseValue) -> PoseValue:
+        """Of all frames of the same figure the one nearest to `reference`: its position is that of
+        `reference` projected onto the figure, its rotation that of `reference` turned as little as
+        the figure asks for. Iterations leave these to their path, which has no derivative."""
         M = matrix_from_quaternion(value.rotation)
         along_itself = jnp.array([k not in self.columns for k in range(3)])
-        away = jnp.where(along_itself, M @ (given.position - value.position), 0.0)
-        position = value.position + M.T @ away
+        offset = jnp.where(along_itself, M @ (reference.position - value.position), 0.0)
+        position = value.position + M.T @ offset
         axes = [k for k in range(3) if 3 + k not in self.columns]
         if len(axes) == 3:
-            return PoseValue(position, given.rotation)
-        if len(axes) == 1:  # about which the trace of the rotation from `given` is the largest
+            return PoseValue(position, reference.rotation)
+        if len(axes) == 1:  # about which the trace of the rotation from `reference` is the largest
             (k,), (i, j) = axes, ((axes[0] + 1) % 3, (axes[0] + 2) % 3)
-            A = M @ matrix_from_quaternion(given.rotation).T
+            A = M @ matrix_from_quaternion(reference.rotation).T
             turn = jnp.arctan2(A[i, j] - A[j, i], A[i, i] + A[j, j])
             rotation = retract_quaternion(value.rotation, jnp.zeros(3).at[k].set(turn))
             return PoseValue(position, rotation)
@@ -359,8 +364,8 @@ class Direction(WithoutChart):
     def retract(
         self, value: Float[Array, " size"], change: Float[AnyArray, " width"]
     ) -> Float[Array, " size"]:
-        moved = value + tangent_basis(value) @ change
-        return moved / jnp.linalg.norm(moved)
+        displaced = value + tangent_basis(value) @ change
+        return displaced / jnp.linalg.norm(displaced)
 
     def difference(
         self, value: Float[Array, " size"], origin: Float[Array, " size"]
@@ -370,10 +375,10 @@ class Direction(WithoutChart):
     def hold(
         self,
         value: Float[Array, " size"],
-        given: Float[Array, " size"],
+        start: Float[Array, " size"],
         free: Float[Array, " width"],
     ) -> Float[Array, " size"]:
-        return jnp.where(free.max() > 0, value, given)
+        return jnp.where(free.max() > 0, value, start)
 
 
 def tangent_basis(value: Float[Array, " n"]) -> Float[Array, "n n-1"]:
@@ -392,6 +397,6 @@ def turn_by(angle: Triple, x: Triple) -> Triple:
     square = sum(a * a for a in angle)
     sine = 1 - square / 6 * (1 - square / 20 * (1 - square / 42 * (1 - square / 72)))
     cosine = 0.5 - square / 24 * (1 - square / 30 * (1 - square / 56 * (1 - square / 90)))
-    first = cross(angle, x)
-    second = cross(angle, first)
-    return tuple(a + sine * b + cosine * c for a, b, c in zip(x, first, second))
+    first_order = cross(angle, x)
+    second_order = cross(angle, first_order)
+    return tuple(a + sine * b + cosine * c for a, b, c in zip(x, first_order, second_order))

@@ -38,9 +38,9 @@ def without_residual(W: Float[np.ndarray, "r r"], removed: int) -> Float[np.ndar
     # Rows that remain of W alone would be those of a conditional one.
     stay = np.diagonal(W) > 0
     stay[removed] = False
-    stay, found = np.flatnonzero(stay), np.zeros_like(W)
-    found[np.ix_(stay, stay)] = whitening(_covariance(W[None])[0][np.ix_(stay, stay)])
-    return found
+    stay, root = np.flatnonzero(stay), np.zeros_like(W)
+    root[np.ix_(stay, stay)] = whitening(_covariance(W[None])[0][np.ix_(stay, stay)])
+    return root
 
 
 def _covariance(W: Float[np.ndarray, "n r r"]) -> Float[np.ndarray, "n r r"]:

@@ -27,20 +27,26 @@ TABLE_ALONE = "table"
 
 def directions_of_motions(declared: Declared, values: Values) -> Tangent:
     """`datum.generators` of all tables: [rows, width, motions]."""
-    found, given = {}, not_none(declared.motions)
+    directions, motions_of_space = {}, not_none(declared.motions)
     for name, value in values.items():
-        action = tuple((TABLE_ALONE, act) for table, act in given.actions if table == name)
+        action = tuple(
+            (TABLE_ALONE, act) for table, act in motions_of_space.actions if table == name
+        )
         if not action:
             rows = len(jax.tree.leaves(value)[0])
-            found[name] = np.zeros((rows, declared.spaces[name].width, len(given.names)))
+            directions[name] = np.zeros(
+                (rows, declared.spaces[name].width, len(motions_of_space.names))
+            )
             continue
         # A declaration of this table alone, equal for all of its kind: the key of the shared
         # program.
-        motions = Motions(given.names, action)
-        one = Declared((), ((TABLE_ALONE, declared.spaces[name]),), motions)
-        of_rows = lambda rows, one=one: _generators(one, {TABLE_ALONE: rows})[TABLE_ALONE]
-        found[name] = _of_rows(of_rows, value)
-    return found
+        motions = Motions(motions_of_space.names, action)
+        table_alone = Declared((), ((TABLE_ALONE, declared.spaces[name]),), motions)
+        directions_of_rows = lambda rows, table_alone=table_alone: _generators(
+            table_alone, {TABLE_ALONE: rows}
+        )[TABLE_ALONE]
+        directions[name] = _of_rows(directions_of_rows, value)
+    return directions
 
 
 def move_into_datum(
@@ -52,8 +58,10 @@ def move_into_datum(
     if plan.datum.turned:
         start = _turn_start(declared, plan, values, start)
     if plan.datum.held:
-        held = directions_of_motions(declared, {name: values[name] for name in plan.datum.held})
-        plan = _keep_held_fixed(declared, plan, values, held)
+        held_directions = directions_of_motions(
+            declared, {name: values[name] for name in plan.datum.held}
+        )
+        plan = _keep_held_fixed(declared, plan, values, held_directions)
     host_datum = jax.tree.map(np.asarray, not_none(plan.datum))
     curved, free = not_none(declared.motions).curved, _free(declared, plan, values)
     size = float(datum.largest(host_datum.weight, start))
@@ -61,27 +69,28 @@ def move_into_datum(
     def one_step(values: Values) -> tuple[Values, float]:
         tables = {name: values[name] for name in host_datum.weight}
         moves = directions_of_motions(declared, tables)
-        away = {
+        offset = {
             name: _of_rows(partial(_difference, declared.spaces[name]), value, start[name])
             for name, value in tables.items()
         }
-        misclosure, slope = datum.datum_conditions(host_datum, moves, away)
+        misclosure, slope = datum.datum_conditions(host_datum, moves, offset)
         step = datum.limit_step(host_datum.gauge @ -np.linalg.solve(slope, misclosure), curved)
-        moved = _move_tables(declared, free, step, values)
+        displaced = _move_tables(declared, free, step, values)
         change = {
-            name: jax.tree.map(np.subtract, moved[name], values[name]) for name in host_datum.weight
+            name: jax.tree.map(np.subtract, displaced[name], values[name])
+            for name in host_datum.weight
         }
-        return moved, float(datum.largest(host_datum.weight, change))
+        return displaced, float(datum.largest(host_datum.weight, change))
 
     # Larger than any step, so that the first one is taken.
-    distance, before, count = 1e300, np.inf, 0
+    distance, previous_distance, count = 1e300, np.inf, 0
     with np.errstate(all="ignore"):
-        while datum.moves_on(size, distance, before, count):
+        while datum.moves_on(size, distance, previous_distance, count):
             try:
-                moved, new = one_step(values)
+                displaced, new = one_step(values)
             except np.linalg.LinAlgError:
                 return values, False
-            values, distance, before, count = moved, new, distance, count + 1
+            values, distance, previous_distance, count = displaced, new, distance, count + 1
     return values, distance <= datum.DATUM_MOTION.reached * size
 
 
@@ -92,14 +101,14 @@ def _move_tables(
     values: Values,
 ) -> Values:
     """All tables moved, except held values."""
-    moved = dict(values)
+    displaced = dict(values)
     for name, act in not_none(declared.motions).actions:
-        by = motion
+        table_motion = motion
         if isinstance(act, JointMotion):
-            act, by = act.move, _move_at_once(act.transform, motion, act.size)
-        of_rows = partial(_move, declared.spaces[name], act, by)
-        moved[name] = _of_rows(of_rows, values[name], free[name])
-    return moved
+            act, table_motion = act.move, _move_at_once(act.transform, motion, act.size)
+        of_rows = partial(_move, declared.spaces[name], act, table_motion)
+        displaced[name] = _of_rows(of_rows, values[name], free[name])
+    return displaced
 
 
 @compile_once
@@ -115,18 +124,18 @@ def _move(
     values: Any,
     free: Float[Array, "rows width"],
 ) -> Any:
-    one = lambda value, f: space.hold(act(motion, value), value, f)
-    return jax.vmap(one)(values, free)
+    move_row = lambda value, f: space.hold(act(motion, value), value, f)
+    return jax.vmap(move_row)(values, free)
 
 
-def _of_rows(program: Callable, *given: Any) -> Any:
+def _of_rows(program: Callable, *arguments: Any) -> Any:
     """A program on the rows of a table, padded and cut again; in NumPy."""
-    rows = jax.tree.leaves(given)[0].shape[0]
+    rows = jax.tree.leaves(arguments)[0].shape[0]
     # 128 rows: cameras and stations of most networks in one program; half or double only moves
     # where a second one is compiled.
-    more = max(128 - rows, 0)
-    wide = lambda x: np.pad(x, [(0, more), *[(0, 0)] * (np.ndim(x) - 1)], mode="edge")
-    return jax.tree.map(lambda x: np.asarray(x)[:rows], program(*jax.tree.map(wide, given)))
+    missing_rows = max(128 - rows, 0)
+    wide = lambda x: np.pad(x, [(0, missing_rows), *[(0, 0)] * (np.ndim(x) - 1)], mode="edge")
+    return jax.tree.map(lambda x: np.asarray(x)[:rows], program(*jax.tree.map(wide, arguments)))
 
 
 _generators = compile_once(datum.generators)

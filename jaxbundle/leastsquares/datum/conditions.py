@@ -73,8 +73,8 @@ DATUM_MOTION = MotionSettings()
 
 def generators(declared: Declared, values: Values) -> Tangent:
     """The derivative of every table along each motion, [rows, width, motions]."""
-    given = not_none(declared.motions)
-    motions, actions = len(given.names), dict(given.actions)
+    declared_motions = not_none(declared.motions)
+    motions, actions = len(declared_motions.names), dict(declared_motions.actions)
 
     def of_table(name: str) -> Float[Array, "rows width motions"]:
         space, act = declared.spaces[name], actions.get(name)
@@ -95,7 +95,7 @@ def generators(declared: Declared, values: Values) -> Tangent:
 def of_groups(plan: Plan, of_tables: Mapping[str, Float[AnyArray, "rows width ..."]]) -> Tangent:
     """Quantities by table directions, [rows, width, …], rearranged by groups; zero for held
     unknowns. Those of the eliminated table may be left out, and are missing then."""
-    found = {}
+    by_group = {}
     for name, group in plan.groups.items():
         if name == plan.eliminated and all(m.table not in of_tables for m in group.members):
             continue
@@ -105,8 +105,8 @@ def of_groups(plan: Plan, of_tables: Mapping[str, Float[AnyArray, "rows width ..
         ]
         rows = jnp.concatenate(parts, 1)
         free = group.free.reshape(*group.free.shape, *(1,) * (rows.ndim - 2))
-        found[name] = rows * free
-    return found
+        by_group[name] = rows * free
+    return by_group
 
 
 def open_directions(
@@ -125,13 +125,16 @@ def keep_held_fixed(
     """The plan with the smallest correction of its open motions that leaves held unknowns as they
     are: a rotation about a held point follows the point. `moves`: the `generators`, if known."""
     datum = not_none(plan.datum)
-    held, gauge = datum.held, datum.gauge
-    if not held:
+    held_directions, gauge = datum.held, datum.gauge
+    if not held_directions:
         return plan
     if moves is None:
-        moves = generators(declared, {name: values[name] for name in held})
+        moves = generators(declared, {name: values[name] for name in held_directions})
     rows = jnp.concatenate(
-        [(moves[name] * mask[..., None]).reshape(-1, len(gauge)) for name, mask in held.items()]
+        [
+            (moves[name] * mask[..., None]).reshape(-1, len(gauge))
+            for name, mask in held_directions.items()
+        ]
     )
     # The combination of motions c that leaves held unknowns as they are, R·(g − c) = 0, with the
     # smallest c, which is (RᵀR)⁺RᵀR·g; columns are scaled, since radians stand beside metres.
@@ -157,8 +160,8 @@ def s_transform(
     G, B = datum_directions(declared, plan, values, moves)
     # BᵀG is as small as the defect: at most 7 × 7.
     gram = contract(plan, B, G)
-    along = jnp.linalg.solve(gram, contract(plan, B, change))
-    return {name: d - G[name] @ along for name, d in change.items()}
+    motion = jnp.linalg.solve(gram, contract(plan, B, change))
+    return {name: d - G[name] @ motion for name, d in change.items()}
 
 
 def s_transform_transposed(
@@ -168,8 +171,8 @@ def s_transform_transposed(
     if plan.datum is None:
         return row
     G, B = datum_directions(declared, plan, values, moves)
-    along = jnp.linalg.solve(contract(plan, G, B), contract(plan, G, row))
-    return {name: f - B[name] @ along for name, f in row.items()}
+    motion = jnp.linalg.solve(contract(plan, G, B), contract(plan, G, row))
+    return {name: f - B[name] @ motion for name, f in row.items()}
 
 
 def datum_directions(
@@ -195,7 +198,7 @@ def move_to_datum(
     start = turn_start(declared, plan, values, start)
     plan = keep_held_fixed(declared, plan, values)
     datum = not_none(plan.datum)
-    still, curved = jnp.zeros(datum.gauge.shape[1]), not_none(declared.motions).curved
+    no_motion, curved = jnp.zeros(datum.gauge.shape[1]), not_none(declared.motions).curved
     size = largest(datum.weight, start)
 
     def moving(state: tuple) -> bool | Bool[AnyArray, ""]:
@@ -203,16 +206,16 @@ def move_to_datum(
         return moves_on(size, *progress)
 
     def one_step(state: tuple) -> tuple:
-        values, before, _, count = state
+        values, previous_distance, _, count = state
         misclosure, slope = _conditions_of_tables(declared, plan, values, start)
-        newton_slope = jax.jacfwd(_datum_misclosure)(still, (declared, plan), (values, start))
-        slope = jnp.where(before > DATUM_MOTION.near * size, slope, newton_slope)
+        newton_slope = jax.jacfwd(_datum_misclosure)(no_motion, (declared, plan), (values, start))
+        slope = jnp.where(previous_distance > DATUM_MOTION.near * size, slope, newton_slope)
         step = limit_step(datum.gauge @ -jnp.linalg.solve(slope, misclosure), curved)
-        moved = _move(declared, plan, step, values)
+        displaced = _move(declared, plan, step, values)
         differences = {
-            name: jax.tree.map(jnp.subtract, moved[name], values[name]) for name in datum.weight
+            name: jax.tree.map(jnp.subtract, displaced[name], values[name]) for name in datum.weight
         }
-        return moved, largest(datum.weight, differences), before, count + 1
+        return displaced, largest(datum.weight, differences), previous_distance, count + 1
 
     # Larger than any step, so that the first one is taken.
     begin = values, jnp.asarray(1e300), jnp.asarray(jnp.inf), 0
@@ -235,9 +238,9 @@ def turn_start(declared: Declared, plan: Plan, values: Values, start: Values) ->
     centre, centre0 = (p @ x / p.sum() for x in (X, X0))
 
     def misalignment(
-        turn: Float[Array, "3"], weight: Float[Array, " n"], given: tuple[Array, Array]
+        turn: Float[Array, "3"], weight: Float[Array, " n"], centred: tuple[Array, Array]
     ) -> Float[Array, "3"]:
-        Y, Y0 = given
+        Y, Y0 = centred
         return weight @ jnp.cross(Y0 @ matrix_from_rotation_vector(turn).T, Y)
 
     given = X - centre, X0 - centre0
@@ -249,8 +252,8 @@ def turn_start(declared: Declared, plan: Plan, values: Values, start: Values) ->
         misalignment, solve_dense, stop_gradient(rotation_vector_from_matrix(R)), p, given
     )
     # Where no shift is open, the centroid too is where the observations have it.
-    to = centre if datum.gauge.shape[1] == 1 else centre0
-    shift = to - matrix_from_rotation_vector(turn) @ centre0
+    centre_after = centre if datum.gauge.shape[1] == 1 else centre0
+    shift = centre_after - matrix_from_rotation_vector(turn) @ centre0
     motion = jnp.concatenate([shift, turn, jnp.zeros(1)])
     turned = dict(start)
     for name, act in not_none(declared.motions).actions:
@@ -273,16 +276,16 @@ def _datum_places(
 def moves_on(
     size: Scalar,
     distance: Scalar,
-    before: Scalar,
+    previous_distance: Scalar,
     count: int | Int[Array, ""],
     settings: MotionSettings = DATUM_MOTION,
 ) -> bool | Bool[AnyArray, ""]:
     """Whether a motion to the datum continues after a step of `distance` and a previous one of
-    `before`."""
+    `previous_distance`."""
     # Far from its end a motion may overshoot for some steps; near it, one that does not halve is
     # rounding.
-    falling = (distance > settings.small * size) | (distance < 0.5 * before)
-    return (distance > settings.reached * size) & falling & (count < settings.max_steps)
+    is_falling = (distance > settings.small * size) | (distance < 0.5 * previous_distance)
+    return (distance > settings.reached * size) & is_falling & (count < settings.max_steps)
 
 
 def limit_step(
@@ -306,15 +309,15 @@ def largest(holding: Tangent, tables: Values) -> Any:
 
 
 def datum_conditions(
-    datum: Datum, moves: Tangent, away: Tangent
+    datum: Datum, moves: Tangent, offset: Tangent
 ) -> tuple[Float[AnyArray, " defect"], Float[AnyArray, "defect defect"]]:
-    """Bᵀ(x − x_start) and BᵀG, over the datum tables; `away`: x − x_start."""
+    """Bᵀ(x − x_start) and BᵀG, over the datum tables; `offset`: x − x_start."""
     misclosure: Any = 0.0
     gram: Any = 0.0
     for name, weight in datum.weight.items():
         G = moves[name] @ datum.gauge
         B = (G * weight[..., None]).reshape(-1, G.shape[-1])
-        misclosure = misclosure + B.T @ away[name].ravel()
+        misclosure = misclosure + B.T @ offset[name].ravel()
         gram = gram + B.T @ G.reshape(B.shape)
     return misclosure, gram
 
@@ -325,23 +328,25 @@ def _conditions_of_tables(
     """Bᵀ(x − x_start) and BᵀG of the tables at these values, differentiable."""
     datum = not_none(plan.datum)
     moves = generators(declared, {name: values[name] for name in datum.weight})
-    away = {
+    offset = {
         name: jax.vmap(declared.spaces[name].difference)(values[name], start[name])
         for name in datum.weight
     }
-    return datum_conditions(datum, moves, away)
+    return datum_conditions(datum, moves, offset)
 
 
 def _datum_misclosure(
-    tau: Float[Array, " defect"], fixed: tuple[Declared, Plan], given: tuple[Values, Values]
+    tau: Float[Array, " defect"],
+    fixed: tuple[Declared, Plan],
+    values_and_start: tuple[Values, Values],
 ) -> Float[AnyArray, " defect"]:
     """Bᵀ(x − x_start) after a motion along the open directions."""
-    (declared, plan), (values, start) = fixed, given
+    (declared, plan), (values, start) = fixed, values_and_start
     plan = keep_held_fixed(declared, plan, values)
     datum = not_none(plan.datum)
     tables = {name: values[name] for name in datum.weight}
-    moved = _move(declared, plan, datum.gauge @ tau, tables)
-    return _conditions_of_tables(declared, plan, moved, start)[0]
+    displaced = _move(declared, plan, datum.gauge @ tau, tables)
+    return _conditions_of_tables(declared, plan, displaced, start)[0]
 
 
 def attach_motion(declared: Declared, plan: Plan, values: Values, start: Values) -> Values:
@@ -350,21 +355,23 @@ def attach_motion(declared: Declared, plan: Plan, values: Values, start: Values)
     if plan.datum is None:
         return values
     start = turn_start(declared, plan, values, start)
-    still, fixed = jnp.zeros(plan.datum.gauge.shape[1]), (declared, plan)
+    no_motion, fixed = jnp.zeros(plan.datum.gauge.shape[1]), (declared, plan)
 
     def along(tau: Float[Array, " defect"], of: Values, values: Values) -> Values:
         datum = not_none(keep_held_fixed(declared, plan, of).datum)
         return _move(declared, plan, datum.gauge @ tau, values)
 
     # First remove the remaining motion, so that derivatives are taken at zero motion.
-    known = jax.lax.stop_gradient((values, start))
-    slope = jax.jacfwd(_datum_misclosure)(still, fixed, known)
+    constants = jax.lax.stop_gradient((values, start))
+    slope = jax.jacfwd(_datum_misclosure)(no_motion, fixed, constants)
     # `values` are in the datum to 1e-12 already: one Newton step of rounding size, but with it the
     # root below is exactly zero, where its equation is differentiated.
     values = along(
-        -jnp.linalg.solve(slope, _datum_misclosure(still, fixed, known)), known[0], values
+        -jnp.linalg.solve(slope, _datum_misclosure(no_motion, fixed, constants)),
+        constants[0],
+        values,
     )
-    tau = implicit_root(_datum_misclosure, solve_dense, still, fixed, (values, start))
+    tau = implicit_root(_datum_misclosure, solve_dense, no_motion, fixed, (values, start))
     return along(tau, values, values)
 
 
@@ -372,14 +379,14 @@ def _move(
     declared: Declared, plan: Plan, motion: Float[AnyArray, " motions"], values: Values
 ) -> Values:
     """All tables moved, except held values."""
-    moved, free = dict(values), free_of_tables(declared, plan, values)
+    displaced, free = dict(values), free_of_tables(declared, plan, values)
     for name, act in not_none(declared.motions).actions:
         if name not in values:
             continue
         space = declared.spaces[name]
-        one = lambda value, f, act=act, space=space: space.hold(act(motion, value), value, f)
-        moved[name] = jax.vmap(one)(values[name], free[name])
-    return moved
+        move_row = lambda value, f, act=act, space=space: space.hold(act(motion, value), value, f)
+        displaced[name] = jax.vmap(move_row)(values[name], free[name])
+    return displaced
 
 
 def free_of_tables(declared: Declared, plan: Plan, values: Values) -> dict[str, Array]:
@@ -404,5 +411,5 @@ def contract(plan: Plan, B: Tangent, x: Tangent) -> Float[Array, "defect ..."]:
     parts = {name: jnp.einsum("nwk,nw...->k...", b, x[name]) for name, b in B.items()}
     e = plan.eliminated
     # Kept rows are on all devices, eliminated ones on one each.
-    kept: Any = sum(part for name, part in parts.items() if name != e)
-    return kept if e is None else kept + sum_over_devices(plan, parts[e])
+    sum_of_kept: Any = sum(part for name, part in parts.items() if name != e)
+    return sum_of_kept if e is None else sum_of_kept + sum_over_devices(plan, parts[e])

@@ -71,7 +71,7 @@ def _survey(
     real: dict[str, Bool[np.ndarray, " rows"]],
     moves: Tangent,
 ) -> Survey:
-    laid, prepared = lay_out_data(plan, data), prepare(declared, data.start)
+    chunked, prepared = lay_out_data(plan, data), prepare(declared, data.start)
     motions = len(not_none(declared.motions).names)
     everywhere = {
         name: jnp.concatenate(
@@ -83,7 +83,7 @@ def _survey(
     for number, part in enumerate(plan.parts):
         if declared.kinds[part.set_name].invariant:
             continue
-        _, touches, E = differentiate(declared, plan, number, prepared, laid)
+        _, touches, E = differentiate(declared, plan, number, prepared, chunked)
         blocks = [
             (J, everywhere[t.group][t.row, t.start : t.stop][:, None])
             for t, J in zip(part.touches, touches)
@@ -96,16 +96,16 @@ def _survey(
         total = lambda rows: reduce(jnp.add, rows).reshape(-1, motions)
         product, terms = (total([f(J) @ f(G) for J, G in blocks]) for f in (jnp.asarray, abs))
         # Non-finite values at the start are ignored here; the solver will report them.
-        there = jnp.isfinite(terms).all(1, keepdims=True)
-        products.append(jnp.where(there, product, 0.0))
-        squares += jnp.where(there, terms**2, 0.0).sum(0)
+        is_finite = jnp.isfinite(terms).all(1, keepdims=True)
+        products.append(jnp.where(is_finite, product, 0.0))
+        squares += jnp.where(is_finite, terms**2, 0.0).sum(0)
     free = free_of_tables(declared, plan, data.start)
-    held = [
+    held_rows = [
         jnp.where((free[name] > 0)[..., None] | ~real[name][:, None, None], 0.0, rows)
         for name, rows in moves.items()
     ]
-    held = jnp.concatenate([rows.reshape(-1, motions) for rows in held])
-    return Survey(tuple(products), squares, held, moves, free, of_groups(plan, moves))
+    held_rows = jnp.concatenate([rows.reshape(-1, motions) for rows in held_rows])
+    return Survey(tuple(products), squares, held_rows, moves, free, of_groups(plan, moves))
 
 
 def find_open_motions(survey: Survey) -> Float[np.ndarray, "motions defect"]:
@@ -113,18 +113,20 @@ def find_open_motions(survey: Survey) -> Float[np.ndarray, "motions defect"]:
 
     Computed from the singular values of J·G, its columns scaled by the size of their terms, so that
     neither units nor the number of observations matter."""
-    held = np.asarray(survey.held)
-    held = held[np.isfinite(held).all(1)]
-    scale = np.sqrt(np.asarray(survey.squares) + (held**2).sum(0))
+    held_rows = np.asarray(survey.held)
+    held_rows = held_rows[np.isfinite(held_rows).all(1)]
+    scale = np.sqrt(np.asarray(survey.squares) + (held_rows**2).sum(0))
     # A motion without any effect gets the scale of the others by the size of its displacements:
     # combinations of motions of very different sizes would be nearly parallel.
-    moved = np.sqrt(sum((np.asarray(x) ** 2).sum((0, 1)) for x in survey.moves.values()))
-    moved = np.where(moved > 0, moved, 1.0)
-    scale = np.where(scale > 0, scale, moved * ((scale / moved).max(initial=0.0) or 1.0))
-    held = held / scale
+    displacement = np.sqrt(sum((np.asarray(x) ** 2).sum((0, 1)) for x in survey.moves.values()))
+    displacement = np.where(displacement > 0, displacement, 1.0)
+    scale = np.where(
+        scale > 0, scale, displacement * ((scale / displacement).max(initial=0.0) or 1.0)
+    )
+    held_rows = held_rows / scale
     # A held unknown that moves at all holds: every row counts the same.
-    size = np.linalg.norm(held, axis=1, keepdims=True)
-    rows = [held / np.where(size > 0, size, 1.0), *map(np.asarray, survey.products)]
+    size = np.linalg.norm(held_rows, axis=1, keepdims=True)
+    rows = [held_rows / np.where(size > 0, size, 1.0), *map(np.asarray, survey.products)]
     scales = [np.ones_like(scale), *[scale] * len(survey.products)]
     # Directions with J·G = 0. Of the Gram matrix (JG)ᵀJG eigenvalues below 1e-16 of the largest are
     # noise: open and weak (1e-8) would look alike; hence the triangle of a QR.
@@ -159,15 +161,15 @@ def make_datum(
     many of them as the defect, chosen well spread. `real`: see `survey_motions`.
 
     **Raises:** `CannotHold`."""
-    along = lambda moves: {name: np.asarray(rows) @ gauge for name, rows in moves.items()}
-    moves, free = along(survey.moves), {t: np.asarray(f) for t, f in survey.free.items()}
+    along_gauge = lambda moves: {name: np.asarray(rows) @ gauge for name, rows in moves.items()}
+    moves, free = along_gauge(survey.moves), {t: np.asarray(f) for t, f in survey.free.items()}
     weight = {name: np.asarray(w) * free[name] for name, w in weight.items()}
     defect = gauge.shape[1]
     directions = [moves[t].reshape(-1, defect) for t in weight]
     candidates = [w.ravel() for w in weight.values()]
     size = np.sqrt(sum((rows**2).sum(0) for rows in directions))
-    chosen = [rows * c[:, None] for rows, c in zip(directions, candidates)]
-    R = _triangle(chosen, [size] * len(chosen))
+    candidate_rows = [rows * c[:, None] for rows, c in zip(directions, candidates)]
+    R = _triangle(candidate_rows, [size] * len(candidate_rows))
     if np.isfinite(R).all():  # otherwise the solver will report it
         singular = np.linalg.svd(R, compute_uv=False)
         if singular[-1] <= MIN_RELATIVE_MOTION * singular[0]:
@@ -181,11 +183,11 @@ def make_datum(
         weight = {
             t: part.reshape(weight[t].shape) for t, part in zip(weight, np.split(picked, cuts))
         }
-    pins = _choose_pins(plan, along({name: survey.of_groups[name] for name in plan.kept}))
-    held = {t: (1 - free[t]) * real[t][:, None] for t, rows in moves.items() if rows.any()}
-    held = {t: mask for t, mask in held.items() if mask.any()}
+    pins = _choose_pins(plan, along_gauge({name: survey.of_groups[name] for name in plan.kept}))
+    held_unknowns = {t: (1 - free[t]) * real[t][:, None] for t, rows in moves.items() if rows.any()}
+    held_unknowns = {t: mask for t, mask in held_unknowns.items() if mask.any()}
     turned = _leaves_scale_but_no_rotation(survey.moves, gauge, weight)
-    datum = Datum(*jax.device_put((gauge, weight, pins, held)))
+    datum = Datum(*jax.device_put((gauge, weight, pins, held_unknowns)))
     return dataclasses.replace(datum, turned=turned)
 
 
@@ -198,8 +200,8 @@ def _leaves_scale_but_no_rotation(
 
     def size(motions: slice) -> float:
         parts = [np.asarray(moves[t])[..., motions] @ gauge[motions] for t in weight]
-        known = [weight[t][..., None] * part for t, part in zip(weight, parts)]
-        return max(float(np.nanmax(abs(part), initial=0.0)) for part in known)
+        weighted = [weight[t][..., None] * part for t, part in zip(weight, parts)]
+        return max(float(np.nanmax(abs(part), initial=0.0)) for part in weighted)
 
     return size(SCALE) > 0 and size(ROTATION) <= MIN_RELATIVE_MOTION * size(SCALE)
 
@@ -213,14 +215,14 @@ def _choose_pins(
     # Coordinates of a large block move by kilometres in a rotation, its angles by radians: without
     # this all pins would be coordinates.
     size = {name: np.sqrt((G[name] ** 2).mean((0, 2), keepdims=True)) for name in plan.kept}
-    least = max(1e-300, MAX_OPEN_EFFECT * max(x.max() for x in size.values()))
+    smallest_size = max(1e-300, MAX_OPEN_EFFECT * max(x.max() for x in size.values()))
     for name in plan.kept:
-        sized = G[name] / np.maximum(size[name], least)
+        sized = G[name] / np.maximum(size[name], smallest_size)
         rows.append(sized.reshape(-1, sized.shape[2]))
         shapes.append(G[name].shape[:2])
-    whole = np.concatenate(rows)
+    all_rows = np.concatenate(rows)
     free = np.concatenate([np.asarray(plan.groups[g].free).ravel() for g in plan.kept])
-    picked = _pick_rows(whole, free)
+    picked = _pick_rows(all_rows, free)
     cuts = np.cumsum([len(r) for r in rows])[:-1]
     return {
         name: part.reshape(shape)
@@ -236,10 +238,10 @@ def _pick_rows(
     # (D-optimal step by step), e.g. points far apart.
     q, _ = np.linalg.qr(G)
     rows = q * candidates[:, None]
-    chosen = np.zeros(len(rows))
+    is_chosen = np.zeros(len(rows))
     for _ in range(G.shape[1]):
         pick = np.argmax((rows**2).sum(1))
         direction = rows[pick] / np.linalg.norm(rows[pick])
         rows = rows - np.outer(rows @ direction, direction)
-        chosen[pick] = 1.0
-    return chosen
+        is_chosen[pick] = 1.0
+    return is_chosen

@@ -38,8 +38,8 @@ NODES, WEIGHTS = np.polynomial.legendre.leggauss(20)
 
 def similarity(points: Sequence[str] = ("point",), poses: Sequence[str] = ()) -> Motions:
     """The seven similarity parameters of space, for tables of points [n, 3] and of poses."""
-    moved = [(name, _move_point) for name in points] + [(name, move_pose) for name in poses]
-    return Motions(SIMILARITY_PARAMETERS, tuple(moved), curved=(3, 4, 5, 6))
+    actions = [(name, _move_point) for name in points] + [(name, move_pose) for name in poses]
+    return Motions(SIMILARITY_PARAMETERS, tuple(actions), curved=(3, 4, 5, 6))
 
 
 def similarity_of_plane(points: Sequence[str]) -> Motions:
@@ -116,9 +116,9 @@ def move_at_once(
     A(u) the rotation and scale after the time u (Gauss–Legendre, to rounding up to two turns and a
     scale of e⁵)."""
     # A shift per unit of time, rotated and scaled by what has happened until then.
-    still = motion.at[:size].set(0.0)
-    moved = jax.vmap(lambda u: transform(u * still, motion[:size]))((NODES + 1) / 2)
-    return still.at[:size].set(WEIGHTS / 2 @ moved)
+    without_shift = motion.at[:size].set(0.0)
+    shifts = jax.vmap(lambda u: transform(u * without_shift, motion[:size]))((NODES + 1) / 2)
+    return without_shift.at[:size].set(WEIGHTS / 2 @ shifts)
 
 
 def scale_length(motion: Float[Array, "7"], value: Float[AnyArray, "*n"]) -> Float[Array, "*n"]:

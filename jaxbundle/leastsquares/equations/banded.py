@@ -25,7 +25,7 @@ from jaxbundle.leastsquares.equations.reduced import (
     blocks_of,
     cholesky_of_lower,
     flat,
-    split,
+    split_by_group,
 )
 from jaxbundle.leastsquares.indexing.plan import Plan, Tangent
 from jaxbundle.types import not_none
@@ -42,20 +42,22 @@ class BandFactor(eqx.Module):
     corner: Float[Array, "q q"]
 
     def solve(self, b: Tangent) -> Tangent:
-        g, others = _groups(self.plan)
+        g, border_groups = _groups(self.plan)
 
         def forward(
-            less: Float[Array, " m"], block: tuple[Array, Array, Array]
+            subtrahend: Float[Array, " m"], block: tuple[Array, Array, Array]
         ) -> tuple[Array, Array]:
             L, C, right = block
-            y = solve_triangular(L, right - less, lower=True)
+            y = solve_triangular(L, right - subtrahend, lower=True)
             return C @ y, y
 
         nothing, right = jnp.zeros(self.lower.shape[1]), _into_band(self.plan, b[g])
         _, y = jax.lax.scan(forward, nothing, (self.lower, self.below, right))
-        rest = flat(others, b) - jnp.einsum("bmq,bm->q", self.border, y)
-        rest = cho_solve((self.corner, True), rest) if rest.size else rest
-        y = y - jnp.einsum("bmq,q->bm", self.border, rest)
+        border_part = flat(border_groups, b) - jnp.einsum("bmq,bm->q", self.border, y)
+        border_part = (
+            cho_solve((self.corner, True), border_part) if border_part.size else border_part
+        )
+        y = y - jnp.einsum("bmq,q->bm", self.border, border_part)
 
         def backward(
             x: Float[Array, " m"], block: tuple[Array, Array, Array]
@@ -65,10 +67,10 @@ class BandFactor(eqx.Module):
             return x, x
 
         _, x = jax.lax.scan(backward, nothing, (self.lower, self.below, y), reverse=True)
-        return {g: _from_band(self.plan, x)} | split(self.plan, others, rest)
+        return {g: _from_band(self.plan, x)} | split_by_group(self.plan, border_groups, border_part)
 
     def inverse(self) -> Reduced:
-        plan, (g, others) = self.plan, _groups(self.plan)
+        plan, (g, border_groups) = self.plan, _groups(self.plan)
         m, q = self.border.shape[1:]
         corner = cho_solve((self.corner, True), jnp.eye(q)) if q else self.corner
 
@@ -91,16 +93,18 @@ class BandFactor(eqx.Module):
         _, (D, E, with_border) = jax.lax.scan(backward, start, factor, reverse=True)
         # Only the blocks of Q where S has blocks: statistics need no others, and the recursion
         # gives no others.
-        Q, index = blocks_of(plan, others, corner), jnp.arange(plan.groups[g].rows)
+        Q, index = blocks_of(plan, border_groups, corner), jnp.arange(plan.groups[g].rows)
         Q.diagonal_blocks[g] = _blocks(plan, D, E, index, index)
-        border = split(plan, others, jnp.moveaxis(_from_band(plan, with_border), -1, 0))
-        for (a, b), at in plan.blocks.items():
+        border = split_by_group(
+            plan, border_groups, jnp.moveaxis(_from_band(plan, with_border), -1, 0)
+        )
+        for (a, b), block_rows in plan.blocks.items():
             if a == b == g:
-                Q.off_diagonal_blocks[a, b] = _blocks(plan, D, E, at.row, at.column)
+                Q.off_diagonal_blocks[a, b] = _blocks(plan, D, E, block_rows.row, block_rows.column)
             elif a == g:
-                Q.off_diagonal_blocks[a, b] = border[b][at.column, :, at.row].mT
+                Q.off_diagonal_blocks[a, b] = border[b][block_rows.column, :, block_rows.row].mT
             elif b == g:
-                Q.off_diagonal_blocks[a, b] = border[a][at.row, :, at.column]
+                Q.off_diagonal_blocks[a, b] = border[a][block_rows.row, :, block_rows.column]
         return Q
 
     @property
@@ -111,15 +115,17 @@ class BandFactor(eqx.Module):
 
 def factorise_band(plan: Plan, S: Reduced) -> BandFactor:
     """The factor of a banded S; NaN if it is not positive definite."""
-    g, others = _groups(plan)
+    g, border_groups = _groups(plan)
     band = not_none(plan.band)
     place, width, blocks = band.place, band.width, band.blocks
     w = plan.groups[g].width
     m = width * w
     # Two rows at most one band width apart are in one super-block (0: D) or in two neighbouring
     # ones (1: E): this defines the width. One scatter for both.
-    both = jnp.zeros((2, blocks, width, width, w, w))
-    both = both.at[0, place // width, place % width, place % width].set(S.diagonal_blocks[g])
+    diagonal_and_above = jnp.zeros((2, blocks, width, width, w, w))
+    diagonal_and_above = diagonal_and_above.at[0, place // width, place % width, place % width].set(
+        S.diagonal_blocks[g]
+    )
     if (g, g) in S.off_diagonal_blocks:
         a, b = place[plan.blocks[g, g].row], place[plan.blocks[g, g].column]
         # Which of two rows comes later in the band differs from which is later in the group.
@@ -128,12 +134,14 @@ def factorise_band(plan: Plan, S: Reduced) -> BandFactor:
             (a < b)[:, None, None], S.off_diagonal_blocks[g, g].mT, S.off_diagonal_blocks[g, g]
         )
         beside = high // width - low // width
-        both = both.at[beside, low // width, high % width, low % width].add(turned)
-    D, E = both.transpose(0, 1, 2, 4, 3, 5).reshape(2, blocks, m, m)
+        diagonal_and_above = diagonal_and_above.at[
+            beside, low // width, high % width, low % width
+        ].add(turned)
+    D, E = diagonal_and_above.transpose(0, 1, 2, 4, 3, 5).reshape(2, blocks, m, m)
     # Positions of padding get a one, so that every block has a factor; they are never read.
     unused = 1.0 - _into_band(plan, jnp.ones(plan.groups[g].free.shape))
     D = D + unused[:, :, None] * jnp.eye(m)
-    border = [S.block(plan, g, other) for other in others]
+    border = [S.block(plan, g, other) for other in border_groups]
     # No columns first: without a border there would be nothing to join.
     border = jnp.concatenate([jnp.zeros((plan.groups[g].free.size, 0)), *border], 1)
     # All other groups (shared cameras, mostly): q columns beside the band, dense.
@@ -154,7 +162,7 @@ def factorise_band(plan: Plan, S: Reduced) -> BandFactor:
     # its cube. A street of 1723 images has 15 507 unknowns: 1.9 GB dense; here in blocks of
     # 29 images.
     _, (L, C, X) = jax.lax.scan(step, start, (D, E, border))
-    corner = S.matrix(plan, others) - jnp.einsum("bmi,bmj->ij", X, X)
+    corner = S.matrix(plan, border_groups) - jnp.einsum("bmi,bmj->ij", X, X)
     return BandFactor(plan, L, C, X, cholesky_of_lower(corner))
 
 
@@ -167,8 +175,8 @@ def _groups(plan: Plan) -> tuple[str, tuple[str, ...]]:
 def _into_band(plan: Plan, rows: Float[Array, "rows w *q"]) -> Float[Array, "blocks m *q"]:
     """Rows of the group at their positions in the band; zero for padding."""
     band, (_, w, *q) = not_none(plan.band), rows.shape
-    whole = jnp.zeros((band.blocks * band.width, w, *q)).at[band.place].set(rows)
-    return whole.reshape(band.blocks, band.width * w, *q)
+    padded = jnp.zeros((band.blocks * band.width, w, *q)).at[band.place].set(rows)
+    return padded.reshape(band.blocks, band.width * w, *q)
 
 
 def _from_band(plan: Plan, x: Float[Array, "blocks m *q"]) -> Float[Array, "rows w *q"]:
@@ -189,6 +197,9 @@ def _blocks(
     w, width = plan.groups[band.group].width, band.width
     a, b = band.place[row], band.place[column]
     low, high = jnp.minimum(a, b), jnp.maximum(a, b)
-    both, here = jnp.stack([D, E]).reshape(2, -1, width, w, width, w), low // width
-    found = both[high // width - here, here, low % width, :, high % width]
-    return jnp.where((a > b)[:, None, None], found.mT, found)
+    diagonal_and_above, low_block = (
+        jnp.stack([D, E]).reshape(2, -1, width, w, width, w),
+        low // width,
+    )
+    blocks = diagonal_and_above[high // width - low_block, low_block, low % width, :, high % width]
+    return jnp.where((a > b)[:, None, None], blocks.mT, blocks)

@@ -48,9 +48,12 @@ def _damping_of_group(
     # A group may hold several tables (a pose and its camera): each with its own chart, or none.
     T = inverse = jnp.broadcast_to(jnp.eye(blocks.shape[1]), blocks.shape)
     for member, chart in zip(group.members, charts):
-        at = slice(member.start, member.start + member.width)
+        columns = slice(member.start, member.start + member.width)
         if chart is not None:
-            T, inverse = T.at[:, at, at].set(chart[0]), inverse.at[:, at, at].set(chart[1])
+            T, inverse = (
+                T.at[:, columns, columns].set(chart[0]),
+                inverse.at[:, columns, columns].set(chart[1]),
+            )
 
     def damping_of_row(
         T: Float[Array, "w w"],

@@ -70,9 +70,9 @@ class NormalFactor(eqx.Module):
 def damp(normal: Normal, damping: Float[Array, ""]) -> Normal:
     """N + λ·D."""
     N, e = normal.blocks, normal.plan.eliminated
-    added = {name: damping * d for name, d in matrices(N.damping_matrix).items()}
-    diagonal = {name: B + added[name] for name, B in N.diagonal_blocks.items()}
-    eliminated = None if e is None else not_none(N.eliminated) + added[e]
+    damping_blocks = {name: damping * d for name, d in matrices(N.damping_matrix).items()}
+    diagonal = {name: B + damping_blocks[name] for name, B in N.diagonal_blocks.items()}
+    eliminated = None if e is None else not_none(N.eliminated) + damping_blocks[e]
     return Normal(
         normal.plan, dataclasses.replace(N, diagonal_blocks=diagonal, eliminated=eliminated)
     )
@@ -131,14 +131,14 @@ def reduced_system(
     scale = {g: jnp.where(diagonal[g] > 0, diagonal[g], 1.0) ** -0.5 for g in plan.kept}
     S = S.scale_symmetrically(plan, scale)
     for g, B in S.diagonal_blocks.items():
-        added = 1.0 - plan.groups[g].free
+        diagonal_additions = 1.0 - plan.groups[g].free
         # With d pins on a matrix of defect d, N + Σ eᵢeᵢᵀ is regular, and the solution is that of
         # the minimal datum in which the pinned unknowns do not change. Inner constraints instead
         # (G·Gᵀ added) would fill the whole matrix, band and all; a QR of G in the loop compiled
         # longer.
         if plan.datum is not None:
-            added = added + pin_datum * plan.datum.pins[g]
-        S.diagonal_blocks[g] = B + added[:, :, None] * jnp.eye(B.shape[1])
+            diagonal_additions = diagonal_additions + pin_datum * plan.datum.pins[g]
+        S.diagonal_blocks[g] = B + diagonal_additions[:, :, None] * jnp.eye(B.shape[1])
     return S, scale, lower_inverse, Z
 
 
@@ -149,8 +149,8 @@ def eliminate(normal: Normal) -> tuple[Reduced, Float[Array, "rows w w"] | None,
     if e is None:
         return Reduced(diagonal, off_diagonal), None, {}
     # Held directions have zero rows in W: with a one on the diagonal they take no part.
-    held = (1.0 - plan.groups[e].free)[:, :, None] * jnp.eye(plan.groups[e].width)
-    lower_inverse = inverse_cholesky(not_none(N.eliminated) + held)
+    held_directions = (1.0 - plan.groups[e].free)[:, :, None] * jnp.eye(plan.groups[e].width)
+    lower_inverse = inverse_cholesky(not_none(N.eliminated) + held_directions)
     # L⁻¹ itself and not L: it is used for every incidence, for right-hand sides and for cofactors,
     # and a product of 3×3 vectorises where a substitution does not.
     Z, ZtZ, ZtZ_off = {}, {}, {}
@@ -182,14 +182,14 @@ def solve(factor: NormalFactor, right: Tangent) -> Tangent:
     plan, Z = factor.plan, factor.Z
     e = plan.eliminated if plan.eliminated in right else None
     # Free: held unknowns do not change, whatever a right-hand side has along them.
-    kept = {g: right[g] * plan.groups[g].free * s for g, s in factor.scale.items()}
+    kept_right = {g: right[g] * plan.groups[g].free * s for g, s in factor.scale.items()}
     if e is not None:
         free = plan.groups[e].free
         h = jnp.einsum("nij,nj->ni", factor.lower_inverse, right[e] * free)
         for g, x in gather(plan, Z, h).items():
-            kept[g] = kept[g] - x * factor.scale[g]
+            kept_right[g] = kept_right[g] - x * factor.scale[g]
     # Devices that differ in the last digit would take different branches later.
-    x = average_over_devices(plan, factor.reduced.solve(kept))
+    x = average_over_devices(plan, factor.reduced.solve(kept_right))
     x = {g: rows * plan.groups[g].free * factor.scale[g] for g, rows in x.items()}
     if e is not None:
         # x_e = L⁻ᵀ·(h − Z·x), with h = L⁻¹·b_e from above.
@@ -217,15 +217,15 @@ def sum_pairs(
     ) -> Float[Array, "blocks w v"]:
         number, depth = len(i), i.shape[1] * width
         # Gathering whole blocks takes 18 ms for the pairs of BAL 16; column by column, 53.
-        left, right = look_up(a, i), look_up(b, j).reshape(number, depth, n)
+        first_rows, second_rows = look_up(a, i), look_up(b, j).reshape(number, depth, n)
         # With the left factor transposed as it is gathered, chunks of up to 100 pairs take three
         # quarters of the time (BAL 49: 8.9 ms for all pairs instead of 12.1); in longer ones, most
         # of those of BAL 16, the transposition costs a third more than it saves.
         if i.shape[1] <= 100:
-            turned = _row_major(jnp.moveaxis(left, 3, 1))
-            product = turned.reshape(number, m, depth) @ right
+            turned = _row_major(jnp.moveaxis(first_rows, 3, 1))
+            product = turned.reshape(number, m, depth) @ second_rows
         else:
-            product = jnp.einsum("cki,ckj->cij", left.reshape(number, depth, m), right)
+            product = jnp.einsum("cki,ckj->cij", first_rows.reshape(number, depth, m), second_rows)
         # `chunk_pairs` lists them by block.
         return sums.at[k].add(product, indices_are_sorted=True)
 
@@ -244,11 +244,11 @@ def sum_over_pairs(
         # they would be 73 MB for the 170 046 pairs of BAL 16 (two blocks of 3 × 9 each).
         number, length = chunks[0].shape
         step = max(1, at_once // length)
-        whole = number // step * step
+        whole_steps = number // step * step
         if number > step:
-            steps = [x[:whole].reshape(-1, step, *x.shape[1:]) for x in chunks]
+            steps = [x[:whole_steps].reshape(-1, step, *x.shape[1:]) for x in chunks]
             sums, _ = jax.lax.scan(lambda sums, chunk: (add(sums, *chunk), None), sums, steps)
-            chunks = [x[whole:] for x in chunks]
+            chunks = [x[whole_steps:] for x in chunks]
         # The rest, which fills no whole step.
         if len(chunks[0]):
             sums = add(sums, *chunks)
@@ -276,14 +276,14 @@ def inverse_cholesky(V: Float[Array, "n w w"]) -> Float[Array, "n w w"]:
 
 def _lower_times(
     lower: Float[Array, "rows w w"],
-    at: Int[Array, "chunks length"],
+    rows: Int[Array, "chunks length"],
     W: Float[Array, "chunks length w v"],
 ) -> Float[Array, "chunks length w v"]:
     """lower[at]·W of every incidence, `lower` triangular; written out: half the time of a
     product."""
     w = lower.shape[-1]
-    of = look_up(lower.reshape(-1, w * w), at)
-    row = lambda i: sum(of[..., w * i + j, None] * W[..., j, :] for j in range(i + 1))
+    blocks = look_up(lower.reshape(-1, w * w), rows)
+    row = lambda i: sum(blocks[..., w * i + j, None] * W[..., j, :] for j in range(i + 1))
     return jnp.stack([row(i) for i in range(w)], -2)
 
 

@@ -42,20 +42,20 @@ class SecondOrder(eqx.Module):
 
 
 def equations_and_terms(
-    declared: Declared, plan: Plan, values: Values, laid: ChunkedData
+    declared: Declared, plan: Plan, values: Values, chunked: ChunkedData
 ) -> tuple[tuple[Float[Array, ""], Tangent, NormalBlocks], tuple[SecondOrder, ...]]:
     """½·vᵀPv, its gradient and its Hessian, like `normal.normal_equations`, and the derivatives of
     every part, of which they are sums."""
-    plan, laid = fill_places(plan, laid)
+    plan, chunked = fill_places(plan, chunked)
     prepared, sums, terms = prepare(declared, values), Sums(plan), []
     for number, part in enumerate(plan.parts):
-        v, found = _derivatives(declared, plan, number, prepared, laid)
-        J = found.jacobian
+        v, derivatives = _derivatives(declared, plan, number, prepared, chunked)
+        J = derivatives.jacobian
         gradient = jnp.einsum("clri,clr->cli", J, v)
-        hessian = jnp.einsum("clri,clrj->clij", J, J) + found.curvature
-        more = _blocks(declared, plan, part, gradient, hessian)
-        sums.add_part(part, 0.5 * jnp.vdot(v, v), *more)
-        terms.append(found)
+        hessian = jnp.einsum("clri,clrj->clij", J, J) + derivatives.curvature
+        blocks = _blocks(declared, plan, part, gradient, hessian)
+        sums.add_part(part, 0.5 * jnp.vdot(v, v), *blocks)
+        terms.append(derivatives)
     return sums.total(declared, values), tuple(terms)
 
 
@@ -66,13 +66,13 @@ def count_terms(declared: Declared, plan: Plan) -> int:
 
 
 def _derivatives(
-    declared: Declared, plan: Plan, number: int, prepared: Prepared, laid: ChunkedData
+    declared: Declared, plan: Plan, number: int, prepared: Prepared, chunked: ChunkedData
 ) -> tuple[Float[Array, "chunks length r"], SecondOrder]:
     """The residuals of every observation of a part and their derivatives."""
     part = plan.parts[number]
     kind, widths = declared.kinds[part.set_name], widths_of(declared, part)
-    one = _SecondOrderOfOne(residual_of(declared, part), widths)
-    v, J, curvature = map_observations(part, kind, prepared, laid, number, one)
+    second_order = _SecondOrderOfOne(residual_of(declared, part), widths)
+    v, J, curvature = map_observations(part, kind, prepared, chunked, number, second_order)
     return v, SecondOrder(J, curvature)
 
 
@@ -89,17 +89,17 @@ class _SecondOrderOfOne:
         # One vector of all directions of all slots: the curvature has the mixed second derivatives
         # of slots, too.
         ends = [sum(self.widths[:s]) for s in range(len(self.widths) + 1)]
-        still = jnp.zeros(ends[-1])
+        zero_change = jnp.zeros(ends[-1])
 
         def residuals(x: Float[Array, " n"]) -> tuple[Array, Array]:
             changes = tuple(tuple(x[a:b]) for a, b in zip(ends, ends[1:]))
             v = jnp.stack(self.residual(blocks, measured, weight, changes))
             return v, v
 
-        J, v = jax.jacfwd(residuals, has_aux=True)(still)
+        J, v = jax.jacfwd(residuals, has_aux=True)(zero_change)
         # Forward over reverse: as many forward passes as directions over one reverse pass, instead
         # of reverse over reverse, which would keep every intermediate value twice.
-        curvature = jax.jacfwd(jax.grad(lambda x: jnp.vdot(v, residuals(x)[0])))(still)
+        curvature = jax.jacfwd(jax.grad(lambda x: jnp.vdot(v, residuals(x)[0])))(zero_change)
         # The zero at the end is column −1, for directions that a touch lacks.
         return v, jnp.pad(J, ((0, 0), (0, 1))), jnp.pad(curvature, (0, 1))
 
@@ -115,8 +115,10 @@ def _blocks(
     widths = widths_of(declared, part)
 
     def columns(slots: Slots, start: int, stop: int) -> Int[np.ndarray, " w"]:
-        at = columns_of(widths, slots, start, stop)
-        return np.array([-1 if c is None else sum(widths[: c[0]]) + c[1] for c in at], int)
+        slots_and_directions = columns_of(widths, slots, start, stop)
+        return np.array(
+            [-1 if c is None else sum(widths[: c[0]]) + c[1] for c in slots_and_directions], int
+        )
 
     def block(
         H: Float[Array, "*at n n"],
@@ -124,8 +126,8 @@ def _blocks(
         columns: tuple[np.ndarray, Array],
     ) -> Float[Array, "*at w v"]:
         """Some rows and columns of H, (which, free) each."""
-        (i, free), (j, others) = rows, columns
-        return H[..., i[:, None], j] * free[..., :, None] * others[..., None, :]
+        (i, free), (j, column_free) = rows, columns
+        return H[..., i[:, None], j] * free[..., :, None] * column_free[..., None, :]
 
     free = lambda t: plan.groups[t.group].free[t.row, t.start : t.stop]
     touches = [(columns(t.slots, t.start, t.stop), free(t)) for t in part.touches]

@@ -59,39 +59,42 @@ class ConjugateGradients(eqx.Module):
         }
         # One preconditioner on both sides keeps the operator symmetric. The residual is then in
         # units of σ with all else given, radians beside metres: one norm, one tolerance.
-        divided, back = (lambda x: times("nij,nj->ni", x)), (lambda x: times("nji,nj->ni", x))
-        right, tag = divided(b), lx.positive_semidefinite_tag
-        product = lambda y: divided(self._times(back(y)))
+        scale, scale_back = (lambda x: times("nij,nj->ni", x)), (lambda x: times("nji,nj->ni", x))
+        right, tag = scale(b), lx.positive_semidefinite_tag
+        product = lambda y: scale(self._times(scale_back(y)))
         operator = lx.FunctionLinearOperator(product, jax.eval_shape(lambda: right), tag)
 
         def improved(
-            y: Tangent, left: Tangent, tolerance: float, steps: int
+            y: Tangent, residual: Tangent, tolerance: float, steps: int
         ) -> tuple[Tangent, Tangent]:
-            """y refined with the residual `left`, if that decreases it; and the new residual."""
+            """y refined with the residual `residual`, if that decreases it; and the new "
+            "residual."""
             # Lineax annotates a float, but accepts an array. 1e-300: a right-hand side of zeros
             # has its solution at once, instead of 0/0.
-            limit: Any = jnp.maximum(tolerance * optx.two_norm(left), 1e-300)
+            limit: Any = jnp.maximum(tolerance * optx.two_norm(residual), 1e-300)
             method = lx.CG(rtol=0.0, atol=limit, norm=optx.two_norm, max_steps=steps)
-            change = lx.linear_solve(operator, left, method, throw=False).value
+            change = lx.linear_solve(operator, residual, method, throw=False).value
             better = jax.tree.map(jnp.add, y, change)
-            after = jax.tree.map(jnp.subtract, right, product(better))
+            residual_after = jax.tree.map(jnp.subtract, right, product(better))
             # Near the limit of rounding a run may end worse than it began.
-            less = optx.two_norm(after) < optx.two_norm(left)
-            return jax.tree.map(partial(jnp.where, less), (better, after), (y, left))
+            is_smaller = optx.two_norm(residual_after) < optx.two_norm(residual)
+            return jax.tree.map(
+                partial(jnp.where, is_smaller), (better, residual_after), (y, residual)
+            )
 
         nothing = jax.tree.map(jnp.zeros_like, right)
         reached = max(self.tolerance, self.reachable)
         # Iterative refinement: the second run solves for the error of the first, whose residual is
         # computed from scratch. One run to the full tolerance would iterate on rounding.
-        y, left = improved(nothing, right, reached, self.max_steps)
+        y, residual = improved(nothing, right, reached, self.max_steps)
         if self.tolerance < self.reachable:
-            more = self.tolerance / self.reachable
-            y, left = improved(y, left, more, self.max_refinement_steps)
+            reachable_tolerance = self.tolerance / self.reachable
+            y, residual = improved(y, residual, reachable_tolerance, self.max_refinement_steps)
         # NaN if it is not solved: the step is rejected, and more damping makes it easier. Half a
         # step would be taken for the whole one, a step of zero for the end of the iterations.
         # Twice: the residual is computed anew, not by the recursion that met the limit.
-        solved = optx.two_norm(left) <= 2 * reached * optx.two_norm(right)
-        return back(jax.tree.map(lambda x: jnp.where(solved, x, jnp.nan), y))
+        solved = optx.two_norm(residual) <= 2 * reached * optx.two_norm(right)
+        return scale_back(jax.tree.map(lambda x: jnp.where(solved, x, jnp.nan), y))
 
     def inverse(self) -> Reduced:
         raise ValueError(
@@ -109,8 +112,8 @@ class ConjugateGradients(eqx.Module):
         plan = self.normal.plan
         x = {g: rows * self.scale[g] for g, rows in x.items()}
         product = times_kept(plan, self.normal.blocks, x)
-        for g, less in gather(plan, self.Z, scatter(plan, self.Z, x)).items():
-            product[g] = product[g] - less
+        for g, subtrahend in gather(plan, self.Z, scatter(plan, self.Z, x)).items():
+            product[g] = product[g] - subtrahend
         return average_over_devices(plan, {g: rows * self.scale[g] for g, rows in product.items()})
 
 
@@ -136,10 +139,12 @@ def inverse_of_lower(B: Float[Array, "rows w w"]) -> Float[Array, "rows w w"]:
     w = B.shape[1]
 
     # Gaussian elimination without pivoting, which a positive definite matrix does not need.
-    def eliminate(k: Int[Array, ""], both: Float[Array, "rows w v"]) -> Float[Array, "rows w v"]:
-        row = both[:, k] / jnp.sqrt(both[:, k, k])[:, None]
-        below = jnp.where(jnp.arange(w) > k, row[:, :w], 0.0)
-        return (both - below[:, :, None] * row[:, None]).at[:, k].set(row)
+    def eliminate(
+        k: Int[Array, ""], augmented: Float[Array, "rows w v"]
+    ) -> Float[Array, "rows w v"]:
+        row = augmented[:, k] / jnp.sqrt(augmented[:, k, k])[:, None]
+        below_pivot = jnp.where(jnp.arange(w) > k, row[:, :w], 0.0)
+        return (augmented - below_pivot[:, :, None] * row[:, None]).at[:, k].set(row)
 
-    both = jnp.concatenate([B, jnp.broadcast_to(jnp.eye(w), B.shape)], -1)
-    return jax.lax.fori_loop(0, w, eliminate, both)[:, :, w:]
+    augmented = jnp.concatenate([B, jnp.broadcast_to(jnp.eye(w), B.shape)], -1)
+    return jax.lax.fori_loop(0, w, eliminate, augmented)[:, :, w:]

@@ -34,41 +34,43 @@ from jaxbundle.types import Scalar, not_none
 def widths_of(declared: Declared, part: ObservationPart) -> tuple[int, ...]:
     """The number of directions of every slot of a part, 0 if it is not differentiated."""
     of = declared.kinds[part.set_name].of
-    used = {s for touch in part.touches for s, _ in touch.slots} | {part.slot}
-    return tuple(declared.spaces[name].width if s in used else 0 for s, name in enumerate(of))
+    differentiated_slots = {s for touch in part.touches for s, _ in touch.slots} | {part.slot}
+    return tuple(
+        declared.spaces[name].width if s in differentiated_slots else 0 for s, name in enumerate(of)
+    )
 
 
 def columns_of(
     widths: Sequence[int], slots: Slots, start: int, stop: int
 ) -> list[tuple[int, int] | None]:
     """The columns of a touch: slot and direction, None if unused."""
-    place = {first + j: (slot, j) for slot, first in slots for j in range(widths[slot])}
-    return [place.get(c) for c in range(start, stop)]
+    slot_of_column = {first + j: (slot, j) for slot, first in slots for j in range(widths[slot])}
+    return [slot_of_column.get(c) for c in range(start, stop)]
 
 
 def differentiate(
-    declared: Declared, plan: Plan, number: int, prepared: Prepared, laid: ChunkedData
+    declared: Declared, plan: Plan, number: int, prepared: Prepared, chunked: ChunkedData
 ) -> tuple[Array, tuple[Array, ...], Array | None]:
     """Residuals [chunks, length, r] of a part, the blocks of its touches, [chunks, length, r, w]
     each, and of its eliminated rows (None if there are none). Columns of held unknowns are zero."""
     part = plan.parts[number]
     kind, widths = declared.kinds[part.set_name], widths_of(declared, part)
     rows = _ResidualsAndDerivatives(residual_of(declared, part), widths, part.large)
-    r, found = map_observations(part, kind, prepared, laid, number, rows)
+    r, by_slot = map_observations(part, kind, prepared, chunked, number, rows)
     # Of few observations: computed once, not again in every loop that uses some of its columns.
-    r, found = (r, found) if part.large else jax.lax.optimization_barrier((r, found))
+    r, by_slot = (r, by_slot) if part.large else jax.lax.optimization_barrier((r, by_slot))
     shape, starts = r[0].shape, np.cumsum((0, *widths))
 
     def block(slots: Slots, start: int, stop: int) -> Float[Array, "chunks length r w"]:
         columns = columns_of(widths, slots, start, stop)
         # The index behind the last column stands for a column of zeros.
-        used = [starts[at[0]] + at[1] if at else starts[-1] for at in columns]
+        positions = [starts[at[0]] + at[1] if at else starts[-1] for at in columns]
         if part.large:
             # Columns that no slot of this part has, as those of another table of the group.
             nil = jnp.zeros(shape)
-            parts = [[*derivatives, nil][c] for derivatives in found for c in used]
+            parts = [[*derivatives, nil][c] for derivatives in by_slot for c in positions]
             return jnp.stack(parts, -1).reshape(*shape, len(r), stop - start)
-        return jnp.take(found, np.array(used, int), -1, mode="fill", fill_value=0.0)
+        return jnp.take(by_slot, np.array(positions, int), -1, mode="fill", fill_value=0.0)
 
     touches = []
     for touch in part.touches:
@@ -110,12 +112,15 @@ def differentiate_rows(
     observation, and their derivatives with respect to the changes of every slot [chunks, length, r,
     width]."""
     rows = _ResidualsAndDerivatives(function, widths, True)
-    r, found = map_blocks(rows, part.by_row, blocks, measured, weight)
+    r, derivatives = map_blocks(rows, part.by_row, blocks, measured, weight)
     starts = np.cumsum((0, *widths))
-    none = jnp.zeros((*r[0].shape, 0))
+    empty = jnp.zeros((*r[0].shape, 0))
     # A held slot has no derivatives: a block without columns.
-    of = lambda row, a, b: jnp.stack(row[a:b], -1) if b > a else none
-    slots = [jnp.stack([of(row, a, b) for row in found], -2) for a, b in zip(starts, starts[1:])]
+    columns_of_slot = lambda row, a, b: jnp.stack(row[a:b], -1) if b > a else empty
+    slots = [
+        jnp.stack([columns_of_slot(row, a, b) for row in derivatives], -2)
+        for a, b in zip(starts, starts[1:])
+    ]
     return jnp.stack(r, -1), slots
 
 
@@ -124,7 +129,7 @@ def differentiate_chunks(
     plan: Plan,
     number: int,
     prepared: Prepared,
-    laid: ChunkedData,
+    chunked: ChunkedData,
     of_chunk: Callable,
     at_once: int = 1 << 16,
 ) -> Any:
@@ -145,18 +150,20 @@ def differentiate_chunks(
     # reads it.
     part = dataclasses.replace(part, touches=touches, place=in_order)
 
-    def differentiate_one(given: tuple) -> Any:
-        part, measured, weight = jax.tree.map(lambda x: x[None], given)
-        one = dataclasses.replace(plan, parts=(part,))
-        found = differentiate(declared, one, 0, prepared, ChunkedData((measured,), (weight,)))
-        return of_chunk(given[0], *jax.tree.map(lambda x: x[0], found))
+    def differentiate_one(mapped: tuple) -> Any:
+        part, measured, weight = jax.tree.map(lambda x: x[None], mapped)
+        one_part = dataclasses.replace(plan, parts=(part,))
+        differentiated = differentiate(
+            declared, one_part, 0, prepared, ChunkedData((measured,), (weight,))
+        )
+        return of_chunk(mapped[0], *jax.tree.map(lambda x: x[0], differentiated))
 
-    given = part, laid.measured[number], laid.weight[number]
+    mapped = part, chunked.measured[number], chunked.weight[number]
     batch = max(at_once // max(length, 1), 1)
     # One chunk at a time would be a loop of tiny operations; all at once 1 kB an observation.
     if chunks > batch:
-        return jax.lax.map(differentiate_one, given, batch_size=batch)
-    return jax.vmap(differentiate_one)(given)
+        return jax.lax.map(differentiate_one, mapped, batch_size=batch)
+    return jax.vmap(differentiate_one)(mapped)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -181,8 +188,8 @@ def _reverse(
     # a pose, a camera and a point (29 ms instead of 5 to 7 on BAL 16).
     weight = row[2]
     nil = jnp.zeros_like(jax.tree.leaves(weight)[0])
-    still = tuple((nil,) * w for w in widths)
-    r, pull = jax.vjp(lambda d: residual(*row, d), still)
+    zero_change = tuple((nil,) * w for w in widths)
+    r, pull = jax.vjp(lambda d: residual(*row, d), zero_change)
     unit = lambda i: tuple(jnp.ones_like(nil) if a == i else nil for a in range(len(r)))
     columns = lambda i: [x for slot in pull(unit(i))[0] for x in slot]
     return r, [_where_weighted(weight, i, columns(i)) for i in range(len(r))]
@@ -192,18 +199,20 @@ def _forward(
     residual: Callable, widths: tuple[int, ...], row: tuple
 ) -> tuple[Change, Float[Array, "r directions"]]:
     """Residuals, a tuple of scalars, and their derivatives [r, directions]."""
-    blocks, given, weight = row
+    blocks, measured, weight = row
     ends = np.cumsum((0, *widths))
-    split = lambda x: tuple(tuple(x[a:b]) for a, b in zip(ends, ends[1:]))
+    by_slot = lambda x: tuple(tuple(x[a:b]) for a, b in zip(ends, ends[1:]))
 
     if isinstance(residual, Residual) and residual.is_wide(weight):
         parts = lambda x: [x[a:b] for a, b in zip(ends, ends[1:])]
-        one = lambda x: residual.array(blocks, given, weight, parts(x))
+        residual_of_change = lambda x: residual.array(blocks, measured, weight, parts(x))
         w, nothing = jnp.stack(weight), jnp.zeros(ends[-1])
-        return tuple(one(nothing)), jnp.where(w[:, None] > 0, jax.jacfwd(one)(nothing), 0.0)
+        return tuple(residual_of_change(nothing)), jnp.where(
+            w[:, None] > 0, jax.jacfwd(residual_of_change)(nothing), 0.0
+        )
 
     def stacked(x: Float[Array, " directions"]) -> tuple[Float[Array, " r"], Change]:
-        r = residual(blocks, given, weight, split(x))
+        r = residual(blocks, measured, weight, by_slot(x))
         return jnp.stack(r), r
 
     J, r = jax.jacfwd(stacked, has_aux=True)(jnp.zeros(ends[-1]))

@@ -64,41 +64,48 @@ def local_touch(declared: Declared, part: ObservationPart) -> int | None:
         return None
     # Only a touch of this slot alone: beside other tables of its group the columns would not be
     # those of the vector.
-    alone = [[s for s, _ in touch.slots] == [kind.local.slot] for touch in part.touches]
-    return alone.index(True) if any(alone) else None
+    is_local = [[s for s, _ in touch.slots] == [kind.local.slot] for touch in part.touches]
+    return is_local.index(True) if any(is_local) else None
 
 
 def differentiate_locally(
-    declared: Declared, plan: Plan, number: int, touch: int, prepared: Prepared, laid: ChunkedData
+    declared: Declared,
+    plan: Plan,
+    number: int,
+    touch: int,
+    prepared: Prepared,
+    chunked: ChunkedData,
 ) -> LocalJacobian:
     """As `differentiate`, for a part that has such a touch."""
     part = plan.parts[number]
     kind, local = declared.kinds[part.set_name], declared.kinds[part.set_name].local
     assert local is not None
-    blocks = tuple(look_up(prepared[name], at) for name, at in zip(kind.of, part.lookup))
-    measured, weight = laid.measured[number], laid.weight[number]
-    at = map_blocks(_Columns(kind), part.by_row, blocks, measured, weight)
+    blocks = tuple(
+        look_up(prepared[name], columns_used) for name, columns_used in zip(kind.of, part.lookup)
+    )
+    measured, weight = chunked.measured[number], chunked.weight[number]
+    columns_used = map_blocks(_Columns(kind), part.by_row, blocks, measured, weight)
     table, row = jnp.stack(prepared[kind.of[local.slot]], -1), part.lookup[local.slot]
-    values = tuple(table[row if row.ndim == 2 else row[:, None], column] for column in at)
+    values = tuple(table[row if row.ndim == 2 else row[:, None], column] for column in columns_used)
     spaces = tuple(declared.spaces[name] for name in kind.of)
     widths = list(widths_of(declared, part))
     widths[local.slot] = local.number
     residual = _LocalResidual(kind, spaces)
     r, derivatives = differentiate_rows(
-        residual, tuple(widths), part, blocks, (measured, at, values), weight
+        residual, tuple(widths), part, blocks, (measured, columns_used, values), weight
     )
     group = plan.groups[part.touches[touch].group]
     # From elements of the vector to columns of the group; held elements to a column beyond its
     # width, where `mode="drop"` leaves them out.
-    to = jnp.full(len(prepared[kind.of[local.slot]]), group.width)
+    column_of = jnp.full(len(prepared[kind.of[local.slot]]), group.width)
     space = spaces[local.slot]
     assert isinstance(space, Vector)
     moving = jnp.array(space.moving, int)
-    to = to.at[moving].set(part.touches[touch].start + jnp.arange(len(space.moving)))
-    columns = to[jnp.stack(at, -1)]
+    column_of = column_of.at[moving].set(part.touches[touch].start + jnp.arange(len(space.moving)))
+    columns = column_of[jnp.stack(columns_used, -1)]
     free = group.free[part.touches[touch].row][:, None]
-    found = []
-    for t, one in enumerate(part.touches):
+    jacobians = []
+    for t, touched in enumerate(part.touches):
         if t == touch:
             J = derivatives[local.slot]
             mask = jnp.take_along_axis(
@@ -111,15 +118,15 @@ def differentiate_locally(
             J = J * mask[:, :, None, :]
         else:
             # In the order of the group's columns, not of the slots.
-            places = columns_of(widths, one.slots, one.start, one.stop)
+            places = columns_of(widths, touched.slots, touched.start, touched.stop)
             nil = jnp.zeros(r.shape)
             J = jnp.stack([derivatives[p[0]][..., p[1]] if p else nil for p in places], -1)
-            J = zero_held_columns(plan, one, J)
-        found.append(J)
+            J = zero_held_columns(plan, touched, J)
+        jacobians.append(J)
     E = None
     if plan.eliminated is not None and part.slot is not None:
         E = zero_held_columns_of_eliminated(plan, part, derivatives[part.slot])
-    return LocalJacobian(r, tuple(found), E, touch, columns)
+    return LocalJacobian(r, tuple(jacobians), E, touch, columns)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,16 +150,20 @@ class _LocalResidual:
     spaces: tuple[Space, ...]
 
     def __call__(
-        self, blocks: tuple[Block, ...], given: tuple, weight: Weight, changes: Sequence[Change]
+        self,
+        blocks: tuple[Block, ...],
+        local_measured: tuple,
+        weight: Weight,
+        changes: Sequence[Change],
     ) -> Change:
-        local, (measured, columns, values) = self.kind.local, given
+        local, (measured, columns, values) = self.kind.local, local_measured
         assert local is not None
         values = tuple(v + d for v, d in zip(values, changes[local.slot], strict=True))
-        moved: list[Any] = [
+        moved_blocks: list[Any] = [
             block if slot == local.slot else space.move(block, change)
             for slot, (space, block, change) in enumerate(zip(self.spaces, blocks, changes))
         ]
-        return whiten(local.residual(*moved, columns, values, measured), weight)
+        return whiten(local.residual(*moved_blocks, columns, values, measured), weight)
 
 
 def products_of(
@@ -166,20 +177,20 @@ def products_of(
     def add(
         N: Float[Array, "rows w w"], chunk: tuple[Array, Array, Array]
     ) -> tuple[Float[Array, "rows w w"], None]:
-        row, J, at = chunk
+        row, J, columns = chunk
         products = jnp.einsum("kri,krj->kij", J, J)
-        return N.at[row, at[:, :, None], at[:, None, :]].add(products, mode="drop"), None
+        return N.at[row, columns[:, :, None], columns[:, None, :]].add(products, mode="drop"), None
 
     # A loop over chunks, not one scatter: products of all observations would be m² numbers each,
     # 32² instead of 2 · 32 (16 knots of two numbers).
     return jax.lax.scan(add, jnp.zeros(like.shape), (row, J, columns))[0]
 
 
-def spread(
-    found: Float[Array, "chunks length m *v"], columns: Int[Array, "chunks length m"], width: int
+def sum_by_column(
+    rows: Float[Array, "chunks length m *v"], columns: Int[Array, "chunks length m"], width: int
 ) -> Float[Array, "chunks width *v"]:
     """Rows that belong to columns, summed over the observations of a chunk: [chunks, width, v]."""
-    zero = jnp.zeros((found.shape[0], width, *found.shape[3:]))
+    zero = jnp.zeros((rows.shape[0], width, *rows.shape[3:]))
     # Two observations of a chunk may share columns: they add up.
-    chunk = jnp.arange(found.shape[0])[:, None, None]
-    return zero.at[chunk, columns].add(found, mode="drop")
+    chunk = jnp.arange(rows.shape[0])[:, None, None]
+    return zero.at[chunk, columns].add(rows, mode="drop")

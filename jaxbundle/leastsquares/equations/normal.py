@@ -26,7 +26,7 @@ from jaxbundle.leastsquares.equations.local import (
     differentiate_locally,
     local_touch,
     products_of,
-    spread,
+    sum_by_column,
 )
 from jaxbundle.leastsquares.indexing.plan import (
     Coupling,
@@ -70,8 +70,8 @@ class Normal(lx.AbstractLinearOperator):
         if e is not None:
             product[e] = jnp.einsum("nij,nj->ni", N.eliminated, vector[e])
             product[e] = product[e] + scatter(plan, N.W, vector)
-            for g, more in gather(plan, N.W, vector[e]).items():
-                product[g] = product[g] + more
+            for g, addend in gather(plan, N.W, vector[e]).items():
+                product[g] = product[g] + addend
         return product
 
     def diagonal(self) -> Tangent:
@@ -129,36 +129,36 @@ def times_kept(plan: Plan, N: NormalBlocks, x: Tangent) -> Tangent:
     product = {g: jnp.einsum("nij,nj->ni", B, x[g]) for g, B in N.diagonal_blocks.items()}
     # One of each pair of blocks is stored; the other is its transpose.
     for (later, earlier), B in N.off_diagonal_blocks.items():
-        at = plan.blocks[later, earlier]
-        down = jnp.einsum("bij,bj->bi", B, x[earlier][at.column])
-        up = jnp.einsum("bij,bi->bj", B, x[later][at.row])
-        product[later] = product[later].at[at.row].add(down)
-        product[earlier] = product[earlier].at[at.column].add(up)
+        block_rows = plan.blocks[later, earlier]
+        lower_product = jnp.einsum("bij,bj->bi", B, x[earlier][block_rows.column])
+        upper_product = jnp.einsum("bij,bi->bj", B, x[later][block_rows.row])
+        product[later] = product[later].at[block_rows.row].add(lower_product)
+        product[earlier] = product[earlier].at[block_rows.column].add(upper_product)
     return product
 
 
 def gather(plan: Plan, W: dict[str, Array], h: Float[Array, "rows w"]) -> Tangent:
     """Wᵀ·h for rows h that are eliminated; the sum of all devices."""
-    found = {}
+    products = {}
     for g, blocks in W.items():
-        at, rows = plan.incidences[g], _tall(blocks)
-        of_chunks = jnp.einsum("cki,ck->ci", rows, h[at.eliminated].reshape(rows.shape[:2]))
-        found[g] = jax.ops.segment_sum(of_chunks, at.row, plan.groups[g].rows)
-    return sum_over_devices(plan, found)
+        incidences, rows = plan.incidences[g], _tall(blocks)
+        of_chunks = jnp.einsum("cki,ck->ci", rows, h[incidences.eliminated].reshape(rows.shape[:2]))
+        products[g] = jax.ops.segment_sum(of_chunks, incidences.row, plan.groups[g].rows)
+    return sum_over_devices(plan, products)
 
 
 def scatter(plan: Plan, W: dict[str, Array], x: Tangent) -> Float[Array, "..."]:
     """W·x."""
-    found = jnp.zeros(())
+    sums = jnp.zeros(())
     for g, blocks in W.items():
-        at = plan.incidences[g]
-        moved = jnp.einsum("cki,ci->ck", _tall(blocks), x[g][at.row])
-        found = found + jax.ops.segment_sum(
-            moved.reshape(-1, blocks.shape[-2]),
-            at.eliminated.ravel(),
+        incidences = plan.incidences[g]
+        products = jnp.einsum("cki,ci->ck", _tall(blocks), x[g][incidences.row])
+        sums = sums + jax.ops.segment_sum(
+            products.reshape(-1, blocks.shape[-2]),
+            incidences.eliminated.ravel(),
             plan.groups[not_none(plan.eliminated)].rows,
         )
-    return found
+    return sums
 
 
 def _tall(blocks: Float[Array, "chunks length w v"]) -> Float[Array, "chunks length*w v"]:
@@ -168,7 +168,7 @@ def _tall(blocks: Float[Array, "chunks length w v"]) -> Float[Array, "chunks len
 
 @partial(jax.jit, static_argnums=0, inline=True)
 def normal_equations(
-    declared: Declared, plan: Plan, values: Values, laid: ChunkedData
+    declared: Declared, plan: Plan, values: Values, chunked: ChunkedData
 ) -> tuple[Float[Array, ""], Tangent, NormalBlocks]:
     """½·vᵀPv, its gradient g = Jᵀr and N = JᵀJ at these values (the weights are in r and J).
 
@@ -178,10 +178,10 @@ def normal_equations(
         local = local_touch(declared, part)
         if local is not None:
             sums.add_local(
-                part, differentiate_locally(declared, plan, number, local, prepared, laid)
+                part, differentiate_locally(declared, plan, number, local, prepared, chunked)
             )
             continue
-        r, touches, E = differentiate(declared, plan, number, prepared, laid)
+        r, touches, E = differentiate(declared, plan, number, prepared, chunked)
         sums.add_part(part, 0.5 * jnp.vdot(r, r), *_gauss_newton_products(part, r, touches, E))
     return sums.total(declared, values)
 
@@ -250,49 +250,61 @@ class Sums:
             self._add_coupling(part, coupling, N)
         if eliminated is not None:
             # Positions of padding point at the last, empty row.
-            at, e = not_none(part.eliminated).ravel(), not_none(self.plan.eliminated)
-            both = jax.ops.segment_sum(eliminated, at, self.diagonal_blocks[e].shape[0])
-            self.diagonal_blocks[e] += both[..., :-1]
-            self.gradient[e] += both[..., -1]
+            rows, e = not_none(part.eliminated).ravel(), not_none(self.plan.eliminated)
+            block_and_gradient = jax.ops.segment_sum(
+                eliminated, rows, self.diagonal_blocks[e].shape[0]
+            )
+            self.diagonal_blocks[e] += block_and_gradient[..., :-1]
+            self.gradient[e] += block_and_gradient[..., -1]
         for touch, N in zip(part.touches, W):
             self._add_incidences(touch, N)
 
-    def add_local(self, part: ObservationPart, found: LocalJacobian) -> None:
+    def add_local(self, part: ObservationPart, jacobian: LocalJacobian) -> None:
         """What a part with local columns adds (`local.py`)."""
-        t, J, at = found.touch, found.touches[found.touch], found.columns
+        t, J, columns = jacobian.touch, jacobian.touches[jacobian.touch], jacobian.columns
         touch, width = part.touches[t], self.plan.groups[part.touches[t].group].width
-        others = [k for k in range(len(part.touches)) if k != t]
+        other_touches = [k for k in range(len(part.touches)) if k != t]
         couplings = [c for c in part.couplings if t not in (c.first, c.second)]
-        rest = dataclasses.replace(
+        other_part = dataclasses.replace(
             part,
-            touches=tuple(part.touches[k] for k in others),
+            touches=tuple(part.touches[k] for k in other_touches),
             couplings=tuple(
-                dataclasses.replace(c, first=others.index(c.first), second=others.index(c.second))
+                dataclasses.replace(
+                    c, first=other_touches.index(c.first), second=other_touches.index(c.second)
+                )
                 for c in couplings
             ),
         )
-        r, E = found.r, found.eliminated
-        kept = tuple(found.touches[k] for k in others)
-        self.add_part(rest, 0.5 * jnp.vdot(r, r), *_gauss_newton_products(rest, r, kept, E))
-        self.diagonal_blocks[touch.group] += products_of(
-            self.diagonal_blocks[touch.group], touch.row, J, at
+        r, E = jacobian.r, jacobian.eliminated
+        other_jacobians = tuple(jacobian.touches[k] for k in other_touches)
+        self.add_part(
+            other_part,
+            0.5 * jnp.vdot(r, r),
+            *_gauss_newton_products(other_part, r, other_jacobians, E),
         )
-        g = spread(jnp.einsum("clri,clr->cli", J, r), at, width)
+        self.diagonal_blocks[touch.group] += products_of(
+            self.diagonal_blocks[touch.group], touch.row, J, columns
+        )
+        g = sum_by_column(jnp.einsum("clri,clr->cli", J, r), columns, width)
         self.gradient[touch.group] = self.gradient[touch.group].at[touch.row].add(g)
         # The touch with local columns, spread to the width of its row, meets the others as usual.
-        whole = dataclasses.replace(touch, start=0, stop=width)
+        whole_touch = dataclasses.replace(touch, start=0, stop=width)
         for coupling in part.couplings:
             if t in (coupling.first, coupling.second):
                 k = coupling.second if coupling.first == t else coupling.first
-                B = spread(jnp.einsum("clri,clrj->clij", J, found.touches[k]), at, width)
-                touches = tuple(whole if i == t else one for i, one in enumerate(part.touches))
+                B = sum_by_column(
+                    jnp.einsum("clri,clrj->clij", J, jacobian.touches[k]), columns, width
+                )
+                touches = tuple(
+                    whole_touch if i == t else touched for i, touched in enumerate(part.touches)
+                )
                 self._add_coupling(
                     dataclasses.replace(part, touches=touches),
                     coupling,
                     B if coupling.first == t else B.mT,
                 )
         if E is not None:
-            self._add_local_incidences(touch, jnp.einsum("clri,clrj->clij", J, E), at, width)
+            self._add_local_incidences(touch, jnp.einsum("clri,clrj->clij", J, E), columns, width)
 
     def _add_local_incidences(
         self,
@@ -303,10 +315,12 @@ class Sums:
     ) -> None:
         plan = self.plan.incidences[touch.group]
         n, shape = plan.eliminated.size, W.shape[:2]
-        at = jnp.arange(n).reshape(shape) if touch.incidence is None else touch.incidence
+        incidence = jnp.arange(n).reshape(shape) if touch.incidence is None else touch.incidence
         # Held elements have a column beyond the width, where `mode="drop"` leaves them out.
-        found = jnp.zeros((n, width, W.shape[-1])).at[at[..., None], columns].add(W, mode="drop")
-        self.W[touch.group] = self.W.get(touch.group, 0.0) + found.mT.reshape(
+        blocks = (
+            jnp.zeros((n, width, W.shape[-1])).at[incidence[..., None], columns].add(W, mode="drop")
+        )
+        self.W[touch.group] = self.W.get(touch.group, 0.0) + blocks.mT.reshape(
             *plan.eliminated.shape, W.shape[-1], width
         )
 
@@ -316,22 +330,28 @@ class Sums:
         """An off-diagonal block, or a diagonal one if the two rows are the same."""
         first, second = part.touches[coupling.first], part.touches[coupling.second]
         key = first.group, second.group
-        columns, others = slice(first.start, first.stop), slice(second.start, second.stop)
+        columns, other_columns = slice(first.start, first.stop), slice(second.start, second.stop)
         # The observation touches one row twice (two slots): J = J₁ + J₂ there, and JᵀJ has the two
         # mixed terms.
         if coupling.same is not None:
-            on = N * coupling.same[:, None, None]
-            block = self.diagonal_blocks[first.group].at[first.row, columns, others].add(on)
-            self.diagonal_blocks[first.group] = block.at[first.row, others, columns].add(on.mT)
+            diagonal = N * coupling.same[:, None, None]
+            block = (
+                self.diagonal_blocks[first.group]
+                .at[first.row, columns, other_columns]
+                .add(diagonal)
+            )
+            self.diagonal_blocks[first.group] = block.at[first.row, other_columns, columns].add(
+                diagonal.mT
+            )
         if coupling.block is None:
             return
         shape = tuple(self.plan.groups[g].width for g in key)
         pad = lambda B, rows, columns: jnp.zeros((B.shape[0], *shape)).at[:, rows, columns].set(B)
-        placed = pad(N, columns, others)
+        placed = pad(N, columns, other_columns)
         # The block list has the later row first; where this chunk has it second, the transpose.
         if coupling.turned is not None:
             turned = coupling.turned[:, None, None]
-            placed = turned * pad(N.mT, others, columns) + (1 - turned) * placed
+            placed = turned * pad(N.mT, other_columns, columns) + (1 - turned) * placed
         summed = jax.ops.segment_sum(placed, coupling.block, self.plan.blocks[key].row.shape[0])
         # The last block is no block: padding and meetings of a row with itself end there.
         self.off_diagonal_blocks[key] = self.off_diagonal_blocks.get(key, 0.0) + summed.at[-1].set(
@@ -354,11 +374,16 @@ class Sums:
         self, declared: Declared, values: Values
     ) -> tuple[Float[Array, ""], Tangent, NormalBlocks]:
         plan, e = self.plan, self.plan.eliminated
-        kept = lambda tree: {name: x for name, x in tree.items() if name != e}
+        without_eliminated = lambda tree: {name: x for name, x in tree.items() if name != e}
         # Everything that belongs to kept rows is added up over the devices, in one exchange.
         diagonal, off_diagonal, cost, gradient = sum_over_devices(
             plan,
-            (kept(self.diagonal_blocks), self.off_diagonal_blocks, self.cost, kept(self.gradient)),
+            (
+                without_eliminated(self.diagonal_blocks),
+                self.off_diagonal_blocks,
+                self.cost,
+                without_eliminated(self.gradient),
+            ),
         )
         eliminated = None
         if e is not None:
@@ -381,8 +406,8 @@ def dot(plan: Plan, a: Tangent, b: Tangent) -> Float[Array, ""]:
     """aᵀb, the eliminated rows of all devices."""
     e = plan.eliminated
     # Kept rows are the same on all devices, so they count once.
-    kept = sum((jnp.vdot(a[g], b[g]) for g in plan.kept), jnp.zeros(()))
-    return kept if e is None else kept + sum_over_devices(plan, jnp.vdot(a[e], b[e]))
+    sum_of_kept = sum((jnp.vdot(a[g], b[g]) for g in plan.kept), jnp.zeros(()))
+    return sum_of_kept if e is None else sum_of_kept + sum_over_devices(plan, jnp.vdot(a[e], b[e]))
 
 
 def zero_tangent(plan: Plan) -> Tangent:

@@ -60,9 +60,11 @@ class Reduced(eqx.Module):
         (n, w), (m, v) = plan.groups[a].free.shape, plan.groups[b].free.shape
         matrix = jnp.zeros((n, m, w, v))
         if (a, b) in self.off_diagonal_blocks:
-            at = plan.blocks[a, b]
+            block_rows = plan.blocks[a, b]
             # Of one group with itself the blocks are those below the diagonal.
-            matrix = matrix.at[at.row, at.column].add(self.off_diagonal_blocks[a, b])
+            matrix = matrix.at[block_rows.row, block_rows.column].add(
+                self.off_diagonal_blocks[a, b]
+            )
         if a == b:
             matrix = matrix.at[jnp.arange(n), jnp.arange(n)].add(self.diagonal_blocks[a])
         return matrix.transpose(0, 2, 1, 3).reshape(n * w, m * v)
@@ -75,8 +77,10 @@ class DenseFactor(eqx.Module):
     lower: Float[Array, "n n"]
 
     def solve(self, b: Tangent) -> Tangent:
-        kept = self.plan.kept
-        return split(self.plan, kept, cho_solve((self.lower, True), flat(kept, b)))
+        kept_groups = self.plan.kept
+        return split_by_group(
+            self.plan, kept_groups, cho_solve((self.lower, True), flat(kept_groups, b))
+        )
 
     def inverse(self) -> Reduced:
         Q = cho_solve((self.lower, True), jnp.eye(self.lower.shape[0]))
@@ -109,14 +113,15 @@ def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
 def blocks_of(plan: Plan, groups: Groups, Q: Float[Array, "n n"]) -> Reduced:
     """The blocks of a symmetric matrix of some groups where S has blocks."""
     # Cut by rows, then by columns: `parts[b][a]` is [row of a, column of a, row of b, column of b].
-    cut = lambda x: split(plan, groups, x)
-    parts = {b: cut(jnp.moveaxis(x, -1, 0)) for b, x in cut(Q).items()}
+    split_groups = lambda x: split_by_group(plan, groups, x)
+    parts = {b: split_groups(jnp.moveaxis(x, -1, 0)) for b, x in split_groups(Q).items()}
     index = {g: jnp.arange(plan.groups[g].rows) for g in groups}
     diagonal = {g: parts[g][g][i, :, i] for g, i in index.items()}
     keys = [(a, b) for a, b in plan.blocks if a in index and b in index]
-    at = plan.blocks
+    block_rows = plan.blocks
     return Reduced(
-        diagonal, {(a, b): parts[b][a][at[a, b].row, :, at[a, b].column] for a, b in keys}
+        diagonal,
+        {(a, b): parts[b][a][block_rows[a, b].row, :, block_rows[a, b].column] for a, b in keys},
     )
 
 
@@ -125,7 +130,7 @@ def flat(groups: Groups, rows: AnyTangent) -> Float[Array, " n"]:
     return jnp.concatenate([jnp.zeros(0), *(rows[g].ravel() for g in groups)])
 
 
-def split(
+def split_by_group(
     plan: Plan, groups: Groups, vector: Float[Array, "n ..."]
 ) -> dict[str, Float[Array, "rows w ..."]]:
     """The rows of some groups in one, group by group."""

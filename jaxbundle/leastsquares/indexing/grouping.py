@@ -62,7 +62,9 @@ class Grouping:
         settings: PlanningSettings,
     ):
         self.tables = {t.name: t for t in tables}
-        self.observations = {given.name: given for given in observations}
+        self.observations = {
+            observation_set.name: observation_set for observation_set in observations
+        }
         self.eliminate, self.choose, self.settings = eliminate, choose, settings
         self.estimated = choose("estimated", default=[t.name for t in tables if t.free.any()])
         self.coupled_rows = self._find_coupled_rows()
@@ -78,26 +80,26 @@ class Grouping:
             return None
         table = self.tables[self.eliminate]
         coupled = np.zeros(table.rows, bool)
-        for given in self.observations.values():
-            slots = [s for s, name in enumerate(given.kind.of) if name == self.eliminate]
+        for observation_set in self.observations.values():
+            slots = [s for s, name in enumerate(observation_set.kind.of) if name == self.eliminate]
             # Two rows of the eliminated table in one observation (a distance between points): V
             # would not be block diagonal, so both go to the reduced system.
             for s in slots if len(slots) > 1 else ():
-                coupled[given.rows[s]] = True
+                coupled[observation_set.rows[s]] = True
         # Held rows are no unknowns: in the reduced system they would be rows of zeros.
         return self.choose("coupled rows", default=coupled & table.free.any(1))
 
     def _split_observations(self) -> list[ObservationSubset]:
         """Observations of one set, separated by the slot that touches an eliminated row."""
         subsets = []
-        for o, given in self.observations.items():
-            slots = [s for s, name in enumerate(given.kind.of) if name == self.eliminate]
+        for o, observation_set in self.observations.items():
+            slots = [s for s, name in enumerate(observation_set.kind.of) if name == self.eliminate]
             # −1: the observation touches no eliminated row; it adds to the reduced system directly.
-            slot_of = np.full(given.number, -1)
+            slot_of = np.full(observation_set.number, -1)
             # An observation may touch two held rows of the table: the last one counts as
             # eliminated.
             for s in slots:
-                slot_of[~not_none(self.coupled_rows)[given.rows[s]]] = s
+                slot_of[~not_none(self.coupled_rows)[observation_set.rows[s]]] = s
             # A set without observations is an empty subset.
             for slot in self.choose("slots", o, default=np.unique(slot_of).tolist() or [-1]):
                 rows = np.flatnonzero(slot_of == slot)
@@ -130,9 +132,9 @@ class Grouping:
             # Kept rows and eliminated ones are numbered separately.
             place = lambda mask: np.where(mask, np.cumsum(mask) - 1, -1)
             if coupled.any():
-                kept = f"{name} (kept)"
-                self.members[kept] = [(name, 0, np.flatnonzero(coupled))]
-                self.group_of[name] = kept, 0, place(coupled)
+                name_of_kept = f"{name} (kept)"
+                self.members[name_of_kept] = [(name, 0, np.flatnonzero(coupled))]
+                self.group_of[name] = name_of_kept, 0, place(coupled)
             rows = np.flatnonzero(~coupled) if coupled.any() else None
             self.members[name] = [(name, 0, rows)]
             self.row_in = place(~coupled)
@@ -143,34 +145,34 @@ class Grouping:
     def _meet_always(self, group: str, name: str) -> bool:
         """Whether every row of a table occurs in exactly the same observations of eliminated rows
         as the row of a group with its number."""
-        first = self.members[group][0][0]
-        if self.tables[first].rows != self.tables[name].rows:
+        first_table = self.members[group][0][0]
+        if self.tables[first_table].rows != self.tables[name].rows:
             return False
-        met = False
+        is_met = False
         for subset in self.subsets:
-            given = self.observations[subset.set_name]
-            of, rows = given.kind.of, given.rows
+            observation_set = self.observations[subset.set_name]
+            of, rows = observation_set.kind.of, observation_set.rows
             if subset.slot is None:
                 continue
-            a = [s for s, t in enumerate(of) if t == first]
+            a = [s for s, t in enumerate(of) if t == first_table]
             b = [s for s, t in enumerate(of) if t == name]
             # A set of observations that touches one table but not the other: their blocks have
             # different incidences.
             if len(a) != len(b) or len(a) > 1:
                 return False
             if a:
-                met = True
+                is_met = True
                 if not np.array_equal(rows[a[0]][subset.source], rows[b[0]][subset.source]):
                     return False
-        return met
+        return is_met
 
     def group(self, name: str) -> UnknownGroup:
         members, free = [], []
         for table, start, rows in self.members[name]:
-            given = self.tables[table]
-            free.append(given.free if rows is None else given.free[rows])
+            member_table = self.tables[table]
+            free.append(member_table.free if rows is None else member_table.free[rows])
             index = None if rows is None else as_index(rows, ("group", name), ("table", table))
-            members.append(Member(table, start, given.space.width, index))
+            members.append(Member(table, start, member_table.space.width, index))
         free = np.concatenate(free, 1)
         # A slot of the eliminated table may touch a row that is not in this group: it is masked.
         partial = any(rows is not None for *_, rows in self.members[name])
@@ -188,22 +190,24 @@ class Grouping:
         Slots of one group are one touch if they have the same row in every observation of the
         subset. This is decided for each subset: tables that always meet where rows are eliminated
         may cross elsewhere, as the velocity of one image and the pose of the next."""
-        given, found = self.observations[subset.set_name], []
-        for s, name in enumerate(given.kind.of):
+        observation_set, touches = self.observations[subset.set_name], []
+        for s, name in enumerate(observation_set.kind.of):
             if s == subset.slot or name not in self.group_of:
                 continue
             group, start, place = self.group_of[name]
-            row = place[given.rows[s][subset.source]]
-            same = (t for t, at in found if t.group == group and np.array_equal(at, row))
-            tables = lambda t: [given.kind.of[q] for q, _ in t.slots]
+            row = place[observation_set.rows[s][subset.source]]
+            touches_of_row = (
+                t for t, at in touches if t.group == group and np.array_equal(at, row)
+            )
+            tables = lambda t: [observation_set.kind.of[q] for q, _ in t.slots]
             # Two slots of one table need columns of their own.
-            host = next((t for t in same if name not in tables(t)), None)
+            host = next((t for t in touches_of_row if name not in tables(t)), None)
             if host is None:
-                found.append((TouchedGroup(group, [(s, start)]), row))
+                touches.append((TouchedGroup(group, [(s, start)]), row))
             else:
                 host.slots.append((s, start))
-        found = sorted((t for t, _ in found), key=lambda t: self.kept.index(t.group))
-        return self.choose("touches", number, default=found)
+        touches = sorted((t for t, _ in touches), key=lambda t: self.kept.index(t.group))
+        return self.choose("touches", number, default=touches)
 
     def rows(self, group: str) -> int:
         table, _, rows = self.members[group][0]

@@ -72,10 +72,10 @@ def common(all_sizes: Iterable[Sizes], rounder: Callable[[Hashable, int], int]) 
     return {key: rounder(key, size) for key, size in largest.items()}
 
 
-def fill_up(n: int, least: int = 64) -> np.ndarray:
+def fill_up(n: int, min_size: int = 64) -> np.ndarray:
     """The numbers of n rows, the last one repeated up to the next power of two: many small arrays
-    of all sizes share few compiled programs. `least`: a size that takes no time anyway."""
-    size = max(1 << max(n - 1, 0).bit_length(), least)
+    of all sizes share few compiled programs. `min_size`: a size that takes no time anyway."""
+    size = max(1 << max(n - 1, 0).bit_length(), min_size)
     return np.minimum(np.arange(size), max(n - 1, 0))
 
 
@@ -99,8 +99,8 @@ def finish(plan: PyTree, sizes: Sizes) -> Any:
         # mask is needed in the loops.
         nothing = -1 if isinstance(leaf, PlanIndex) else leaf.fill
         rows = np.asarray(leaf.rows)
-        more = np.full((sizes[leaf.along] - len(rows), *rows.shape[1:]), nothing, rows.dtype)
-        rows = np.concatenate([rows, more])
+        filling = np.full((sizes[leaf.along] - len(rows), *rows.shape[1:]), nothing, rows.dtype)
+        rows = np.concatenate([rows, filling])
         if isinstance(leaf, PlanIndex):
             # `times`: an item of the list is a chunk; the last row of the last chunk is the empty
             # one.

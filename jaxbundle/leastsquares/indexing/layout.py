@@ -36,8 +36,8 @@ def lay_out(
     room = -(-number // length) * length
     within = np.arange(room.sum()) - np.repeat(np.cumsum(room) - room, room)
     # Unused positions repeat a row that exists: what is computed there is finite, and weighted 0.
-    last = np.repeat(number, room) - 1
-    return order[np.repeat(first, room) + np.minimum(within, last)], within <= last
+    last_place = np.repeat(number, room) - 1
+    return order[np.repeat(first, room) + np.minimum(within, last_place)], within <= last_place
 
 
 def pairs_between(
@@ -56,8 +56,8 @@ def pair_chunk_lengths(pairs: int, settings: PlanningSettings) -> tuple[int, ...
     """The chunk lengths for this number of pairs; none without pairs."""
     if not pairs:
         return ()
-    few = pairs < settings.few_pairs
-    return (settings.few_pairs_chunk_length,) if few else settings.pair_chunk_lengths
+    is_few = pairs < settings.few_pairs
+    return (settings.few_pairs_chunk_length,) if is_few else settings.pair_chunk_lengths
 
 
 def chunk_pairs(
@@ -72,21 +72,21 @@ def chunk_pairs(
     """Pairs sorted by block, in chunks of one block, the longest first."""
     order = np.argsort(block, kind="stable")
     i, j = i[order], j[order]
-    blocks, start, left = np.unique(block[order], return_index=True, return_counts=True)
-    first, second, of = [], [], []
+    blocks, start, remaining = np.unique(block[order], return_index=True, return_counts=True)
+    first, second, block_of_chunk = [], [], []
     # Blocks with many pairs take long chunks first, what is left shorter ones; the last is padded.
     for length in lengths:
-        number = -(-left // length) if length == lengths[-1] else left // length
+        number = -(-remaining // length) if length == lengths[-1] else remaining // length
         chunk = np.repeat(np.arange(len(blocks)), number)
         within = np.arange(number.sum()) - np.repeat(np.cumsum(number) - number, number)
-        at = start[chunk][:, None] + within[:, None] * length + np.arange(length)
-        valid = at < (start + left)[chunk][:, None]
-        at = np.where(valid, at, 0)
+        pair = start[chunk][:, None] + within[:, None] * length + np.arange(length)
+        valid = pair < (start + remaining)[chunk][:, None]
+        pair = np.where(valid, pair, 0)
         # −1 at unused positions: the empty incidence, whose product is 0.
-        own = ("pairs", *key, length)
-        first.append(as_index(np.where(valid, i[at], -1), own, *into[0]))
-        second.append(as_index(np.where(valid, j[at], -1), own, *into[1]))
-        of.append(as_index(blocks[chunk], own, along))
-        taken = np.minimum(number * length, left)
-        start, left = start + taken, left - taken
-    return IncidencePairs(tuple(first), tuple(second), tuple(of))
+        size_key = ("pairs", *key, length)
+        first.append(as_index(np.where(valid, i[pair], -1), size_key, *into[0]))
+        second.append(as_index(np.where(valid, j[pair], -1), size_key, *into[1]))
+        block_of_chunk.append(as_index(blocks[chunk], size_key, along))
+        done = np.minimum(number * length, remaining)
+        start, remaining = start + done, remaining - done
+    return IncidencePairs(tuple(first), tuple(second), tuple(block_of_chunk))

@@ -108,14 +108,14 @@ class _Planner:
     def plan(self) -> Plan:
         parts = [self.plan_part(k, subset) for k, subset in enumerate(self.grouping.subsets)]
         incidences = {g: self.incidences_of(g, parts) for g in self.grouping.kept}
-        incidences = {g: found for g, found in incidences.items() if found is not None}
+        incidences = {g: chunks for g, chunks in incidences.items() if chunks is not None}
         groups = {
             g: self.grouping.group(g)
             for g in (*self.grouping.kept, self.grouping.eliminate)
             if g is not None
         }
         blocks, reduction, band = self.plan_reduced_system(parts, incidences, groups)
-        incidences = {g: found.incidences for g, found in incidences.items()}
+        incidences = {g: chunks.incidences for g, chunks in incidences.items()}
         parts = tuple(p.part for p in parts)
         return Plan(groups, self.grouping.eliminate, parts, incidences, blocks, reduction, band)
 
@@ -126,7 +126,7 @@ class _Planner:
         groups: dict[str, Any],
     ) -> tuple[dict[Key, Blocks], str | None, Band | None]:
         """The blocks of the reduced matrix, its solver, its band."""
-        rows = [np.zeros(0, np.int64), *(found.eliminated for found in incidences.values())]
+        rows = [np.zeros(0, np.int64), *(chunks.eliminated for chunks in incidences.values())]
         # m incidences of an eliminated row are m(m − 1)/2 pairs: counted before they are listed.
         m, solvers = np.bincount(np.concatenate(rows)).astype(float), self.solvers
         if len(solvers) > 1 and (m * (m - 1)).sum() / 2 > self.settings.max_pairs:
@@ -134,10 +134,12 @@ class _Planner:
             solvers = ("iterative",)
         blocks = self.find_blocks(parts, {} if solvers == ("iterative",) else incidences)
         shapes = {g: groups[g].free.rows.shape for g in self.grouping.kept}
-        none = np.zeros(0, np.int64)
-        rows_of = lambda at: (at.row.rows, at.column.rows) if at else (none, none)
+        no_rows = np.zeros(0, np.int64)
+        rows_of = lambda at: (at.row.rows, at.column.rows) if at else (no_rows, no_rows)
         couplings = lambda g: rows_of(blocks.get((g, g)))
-        observations = sum(given.number for given in self.grouping.observations.values())
+        observations = sum(
+            observation_set.number for observation_set in self.grouping.observations.values()
+        )
         solver, band = plan_reduction(shapes, couplings, observations, solvers, self.settings)
         # The parts of a problem on several devices must not choose another one.
         self.choose.made["solvers",] = (solver,)
@@ -146,14 +148,14 @@ class _Planner:
 
     def plan_part(self, k: int, subset: ObservationSubset) -> _PartInChunks:
         """Part k in chunks, with its touches (couplings and incidences are added later)."""
-        given = self.grouping.observations[subset.set_name]
-        rows = [np.asarray(r)[subset.source] for r in given.rows]
+        observation_set = self.grouping.observations[subset.set_name]
+        rows = [np.asarray(r)[subset.source] for r in observation_set.rows]
         slots = self.grouping.touched_groups(k, subset)
         # Of every touch the row of its group, for every observation.
         kept_rows = []
         for _, touched in slots:
             slot = touched[0][0]
-            kept_rows.append(self.grouping.group_of[given.kind.of[slot]][2][rows[slot]])
+            kept_rows.append(self.grouping.group_of[observation_set.kind.of[slot]][2][rows[slot]])
         # One number for every combination of kept rows that occurs; `unique` keeps it small.
         major = np.zeros(len(subset.source), np.int64)
         for row in kept_rows:
@@ -168,20 +170,20 @@ class _Planner:
         lookup, by_row = self._plan_lookups(k, subset, rows, major, chunk)
         touches = []
         for (group, touched), row in zip(slots, kept_rows):
-            width = lambda slot: self.grouping.tables[given.kind.of[slot]].space.width
+            width = lambda slot: self.grouping.tables[observation_set.kind.of[slot]].space.width
             stop = max(start + width(slot) for slot, start in touched)
             start = min(start for _, start in touched)
             index = as_index(chunk(row)[:, 0], along, ("group", group))
             touches.append(TouchedRows(group, tuple(touched), start, stop, index, None))
         source = np.where(used, subset.source[order], -1).reshape(-1, length)
-        place = np.full(given.number, -1)
+        place = np.full(observation_set.number, -1)
         place[subset.source[order][used]] = np.flatnonzero(used)
         eliminated = None
         if subset.slot is not None:
             at = self.grouping.row_in[chunk(rows[subset.slot])]
             eliminated = as_index(at, along, ("group", self.grouping.eliminate))
         number = ("observations", subset.set_name)
-        made = ObservationPart(
+        part = ObservationPart(
             set_name=subset.set_name,
             slot=subset.slot,
             by_row=tuple(by_row),
@@ -193,7 +195,7 @@ class _Planner:
             touches=tuple(touches),
             couplings=(),
         )
-        return _PartInChunks(made, used, length, along)
+        return _PartInChunks(part, used, length, along)
 
     def _plan_lookups(
         self,
@@ -207,46 +209,52 @@ class _Planner:
         observation; and which of both."""
         of = self.grouping.observations[subset.set_name].kind.of
         along, lookup, by_row = ("part", k), [], []
-        first = np.zeros(major.max(initial=0) + 1, np.int64)
-        first[major] = np.arange(len(major))  # An observation of every major.
+        observation_of = np.zeros(major.max(initial=0) + 1, np.int64)
+        observation_of[major] = np.arange(len(major))  # An observation of every major.
         for s, name in enumerate(of):
-            at = chunk(rows[s])
+            rows_in_chunks = chunk(rows[s])
             # A slot whose row is the same in a chunk is looked up once for it, the others for each
             # observation.
-            same = at.shape[1] == 1 or bool((rows[s] == rows[s][first[major]]).all())
+            is_constant = rows_in_chunks.shape[1] == 1 or bool(
+                (rows[s] == rows[s][observation_of[major]]).all()
+            )
             # The eliminated row is looked up for each observation in any case.
-            once = self.choose("by chunk", k, s, default=same and s != subset.slot)
-            by_row.append(not once)
-            lookup.append(as_index(at[:, 0] if once else at, along, ("table", name)))
+            by_chunk = self.choose("by chunk", k, s, default=is_constant and s != subset.slot)
+            by_row.append(not by_chunk)
+            lookup.append(
+                as_index(
+                    rows_in_chunks[:, 0] if by_chunk else rows_in_chunks, along, ("table", name)
+                )
+            )
         return lookup, by_row
 
     def incidences_of(self, group: str, parts: list[_PartInChunks]) -> _IncidencesInChunks | None:
         """The incidences of a group; sets the incidence of the observations of the parts."""
-        at = [
+        touches = [
             (k, t)
             for k, p in enumerate(parts)
             if p.part.slot is not None
             for t, touch in enumerate(p.part.touches)
             if touch.group == group
         ]
-        if not at:
+        if not touches:
             return None
-        eliminated, row, used = [], [], []
-        for k, t in at:
+        eliminated, row, is_used = [], [], []
+        for k, t in touches:
             p = parts[k]
             eliminated.append(p.part.eliminated.rows.ravel())
             row.append(np.repeat(p.part.touches[t].row.rows, p.length))
-            used.append(p.used)
-        eliminated, row, used = (np.concatenate(x) for x in (eliminated, row, used))
+            is_used.append(p.used)
+        eliminated, row, is_used = (np.concatenate(x) for x in (eliminated, row, is_used))
         # An incidence is a combination of both rows; several observations may share it (an image
         # point and a distance to the same camera).
         number = len(self.grouping.row_in)
-        keys = row[used].astype(np.int64) * number + eliminated[used]
+        keys = row[is_used].astype(np.int64) * number + eliminated[is_used]
         keys, incidence = np.unique(keys, return_inverse=True)
         # The usual case: every observation is an incidence of its own, and W needs no sum.
-        one_each = len(at) == 1 and len(keys) == used.sum()
+        one_each = len(touches) == 1 and len(keys) == is_used.sum()
         if self.choose("one incidence an observation", group, default=one_each):
-            p = parts[at[0][0]]
+            p = parts[touches[0][0]]
             along, length = p.along, p.length
         else:
             row, eliminated = keys // number, keys % number
@@ -255,13 +263,13 @@ class _Planner:
             order, filled = lay_out(row, eliminated, length)
             place = np.empty(len(keys), np.int64)
             place[order[filled]] = np.flatnonzero(filled)
-            self._set_incidences(parts, at, used, place[incidence], along, length)
-            eliminated, row, used = eliminated[order], row[order], filled
+            self._set_incidences(parts, touches, is_used, place[incidence], along, length)
+            eliminated, row, is_used = eliminated[order], row[order], filled
         plan = Incidences(
             as_index(eliminated.reshape(-1, length), along, ("group", self.grouping.eliminate)),
             as_index(row[::length], along, ("group", group)),
         )
-        places = np.flatnonzero(used)
+        places = np.flatnonzero(is_used)
         eliminated, row = eliminated[places], row[places]
         return _IncidencesInChunks(plan, places, eliminated, row, along, length)
 
@@ -269,15 +277,15 @@ class _Planner:
     def _set_incidences(
         parts: list[_PartInChunks],
         touches: Sequence[tuple[int, int]],
-        used: Bool[np.ndarray, " places"],
+        is_used: Bool[np.ndarray, " places"],
         place: Int[np.ndarray, " used"],
         along: Hashable,
         length: int,
     ) -> None:
         """Sets the place of the incidence of every used observation of these touches (part, number
         of its touch), one after the other."""
-        of_all = np.full(len(used), -1)
-        of_all[used] = place
+        of_all = np.full(len(is_used), -1)
+        of_all[is_used] = place
         cuts = np.cumsum([len(parts[k].used) for k, _ in touches])[:-1]
         for (k, t), of_part in zip(touches, np.split(of_all, cuts)):
             place = of_part.reshape(-1, parts[k].length)
@@ -297,9 +305,9 @@ class _Planner:
             for earlier in self.grouping.kept[: place + 1]:
                 key, a, b = (later, earlier), incidences.get(later), incidences.get(earlier)
                 pairs = self._pairs(a, b, later == earlier)
-                made = self._block_list(key, pairs, direct.get(key, ()), parts)
-                if made is not None:
-                    blocks[key] = made
+                block_list = self._block_list(key, pairs, direct.get(key, ()), parts)
+                if block_list is not None:
+                    blocks[key] = block_list
         return blocks
 
     def _couplings(self, k: int, p: _PartInChunks, direct: DirectBlocks) -> None:
@@ -310,18 +318,18 @@ class _Planner:
             for i in range(j):
                 a, b = touches[j], touches[i]  # the later group first
                 row, column = a.row.rows, b.row.rows
-                same = turned = None
-                none = (row < 0) | (column < 0)
+                is_same = turned = None
+                is_absent = (row < 0) | (column < 0)
                 if a.group == b.group:
-                    equal, less = (row == column) & ~none, row < column
+                    is_equal, is_lower = (row == column) & ~is_absent, row < column
                     row, column = np.maximum(row, column), np.minimum(row, column)
-                    meets = self.choose("same", k, j, i, default=bool(equal.any()))
-                    same = as_column(equal.astype(float), p.along) if meets else None
-                    turned = as_column(less.astype(float), p.along)
-                    none |= equal
-                row = np.where(none, -1, row)
+                    meets = self.choose("same", k, j, i, default=bool(is_equal.any()))
+                    is_same = as_column(is_equal.astype(float), p.along) if meets else None
+                    turned = as_column(is_lower.astype(float), p.along)
+                    is_absent |= is_equal
+                row = np.where(is_absent, -1, row)
                 direct.setdefault((a.group, b.group), []).append((k, len(couplings), row, column))
-                couplings.append(Coupling(j, i, None, turned, same))
+                couplings.append(Coupling(j, i, None, turned, is_same))
         p.part = dataclasses.replace(p.part, couplings=tuple(couplings))
 
     def _pairs(
@@ -357,15 +365,15 @@ class _Planner:
         for k, coupling, r, c in direct:
             block = np.where(r >= 0, np.searchsorted(keys, number(r, c)), -1)
             parts[k].set("couplings", coupling, block=as_index(block, parts[k].along, along))
-        found = None
+        pairs_in_chunks = None
         lengths = self.choose(
             "pair chunks", *key, default=pair_chunk_lengths(len(i), self.settings)
         )
         if lengths:
             block = np.searchsorted(keys, number(row, column))
-            found = chunk_pairs(i, j, block, into, along, key, lengths)
+            pairs_in_chunks = chunk_pairs(i, j, block, into, along, key, lengths)
         return Blocks(
             as_index(keys // columns, along, ("group", key[0])),
             as_index(keys % columns, along, ("group", key[1])),
-            found,
+            pairs_in_chunks,
         )

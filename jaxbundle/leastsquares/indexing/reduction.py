@@ -109,9 +109,9 @@ def choose_reduction(
     fits = {
         name: work[name][0] for name in solvers if work[name][1] <= settings.max_factor_elements
     }
-    least = min(fits, key=fits.__getitem__, default=None)
+    cheapest = min(fits, key=fits.__getitem__, default=None)
     return (
         "dense"
-        if "dense" in fits and fits["dense"] < settings.required_gain * fits[not_none(least)]
-        else least
+        if "dense" in fits and fits["dense"] < settings.required_gain * fits[not_none(cheapest)]
+        else cheapest
     )

@@ -78,10 +78,10 @@ class Declared:
 
 def lay_out_data(plan: Plan, data: Data) -> ChunkedData:
     """The measurements, looked up once per solution."""
-    of = lambda rows, part: look_up(scalars(rows), part.source)
+    rows_of_part = lambda rows, part: look_up(scalars(rows), part.source)
     return ChunkedData(
-        tuple(of(data.measured[part.set_name], part) for part in plan.parts),
-        tuple(of(data.weight[part.set_name], part) for part in plan.parts),
+        tuple(rows_of_part(data.measured[part.set_name], part) for part in plan.parts),
+        tuple(rows_of_part(data.weight[part.set_name], part) for part in plan.parts),
     )
 
 
@@ -125,8 +125,8 @@ class Residual:
         changes = ((),) * len(self.spaces) if changes is None else changes
         # Derivatives are taken at zero changes; the changed block is the one place where the chart
         # of a space enters the residual.
-        moved = [s.move(b, d) for s, b, d in zip(self.spaces, blocks, changes)]
-        return whiten(evaluate(self.kind, moved, measured), weight)
+        moved_blocks = [s.move(b, d) for s, b, d in zip(self.spaces, blocks, changes)]
+        return whiten(evaluate(self.kind, moved_blocks, measured), weight)
 
     def array(
         self,
@@ -137,19 +137,19 @@ class Residual:
     ) -> Float[Array, " r"]:
         """Residuals / σ as an array, of changes [width] of every slot: for kinds of arrays with
         many residuals (`SCALAR_RESIDUALS_UP_TO`)."""
-        moved = []
+        moved_blocks = []
         for space, block, change in zip(self.spaces, blocks, changes, strict=True):
             if isinstance(space, Vector) and space.size:
                 block = _stack(block)
                 if change.shape[0]:
-                    columns, of = (jnp.array(x, int) for x in space.moves)
-                    block = block.at[columns].add(change[of])
+                    columns, direction = (jnp.array(x, int) for x in space.moves)
+                    block = block.at[columns].add(change[direction])
             else:
                 block = _stack(space.move(block, tuple(change)))
-            moved.append(block)
-        given = jax.tree.map(_stack, measured, is_leaf=lambda x: type(x) is Elements)
-        found, w = self.kind.residual(*moved, given), jnp.stack(weight)
-        v = jnp.stack(found) if isinstance(found, tuple) else jnp.atleast_1d(found)
+            moved_blocks.append(block)
+        stacked = jax.tree.map(_stack, measured, is_leaf=lambda x: type(x) is Elements)
+        value, w = self.kind.residual(*moved_blocks, stacked), jnp.stack(weight)
+        v = jnp.stack(value) if isinstance(value, tuple) else jnp.atleast_1d(value)
         return jnp.where(w > 0, w * v, 0.0)
 
     def is_wide(self, weight: Weight) -> bool:
@@ -170,10 +170,10 @@ def evaluate(kind: Kind, blocks: Iterable[Block], measured: PyTree[Scalar]) -> C
     if not kind.scalars:
         blocks = (_stack(b) for b in blocks)
         measured = jax.tree.map(_stack, measured, is_leaf=lambda x: type(x) is Elements)
-    found = kind.residual(*blocks, measured)
-    if isinstance(found, tuple):
-        return found
-    return (found,) if jnp.ndim(found) == 0 else tuple(found)
+    value = kind.residual(*blocks, measured)
+    if isinstance(value, tuple):
+        return value
+    return (value,) if jnp.ndim(value) == 0 else tuple(value)
 
 
 def _stack(block: Block) -> Any:
@@ -186,11 +186,11 @@ def _stack(block: Block) -> Any:
 def whiten(v: Change, weight: Weight) -> Change:
     """L⁻¹·v, or v/σ; 0 if the weight is 0, whatever v is."""
     if isinstance(weight[0], tuple):
-        used = [row[i] > 0 for i, row in enumerate(weight)]
-        v = tuple(jnp.where(u, x, 0.0) for u, x in zip(used, v))
+        has_weight = [row[i] > 0 for i, row in enumerate(weight)]
+        v = tuple(jnp.where(u, x, 0.0) for u, x in zip(has_weight, v))
         # L⁻¹ is lower triangular.
         rows = [sum(w * x for w, x in zip(row[: i + 1], v)) for i, row in enumerate(weight)]
-        return tuple(jnp.where(u, r, 0.0) for u, r in zip(used, rows))
+        return tuple(jnp.where(u, r, 0.0) for u, r in zip(has_weight, rows))
     return tuple(jnp.where(w > 0, w * x, 0.0) for w, x in zip(weight, v))
 
 
@@ -202,11 +202,11 @@ def diagonal_of(weight: Weight | Float[AnyArray, "n r *r"]) -> Any:
     return weight if weight.ndim == 2 else weight.diagonal(axis1=1, axis2=2)
 
 
-def fill_places(plan: Plan, laid: ChunkedData) -> tuple[Plan, ChunkedData]:
+def fill_places(plan: Plan, chunked: ChunkedData) -> tuple[Plan, ChunkedData]:
     """Positions without weight use the rows of one with weight: an undefined value, such as the
     distance of a point from itself, would be NaN in reverse mode in spite of its zero weight."""
     parts, measured = [], []
-    for part, values, weight in zip(plan.parts, laid.measured, laid.weight):
+    for part, values, weight in zip(plan.parts, chunked.measured, chunked.weight):
         shape = part.source.shape
         live = jnp.stack([w > 0 for w in diagonal_of(weight)]).any(0)
         # If the weights are constants of a program, XLA would search for the first one while it
@@ -214,19 +214,26 @@ def fill_places(plan: Plan, laid: ChunkedData) -> tuple[Plan, ChunkedData]:
         live = jax.lax.optimization_barrier(live)
         # `argmax`: the first position with weight, or 0.
         place = jnp.where(live, jnp.arange(live.size).reshape(shape), jnp.argmax(live))
-        every = lambda at, shape=shape: jnp.broadcast_to(at if at.ndim == 2 else at[:, None], shape)
-        seen = lambda x, place=place: x.ravel()[place]
-        lookup, by_row = tuple(seen(every(at)) for at in part.lookup), (True,) * len(part.lookup)
+        in_chunks = lambda at, shape=shape: jnp.broadcast_to(
+            at if at.ndim == 2 else at[:, None], shape
+        )
+        pick = lambda x, place=place: x.ravel()[place]
+        lookup, by_row = (
+            tuple(pick(in_chunks(at)) for at in part.lookup),
+            (True,) * len(part.lookup),
+        )
         parts.append(dataclasses.replace(part, lookup=lookup, by_row=by_row))
-        measured.append(jax.tree.map(seen, values))
-    return dataclasses.replace(plan, parts=tuple(parts)), ChunkedData(tuple(measured), laid.weight)
+        measured.append(jax.tree.map(pick, values))
+    return dataclasses.replace(plan, parts=tuple(parts)), ChunkedData(
+        tuple(measured), chunked.weight
+    )
 
 
 def map_observations(
     part: ObservationPart,
     kind: Kind,
     prepared: Prepared,
-    laid: ChunkedData,
+    chunked: ChunkedData,
     number: int,
     function: Callable,
 ) -> Any:
@@ -234,7 +241,9 @@ def map_observations(
     axes [chunks, length]. Functions that are equal are traced once for columns of one size."""
     look = _look_up_in_copies if on_accelerator() else look_up
     blocks = tuple(look(prepared[name], at) for name, at in zip(kind.of, part.lookup))
-    return map_blocks(function, part.by_row, blocks, laid.measured[number], laid.weight[number])
+    return map_blocks(
+        function, part.by_row, blocks, chunked.measured[number], chunked.weight[number]
+    )
 
 
 @partial(jax.jit, static_argnums=(0, 1), inline=True)
@@ -248,22 +257,22 @@ def map_blocks(
     """`map_observations` of blocks that are looked up."""
     # Outer axis: chunks; inner: observations of a chunk, over which a row looked up by chunk is
     # constant. Traced once for all parts of equal kinds and shapes.
-    axes = tuple(0 if one else None for one in by_row)
+    axes = tuple(0 if is_by_row else None for is_by_row in by_row)
     return jax.vmap(jax.vmap(function, (axes, 0, 0)))(blocks, measured, weight)
 
 
 def look_up(
-    columns: PyTree[Float[Array, " rows"]], at: Int[Array, "..."]
+    columns: PyTree[Float[Array, " rows"]], index: Int[Array, "..."]
 ) -> PyTree[Float[Array, "..."]]:
     """The elements of every column at these (non-negative) indices of a plan."""
     # Indices of a plan are in bounds by construction. Without the promise XLA compares and clamps
     # each, and negative ones are counted from the end.
     promise = {"mode": "promise_in_bounds", "wrap_negative_indices": False}
-    return jax.tree.map(lambda column: column.at[at].get(**promise), columns)
+    return jax.tree.map(lambda column: column.at[index].get(**promise), columns)
 
 
 def _look_up_in_copies(
-    columns: PyTree[Float[Array, " rows"]], at: Int[Array, "..."]
+    columns: PyTree[Float[Array, " rows"]], index: Int[Array, "..."]
 ) -> PyTree[Float[Array, "..."]]:
     """`look_up` for an accelerator: each observation of a chunk in a copy of its own, if the copies
     of a column are not more numbers than the observations.
@@ -274,24 +283,26 @@ def _look_up_in_copies(
     one by one anyway."""
 
     def look(column: Float[Array, " rows"]) -> Float[Array, "..."]:
-        if at.ndim == 1 or column.size * at.shape[1] > at.size:
-            return look_up(column, at)
-        copies = jnp.broadcast_to(column[:, None], (column.size, at.shape[1])).ravel()
-        return look_up(copies, at * at.shape[1] + jnp.arange(at.shape[1], dtype=at.dtype))
+        if index.ndim == 1 or column.size * index.shape[1] > index.size:
+            return look_up(column, index)
+        copies = jnp.broadcast_to(column[:, None], (column.size, index.shape[1])).ravel()
+        return look_up(
+            copies, index * index.shape[1] + jnp.arange(index.shape[1], dtype=index.dtype)
+        )
 
     return jax.tree.map(look, columns)
 
 
 def residuals(
-    declared: Declared, plan: Plan, values: Values, laid: ChunkedData
+    declared: Declared, plan: Plan, values: Values, chunked: ChunkedData
 ) -> tuple[Float[Array, "chunks length r"], ...]:
     """Residuals divided by σ of every part, [chunks, length, r]."""
-    prepared, found = prepare(declared, values), []
+    prepared, by_part = prepare(declared, values), []
     for number, part in enumerate(plan.parts):
         kind = declared.kinds[part.set_name]
-        rows = map_observations(part, kind, prepared, laid, number, residual_of(declared, part))
-        found.append(jnp.stack(rows, -1))
-    return tuple(found)
+        rows = map_observations(part, kind, prepared, chunked, number, residual_of(declared, part))
+        by_part.append(jnp.stack(rows, -1))
+    return tuple(by_part)
 
 
 def restore_order(
@@ -299,10 +310,10 @@ def restore_order(
 ) -> dict[str, Float[Array, "n ..."]]:
     """Quantities by observation of every part, by the name of its set, rows in the given
     order."""
-    found: dict[str, Float[Array, "n ..."]] = {}
+    by_set: dict[str, Float[Array, "n ..."]] = {}
     for part, rows in zip(plan.parts, parts):
         # Observations of other parts of the set have the empty position, whose value is 0.
         flat = rows.reshape(-1, *rows.shape[2:])[part.place]
-        known = found.get(part.set_name)
-        found[part.set_name] = flat if known is None else known + flat
-    return found
+        sum_of_parts = by_set.get(part.set_name)
+        by_set[part.set_name] = flat if sum_of_parts is None else sum_of_parts + flat
+    return by_set

@@ -28,7 +28,7 @@ from jaxbundle.leastsquares.equations.elimination import (
     solve,
 )
 from jaxbundle.leastsquares.equations.normal import Normal, normal_equations
-from jaxbundle.leastsquares.equations.reduced import flat, split
+from jaxbundle.leastsquares.equations.reduced import flat, split_by_group
 from jaxbundle.leastsquares.indexing.plan import Plan, Tangent
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
 from jaxbundle.leastsquares.indexing.rows import Data, Declared, Values, lay_out_data
@@ -205,7 +205,7 @@ def _products(
     still = {name: jnp.zeros(group.free.shape) for name, group in plan.groups.items()}
 
     def product(direction: Float[Array, " reduced"]) -> Float[Array, " reduced"]:
-        right = still | split(plan, plan.kept, direction * per_extent)
+        right = still | split_by_group(plan, plan.kept, direction * per_extent)
         right = s_transform_transposed(declared, plan, values, right, moves)
         change = s_transform(declared, plan, values, solve(factor, right), moves)
         return flat(plan.kept, change) * per_extent
