@@ -257,7 +257,7 @@ class _AdjustmentState:
     def weight_robustly(self, again: Minimise, robust: str, significance: float) -> None:
         found, self.minimum = adjust_robustly(self.problem, self.minimum, again, robust)
         suspects = (name_suspect(self.problem, s) for s in found.suspects(significance))
-        self.problem = cast(NetworkProblem, found.found.problem)
+        self.problem = cast(NetworkProblem, found.solution.problem)
         doubt = doubt_of_robust(found.scale, self.problem.counts.redundancy)
         self.result_fields |= {"robust": robust, "reweighted": found, "suspects": tuple(suspects)}
         self.result_fields["doubts"] = (doubt,) if doubt else ()

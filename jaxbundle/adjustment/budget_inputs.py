@@ -230,9 +230,9 @@ def shared_errors(
         return []
     model = adjustment.error_model.as_estimated
     modelled = np.diagonal(model.propagate_rows(slopes))
-    if not np.mean(modelled / np.maximum((model.found.sigma0 * sigma) ** 2, 1e-300)) > 1:
+    if not np.mean(modelled / np.maximum((model.solution.sigma0 * sigma) ** 2, 1e-300)) > 1:
         return []
-    D = effects(model.found, slopes)
+    D = effects(model.solution, slopes)
     lines = []
     for theta, spread, component in zip(model.theta[1:], model.theta_sigma[1:], model.components):
         if not theta > 0 or component.name == OTHERS:

@@ -310,7 +310,7 @@ def adjust(  # noqa: PLR0913 - the options of an adjustment
         return unweighted
     if robust:
         reweighted = reweight(problem, solution.values, minimise_again, robust)
-        solution, suspects = reweighted.found, reweighted.suspects(significance)
+        solution, suspects = reweighted.solution, reweighted.suspects(significance)
     if snooping:
         solution = Solution(problem, solution.values)
         solution, removed = snoop(

@@ -35,7 +35,7 @@ from jaxbundle.leastsquares.iterations.retraction import retract
 from jaxbundle.leastsquares.iterations.solver import LeastSquares
 from jaxbundle.leastsquares.iterations.stopping import Tolerance
 from jaxbundle.leastsquares.spaces import Space
-from jaxbundle.leastsquares.whitening import diagonal, inverse_sigma, used
+from jaxbundle.leastsquares.whitening import diagonal, has_weight, inverse_sigma
 from jaxbundle.system.memory import return_freed_memory
 from jaxbundle.types import AnyArray, Scalar
 
@@ -291,7 +291,7 @@ def with_data(problem: AnyProblem, data: Data) -> AnyProblem:
 def count(tables: Sequence[Table], data: Data) -> SystemCounts:
     """Rows with weight, and free unknowns."""
     return SystemCounts(
-        sum(int(used(np.asarray(w)).sum()) for w in data.weight.values()),
+        sum(int(has_weight(np.asarray(w)).sum()) for w in data.weight.values()),
         sum(int((t.free > 0).sum()) for t in tables),
     )
 
@@ -345,7 +345,7 @@ def check_numbers(
         weight = weights[observation_set.name]
         for rows in jax.tree.leaves(observation_set.measured):
             bad = ~np.isfinite(rows).reshape(observation_set.number, math.prod(np.shape(rows)[1:]))
-            counts = used(weight)
+            counts = has_weight(weight)
             # Measured values without weight may be anything: excluded observations keep their rows.
             bad &= counts if counts.shape == bad.shape else counts.any(1, keepdims=True)
             if bad.any():

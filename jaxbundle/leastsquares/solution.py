@@ -240,10 +240,10 @@ class Solution:
 
     def cofactor(self, table: str) -> Float[np.ndarray, "rows width width"]:
         """The cofactor block of every row of a table; zero for held unknowns."""
-        return self._own[table]
+        return self._blocks_of_tables[table]
 
     @functools.cached_property
-    def _own(self) -> dict[str, Float[np.ndarray, "rows width width"]]:
+    def _blocks_of_tables(self) -> dict[str, Float[np.ndarray, "rows width width"]]:
         """The cofactor blocks of all tables."""
         declared, plan, values = self.arguments[:3]
         blocks = _of_tables(declared, plan, self.cofactors.diagonal_blocks, values)

@@ -18,7 +18,7 @@ def diagonal(weight: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "n r"]:
     return weight if weight.ndim == 2 else np.diagonal(weight, axis1=1, axis2=2)
 
 
-def used(weight: Float[np.ndarray, "n ..."]) -> Bool[np.ndarray, "n r"]:
+def has_weight(weight: Float[np.ndarray, "n ..."]) -> Bool[np.ndarray, "n r"]:
     """Which residuals have weight."""
     return diagonal(weight) > 0
 
@@ -28,7 +28,7 @@ def inverse_sigma(weight: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "n r"
     if weight.ndim == 2:
         return weight
     variance = np.diagonal(_covariance(weight), axis1=1, axis2=2)
-    return np.where(used(weight), 1 / np.sqrt(variance), 0.0)
+    return np.where(has_weight(weight), 1 / np.sqrt(variance), 0.0)
 
 
 def without_residual(W: Float[np.ndarray, "r r"], removed: int) -> Float[np.ndarray, "r r"]:
@@ -45,5 +45,5 @@ def without_residual(W: Float[np.ndarray, "r r"], removed: int) -> Float[np.ndar
 
 def _covariance(W: Float[np.ndarray, "n r r"]) -> Float[np.ndarray, "n r r"]:
     """C, with a one on the diagonal for residuals without weight."""
-    L = np.linalg.inv(W + np.eye(W.shape[-1]) * ~used(W)[:, None])
+    L = np.linalg.inv(W + np.eye(W.shape[-1]) * ~has_weight(W)[:, None])
     return L @ L.mT

@@ -67,10 +67,10 @@ def iterate(
 
     def body(loop: Loop) -> Loop:
         # The start is tried in the first pass: the program contains the linearisation once.
-        first, (trial_equations, trial_cost) = loop.steps == 0, linearise(loop.trial)
+        is_first, (trial_equations, trial_cost) = loop.steps == 0, linearise(loop.trial)
         noise = tolerance(loop.equations).noise(loop.cost)
         ratio = gain_ratio(loop.predicted, loop.cost - trial_cost, noise)
-        accept, region = loop.region.after(first, ratio)
+        accept, region = loop.region.after(is_first, ratio)
         # N in every pass: under `vmap` a condition would compute both branches, too.
         at, equations, cost = jax.tree.map(
             lambda new, old: jnp.where(accept, new, old),
@@ -78,7 +78,7 @@ def iterate(
             (loop.at, loop.equations, loop.cost),
         )
         step_size, undamped_state = loop.undamped_state.choose_step(
-            region.radius, loop.step_size, first, accept, loop.predicted, ratio, cost
+            region.radius, loop.step_size, is_first, accept, loop.predicted, ratio, cost
         )
         damping = 1 / step_size
         change, decrement, damped = step(equations, damping)
@@ -87,7 +87,7 @@ def iterate(
         change = jax.tree.map(lambda x: jnp.where(finite, x, 0.0), change)
         costs = loop.cost, cost, trial_cost
         termination, undamped_state = undamped_state.judge(
-            tolerance(equations), step_size, finite, decrement, first, accept, *costs
+            tolerance(equations), step_size, finite, decrement, is_first, accept, *costs
         )
         return Loop(
             at=at,

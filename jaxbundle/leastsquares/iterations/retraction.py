@@ -11,15 +11,15 @@ from jaxbundle.leastsquares.spaces import Frame
 
 def retract(declared: Declared, plan: Plan, values: Values, change: Tangent) -> Values:
     """The tables after a change; held unknowns must have a zero change."""
-    moved = dict(values)
+    tables = dict(values)
     for name, rows in changes_of_tables(plan, values, change).items():
-        moved[name] = jax.vmap(declared.spaces[name].retract)(values[name], rows)
-    return moved
+        tables[name] = jax.vmap(declared.spaces[name].retract)(values[name], rows)
+    return tables
 
 
 def changes_of_tables(plan: Plan, values: Values, change: AnyTangent) -> dict[str, Rows]:
     """The change of every table that moves, [rows, width]."""
-    found: dict[str, Rows] = {}
+    changes: dict[str, Rows] = {}
     for name, group in plan.groups.items():
         for member in group.members:
             part = change[name][:, member.start : member.start + member.width]
@@ -28,9 +28,9 @@ def changes_of_tables(plan: Plan, values: Values, change: AnyTangent) -> dict[st
                 rows = jax.tree.leaves(values[member.table])[0].shape[0]
                 part = jnp.zeros((rows, member.width)).at[member.rows].add(part)
             # A table may be in two groups: eliminated rows, and those that are kept.
-            known = found.get(member.table)
-            found[member.table] = part if known is None else known + part
-    return found
+            sum_of_parts = changes.get(member.table)
+            changes[member.table] = part if sum_of_parts is None else sum_of_parts + part
+    return changes
 
 
 def representatives(declared: Declared, values: Values, start: Values) -> Values:

@@ -142,7 +142,7 @@ class RegionState(eqx.Module):
         return cls(jnp.asarray(settings.initial), jnp.asarray(2.0), settings)
 
     def after(
-        self, first: Bool[Array, ""], gain_ratio: Float[Array, ""]
+        self, is_first: Bool[Array, ""], gain_ratio: Float[Array, ""]
     ) -> tuple[Bool[Array, ""], "RegionState"]:
         """Whether a step with this gain ratio is accepted, and the next region.
 
@@ -154,13 +154,13 @@ class RegionState(eqx.Module):
         The cubic has no jumps at thresholds: steps that alternate about a threshold of the older
         rules (Marquardt's factors 10) make the radius oscillate."""
         rules = self.settings
-        accept = first | (gain_ratio > rules.sufficient_decrease)
+        accept = is_first | (gain_ratio > rules.sufficient_decrease)
         finite = jnp.minimum(self.radius, rules.largest)
         growth = 1 / jnp.maximum(1 / 3, 1 - (2 * gain_ratio - 1) ** 3)
         wider = jnp.minimum(finite * growth, rules.largest)
         radius = jnp.where(accept, wider, finite / self.divisor)
         # The first evaluation is of the start values: no step was taken, its gain ratio is void.
-        radius = jnp.where(first, self.radius, radius)
+        radius = jnp.where(is_first, self.radius, radius)
         divisor = jnp.where(accept, 2.0, 2.0 * self.divisor)
         return accept, RegionState(radius, divisor, rules)
 

@@ -78,8 +78,8 @@ def minimise(
     def linearise(x: PyTree[Float[Array, "..."]]) -> tuple[tuple, Float[Array, ""]]:
         N, g, v = _linearise(residuals, retract, x, data, unknowns)
         # NaN as cost lets the trust region reject the step.
-        there = jnp.isfinite(N).all() & jnp.isfinite(g).all()
-        return (N, g, jnp.asarray(len(v))), 0.5 * jnp.where(there, jnp.sum(v**2), jnp.nan)
+        is_finite = jnp.isfinite(N).all() & jnp.isfinite(g).all()
+        return (N, g, jnp.asarray(len(v))), 0.5 * jnp.where(is_finite, jnp.sum(v**2), jnp.nan)
 
     def step(
         equations: tuple, damping: Float[Array, ""]
@@ -109,8 +109,8 @@ def finish(
     unknowns: int,
 ) -> Fit:
     """The last step, without damping, the derivatives and the cofactors."""
-    x, held = stop_gradient((estimate, data))
-    N, g = normal_equations(residuals, retract, x, held, unknowns)
+    x, constant_data = stop_gradient((estimate, data))
+    N, g = normal_equations(residuals, retract, x, constant_data, unknowns)
     diagonal = jnp.diag(N)
     scale = 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
     scaled = N * scale * scale[:, None]
@@ -122,12 +122,12 @@ def finish(
     square = lambda x, data: jnp.sum(residuals(x, *data) ** 2)
     # At the minimum, rounding may let vᵀv rise; far from it, an undamped step may be wrong.
     rounding = 1e-22 * jnp.sum(diagonal)
-    good = square(retract(x, step), held) <= 1.001 * square(x, held) + rounding
+    good = square(retract(x, step), constant_data) <= 1.001 * square(x, constant_data) + rounding
     x = retract(x, jnp.where(good, step, 0))
-    still = jnp.zeros(unknowns, step.dtype)
+    zero_change = jnp.zeros(unknowns, step.dtype)
     fixed = (residuals, retract, x)
     # The step here is zero; it carries the derivatives of the minimum with respect to the data.
-    x = retract(x, implicit_root(_half_gradient, solve_dense, still, fixed, data))
+    x = retract(x, implicit_root(_half_gradient, solve_dense, zero_change, fixed, data))
     N, _ = normal_equations(residuals, retract, x, data, unknowns)
     N = jnp.where(determined, N, jnp.eye(unknowns, dtype=N.dtype))
     cofactor = jnp.where(determined, inverse(N), jnp.inf)

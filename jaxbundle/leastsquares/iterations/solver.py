@@ -66,12 +66,12 @@ class History(eqx.Module):
         i: Int[Array, ""],
         cost: Float[Array, ""],
         damping: Float[Array, ""],
-        accepted: Bool[Array, ""],
+        is_accepted: Bool[Array, ""],
     ) -> "History":
         return History(
             self.cost.at[i].set(cost),
             self.damping.at[i].set(damping),
-            self.accepted.at[i].set(accepted),
+            self.accepted.at[i].set(is_accepted),
         )
 
 
@@ -163,28 +163,28 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
         state: SolverState,
         tags: frozenset[object],
     ) -> tuple[Values, SolverState, Any]:
-        before, zero = self._info(state.known), zero_tangent(self.plan)
+        information, zero = self._info(state.known), zero_tangent(self.plan)
         residual, aux = fn(state.trial, args)
         # The residuals of the trial point alone: its Jacobian only if it is accepted.
         trial = optx.FunctionInfo.Eval(half_square(self.plan, residual))
         step_size, accept, _, search = self.search.step(
-            state.first, zero, state.change, before, trial, state.search
+            state.first, zero, state.change, information, trial, state.search
         )
         # Here as well as in our search: those of optimistix do not return them.
-        predicted, ratio = compare_with_prediction(before, state.change, trial.f)
+        predicted, ratio = compare_with_prediction(information, state.change, trial.f)
         # N is formed again at accepted points only: a rejected step costs residuals and a solution.
-        y, known = jax.lax.cond(
+        y, linearisation = jax.lax.cond(
             accept,
             lambda: (state.trial, self._linearise(state.trial, args)),
             lambda: (y, state.known),
         )
         step_size, undamped_state = state.undamped_state.choose_step(
-            step_size, state.step_size, state.first, accept, predicted, ratio, known.cost
+            step_size, state.step_size, state.first, accept, predicted, ratio, linearisation.cost
         )
-        change, finite = self._next_change(known, step_size, state.descent)
+        change, finite = self._next_change(linearisation, step_size, state.descent)
         # d² = −gᵀδ; for an undamped step δᵀNδ.
-        costs = before.f, known.cost, trial.f
-        decrement = -dot(self.plan, known.gradient, change)
+        costs = information.f, linearisation.cost, trial.f
+        decrement = -dot(self.plan, linearisation.gradient, change)
         termination, undamped_state = undamped_state.judge(
             self.tolerance, step_size, finite, decrement, state.first, accept, *costs
         )
@@ -197,7 +197,7 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
             y,
             SolverState(
                 first=jnp.asarray(False),
-                known=dataclasses.replace(known, damping=1 / step_size),
+                known=dataclasses.replace(linearisation, damping=1 / step_size),
                 change=change,
                 trial=following,
                 step_size=step_size,
@@ -243,21 +243,28 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
         }
         return y, aux, stats
 
-    def _linearise(self, values: Values, laid: ChunkedData) -> Linearisation:
-        equations = normal_equations(self.declared, self.plan, values, laid)
+    def _linearise(self, values: Values, chunked: ChunkedData) -> Linearisation:
+        equations = normal_equations(self.declared, self.plan, values, chunked)
         return Linearisation(*equations, damping=jnp.asarray(0.0))
 
-    def _info(self, known: Linearisation) -> Info:
+    def _info(self, linearisation: Linearisation) -> Info:
         """The information passed to searches and descents."""
-        normal, noise = Normal(self.plan, known.normal), self.tolerance.noise(known.cost)
-        return Info(known.cost, known.gradient, normal, known.damping, noise)
+        normal, noise = (
+            Normal(self.plan, linearisation.normal),
+            self.tolerance.noise(linearisation.cost),
+        )
+        return Info(
+            linearisation.cost, linearisation.gradient, normal, linearisation.damping, noise
+        )
 
     def _next_change(
-        self, known: Linearisation, step_size: Float[Array, ""], descent_state: Any
+        self, linearisation: Linearisation, step_size: Float[Array, ""], descent_state: Any
     ) -> tuple[Tangent, Bool[Array, ""]]:
         """The descent's step from the accepted point, zero if it cannot be computed."""
-        asked = self.descent.query(zero_tangent(self.plan), self._info(known), descent_state)
-        change, _ = self.descent.step(step_size, asked)
+        query = self.descent.query(
+            zero_tangent(self.plan), self._info(linearisation), descent_state
+        )
+        change, _ = self.descent.step(step_size, query)
         # All devices must agree, or they take different branches and wait for each other forever.
         finite = sum_over_devices(self.plan, 1 - _all_finite(change).astype(int)) == 0
         return jax.tree.map(lambda d: jnp.where(finite, d, 0.0), change), finite
@@ -290,10 +297,10 @@ class Minimum(eqx.Module, Generic[V]):
 
 def minimise(solver: LeastSquares, data: Data, start: Values) -> Minimum[Values]:
     """Run the solver from `start` by `optimistix.least_squares`; no derivatives."""
-    laid = lay_out_data(solver.plan, data)
-    fn = lambda values, laid: residuals(solver.declared, solver.plan, values, laid)
+    chunked = lay_out_data(solver.plan, data)
+    fn = lambda values, chunked: residuals(solver.declared, solver.plan, values, chunked)
     solution = optx.least_squares(
-        fn, solver, start, laid, max_steps=None, adjoint=NoAdjoint(), throw=False
+        fn, solver, start, chunked, max_steps=None, adjoint=NoAdjoint(), throw=False
     )
     stats = solution.stats
     values = representatives(solver.declared, solution.value, start)

@@ -140,7 +140,7 @@ class UndampedStepState(eqx.Module):
         self,
         step_size: Float[Array, ""],
         last_size: Float[Array, ""],
-        first: Bool[Array, ""],
+        is_first: Bool[Array, ""],
         accept: Bool[Array, ""],
         predicted: Float[Array, ""],
         gain_ratio: Float[Array, ""],
@@ -159,9 +159,9 @@ class UndampedStepState(eqx.Module):
         # street of 200 images converges after 31 evaluations instead of 36.
         rules = self.settings
         # A rejected undamped step was tried too early.
-        rejected = jnp.isinf(last_size) & ~accept
-        near_limit = jnp.where(rejected, rules.narrowing * self.near_limit, self.near_limit)
-        quadratic = accept & (gain_ratio > rules.quadratic_gain) & ~self.singular & ~first
+        is_rejected = jnp.isinf(last_size) & ~accept
+        near_limit = jnp.where(is_rejected, rules.narrowing * self.near_limit, self.near_limit)
+        quadratic = accept & (gain_ratio > rules.quadratic_gain) & ~self.singular & ~is_first
         decrease = rules.quadratic_decrease
         quadratic &= (predicted < near_limit * cost) & (predicted < decrease * self.predicted)
         state = dataclasses.replace(
@@ -181,15 +181,15 @@ class UndampedStepState(eqx.Module):
         step_size: Float[Array, ""],
         finite: Bool[Array, ""],
         decrement: Float[Array, ""],
-        first: Bool[Array, ""],
+        is_first: Bool[Array, ""],
         accept: Bool[Array, ""],
-        before: Float[Array, ""],
+        previous_cost: Float[Array, ""],
         cost: Float[Array, ""],
         trial_cost: Float[Array, ""],
     ) -> tuple[Int[Array, ""], "UndampedStepState"]:
         """The termination code after a step was computed, and the next state.
 
-        `cost`: at the accepted point; `before`: at the one before; `trial_cost`: at the one tried.
+        `cost`: at the accepted point; `previous_cost`: at the one before; `trial_cost`: at the one tried.
         """
         rules, undamped = self.settings, jnp.isinf(step_size)
         # The decrement of a damped step underestimates that of the undamped one, so that only an
@@ -199,21 +199,23 @@ class UndampedStepState(eqx.Module):
         # Levenberg–Marquardt goes on with damping after a failure, until a damped step is small and
         # the undamped one that repeats it fails as well; a failure far from the minimum says
         # nothing. Gauss–Newton has no other step, and fails again at the same point.
-        failed = undamped & ~finite & (self.singular | self.repeated)
+        has_failed = undamped & ~finite & (self.singular | self.repeated)
         # Equations that can only just be factorised send undamped steps anywhere: each is rejected
         # although the damped ones have settled. Twice, since once may be an accident of rounding.
         undamped_rejected_too_often = self.rejected >= rules.max_rejected_undamped
         singular = self.singular | (undamped & ~finite) | undamped_rejected_too_often
-        # `first`: the start values were evaluated, no step was taken.
-        stalled = accept & ~first & (before - trial_cost < tolerance.rtol * before)
+        # `is_first`: the start values were evaluated, no step was taken.
+        has_stalled = (
+            accept & ~is_first & (previous_cost - trial_cost < tolerance.rtol * previous_cost)
+        )
         # Gauss–Newton accepts every step: a sum of squares that grows has not stalled, it diverges.
-        stalled &= trial_cost - before <= tolerance.noise(before)
+        has_stalled &= trial_cost - previous_cost <= tolerance.noise(previous_cost)
         reasons = (
             (~jnp.isfinite(cost), NOT_FINITE),
             (settled, SETTLED),
-            (stalled & ~singular, RELATIVE_COST),
-            ((small & undamped_rejected_too_often) | (stalled & singular), SINGULAR),
-            (failed, SINGULAR),
+            (has_stalled & ~singular, RELATIVE_COST),
+            ((small & undamped_rejected_too_often) | (has_stalled & singular), SINGULAR),
+            (has_failed, SINGULAR),
             ((step_size < rules.shortest_step) & ~small, STUCK),
         )
         termination = jnp.asarray(LIMIT)

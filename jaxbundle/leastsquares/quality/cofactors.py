@@ -89,11 +89,11 @@ def _couplings(factor: NormalFactor, Q: Reduced) -> Incident:
     }
     flat = {g: k.reshape(-1, *k.shape[2:]) for g, k in K.items()}
     rows = {g: z.reshape(-1, *z.shape[2:]) for g, z in Z.items()}
-    for (later, earlier), at in plan.blocks.items():
-        if at.pairs is None:
+    for (later, earlier), block in plan.blocks.items():
+        if block.pairs is None:
             continue
-        flat[later], flat[earlier] = _spread(
-            at.pairs,
+        flat[later], flat[earlier] = _add_over_pairs(
+            block.pairs,
             rows[later],
             rows[earlier],
             Q.off_diagonal_blocks[later, earlier],
@@ -104,7 +104,7 @@ def _couplings(factor: NormalFactor, Q: Reduced) -> Incident:
     return {g: flat[g].reshape(k.shape) for g, k in K.items()}
 
 
-def _spread(
+def _add_over_pairs(
     pairs: IncidencePairs,
     a: Float[Array, "places e w"],
     b: Float[Array, "places e v"],
@@ -124,11 +124,11 @@ def _spread(
         k: Int[Array, " chunks"],
     ) -> tuple[Array, ...]:
         # Both incidences of a pair get the other's share: K_i gains Z_j·Qᵀ, K_j Z_i·Q.
-        forth = jnp.einsum("clij,cjk->clik", a[i], Q[k])
-        back = jnp.einsum("clij,ckj->clik", b[j], Q[k])
+        to_second = jnp.einsum("clij,cjk->clik", a[i], Q[k])
+        to_first = jnp.einsum("clij,ckj->clik", b[j], Q[k])
         if within:
-            return (totals[0].at[i].add(back).at[j].add(forth),)
-        return totals[0].at[i].add(back), totals[1].at[j].add(forth)
+            return (totals[0].at[i].add(to_first).at[j].add(to_second),)
+        return totals[0].at[i].add(to_first), totals[1].at[j].add(to_second)
 
     totals = sum_over_pairs(pairs, add, totals)
     # The row that represents nothing has accumulated the padding of chunks.
@@ -154,7 +154,7 @@ def _in_datum(
     A = {g: h @ M.T for g, h in H.items()}
     C = M @ contract(plan, B, A)
 
-    def moved(
+    def project(
         Q: Float[Array, "rows w w"],
         g: Float[Array, "rows w defect"],
         a: Float[Array, "rows w defect"],
@@ -162,7 +162,7 @@ def _in_datum(
         cross = jnp.einsum("nik,njk->nij", g, a)
         return Q - cross - cross.transpose(0, 2, 1) + jnp.einsum("nik,kl,njl->nij", g, C, g)
 
-    return {name: moved(Q, G[name], A[name]) for name, Q in diagonal.items()}
+    return {name: project(Q, G[name], A[name]) for name, Q in diagonal.items()}
 
 
 def blocks_of_tables(
@@ -170,12 +170,15 @@ def blocks_of_tables(
 ) -> dict[str, Float[Array, "rows width width"]]:
     """`Cofactors.diagonal_blocks` by table rows; zero for held unknowns."""
     empty = zeros_of_tables(declared, values)
-    found = {name: jnp.zeros((*zero.shape, zero.shape[1])) for name, zero in empty.items()}
+    blocks = {name: jnp.zeros((*zero.shape, zero.shape[1])) for name, zero in empty.items()}
     for name, group in plan.groups.items():
         for m in group.members:
-            at, rows = slice(m.start, m.start + m.width), slice(None) if m.rows is None else m.rows
-            found[m.table] = found[m.table].at[rows].add(diagonal[name][:, at, at])
-    return found
+            columns, rows = (
+                slice(m.start, m.start + m.width),
+                slice(None) if m.rows is None else m.rows,
+            )
+            blocks[m.table] = blocks[m.table].at[rows].add(diagonal[name][:, columns, columns])
+    return blocks
 
 
 def propagate(

@@ -102,8 +102,8 @@ def solve(
     good = converged(minimum.termination)
     values = attach_derivatives(problem.declared, problem.plan, minimum.values, data, sensitivity)
     # A factor, not `where`: derivatives of a failed solution are NaN as well, not 0.
-    found = without_filling(problem, values)
-    return jax.tree.map(lambda x: x * jnp.where(good, 1.0, jnp.nan), found)
+    tables = without_filling(problem, values)
+    return jax.tree.map(lambda x: x * jnp.where(good, 1.0, jnp.nan), tables)
 
 
 class LinearisedSolution(eqx.Module):
@@ -130,10 +130,10 @@ class LinearisedSolution(eqx.Module):
 
     def residuals(self, change: Tangent, data: Data) -> tuple[Float[Array, "chunks length r"], ...]:
         """v/σ after a change of the unknowns."""
-        plan, laid = fill_places(self.plan, lay_out_data(self.plan, data))
+        plan, chunked = fill_places(self.plan, lay_out_data(self.plan, data))
         # Changes of held unknowns have no effect, so that their gradients are zero, not undefined.
         change = {name: x * plan.groups[name].free for name, x in change.items()}
-        return residuals(self.declared, plan, self.move(change, data), laid)
+        return residuals(self.declared, plan, self.move(change, data), chunked)
 
     def times(self, change: Tangent) -> Tangent:
         """H·δ of ½vᵀPv and of the penalty on the pins, from `terms`."""
@@ -161,15 +161,17 @@ def attach_derivatives(
     # 32 MB of derivatives of single observations. Larger problems form each product with the
     # Hessian from the residuals: there memory counts, not the time to compile.
     if exact and count_terms(declared, plan) <= 4_000_000:
-        at, step = _step_twice(declared, plan, values, fixed)
+        linearised, step = _step_twice(declared, plan, values, fixed)
     else:
-        at, step = _newton_step(declared, plan, values, fixed, exact)
+        linearised, step = _newton_step(declared, plan, values, fixed, exact)
     if sensitivity == "gauss-newton":
         change = datum.s_transform(declared, plan, values, step)
-        return representatives(declared, at.move(_propagate(change, at, data), data), data.start)
-    change = implicit_root(gradient_after, _solve_structured, step, at, data)
-    moved = datum.attach_motion(declared, plan, at.move(change, data), data.start)
-    return representatives(declared, moved, data.start)
+        return representatives(
+            declared, linearised.move(_propagate(change, linearised, data), data), data.start
+        )
+    change = implicit_root(gradient_after, _solve_structured, step, linearised, data)
+    tables = datum.attach_motion(declared, plan, linearised.move(change, data), data.start)
+    return representatives(declared, tables, data.start)
 
 
 def _newton_step(
@@ -177,17 +179,17 @@ def _newton_step(
 ) -> tuple[LinearisedSolution, Tangent]:
     """The problem at the values, with the factor of the exact Hessian (and its terms, to `keep`) or
     of JᵀPJ; and the step from there."""
-    laid, terms = lay_out_data(plan, data), None
+    chunked, terms = lay_out_data(plan, data), None
     if exact:
-        equations, terms = equations_and_terms(declared, plan, values, laid)
+        equations, terms = equations_and_terms(declared, plan, values, chunked)
     else:
-        equations = normal_equations(declared, plan, values, laid)
+        equations = normal_equations(declared, plan, values, chunked)
     _, gradient, blocks = equations
     normal = Normal(plan, blocks)
     # Conjugate gradients tolerate open motions.
     pinned = plan.datum if plan.reduction in FACTORS else None
-    pins, own = {} if pinned is None else pinned.pins, normal.diagonal()
-    pins = {g: p * jnp.where(own[g] > 0, own[g], 1.0) for g, p in pins.items()}
+    pins, diagonal = {} if pinned is None else pinned.pins, normal.diagonal()
+    pins = {g: p * jnp.where(diagonal[g] > 0, diagonal[g], 1.0) for g, p in pins.items()}
     factor = elimination.factorise(normal)
     # Along open motions the gradient is only rounding: that part is removed.
     gradient = datum.s_transform_transposed(declared, plan, values, gradient)
@@ -202,29 +204,35 @@ def _step_twice(
     """`_newton_step` after another: the terms are those of the solution itself. In a loop, so that
     the program contains it once."""
 
-    def one(values: Values, _: None) -> tuple[Values, tuple]:
-        at, step = _newton_step(declared, plan, values, data, True, keep=True)
-        return at.move(step, data), (values, at.factor, at.pins, at.terms, step)
+    def take_step(values: Values, _: None) -> tuple[Values, tuple]:
+        linearised, step = _newton_step(declared, plan, values, data, True, keep=True)
+        return linearised.move(step, data), (
+            values,
+            linearised.factor,
+            linearised.pins,
+            linearised.terms,
+            step,
+        )
 
-    _, both = jax.lax.scan(one, values, length=2)
-    *at, step = jax.tree.map(lambda x: x[-1], both)
-    values, factor, pins, terms = at
+    _, both_steps = jax.lax.scan(take_step, values, length=2)
+    *linearised, step = jax.tree.map(lambda x: x[-1], both_steps)
+    values, factor, pins, terms = linearised
     return LinearisedSolution(declared, plan, values, data, factor, pins, terms), step
 
 
-def gradient_after(change: Tangent, at: LinearisedSolution, data: Data) -> Tangent:
+def gradient_after(change: Tangent, linearised: LinearisedSolution, data: Data) -> Tangent:
     """g of ½vᵀPv and of the penalty on the pins, after a change of the unknowns."""
 
     def penalised(change: Tangent) -> Float[Array, ""]:
         # It keeps as many unknowns as the defect from changing, so that H is regular; the motion
         # into the datum follows.
-        penalty = sum(jnp.sum(pins * change[g] ** 2) for g, pins in at.pins.items())
-        return half_square(at.plan, at.residuals(change, data)) + 0.5 * penalty
+        penalty = sum(jnp.sum(pins * change[g] ** 2) for g, pins in linearised.pins.items())
+        return half_square(linearised.plan, linearised.residuals(change, data)) + 0.5 * penalty
 
     return jax.grad(penalised)(change)
 
 
-def _solve_structured(times: Callable, at: LinearisedSolution, b: Tangent) -> Tangent:
+def _solve_structured(times: Callable, linearised: LinearisedSolution, b: Tangent) -> Tangent:
     """H⁻¹·b by the factor, differentiable as the solution of H·x = b.
 
     Refined once with the residual, computed without N: like the corrected seminormal equations
@@ -234,20 +242,20 @@ def _solve_structured(times: Callable, at: LinearisedSolution, b: Tangent) -> Ta
     # In one vector: the transpose requires one linear function.
     right, unravel = ravel_pytree(b)
     flat = lambda tree: ravel_pytree(tree)[0]
-    factor = lambda b: flat(elimination.solve(at.factor, unravel(b)))
+    factor = lambda b: flat(elimination.solve(linearised.factor, unravel(b)))
 
     product = lambda x: flat(times(unravel(x)))
-    quick = product if at.terms is None else lambda x: flat(at.times(unravel(x)))
+    quick = product if linearised.terms is None else lambda x: flat(linearised.times(unravel(x)))
 
     def improved(_: Callable, b: Float[Array, " n"]) -> Float[Array, " n"]:
         x = factor(b)
-        return x + factor(b - quick(x)) if at.plan.reduction in FACTORS else x
+        return x + factor(b - quick(x)) if linearised.plan.reduction in FACTORS else x
 
     return unravel(jax.lax.custom_linear_solve(product, right, improved, symmetric=True))
 
 
 @eqx.filter_custom_jvp
-def _propagate(change: Tangent, at: LinearisedSolution, data: Data) -> Tangent:  # noqa: ARG001
+def _propagate(change: Tangent, linearised: LinearisedSolution, data: Data) -> Tangent:  # noqa: ARG001
     """`change` with the derivative of error propagation, which cannot be differentiated again."""
     return change
 
@@ -270,11 +278,11 @@ def _(primals: tuple, tangents: tuple) -> tuple[Tangent, Tangent]:
     return change, jax.tree.map(jnp.add, into, start)
 
 
-def _change_of_start(at: LinearisedSolution, data: Data) -> Tangent:
+def _change_of_start(linearised: LinearisedSolution, data: Data) -> Tangent:
     """The change of the start values of datum unknowns from those that the solution was computed
     with: zero, but with derivatives."""
-    moved = datum.zeros_of_tables(at.declared, at.values)
-    for name in () if at.plan.datum is None else at.plan.datum.weight:
-        difference = jax.vmap(at.declared.spaces[name].difference)
-        moved[name] = difference(data.start[name], at.data.start[name])
-    return datum.of_groups(at.plan, moved)
+    changes = datum.zeros_of_tables(linearised.declared, linearised.values)
+    for name in () if linearised.plan.datum is None else linearised.plan.datum.weight:
+        difference = jax.vmap(linearised.declared.spaces[name].difference)
+        changes[name] = difference(data.start[name], linearised.data.start[name])
+    return datum.of_groups(linearised.plan, changes)

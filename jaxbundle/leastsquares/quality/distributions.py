@@ -34,8 +34,8 @@ def skewed_quantile(probability: float, skewness: float) -> float:
     # χ² of ν has the skewness √(8/ν); of more degrees of freedom it is normal to 1e-6
     if skewness < 1e-5:
         return normal_quantile(probability)
-    half = 4 / skewness**2
-    return float((_special().gammaincinv(half, probability) - half) / math.sqrt(half))
+    shape = 4 / skewness**2
+    return float((_special().gammaincinv(shape, probability) - shape) / math.sqrt(shape))
 
 
 def chi2_quantile(probability: float, degrees: float) -> float:

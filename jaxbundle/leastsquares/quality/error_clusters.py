@@ -40,19 +40,19 @@ class Clusters:
         """P·x."""
         return x - self.Q @ (self.Q.transpose(0, 2, 1) @ x)
 
-    def spread(self, values: Batch, at: Places, number: int) -> Batch:
-        """Values in all of a number of columns from those in the columns `at`; others are left
+    def spread(self, values: Batch, columns: Places, number: int) -> Batch:
+        """Values in all of a number of columns from those in the columns `columns`; others are left
         out."""
         dense = np.zeros((*self.rows.shape, number + 1))
         cluster, row = (np.arange(n) for n in self.rows.shape)
-        at = np.where((at < 0) | (at > number), number, at)
-        dense[cluster[:, None, None], row[:, None], at[:, None]] = values
+        columns = np.where((columns < 0) | (columns > number), number, columns)
+        dense[cluster[:, None, None], row[:, None], columns[:, None]] = values
         return dense[:, :, :number]
 
     def some(self, at: Any) -> "Clusters":
         """Some of the clusters."""
-        given = self.rows, self.eliminated, self.Q, self.A, self.A_at, self.F, self.F_at
-        rows, eliminated, Q, A, A_at, F, F_at = (x[at] for x in given)
+        fields = self.rows, self.eliminated, self.Q, self.A, self.A_at, self.F, self.F_at
+        rows, eliminated, Q, A, A_at, F, F_at = (x[at] for x in fields)
         V, groups = None if self.V is None else self.V[at], _begin_groups([A_at, F_at])
         return Clusters(rows, eliminated, Q, A, A_at, F, F_at, V, groups)
 
@@ -61,13 +61,13 @@ class Clusters:
         MB: four times as many take the same time, but memory that has to be cleared first)."""
         m, k = self.rows.shape
         step = max(at_once // max(k * columns, 1), 1)
-        for first in range(0, m, step):
-            yield self.some(slice(first, first + step))
+        for begin in range(0, m, step):
+            yield self.some(slice(begin, begin + step))
 
     def by_columns(self) -> Iterator[slice]:
         """Clusters of equal columns."""
-        for first, last in zip(self.groups, [*self.groups[1:], len(self.rows)]):
-            yield slice(first, last)
+        for begin, end in zip(self.groups, [*self.groups[1:], len(self.rows)]):
+            yield slice(begin, end)
 
 
 def lay_out_clusters(linear: LinearisedRows, F: Any, many: Any | None) -> list[Clusters] | None:
@@ -75,9 +75,9 @@ def lay_out_clusters(linear: LinearisedRows, F: Any, many: Any | None) -> list[C
     roots: of narrow ones, and of the component of many columns; None if a column of this has rows
     of different clusters."""
     cluster = linear.eliminated.copy()
-    alone = cluster < 0
+    is_alone = cluster < 0
     # A row without an eliminated row is a cluster of its own: P is 1 there.
-    cluster[alone] = cluster.max(initial=-1) + 1 + np.arange(alone.sum())
+    cluster[is_alone] = cluster.max(initial=-1) + 1 + np.arange(is_alone.sum())
     # Rows without weight have neither.
     some = (np.diff(linear.A.indptr) + np.diff(F.indptr) > 0) | (linear.Q != 0).any(1)
     if many is not None:
@@ -92,36 +92,36 @@ def lay_out_clusters(linear: LinearisedRows, F: Any, many: Any | None) -> list[C
     order = order[np.argsort(cluster[order], kind="stable")]
     _, start, count = np.unique(cluster[order], return_index=True, return_counts=True)
     roots = [linear.A, F] if many is None else [linear.A, F, many]
-    padded, found = [_padded(matrix) for matrix in roots], []
+    padded, clusters = [_padded(matrix) for matrix in roots], []
     # Sorted by a random number of their columns, clusters of equal ones are neighbours: points of
     # the same photographs, whose sums are one product.
     rng = np.random.default_rng(0)
-    of_columns = [rng.integers(1, 1 << 40, none + 1) for *_, none in padded[:2]]
+    of_columns = [rng.integers(1, 1 << 40, absent + 1) for *_, absent in padded[:2]]
     key = np.zeros(len(cluster), int)
-    for number, (at, *_) in zip(of_columns, padded):
-        key += number[at].sum(1)
+    for number, (columns, *_) in zip(of_columns, padded):
+        key += number[columns].sum(1)
     # Batches of equal numbers of rows: padding to the longest track would square its length.
-    kinds = np.stack([count, alone[order[start]]], 1)
+    kinds = np.stack([count, is_alone[order[start]]], 1)
     for kind in np.unique(kinds, axis=0):
         rows = order[start[(kinds == kind).all(1)][:, None] + np.arange(kind[0])]
         rows = rows[np.argsort(key[rows].sum(1))]
         (A, A_at), (narrow, narrow_at) = (
-            _local(at[rows], x[rows], none) for at, x, none in padded[:2]
+            _local(columns[rows], x[rows], absent) for columns, x, absent in padded[:2]
         )
         V = None
-        for at, x, none in padded[2:]:
-            V = _products(at[rows], x[rows], none)
-        given = rows, linear.eliminated[rows[:, 0]], linear.Q[rows], A, A_at, narrow, narrow_at
-        found.append(Clusters(*given, V, _begin_groups([A_at, narrow_at])))
-    return found
+        for columns, x, absent in padded[2:]:
+            V = _products(columns[rows], x[rows], absent)
+        fields = rows, linear.eliminated[rows[:, 0]], linear.Q[rows], A, A_at, narrow, narrow_at
+        clusters.append(Clusters(*fields, V, _begin_groups([A_at, narrow_at])))
+    return clusters
 
 
 def _begin_groups(places: Sequence[Places]) -> Int[np.ndarray, " groups"]:
     """Where clusters of equal columns begin."""
     new = np.zeros(len(places[0]), bool)
     new[:1] = True
-    for at in places:
-        new[1:] |= (at[1:] != at[:-1]).any(1)
+    for columns in places:
+        new[1:] |= (columns[1:] != columns[:-1]).any(1)
     return np.flatnonzero(new)
 
 
@@ -130,46 +130,48 @@ def _padded(
 ) -> tuple[Int[np.ndarray, "rows s"], Float[np.ndarray, "rows s"], int]:
     """Columns and values of every row of a sparse matrix, up to the largest number of them, and the
     column that stands for none."""
-    none, count = matrix.shape[1], np.diff(matrix.indptr)
+    absent, count = matrix.shape[1], np.diff(matrix.indptr)
     shape = len(count), int(count.max(initial=0))
-    at, values = np.full(shape, none, np.int32), np.zeros(shape)
+    columns, values = np.full(shape, absent, np.int32), np.zeros(shape)
     row = np.repeat(np.arange(len(count)), count)
     place = np.arange(len(row)) - matrix.indptr[row]
-    at[row, place], values[row, place] = matrix.indices, matrix.data
-    return at, values, none
+    columns[row, place], values[row, place] = matrix.indices, matrix.data
+    return columns, values, absent
 
 
 def _local(
-    at: Int[np.ndarray, "m k s"], values: Float[np.ndarray, "m k s"], none: int
+    columns: Int[np.ndarray, "m k s"], values: Float[np.ndarray, "m k s"], absent: int
 ) -> tuple[Batch, Places]:
     """The values of k rows in the distinct columns that any of them has, and these."""
-    m, k, s = at.shape
+    m, k, s = columns.shape
     if m * k * s == 0:
         return np.zeros((m, k, 0)), np.zeros((m, 0), int)
     # Columns are sorted once for all neighbours that have the same in every row.
     new = np.ones(m, bool)
-    new[1:] = (at[1:] != at[:-1]).any((1, 2))
+    new[1:] = (columns[1:] != columns[:-1]).any((1, 2))
     run = np.cumsum(new) - 1
-    flat = at[new].reshape(-1, k * s)
+    flat = columns[new].reshape(-1, k * s)
     order = np.argsort(flat, 1)
     ordered = np.take_along_axis(flat, order, 1)
     slot = np.zeros(flat.shape, int)
     slot[:, 1:] = np.cumsum(ordered[:, 1:] != ordered[:, :-1], 1)
-    places = np.full((len(flat), int(slot.max()) + 1), none)
+    places = np.full((len(flat), int(slot.max()) + 1), absent)
     np.put_along_axis(places, slot, ordered, 1)
-    of = np.empty_like(slot)
-    np.put_along_axis(of, order, slot, 1)
+    slot_of = np.empty_like(slot)
+    np.put_along_axis(slot_of, order, slot, 1)
     dense = np.zeros((m, k, places.shape[1]))
     cluster, row = np.arange(m)[:, None, None], np.arange(k)[None, :, None]
-    dense[cluster, row, of.reshape(-1, k, s)[run]] = values
+    dense[cluster, row, slot_of.reshape(-1, k, s)[run]] = values
     return dense, places[run]
 
 
 def _products(
-    at: Int[np.ndarray, "m k s"], values: Float[np.ndarray, "m k s"], none: int
+    columns: Int[np.ndarray, "m k s"], values: Float[np.ndarray, "m k s"], absent: int
 ) -> Float[np.ndarray, "m k k"]:
     """G·Gᵀ of sparse rows G of every cluster."""
     # Columns differ from cluster to cluster, but hardly so if counted from their first.
-    relative = np.where(at == none, none, at - at.min((1, 2), initial=none)[:, None, None])
-    G, _ = _local(relative, values, none)
+    relative = np.where(
+        columns == absent, absent, columns - columns.min((1, 2), initial=absent)[:, None, None]
+    )
+    G, _ = _local(relative, values, absent)
     return G @ G.transpose(0, 2, 1)

@@ -74,10 +74,10 @@ class ErrorComponent(NamedTuple):
 
     def products(self, x: Float[np.ndarray, "rows n"]) -> Float[np.ndarray, "columns n"]:
         """Fᵀ·x."""
-        found = np.asarray(self.root.T @ x)
+        products = np.asarray(self.root.T @ x)
         if self.mixing is None:
-            return found
-        of_blocks = found.reshape(-1, len(self.mixing), x.shape[1])
+            return products
+        of_blocks = products.reshape(-1, len(self.mixing), x.shape[1])
         return (self.mixing.T @ of_blocks).reshape(-1, x.shape[1])
 
     def combine(self, z: Float[np.ndarray, "columns n"]) -> Float[np.ndarray, "rows n"]:
@@ -167,28 +167,28 @@ class IndependentErrors:
     """The classical covariance of a solved problem: independent observations with σ times one
     factor, of which `variance` is the square. It answers what an `ErrorModel` answers."""
 
-    found: Solution
+    solution: Solution
     variance: float
 
     def covariance(self, table: str) -> Float[np.ndarray, "rows width width"]:
         """The covariance blocks of all rows of a table."""
-        return self.variance * np.asarray(self.found.cofactor(table))
+        return self.variance * np.asarray(self.solution.cofactor(table))
 
     def propagate_rows(
         self, rows: Mapping[str, Float[np.ndarray, "n rows width"]]
     ) -> Float[np.ndarray, "n n"]:
         """The covariance of linear functions of the changes of tables (`Solution.jacobian_of`)."""
-        return self.variance * self.found.propagate_rows(rows)
+        return self.variance * self.solution.propagate_rows(rows)
 
     def propagate(self, function: Callable[[Values], Array]) -> Float[np.ndarray, "n n"]:
         """The covariance of a differentiable function (`Values` → [n]) of the unknowns."""
-        return self.variance * self.found.propagate(function)
+        return self.variance * self.solution.propagate(function)
 
     def joint_covariance(
         self, table: str, rows: Sequence[int]
     ) -> Float[np.ndarray, "n width n width"]:
         """The covariance of some rows of a table among each other."""
-        return self.variance * self.found.joint_cofactors(table, rows)
+        return self.variance * self.solution.joint_cofactors(table, rows)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -200,7 +200,7 @@ class ErrorModel:
     `equations` of the θ, None where they are stated; `widened`: by `widening`, as all covariances
     that are stated, or as estimated."""
 
-    found: Solution
+    solution: Solution
     components: tuple[ErrorComponent, ...]
     theta: Float[np.ndarray, " k"]
     theta_covariance: Float[np.ndarray, "k k"]
@@ -232,23 +232,25 @@ class ErrorModel:
     def _parts_of_tables(self) -> Iterator[Float[np.ndarray, "k unknowns"]]:
         """The variances that every θ = 1 gives the unknowns of the tables not eliminated."""
         for table in self.own[0]:
-            if table == self.found.problem.plan.eliminated:
+            if table == self.solution.problem.plan.eliminated:
                 continue
-            blocks = [self.found.cofactor(table), *(own.get(table) for own in self.own)]
-            none = np.zeros_like(np.asarray(blocks[0]))
-            parts = [none if block is None else np.asarray(block) for block in blocks]
+            blocks = [self.solution.cofactor(table), *(own.get(table) for own in self.own)]
+            zeros = np.zeros_like(np.asarray(blocks[0]))
+            parts = [zeros if block is None else np.asarray(block) for block in blocks]
             yield np.stack([np.diagonal(part, axis1=1, axis2=2).ravel() for part in parts])
 
     @property
     def sizes(self) -> tuple[ErrorSize, ...]:
         """√θ of the independent part, as a factor of the a priori σ, and of all components."""
         names = [(INDEPENDENT, "σ"), *((c.name, c.unit) for c in self.components)]
-        names = [one for one in names if one[0] != OTHERS]
+        names = [key for key in names if key[0] != OTHERS]
         # σ of √θ: σ_θ/(2√θ), but at most √σ_θ, its value at θ = 0
-        theta, spread = (x[: len(names)] for x in (self.theta, self.theta_sigma))
-        root, most = np.sqrt(theta), np.sqrt(spread)
-        sigma = np.minimum(spread, 2 * root * most) / np.where(root > 0, 2 * root, 1.0)
-        sigma = np.where(root > 0, sigma, most)
+        theta, variance_of_theta = (x[: len(names)] for x in (self.theta, self.theta_sigma))
+        root, largest_sigma = np.sqrt(theta), np.sqrt(variance_of_theta)
+        sigma = np.minimum(variance_of_theta, 2 * root * largest_sigma) / np.where(
+            root > 0, 2 * root, 1.0
+        )
+        sigma = np.where(root > 0, sigma, largest_sigma)
         return tuple(
             ErrorSize(name, unit, float(s), float(d), float(z))
             for (name, unit), s, d, z in zip(names, root, sigma, self.score)
@@ -258,65 +260,71 @@ class ErrorModel:
     def widened_sizes(self) -> dict[str, float]:
         """The sizes that covariances are of, by name, as a design takes them."""
         factor = np.sqrt(self.widening)
-        return {one.name: float(k * one.size) for k, one in zip(factor, self.sizes)}
+        return {size.name: float(k * size.size) for k, size in zip(factor, self.sizes)}
 
     def covariance(self, table: str) -> Float[np.ndarray, "rows width width"]:
         """The covariance blocks of all rows of a table."""
         theta = self.widening * self.theta
-        blocks = theta[0] * np.asarray(self.found.cofactor(table))
-        return blocks + sum(t * own[table] for t, own in zip(theta[1:], self.own) if t != 0)
+        blocks = theta[0] * np.asarray(self.solution.cofactor(table))
+        return blocks + sum(
+            t * blocks_of_theta[table] for t, blocks_of_theta in zip(theta[1:], self.own) if t != 0
+        )
 
     def propagate_rows(
         self, rows: Mapping[str, Float[np.ndarray, "n rows width"]]
     ) -> Float[np.ndarray, "n n"]:
         """The covariance of linear functions of the changes of tables (`Solution.jacobian_of`)."""
-        return self.of_effects(effects(self.found, rows))
+        return self.of_effects(effects(self.solution, rows))
 
     def propagate(self, function: Callable[[Values], Array]) -> Float[np.ndarray, "n n"]:
         """The covariance of a differentiable function (`Values` → [n]) of the unknowns."""
-        slopes = self.found.jacobian_of(function)
+        slopes = self.solution.jacobian_of(function)
         return self.propagate_rows({table: np.asarray(x) for table, x in slopes.items()})
 
     def joint_covariance(
         self, table: str, rows: Sequence[int]
     ) -> Float[np.ndarray, "n width n width"]:
         """The covariance of some rows of a table among each other."""
-        given = self.found.problem.table(table)
-        width, number = given.space.width, len(rows) * given.space.width
-        one = np.zeros((number, given.rows, width))
-        one[np.arange(number), np.repeat(rows, width), np.tile(np.arange(width), len(rows))] = 1.0
-        return self.propagate_rows({table: one}).reshape(len(rows), width, len(rows), width)
+        declared_table = self.solution.problem.table(table)
+        width, number = declared_table.space.width, len(rows) * declared_table.space.width
+        unit_rows = np.zeros((number, declared_table.rows, width))
+        unit_rows[
+            np.arange(number), np.repeat(rows, width), np.tile(np.arange(width), len(rows))
+        ] = 1.0
+        return self.propagate_rows({table: unit_rows}).reshape(len(rows), width, len(rows), width)
 
     def draw(
         self, number: int, rng: np.random.Generator
     ) -> tuple[Float[np.ndarray, "n rows"], Float[np.ndarray, "n k"]]:
         """Normal errors of all rows with this covariance, and the θ that would be estimated from
         the residuals they leave."""
-        size = len(stack_rows(self.found, self.found.residuals))
+        size = len(stack_rows(self.solution, self.solution.residuals))
         _, independent = _independent_part(self.components, self.theta, size)
         errors = np.sqrt(independent) * rng.standard_normal((number, size))
         for t, component in zip(self.theta[1:], self.components):
             if t > 0 and component.name != OTHERS:
                 z = rng.standard_normal((component.columns, number))
                 errors += np.sqrt(t) * component.combine(z).T
-        forms = quadratic_forms(self.components, remove_fit(self.found, errors)[0])
+        forms = quadratic_forms(self.components, remove_fit(self.solution, errors)[0])
         return errors, np.array([not_none(self.equations).solve(q)[0] for q in forms])
 
     def covariances_of_residuals(self, rows: Int[np.ndarray, "n k"]) -> Float[np.ndarray, "n k k"]:
         """The covariance M·Σ·M of the residuals of groups of rows (`first_rows`), in units of their
         a priori σ."""
-        size = len(stack_rows(self.found, self.found.residuals))
-        (n, k), found = rows.shape, np.zeros((*rows.shape, rows.shape[1]))
+        size = len(stack_rows(self.solution, self.solution.residuals))
+        (n, k), blocks = rows.shape, np.zeros((*rows.shape, rows.shape[1]))
         # So many columns have 80 MB for 100 000 rows.
-        together = max(100 // k, 1)
-        for first in range(0, n, together):
-            some = rows[first : first + together]
+        at_once = max(100 // k, 1)
+        for begin in range(0, n, at_once):
+            some = rows[begin : begin + at_once]
             unit = np.zeros((some.size, size))
             unit[np.arange(some.size), some.ravel()] = 1.0
-            C = self.of_effects(remove_fit(self.found, unit)[0]).reshape(len(some), k, len(some), k)
+            C = self.of_effects(remove_fit(self.solution, unit)[0]).reshape(
+                len(some), k, len(some), k
+            )
             number = np.arange(len(some))
-            found[first : first + together] = C[number, :, number]
-        return found
+            blocks[begin : begin + at_once] = C[number, :, number]
+        return blocks
 
     def of_effects(self, D: Float[np.ndarray, "n rows"]) -> Float[np.ndarray, "n n"]:
         """The covariance D·Σ·Dᵀ of linear functions D of the errors, in units of their σ."""
@@ -345,15 +353,15 @@ Errors = ErrorModel | IndependentErrors
 
 
 def fit_error_model(
-    found: Solution, components: Sequence[ErrorComponent], settings: ErrorSettings = DEFAULTS
+    solution: Solution, components: Sequence[ErrorComponent], settings: ErrorSettings = DEFAULTS
 ) -> ErrorModel:
     """The sizes of components from the residuals of a solution; `OTHERS` comes last."""
-    v = stack_rows(found, found.residuals)
-    products = products_of(found, components, settings)
+    v = stack_rows(solution, solution.residuals)
+    products = products_of(solution, components, settings)
     rng = np.random.default_rng(settings.seed)
     if products is None:
         F = [component.sparse_root() for component in components]
-        T, cubes, own = _traces(found, F, settings, rng)
+        T, cubes, blocks_by_theta = _traces(solution, F, settings, rng)
     else:
         traces = products.traces(settings.max_clusters, rng)
         T, cubes = traces.T, traces.cubes
@@ -362,12 +370,12 @@ def fit_error_model(
     system = SizeEquations(T, has_others, critical, cubes)
     theta, score = system.solve(quadratic_forms(components, v))
     if products is None:
-        given, independent = _independent_part(components, theta, len(v))
+        is_other, independent = _independent_part(components, theta, len(v))
         F = F[: len(F) - has_others]
         estimated = theta[: len(F) + 1]
-        forms = _covariance_of_forms(found, F, estimated, independent, given, rng)
+        forms = _covariance_of_forms(solution, F, estimated, independent, is_other, rng)
     else:
-        own = products.blocks(theta)
+        blocks_by_theta = products.blocks(theta)
         # V_0 without the given rows
         _, part = system.reduced
         forms = traces.covariance_of_forms(theta)
@@ -381,66 +389,70 @@ def fit_error_model(
         # θ of the given rows is σ0² − θ_0, so that their sum is σ0² whatever θ_0 is
         onto = np.concatenate([np.eye(len(covariance)), -np.eye(len(covariance))[:1]])
         covariance = onto @ covariance @ onto.T
-    return ErrorModel(found, tuple(components), theta, covariance, score, tuple(own), system)
+    return ErrorModel(
+        solution, tuple(components), theta, covariance, score, tuple(blocks_by_theta), system
+    )
 
 
 def _traces(
-    found: Solution, F: Sequence[Any], settings: ErrorSettings, rng: np.random.Generator
+    solution: Solution, F: Sequence[Any], settings: ErrorSettings, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, "k k k"], list[dict[str, np.ndarray]]]:
     """T of the independent part and of roots F; tr(M·V_i·M·V_j·M·V_l), which their skewness is
     from; by root the covariance blocks that it gives. The cubes of two different roots of many
     columns are left at zero: sums of so many squares are nearly normal."""
-    traces = Traces(F, found.problem.counts.redundancy)
-    own: list[dict[str, np.ndarray]] = [{} for _ in F]
+    traces = Traces(F, solution.problem.counts.redundancy)
+    blocks_by_theta: list[dict[str, np.ndarray]] = [{} for _ in F]
     exact = [root.shape[1] <= settings.max_columns for root in F]
     # Cubes of random combinations need the products of the others.
     for k in sorted(range(len(F)), key=lambda k: not exact[k]):
         for n, columns in enumerate(_columns(F[k], settings, rng)):
-            remaining, changes = remove_fit(found, columns)
+            remaining, changes = remove_fit(solution, columns)
             products = traces.add(k, columns, remaining, exact[k])
-            _add_squares(own[k], changes)
+            _add_squares(blocks_by_theta[k], changes)
             if not exact[k] and n == 0:
-                again, _ = remove_fit(found, np.asarray((F[k] @ products).T))
-                traces.add_cubes(k, remaining, again, settings.draws / len(columns))
-    return *traces.of_all(), own
+                remaining_again, _ = remove_fit(solution, np.asarray((F[k] @ products).T))
+                traces.add_cubes(k, remaining, remaining_again, settings.draws / len(columns))
+    return *traces.of_all(), blocks_by_theta
 
 
 def stated_error_model(
-    found: Solution,
+    solution: Solution,
     components: Sequence[ErrorComponent],
     theta: Float[np.ndarray, " k"],
     settings: ErrorSettings = DEFAULTS,
 ) -> ErrorModel:
     """The error model of components of known sizes, such as those of a camera from earlier jobs, in
     a solution or a design; `theta`: of the independent part and of the components."""
-    rng, own = np.random.default_rng(settings.seed), []
-    products = products_of(found, components, settings)
+    rng, blocks_by_theta = np.random.default_rng(settings.seed), []
+    products = products_of(solution, components, settings)
     if products is not None:
-        own = products.blocks(theta)
+        blocks_by_theta = products.blocks(theta)
     else:
         for t, component in zip(theta[1:], components):
             blocks: dict[str, np.ndarray] = {}
             root = component.sparse_root()
             for columns in _columns(root, settings, rng) if t > 0 else ():
-                _add_squares(blocks, remove_fit(found, columns)[1])
-            own.append(blocks)
-    none = np.zeros(len(theta))
-    return ErrorModel(found, tuple(components), theta, np.diag(none), none, tuple(own))
+                _add_squares(blocks, remove_fit(solution, columns)[1])
+            blocks_by_theta.append(blocks)
+    zeros = np.zeros(len(theta))
+    return ErrorModel(
+        solution, tuple(components), theta, np.diag(zeros), zeros, tuple(blocks_by_theta)
+    )
 
 
 def products_of(
-    found: Solution, components: Sequence[ErrorComponent], settings: ErrorSettings
+    solution: Solution, components: Sequence[ErrorComponent], settings: ErrorSettings
 ) -> ErrorProducts | None:
     """The products of the roots of components with M; None if they cannot be had exactly."""
     roots = [(component.root.tocsr(), component.mixing) for component in components]
-    return error_products(found, roots, settings.max_columns)
+    return error_products(solution, roots, settings.max_columns)
 
 
 def _add_squares(blocks: dict[str, np.ndarray], changes: Mapping[str, np.ndarray]) -> None:
     """Add the blocks of X·Xᵀ of some columns of X."""
     for table, x in changes.items():
-        more = np.einsum("cni,cnj->nij", x, x)
-        blocks[table] = blocks[table] + more if table in blocks else more
+        squares = np.einsum("cni,cnj->nij", x, x)
+        blocks[table] = blocks[table] + squares if table in blocks else squares
 
 
 def _has_others(components: Sequence[ErrorComponent]) -> bool:
@@ -451,18 +463,20 @@ def _independent_part(
     components: Sequence[ErrorComponent], theta: Float[np.ndarray, " k"], size: int
 ) -> tuple[Bool[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:
     """Which rows are those of `OTHERS`; the variances of the independent errors of all rows."""
-    given = np.zeros(size, bool)
+    is_other = np.zeros(size, bool)
     if _has_others(components):
-        given[components[-1].root.nonzero()[0]] = True
-    return given, np.where(given, theta[0] + theta[-1], theta[0])
+        is_other[components[-1].root.nonzero()[0]] = True
+    return is_other, np.where(is_other, theta[0] + theta[-1], theta[0])
 
 
 def quadratic_forms(
     components: Sequence[ErrorComponent], v: Float[np.ndarray, "*draws rows"]
 ) -> Float[np.ndarray, "*draws k"]:
     """q of residuals v: vᵀv, and vᵀV_k·v of the components."""
-    of = lambda one: np.sum(one.products(np.atleast_2d(v).T) ** 2, 0).reshape(v.shape[:-1])
-    return np.stack([np.sum(v**2, -1), *map(of, components)], -1)
+    form_of = lambda component: np.sum(component.products(np.atleast_2d(v).T) ** 2, 0).reshape(
+        v.shape[:-1]
+    )
+    return np.stack([np.sum(v**2, -1), *map(form_of, components)], -1)
 
 
 def _columns(
@@ -473,37 +487,37 @@ def _columns(
     exact = number <= settings.max_columns
     total = number if exact else settings.draws
     root = root.tocsc()
-    for first in range(0, total, AT_ONCE):
-        last = min(first + AT_ONCE, total)
+    for begin in range(0, total, AT_ONCE):
+        end = min(begin + AT_ONCE, total)
         if exact:
-            yield root[:, first:last].toarray().T
+            yield root[:, begin:end].toarray().T
         else:
-            signs = rng.choice([-1.0, 1.0], (number, last - first))
+            signs = rng.choice([-1.0, 1.0], (number, end - begin))
             yield np.asarray(root @ signs).T / np.sqrt(total)
 
 
 def _covariance_of_forms(
-    found: Solution,
+    solution: Solution,
     F: Sequence[Any],
     theta: Float[np.ndarray, " k"],
     independent: Float[np.ndarray, " rows"],
-    given: Bool[np.ndarray, " rows"],
+    is_other: Bool[np.ndarray, " rows"],
     rng: np.random.Generator,
     draws: int = AT_ONCE,
 ) -> Float[np.ndarray, "k k"]:
     """cov(q)_ij = 2·tr(V_i·MΣM·V_j·MΣM) of normal errors of the fitted Σ, by residuals drawn from
-    it; `independent`: variances of the rows, of which some are `given`. From 16 draws σ of a size
+    it; `independent`: variances of the rows, of which some are `is_other`. From 16 draws σ of a size
     is right to about 1/√32 = 18 %."""
     of_components = [lambda e, f=f: np.asarray((f @ (f.T @ e.T)).T) for f in F]
-    of_parts = [lambda e: e * ~given, *of_components]
+    of_parts = [lambda e: e * ~is_other, *of_components]
     parts = list(zip(theta[1:], of_components))
     sigma = lambda e: independent * e + sum(t * V(e) for t, V in parts if t > 0)
-    errors = np.sqrt(independent) * rng.standard_normal((draws, len(given)))
+    errors = np.sqrt(independent) * rng.standard_normal((draws, len(is_other)))
     for t, f in zip(theta[1:], F):
         if t > 0:
             errors += np.sqrt(t) * np.asarray((f @ rng.standard_normal((f.shape[1], draws))).T)
-    u, _ = remove_fit(found, errors)
-    b = [remove_fit(found, V(u))[0] for V in of_parts]
+    u, _ = remove_fit(solution, errors)
+    b = [remove_fit(solution, V(u))[0] for V in of_parts]
     Sb = [sigma(x) for x in b]
     G = np.array([[np.sum(x * y) / draws for y in Sb] for x in b])
     # Twice the symmetric part: the factor 2 of the covariance.

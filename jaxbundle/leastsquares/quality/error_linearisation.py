@@ -30,49 +30,51 @@ class LinearisedRows(NamedTuple):
     eliminated: Int[np.ndarray, " rows"]
 
 
-def linearise_rows(found: Solution) -> LinearisedRows:
+def linearise_rows(solution: Solution) -> LinearisedRows:
     """The rows of all observations of a solution."""
     import scipy.sparse as sp
 
-    plan = found.problem.plan
+    plan = solution.problem.plan
     starts, total = {}, 0
-    for o in found.problem.observations:
+    for o in solution.problem.observations:
         starts[o.name] = total
-        total += np.asarray(found.residuals[o.name]).size
-    first, unknowns = {}, 0
+        total += np.asarray(solution.residuals[o.name]).size
+    first_column, unknowns = {}, 0
     for g in plan.kept:
-        first[g] = unknowns
+        first_column[g] = unknowns
         unknowns += plan.groups[g].free.size
     # Indices of 32 bits: half the memory, and what sparse matrices have.
-    none = np.zeros(0, np.int32)
-    entries: list[tuple[np.ndarray, ...]] = [(none, none, np.zeros(0))]
+    no_entries = np.zeros(0, np.int32)
+    entries: list[tuple[np.ndarray, ...]] = [(no_entries, no_entries, np.zeros(0))]
     width = 0 if plan.eliminated is None else plan.groups[plan.eliminated].width
     Q, eliminated = np.zeros((total, width)), np.full(total, -1)
-    numbers = {o.name: o.number for o in found.problem.observations}
-    for part, (touches, E) in zip(plan.parts, _derivatives(*found.arguments)):
+    numbers = {o.name: o.number for o in solution.problem.observations}
+    for part, (touches, E) in zip(plan.parts, _derivatives(*solution.arguments)):
         n, (_, length) = numbers[part.set_name], part.source.shape
         place, source = np.asarray(part.place)[:n], np.asarray(part.source).ravel()
         # Observations of other parts of the set have an empty place.
-        own = np.flatnonzero(source[np.minimum(place, len(source) - 1)] == np.arange(n))
-        own = own[place[own] < len(source)]
-        place = place[own]
-        r = np.asarray(found.residuals[part.set_name]).shape[1]
-        row = (starts[part.set_name] + r * own)[:, None] + np.arange(r)
+        first_places = np.flatnonzero(source[np.minimum(place, len(source) - 1)] == np.arange(n))
+        first_places = first_places[place[first_places] < len(source)]
+        place = place[first_places]
+        r = np.asarray(solution.residuals[part.set_name]).shape[1]
+        row = (starts[part.set_name] + r * first_places)[:, None] + np.arange(r)
         for touch, J in zip(part.touches, touches):
             J = np.asarray(J).reshape(-1, *J.shape[2:])[place]
             wide = plan.groups[touch.group].width
-            column = first[touch.group] + touch.start + wide * np.asarray(touch.row)
+            column = first_column[touch.group] + touch.start + wide * np.asarray(touch.row)
             column = column[place // length][:, None] + np.arange(J.shape[2])
-            spread = lambda x, shape: np.broadcast_to(x.astype(np.int32), shape).ravel()
+            broadcast_ravelled = lambda x, shape: np.broadcast_to(x.astype(np.int32), shape).ravel()
             rows, columns = row[:, :, None], column[:, None, :]
-            entries.append((spread(rows, J.shape), spread(columns, J.shape), J.ravel()))
+            entries.append(
+                (broadcast_ravelled(rows, J.shape), broadcast_ravelled(columns, J.shape), J.ravel())
+            )
         if E is not None:
-            at = np.asarray(part.eliminated).ravel()[place]
+            eliminated_rows = np.asarray(part.eliminated).ravel()[place]
             # Q = E·L⁻ᵀ: with it P·x needs no solution of a point's equations.
-            L = np.asarray(found.factor.lower_inverse)[at]
+            L = np.asarray(solution.factor.lower_inverse)[eliminated_rows]
             J = np.asarray(E).reshape(-1, *E.shape[2:])[place]
             Q[row] = J @ L.transpose(0, 2, 1)
-            eliminated[row] = at[:, None]
+            eliminated[row] = eliminated_rows[:, None]
     rows, columns, values = (np.concatenate(x) for x in zip(*entries))
     del entries
     A = sp.csr_matrix((values, (rows, columns)), shape=(total, unknowns))
@@ -84,9 +86,9 @@ def linearise_rows(found: Solution) -> LinearisedRows:
 @compile_once
 def _derivatives(declared: Declared, plan: Plan, values: Values, data: Data) -> list[Any]:
     """The blocks of the touches and of the eliminated rows of every part."""
-    laid, prepared = lay_out_data(plan, data), prepare(declared, values)
+    chunked, prepared = lay_out_data(plan, data), prepare(declared, values)
     numbers = range(len(plan.parts))
-    return [differentiate(declared, plan, k, prepared, laid)[1:] for k in numbers]
+    return [differentiate(declared, plan, k, prepared, chunked)[1:] for k in numbers]
 
 
 class DatumDirections(NamedTuple):
@@ -114,29 +116,31 @@ class DatumDirections(NamedTuple):
         return Q @ self.of_eliminated[eliminated]
 
 
-def datum_of(found: Solution, linear: LinearisedRows) -> DatumDirections:
+def datum_of(solution: Solution, linear: LinearisedRows) -> DatumDirections:
     """The datum of a solution; without columns if nothing is open."""
-    plan, unknowns = found.problem.plan, linear.A.shape[1]
+    plan, unknowns = solution.problem.plan, linear.A.shape[1]
     rows, width = 0, linear.Q.shape[1]
     if plan.eliminated is not None:
         rows = plan.groups[plan.eliminated].rows
     if plan.datum is None:
-        none = np.zeros((unknowns, 0)), np.zeros((rows, width, 0))
-        return DatumDirections(*none, *none, np.zeros((0, 0)))
-    declared, _, values, _ = found.arguments
-    directions = _directions(declared, plan, values, found.moves)
+        no_columns = np.zeros((unknowns, 0)), np.zeros((rows, width, 0))
+        return DatumDirections(*no_columns, *no_columns, np.zeros((0, 0)))
+    declared, _, values, _ = solution.arguments
+    directions = _directions(declared, plan, values, solution.moves)
     G, B, gram = jax.tree.map(np.asarray, directions)
     d = len(gram)
-    kept = lambda x: np.concatenate([np.zeros((0, d)), *(x[g].reshape(-1, d) for g in plan.kept)])
-    conditions, e = kept(B), plan.eliminated
+    stack_kept = lambda x: np.concatenate(
+        [np.zeros((0, d)), *(x[g].reshape(-1, d) for g in plan.kept)]
+    )
+    conditions, e = stack_kept(B), plan.eliminated
     of_eliminated = motions = np.zeros((rows, width, d))
     if e is not None:
         motions = G[e]
-        of_eliminated = np.asarray(found.factor.lower_inverse) @ B[e]
+        of_eliminated = np.asarray(solution.factor.lower_inverse) @ B[e]
         # Q is zero where no row is eliminated.
         h = np.einsum("rw,rwd->rd", linear.Q, of_eliminated[linear.eliminated])
         conditions = conditions - linear.A.T @ h
-    return DatumDirections(kept(G), motions, conditions, of_eliminated, np.linalg.inv(gram))
+    return DatumDirections(stack_kept(G), motions, conditions, of_eliminated, np.linalg.inv(gram))
 
 
 @compile_once

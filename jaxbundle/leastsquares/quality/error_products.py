@@ -107,14 +107,14 @@ def sum_products(
     # of their batch needs, and what those left over add is cut away at the end.
     p, n, w = unknowns + 1, roots.narrow.shape[1] + 1, roots.wide.shape[1]
     d = datum.number
-    both, with_wide, wide = np.zeros((p + n, p + n)), np.zeros((p + n, w)), gram(roots.wide)
+    with_narrow, with_wide, wide = np.zeros((p + n, p + n)), np.zeros((p + n, w)), gram(roots.wide)
     AV, AV_wide, AVPVA = np.zeros((p, p + n)), np.zeros((p, w)), np.zeros((p, p))
     AVh, hVh, hF, hW = np.zeros((p, d)), np.zeros((d, d)), np.zeros((d, n)), np.zeros((d, w))
     FVF, powers = np.zeros(n), np.zeros(4)
-    for of in clusters:
-        for c in of.portions(of.A.shape[2] + of.F.shape[2] + w):
+    for of_equal_size in clusters:
+        for c in of_equal_size.portions(of_equal_size.A.shape[2] + of_equal_size.F.shape[2] + w):
             a = c.A.shape[2]
-            at = np.concatenate([c.A_at, p + c.F_at], 1)
+            columns = np.concatenate([c.A_at, p + c.F_at], 1)
             W = roots.wide_rows(c.rows)
             # WᵀPW = WᵀW − (QᵀW)ᵀ·QᵀW: three rows of QᵀW for a point instead of all of its rays.
             QW = _tall(c.Q.transpose(0, 2, 1) @ W)
@@ -123,35 +123,35 @@ def sum_products(
             A, F = X[:, :, :a], X[:, :, a:]
             h = datum.effects(c.Q, c.eliminated)
             # Rows of AᵀPW, FᵀPW and hᵀW, and of AᵀPVPW, in one product.
-            left = [X, h]
+            left_parts = [X, h]
             if c.V is not None:
                 VA, Vh = c.V @ A, c.V @ h
                 PVA = c.without_fit(VA)
-                left.append(PVA)
+                left_parts.append(PVA)
                 FVF += np.bincount(c.F_at.ravel(), np.sum(c.V @ F * F, 1).ravel(), n)
                 powers += _powers(c)
                 hVh += _tall(h).T @ _tall(Vh)
-            joint = np.concatenate(left, 2)
+            joint = np.concatenate(left_parts, 2)
             # Clusters of the same photographs add to the same places: one product for all of them.
             for some in c.by_columns():
-                to, x, y = at[some.start], _tall(X[some]), _tall(joint[some])
-                to_A, of_wide = to[:a], y.T @ _tall(W[some])
-                both[to[:, None], to] += x.T @ x
-                with_wide[to] += of_wide[: len(to)]
-                hW += of_wide[len(to) : len(to) + d]
-                hF[:, to[a:] - p] += _tall(h[some]).T @ _tall(c.F[some])
+                rows, x, y = columns[some.start], _tall(X[some]), _tall(joint[some])
+                rows_of_A, product_with_wide = rows[:a], y.T @ _tall(W[some])
+                with_narrow[rows[:, None], rows] += x.T @ x
+                with_wide[rows] += product_with_wide[: len(rows)]
+                hW += product_with_wide[len(rows) : len(rows) + d]
+                hF[:, rows[a:] - p] += _tall(h[some]).T @ _tall(c.F[some])
                 if c.V is not None:
-                    v, b = _tall(VA[some]), y[:, len(to) + d :]
-                    AV[to_A[:, None], to] += v.T @ x
-                    AV_wide[to_A] += of_wide[len(to) + d :]
-                    AVPVA[to_A[:, None], to_A] += b.T @ b
-                    AVh[to_A] += x[:, :a].T @ _tall(Vh[some])
+                    v, b = _tall(VA[some]), y[:, len(rows) + d :]
+                    AV[rows_of_A[:, None], rows] += v.T @ x
+                    AV_wide[rows_of_A] += product_with_wide[len(rows) + d :]
+                    AVPVA[rows_of_A[:, None], rows_of_A] += b.T @ b
+                    AVh[rows_of_A] += x[:, :a].T @ _tall(Vh[some])
     kept, narrow = slice(0, p - 1), slice(p, p + n - 1)
     mixed = roots.mix(with_wide)
     wide = roots.mix(roots.mix(wide).T)
     return ClusterSums(
-        np.concatenate([both[kept, narrow], mixed[kept]], 1),
-        np.block([[both[narrow, narrow], mixed[narrow]], [mixed[narrow].T, wide]]),
+        np.concatenate([with_narrow[kept, narrow], mixed[kept]], 1),
+        np.block([[with_narrow[narrow, narrow], mixed[narrow]], [mixed[narrow].T, wide]]),
         np.concatenate([hF[:, : n - 1], roots.mix(hW)], 1),
         AV[kept, kept],
         np.concatenate([AV[kept, narrow], roots.mix(AV_wide[kept])], 1),
@@ -172,24 +172,24 @@ def gram(F: Any) -> Matrix:
     key = np.random.default_rng(0).integers(1, 1 << 40, F.shape[1])[F.indices]
     pattern = np.add.reduceat(key, F.indptr[rows]) if len(rows) else rows
     order = np.argsort(pattern, kind="stable")
-    first = np.flatnonzero(np.diff(pattern[order], prepend=-1))
+    begins = np.flatnonzero(np.diff(pattern[order], prepend=-1))
     # Fewer than four rows of a pattern: the call costs more than a sparse product saves.
-    if 4 * len(first) > len(rows):
+    if 4 * len(begins) > len(rows):
         return (F.T @ F).toarray()
-    found, rows = np.zeros((F.shape[1],) * 2), rows[order]
-    for a, b in zip(first, [*first[1:], len(rows)]):
+    product, rows = np.zeros((F.shape[1],) * 2), rows[order]
+    for a, b in zip(begins, [*begins[1:], len(rows)]):
         start, number = F.indptr[rows[a:b]], count[rows[a]]
-        at = F.indices[start[0] : start[0] + number]
+        columns = F.indices[start[0] : start[0] + number]
         x = F.data[start[:, None] + np.arange(number)]
-        found[at[:, None], at] += x.T @ x
-    return found
+        product[columns[:, None], columns] += x.T @ x
+    return product
 
 
 def share_of_many(
     clusters: Sequence[Clusters],
     roots: RootColumns,
     FF: Matrix,
-    chosen: Bool[np.ndarray, " clusters"],
+    is_chosen: Bool[np.ndarray, " clusters"],
 ) -> Float[np.ndarray, " mixed"]:
     """The diagonal of FᵀPVPF of mixed wide roots, whose FᵀPF is given, from chosen clusters.
 
@@ -197,7 +197,7 @@ def share_of_many(
     them."""
     w = len(FF)
     part, of_white, like, white = np.zeros(w), np.zeros(w), 0.0, 0.0
-    for c in _chosen(clusters, chosen, w):
+    for c in _chosen_portions(clusters, is_chosen, w):
         W = c.without_fit(roots.mix(roots.wide_rows(c.rows)))
         V = not_none(c.V)
         part += np.sum(V @ W * W, (0, 1))
@@ -207,20 +207,20 @@ def share_of_many(
     # V = f·1 + (V − f·1), f its mean: the first part gives f·diag(FᵀPF), which is known exactly;
     # the second is small, and its error with it.
     factor = like / max(white, 1.0)
-    share = len(chosen) / max(chosen.sum(), 1)
+    share = len(is_chosen) / max(is_chosen.sum(), 1)
     return factor * np.diag(FF) + share * (part - factor * of_white)
 
 
-def _chosen(
-    clusters: Sequence[Clusters], chosen: Bool[np.ndarray, " clusters"], columns: int
+def _chosen_portions(
+    clusters: Sequence[Clusters], is_chosen: Bool[np.ndarray, " clusters"], columns: int
 ) -> Iterator[Clusters]:
     """Chosen clusters, some at a time."""
-    first = 0
-    for of in clusters:
-        own = np.flatnonzero(chosen[first : first + len(of.rows)])
-        first += len(of.rows)
-        if len(own):
-            yield from of.some(own).portions(columns)
+    begin = 0
+    for of_equal_size in clusters:
+        positions = np.flatnonzero(is_chosen[begin : begin + len(of_equal_size.rows)])
+        begin += len(of_equal_size.rows)
+        if len(positions):
+            yield from of_equal_size.some(positions).portions(columns)
 
 
 def _tall(x: Batch) -> Matrix:
@@ -244,21 +244,21 @@ class ErrorProducts:
 
     def __init__(
         self,
-        found: Solution,
+        solution: Solution,
         linear: LinearisedRows,
         clusters: Sequence[Clusters],
         roots: RootColumns,
         reduced: DenseFactor,
     ):
-        self.found, self.linear, self.clusters, self.roots = found, linear, clusters, roots
-        self.datum = datum_of(found, linear)
+        self.solution, self.linear, self.clusters, self.roots = solution, linear, clusters, roots
+        self.datum = datum_of(solution, linear)
         self.sums = sum_products(clusters, roots, linear.A.shape[1], self.datum)
-        factor = found.factor
+        factor = solution.factor
         # The factor of the reduced system that the solution has anyway; Y = L⁻¹·D·AᵀPF, so that
         # (AᵀPF)ᵀ·S⁻¹·AᵀPF = YᵀY.
         self.lower = np.asarray(reduced.lower)
-        kept = [np.asarray(factor.scale[g]).ravel() for g in found.problem.plan.kept]
-        self.scale = np.concatenate([np.zeros(0), *kept])[:, None]
+        scales = [np.asarray(factor.scale[g]).ravel() for g in solution.problem.plan.kept]
+        self.scale = np.concatenate([np.zeros(0), *scales])[:, None]
         self.Y = self._forth(self.sums.AF)
         self.few = self.sums.FF - self.Y.T @ self.Y
 
@@ -268,7 +268,7 @@ class ErrorProducts:
 
         return solve_triangular(self.lower, self.scale * x, lower=True)
 
-    def _back(self, x: Matrix) -> Matrix:
+    def _back_substitute(self, x: Matrix) -> Matrix:
         """D·L⁻ᵀ·x."""
         from scipy.linalg import solve_triangular
 
@@ -277,33 +277,33 @@ class ErrorProducts:
     def changes(self) -> tuple[Matrix, Matrix]:
         """The changes of kept unknowns by the columns of the roots, N⁻¹AᵀF without the datum, and
         the motions a into it."""
-        x, datum = self._back(self.Y), self.datum
+        x, datum = self._back_substitute(self.Y), self.datum
         return x, datum.inverse @ (datum.conditions.T @ x + self.sums.hF)
 
     def blocks_of_few(self, columns: slice, eliminated: bool) -> dict[str, np.ndarray]:
         """By group the covariance blocks X·Xᵀ that a component of few columns gives, of eliminated
         rows if wanted."""
-        plan, datum = self.found.problem.plan, self.datum
+        plan, datum = self.solution.problem.plan, self.datum
         x, a = (y[:, columns] for y in self.changes())
-        moved, found, first = x - datum.motions @ a, {}, 0
+        in_datum, blocks, begin = x - datum.motions @ a, {}, 0
         for g in plan.kept:
             n, w = plan.groups[g].free.shape
-            of = moved[first : first + n * w].reshape(n, w, -1)
-            found[g], first = of @ of.transpose(0, 2, 1), first + n * w
+            rows = in_datum[begin : begin + n * w].reshape(n, w, -1)
+            blocks[g], begin = rows @ rows.transpose(0, 2, 1), begin + n * w
         if eliminated and plan.eliminated is not None:
-            found[plan.eliminated] = self._eliminated_of_few(columns, x, a)
-        return found
+            blocks[plan.eliminated] = self._eliminated_of_few(columns, x, a)
+        return blocks
 
     def _eliminated_of_few(self, columns: slice, x: Matrix, a: Matrix) -> Batch:
         """The blocks of eliminated rows, whose changes are L⁻ᵀ·Qᵀ·(F − A·x) − G·a."""
         datum, number = self.datum, columns.stop - columns.start
         narrow = self.roots.narrow.shape[1]
-        found = np.zeros((*datum.motions_eliminated.shape[:2], self.linear.Q.shape[1]))
-        below = np.concatenate([x, np.zeros((1, number))])
-        for of in self.clusters:
-            if of.eliminated[0] < 0:
+        blocks = np.zeros((*datum.motions_eliminated.shape[:2], self.linear.Q.shape[1]))
+        padded = np.concatenate([x, np.zeros((1, number))])
+        for of_equal_size in self.clusters:
+            if of_equal_size.eliminated[0] < 0:
                 continue
-            for c in of.portions(number):
+            for c in of_equal_size.portions(number):
                 if columns.start >= narrow:
                     wide = slice(columns.start - narrow, columns.stop - narrow)
                     F = self.roots.mix(self.roots.wide_rows(c.rows))[:, :, wide]
@@ -312,44 +312,44 @@ class ErrorProducts:
                 turned = c.Q.transpose(0, 2, 1)
                 QF, QA = turned @ F, turned @ c.A
                 for some in c.by_columns():
-                    QF[some] -= QA[some] @ below[c.A_at[some.start]]
-                L = np.asarray(self.found.factor.lower_inverse)[c.eliminated]
+                    QF[some] -= QA[some] @ padded[c.A_at[some.start]]
+                L = np.asarray(self.solution.factor.lower_inverse)[c.eliminated]
                 change = L.transpose(0, 2, 1) @ QF - datum.motions_eliminated[c.eliminated] @ a
-                found[c.eliminated] = change @ change.transpose(0, 2, 1)
-        return found
+                blocks[c.eliminated] = change @ change.transpose(0, 2, 1)
+        return blocks
 
     def blocks_of_block(self, eliminated: bool) -> dict[str, np.ndarray]:
         """`blocks_of_few` of the component with a block for every cluster."""
-        plan, datum, p = self.found.problem.plan, self.datum, self.linear.A.shape[1]
+        plan, datum, p = self.solution.problem.plan, self.datum, self.linear.A.shape[1]
         d = datum.number
         # Errors e change the kept unknowns by x and the datum by a, both linear in two sums over
         # clusters, z = (x, a) = T·(Aᵀ·P·e, hᵀ·e), whose covariance is that of the sums.
-        inverse = self._back(self._forth(np.eye(p)))
+        inverse = self._back_substitute(self._forth(np.eye(p)))
         onto = datum.inverse @ datum.conditions.T @ inverse
         T = np.block([[inverse, np.zeros((p, d))], [onto, datum.inverse]])
         C = T @ np.block([[self.sums.AVA, self.sums.AVh], [self.sums.AVh.T, self.sums.hVh]]) @ T.T
         of_kept = np.concatenate([np.eye(p), -datum.motions], 1)
-        moved, found, first = of_kept @ C @ of_kept.T, {}, 0
+        in_datum, blocks, begin = of_kept @ C @ of_kept.T, {}, 0
         for g in plan.kept:
             n, w = plan.groups[g].free.shape
-            of = moved[first : first + n * w, first : first + n * w].reshape(n, w, n, w)
-            found[g], first = of[np.arange(n), :, np.arange(n)], first + n * w
+            rows = in_datum[begin : begin + n * w, begin : begin + n * w].reshape(n, w, n, w)
+            blocks[g], begin = rows[np.arange(n), :, np.arange(n)], begin + n * w
         if eliminated and plan.eliminated is not None:
-            found[plan.eliminated] = self._eliminated_of_block(T, C)
-        return found
+            blocks[plan.eliminated] = self._eliminated_of_block(T, C)
+        return blocks
 
     def _eliminated_of_block(self, T: Matrix, C: Matrix) -> Batch:
         """The blocks of eliminated rows, whose changes are α·e − β·z."""
         datum, p = self.datum, self.linear.A.shape[1]
-        found = np.zeros((*datum.motions_eliminated.shape[:2], self.linear.Q.shape[1]))
+        all_blocks = np.zeros((*datum.motions_eliminated.shape[:2], self.linear.Q.shape[1]))
         # The last of A's places stands for none.
         T, C = (np.insert(np.insert(x, p, 0.0, 0), p, 0.0, 1) for x in (T, C))
         of_datum = np.arange(p + 1, len(T))
-        for of in self.clusters:
-            if of.eliminated[0] < 0:
+        for of_equal_size in self.clusters:
+            if of_equal_size.eliminated[0] < 0:
                 continue
-            for c in of.portions(of.A.shape[2]):
-                L = np.asarray(self.found.factor.lower_inverse)[c.eliminated]
+            for c in of_equal_size.portions(of_equal_size.A.shape[2]):
+                L = np.asarray(self.solution.factor.lower_inverse)[c.eliminated]
                 alpha = L.transpose(0, 2, 1) @ c.Q.transpose(0, 2, 1)
                 beta = np.concatenate([alpha @ c.A, datum.motions_eliminated[c.eliminated]], 2)
                 Va = not_none(c.V) @ alpha.transpose(0, 2, 1)
@@ -357,15 +357,15 @@ class ErrorProducts:
                 onto = np.concatenate([c.without_fit(c.A), h], 2).transpose(0, 2, 1) @ Va
                 blocks = alpha @ Va
                 for some in c.by_columns():
-                    at = np.concatenate([c.A_at[some.start], of_datum])
-                    square = at[:, None], at
+                    columns = np.concatenate([c.A_at[some.start], of_datum])
+                    square = columns[:, None], columns
                     b = beta[some]
                     cross = b @ (T[square] @ onto[some])
                     # cov(α·e − β·z) = α·V·αᵀ + β·C·βᵀ − β·cov(z, e)·αᵀ − its transpose
                     blocks[some] += b @ C[square] @ b.transpose(0, 2, 1)
                     blocks[some] -= cross + cross.transpose(0, 2, 1)
-                found[c.eliminated] = blocks
-        return found
+                all_blocks[c.eliminated] = blocks
+        return all_blocks
 
     def powers(self, at_most: int, rng: np.random.Generator) -> "Powers":
         """Traces and products with powers of M·V of the component with a block for every cluster,
@@ -378,8 +378,8 @@ class ErrorProducts:
         # skewness and the uncertainty of sizes need.
         number = sum(len(c.rows) for c in self.clusters)
         order, n = rng.permutation(number), self.roots.narrow.shape[1]
-        chosen, near = np.zeros(number, bool), np.zeros(number, bool)
-        chosen[order[:at_most]] = near[order[: 10 * at_most]] = True
+        is_chosen, near = np.zeros(number, bool), np.zeros(number, bool)
+        is_chosen[order[:at_most]] = near[order[: 10 * at_most]] = True
         exact = share_of_many(self.clusters, self.roots, s.FF[n:, n:], near)
         exact = np.concatenate([s.FVF, exact]) - 2 * np.sum(self.Y * self._forth(s.AVF), 0)
         exact = exact + np.sum(self.Y * (a1 @ self.Y), 0)
@@ -394,8 +394,8 @@ class ErrorProducts:
         )
         # Errors along a track are nearly independent ones, V ≈ f·1 with F̃ᵀVF̃ ≈ f·S: only the
         # difference is from some clusters.
-        like = t1 / max(self.found.problem.counts.redundancy, 1)
-        for c in _chosen(self.clusters, chosen, p + q):
+        like = t1 / max(self.solution.problem.counts.redundancy, 1)
+        for c in _chosen_portions(self.clusters, is_chosen, p + q):
             x0 = np.concatenate(self._dense(c), 2)
             V = not_none(c.V)
             # x0 = (U, F̃); V·x0, P·V·x0, V·P·V·x0, P·V·P·V·x0: products of two of them are all
@@ -412,7 +412,7 @@ class ErrorProducts:
             a4 += x4[:, :p].T @ x4[:, :p]
             R2 += f2.T @ f2
             R3 += f2.T @ x3[:, p:]
-        share = number / max(chosen.sum(), 1)
+        share = number / max(is_chosen.sum(), 1)
         a3, a4, b2, near, R2, R3 = (share * x for x in (a3, a4, b2, near, R2, R3))
         # From powers of P·V between F̃ to those of M·V: what the kept unknowns take is subtracted.
         R1 = like * self.few + near
@@ -438,24 +438,24 @@ class ErrorProducts:
     def traces(self, max_clusters: int, rng: np.random.Generator) -> ReducedTraces:
         """The traces of all components; `max_clusters`: see `powers`."""
         powers = self.powers(max_clusters, rng) if self.roots.many is not None else None
-        redundancy = self.found.problem.counts.redundancy
+        redundancy = self.solution.problem.counts.redundancy
         return ReducedTraces(self.few, self.roots.of_components, powers, redundancy)
 
     def blocks(self, theta: Float[np.ndarray, " k"]) -> list[dict[str, np.ndarray]]:
         """By table the covariance blocks that every component of θ = 1 gives; of the eliminated
         table, and of the others of a component of many columns, only where its θ is not zero."""
-        found: list[dict[str, np.ndarray]] = []
+        by_component: list[dict[str, np.ndarray]] = []
         for t, columns in zip(theta[1:], self.roots.of_components):
             if columns is None:
                 blocks = self.blocks_of_block(bool(t != 0))
             else:
                 blocks = self.blocks_of_few(columns, bool(t != 0))
-            found.append(self._by_table(blocks))
-        return found
+            by_component.append(self._by_table(blocks))
+        return by_component
 
     def _by_table(self, blocks: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Blocks of groups as those of the rows of tables; zero for held unknowns."""
-        problem, found = self.found.problem, {}
+        problem, by_table = self.solution.problem, {}
         for table in problem.tables:
             members = [
                 (g, m)
@@ -468,29 +468,29 @@ class ErrorProducts:
             width = table.space.width
             of_table = np.zeros((problem.sizes["table", table.name], width, width))
             for g, m in members:
-                at = slice(m.start, m.start + m.width)
+                columns = slice(m.start, m.start + m.width)
                 rows = np.arange(len(blocks[g])) if m.rows is None else np.asarray(m.rows)
-                np.add.at(of_table, rows, blocks[g][:, at, at])
-            found[table.name] = of_table[: table.rows]
-        return found
+                np.add.at(of_table, rows, blocks[g][:, columns, columns])
+            by_table[table.name] = of_table[: table.rows]
+        return by_table
 
 
 def error_products(
-    found: Solution, roots: Sequence[tuple[Any, Matrix | None]], max_columns: int
+    solution: Solution, roots: Sequence[tuple[Any, Matrix | None]], max_columns: int
 ) -> ErrorProducts | None:
     """The products of roots, sparse matrices [rows, columns] with what mixes their columns.
 
     None if the reduced system is not factorised densely, or if several have more than
     `max_columns` and their errors are shared by more than one cluster."""
     sorted_roots = _sort_roots(roots, max_columns)
-    reduced = found.factor.reduced
+    reduced = solution.factor.reduced
     if sorted_roots is None or not isinstance(reduced, DenseFactor):
         return None
-    linear = linearise_rows(found)
+    linear = linearise_rows(solution)
     clusters = lay_out_clusters(linear, sorted_roots.narrow, sorted_roots.many)
     if clusters is None:
         return None
-    return ErrorProducts(found, linear, clusters, sorted_roots, reduced)
+    return ErrorProducts(solution, linear, clusters, sorted_roots, reduced)
 
 
 def _sort_roots(
@@ -509,21 +509,21 @@ def _sort_roots(
     few = [k for k in range(len(roots)) if k not in many]
     # Narrow ones first: they are laid out by clusters, wide ones read from their sparse matrix.
     few.sort(key=lambda k: dense(roots[k][0]))
-    none = sp.csr_matrix((roots[0][0].shape[0], 0))
-    narrow, wide, mixed, first = [none], [none], [], 0
+    empty = sp.csr_matrix((roots[0][0].shape[0], 0))
+    narrow, wide, mixed, begin = [empty], [empty], [], 0
     for k in few:
         root, mixing = roots[k]
         number = root.shape[1]
         if dense(root):
-            before = sum(x.shape[1] for x in wide)
-            mixed.append((slice(before, before + number), mixing))
+            columns_before = sum(x.shape[1] for x in wide)
+            mixed.append((slice(columns_before, columns_before + number), mixing))
             wide.append(root)
         else:
             narrow.append(root if mixing is None else root @ _repeat(mixing, number))
         if mixing is not None:
             number = number // len(mixing) * mixing.shape[1]
-        of_components[k] = slice(first, first + number)
-        first += number
+        of_components[k] = slice(begin, begin + number)
+        begin += number
     of_many = None
     for k in many:
         root, mixing = roots[k]

@@ -109,20 +109,20 @@ def widenings(
             continue  # independent errors alone
         # Of the θ that are not zero, in the system of these alone.
         inverse = np.linalg.pinv(T[np.ix_(some, some)], 1e-10, hermitian=True)
-        spread = inverse @ forms[np.ix_(some, some)] @ inverse
-        sigma = np.sqrt(np.diag(spread))
-        of = np.flatnonzero((positive == pattern).all(1))
-        block = np.ix_(of, some)
-        excess = np.zeros(len(of))
+        covariance = inverse @ forms[np.ix_(some, some)] @ inverse
+        sigma = np.sqrt(np.diag(covariance))
+        rows = np.flatnonzero((positive == pattern).all(1))
+        block = np.ix_(rows, some)
+        excess = np.zeros(len(rows))
         for parts in tables:
-            excess = np.maximum(excess, _excess(theta[block], spread, parts[block]))
+            excess = np.maximum(excess, _excess(theta[block], covariance, parts[block]))
         factor[block] += excess[:, None] * sigma / theta[block]
     return factor
 
 
 def _excess(
     theta: Float[np.ndarray, "n s"],
-    spread: Float[np.ndarray, "s s"],
+    covariance: Float[np.ndarray, "s s"],
     parts: Float[np.ndarray, "n s unknowns"],
     coverage: float = 0.95,
     min_degrees: float = 3.0,
@@ -132,8 +132,8 @@ def _excess(
     upper = 1 - (1 - coverage) / 2
     variance = (theta[:, None] @ parts)[:, 0]
     free = variance > 0
-    of_variance = np.sum((spread @ parts) * parts, 1)
-    of_sigma = np.sqrt(np.diag(spread)) @ parts
+    of_variance = np.sum((covariance @ parts) * parts, 1)
+    of_sigma = np.sqrt(np.diag(covariance)) @ parts
     degrees = _median(2 * variance**2, of_variance, free)
     t = np.array([t_quantile(upper, d) for d in np.maximum(degrees, min_degrees)])
     excess = ((t / normal_quantile(upper)) ** 2 - 1) * _median(variance, of_sigma, free)
@@ -178,17 +178,21 @@ def _significant(
     """θ ≥ 0 of the components whose θ is beyond the quantile that it has in the system of all that
     are left, if errors are independent; the least significant is left out first."""
     # The mean square of all residuals: θ_0 may be zero, where others are in every observation.
-    kept, white = np.arange(len(q)), max(q[0] / T[0, 0], 0.0)
+    components, white = np.arange(len(q)), max(q[0] / T[0, 0], 0.0)
     while True:
-        part = T[np.ix_(kept, kept)]
-        theta = _nonnegative(part, q[kept])
+        part = T[np.ix_(components, components)]
+        theta = _nonnegative(part, q[components])
         inverse = np.linalg.pinv(part, 1e-10, hermitian=True)
         # The covariance of q is 2·T·σ0⁴ for independent errors.
         sigma = np.sqrt(2 * np.diag(inverse))
-        limit = np.full(len(kept), critical)
+        limit = np.full(len(components), critical)
         if cubes is not None:
             third = 8 * np.einsum(
-                "na,nb,nc,abc->n", inverse, inverse, inverse, cubes[np.ix_(kept, kept, kept)]
+                "na,nb,nc,abc->n",
+                inverse,
+                inverse,
+                inverse,
+                cubes[np.ix_(components, components, components)],
             )
             level = normal_probability(critical)
             skewness = third / np.where(sigma > 0, sigma, 1.0) ** 3
@@ -196,18 +200,18 @@ def _significant(
         limit = limit * white * sigma
         short = theta[1:] < limit[1:]
         if not short.any():
-            found = np.zeros(len(q))
-            found[kept] = theta
-            return found
-        kept = np.delete(kept, 1 + np.argmin(theta[1:] / np.maximum(limit[1:], 1e-300)))
+            sizes = np.zeros(len(q))
+            sizes[components] = theta
+            return sizes
+        components = np.delete(components, 1 + np.argmin(theta[1:] / np.maximum(limit[1:], 1e-300)))
 
 
 def _scores(T: Float[np.ndarray, "k k"], q: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
     """How far each quadratic form exceeds that of independent errors alone, in units of its σ."""
     white = q[0] / T[0, 0]
     variance = np.diag(T) - T[:, 0] ** 2 / T[0, 0]
-    away = q - T[:, 0] * white
+    excess = q - T[:, 0] * white
     # The form of the independent part determines its size: it exceeds nothing
     # (a difference of two numbers of the size of T: smaller ones are rounding).
     good = variance > 1e-9 * np.diag(T)
-    return np.where(good, away / np.sqrt(2 * np.where(good, variance, 1.0)) / white, 0.0)
+    return np.where(good, excess / np.sqrt(2 * np.where(good, variance, 1.0)) / white, 0.0)

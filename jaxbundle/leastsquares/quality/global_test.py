@@ -38,36 +38,36 @@ def chi_squared_test(
     vtpv: float, redundancy: int, origin: str = STATED, significance: float = LEVEL
 ) -> dict:
     """χ² test of vᵀPv against a variance factor of 1, two-sided: `vtpv`; `low`, `high`, the
-    interval; `passed`, None if nothing is tested; `sigma_origin`."""
-    low = high = passed = None
+    interval; `has_passed`, None if nothing is tested; `sigma_origin`."""
+    low = high = has_passed = None
     if redundancy > 0:
         ends = significance / 2, 1 - significance / 2
         low, high = (chi2_quantile(p, redundancy) for p in ends)
         if is_tested(redundancy, origin):
-            passed = low <= vtpv <= high
-    return {"vtpv": vtpv, "low": low, "high": high, "passed": passed, "sigma_origin": origin}
+            has_passed = low <= vtpv <= high
+    return {"vtpv": vtpv, "low": low, "high": high, "passed": has_passed, "sigma_origin": origin}
 
 
 def describe_test(
-    found: dict, unit: str, significance: float = LEVEL, shared_errors: bool = False
+    test: dict, unit: str, significance: float = LEVEL, shared_errors: bool = False
 ) -> str:
     """The conclusion of a `chi_squared_test`, or why there is none; `unit`: of weight, such as
     "1 mm"; `shared_errors`: whether an error model found errors that residuals hardly show."""
-    if found["low"] is None:
+    if test["low"] is None:
         return "no redundancy: σ0 and standard deviations cannot be estimated"
-    if found["sigma_origin"] == ESTIMATED:
+    if test["sigma_origin"] == ESTIMATED:
         return "not done: the σ were estimated from these residuals, so that σ0 is 1"
-    if found["passed"] is None:
+    if test["passed"] is None:
         return f"no a priori σ was given: {unit} is a unit of weight; σ0 a posteriori estimates it"
-    vtpv, low, high = (f"{found[name]:.5g}" for name in ("vtpv", "low", "high"))
-    said = (
-        f"{'' if found['passed'] else 'not '}passed: vᵀPv {vtpv}, "
+    vtpv, low, high = (f"{test[name]:.5g}" for name in ("vtpv", "low", "high"))
+    beginning = (
+        f"{'' if test['passed'] else 'not '}passed: vᵀPv {vtpv}, "
         f"{100 * (1 - significance):g} % interval {low} to {high}; "
     )
-    if found["passed"] and shared_errors:
-        return f"{said}it does not show errors that observations share"
-    if found["passed"]:
-        return f"{said}the a priori σ are confirmed"
-    if found["vtpv"] < found["low"]:
-        return f"{said}the observations are better than their a priori σ"
-    return f"{said}the a priori σ are too small, blunders are left, or the cameras lack parameters"
+    if test["passed"] and shared_errors:
+        return f"{beginning}it does not show errors that observations share"
+    if test["passed"]:
+        return f"{beginning}the a priori σ are confirmed"
+    if test["vtpv"] < test["low"]:
+        return f"{beginning}the observations are better than their a priori σ"
+    return f"{beginning}the a priori σ are too small, blunders are left, or the cameras lack parameters"

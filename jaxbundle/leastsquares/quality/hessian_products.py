@@ -39,22 +39,24 @@ def _look_up_changes(
     declared: Declared, part: ObservationPart, moves: Mapping[str, Rows]
 ) -> Float[Array, "chunks length n"]:
     """The changes of all directions of the slots of every observation; 0 for tables at rest."""
-    found = []
-    for name, at, width in zip(
+    changes = []
+    for name, rows, width in zip(
         declared.kinds[part.set_name].of, part.lookup, widths_of(declared, part)
     ):
         shape = (*part.source.shape, width)
         # Rows looked up by chunk are those of all of its observations.
-        change = moves[name][at if at.ndim == 2 else at[:, None]] if name in moves else 0.0
+        change = moves[name][rows if rows.ndim == 2 else rows[:, None]] if name in moves else 0.0
         if width:
-            found.append(jnp.broadcast_to(change, shape))
-    return jnp.concatenate(found, -1)
+            changes.append(jnp.broadcast_to(change, shape))
+    return jnp.concatenate(changes, -1)
 
 
 def _multiply_each(
-    found: SecondOrder, delta: Float[Array, "chunks length n"]
+    derivatives: SecondOrder, delta: Float[Array, "chunks length n"]
 ) -> Float[Array, "chunks length n"]:
     # Without the zeros at the end.
-    J, curvature = found.jacobian[..., :-1], found.curvature[..., :-1, :-1]
-    along = jnp.einsum("clri,cli->clr", J, delta)
-    return jnp.einsum("clri,clr->cli", J, along) + jnp.einsum("clij,clj->cli", curvature, delta)
+    J, curvature = derivatives.jacobian[..., :-1], derivatives.curvature[..., :-1, :-1]
+    first_order = jnp.einsum("clri,cli->clr", J, delta)
+    return jnp.einsum("clri,clr->cli", J, first_order) + jnp.einsum(
+        "clij,clj->cli", curvature, delta
+    )

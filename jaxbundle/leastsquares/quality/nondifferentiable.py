@@ -27,19 +27,23 @@ def without_derivatives(problem: Problem, values: Values, sets: Collection[str])
     """The observations of these sets, in words, whose residuals or derivatives are not finite at
     `values`."""
     data = complete_data(problem, dataclasses.replace(problem.data, start=values))
-    plan, laid = fill_places(problem.plan, lay_out_data(problem.plan, data))
+    plan, chunked = fill_places(problem.plan, lay_out_data(problem.plan, data))
     # Any direction that moves every free unknown shows them.
-    along = {name: group.free for name, group in problem.plan.groups.items()}
+    all_free = {name: group.free for name, group in problem.plan.groups.items()}
 
-    def seen(change: Tangent) -> tuple[Float[Array, "chunks length r"], ...]:
-        moved = retract(problem.declared, plan, data.start, change)
-        return residuals(problem.declared, plan, moved, laid)
+    def residuals_after(change: Tangent) -> tuple[Float[Array, "chunks length r"], ...]:
+        tables = retract(problem.declared, plan, data.start, change)
+        return residuals(problem.declared, plan, tables, chunked)
 
-    still = jax.tree.map(jnp.zeros_like, along)
-    parts = [abs(v) + abs(dv) for v, dv in zip(*jax.jvp(seen, (still,), (along,)))]
-    found = restore_order(plan, parts)
-    for given in (o for o in problem.observations if o.name in sets):
+    zero_change = jax.tree.map(jnp.zeros_like, all_free)
+    parts = [
+        abs(v) + abs(dv) for v, dv in zip(*jax.jvp(residuals_after, (zero_change,), (all_free,)))
+    ]
+    sizes = restore_order(plan, parts)
+    for observation_set in (o for o in problem.observations if o.name in sets):
         # Rows behind the observations fill up the size of the program.
-        finite = np.isfinite(np.asarray(found[given.name])[: given.number]).all(1)
+        finite = np.isfinite(np.asarray(sizes[observation_set.name])[: observation_set.number]).all(
+            1
+        )
         for row in np.flatnonzero(~finite):
-            yield given.label(problem.tables, int(row))
+            yield observation_set.label(problem.tables, int(row))

@@ -74,8 +74,8 @@ def scaled_system(
     plan, data = problem.plan, pad_data(problem, problem.data)
     values = pad_values(problem, values)
     moves = None if plan.datum is None else directions_of_motions(problem.declared, values)
-    found = _scale(problem.declared, plan, values, data, moves)
-    S, V, G = jax.tree.map(np.asarray, found)
+    system = _scale(problem.declared, plan, values, data, moves)
+    S, V, G = jax.tree.map(np.asarray, system)
     return np.tril(S) + np.tril(S, -1).T, V, G
 
 
@@ -99,8 +99,8 @@ def _name_singular(problem: Problem, V: Float[np.ndarray, "rows w w"]) -> list[s
     group, table = problem.plan.groups[e], problem.table(e)
     finite = np.asarray(np.isfinite(V).all((1, 2)))
     V = np.where(finite[:, None, None], V, np.eye(V.shape[1]))
-    held = 1.0 - np.asarray(group.free)
-    V = V + held[:, :, None] * np.eye(V.shape[1])
+    held_directions = 1.0 - np.asarray(group.free)
+    V = V + held_directions[:, :, None] * np.eye(V.shape[1])
     diagonal = np.diagonal(V, axis1=1, axis2=2)
     scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     smallest = np.linalg.eigvalsh(V * scale[:, :, None] * scale[:, None, :])[:, 0]

@@ -65,14 +65,14 @@ def precision(
             not_none(of)(without_filling(problem, retract(declared, plan, data.start, change)))
         )
 
-    still = zero_tangent(plan)
+    zero_change = zero_tangent(plan)
     if of is None:
-        rows = jax.tree.map(lambda x: jnp.zeros((0, *x.shape)), still)
+        rows = jax.tree.map(lambda x: jnp.zeros((0, *x.shape)), zero_change)
     else:
-        rows = jax.jacrev(functions)(still)
-    own, covariance = covariances(declared, plan, data, rows)
-    found = TablePrecision(without_filling(problem, own), covariance)
-    return jax.tree.map(lambda C: sigma0**2 * C, found)
+        rows = jax.jacrev(functions)(zero_change)
+    cofactor_blocks, covariance = covariances(declared, plan, data, rows)
+    table_precision = TablePrecision(without_filling(problem, cofactor_blocks), covariance)
+    return jax.tree.map(lambda C: sigma0**2 * C, table_precision)
 
 
 @compile_once
@@ -81,20 +81,20 @@ def covariances(
 ) -> tuple[dict[str, Float[Array, "rows width width"]], Float[Array, "functions functions"]]:
     """Cofactors of all tables and of linear functions `rows` of the unknowns, for data padded to
     the sizes of the plan (`problem.pad_data`): shared by designs of one shape."""
-    filled, laid = fill_places(plan, lay_out_data(plan, data))
-    normal = normal_equations(declared, filled, data.start, laid)[-1]
+    filled, chunked = fill_places(plan, lay_out_data(plan, data))
+    normal = normal_equations(declared, filled, data.start, chunked)[-1]
     factor = factorise(Normal(plan, normal))
-    own = blocks_of_tables(
+    blocks = blocks_of_tables(
         declared, plan, cofactors(declared, data.start, factor).diagonal_blocks, data.start
     )
-    return own, propagate(declared, data.start, factor, rows)
+    return blocks, propagate(declared, data.start, factor, rows)
 
 
 @compile_once
 def redundancy(declared: Declared, plan: Plan, data: Data) -> Mapping[int, Float[AnyArray, "n r"]]:
     """Redundancy numbers by set, for data padded to the sizes of the plan."""
-    filled, laid = fill_places(plan, lay_out_data(plan, data))
-    normal = normal_equations(declared, filled, data.start, laid)[-1]
+    filled, chunked = fill_places(plan, lay_out_data(plan, data))
+    normal = normal_equations(declared, filled, data.start, chunked)[-1]
     factor = factorise(Normal(plan, normal))
     Q = cofactors(declared, data.start, factor)
     return reliability(declared, plan, data.start, data, Q).redundancy

@@ -80,7 +80,7 @@ class ReducedTraces:
         S, sizes = self.S, np.zeros(len(self.S))
         for k, a in self.few:
             sizes[a] = theta[k]
-        by_column, found = S * sizes, np.zeros(self.T.shape)
+        by_column, covariance = S * sizes, np.zeros(self.T.shape)
         # K = F̃ᵀΣF̃: what the errors of all components give in the columns of the roots.
         K = theta[0] * S + by_column @ S
         if self.powers is not None:
@@ -89,19 +89,19 @@ class ReducedTraces:
             K = K + of_t * R1
             B = theta[0] * np.eye(len(S)) + by_column
             BR = B @ R2
-            both = B @ R1 @ B.T + of_t * (BR + BR.T) + of_t**2 * R3
+            combined = B @ R1 @ B.T + of_t * (BR + BR.T) + of_t**2 * R3
             # V between the columns of a component, through both Σ.
             for k, a in self.few:
-                found[k, t] = found[t, k] = np.trace(both[a, a])
+                covariance[k, t] = covariance[t, k] = np.trace(combined[a, a])
             R = R1 * sizes
             mixed = 2 * (theta[0] * np.trace(R2 * sizes) + of_t * np.trace(R3 * sizes))
             powers = (
                 np.array([theta[0] ** 2, 2 * theta[0] * of_t, of_t**2]) @ self.powers.traces[1:]
             )
-            found[t, t] = powers + mixed + np.sum(R * R.T)
+            covariance[t, t] = powers + mixed + np.sum(R * R.T)
         for i, a in self.few:
             for j, b in self.few:
-                found[i, j] = np.sum(K[a, b] ** 2)
-        found[0] = np.einsum("a,b,ajb->j", theta, theta, self.cubes)
-        found[:, 0] = found[0]
-        return 2 * found
+                covariance[i, j] = np.sum(K[a, b] ** 2)
+        covariance[0] = np.einsum("a,b,ajb->j", theta, theta, self.cubes)
+        covariance[:, 0] = covariance[0]
+        return 2 * covariance

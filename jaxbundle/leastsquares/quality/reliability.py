@@ -70,9 +70,9 @@ def reliability(
     declared: Declared, plan: Plan, values: Values, data: Data, Q: Cofactors
 ) -> Reliability:
     """Redundancy numbers and test statistics of all observations."""
-    laid = lay_out_data(plan, data)
-    found = hat_blocks(declared, plan, values, laid, Q)
-    whitened, hats, eliminated_leverages = (restore_order(plan, rows) for rows in found)
+    chunked = lay_out_data(plan, data)
+    by_part = hat_blocks(declared, plan, values, chunked, Q)
+    whitened, hats, eliminated_leverages = (restore_order(plan, rows) for rows in by_part)
     by_set = {
         o: _correlated(data.weight[o], u, hats[o], eliminated_leverages[o])
         if data.weight[o].ndim == 3
@@ -89,14 +89,14 @@ def _uncorrelated(
     hat: Float[Array, "n rc"],
     eliminated_leverage: Float[Array, "n rc"],
 ) -> dict[str, Float[AnyArray, "n r"]]:
-    used, r = weight > 0, v.shape[-1]
+    has_weight, r = weight > 0, v.shape[-1]
     hat, joint, eliminated_leverage = hat[:, :r], hat[:, r:], eliminated_leverage[:, :r]
     return {
         "residual": v,
         "standard": v,
-        "gain": used.astype(float),
-        "redundancy": jnp.where(used, jnp.clip(1 - hat, 0.0, 1.0), 0.0),
-        "w": _test(v, hat, used),
+        "gain": has_weight.astype(float),
+        "redundancy": jnp.where(has_weight, jnp.clip(1 - hat, 0.0, 1.0), 0.0),
+        "w": _test(v, hat, has_weight),
         "hat": hat,
         "eliminated_leverage": eliminated_leverage,
         "joint": joint,
@@ -110,30 +110,30 @@ def _correlated(
     eliminated_leverage: Float[Array, "n r r"],
 ) -> dict[str, Float[AnyArray, "n r"]]:
     """Of whitening matrices L⁻¹ [n, r, r] and blocks B of the same shape."""
-    used = diagonal_of(weight) > 0
-    L = _invert_lower(jnp.where(used[..., None], weight, jnp.eye(weight.shape[-1])))
+    has_weight = diagonal_of(weight) > 0
+    L = _invert_lower(jnp.where(has_weight[..., None], weight, jnp.eye(weight.shape[-1])))
     sigma = jnp.sqrt((L**2).sum(2))
     length = jnp.sqrt((weight**2).sum(1))  # √Pᵢᵢ
-    n = weight / jnp.where(used, length, 1.0)[:, None, :]
-    along = lambda B: jnp.einsum("nki,nkl,nli->ni", n, B, n)
-    h, standard = along(hat), jnp.einsum("nki,nk->ni", n, u)
+    n = weight / jnp.where(has_weight, length, 1.0)[:, None, :]
+    along_normals = lambda B: jnp.einsum("nki,nkl,nli->ni", n, B, n)
+    h, standard = along_normals(hat), jnp.einsum("nki,nk->ni", n, u)
     r = jnp.einsum("nik,nkl,nli->ni", L, jnp.eye(weight.shape[-1]) - hat, weight)
     return {
         "residual": jnp.einsum("nik,nk->ni", L, u) / sigma,
         "standard": standard,
-        "gain": jnp.where(used, sigma * length, 0.0),
-        "redundancy": jnp.where(used, r, 0.0),
-        "w": _test(standard, h, used),
+        "gain": jnp.where(has_weight, sigma * length, 0.0),
+        "redundancy": jnp.where(has_weight, r, 0.0),
+        "w": _test(standard, h, has_weight),
         "hat": h,
-        "eliminated_leverage": along(eliminated_leverage),
+        "eliminated_leverage": along_normals(eliminated_leverage),
         "joint": jnp.zeros((len(u), 0)),
     }
 
 
 def _test(
-    standard: Float[Array, "n r"], hat: Float[Array, "n r"], used: Bool[AnyArray, "n r"]
+    standard: Float[Array, "n r"], hat: Float[Array, "n r"], has_weight: Bool[AnyArray, "n r"]
 ) -> Float[Array, "n r"]:
-    controlled = used & (1 - hat > MIN_REDUNDANCY)
+    controlled = has_weight & (1 - hat > MIN_REDUNDANCY)
     return jnp.where(controlled, standard / jnp.sqrt(jnp.where(controlled, 1 - hat, 1.0)), jnp.nan)
 
 
@@ -149,19 +149,19 @@ def _invert_lower(W: Float[AnyArray, "n r r"]) -> Float[AnyArray, "n r r"]:
 
 
 def hat_blocks(
-    declared: Declared, plan: Plan, values: Values, laid: ChunkedData, Q: Cofactors
+    declared: Declared, plan: Plan, values: Values, chunked: ChunkedData, Q: Cofactors
 ) -> Iterable[tuple[Array, ...]]:
     """Of every part, from the blocks of Q that each observation touches: whitened residuals
     [chunks, length, r], B, and its part E·V⁻¹·Eᵀ of the eliminated row alone; of B the diagonal
     and, of two residuals, the element between them, [chunks, length, r or 3], or for correlated
     observations all of it, [chunks, length, r, r]."""
     prepared = prepare(declared, values)
-    found = []
+    blocks = []
     for number in range(len(plan.parts)):
-        correlated = isinstance(laid.weight[number][0], tuple)
+        correlated = isinstance(chunked.weight[number][0], tuple)
         of_chunk = partial(_hat_of_chunk, Q, correlated)
-        found.append(differentiate_chunks(declared, plan, number, prepared, laid, of_chunk))
-    return zip(*found) if found else ((), (), ())
+        blocks.append(differentiate_chunks(declared, plan, number, prepared, chunked, of_chunk))
+    return zip(*blocks) if blocks else ((), (), ())
 
 
 def _hat_of_chunk(
@@ -203,31 +203,33 @@ def _diagonal_and_joint(
     diagonal = jnp.sum(a * b, -1)
     if a.shape[1] != 2:
         return diagonal
-    between = jnp.sum(a[:, 0] * b[:, 1] + a[:, 1] * b[:, 0], -1, keepdims=True) / 2
-    return jnp.concatenate([diagonal, between], -1)
+    joint = jnp.sum(a[:, 0] * b[:, 1] + a[:, 1] * b[:, 0], -1, keepdims=True) / 2
+    return jnp.concatenate([diagonal, joint], -1)
 
 
 def _kept_cofactors(part: ObservationPart, Q: Cofactors) -> Float[Array, "n n"]:
     """The block of Q of all kept rows that a chunk touches, in the order of its touches."""
     touches = part.touches
-    cut = lambda B, rows, columns: B[rows.start : rows.stop, columns.start : columns.stop]
+    sub_block = lambda B, rows, columns: B[rows.start : rows.stop, columns.start : columns.stop]
     blocks: list[list[Any]] = [[None] * len(touches) for _ in touches]
     for t, touch in enumerate(touches):
-        blocks[t][t] = cut(Q.kept.diagonal_blocks[touch.group][touch.row], touch, touch)
+        blocks[t][t] = sub_block(Q.kept.diagonal_blocks[touch.group][touch.row], touch, touch)
     for coupling in part.couplings:
         first, second = touches[coupling.first], touches[coupling.second]
-        found: Any = 0.0
+        block: Any = 0.0
         if coupling.block is not None:
             # Stored below the diagonal; `turned` where this chunk has the later row second.
             B = Q.kept.off_diagonal_blocks[first.group, second.group][coupling.block]
-            found = cut(B, first, second)
+            block = sub_block(B, first, second)
             if coupling.turned is not None:
-                found = jnp.where(coupling.turned > 0, cut(B, second, first).T, found)
+                block = jnp.where(coupling.turned > 0, sub_block(B, second, first).T, block)
         if coupling.same is not None:
-            on = cut(Q.kept.diagonal_blocks[first.group][first.row], first, second)
-            found = jnp.where(coupling.same > 0, on, found)
-        blocks[coupling.first][coupling.second] = found
-        blocks[coupling.second][coupling.first] = found.T
+            diagonal_block = sub_block(
+                Q.kept.diagonal_blocks[first.group][first.row], first, second
+            )
+            block = jnp.where(coupling.same > 0, diagonal_block, block)
+        blocks[coupling.first][coupling.second] = block
+        blocks[coupling.second][coupling.first] = block.T
     return jnp.block(blocks)
 
 

@@ -89,7 +89,7 @@ class Reweighted:
     """The solution with the last weights; by set their factors w; the scale a posteriori; whether
     the weights converged; `lengths` t in units of σ and scale."""
 
-    found: Solution
+    solution: Solution
     weights: dict[str, Float[np.ndarray, " n"]]
     scale: float
     converged: bool
@@ -98,22 +98,22 @@ class Reweighted:
     def suspects(self, significance: float = 0.001) -> list[SuspectRow]:
         """Observations with residuals above the critical length, the worst first; `significance` is
         the probability of any in data without blunders."""
-        used = {o: (self.found.problem.weights(o) > 0).any(1) for o in self.lengths}
-        critical = critical_length(significance, sum(int(u.sum()) for u in used.values()))
-        found = [
+        has_weight = {o: (self.solution.problem.weights(o) > 0).any(1) for o in self.lengths}
+        critical = critical_length(significance, sum(int(u.sum()) for u in has_weight.values()))
+        suspects = [
             SuspectRow(o, row, float(t[row]), float(self.weights[o][row]))
             for o, t in self.lengths.items()
-            for row in np.flatnonzero(used[o] & (t > critical)).tolist()
+            for row in np.flatnonzero(has_weight[o] & (t > critical)).tolist()
         ]
-        return sorted(found, key=lambda s: -s.test)
+        return sorted(suspects, key=lambda s: -s.test)
 
 
-def residual_lengths(found: Solution) -> dict[str, Float[np.ndarray, " n"]]:
+def residual_lengths(solution: Solution) -> dict[str, Float[np.ndarray, " n"]]:
     """|v/σ| of the observations that are removed or weighted as a whole, by set; not of those
     tested residual by residual, or never, like priors (`Kind.snooped`)."""
     return {
-        o.name: np.sqrt((found.residuals[o.name] ** 2).sum(1))
-        for o in found.problem.observations
+        o.name: np.sqrt((solution.residuals[o.name] ** 2).sum(1))
+        for o in solution.problem.observations
         if o.kind.snooped == "whole"
     }
 
@@ -123,10 +123,10 @@ def robust_scale(problem: Problem, lengths: dict[str, Float[np.ndarray, " n"]]) 
     normal = []  # |v/σ| by the median of the lengths of as many normal residuals
     for o, t in lengths.items():
         weight = problem.weights(o)
-        used = (weight > 0).any(1)
+        has_weight = (weight > 0).any(1)
         # Lengths of one, two or three residuals have different medians, √χ²₀.₅(k): divided by them
         # they are comparable.
-        normal.append(t[used] / math.sqrt(chi2_quantile(0.5, weight.shape[1])))
+        normal.append(t[has_weight] / math.sqrt(chi2_quantile(0.5, weight.shape[1])))
     counts = problem.counts
     share = counts.redundancy / max(counts.redundancy + counts.unknowns - counts.datum, 1)
     # 1e-3: with a thousand unknowns for one redundant observation the scale is no estimate.
@@ -150,7 +150,7 @@ def reweight(
     """
     if not any(x.kind.snooped == "whole" and x.number for x in problem.observations):
         raise InputError("robust estimation: no kind of observation is weighted as a whole")
-    given, scale, converged = problem.data.weight, 1.0, False
+    planned_weight, scale, converged = problem.data.weight, 1.0, False
     t = residual_lengths(Solution(problem, values))
     weighted, w = problem, {o: np.ones(len(x)) for o, x in t.items()}
     move = lambda problem, values, adjust_from: adjust_from(problem, values)
@@ -160,20 +160,22 @@ def reweight(
         small = settings.converged_change if name == estimator else settings.starting_change
         for _ in range(settings.max_rounds):
             scale = robust_scale(problem, t) if name == "huber" else scale
-            before = w
-            least = settings.min_weight
-            w = {o: np.maximum(_WEIGHT[name](x / scale), least) for o, x in t.items()}
-            change = np.concatenate([w[o] - before[o] for o in w])
+            previous = w
+            min_weight = settings.min_weight
+            w = {o: np.maximum(_WEIGHT[name](x / scale), min_weight) for o, x in t.items()}
+            change = np.concatenate([w[o] - previous[o] for o in w])
             converged = bool(np.sqrt(np.mean(change**2)) < small)
             if converged:
                 break
             # `weight` is 1/σ, or L⁻¹ [n, r, r]: both times √w of the observation.
             root = lambda o, p, w=w: np.sqrt(w[o]).reshape(-1, *(1,) * (np.ndim(p) - 1))
-            weight = {o: np.asarray(p) * root(o, p) if o in w else p for o, p in given.items()}
+            weight = {
+                o: np.asarray(p) * root(o, p) if o in w else p for o, p in planned_weight.items()
+            }
             weighted = with_data(problem, dataclasses.replace(problem.data, weight=weight))
             # The first start values may be far from a solution.
             values = move(weighted, values, adjust_from).values
             move, t = readjust, residual_lengths(Solution(problem, values))
     # Single steps on the way; the last solution is iterated to the end.
-    found = adjust_from(weighted, values)
-    return Reweighted(found, w, scale, converged, {o: x / scale for o, x in t.items()})
+    solution = adjust_from(weighted, values)
+    return Reweighted(solution, w, scale, converged, {o: x / scale for o, x in t.items()})

@@ -37,7 +37,7 @@ from jaxbundle.types import AnyArray
 Change = Sequence[tuple[str, int, PyTree]]
 
 
-def follow(found: Solution, changes: Sequence[Change], at_once: int = 16) -> Iterator[Values]:
+def follow(solution: Solution, changes: Sequence[Change], at_once: int = 16) -> Iterator[Values]:
     """The response of all tables to each change of held quantities: tangents of the values of every
     row, [≤ `at_once`, rows, …], some changes at a time, exact to first order.
 
@@ -45,26 +45,28 @@ def follow(found: Solution, changes: Sequence[Change], at_once: int = 16) -> Ite
     save calls of milliseconds and need memory for the tables of each.
 
     **Raises:** `NotSolvedError` if the values are not a minimum."""
-    declared, plan, values, data = found.arguments
-    still = jax.tree.map(np.asarray, values)
-    for first in range(0, len(changes), at_once):
-        some = changes[first : first + at_once]
-        held = jax.tree.map(lambda x: np.zeros((at_once, *x.shape)), still)
+    declared, plan, values, data = solution.arguments
+    zeros = jax.tree.map(np.asarray, values)
+    for begin in range(0, len(changes), at_once):
+        some = changes[begin : begin + at_once]
+        held_changes = jax.tree.map(lambda x: np.zeros((at_once, *x.shape)), zeros)
         for k, change in enumerate(some):
             for table, row, amount in change:
                 add = lambda x, a, k=k, row=row: np.add.at(x, (k, row), a)
-                jax.tree.map(add, held[table], amount)
-        followed, left = _follow(declared, plan, values, data, found.factor, held)
-        _require_converged(left)
-        real = {t.name: np.s_[: len(some), : t.rows] for t in found.problem.tables}
+                jax.tree.map(add, held_changes[table], amount)
+        followed, residual = _follow(declared, plan, values, data, solution.factor, held_changes)
+        _require_converged(residual)
+        real = {t.name: np.s_[: len(some), : t.rows] for t in solution.problem.tables}
         yield {
-            name: jax.tree.map(lambda x, at=at: np.asarray(x)[at], followed[name])
-            for name, at in real.items()
+            name: jax.tree.map(
+                lambda x, real_rows=real_rows: np.asarray(x)[real_rows], followed[name]
+            )
+            for name, real_rows in real.items()
         }
 
 
 def pull_back(
-    found: Solution, functions: Mapping[str, Float[AnyArray, "f rows width"]]
+    solution: Solution, functions: Mapping[str, Float[AnyArray, "f rows width"]]
 ) -> dict[str, Float[np.ndarray, "f n r"]]:
     """The change of linear functions of the changes of tables by one σ (a priori) of every
     observation, by set.
@@ -73,23 +75,28 @@ def pull_back(
     have one number per residual, the residual is changed by −1, as by a measurement larger by σ.
 
     **Raises:** `NotSolvedError` if the values are not a minimum."""
-    declared, plan, values, data = found.arguments
-    problem, number = found.problem, len(next(iter(functions.values())))
+    declared, plan, values, data = solution.arguments
+    problem, number = solution.problem, len(next(iter(functions.values())))
     size = {t.name: problem.sizes["table", t.name] for t in problem.tables}
     wide = lambda t, x: np.pad(x, ((0, 0), (0, size[t] - x.shape[1]), (0, 0)))
     rows = {t: wide(t, np.asarray(x)) for t, x in functions.items()}
     pulled = [
         _pull_back(
-            declared, plan, values, data, found.factor, {t: x[k : k + 1] for t, x in rows.items()}
+            declared,
+            plan,
+            values,
+            data,
+            solution.factor,
+            {t: x[k : k + 1] for t, x in rows.items()},
         )
         for k in range(number)
     ]
-    _require_converged(np.array([left for _, _, left in pulled]))
+    _require_converged(np.array([residual for _, _, residual in pulled]))
     effects = {}
-    for given in problem.observations:
-        o = given.name
+    for observation_set in problem.observations:
+        o = observation_set.name
         of_residuals = np.concatenate([np.asarray(by[o]) for _, by, _ in pulled])
-        weight, n = np.asarray(problem.data.weight[o]), given.number
+        weight, n = np.asarray(problem.data.weight[o]), observation_set.number
         effects[o] = of_residuals[:, :n]
         leaves = [jax.tree.leaves(slopes[o])[:1] for slopes, *_ in pulled]
         if weight.ndim == 2 and leaves[0] and leaves[0][0].size == of_residuals[0].size:
@@ -99,10 +106,10 @@ def pull_back(
     return effects
 
 
-def _require_converged(left: Float[AnyArray, " k"], max_residual: float = 1e-6) -> None:
+def _require_converged(residuals: Float[AnyArray, " k"], max_residual: float = 1e-6) -> None:
     """Refuse equations that were not solved: six digits are more than anyone reads of a
     derivative, and a problem that is no clear minimum does not come near them."""
-    worst = float(np.max(np.asarray(left)))
+    worst = float(np.max(np.asarray(residuals)))
     if not worst < max_residual:
         raise NotSolvedError(
             "derivatives of the solution were not found: its residuals are so large, or so curved, "
@@ -112,17 +119,22 @@ def _require_converged(left: Float[AnyArray, " k"], max_residual: float = 1e-6) 
 
 @compile_once
 def _follow(
-    declared: Declared, plan: Plan, values: Values, data: Data, factor: NormalFactor, held: Values
+    declared: Declared,
+    plan: Plan,
+    values: Values,
+    data: Data,
+    factor: NormalFactor,
+    held_changes: Values,
 ) -> tuple[Values, Float[Array, " changes"]]:
-    at = LinearisedSolution(declared, plan, values, data, factor, {})
-    still = zero_tangent(plan)
+    linearised = LinearisedSolution(declared, plan, values, data, factor, {})
+    zero_change = zero_tangent(plan)
 
-    def follow_one(held: Values) -> tuple[Values, Float[Array, ""]]:
-        x, left = _solve(at, still, held)
-        moved = lambda change, start: _in_datum(at, change, start)
-        return jax.jvp(moved, (still, data.start), (x, held))[1], left
+    def follow_one(held_changes: Values) -> tuple[Values, Float[Array, ""]]:
+        x, residual = _solve(linearised, zero_change, held_changes)
+        tables_in_datum = lambda change, start: _in_datum(linearised, change, start)
+        return jax.jvp(tables_in_datum, (zero_change, data.start), (x, held_changes))[1], residual
 
-    return jax.lax.map(follow_one, held)
+    return jax.lax.map(follow_one, held_changes)
 
 
 @compile_once
@@ -130,43 +142,43 @@ def _pull_back(
     declared: Declared, plan: Plan, values: Values, data: Data, factor: NormalFactor, rows: Tangent
 ) -> tuple[PyTree, dict[str, Array], Float[Array, " f"]]:
     """Derivatives by measurements and by residuals, and the residual of the equations."""
-    at = LinearisedSolution(declared, plan, values, data, factor, {})
-    still, unchanged = zero_tangent(plan), jax.tree.map(jnp.zeros_like, data.start)
+    linearised = LinearisedSolution(declared, plan, values, data, factor, {})
+    zero_change, unchanged = zero_tangent(plan), jax.tree.map(jnp.zeros_like, data.start)
 
     def changes(change: Tangent) -> Tangent:
         """The changes of all tables."""
-        moved = _in_datum(at, change, data.start)
-        of = lambda name, space: jax.vmap(space.difference)(moved[name], values[name])
-        return {name: of(name, space) for name, space in declared.named_spaces}
+        tables = _in_datum(linearised, change, data.start)
+        difference_of = lambda name, space: jax.vmap(space.difference)(tables[name], values[name])
+        return {name: difference_of(name, space) for name, space in declared.named_spaces}
 
     def pull_back_one(row: Tangent) -> tuple[PyTree, dict[str, Array], Float[Array, ""]]:
-        (row,) = jax.vjp(changes, still)[1](row)
-        adjoint, left = _solve(at, row, unchanged)
+        (row,) = jax.vjp(changes, zero_change)[1](row)
+        adjoint, residual = _solve(linearised, row, unchanged)
 
-        def along(measured: PyTree) -> Float[Array, ""]:
+        def gradient_along(measured: PyTree) -> Float[Array, ""]:
             """λᵀ·g."""
-            given = dataclasses.replace(data, measured=measured)
-            cost = lambda change: half_square(plan, at.residuals(change, given))
-            return jax.jvp(cost, (still,), (adjoint,))[1]
+            changed_data = dataclasses.replace(data, measured=measured)
+            cost = lambda change: half_square(plan, linearised.residuals(change, changed_data))
+            return jax.jvp(cost, (zero_change,), (adjoint,))[1]
 
-        slopes = jax.tree.map(jnp.negative, jax.grad(along)(data.measured))
-        residuals = lambda change: at.residuals(change, data)
-        of_parts = jax.jvp(residuals, (still,), (adjoint,))[1]
-        return slopes, restore_order(plan, of_parts), left
+        slopes = jax.tree.map(jnp.negative, jax.grad(gradient_along)(data.measured))
+        residuals = lambda change: linearised.residuals(change, data)
+        of_parts = jax.jvp(residuals, (zero_change,), (adjoint,))[1]
+        return slopes, restore_order(plan, of_parts), residual
 
     return jax.lax.map(pull_back_one, rows)
 
 
-def _in_datum(at: LinearisedSolution, change: Tangent, start: Values) -> Values:
+def _in_datum(linearised: LinearisedSolution, change: Tangent, start: Values) -> Values:
     """The tables after a change, in the datum defined by `start`."""
-    moved = at.move(change, dataclasses.replace(at.data, start=start))
-    return attach_motion(at.declared, at.plan, moved, start)
+    tables = linearised.move(change, dataclasses.replace(linearised.data, start=start))
+    return attach_motion(linearised.declared, linearised.plan, tables, start)
 
 
 def _solve(
-    at: LinearisedSolution,
+    linearised: LinearisedSolution,
     right: Tangent,
-    held: Values,
+    held_changes: Values,
     tolerance: float = 1e-11,
     max_steps: int = 50,
 ) -> tuple[Tangent, Float[Array, ""]]:
@@ -177,39 +189,39 @@ def _solve(
     H is N and the curvature: with the factor of N the error falls in each step by about the ratio
     of the two, so that some steps reach `tolerance`, just above rounding. Where `max_steps` do not,
     the curvature is as large as N, and the point is no clear minimum."""
-    plan, still, start = at.plan, zero_tangent(at.plan), at.data.start
+    plan, zero_change, start = linearised.plan, zero_tangent(linearised.plan), linearised.data.start
     plus = lambda a, factor, b: jax.tree.map(lambda a, b: a + factor * b, a, b)
 
     def product(x: Tangent, share: Float[Array, ""]) -> Tangent:
         """H·x + share·(∂g/∂θ)·held."""
         gradient = lambda change, start: gradient_after(
-            change, at, dataclasses.replace(at.data, start=start)
+            change, linearised, dataclasses.replace(linearised.data, start=start)
         )
-        along = jax.tree.map(lambda d: share * d, held)
-        return jax.jvp(gradient, (still, start), (x, along))[1]
+        held_part = jax.tree.map(lambda d: share * d, held_changes)
+        return jax.jvp(gradient, (zero_change, start), (x, held_part))[1]
 
-    def going(state: tuple) -> Bool[Array, ""]:
+    def is_unsolved(state: tuple) -> Bool[Array, ""]:
         *_, size, begin, count = state
-        open_ = (size > tolerance**2 * begin) & (count <= max_steps)
-        return (count == 0) | open_
+        is_open = (size > tolerance**2 * begin) & (count <= max_steps)
+        return (count == 0) | is_open
 
     def one_step(state: tuple) -> tuple:
-        x, left, direction, size, begin, count = state
+        x, residual, direction, size, begin, count = state
         # Pass 0 has x = 0 and direction 0: its product is (∂g/∂θ)·held, the right-hand side.
-        first = count == 0
-        times = product(direction, jnp.where(first, 1.0, 0.0))
-        curvature = dot(plan, direction, times)
-        step = jnp.where(first, 1.0, size / jnp.where(first, 1.0, curvature))
-        x = plus(x, jnp.where(first, 0.0, step), direction)
-        left = plus(left, -step, times)
-        better = solve(at.factor, left)
-        new = dot(plan, left, better)
-        turn = jnp.where(first, 0.0, new / jnp.where(first, 1.0, size))
-        direction = plus(better, turn, direction)
-        return x, left, direction, new, jnp.where(first, new, begin), count + 1
+        is_first = count == 0
+        curved = product(direction, jnp.where(is_first, 1.0, 0.0))
+        curvature = dot(plan, direction, curved)
+        step = jnp.where(is_first, 1.0, size / jnp.where(is_first, 1.0, curvature))
+        x = plus(x, jnp.where(is_first, 0.0, step), direction)
+        residual = plus(residual, -step, curved)
+        preconditioned = solve(linearised.factor, residual)
+        new = dot(plan, residual, preconditioned)
+        beta = jnp.where(is_first, 0.0, new / jnp.where(is_first, 1.0, size))
+        direction = plus(preconditioned, beta, direction)
+        return x, residual, direction, new, jnp.where(is_first, new, begin), count + 1
 
     nothing: Any = jnp.zeros(())
     x, *_, size, begin, _ = jax.lax.while_loop(
-        going, one_step, (still, right, still, nothing, nothing, jnp.asarray(0))
+        is_unsolved, one_step, (zero_change, right, zero_change, nothing, nothing, jnp.asarray(0))
     )
     return x, jnp.sqrt(jnp.where(begin == 0, 0.0, size / jnp.where(begin == 0, 1.0, begin)))

@@ -45,17 +45,17 @@ def choose_together(
       (h̃/r) allows, others as uncorrelated.
     """
     chosen: list[int] = []
-    taken: set[int] = set()
+    taken_rows: set[int] = set()
     influence: dict[int, float] = {}
     root = np.sqrt(leverage)
     for a in np.argsort(-tests, kind="stable").tolist():
-        kept, eliminated = int(first_kept_row[a]), int(eliminated_row[a])
-        before = influence.get(kept, 0.0)
-        if eliminated in taken or not tests[a] - root[a] * before > critical:
+        kept_row, eliminated = int(first_kept_row[a]), int(eliminated_row[a])
+        earlier_influence = influence.get(kept_row, 0.0)
+        if eliminated in taken_rows or not tests[a] - root[a] * earlier_influence > critical:
             continue
         chosen.append(a)
-        taken.add(eliminated)
-        influence[kept] = float(before + root[a] * tests[a])
+        taken_rows.add(eliminated)
+        influence[kept_row] = float(earlier_influence + root[a] * tests[a])
     return chosen
 
 
@@ -89,14 +89,14 @@ def find_alternatives(
         # (R_AA)⁺ by its eigenvalues: for the two rays of a point R has rank one, and the test of
         # both together is that of either.
         size, axes = np.linalg.eigh(R[np.ix_(rows, rows)])
-        seen = size > min_redundancy
-        along = axes[:, seen].T @ residual[rows]
-        return float(along**2 @ (1 / size[seen]))
+        is_controlled = size > min_redundancy
+        components = axes[:, is_controlled].T @ residual[rows]
+        return float(components**2 @ (1 / size[is_controlled]))
 
     return [
-        other
-        for other in range(len(observations))
-        if other != suspect
-        and explained(other) > critical**2
-        and explained(suspect, other) - explained(other) < critical_alone**2
+        candidate
+        for candidate in range(len(observations))
+        if candidate != suspect
+        and explained(candidate) > critical**2
+        and explained(suspect, candidate) - explained(candidate) < critical_alone**2
     ]

@@ -32,7 +32,7 @@ class Traces:
         `remaining`. Those of roots of few columns, `exact`, come first.
 
         **Returns:** the products F_kᵀ·M·F with them."""
-        products = [np.asarray(other.T @ remaining.T) for other in self.F]
+        products = [np.asarray(root.T @ remaining.T) for root in self.F]
         # T_0k = tr(M·V_k) = tr(F_kᵀ·M·F_k), as M·M = M, and T_kj = ‖F_jᵀ·M·F_k‖²
         self.T[0, k + 1] += np.sum(columns * remaining)
         self.T[1:, k + 1] += [np.sum(y**2) for y in products]
@@ -40,21 +40,22 @@ class Traces:
             self.products.setdefault(k, []).append(products)
         else:
             S = self.S
-            few = [*self.products]
-            for i in few:
-                for j in few:
+            exact_roots = [*self.products]
+            for i in exact_roots:
+                for j in exact_roots:
                     # E (F_iᵀ·M·F_k·ξ)ᵀ·S_ij·(F_jᵀ·M·F_k·ξ)
                     cube = np.sum((S[i, j] @ products[j]) * products[i])
                     self.cubes[1 + k, 1 + i, 1 + j] += cube
         return products[k]
 
-    def add_cubes(self, k: int, remaining: Columns, again: Columns, times: float) -> None:
+    def add_cubes(self, k: int, remaining: Columns, remaining_again: Columns, times: float) -> None:
         """Cubes of the root k with itself, from some combinations of its columns, of which M·F·ξ is
-        `remaining` and M·F·(FᵀM·F·ξ) is `again`; `times`: all draws by those given here."""
+        `remaining` and M·F·(FᵀM·F·ξ) is `remaining_again`; `times`: all draws by those given
+        here."""
         # With S = FᵀM·F, ‖M·F·S·ξ‖² = ξᵀ·S³·ξ, whose expectation is tr S³.
-        self.cubes[1 + k, 1 + k, 1 + k] = times * np.sum(again**2)
+        self.cubes[1 + k, 1 + k, 1 + k] = times * np.sum(remaining_again**2)
         for j in self.products:
-            y = [np.asarray(self.F[j].T @ rows.T) for rows in (again, remaining)]
+            y = [np.asarray(self.F[j].T @ rows.T) for rows in (remaining_again, remaining)]
             self.cubes[1 + k, 1 + k, 1 + j] = times * np.sum(y[0] * y[1])
 
     @property
@@ -79,10 +80,10 @@ class Traces:
         return T, with_traces(self.cubes, T)
 
     def _cubes_of_few(self) -> Iterator[tuple[tuple[int, int, int], float]]:
-        S, few = self.S, sorted(self.products)
-        for i in few:
-            for j in few:
-                for k in few:
+        S, exact_roots = self.S, sorted(self.products)
+        for i in exact_roots:
+            for j in exact_roots:
+                for k in exact_roots:
                     if i <= j <= k:
                         yield (i, j, k), float(np.sum((S[i, j] @ S[j, k]) * S[i, k]))
 
@@ -93,8 +94,8 @@ def with_traces(
     """All entries of the traces of three, which are symmetric in their axes, from at least one of
     every kind, the others zero; those with the independent part are T, as M·M = M."""
     orders = [np.transpose(cubes, order) for order in permutations(range(3))]
-    number = np.maximum(np.sum([one != 0 for one in orders], 0), 1)
-    found = np.sum(orders, 0) / number
+    number = np.maximum(np.sum([entries != 0 for entries in orders], 0), 1)
+    mean = np.sum(orders, 0) / number
     for axis in range(3):
-        np.moveaxis(found, axis, 0)[0] = T
-    return found
+        np.moveaxis(mean, axis, 0)[0] = T
+    return mean

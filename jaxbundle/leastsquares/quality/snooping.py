@@ -35,7 +35,7 @@ from jaxbundle.leastsquares.quality.distributions import critical_w, normal_quan
 from jaxbundle.leastsquares.quality.names import eliminated_rows
 from jaxbundle.leastsquares.quality.separability import choose_together, find_alternatives
 from jaxbundle.leastsquares.solution import Solution, take_step
-from jaxbundle.leastsquares.whitening import used, without_residual
+from jaxbundle.leastsquares.whitening import has_weight, without_residual
 from jaxbundle.types import AnyArray, not_none
 
 # Observations are removed together with the worst if their test is at least this fraction of its.
@@ -81,11 +81,11 @@ def readjust(problem: Problem, values: Values, adjust_from: Adjust) -> Solution:
     """The solution of a problem with slightly changed weights. A large one takes a single
     Gauss–Newton step if this decreases vᵀPv, with an error of the square of the change; for a small
     one compiling the step would take longer. A final result must be adjusted once more."""
-    if sum(given.number for given in problem.observations) >= SINGLE_STEPS_FROM:
-        before = Solution(problem, values)
-        after = Solution(problem, take_step(problem, values))
-        if after.vtpv <= before.vtpv:
-            return after
+    if sum(observation_set.number for observation_set in problem.observations) >= SINGLE_STEPS_FROM:
+        current = Solution(problem, values)
+        stepped = Solution(problem, take_step(problem, values))
+        if stepped.vtpv <= current.vtpv:
+            return stepped
     return adjust_from(problem, values)
 
 
@@ -118,7 +118,7 @@ def snoop(
     """
     check_test(test, significance)
     full_problem = solution.problem
-    touched = _TouchedRows(full_problem)
+    touched_rows = _TouchedRows(full_problem)
     removed, restored = [*doubtful], set()
     excluded: set[int] = set()
     if removed:
@@ -128,10 +128,14 @@ def snoop(
         unit = _unit_of_tests(solution, test)
         counts = solution.problem.counts
         critical = critical_w(
-            test, significance, touched.tested(solution.problem), counts.redundancy, solution.sigma0
+            test,
+            significance,
+            touched_rows.tested(solution.problem),
+            counts.redundancy,
+            solution.sigma0,
         )
         critical_alone = normal_quantile(1 - significance / 2)
-        worst = _worst(solution, touched, unit, critical / unit, critical_alone)
+        worst = _worst(solution, touched_rows, unit, critical / unit, critical_alone)
         if worst and limit is not None:
             worst = worst[: max(limit - len(removed), 0)]
         if worst:
@@ -139,18 +143,18 @@ def snoop(
         else:
             # What was restored once is not again: two that exclude each other would alternate
             # forever.
-            passing = _passing(full_problem, solution, touched, removed, critical) - restored
-            kept = list(_without_passing(removed, passing))
-            if kept == removed:
+            passing = _passing(full_problem, solution, touched_rows, removed, critical) - restored
+            still_removed = list(_without_passing(removed, passing))
+            if still_removed == removed:
                 break
             restored |= passing
-            removed = kept
-        again = lambda problem, values: readjust(problem, values, adjust_from)
-        solution = _solve(full_problem, removed, excluded, solution.values, again)
+            removed = still_removed
+        readjust_from = lambda problem, values: readjust(problem, values, adjust_from)
+        solution = _solve(full_problem, removed, excluded, solution.values, readjust_from)
     if doubtful:
         # The tests of those that were doubtful from the beginning.
         unit = _unit_of_tests(solution, test)
-        tested = _test_removed(full_problem, solution, touched, removed)
+        tested = _test_removed(full_problem, solution, touched_rows, removed)
         of_unknown = lambda r, tests: r.test if np.isfinite(r.test) else max(tests) / unit
         removed = [dataclasses.replace(r, test=of_unknown(r, tests)) for r, tests in tested]
     if removed:
@@ -177,10 +181,10 @@ def _solve(
         try:
             return adjust_from(without(full_problem, removed, excluded), values)
         except NotSolvedError as error:
-            more = {*eliminated_rows(full_problem, error.undetermined)} - excluded
-            if not more:
+            newly_excluded = {*eliminated_rows(full_problem, error.undetermined)} - excluded
+            if not newly_excluded:
                 raise
-            excluded |= more
+            excluded |= newly_excluded
 
 
 class _TouchedRows:
@@ -191,23 +195,31 @@ class _TouchedRows:
         self.eliminated = problem.plan.eliminated
         self.eliminated_row: dict[str, Int[np.ndarray, " n"]] = {}
         self.first_kept_row: dict[str, Int[np.ndarray, " n"]] = {}
-        first = np.cumsum([0, *(t.rows for t in problem.tables)])
-        start = {t.name: n for t, n in zip(problem.tables, first)}
+        first_numbers = np.cumsum([0, *(t.rows for t in problem.tables)])
+        start = {t.name: n for t, n in zip(problem.tables, first_numbers)}
         is_free = {t.name: t.free.any(1) for t in problem.tables}
-        for given in problem.observations:
-            eliminated, kept = np.full(given.number, -1), np.full(given.number, -1)
-            for name, rows in zip(given.kind.of, given.rows):
+        for observation_set in problem.observations:
+            eliminated, first_kept = (
+                np.full(observation_set.number, -1),
+                np.full(observation_set.number, -1),
+            )
+            for name, rows in zip(observation_set.kind.of, observation_set.rows):
                 if name == self.eliminated:
                     is_eliminated = is_free[name][rows] & ~problem.kept_rows[rows]
                     eliminated = np.where(is_eliminated, rows, eliminated)
                 elif is_free[name].any():
-                    kept = np.where(kept < 0, start[name] + rows, kept)
-            self.eliminated_row[given.name], self.first_kept_row[given.name] = eliminated, kept
-        chosen = lambda policy: [
-            given.name for given in problem.observations if given.kind.snooped == policy
+                    first_kept = np.where(first_kept < 0, start[name] + rows, first_kept)
+            self.eliminated_row[observation_set.name], self.first_kept_row[observation_set.name] = (
+                eliminated,
+                first_kept,
+            )
+        sets_with = lambda policy: [
+            observation_set.name
+            for observation_set in problem.observations
+            if observation_set.kind.snooped == policy
         ]
-        self.sets_removed_by_row = chosen("whole")
-        self.sets_removed_by_residual = chosen("single")
+        self.sets_removed_by_row = sets_with("whole")
+        self.sets_removed_by_residual = sets_with("single")
 
     def tested(self, problem: Problem) -> int:
         """The number of tested residuals."""
@@ -224,20 +236,24 @@ class _Candidates:
     row: Int[np.ndarray, " n"]
     test: Float[np.ndarray, " n"]
 
-    def of(self, by_set: Mapping[str, np.ndarray], positions: Iterable[int]) -> np.ndarray:
+    def take(self, by_set: Mapping[str, np.ndarray], positions: Iterable[int]) -> np.ndarray:
         """Values by set and row, of the candidates at these positions."""
         return np.array([by_set[self.set[k]][self.row[k]] for k in positions])
 
 
 def _worst(
-    solution: Solution, touched: _TouchedRows, unit: float, critical: float, critical_alone: float
+    solution: Solution,
+    touched_rows: _TouchedRows,
+    unit: float,
+    critical: float,
+    critical_alone: float,
 ) -> list[RemovedRow]:
     """The observations to remove now, the worst first; tests in `unit`.
 
     Observations of a row are separable if the test of the suspect exceeds `critical_alone` without
     the other."""
     tests = {o: _finite(w) / unit for o, w in solution.reliability.w.items()}
-    single, joint = _find_candidates(tests, touched)
+    single, joint = _find_candidates(tests, touched_rows)
     worst = max(single, key=lambda r: r.test, default=None)
     largest_single, largest_test = worst.test if worst else 0.0, joint.test.max(initial=0.0)
     # Observations without an eliminated row (control, distances) influence everything: alone.
@@ -247,48 +263,48 @@ def _worst(
     positions = np.flatnonzero(joint.test > limit)
     if not len(positions):
         return []
-    chosen = positions[
+    chosen_positions = positions[
         choose_together(
             joint.test[positions],
-            joint.of(touched.eliminated_row, positions),
-            joint.of(touched.first_kept_row, positions),
-            joint.of(_leverage(solution), positions),
+            joint.take(touched_rows.eliminated_row, positions),
+            joint.take(touched_rows.first_kept_row, positions),
+            joint.take(_leverage(solution), positions),
             critical,
         )
     ]
-    neighbours = _Neighbours(solution, touched, unit)
-    others = {
+    neighbours = _Neighbours(solution, touched_rows, unit)
+    alternatives = {
         k: neighbours.alternatives(joint.set[k], int(joint.row[k]), critical, critical_alone)
-        for k in chosen.tolist()
+        for k in chosen_positions.tolist()
     }
     # Those beyond doubt first: without them, some of the others may become separable.
-    certain = [k for k in others if not others[k]]
+    certain = [k for k in alternatives if not alternatives[k]]
     return [
-        RemovedRow(joint.set[k], int(joint.row[k]), None, float(joint.test[k]), others[k])
-        for k in certain or others
+        RemovedRow(joint.set[k], int(joint.row[k]), None, float(joint.test[k]), alternatives[k])
+        for k in certain or alternatives
     ]
 
 
 def _find_candidates(
-    tests: Mapping[str, Float[np.ndarray, "n r"]], touched: _TouchedRows
+    tests: Mapping[str, Float[np.ndarray, "n r"]], touched_rows: _TouchedRows
 ) -> tuple[list[RemovedRow], _Candidates]:
     """Of every set the worst of those that are removed alone; and all rows with an eliminated row,
     which may be removed with others."""
     single_candidates = [
         RemovedRow(o, *divmod(int(t.argmax()), t.shape[1]), float(t.max()))
-        for o, t in ((o, tests[o]) for o in touched.sets_removed_by_residual)
+        for o, t in ((o, tests[o]) for o in touched_rows.sets_removed_by_residual)
         if t.size
     ]
     sets, rows, joint_tests = [], [np.zeros(0, int)], [np.zeros(0)]
-    for o in (o for o in touched.sets_removed_by_row if len(tests[o])):
+    for o in (o for o in touched_rows.sets_removed_by_row if len(tests[o])):
         largest_test = tests[o].max(1, initial=0.0)
-        alone = touched.eliminated_row[o] < 0
-        without_eliminated_row = np.where(alone, largest_test, 0.0)
+        has_none = touched_rows.eliminated_row[o] < 0
+        without_eliminated_row = np.where(has_none, largest_test, 0.0)
         worst, test = without_eliminated_row.argmax(), without_eliminated_row.max(initial=0.0)
         single_candidates.append(RemovedRow(o, int(worst), None, float(test)))
         sets += [o] * len(largest_test)
         rows.append(np.arange(len(largest_test)))
-        joint_tests.append(np.where(alone, 0.0, largest_test))
+        joint_tests.append(np.where(has_none, 0.0, largest_test))
     return single_candidates, _Candidates(sets, np.concatenate(rows), np.concatenate(joint_tests))
 
 
@@ -296,21 +312,23 @@ def _leverage(solution: Solution) -> dict[str, Float[np.ndarray, " n"]]:
     """(h − h_e)/(1 − h) of every observation, the largest of its residuals: its leverage h without
     the part h_e of its eliminated row, over its redundancy number."""
     tested, tiny = solution.reliability, np.finfo(float).tiny
-    rest = {o: np.clip(h - tested.eliminated_leverage[o], 0, None) for o, h in tested.hat.items()}
+    kept_leverage = {
+        o: np.clip(h - tested.eliminated_leverage[o], 0, None) for o, h in tested.hat.items()
+    }
     redundancy = {o: np.maximum(1 - h, tiny) for o, h in tested.hat.items()}
-    return {o: (rest[o] / redundancy[o]).max(1, initial=0.0) for o in rest}
+    return {o: (kept_leverage[o] / redundancy[o]).max(1, initial=0.0) for o in kept_leverage}
 
 
 class _Neighbours:
     """The observations of every eliminated row, to test their separability."""
 
-    def __init__(self, solution: Solution, touched: _TouchedRows, unit: float):
+    def __init__(self, solution: Solution, touched_rows: _TouchedRows, unit: float):
         self.solution, self.unit = solution, unit
-        self.eliminated_row = touched.eliminated_row
+        self.eliminated_row = touched_rows.eliminated_row
         # By set: the rows with weight in the order of their eliminated rows, and these.
         self.order, self.sorted = {}, {}
-        for o, eliminated in touched.eliminated_row.items():
-            weighted = used(np.asarray(solution.problem.data.weight[o])).any(1)
+        for o, eliminated in touched_rows.eliminated_row.items():
+            weighted = has_weight(np.asarray(solution.problem.data.weight[o])).any(1)
             rows = np.flatnonzero(weighted & (eliminated >= 0))
             self.order[o] = rows[np.argsort(eliminated[rows], kind="stable")]
             self.sorted[o] = eliminated[self.order[o]]
@@ -320,9 +338,9 @@ class _Neighbours:
     ) -> tuple[int, ...]:
         """Inseparable rows of the same set and eliminated row."""
         eliminated = self.eliminated_row[o][row]
-        between = [eliminated, eliminated + 1]
+        bounds = [eliminated, eliminated + 1]
         rows = {
-            s: self.order[s][slice(*np.searchsorted(self.sorted[s], between))]
+            s: self.order[s][slice(*np.searchsorted(self.sorted[s], bounds))]
             for s in (o, *(s for s in self.order if s != o))
         }
         E, v = self.solution.jacobian_eliminated, self.solution.residuals
@@ -339,7 +357,7 @@ class _Neighbours:
 def _passing(
     full_problem: Problem,
     solution: Solution,
-    touched: _TouchedRows,
+    touched_rows: _TouchedRows,
     removed: Sequence[RemovedRow],
     critical: float,
 ) -> set[tuple[str, int, int | None]]:
@@ -347,14 +365,17 @@ def _passing(
     them."""
     return {
         (r.set, row, r.residual)
-        for r, tests in _test_removed(full_problem, solution, touched, removed)
+        for r, tests in _test_removed(full_problem, solution, touched_rows, removed)
         for row, test in zip(r.rows, tests)
         if test < critical
     }
 
 
 def _test_removed(
-    full_problem: Problem, solution: Solution, touched: _TouchedRows, removed: Sequence[RemovedRow]
+    full_problem: Problem,
+    solution: Solution,
+    touched_rows: _TouchedRows,
+    removed: Sequence[RemovedRow],
 ) -> Iterable[tuple[RemovedRow, list[float]]]:
     """Each of the removed with the test of its rows against what remains; NaN in rows of an
     excluded eliminated row, which agrees with anything.
@@ -373,20 +394,24 @@ def _test_removed(
     def pass_of(r: RemovedRow) -> int:
         return of_one_row[r.set, r.row].index(r) if is_correlated(r) else 0
 
-    held = np.zeros(0, bool)
-    if touched.eliminated is not None:
-        free = lambda problem: problem.table(touched.eliminated).free.any(1)
-        held = free(full_problem) & ~free(solution.problem)
+    is_held = np.zeros(0, bool)
+    if touched_rows.eliminated is not None:
+        free = lambda problem: problem.table(touched_rows.eliminated).free.any(1)
+        is_held = free(full_problem) & ~free(solution.problem)
 
     def is_excluded(r: RemovedRow, row: int) -> bool:
-        eliminated = touched.eliminated_row[r.set][row]
-        return bool(eliminated >= 0 and held[eliminated])
+        eliminated = touched_rows.eliminated_row[r.set][row]
+        return bool(eliminated >= 0 and is_held[eliminated])
 
     for this_pass in sorted({pass_of(r) for r in removed}):
         tested = [r for r in removed if pass_of(r) == this_pass]
         same_rows = (of_one_row[r.set, r.row] for r in tested if is_correlated(r))
-        others = [x for rows in same_rows for x in rows if pass_of(x) != this_pass]
-        data = without(full_problem, others).data if others else full_problem.data
+        removed_in_other_passes = [x for rows in same_rows for x in rows if pass_of(x) != this_pass]
+        data = (
+            without(full_problem, removed_in_other_passes).data
+            if removed_in_other_passes
+            else full_problem.data
+        )
         tests = {o: _finite(t) for o, t in solution.predicted_tests(data).items()}
         for r in tested:
             residual = r.residual if r.residual is not None else slice(None)
@@ -436,16 +461,16 @@ def without(
     e = problem.plan.eliminated
     undetermined: list[int] = []
     if e is not None and (removed or excluded):
-        touched, width = _TouchedRows(problem), problem.table(e).space.width
-        left = np.zeros(problem.table(e).rows)
-        for o, eliminated in touched.eliminated_row.items():
-            rows = used(weight[o]).sum(1)
-            np.add.at(left, eliminated[eliminated >= 0], rows[eliminated >= 0])
+        touched_rows, width = _TouchedRows(problem), problem.table(e).space.width
+        residuals_left = np.zeros(problem.table(e).rows)
+        for o, eliminated in touched_rows.eliminated_row.items():
+            rows = has_weight(weight[o]).sum(1)
+            np.add.at(residuals_left, eliminated[eliminated >= 0], rows[eliminated >= 0])
         # −1: no eliminated row.
-        of_removed = ((touched.eliminated_row[r.set], row) for r in removed for row in r.rows)
+        of_removed = ((touched_rows.eliminated_row[r.set], row) for r in removed for row in r.rows)
         changed = {int(eliminated[row]) for eliminated, row in of_removed} - {-1}
-        undetermined = sorted({*excluded} | {row for row in changed if left[row] < width})
-        for o, eliminated in touched.eliminated_row.items():
+        undetermined = sorted({*excluded} | {row for row in changed if residuals_left[row] < width})
+        for o, eliminated in touched_rows.eliminated_row.items():
             weight[o][np.isin(eliminated, undetermined)] = 0.0
     data = dataclasses.replace(problem.data, weight=weight)
     problem = with_data(problem, data)

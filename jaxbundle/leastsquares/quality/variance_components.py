@@ -75,18 +75,18 @@ class Component:
 
 
 def variance_components(
-    found: Solution, groups: Sequence[VarianceGroup], factors: Mapping[str, float]
+    solution: Solution, groups: Sequence[VarianceGroup], factors: Mapping[str, float]
 ) -> dict[str, Component]:
     """The components of groups of observations; `factors`: by group, the factor of σ that is
     applied already (1 if absent)."""
-    problem, tested, components = found.problem, found.reliability, {}
+    problem, tested, components = solution.problem, solution.reliability, {}
     for group in groups:
         take = lambda by_set, group=group: np.concatenate(
             [np.zeros(0), *(np.asarray(by_set(o))[at].ravel() for o, at in group.parts)]
         )
         weight = take(problem.weights)
-        used = weight[weight > 0]
-        if used.size:
+        weighted = weight[weight > 0]
+        if weighted.size:
             # v·(P·v), of which the expectation is the redundancy number (with covariances too). P·v
             # is gain · standard (`Reliability`); standard is not yet divided by √r.
             v, r = take(tested.residual.get), take(tested.redundancy.get)
@@ -94,10 +94,10 @@ def variance_components(
             factor = factors.get(group.name, 1.0)
             unit = group.unit / factor
             components[group.name] = Component(
-                used.size,
+                weighted.size,
                 float(r.sum()),
                 float(square.sum()),
-                (float(unit / used.max()), float(unit / used.min())),
+                (float(unit / weighted.max()), float(unit / weighted.min())),
                 factor,
                 group.word,
             )
@@ -108,13 +108,13 @@ class ComponentEstimate(NamedTuple):
     """Estimated variance components: the solution, the factors of σ by group, and the groups whose
     components have not converged."""
 
-    found: Solution
+    solution: Solution
     factors: dict[str, float]
     unsettled: list[str]
 
 
 def estimate(
-    found: Solution,
+    solution: Solution,
     groups: Sequence[VarianceGroup],
     again: Callable,
     smallest_change: float = 1e-3,
@@ -128,16 +128,16 @@ def estimate(
       known to a hundredth from 5000 observations.
     """
     factors: dict[str, float] = {}
-    for done in range(ROUNDS + 1):
-        components = variance_components(found, groups, factors)
+    for round_number in range(ROUNDS + 1):
+        components = variance_components(solution, groups, factors)
         usable = {name: c for name, c in components.items() if c.usable}
         factors = {name: c.factor for name, c in usable.items()} | factors
         unsettled = [name for name, c in usable.items() if abs(c.ratio - 1) >= smallest_change]
-        if done == ROUNDS or not unsettled:
-            return ComponentEstimate(found, factors, unsettled)
+        if round_number == ROUNDS or not unsettled:
+            return ComponentEstimate(solution, factors, unsettled)
         ratios = {name: c.ratio for name, c in usable.items()}
         # From the last values: weights change little from round to round.
-        found = again(rescale(found.problem, groups, ratios), found.values)
+        solution = again(rescale(solution.problem, groups, ratios), solution.values)
         factors |= {name: c.sigma for name, c in usable.items()}
     raise AssertionError("the last round returns")
 

@@ -65,23 +65,23 @@ class Weak:
 
 
 def find_weak(
-    found: Solution, extents: Extents, sigma0: float, explained: Extents | None = None
+    solution: Solution, extents: Extents, sigma0: float, explained: Extents | None = None
 ) -> Weak:
     """The weak directions of a solution; none without a factor. `explained`: cofactors of its
     unknowns, by table, that are not counted, such as those of a common motion."""
-    if found.problem.plan.reduction not in FACTORS:
+    if solution.problem.plan.reduction not in FACTORS:
         return Weak()
-    at_hand = "cofactors" in vars(found) or len(kept_unknowns(found.problem)) < SMALL_SYSTEM
-    return _weak(found, found.factor, extents, sigma0, at_hand, explained)
+    at_hand = "cofactors" in vars(solution) or len(kept_unknowns(solution.problem)) < SMALL_SYSTEM
+    return _weak(solution, solution.factor, extents, sigma0, at_hand, explained)
 
 
-def find_weak_unsolved(found: Solution, extents: Extents) -> Weak:
+def find_weak_unsolved(solution: Solution, extents: Extents) -> Weak:
     """The weak directions where iterations ended without a solution, by σ a priori: the normal
     equations get a small ridge, so that there is a factor."""
-    if found.problem.plan.reduction not in FACTORS:
+    if solution.problem.plan.reduction not in FACTORS:
         return Weak()
-    factor = with_plan(_regularised_factor(*found.arguments), found.problem.plan)
-    return _weak(found, factor, extents, 1.0)
+    factor = with_plan(_regularised_factor(*solution.arguments), solution.problem.plan)
+    return _weak(solution, factor, extents, 1.0)
 
 
 @compile_once
@@ -91,37 +91,37 @@ def _regularised_factor(declared: Declared, plan: Plan, values: Values, data: Da
 
 
 def _weak(
-    found: Solution,
+    solution: Solution,
     factor: NormalFactor,
     extents: Extents,
     sigma0: float,
     at_hand: bool = False,
     explained: Extents | None = None,
 ) -> Weak:
-    problem, plan = found.problem, found.problem.plan
+    problem, plan = solution.problem, solution.problem.plan
     sigma0 = sigma0 if np.isfinite(sigma0) else 1.0
     if not np.isfinite(np.asarray(factor.reduced.pivots)).all():
         return Weak()
-    far, judged = _far_rows(problem, factor, extents, sigma0)
-    if far is None:
+    far_rows, judged = _far_rows(problem, factor, extents, sigma0)
+    if far_rows is None:
         return Weak()
     per_extent = _of_columns(problem, extents)
     if at_hand:
-        blocks = found.cofactors.diagonal_blocks
+        blocks = solution.cofactors.diagonal_blocks
         variance = {g: np.diagonal(np.asarray(blocks[g]), axis1=1, axis2=2) for g in plan.kept}
         sigma = np.sqrt(np.asarray(flat(plan.kept, variance))) * per_extent
     else:
-        sigma = _sigma_of_weakest(found, factor, per_extent)
+        sigma = _sigma_of_weakest(solution, factor, per_extent)
     if explained is not None:
-        less = per_extent**2 * _of_columns(problem, explained)
-        sigma = np.sqrt(np.maximum(sigma**2 - less, 0.0))
+        explained_part = per_extent**2 * _of_columns(problem, explained)
+        sigma = np.sqrt(np.maximum(sigma**2 - explained_part, 0.0))
     sigma = sigma0 * sigma
     order = np.argsort(-sigma, kind="stable")[: (VAGUE_RATIO * sigma > 1).sum()]
     names = kept_unknowns(problem) if len(order) else []
     return Weak(
         tuple(str(name_of(problem, *names[k])) for k in order),
         float(sigma.max(initial=0.0)),
-        far,
+        far_rows,
         judged,
     )
 
@@ -146,32 +146,34 @@ def _far_rows(
     # L⁻¹ has a one for a held unknown, whose σ is 0 (`elimination.eliminate`).
     sigma = np.sqrt((L[real] ** 2 * free[:, None, :]).sum((1, 2))) * sigma0
     ratio = np.where(judged, sigma / np.where(judged, extent, 1.0), 0.0)
-    far = np.argsort(-ratio, kind="stable")[: (NONLINEAR_RATIO * ratio > 1).sum()]
-    return tuple(rows[far].tolist()), int(judged.sum())
+    order = np.argsort(-ratio, kind="stable")[: (NONLINEAR_RATIO * ratio > 1).sum()]
+    return tuple(rows[order].tolist()), int(judged.sum())
 
 
 def _of_columns(problem: Problem, by_table: Extents) -> Float[np.ndarray, " reduced"]:
     """Quantities by table, such as 1/e, as those of the columns of the reduced system; 0 for what
     is held or has none."""
-    plan, found = problem.plan, {}
+    plan, columns = problem.plan, {}
     for g in plan.kept:
         group = plan.groups[g]
-        found[g] = np.zeros(group.free.shape)
+        columns[g] = np.zeros(group.free.shape)
         for m in group.members:
             if m.table not in by_table:
                 continue
-            of = by_table[m.table]
-            if of.ndim == 1:  # Kept rows of the eliminated table.
-                of = np.where(of > 0, 1 / np.where(of > 0, of, 1.0), 0.0)[:, None]
+            quantity = by_table[m.table]
+            if quantity.ndim == 1:  # Kept rows of the eliminated table.
+                quantity = np.where(quantity > 0, 1 / np.where(quantity > 0, quantity, 1.0), 0.0)[
+                    :, None
+                ]
             rows = np.arange(group.rows) if m.rows is None else np.asarray(m.rows)
-            real = np.flatnonzero(rows < len(of))
-            found[g][real, m.start : m.start + m.width] = of[rows[real]]
-        found[g] *= np.asarray(group.free)
-    return np.asarray(flat(plan.kept, found))
+            real = np.flatnonzero(rows < len(quantity))
+            columns[g][real, m.start : m.start + m.width] = quantity[rows[real]]
+        columns[g] *= np.asarray(group.free)
+    return np.asarray(flat(plan.kept, columns))
 
 
 def _sigma_of_weakest(
-    found: Solution, factor: NormalFactor, per_extent: Float[np.ndarray, " reduced"]
+    solution: Solution, factor: NormalFactor, per_extent: Float[np.ndarray, " reduced"]
 ) -> Float[np.ndarray, " reduced"]:
     """σ/e (a priori) of the reduced system's columns, as far as the weakest directions give it."""
     # Six directions: a free camera, a pose or a similarity hidden in the datum can be weak as a
@@ -181,9 +183,9 @@ def _sigma_of_weakest(
     for _ in range(8):
         directions = np.linalg.qr(directions.T)[0].T
         previous = directions
-        declared, _, values, _ = found.arguments
+        declared, _, values, _ = solution.arguments
         directions = np.asarray(
-            _products(declared, values, factor, found.moves, per_extent, directions)
+            _products(declared, values, factor, solution.moves, per_extent, directions)
         )
     # Rayleigh and Ritz: A restricted to the subspace has the largest eigenvalues μ, and the σ² of
     # an unknown is Σ μ·(component)².
@@ -202,10 +204,10 @@ def _products(
 ) -> Float[Array, "m reduced"]:
     """A times each of the directions [m, reduced]."""
     plan = factor.plan
-    still = {name: jnp.zeros(group.free.shape) for name, group in plan.groups.items()}
+    zero_change = {name: jnp.zeros(group.free.shape) for name, group in plan.groups.items()}
 
     def product(direction: Float[Array, " reduced"]) -> Float[Array, " reduced"]:
-        right = still | split_by_group(plan, plan.kept, direction * per_extent)
+        right = zero_change | split_by_group(plan, plan.kept, direction * per_extent)
         right = s_transform_transposed(declared, plan, values, right, moves)
         change = s_transform(declared, plan, values, solve(factor, right), moves)
         return flat(plan.kept, change) * per_extent
