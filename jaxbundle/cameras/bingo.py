@@ -47,8 +47,8 @@ def correct(p: Parameters, x: Scalar, y: Scalar) -> Pair:
 def _radius(x: Scalar, y: Scalar) -> Scalar:
     # √ has no derivative at 0; what is multiplied by x or y there needs none
     square = x * x + y * y
-    inside = square > 0
-    return jnp.where(inside, jnp.sqrt(jnp.where(inside, square, 1.0)), 0.0)
+    is_positive = square > 0
+    return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, square, 1.0)), 0.0)
 
 
 BINGO = CameraModel(

@@ -87,13 +87,13 @@ def get_model(model: str | CameraModel) -> CameraModel:
                 f"Camera model {model.name!r} is built in; give your own another name."
             )
         return model
-    found = _built_in(model)
-    if found is None:
+    built_in = _built_in(model)
+    if built_in is None:
         raise ValueError(
             f"Unknown camera model {model!r}{closest(model, (*MODEL_NAMES, *FAMILIES))} "
             f"The models are {', '.join((*MODEL_NAMES, *FAMILIES))}."
         )
-    return found
+    return built_in
 
 
 def is_own(model: str | CameraModel) -> bool:
@@ -118,12 +118,12 @@ def _built_in(name: str) -> CameraModel | None:
     """
     if isinstance(name, str) and name in MODELS:  # a file may have anything there
         return MODELS[name]
-    found = _of_family(name)
-    return None if found is None else found()
+    make_model = _of_family(name)
+    return None if make_model is None else make_model()
 
 
 def _of_family(name: str) -> Callable[[], CameraModel] | None:
     for form, make in FAMILIES.values():
-        if isinstance(name, str) and (found := re.fullmatch(form, name)):
-            return partial(make, *found.groups())
+        if isinstance(name, str) and (match := re.fullmatch(form, name)):
+            return partial(make, *match.groups())
     return None

@@ -121,12 +121,12 @@ def compare_cameras(
     xy = image_grid(low, high)
     shift, step = between_frames(other, source, image_size, pixel_size)
     rays = rays_of(source, values, xy)
-    seen = come_back(source, values, xy, rays) & _are_one_to_one(other, others, rays)
-    if seen.sum() < 3:
+    is_seen = come_back(source, values, xy, rays) & _are_one_to_one(other, others, rays)
+    if is_seen.sum() < 3:
         raise ValueError("no part of the image has a ray in both calibrations")
     # Beyond the measurements a calibration extrapolates: differences there would turn the frame.
-    near = seen & (np.linalg.norm(xy - xy.mean(0), axis=1) <= radius)
-    if rotate and near.sum() < 3:
+    is_near = is_seen & (np.linalg.norm(xy - xy.mean(0), axis=1) <= radius)
+    if rotate and is_near.sum() < 3:
         raise ValueError(f"a radius of {radius:g} {source.unit} holds too few points to fit")
     p = np.array([others[name] for name in other.parameters], float)
     rotation = np.zeros(3)
@@ -134,10 +134,10 @@ def compare_cameras(
     with local_x64():
         if rotate:
             # In the unit of the first calibration, whatever that of the second is.
-            weight = near[:, None] * np.abs(step)
+            weight = is_near[:, None] * np.abs(step)
             rotation = np.array(_best_turn(other, p, rays, target, weight))
-        there = np.array(_turn(other, p, rotation, rays))
-    difference = np.where(seen[:, None], shift + step * there - xy, np.nan)
+        turned = np.array(_turn(other, p, rotation, rays))
+    difference = np.where(is_seen[:, None], shift + step * turned - xy, np.nan)
     return _as_comparison(source.unit, xy, difference, rotation)
 
 
@@ -149,7 +149,7 @@ def _as_comparison(
 ) -> Comparison:
     """The map of differences at the points of `image_grid`."""
     length = np.linalg.norm(difference, axis=1)
-    known = np.isfinite(length)
+    is_known = np.isfinite(length)
     worst = int(np.nanargmax(length))
     columns, rows = GRID
     grid = xy.reshape(rows, columns, 2)
@@ -159,10 +159,10 @@ def _as_comparison(
         grid[:, 0, 1],
         difference.reshape(rows, columns, 2),
         rotation,
-        float(np.sqrt(np.mean(length[known] ** 2))),
+        float(np.sqrt(np.mean(length[is_known] ** 2))),
         float(length[worst]),
         tuple(xy[worst].tolist()),
-        float(known.mean()),
+        float(is_known.mean()),
     )
 
 
@@ -179,22 +179,22 @@ def difference_rings(comparison: Comparison, step: float) -> dict[str, np.ndarra
     x, y = np.meshgrid(comparison.x - comparison.x.mean(), comparison.y - comparison.y.mean())
     r = np.hypot(x, y).ravel()
     d = comparison.difference.reshape(-1, 2)
-    known = np.isfinite(d).all(1)
-    r, d, x, y = r[known], d[known], x.ravel()[known], y.ravel()[known]
+    is_known = np.isfinite(d).all(1)
+    r, d, x, y = r[is_known], d[is_known], x.ravel()[is_known], y.ravel()[is_known]
     ring = np.floor(r / step).astype(int)
     # At the centre itself no direction is outward: 0.
     out = np.stack([x, y], 1) / np.maximum(r, 1e-300)[:, None]
     radial, tangential = (d * out).sum(1), out[:, 0] * d[:, 1] - out[:, 1] * d[:, 0]
     rings = np.unique(ring)
-    of = lambda function, v: np.array([function(v[ring == k]) for k in rings])
+    in_rings = lambda function, v: np.array([function(v[ring == k]) for k in rings])
     length = np.hypot(*d.T)
     return {
         "r": (rings + 1) * step,
-        "radial": of(np.mean, radial),
-        "tangential": of(np.mean, tangential),
-        "rms": of(lambda v: np.sqrt(np.mean(v**2)), length),
-        "largest": of(np.max, length),
-        "points": of(len, length),
+        "radial": in_rings(np.mean, radial),
+        "tangential": in_rings(np.mean, tangential),
+        "rms": in_rings(lambda v: np.sqrt(np.mean(v**2)), length),
+        "largest": in_rings(np.max, length),
+        "points": in_rings(len, length),
     }
 
 
@@ -204,11 +204,11 @@ def _are_one_to_one(
     """Which rays have an image that belongs to no other ray: a polynomial turns back, and beyond
     that radius its images are those of rays nearer to the axis."""
     images = images_of(model, values, rays)
-    there = np.all(np.isfinite(images), axis=1)
-    back = rays_of(model, values, np.where(there[:, None], images, np.nan))
+    has_image = np.all(np.isfinite(images), axis=1)
+    rays_back = rays_of(model, values, np.where(has_image[:, None], images, np.nan))
     unit = lambda v: v / np.linalg.norm(v, axis=1, keepdims=True)
     # 1e-6 radians: far more than the inverse's rounding, far less than the way to another branch.
-    return there & (np.linalg.norm(unit(back) - unit(rays), axis=1) < 1e-6)
+    return has_image & (np.linalg.norm(unit(rays_back) - unit(rays), axis=1) < 1e-6)
 
 
 @partial(compile_once, static=0)

@@ -106,37 +106,40 @@ def convert_camera(
     shift, step = between_frames(source, target, *sizes)
     xy = image_grid(*(area or image_area(source, *sizes)))
     rays = rays_of(source, values, xy)
-    there = come_back(source, values, xy, rays)
-    if there.mean() < MEASURABLE:
+    has_ray = come_back(source, values, xy, rays)
+    if has_ray.mean() < MEASURABLE:
         raise ValueError(
-            f"only {100 * there.mean():.0f} % of the image has a ray in model {source.name!r}: its "
+            f"only {100 * has_ray.mean():.0f} % of the image has a ray in model {source.name!r}: "
+            "its "
             "distortion turns back inside the image"
         )
-    wanted, rays = (shift + step * xy)[there], rays[there]
+    target_images, rays = (shift + step * xy)[has_ray], rays[has_ray]
     if not target.wide and (rays[:, 2] >= 0).any():
         raise ValueError(
             f"part of the image looks 90° and more from the axis, where model {target.name!r} has "
             "no image; convert a smaller area, or keep the fisheye model"
         )
     try:
-        found, reason = _exact(source, values, target, sizes, r0), ""
-        _check_defaults(found, target, free)
+        converted, reason = _exact(source, values, target, sizes, r0), ""
+        _check_defaults(converted, target, free)
     except NotExact as why:
         reason = str(why)
         starts = start_values(source, values, target, sizes, r0)
         if free:
             default = default_parameters(target)
-            held = {name: v for name, v in default.items() if name not in free}
-            starts = [{**start, **held} for start in starts]
-        found = fit_parameters(target, rays, wanted, starts, free)
+            held_parameters = {name: v for name, v in default.items() if name not in free}
+            starts = [{**start, **held_parameters} for start in starts]
+        converted = fit_parameters(target, rays, target_images, starts, free)
     # Measured in any case: a formula is no proof that the two programs mean the same camera.
-    difference = images_of(target, found, rays) - wanted
-    return _as_conversion(target, found, reason, wanted, difference, float(there.mean()))
+    difference = images_of(target, converted, rays) - target_images
+    return _as_conversion(
+        target, converted, reason, target_images, difference, float(has_ray.mean())
+    )
 
 
 def _as_conversion(
     target: CameraModel,
-    found: Mapping[str, float],
+    converted: Mapping[str, float],
     reason: str,
     xy: Float[np.ndarray, "points 2"],
     difference: Float[np.ndarray, "points 2"],
@@ -156,7 +159,7 @@ def _as_conversion(
         reason = ""
     return Conversion(
         target.name,
-        {name: float(v) for name, v in found.items()},
+        {name: float(v) for name, v in converted.items()},
         not reason,
         float(length[worst]),
         float(np.sqrt(np.mean(length**2))),
@@ -167,12 +170,14 @@ def _as_conversion(
     )
 
 
-def _check_defaults(found: Mapping[str, float], target: CameraModel, free: Sequence[str]) -> None:
+def _check_defaults(
+    converted: Mapping[str, float], target: CameraModel, free: Sequence[str]
+) -> None:
     """**Raises:** `NotExact` if a parameter that is not free has another value than its default."""
     default = default_parameters(target)
-    more = [n for n, v in default.items() if free and n not in free and found[n] != v]
-    if more:
-        raise NotExact(f"{', '.join(more)} must keep the default")
+    not_default = [n for n, v in default.items() if free and n not in free and converted[n] != v]
+    if not_default:
+        raise NotExact(f"{', '.join(not_default)} must keep the default")
 
 
 def _exact(

@@ -102,38 +102,40 @@ def fit_parameters(
     """
     from scipy.optimize import least_squares
 
-    chosen = [model.parameters.index(name) for name in free or fitted_parameters(model)]
+    free_columns = [model.parameters.index(name) for name in free or fitted_parameters(model)]
     cost = lambda p: float(np.square(_images(model, p, rays) - xy).sum())
     with local_x64():
         # `fmin`: a start without an image of every ray costs NaN, more than any other.
-        least = lambda p: np.fmin(cost(p), np.inf)
-        start = min((_order(model, values) for values in starts), key=least)
+        cost_or_infinity = lambda p: np.fmin(cost(p), np.inf)
+        start = min((_order(model, values) for values in starts), key=cost_or_infinity)
         if not np.isfinite(cost(start)):
-            seen = [np.isfinite(_images(model, _order(model, v), rays)).all(1) for v in starts]
-            raise ValueError(_without_images(model, rays, max(seen, key=np.sum)))
+            has_images = [
+                np.isfinite(_images(model, _order(model, v), rays)).all(1) for v in starts
+            ]
+            raise ValueError(_without_images(model, rays, max(has_images, key=np.sum)))
 
         def complete(q: Float[np.ndarray, " free"]) -> Float[np.ndarray, " parameters"]:
             p = start.copy()
-            p[chosen] = q
+            p[free_columns] = q
             return p
 
-        low, high = _bounds(model, chosen)
-        start[chosen] = np.clip(start[chosen], low, high)
+        low, high = _bounds(model, free_columns)
+        start[free_columns] = np.clip(start[free_columns], low, high)
         # Knots at the edge of the image, which no point determines, stay near the start; without
         # this they became thousands of radians for the sake of 0.01 pixels.
         prior = np.array(
-            [FIT_SIGMA / dict(model.prior).get(model.parameters[j], np.inf) for j in chosen]
+            [FIT_SIGMA / dict(model.prior).get(model.parameters[j], np.inf) for j in free_columns]
         )
-        ridge, kept = np.diag(prior)[prior > 0], start[chosen]
+        ridge, start_of_ridge = np.diag(prior)[prior > 0], start[free_columns]
         differences = lambda q: np.asarray(_images(model, complete(q), rays) - xy).ravel()
-        residuals = lambda q: np.concatenate([differences(q), ridge @ (q - kept)])
+        residuals = lambda q: np.concatenate([differences(q), ridge @ (q - start_of_ridge)])
         # All columns are computed: one program for any choice of free parameters.
-        slopes = lambda q: np.asarray(_jacobian(model, complete(q), rays))[..., chosen]
+        slopes = lambda q: np.asarray(_jacobian(model, complete(q), rays))[..., free_columns]
         try:
-            found = least_squares(
+            fit = least_squares(
                 residuals,
-                start[chosen],
-                lambda q: np.concatenate([slopes(q).reshape(-1, len(chosen)), ridge]),
+                start[free_columns],
+                lambda q: np.concatenate([slopes(q).reshape(-1, len(free_columns)), ridge]),
                 x_scale="jac",
                 # To rounding, so that a camera that the target can express is found exactly.
                 ftol=1e-15,
@@ -145,17 +147,17 @@ def fit_parameters(
             )
         except np.linalg.LinAlgError as error:
             raise ValueError(f"the fit failed: {error}") from None
-    return dict(zip(model.parameters, complete(found.x).tolist()))
+    return dict(zip(model.parameters, complete(fit.x).tolist()))
 
 
 def _without_images(
-    model: CameraModel, rays: Float[np.ndarray, "points 3"], seen: Bool[np.ndarray, " points"]
+    model: CameraModel, rays: Float[np.ndarray, "points 3"], has_image: Bool[np.ndarray, " points"]
 ) -> str:
     """What to say where a model has no image of some rays."""
     axis = rays[np.hypot(rays[:, 0], rays[:, 1]).argmin()] * [0.0, 0.0, 1.0]
     cosine = rays @ axis / (np.linalg.norm(rays, axis=1) * np.linalg.norm(axis))
     angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-    reach = f"up to {angle[seen].max():.1f}°" if seen.any() else "none"
+    reach = f"up to {angle[has_image].max():.1f}°" if has_image.any() else "none"
     return (
         f"{model.name} has no image of the whole area: it has rays up to {angle.max():.1f}° from "
         f"the axis, of which the model has images of {reach}; choose one with a larger field"
@@ -163,10 +165,10 @@ def _without_images(
 
 
 def _bounds(
-    model: CameraModel, chosen: Sequence[int]
+    model: CameraModel, columns: Sequence[int]
 ) -> tuple[Float[np.ndarray, " chosen"], Float[np.ndarray, " chosen"]]:
     """Valid ranges of the parameters, with a small margin inside."""
-    ends = [dict(model.ranges).get(model.parameters[j], (-np.inf, np.inf)) for j in chosen]
+    ends = [dict(model.ranges).get(model.parameters[j], (-np.inf, np.inf)) for j in columns]
     low, high = np.array(ends, float).reshape(-1, 2).T
     width = high - low
     # A thousandth of the range: at its end itself (α = 1, ξ = −1) formulas divide by 0.
@@ -180,17 +182,17 @@ def start_values(
     """Start values of the target: without distortion; with that of the source to the first orders,
     if the terms have counterparts; and as a stereographic camera, which has images beyond 90°."""
     shift, step = between_frames(source, target, *sizes)
-    of = lambda names: np.array([values[name] for name in names])
-    focal = of(source.principal_distance) * np.abs(step) * magnification(source, values)
-    point = shift + step * (of(source.principal_point) if source.principal_point else 0.0)
+    values_of = lambda names: np.array([values[name] for name in names])
+    focal = values_of(source.principal_distance) * np.abs(step) * magnification(source, values)
+    point = shift + step * (values_of(source.principal_point) if source.principal_point else 0.0)
     plain = default_parameters(target)
     conventions = {"format_factor": values.get("format_factor")} | ({"r0": r0} if r0 else {})
     plain |= {n: v for n, v in conventions.items() if v and n in target.never_free}
     distances = target.principal_distance
-    both = focal if len(distances) == 2 else [focal.mean()] * 2
+    principal_distances = focal if len(distances) == 2 else [focal.mean()] * 2
     # A fisheye's polynomial in tan θ has no image at 90°; the stereographic camera has one
     # everywhere.
-    wide: dict[str, float] = dict(zip(("fx", "fy"), both))
+    wide: dict[str, float] = dict(zip(("fx", "fy"), principal_distances))
     wide |= dict(zip(("cx", "cy"), point))
     focal = focal / magnification(target, plain)
     plain |= dict(zip(distances, focal if len(distances) == 2 else [focal.mean()]))

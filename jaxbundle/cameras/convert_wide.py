@@ -61,9 +61,9 @@ def exact_wide(
 ) -> dict[str, float]:
     """As `convert_exact.exact_parameters`, for these models."""
     for convert in (_by_angle, _by_division, _by_sphere):
-        found = convert(source, values, target, sizes, r0)
-        if found is not None:
-            return found
+        parameters = convert(source, values, target, sizes, r0)
+        if parameters is not None:
+            return parameters
     raise NotExact(f"{source.name} and {target.name} are different functions")
 
 
@@ -88,8 +88,8 @@ def _by_angle(
         if value != 0 and common not in of_target.values():
             raise NotExact(f"{target.name} has no {common}, which is {value:.6g}")
     core = {name: values[name] for name in CORE}
-    found = {name: terms.get(common, 0.0) for name, common in of_target.items()}
-    return dict.fromkeys(target.parameters, 0.0) | core | found
+    coefficients = {name: terms.get(common, 0.0) for name, common in of_target.items()}
+    return dict.fromkeys(target.parameters, 0.0) | core | coefficients
 
 
 def _by_division(
@@ -188,9 +188,9 @@ def _from_sphere(
     for term in ("k1", "k2", "p1", "p2"):
         if mei[term] != 0:
             _refuse(f"{target.name} has no {term}, which is {mei[term]:.6g}")
-    only = {"stereographic": 1.0, "division": 0.0}.get(name, xi)
-    if abs(xi - only) > EQUAL:
-        _refuse(f"{target.name} is the sphere with xi = {only:g}, and it is {xi:.6g}")
+    fixed_xi = {"stereographic": 1.0, "division": 0.0}.get(name, xi)
+    if abs(xi - fixed_xi) > EQUAL:
+        _refuse(f"{target.name} is the sphere with xi = {fixed_xi:g}, and it is {xi:.6g}")
     core = {n: mei[n] / (1 + xi if n[0] == "f" else 1) for n in CORE}
     alpha = xi / (1 + xi)
     shape = {"eucm": {"alpha": alpha, "beta": 1.0}, "double-sphere": {"xi": 0.0, "alpha": alpha}}

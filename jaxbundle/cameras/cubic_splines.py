@@ -12,9 +12,9 @@ from jaxtyping import Array, Float
 from jaxbundle.cameras.scalars import Scalar
 
 
-def basis(t: Scalar, first: int, number: int) -> Float[Array, "*points knots"]:
+def basis(t: Scalar, first_knot: int, number: int) -> Float[Array, "*points knots"]:
     """B(t − j) of the knots j = first, first + 1, … as a last axis."""
-    t = jnp.asarray(t)[..., None] - jnp.arange(first, first + number)
+    t = jnp.asarray(t)[..., None] - jnp.arange(first_knot, first_knot + number)
     a = jnp.abs(t)
     inner = (4 + t * t * (3 * a - 6)) / 6
     return jnp.where(a < 1, inner, jnp.maximum(2 - a, 0.0) ** 3 / 6)

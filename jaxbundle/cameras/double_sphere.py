@@ -33,8 +33,8 @@ def project(p: Parameters, r: Scalar, s: Scalar, q: Scalar) -> Pair:
     X, Y, Z = r, -s, -q
     square = X * X + Y * Y
     d1 = jnp.sqrt(square + Z * Z)
-    above = xi * d1 + Z
-    N = alpha * jnp.sqrt(square + above * above) + (1 - alpha) * above
+    shifted_Z = xi * d1 + Z
+    N = alpha * jnp.sqrt(square + shifted_Z * shifted_Z) + (1 - alpha) * shifted_Z
     # As far as the image grows: beyond, two rays share a point.
     w1 = reach(alpha)
     w2 = (w1 + xi) / jnp.sqrt(2 * w1 * xi + xi * xi + 1)

@@ -34,8 +34,8 @@ def unproject(p: Parameters, u: Scalar, v: Scalar) -> Triple:
     """The ray of a pixel."""
     fx, fy, cx, cy = p
     longitude, latitude = (u - cx) / fx, (v - cy) / fy
-    there = (jnp.abs(longitude) <= jnp.pi) & (jnp.abs(latitude) <= jnp.pi / 2)
-    longitude = jnp.where(there, longitude, jnp.nan)
+    is_inside = (jnp.abs(longitude) <= jnp.pi) & (jnp.abs(latitude) <= jnp.pi / 2)
+    longitude = jnp.where(is_inside, longitude, jnp.nan)
     flat = jnp.cos(latitude)
     return flat * jnp.sin(longitude), -jnp.sin(latitude), -flat * jnp.cos(longitude)
 

@@ -30,14 +30,14 @@ def equidistant(columns: Sequence[int], up: bool) -> tuple[OfRay, ToRay]:
 
     **Arguments:** as of `perspective.perspective`.
     """
-    first, last = columns[0], columns[-1]
+    column_x, column_y = columns[0], columns[-1]
 
     def ideal(p: Parameters, r: Scalar, s: Scalar, q: Scalar) -> Pair:
         scale = angle_over_sine(r * r + s * s, q)
-        return p[first] * scale * r, p[last] * scale * s if up else -p[last] * scale * s
+        return p[column_x] * scale * r, p[column_y] * scale * s if up else -p[column_y] * scale * s
 
     def ray(p: Parameters, xi: Scalar, yi: Scalar) -> Triple:
-        X, Y = xi / p[first], yi / p[last]
+        X, Y = xi / p[column_x], yi / p[column_y]
         square = X * X + Y * Y
         square = jnp.where(square < jnp.pi**2, square, jnp.nan)
         scale = sine_over_angle(square)
@@ -46,7 +46,7 @@ def equidistant(columns: Sequence[int], up: bool) -> tuple[OfRay, ToRay]:
     return ideal, ray
 
 
-def stereographic(columns: Sequence[int], up: bool) -> tuple[OfRay, ToRay]:
+def stereographic(columns: Sequence[int], y_up: bool) -> tuple[OfRay, ToRay]:
     """As `equidistant`; every ideal image has a ray."""
 
     def scale(R: Scalar, q: Scalar) -> Scalar:
@@ -55,10 +55,10 @@ def stereographic(columns: Sequence[int], up: bool) -> tuple[OfRay, ToRay]:
     def ray(square: Scalar) -> Pair:
         return 4 / (4 + square), (4 - square) / (4 + square)
 
-    return _image(columns, up, scale, ray)
+    return _image(columns, y_up, scale, ray)
 
 
-def equisolid(columns: Sequence[int], up: bool) -> tuple[OfRay, ToRay]:
+def equisolid(columns: Sequence[int], y_up: bool) -> tuple[OfRay, ToRay]:
     """As `equidistant`; NaN beyond θ = 180°."""
 
     def scale(R: Scalar, q: Scalar) -> Scalar:
@@ -68,10 +68,10 @@ def equisolid(columns: Sequence[int], up: bool) -> tuple[OfRay, ToRay]:
         square = jnp.where(square < 4, square, jnp.nan)
         return jnp.sqrt(1 - square / 4), 1 - square / 2
 
-    return _image(columns, up, scale, ray)
+    return _image(columns, y_up, scale, ray)
 
 
-def orthographic(columns: Sequence[int], up: bool) -> tuple[OfRay, ToRay]:
+def orthographic(columns: Sequence[int], y_up: bool) -> tuple[OfRay, ToRay]:
     """As `equidistant`; NaN from θ = 90° on, where the image would turn back."""
 
     def scale(R: Scalar, q: Scalar) -> Scalar:
@@ -81,26 +81,26 @@ def orthographic(columns: Sequence[int], up: bool) -> tuple[OfRay, ToRay]:
         cosine = jnp.sqrt(jnp.where(square < 1, 1 - square, jnp.nan))
         return jnp.where(square < 1, 1.0, jnp.nan), cosine
 
-    return _image(columns, up, scale, ray)
+    return _image(columns, y_up, scale, ray)
 
 
 def _image(
     columns: Sequence[int],
-    up: bool,
+    y_up: bool,
     scale: Callable[[Scalar, Scalar], Scalar],
     ray_of: Callable[[Scalar], tuple[Scalar, Scalar]],
 ) -> tuple[OfRay, ToRay]:
     """`scale` u/√(r² + s²) of R and q; `ray_of` sin θ/u and cos θ of u²."""
-    first, last = columns[0], columns[-1]
+    column_x, column_y = columns[0], columns[-1]
 
     def ideal(p: Parameters, r: Scalar, s: Scalar, q: Scalar) -> Pair:
         k = scale(jnp.sqrt(r * r + s * s + q * q), q)
-        return p[first] * k * r, p[last] * k * s if up else -p[last] * k * s
+        return p[column_x] * k * r, p[column_y] * k * s if y_up else -p[column_y] * k * s
 
     def ray(p: Parameters, xi: Scalar, yi: Scalar) -> Triple:
-        X, Y = xi / p[first], yi / p[last]
+        X, Y = xi / p[column_x], yi / p[column_y]
         sine, cosine = ray_of(X * X + Y * Y)
-        return X * sine, Y * sine if up else -Y * sine, -cosine
+        return X * sine, Y * sine if y_up else -Y * sine, -cosine
 
     return ideal, ray
 
@@ -118,25 +118,27 @@ def angle_over_sine(square: Scalar, q: Scalar) -> Scalar:
     """θ/ρ with ρ² = `square` = r² + s² and θ = atan2(ρ, −q)."""
     # Not near θ = 180°, where the ray has no azimuth and the image none: there the quotient is
     # right, infinite.
-    near = (square < _NEAR * q * q) & (q < 0)
-    t2 = jnp.where(near, square / jnp.where(near, q * q, 1.0), 0.0)
-    series = (1 - t2 * (1 / 3 - t2 * (1 / 5 - t2 * (1 / 7 - t2 / 9)))) / jnp.where(near, -q, 1.0)
-    rho = jnp.sqrt(jnp.where(near, 1.0, square))
-    return jnp.where(near, series, jnp.arctan2(rho, -q) / rho)
+    is_small = (square < _NEAR * q * q) & (q < 0)
+    t2 = jnp.where(is_small, square / jnp.where(is_small, q * q, 1.0), 0.0)
+    series = (1 - t2 * (1 / 3 - t2 * (1 / 5 - t2 * (1 / 7 - t2 / 9)))) / jnp.where(
+        is_small, -q, 1.0
+    )
+    rho = jnp.sqrt(jnp.where(is_small, 1.0, square))
+    return jnp.where(is_small, series, jnp.arctan2(rho, -q) / rho)
 
 
 def sine_over_angle(square: Scalar) -> Scalar:
     """sin θ/θ with θ² = `square`."""
-    near = square < _NEAR
-    t2 = jnp.where(near, square, 0.0)
-    theta = jnp.sqrt(jnp.where(near, 1.0, square))
-    return jnp.where(near, 1 - t2 / 6 * (1 - t2 / 20 * (1 - t2 / 42)), jnp.sin(theta) / theta)
+    is_small = square < _NEAR
+    t2 = jnp.where(is_small, square, 0.0)
+    theta = jnp.sqrt(jnp.where(is_small, 1.0, square))
+    return jnp.where(is_small, 1 - t2 / 6 * (1 - t2 / 20 * (1 - t2 / 42)), jnp.sin(theta) / theta)
 
 
 def cosine(square: Scalar) -> Scalar:
     """cos θ with θ² = `square`."""
-    near = square < _NEAR
-    t2 = jnp.where(near, square, 0.0)
-    theta = jnp.sqrt(jnp.where(near, 1.0, square))
+    is_small = square < _NEAR
+    t2 = jnp.where(is_small, square, 0.0)
+    theta = jnp.sqrt(jnp.where(is_small, 1.0, square))
     series = 1 - t2 / 2 * (1 - t2 / 12 * (1 - t2 / 30 * (1 - t2 / 56)))
-    return jnp.where(near, series, jnp.cos(theta))
+    return jnp.where(is_small, series, jnp.cos(theta))

@@ -75,18 +75,18 @@ def _fisheye(
 ) -> CameraModel:
     """A model of the angle; `coefficients`: those of its radial polynomial, of p."""
     undistort = implicit_inverse(distort, lambda _p, X, Y: (X, Y), 12)
-    one = (1.0, 1.0)
+    unit_scale = (1.0, 1.0)
 
     def project(p: Parameters, r: Scalar, s: Scalar, q: Scalar) -> Pair:
-        a, b = _angle(one, r, s, q)
+        a, b = _angle(unit_scale, r, s, q)
         # Before decentring, which may move a point across the turn, but not turn the image back.
-        there = is_increasing(coefficients(p), a * a + b * b)
+        is_inside = is_increasing(coefficients(p), a * a + b * b)
         a, b = distort(p, a, b)
         u, v = p[2] + p[0] * a, p[3] + p[1] * b
-        return jnp.where(there, u, jnp.nan), jnp.where(there, v, jnp.nan)
+        return jnp.where(is_inside, u, jnp.nan), jnp.where(is_inside, v, jnp.nan)
 
     def unproject(p: Parameters, u: Scalar, v: Scalar) -> Triple:
-        return _ray(one, *undistort(p, (u - p[2]) / p[0], (v - p[3]) / p[1]))
+        return _ray(unit_scale, *undistort(p, (u - p[2]) / p[0], (v - p[3]) / p[1]))
 
     return CameraModel(
         name,

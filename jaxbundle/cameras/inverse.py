@@ -58,11 +58,11 @@ def implicit_inverse(g: Formula, start: Formula, iterations: int = 6) -> Formula
         # A thousand units of rounding: of p in the formula, amplified where J is nearly singular.
         remainder = jnp.abs(gx - X) + jnp.abs(gy - Y)
         size = jnp.abs(x) + jnp.abs(y) + jnp.abs(X) + jnp.abs(Y)
-        found = remainder <= 1000 * jnp.finfo(jnp.result_type(x)).eps * size
+        is_root = remainder <= 1000 * jnp.finfo(jnp.result_type(x)).eps * size
         # On the branch through the principal point the Jacobian keeps eigenvalues of positive real
         # part.
-        found &= (a * d - b * c > 0) & (a + d > 0)
-        return jnp.where(found, x, jnp.nan), jnp.where(found, y, jnp.nan)
+        is_root &= (a * d - b * c > 0) & (a + d > 0)
+        return jnp.where(is_root, x, jnp.nan), jnp.where(is_root, y, jnp.nan)
 
     @inverse.defjvp
     def _(primals: tuple, tangents: tuple) -> tuple[Pair, Pair]:
@@ -84,7 +84,7 @@ def implicit_inverse(g: Formula, start: Formula, iterations: int = 6) -> Formula
 
 def limit_region(
     formula: Formula,
-    inside: Callable[[Parameters, Scalar, Scalar], Scalar],
+    region: Callable[[Parameters, Scalar, Scalar], Scalar],
     start: Formula,
     iterations: int,
 ) -> tuple[Formula, Formula]:
@@ -95,17 +95,17 @@ def limit_region(
     """
     inverse = implicit_inverse(formula, start, iterations)
 
-    def only(p: Parameters, at: Pair, result: Pair) -> Pair:
-        there = inside(p, *at)
-        x, y = (jnp.where(there, value, jnp.nan) for value in result)
+    def inside_only(p: Parameters, at: Pair, result: Pair) -> Pair:
+        is_inside = region(p, *at)
+        x, y = (jnp.where(is_inside, value, jnp.nan) for value in result)
         return x, y
 
-    def back(p: Parameters, X: Scalar, Y: Scalar) -> Pair:
+    def inverse_inside_only(p: Parameters, X: Scalar, Y: Scalar) -> Pair:
         # The limit is applied to the root, not to the steps that lead to it.
         xy = inverse(p, X, Y)
-        return only(p, xy, xy)
+        return inside_only(p, xy, xy)
 
-    return lambda p, x, y: only(p, (x, y), formula(p, x, y)), back
+    return lambda p, x, y: inside_only(p, (x, y), formula(p, x, y)), inverse_inside_only
 
 
 def value_and_derivative(

@@ -54,8 +54,8 @@ def project(p: Parameters, r: Scalar, s: Scalar, q: Scalar) -> Pair:
     x, y = X / N, Y / N
     xd, yd = distort(p, x, y)
     # Beyond the turn a ray has an image that belongs to another ray.
-    there = is_increasing((k1, k2), x * x + y * y)
-    return cx + fx * jnp.where(there, xd, jnp.nan), cy + fy * jnp.where(there, yd, jnp.nan)
+    is_inside = is_increasing((k1, k2), x * x + y * y)
+    return cx + fx * jnp.where(is_inside, xd, jnp.nan), cy + fy * jnp.where(is_inside, yd, jnp.nan)
 
 
 def unproject(p: Parameters, u: Scalar, v: Scalar) -> Triple:

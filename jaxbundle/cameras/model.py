@@ -134,7 +134,7 @@ class CameraModel:
             # Distortion formulas near the identity need an ideal image of the same scale on the
             # axis.
             ideal, ray = (_magnify(of, columns, self.magnification) for of in (ideal, ray))
-        formula, back = self.correct or self.distort, self.inverse
+        formula, inverse = self.correct or self.distort, self.inverse
         if self.project is not None:
             # `project` as a distortion of the ideal image, so that every model has the same two
             # domains.
@@ -143,24 +143,30 @@ class CameraModel:
         if self.unproject is not None:
             unproject = self.unproject
             corrected = lambda p, x, y: ideal(p, *unproject(p, x, y))
-            formula, back = (corrected, back) if formula is None else (formula, corrected)
+            formula, inverse = (corrected, inverse) if formula is None else (formula, corrected)
         assert formula is not None, "checked by _complete"
         # The formula stated is exact; the other direction is its inverse, to rounding.
         point = [self.parameters.index(name) for name in self.principal_point]
         start = _at_the_point(point) if self.correct and point else _less_its_origin(formula)
-        back = back or implicit_inverse(formula, self.start or start, self.iterations)
+        inverse = inverse or implicit_inverse(formula, self.start or start, self.iterations)
         explicit = self.distort or self.project
-        own, other = ("from_ideal", "to_ideal")[:: 1 if explicit else -1]
-        made = {"own_formula": own, own: formula, other: back, "ideal": ideal, "ray": ray}
-        for name, value in made.items():
+        own_formula, other_formula = ("from_ideal", "to_ideal")[:: 1 if explicit else -1]
+        functions = {
+            "own_formula": own_formula,
+            own_formula: formula,
+            other_formula: inverse,
+            "ideal": ideal,
+            "ray": ray,
+        }
+        for name, value in functions.items():
             object.__setattr__(self, name, value)
 
     @property
     def formula(self) -> Formula | OfRay | ToRay:
         """The one function the model states."""
-        given = self.correct or self.distort or self.project or self.unproject
-        assert given is not None, "checked when the model is made"
-        return given
+        stated = self.correct or self.distort or self.project or self.unproject
+        assert stated is not None, "checked when the model is made"
+        return stated
 
     @property
     def wide(self) -> bool:
@@ -193,14 +199,14 @@ def _complete(model: CameraModel) -> dict:
             f"{where}parameters must be different names such as ('c', 'x0', 'y0', 'K1'), none of "
             f"them {', '.join(RESERVED_NAMES)}, but are {model.parameters!r:.200}."
         )
-    given = [name for name in FORMULAS if getattr(model, name) is not None]
-    if len(given) != 1 and given != ["project", "unproject"]:
+    formulas = [name for name in FORMULAS if getattr(model, name) is not None]
+    if len(formulas) != 1 and formulas != ["project", "unproject"]:
         raise ValueError(
             f"{where}give one formula as correct, distort, project or unproject, not "
-            f"{' and '.join(given) or 'none'}; its inverse is inverse, that of project may be "
+            f"{' and '.join(formulas) or 'none'}; its inverse is inverse, that of project may be "
             "unproject."
         )
-    for name in (*given, "inverse", "start", "magnification"):
+    for name in (*formulas, "inverse", "start", "magnification"):
         if getattr(model, name) is not None and not callable(getattr(model, name)):
             raise ValueError(f"{where}{name} must be a function, not {getattr(model, name)!r:.60}.")
     for name, choices in (
@@ -209,34 +215,41 @@ def _complete(model: CameraModel) -> dict:
         ("image", tuple(IMAGES)),
     ):
         if getattr(model, name) not in choices:
-            known = ", ".join(filter(None, choices))
-            raise ValueError(f"{where}{name} is one of {known}, not {getattr(model, name)!r:.60}.")
+            known_set = ", ".join(filter(None, choices))
+            raise ValueError(
+                f"{where}{name} is one of {known_set}, not {getattr(model, name)!r:.60}."
+            )
     if not isinstance(model.iterations, int) or model.iterations < 1:
         raise ValueError(f"{where}iterations must be a number above 0, not {model.iterations!r}.")
     # The first of the usual names that are among the parameters.
-    known = lambda sets: next((names for names in sets if {*names} <= {*parameters}), ())
-    kept = {
+    known_set = lambda sets: next((names for names in sets if {*names} <= {*parameters}), ())
+    fields = {
         "parameters": parameters,
         "axes": model.axes or ("up" if model.unit == "mm" else "down"),
         "defaults": tuple(dict(model.defaults).items()),
         "never_free": tuple(model.never_free),
         "ranges": tuple((name, tuple(ends)) for name, ends in dict(model.ranges).items()),
         "prior": tuple(dict(model.prior).items()),
-        "principal_distance": tuple(model.principal_distance) or known(PRINCIPAL_DISTANCES),
-        "principal_point": tuple(model.principal_point) or known(PRINCIPAL_POINTS),
+        "principal_distance": tuple(model.principal_distance) or known_set(PRINCIPAL_DISTANCES),
+        "principal_point": tuple(model.principal_point) or known_set(PRINCIPAL_POINTS),
     }
-    kept["free"] = tuple(model.free) or tuple(n for n in parameters if n not in kept["never_free"])
+    fields["free"] = tuple(model.free) or tuple(
+        n for n in parameters if n not in fields["never_free"]
+    )
     tables = ("defaults", "ranges", "prior")
     for name in (*tables, "free", "never_free", "principal_distance", "principal_point"):
-        unknown = {*(dict(kept[name]) if name in tables else kept[name])} - {*parameters}
+        unknown = {*(dict(fields[name]) if name in tables else fields[name])} - {*parameters}
         if unknown:
             raise ValueError(f"{where}{name} names {', '.join(unknown)}, which is no parameter.")
-    if len(kept["principal_distance"]) not in (1, 2) or len(kept["principal_point"]) not in (0, 2):
+    if len(fields["principal_distance"]) not in (1, 2) or len(fields["principal_point"]) not in (
+        0,
+        2,
+    ):
         raise ValueError(
             f"{where}principal_distance must name one parameter, or two, along and across, and "
             "principal_point two or none; c, fx and fy, f, x0 and y0, cx and cy need no naming."
         )
-    return kept
+    return fields
 
 
 def _magnify(

@@ -29,8 +29,8 @@ def check_own(model: CameraModel, values: Mapping[str, float] | None = None) -> 
     where = f"camera model {model.name!r}: "
     with local_x64():
         p = np.array([values[name] for name in model.parameters], float)
-        found = [np.asarray(x) for x in _near_the_axis(model, p)]
-    image, (a, b, c, d), missed = found
+        numbers = [np.asarray(x) for x in _near_the_axis(model, p)]
+    image, (a, b, c, d), misclosure = numbers
     if not (np.isfinite(image).all() and np.isfinite([a, b, c, d]).all()):
         raise ValueError(
             f"{where}its formula has no finite value and derivatives on the optical axis, with the "
@@ -45,9 +45,10 @@ def check_own(model: CameraModel, values: Mapping[str, float] | None = None) -> 
     size = max(abs(values[name]) for name in model.principal_distance)
     # 1e-9 of the principal distance: 1e-5 pixels. An inverse that ends its iterations early, as
     # OpenCV's, is refused, since the two domains of a residual would differ.
-    if model.inverse is not None and not missed <= 1e-9 * size:
+    if model.inverse is not None and not misclosure <= 1e-9 * size:
         raise ValueError(
-            f"{where}inverse is not the inverse of its formula: a point comes back {missed:.3g} "
+            f"{where}inverse is not the inverse of its formula: a point comes back "
+            f"{misclosure:.3g} "
             f"{model.unit} beside itself; omit inverse, and it is computed"
         )
 
@@ -60,14 +61,14 @@ def _check_form(model: CameraModel) -> None:
     number, array = (jax.ShapeDtypeStruct(shape, jnp.result_type(float)) for shape in ((), (7, 11)))
     p = (number,) * len(model.parameters)
     # Numbers and arrays: a formula with an `if` works for one of them only.
-    for given in (number, array):
+    for argument in (number, array):
         expected = (
             f"Camera model {model.name!r}: {name}(p, {arguments[0]}) must take the parameters "
             f"({', '.join(model.parameters)}) as a tuple p and return {results} numbers, or for "
             f"arrays {results} arrays, element by element"
         )
         try:
-            out = jax.eval_shape(model.formula, p, *(given,) * arguments[1])
+            out = jax.eval_shape(model.formula, p, *(argument,) * arguments[1])
         except Exception as error:  # whatever a user's function raises
             text = " ".join(str(error).split())
             raise ValueError(f"{expected}; it raised {type(error).__name__}: {text:.160}") from None
@@ -76,8 +77,8 @@ def _check_form(model: CameraModel) -> None:
             if isinstance(out, tuple | list) and all(hasattr(x, "shape") for x in out)
             else None
         )
-        if shapes != [given.shape] * number_of:
-            raise ValueError(f"{expected}; for {given.shape or 'numbers'} it gave {out!r:.160}")
+        if shapes != [argument.shape] * number_of:
+            raise ValueError(f"{expected}; for {argument.shape or 'numbers'} it gave {out!r:.160}")
 
 
 @partial(compile_once, static=0)
@@ -87,16 +88,21 @@ def _near_the_axis(model: CameraModel, p: Any) -> tuple[Array, tuple[Scalar, ...
     p = tuple(p)
     zero, formula = jnp.zeros(()), getattr(model, model.own_formula)
     size = p[model.parameters.index(model.principal_distance[0])]
-    at = zero, zero
+    axis_point = zero, zero
     if model.own_formula == "to_ideal":
         # `to_ideal` is tested where the axis is imaged: at the measured point whose ideal one is 0.
-        near = [-x for x in formula(p, *at)]  # where there is no inverse, something is wrong there
-        at = [jnp.where(jnp.isfinite(x), x, y) for x, y in zip(model.from_ideal(p, *at), near)]
-    value, derivative = value_and_derivative(formula, p, *at)
+        nearby = [
+            -x for x in formula(p, *axis_point)
+        ]  # where there is no inverse, something is wrong there
+        axis_point = [
+            jnp.where(jnp.isfinite(x), x, y)
+            for x, y in zip(model.from_ideal(p, *axis_point), nearby)
+        ]
+    value, derivative = value_and_derivative(formula, p, *axis_point)
     # 3° off the axis, in no symmetric direction: any model has an image there.
     slant = 0.05
-    near = at[0] + slant * size, at[1] - 0.6 * slant * size
-    back = model.to_ideal if model.own_formula == "from_ideal" else model.from_ideal
-    again = back(p, *formula(p, *near))
-    missed = jnp.abs(again[0] - near[0]) + jnp.abs(again[1] - near[1])
-    return jnp.stack(value), derivative, missed
+    nearby = axis_point[0] + slant * size, axis_point[1] - 0.6 * slant * size
+    inverse = model.to_ideal if model.own_formula == "from_ideal" else model.from_ideal
+    there_and_back = inverse(p, *formula(p, *nearby))
+    misclosure = jnp.abs(there_and_back[0] - nearby[0]) + jnp.abs(there_and_back[1] - nearby[1])
+    return jnp.stack(value), derivative, misclosure

@@ -19,16 +19,16 @@ def perspective(columns: Sequence[int], up: bool) -> tuple[OfRay, ToRay]:
     **Arguments:** `columns` of the principal distance among the parameters, or of the two, along
     and across; `up`: whether y points up.
     """
-    first, last = columns[0], columns[-1]
+    column_x, column_y = columns[0], columns[-1]
 
     def ideal(p: Parameters, r: Scalar, s: Scalar, q: Scalar) -> Pair:
-        return -p[first] * r / q, -p[last] * s / q if up else p[last] * s / q
+        return -p[column_x] * r / q, -p[column_y] * s / q if up else p[column_y] * s / q
 
     def ray(p: Parameters, xi: Scalar, yi: Scalar) -> Triple:
-        if first == last:
-            X, Y, Z = xi, yi, p[first]
+        if column_x == column_y:
+            X, Y, Z = xi, yi, p[column_x]
         else:
-            X, Y, Z = xi / p[first], yi / p[last], 1
+            X, Y, Z = xi / p[column_x], yi / p[column_y], 1
         length = jnp.sqrt(X * X + Y * Y + Z * Z)
         return X / length, Y / length if up else -Y / length, -Z / length
 

@@ -37,31 +37,31 @@ def radial_spline(number: int, degrees: float) -> CameraModel:
     **Raises:** `ValueError` for a number that is not 2 to 40, a field of view not in 0° to 360°.
     """
     # Fewer values are hardly more than `equidistant`; 40 of 180° are one every 2°.
-    least, most = 2, 40
-    if not (least <= number <= most and 0 < degrees <= 360):
+    fewest, most = 2, 40
+    if not (fewest <= number <= most and 0 < degrees <= 360):
         raise ValueError(
-            f"a radial spline of {number} values over {degrees:g}°: expected {least} to {most} "
+            f"a radial spline of {number} values over {degrees:g}°: expected {fewest} to {most} "
             "values and a field of view up to 360°, such as radial-spline-6-120"
         )
-    last = float(np.radians(degrees / 2) ** 2)
+    last_square = float(np.radians(degrees / 2) ** 2)
     of_values = through_values(number + 1)[:, 1:]
 
     def square(p: Parameters, xi: Scalar, yi: Scalar) -> Scalar:
         X, Y = xi / p[0], yi / p[1]
         return X * X + Y * Y
 
-    def inside(p: Parameters, xi: Scalar, yi: Scalar) -> Scalar:
-        return square(p, xi, yi) <= last * (1 + 1e-9)
+    def is_inside(p: Parameters, xi: Scalar, yi: Scalar) -> Scalar:
+        return square(p, xi, yi) <= last_square * (1 + 1e-9)
 
     def radial(p: Parameters, xi: Scalar, yi: Scalar) -> Pair:
         _, _, cx, cy, *values = p
         t2 = jnp.asarray(square(p, xi, yi))
         # The spline is a function of θ², even in θ, hence smooth on the axis.
-        weights = basis(t2 * (number / last), -1, number + 3) @ of_values.astype(t2.dtype)
+        weights = basis(t2 * (number / last_square), -1, number + 3) @ of_values.astype(t2.dtype)
         factor = 1 + sum(weights[..., i] * s for i, s in enumerate(values))
         return cx + xi * factor, cy + yi * factor
 
-    distort, inverse = limit_region(radial, inside, opencv.reduce, 12)
+    distort, inverse = limit_region(radial, is_inside, opencv.reduce, 12)
     return CameraModel(
         f"radial-spline-{number}-{degrees:g}",
         ("fx", "fy", "cx", "cy", *(f"s{i}" for i in range(1, number + 1))),

@@ -66,15 +66,17 @@ class _Grid:
 
     def bend(self, p: Parameters, grid: Array, at: Pair, xi: Scalar, yi: Scalar) -> Pair:
         """By a grid of knots [..., rows, columns, 2] of which the first is at (0, 0)."""
-        along, across = basis(at[0], 0, grid.shape[-2]), basis(at[1], 0, grid.shape[-3])
-        da, db = jnp.moveaxis(jnp.einsum("...i,...ijk,...j->...k", across, grid, along), -1, 0)
+        basis_across, basis_down = basis(at[0], 0, grid.shape[-2]), basis(at[1], 0, grid.shape[-3])
+        da, db = jnp.moveaxis(
+            jnp.einsum("...i,...ijk,...j->...k", basis_down, grid, basis_across), -1, 0
+        )
         return p[2] + xi + p[0] * da, p[3] + yi + p[1] * db
 
     def seen(self, p: Parameters, xi: Scalar, yi: Scalar) -> tuple[Array, ...]:
         """The parameters of the 4 × 4 knots on which a point depends."""
         s, t = self.in_knots(p, xi, yi)
-        first = lambda x, n: jnp.clip(jnp.floor(x), 1, n - 3).astype(int) - 1
-        j, i = first(s, self.columns), first(t, self.rows)
+        first_knot = lambda x, n: jnp.clip(jnp.floor(x), 1, n - 3).astype(int) - 1
+        j, i = first_knot(s, self.columns), first_knot(t, self.rows)
         return tuple(
             len(CORE) + 2 * ((i + row) * self.columns + j + column) + k
             for row in range(4)
@@ -87,11 +89,11 @@ class _Grid:
     ) -> Pair:
         """The same as `distort`, by the values of the knots that are seen."""
         # The first of them has the number 2·(row·columns + column) after the core.
-        first = (which[0] - len(CORE)) // 2
+        first_number = (which[0] - len(CORE)) // 2
         s, t = self.in_knots(p, xi, yi)
         grid = jnp.stack(knots, -1)
         grid = grid.reshape(*grid.shape[:-1], 4, 4, 2)
-        at = s - first % self.columns, t - first // self.columns
+        at = s - first_number % self.columns, t - first_number // self.columns
         return self.bend(p, grid, at, xi, yi)
 
 
@@ -103,10 +105,10 @@ def spline(columns: int, rows: int, degrees: float) -> CameraModel:
     is not in 0° to 350°.
     """
     # A point has 4 × 4 knots; 40 × 40 are 3200 parameters, 80 MB of normal equations.
-    least, most = 4, 40
-    if not (least <= min(columns, rows) and max(columns, rows) <= most and 0 < degrees <= 350):
+    fewest, most = 4, 40
+    if not (fewest <= min(columns, rows) and max(columns, rows) <= most and 0 < degrees <= 350):
         raise ValueError(
-            f"a spline of {columns} × {rows} knots over {degrees:g}°: expected {least} to {most} "
+            f"a spline of {columns} × {rows} knots over {degrees:g}°: expected {fewest} to {most} "
             "knots either way and a field of view up to 350°, such as spline-12x9-110"
         )
     per_unit = float((columns - 3) / (4 * np.tan(np.radians(degrees) / 4)))

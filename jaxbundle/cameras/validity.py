@@ -51,12 +51,12 @@ def turning_radius(
     determinant, measured = map(np.asarray, _along(model, p, azimuth[:, None], radii[None, :]))
     # NaN, beyond the range of a formula, counts as turned.
     turned = ~(determinant > 0)
-    first = (turned | (measured > radius_max)).argmax(1)
-    turns = turned[np.arange(len(turned)), first]
-    azimuth, first = azimuth[turns], first[turns]
+    first_turn = (turned | (measured > radius_max)).argmax(1)
+    turns = turned[np.arange(len(turned)), first_turn]
+    azimuth, first_turn = azimuth[turns], first_turn[turns]
     if not len(azimuth):
         return None
-    inner, outer = radii[np.maximum(first - 1, 0)], radii[first]
+    inner, outer = radii[np.maximum(first_turn - 1, 0)], radii[first_turn]
     for _ in range(50):  # 2⁻⁵⁰ of a step: rounding
         middle = (inner + outer) / 2
         good = np.asarray(_along(model, p, azimuth, middle)[0]) > 0
@@ -79,13 +79,13 @@ def validity_message(
     radius = turning_radius(model, parameters, half_diagonal)
     if radius is None:
         return None
-    what, remedy = "distortion", "Free fewer distortion parameters"
+    subject, remedy = "distortion", "Free fewer distortion parameters"
     turns = "turns back"
     if "spline" in model.name:
-        what, turns = "field", "ends, or its distortion turns back,"
+        subject, turns = "field", "ends, or its distortion turns back,"
         remedy = "Choose a model with a wider field or more knots across"
     return (
-        f"Camera {camera!r}: the {what} of model {model.name!r} {turns} at a radius of "
+        f"Camera {camera!r}: the {subject} of model {model.name!r} {turns} at a radius of "
         f"{radius:.4g} {model.unit} from the principal point, inside the image, whose half "
         f"diagonal is {half_diagonal:.4g} {model.unit}: points farther out have no valid image. "
         f"{remedy}, or measure points out to the corners."

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from jaxbundle.choices import Resampling
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import geodetic
-from jaxbundle.geometry.vectors import along
+from jaxbundle.geometry.vectors import point_on_ray
 from jaxbundle.io.rasters.scenes import SceneRaster
 from jaxbundle.photographs.opencv import need_opencv
 from jaxbundle.pushbroom.error_propagation import east_north
@@ -282,5 +282,5 @@ def _drop(
     """The points of the surface on rays of one direction."""
     # Verticals of the plane, not of the ellipsoid: parallel rays, so that scene and map are one
     # projection of the ground.
-    drop = lambda o: along(o, d, surface.distance(o, d))
+    drop = lambda o: point_on_ray(o, d, surface.distance(o, d))
     return jnp.stack(jax.vmap(drop, in_axes=1)(o))

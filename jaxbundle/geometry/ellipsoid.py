@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from jaxbundle.geometry.vectors import Scalar, Triple, Vector, along, dot, unit
+from jaxbundle.geometry.vectors import Scalar, Triple, Vector, dot, point_on_ray, unit
 
 
 class Ellipsoid(NamedTuple):
@@ -58,9 +58,9 @@ def ray_to_ellipsoid(ellipsoid: Ellipsoid, o: Vector, d: Vector) -> Scalar:
     real = discriminant >= 0
     root = jnp.sqrt(jnp.where(discriminant > 0, discriminant, 1.0)) * (discriminant > 0)
     q = -(B + jnp.where(B < 0, -root, root))
-    first, second = q / A, C / jnp.where(q == 0, 1.0, q)
-    near, far = jnp.minimum(first, second), jnp.maximum(first, second)
-    s = jnp.where(near > 0, near, far)
+    root_a, root_b = q / A, C / jnp.where(q == 0, 1.0, q)
+    smaller, larger = jnp.minimum(root_a, root_b), jnp.maximum(root_a, root_b)
+    s = jnp.where(smaller > 0, smaller, larger)
     return jnp.where(real & (s > 0), s, jnp.nan)
 
 
@@ -71,7 +71,7 @@ def ray_to_height(ellipsoid: Ellipsoid, h: Scalar, o: Vector, d: Vector) -> Scal
     """
     s = ray_to_ellipsoid(at_height(ellipsoid, h), o, d)
     for _ in range(2):
-        X = along(o, d, s)
+        X = point_on_ray(o, d, s)
         _, height, n = _foot(ellipsoid, X)
         s = s + (h - height) / dot(n, d)
     return s
@@ -107,11 +107,11 @@ def earth_fixed(ellipsoid: Ellipsoid, geodetic: Vector) -> Triple:
     squeeze = (ellipsoid.c / ellipsoid.a) ** 2
     sine, cosine = jnp.sin(latitude), jnp.cos(latitude)
     N = ellipsoid.a / jnp.sqrt(1 - (1 - squeeze) * sine**2)
-    across = (N + h) * cosine
-    return across * jnp.cos(longitude), across * jnp.sin(longitude), (N * squeeze + h) * sine
+    radius = (N + h) * cosine
+    return radius * jnp.cos(longitude), radius * jnp.sin(longitude), (N * squeeze + h) * sine
 
 
-def up(geodetic: Vector) -> Triple:
+def vertical(geodetic: Vector) -> Triple:
     """The unit vector of increasing height at (λ, φ, h)."""
     longitude, latitude, _ = geodetic
     cosine = jnp.cos(latitude)
@@ -131,8 +131,8 @@ def _foot(ellipsoid: Ellipsoid, X: Vector) -> tuple[tuple[Scalar, Scalar], Scala
     square = x * x + y * y
     # On the axis the iteration would divide zero by zero. 1e-13 metres: no coordinate on the Earth
     # has digits so small (rounding: 1e-9), and its square has all digits.
-    near = 1e-13
-    p = jnp.sqrt(jnp.where(square > near**2, square, near**2))
+    smallest_radius = 1e-13
+    p = jnp.sqrt(jnp.where(square > smallest_radius**2, square, smallest_radius**2))
     k = c / a
     E, P, Z = 1 - k * k, p / a, k * z / a
     S, C = Z, k * P
@@ -146,5 +146,5 @@ def _foot(ellipsoid: Ellipsoid, X: Vector) -> tuple[tuple[Scalar, Scalar], Scala
     size = jnp.sqrt(kC * kC + S * S)
     A = jnp.sqrt(S * S + C * C)
     h = ((p - a * C / A) * kC + (z - c * S / A) * S) / size
-    across = kC / (size * p)
-    return (S, kC), h, (across * x, across * y, S / size)
+    horizontal = kC / (size * p)
+    return (S, kC), h, (horizontal * x, horizontal * y, S / size)

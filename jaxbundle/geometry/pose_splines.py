@@ -42,26 +42,28 @@ def cumulative_basis(u: Scalar) -> tuple[Scalar, Scalar, Scalar]:
 def gibbs_vector(A: Rows, B: Rows) -> Triple:
     """tan(θ/2)·n of the rotation A·Bᵀ (Gibbs, 1884); matrices by rows, without unit."""
     D = lambda i, j: sum(A[3 * i + k] * B[3 * j + k] for k in range(3))
-    over = 1 / (1 + D(0, 0) + D(1, 1) + D(2, 2))
+    scale = 1 / (1 + D(0, 0) + D(1, 1) + D(2, 2))
     return (
-        (D(2, 1) - D(1, 2)) * over,
-        (D(0, 2) - D(2, 0)) * over,
-        (D(1, 0) - D(0, 1)) * over,
+        (D(2, 1) - D(1, 2)) * scale,
+        (D(0, 2) - D(2, 0)) * scale,
+        (D(1, 0) - D(0, 1)) * scale,
     )
 
 
-def compose_gibbs(one: Triple, other: Triple) -> Triple:
+def compose_gibbs(a_vector: Triple, b_vector: Triple) -> Triple:
     """The Gibbs vector of C(one)·C(other)."""
-    over = 1 / (1 - sum(a * b for a, b in zip(one, other)))
-    return tuple((a + b + c) * over for a, b, c in zip(one, other, cross(one, other)))
+    scale = 1 / (1 - sum(a * b for a, b in zip(a_vector, b_vector)))
+    return tuple(
+        (a + b + c) * scale for a, b, c in zip(a_vector, b_vector, cross(a_vector, b_vector))
+    )
 
 
 def turn_by_gibbs(h: Triple, x: Triple) -> Triple:
     """C(h)·x = x + 2·(h × x + h × (h × x))/(1 + h·h)."""
-    first = cross(h, x)
-    second = cross(h, first)
+    first_order = cross(h, x)
+    second_order = cross(h, first_order)
     scale = 2 / (1 + h[0] * h[0] + h[1] * h[1] + h[2] * h[2])
-    return tuple(a + scale * (b + c) for a, b, c in zip(x, first, second))
+    return tuple(a + scale * (b + c) for a, b, c in zip(x, first_order, second_order))
 
 
 def spline_position(positions: Sequence[Triple], u: Scalar) -> Triple:

@@ -98,10 +98,10 @@ def quaternion_from_matrix(M: Float[AnyArray, "3 3"]) -> Float[Array, "4"]:
 @traced_once
 def quaternion_from_rotation_vector(v: Float[AnyArray, "3"]) -> Float[Array, "4"]:
     """The unit quaternion of exp([v]×), v in radians (Solà, 2017, Exp)."""
-    half = v / 2
-    square = jnp.sum(half * half)
+    half_vector = v / 2
+    square = jnp.sum(half_vector * half_vector)
     cosine = 1 - square / 2 * _sine_over_angle(square / 4) ** 2  # cos h = 1 − 2 sin²(h/2)
-    return jnp.concatenate([cosine[None], _sine_over_angle(square) * half])
+    return jnp.concatenate([cosine[None], _sine_over_angle(square) * half_vector])
 
 
 @traced_once

@@ -59,24 +59,30 @@ def refract_flat(
     **Returns:** `point` itself if no interface is between the two: the point is not behind the last
     plane, or the camera not before the first.
     """
-    along = sum(n * x for n, x in zip(normal, point))
-    behind = along - distance - thickness
-    across = tuple(x - along * n for n, x in zip(normal, point))
-    square = sum(x * x for x in across)
-    between = (distance > 0) & (behind > 0)
+    depth = sum(n * x for n, x in zip(normal, point))
+    depth_behind = depth - distance - thickness
+    lateral = tuple(x - depth * n for n, x in zip(normal, point))
+    square = sum(x * x for x in lateral)
+    is_between = (distance > 0) & (depth_behind > 0)
     # Layers that there are not would be roots of negative numbers, whose NaN spoils derivatives.
-    safe = lambda x: jnp.where(between, x, 1.0)
-    layers = (safe(distance), jnp.where(between, thickness, 0.0), safe(behind))
-    least = jax.lax.stop_gradient(jnp.minimum(indices[0], jnp.minimum(indices[1], indices[2])))
-    slope = _flat_root(square, layers, indices, least)
-    out = slope * _tangent(indices[0], least, slope * slope * square)
+    safe = lambda x: jnp.where(is_between, x, 1.0)
+    layers = (safe(distance), jnp.where(is_between, thickness, 0.0), safe(depth_behind))
+    smallest_index = jax.lax.stop_gradient(
+        jnp.minimum(indices[0], jnp.minimum(indices[1], indices[2]))
+    )
+    slope = _flat_root(square, layers, indices, smallest_index)
+    outward = slope * _tangent(indices[0], smallest_index, slope * slope * square)
     # The ray along the normal plus what it goes across for a unit of it.
-    return tuple(jnp.where(between, n + out * a, x) for n, a, x in zip(normal, across, point))
+    return tuple(
+        jnp.where(is_between, n + outward * a, x) for n, a, x in zip(normal, lateral, point)
+    )
 
 
-def _tangent(index: Scalar, least: Scalar, square: Scalar) -> Scalar:
+def _tangent(index: Scalar, smallest_index: Scalar, square: Scalar) -> Scalar:
     """tan θ_k/w for w²."""
-    return least / jnp.sqrt(index * index + (index * index - least * least) * square)
+    return smallest_index / jnp.sqrt(
+        index * index + (index * index - smallest_index * smallest_index) * square
+    )
 
 
 def _flat_remainder(slope: Scalar, fixed: Scalar, data: tuple) -> Scalar:
@@ -86,20 +92,22 @@ def _flat_remainder(slope: Scalar, fixed: Scalar, data: tuple) -> Scalar:
     return slope * sum(tangents) - 1
 
 
-def _flat_root(square: Scalar, layers: Triple, indices: Triple, least: Scalar) -> Scalar:
+def _flat_root(square: Scalar, layers: Triple, indices: Triple, smallest_index: Scalar) -> Scalar:
     # Two lines above the concave ρ(w): its tangents at 0 and at infinity. Their zeros are below
     # the root, and the larger one is close to it at both ends.
-    slope_at_0 = sum(t * least / n for t, n in zip(layers, indices))
+    slope_at_0 = sum(t * smallest_index / n for t, n in zip(layers, indices))
     rise, level = 0.0, 0.0
     for t, n in zip(layers, indices):
-        excess = n * n - least * least
+        excess = n * n - smallest_index * smallest_index
         denser = excess > 0
         rise = rise + jnp.where(denser, 0.0, t)
-        level = level + jnp.where(denser, t * least / jnp.sqrt(jnp.where(denser, excess, 1.0)), 0.0)
+        level = level + jnp.where(
+            denser, t * smallest_index / jnp.sqrt(jnp.where(denser, excess, 1.0)), 0.0
+        )
     # ρ = level + w·rise at infinity; nothing is differentiated here.
-    far = (1 - level / jnp.sqrt(square)) / rise
-    start = jnp.maximum(1 / slope_at_0, jnp.where(jnp.isfinite(far), far, 0.0))
-    return _root(_flat_remainder, start, FLAT_ITERATIONS, least, (square, layers, indices))
+    asymptote = (1 - level / jnp.sqrt(square)) / rise
+    start = jnp.maximum(1 / slope_at_0, jnp.where(jnp.isfinite(asymptote), asymptote, 0.0))
+    return _root(_flat_remainder, start, FLAT_ITERATIONS, smallest_index, (square, layers, indices))
 
 
 def refract_dome(
@@ -120,52 +128,57 @@ def refract_dome(
     e = tuple(x / length for x in point)
     depth = sum(a * b for a, b in zip(e, centre))
     g = tuple(c - depth * a for a, c in zip(e, centre))
-    across = sum(x * x for x in g)
-    outside = (length - depth) ** 2 + across > (radius + thickness) ** 2
-    through = outside & (depth * depth + across < radius * radius)
+    square_across = sum(x * x for x in g)
+    is_outside = (length - depth) ** 2 + square_across > (radius + thickness) ** 2
+    is_refracted = is_outside & (depth * depth + square_across < radius * radius)
     # A root for every lane, also where none is used: its NaN would spoil derivatives.
-    safe = lambda x, other: jnp.where(through, x, other)
+    safe = lambda x, other: jnp.where(is_refracted, x, other)
     data = (
         safe(length, 2 * (1 + thickness)),
         safe(depth, 0.0),
-        safe(across, 0.0),
+        safe(square_across, 0.0),
         safe(radius, 1.0),
         thickness,
         indices,
     )
     turn = _root(_dome_remainder, jnp.zeros_like(length), DOME_ITERATIONS, None, data)
-    return tuple(jnp.where(through, a + turn * b, x) for a, b, x in zip(e, g, point))
+    return tuple(jnp.where(is_refracted, a + turn * b, x) for a, b, x in zip(e, g, point))
 
 
 def _dome_remainder(turn: Scalar, _: None, data: tuple) -> Scalar:
     """The distance of the point from the ray that leaves along e + α·g, by |g| and the distance of
     the point; vectors by their coordinates along e and g."""
-    length, depth, across, radius, thickness, indices = data
-    dot = lambda a, b: a[0] * b[0] + across * a[1] * b[1]
+    length, depth, square_across, radius, thickness, indices = data
+    dot = lambda a, b: a[0] * b[0] + square_across * a[1] * b[1]
     move = lambda a, s, b: (a[0] + s * b[0], a[1] + s * b[1])
-    size = 1 / jnp.sqrt(1 + across * turn * turn)
-    ray, at = (size, turn * size), (jnp.zeros_like(size), jnp.zeros_like(size))
+    size = 1 / jnp.sqrt(1 + square_across * turn * turn)
+    ray, point_on_ray = (size, turn * size), (jnp.zeros_like(size), jnp.zeros_like(size))
     for R, n, n_next in (
         (radius, indices[0], indices[1]),
         (radius + thickness, indices[1], indices[2]),
     ):
-        to_centre = (depth - at[0], 1.0 - at[1])
-        along = dot(ray, to_centre)
-        at = move(at, along + jnp.sqrt(along * along - dot(to_centre, to_centre) + R * R), ray)
-        normal = ((at[0] - depth) / R, (at[1] - 1.0) / R)
+        to_centre = (depth - point_on_ray[0], 1.0 - point_on_ray[1])
+        distance_along = dot(ray, to_centre)
+        point_on_ray = move(
+            point_on_ray,
+            distance_along
+            + jnp.sqrt(distance_along * distance_along - dot(to_centre, to_centre) + R * R),
+            ray,
+        )
+        normal = ((point_on_ray[0] - depth) / R, (point_on_ray[1] - 1.0) / R)
         ratio, cosine = n / n_next, dot(ray, normal)
         refracted = jnp.sqrt(1 - ratio * ratio * (1 - cosine * cosine)) - ratio * cosine
         ray = move((ratio * ray[0], ratio * ray[1]), refracted, normal)
     # e and g are at a right angle: the vector product of the coordinates, by |g|.
-    return (ray[1] * (length - at[0]) + ray[0] * at[1]) / length
+    return (ray[1] * (length - point_on_ray[0]) + ray[0] * point_on_ray[1]) / length
 
 
 def _root(
     remainder: Callable, start: Scalar, iterations: int, fixed: Scalar | None, data: Sequence
 ) -> Scalar:
     """The root of an equation of one unknown as a function of its data."""
-    held = jax.lax.stop_gradient(data)
-    at_data = lambda x: remainder(x, fixed, held)
+    constant_data = jax.lax.stop_gradient(data)
+    at_data = lambda x: remainder(x, fixed, constant_data)
 
     def newton(_: int, x: Scalar) -> Scalar:
         value, slope = jax.jvp(at_data, (x,), (jnp.ones_like(x),))

@@ -107,7 +107,7 @@ def omega_phi_kappa_from_matrix(M: Float[AnyArray, "3 3"]) -> Float[Array, "3"]:
 
 @traced_once
 def omega_phi_kappa_near(
-    M: Float[AnyArray, "3 3"], given: Float[AnyArray, "3"]
+    M: Float[AnyArray, "3 3"], reference: Float[AnyArray, "3"]
 ) -> Float[Array, "3"]:
     """(ω, φ, κ) of M in radians, of all its representations the one nearest to the given angles.
 
@@ -115,12 +115,12 @@ def omega_phi_kappa_near(
     """
     angles = omega_phi_kappa_from_matrix(M)
     # (ω + π, π − φ, κ + π): the same rotation by the other branch of φ.
-    other = angles * jnp.array([1.0, -1.0, 1.0]) + jnp.pi
+    second_solution = angles * jnp.array([1.0, -1.0, 1.0]) + jnp.pi
     # Whole turns nearest to the given angles.
-    turned = lambda a: a + 2 * jnp.pi * jnp.round((given - a) / (2 * jnp.pi))
-    angles, other = turned(angles), turned(other)
-    distance = lambda a: jnp.sum((a - given) ** 2)
-    return jnp.where(distance(other) < distance(angles), other, angles)
+    nearest_turn = lambda a: a + 2 * jnp.pi * jnp.round((reference - a) / (2 * jnp.pi))
+    angles, second_solution = nearest_turn(angles), nearest_turn(second_solution)
+    distance = lambda a: jnp.sum((a - reference) ** 2)
+    return jnp.where(distance(second_solution) < distance(angles), second_solution, angles)
 
 
 @traced_once
@@ -192,5 +192,5 @@ def rodrigues_from_matrix(M: Float[AnyArray, "3 3"]) -> Float[Array, "3"]:
 def _angle(sine: Scalar, cosine: Scalar) -> Array:
     """arctan2, but constant zero where both arguments vanish: an angle that gimbal lock leaves
     undefined."""
-    lost = sine**2 + cosine**2 < (8 * jnp.finfo(jnp.result_type(sine)).eps) ** 2
-    return jnp.where(lost, 0, jnp.arctan2(sine, jnp.where(lost, 1, cosine)))
+    is_undefined = sine**2 + cosine**2 < (8 * jnp.finfo(jnp.result_type(sine)).eps) ** 2
+    return jnp.where(is_undefined, 0, jnp.arctan2(sine, jnp.where(is_undefined, 1, cosine)))

@@ -34,26 +34,26 @@ def squared_distances_to_triangles(
 ) -> Float[AnyArray, " k"]:
     """The squared distances from triangles: from their planes where the foot of the perpendicular
     is inside, else from the nearest edge; by `jax.numpy`, or `numpy`."""
-    side, away = xp.roll(corners, -1, 1) - corners, X - corners
+    side, from_corner = xp.roll(corners, -1, 1) - corners, X - corners
     normal = xp.cross(side[:, 0], side[:, 1])
     size = (normal * normal).sum(1)
-    inside = ((xp.cross(side, away) * normal[:, None]).sum(2) >= 0).all(1) & (size > 0)
+    is_inside = ((xp.cross(side, from_corner) * normal[:, None]).sum(2) >= 0).all(1) & (size > 0)
     length = (side * side).sum(2)
-    t = xp.clip((away * side).sum(2) / xp.where(length > 0, length, 1.0), 0.0, 1.0)
-    edges = ((away - t[..., None] * side) ** 2).sum(2).min(1)
-    off = (away[:, 0] * normal).sum(1) ** 2 / xp.where(size > 0, size, 1.0)
-    return xp.where(inside, off, edges)
+    t = xp.clip((from_corner * side).sum(2) / xp.where(length > 0, length, 1.0), 0.0, 1.0)
+    edges = ((from_corner - t[..., None] * side) ** 2).sum(2).min(1)
+    distance_from_plane = (from_corner[:, 0] * normal).sum(1) ** 2 / xp.where(size > 0, size, 1.0)
+    return xp.where(is_inside, distance_from_plane, edges)
 
 
 def height_above_grid(
     X: Float[Array, "3"],
     heights: Float[Array, "n n"],
-    first: Float[Array, "2"],
+    first_node: Float[Array, "2"],
     step: Float[Array, "2"],
 ) -> Float[Array, ""]:
     """The height above a grid, bilinear: heights [Y, X], the place of the first node, and the steps
     along X and Y. Beyond its edges the outermost cells go on."""
-    place = (X[:2] - first) / step
+    place = (X[:2] - first_node) / step
     cell = jnp.clip(jnp.floor(jax.lax.stop_gradient(place)), 0, heights.shape[0] - 2).astype(int)
     x, y = place - cell
     (a, b), (c, d) = jax.lax.dynamic_slice(heights, (cell[1], cell[0]), (2, 2))

@@ -24,11 +24,11 @@ def unpack(v: Vector | tuple[Scalar, ...]) -> Triple:
     return x, y, z
 
 
-def read(M: Float[AnyArray, "3 3"]) -> tuple[Triple, Triple, Triple]:
+def rows_of_matrix(M: Float[AnyArray, "3 3"]) -> tuple[Triple, Triple, Triple]:
     """The rows of a matrix as triples, for `rotate` and `rotate_back`: every access of an array
     component costs time of compilation."""
-    first, second, third = M
-    return unpack(first), unpack(second), unpack(third)
+    first_row, second_row, third_row = M
+    return unpack(first_row), unpack(second_row), unpack(third_row)
 
 
 def dot(u: Vector, v: Vector) -> Scalar:
@@ -41,7 +41,7 @@ def cross(u: Vector | Sequence[Scalar], v: Vector | Sequence[Scalar]) -> Triple:
     return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
 
 
-def along(o: Vector, d: Vector, s: Scalar) -> Triple:
+def point_on_ray(o: Vector, d: Vector, s: Scalar) -> Triple:
     """o + s·d, the point of a ray."""
     return o[0] + s * d[0], o[1] + s * d[1], o[2] + s * d[2]
 

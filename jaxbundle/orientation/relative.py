@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float, Int, PyTree
 
 from jaxbundle.arguments import without_masks
 from jaxbundle.geometry import matrix_from_quaternion, matrix_from_rotation_vector
-from jaxbundle.geometry.vectors import dot, read, rotate, rotate_back, unpack
+from jaxbundle.geometry.vectors import dot, rotate, rotate_back, rows_of_matrix, unpack
 from jaxbundle.leastsquares.iterations.small import finish, minimise
 from jaxbundle.orientation.absolute import rotation_between
 from jaxbundle.orientation.essential import eight_points, five_solutions, orientations
@@ -116,7 +116,7 @@ def sampson_distance(
 ) -> Float[Array, ""]:
     """Misclosure of coplanarity of one point as a length in the image, c = 1, with a sign."""
     a1, a2 = _rays(xy1, xy2)
-    E = read(jnp.cross(M, b))  # M·[b]×
+    E = rows_of_matrix(jnp.cross(M, b))  # M·[b]×
     line2, line1 = rotate(E, a1), rotate_back(E, a2)
     length = line2[0] ** 2 + line2[1] ** 2 + line1[0] ** 2 + line1[1] ** 2
     return jnp.divide(dot(a2, line2), jnp.sqrt(jnp.where(length > 0, length, 1)))
@@ -130,7 +130,7 @@ def distances_along_rays(
 ) -> Float[Array, "2"]:
     """(s₁, s₂) of the nearest points s₁·a₁ and b + s₂·Mᵀ·a₂ of two rays; positive: in front."""
     a1, a2 = _rays(xy1, xy2)
-    a2, base = rotate_back(read(M), a2), unpack(b)
+    a2, base = rotate_back(rows_of_matrix(M), a2), unpack(b)
     aa, cc, both = dot(a1, a1), dot(a2, a2), dot(a1, a2)
     first, second = dot(base, a1), dot(base, a2)
     determinant = aa * cc - both * both

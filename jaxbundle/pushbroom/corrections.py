@@ -32,10 +32,10 @@ from jaxbundle.geometry.vectors import (
     Scalar,
     Triple,
     Vector,
-    along,
     difference,
     dot,
     length,
+    point_on_ray,
     scale_vector,
     unit,
     unpack,
@@ -69,12 +69,12 @@ def true_direction(seen: Vector, velocity: Vector) -> Triple:
     a, b = dot(seen, seen), dot(seen, velocity)
     c = dot(velocity, velocity) - LIGHT**2
     k = (b + jnp.sqrt(b * b - a * c)) / a
-    return scale_vector(1 / LIGHT, along(scale_vector(-1.0, velocity), seen, k))
+    return scale_vector(1 / LIGHT, point_on_ray(scale_vector(-1.0, velocity), seen, k))
 
 
 def apparent_direction(true: Vector, velocity: Vector) -> Triple:
     """The direction in which a camera with this velocity sees light from `true`."""
-    return along(velocity, unit(true), LIGHT)
+    return point_on_ray(velocity, unit(true), LIGHT)
 
 
 def inertial_velocity(P: Vector, V: Vector) -> Triple:
@@ -123,14 +123,14 @@ def refract(earth: Ellipsoid | None, height: Scalar, o: Vector, d: Vector) -> tu
     for node, weight in NODES:
         border = at_height(earth, height + mean + node * spread)
         o, d = unpack(tuple(ray[:3])), unpack(tuple(ray[3:]))
-        X = along(o, d, ray_to_ellipsoid(border, o, d))
+        X = point_on_ray(o, d, ray_to_ellipsoid(border, o, d))
         n = normal(border, X)
         change = weight * step
         ratio = (1 + index) / (1 + index + change)
         # ratio² − 1, without cancellation.
         zeta = -change * (2 + 2 * index + change) / (1 + index + change) ** 2
         k = ratio * dot(d, n)
-        bent = along(scale_vector(ratio, d), n, zeta / (jnp.sqrt(k * k - zeta) - k))
+        bent = point_on_ray(scale_vector(ratio, d), n, zeta / (jnp.sqrt(k * k - zeta) - k))
         ray = [jnp.where(bends, new, old) for new, old in zip((*X, *bent), ray)]
         index = index + change
     return unpack(tuple(ray[:3])), unpack(tuple(ray[3:]))
@@ -169,11 +169,11 @@ def apparent_point(
         # leaves 5 µm at 50° off the nadir, 1 mm at 60°.
         for _ in range(2):
             start, bent = refract(earth, height, o, d)
-            nearest = along(start, bent, dot(difference(X, start), bent))
-            d = along(d, difference(X, nearest), 1.0)
+            nearest = point_on_ray(start, bent, dot(difference(X, start), bent))
+            d = point_on_ray(d, difference(X, nearest), 1.0)
     if corrections.light_time:
         d = earlier_earth(d, -distance)
     if corrections.aberration:
         seen = apparent_direction(d, inertial_velocity(P, V))
         d = scale_vector(length(d) / length(seen), seen)
-    return along(P, d, 1.0)
+    return point_on_ray(P, d, 1.0)

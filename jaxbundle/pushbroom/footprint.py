@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxbundle.geometry.ellipsoid import Ellipsoid, at_height, residual
-from jaxbundle.geometry.vectors import Vector, along, difference, unpack
+from jaxbundle.geometry.vectors import Vector, difference, point_on_ray, unpack
 from jaxbundle.pushbroom.detector_line import slope_ahead, slopes
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.pieces import Pieces, motion
@@ -170,7 +170,7 @@ def _speeds(
         P, _ = motion(numbers, rates, origin)
         d = unpack(tuple(numbers[k] * xi + numbers[3 + k] * eta - numbers[6 + k] for k in range(3)))
         surface = Plane(level=h) if earth is None else Ground(at_height(earth, h))
-        D = difference(along(P, d, surface.distance(P, d)), origin)
+        D = difference(point_on_ray(P, d, surface.distance(P, d)), origin)
         speed = jax.jvp(lambda n: slope_ahead(n, D, line)[0], (numbers,), (rates / half,))[1]
         return jnp.stack(D), speed
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbundle.arguments import without_masks
-from jaxbundle.geometry.vectors import Triple, along, difference, length, rotate
+from jaxbundle.geometry.vectors import Triple, difference, length, point_on_ray, rotate
 from jaxbundle.pushbroom.corrections import Corrections, earlier_earth, inertial_velocity, refract
 from jaxbundle.pushbroom.corrections import true_direction as without_aberration
 from jaxbundle.pushbroom.image import LinePose, PushbroomImage, pose_at
@@ -39,17 +39,17 @@ def ground_point(
     o, d = P, rotate(R, (*slopes, -1.0))
     if corrections.aberration:
         d = without_aberration(d, inertial_velocity(o, V))
-    X = along(o, d, surface.distance(o, d))
+    X = point_on_ray(o, d, surface.distance(o, d))
     if corrections.light_time:
         start, direction = o, d
         # The distance changes by 1e-6 of itself in the first round, by 1e-12 in the second.
         for _ in range(2):
             distance = length(difference(X, o))
             o, d = earlier_earth(start, distance), earlier_earth(direction, distance)
-            X = along(o, d, surface.distance(o, d))
+            X = point_on_ray(o, d, surface.distance(o, d))
     if corrections.refraction:
         o, d = refract(surface.earth, surface.height(X), o, d)
-        X = along(o, d, surface.distance(o, d))
+        X = point_on_ray(o, d, surface.distance(o, d))
     return X
 
 

@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxbundle.geometry.ellipsoid import earth_fixed, up
+from jaxbundle.geometry.ellipsoid import earth_fixed, vertical
 from jaxbundle.geometry.vectors import Triple, difference, dot, length
 from jaxbundle.pushbroom.error_propagation import east_north, horizontal
 from jaxbundle.pushbroom.ground_to_image import project_from, project_points
@@ -81,7 +81,7 @@ def geographic_nodes(
 
 
 _ground_and_up = compile_once(
-    lambda earth, place: (jnp.stack(earth_fixed(earth, place)), jnp.stack(up(place))), ()
+    lambda earth, place: (jnp.stack(earth_fixed(earth, place)), jnp.stack(vertical(place))), ()
 )
 
 

@@ -33,7 +33,7 @@ from jaxtyping import Array, Bool, Float
 from jaxbundle.arguments import numeric_array
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, at_height, geodetic, ray_to_ellipsoid
-from jaxbundle.geometry.vectors import Scalar, Triple, Vector, along
+from jaxbundle.geometry.vectors import Scalar, Triple, Vector, point_on_ray
 from jaxbundle.implicit import implicit_root, solve_dense
 from jaxbundle.pushbroom.polynomial import value, value_and_rate
 from jaxbundle.pushbroom.surfaces import GroundSurface
@@ -97,7 +97,9 @@ class Terrain(GroundSurface):
 
     def _path(self, o: Vector, d: Vector, top: Scalar, bottom: Scalar) -> Path:
         """Coefficients of (x, y, h) as parabolas in τ, from the top (0) to the bottom (1)."""
-        ends = [self.grid(along(o, d, top + tau * (bottom - top))) for tau in (0.0, 0.5, 1.0)]
+        ends = [
+            self.grid(point_on_ray(o, d, top + tau * (bottom - top))) for tau in (0.0, 0.5, 1.0)
+        ]
         x, y, h = ((a, 4 * b - 3 * a - c, 2 * (a + c) - 4 * b) for a, b, c in zip(*ends))
         return x, y, h
 
@@ -154,7 +156,7 @@ def make_terrain(
 def _above_ground(s: Scalar, _: None, data: tuple[Terrain, Vector, Vector]) -> Scalar:
     """The height above the terrain at the distance s along a ray."""
     terrain, o, d = data
-    x, y, h = terrain.grid(along(o, d, s))
+    x, y, h = terrain.grid(point_on_ray(o, d, s))
     return h - bilinear(terrain.heights, x, y)
 
 

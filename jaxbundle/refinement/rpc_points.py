@@ -26,7 +26,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, geodetic
-from jaxbundle.geometry.vectors import Triple, along
+from jaxbundle.geometry.vectors import Triple, point_on_ray
 from jaxbundle.leastsquares.declarations import Kind
 from jaxbundle.leastsquares.indexing.indices import fill_up
 from jaxbundle.leastsquares.spaces import Change, WithoutChart
@@ -202,7 +202,7 @@ def _lines_of_sight(
     def line_of_sight(row: Int[AnyArray, ""], place: Float[AnyArray, "2"]) -> tuple[Array, Array]:
         one, inverse = jax.tree.map(lambda x: x[row], images)
         top, d = sight(one, place[0], place[1], inverse=inverse)
-        return jnp.stack(along(top, d, -ABOVE_DOMAIN)), jnp.stack(d)
+        return jnp.stack(point_on_ray(top, d, -ABOVE_DOMAIN)), jnp.stack(d)
 
     return jax.vmap(line_of_sight)(image, places)
 

@@ -6,7 +6,7 @@ import pyproj
 import pytest
 
 from jaxbundle.geometry import ellipsoid as el
-from jaxbundle.geometry.vectors import along
+from jaxbundle.geometry.vectors import point_on_ray
 
 rng = np.random.default_rng(0)
 N = 2000
@@ -90,7 +90,7 @@ def rays(reach):
 def test_nearest_point_of_a_ray(ellipsoid):
     o, d = rays(0.9)
     s = np.array(distance(ellipsoid, o, d))
-    X = along(o, d, s)
+    X = point_on_ray(o, d, s)
     assert np.abs(el.residual(ellipsoid, X)).max() < 1e-13
     descending = sum(n * v for n, v in zip(el.normal(ellipsoid, X), d))
     assert (descending < 0).all() and (s > 0).all()
@@ -109,17 +109,17 @@ def test_rays_that_miss():
 def test_ray_to_a_height():
     o, d = rays(0.9)
     for h in (-4e2, 0.0, 8848.0):
-        X = along(o, d, height_distance(el.WGS84, h, o, d))
+        X = point_on_ray(o, d, height_distance(el.WGS84, h, o, d))
         np.testing.assert_allclose(to_geodetic(el.WGS84, X)[2], h, atol=5e-9)
-    assert abs(to_geodetic(el.WGS84, along(o, d, distance(el.at_height(el.WGS84, 8848.0), o, d)))[2]
+    assert abs(to_geodetic(el.WGS84, point_on_ray(o, d, distance(el.at_height(el.WGS84, 8848.0), o, d)))[2]
                - 8848).max() < 6e-6 * 8848  # fmt: skip
 
 
 def test_derivative_of_the_distance_against_differences():
     o, d = rays(0.7)
     value, change = jax.jit(lambda o, d: jax.jvp(
-        lambda k: el.ray_to_height(el.WGS84, 100.0, o, along(d, o, k)), (0.0,), (1.0,)
+        lambda k: el.ray_to_height(el.WGS84, 100.0, o, point_on_ray(d, o, k)), (0.0,), (1.0,)
     ))(o, d)  # fmt: skip
     step = 1e-6
-    ends = [height_distance(el.WGS84, 100.0, o, along(d, o, k)) for k in (step, -step)]
+    ends = [height_distance(el.WGS84, 100.0, o, point_on_ray(d, o, k)) for k in (step, -step)]
     np.testing.assert_allclose(change, (ends[0] - ends[1]) / (2 * step), rtol=1e-6, atol=1e-7)

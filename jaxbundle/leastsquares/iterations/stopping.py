@@ -189,7 +189,8 @@ class UndampedStepState(eqx.Module):
     ) -> tuple[Int[Array, ""], "UndampedStepState"]:
         """The termination code after a step was computed, and the next state.
 
-        `cost`: at the accepted point; `previous_cost`: at the one before; `trial_cost`: at the one tried.
+        `cost`: at the accepted point; `previous_cost`: at the one before; `trial_cost`: at the one
+        tried.
         """
         rules, undamped = self.settings, jnp.isinf(step_size)
         # The decrement of a damped step underestimates that of the undamped one, so that only an

@@ -506,8 +506,8 @@ def _covariance_of_forms(
     draws: int = AT_ONCE,
 ) -> Float[np.ndarray, "k k"]:
     """cov(q)_ij = 2·tr(V_i·MΣM·V_j·MΣM) of normal errors of the fitted Σ, by residuals drawn from
-    it; `independent`: variances of the rows, of which some are `is_other`. From 16 draws σ of a size
-    is right to about 1/√32 = 18 %."""
+    it; `independent`: variances of the rows; `is_other`: which rows are those of `OTHERS`. From 16
+    draws σ of a size is right to about 1/√32 = 18 %."""
     of_components = [lambda e, f=f: np.asarray((f @ (f.T @ e.T)).T) for f in F]
     of_parts = [lambda e: e * ~is_other, *of_components]
     parts = list(zip(theta[1:], of_components))

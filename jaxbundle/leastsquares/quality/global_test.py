@@ -70,4 +70,7 @@ def describe_test(
         return f"{beginning}the a priori σ are confirmed"
     if test["vtpv"] < test["low"]:
         return f"{beginning}the observations are better than their a priori σ"
-    return f"{beginning}the a priori σ are too small, blunders are left, or the cameras lack parameters"
+    return (
+        f"{beginning}the a priori σ are too small, blunders are left, or the cameras lack "
+        "parameters"
+    )

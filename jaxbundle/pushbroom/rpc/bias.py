@@ -26,7 +26,7 @@ from jaxbundle.choices import RPC_BIASES
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, earth_fixed, geodetic
-from jaxbundle.geometry.vectors import Vector, along
+from jaxbundle.geometry.vectors import Vector, point_on_ray
 from jaxbundle.leastsquares.indexing.indices import round_up
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.rpc.fitting import RpcCheck, RpcTable, check_rpc, fit_rpc, plain_table
@@ -277,7 +277,7 @@ def images_and_slopes(
         s, c, z, k = jnp.sin(east), jnp.cos(east), jnp.sin(north), jnp.cos(north)
         X = earth_fixed(earth, place)
         for axis, size in zip(((-s, c, 0.0), (-z * c, -z * s, k), (k * c, k * s, z)), shift):
-            X = along(X, axis, size)
+            X = point_on_ray(X, axis, size)
         value = jnp.stack(project(rpc, *geodetic(earth, X)))
         return value, value
 

@@ -33,7 +33,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxbundle.arguments import without_masks
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, earth_fixed
-from jaxbundle.geometry.vectors import Triple, Vector, along, difference, unit, unpack
+from jaxbundle.geometry.vectors import Triple, Vector, difference, point_on_ray, unit, unpack
 from jaxbundle.implicit import implicit_root
 from jaxbundle.pushbroom.corrections import require_ellipsoid
 from jaxbundle.pushbroom.surfaces import GroundSurface
@@ -239,15 +239,15 @@ def locate_on(
         state: tuple[Vector, tuple[Array, Array, Scalar, Array]], _: None
     ) -> tuple[tuple[Vector, tuple[Array, Array, Scalar, Array]], None]:
         o = state[0]
-        X = along(o, d, surface.distance(o, d))
+        X = point_on_ray(o, d, surface.distance(o, d))
         h = surface.height(X)
         longitude, latitude, status = locate(rpc, line, sample, h, inverse)
         seen = earth_fixed(earth, (longitude, latitude, h))
-        return (along(o, difference(seen, X), 1.0), (longitude, latitude, h, status)), None
+        return (point_on_ray(o, difference(seen, X), 1.0), (longitude, latitude, h, status)), None
 
     nothing = (jnp.zeros(()), jnp.zeros(()), jnp.zeros(()), jnp.zeros((), int))
     # Also of a surface that rises above the heights of the domain the first point is met.
-    start = (along(top, d, -ABOVE_DOMAIN), nothing)
+    start = (point_on_ray(top, d, -ABOVE_DOMAIN), nothing)
     # The ray is nearly parallel to the line of sight: a round leaves of the distance between both
     # only its product with the angle between them.
     (_, (longitude, latitude, h, status)), _ = jax.lax.scan(shift, start, length=3)
