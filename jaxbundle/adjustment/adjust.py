@@ -39,7 +39,11 @@ from jaxbundle.adjustment.readjust import (
     with_components,
 )
 from jaxbundle.adjustment.result import Adjustment
-from jaxbundle.adjustment.second_minima.search import can_have_second, find_second_minima, is_said
+from jaxbundle.adjustment.second_minima.search import (
+    can_have_second,
+    find_second_minima,
+    is_reported,
+)
 from jaxbundle.arguments import at_least_zero, integer, one_of, show, truth
 from jaxbundle.choices import ESTIMATORS, METHODS, REDUCTIONS
 from jaxbundle.errors import InputError, NotSolvedError
@@ -151,17 +155,17 @@ def adjust(  # noqa: PLR0913 - the options of an adjustment
     try_again = partial(_try_mirrored, reduction, options)
     mirror = lambda sigma0: name_mirrored(given, sigma0, try_again, largest_sigma0(given))
     oriented = _orient(given, mirror) if lacks_start_values(given) else None
-    told = (
+    common_options = (
         options
         if progress is None
         else options | {"progress": partial(_tell, progress, max_iterations)}
     )
-    first = FirstMinimum(reduction, also, oriented, told)
-    start = first.find(given, outliers=bool(robust or snooping))
+    first_minimum = FirstMinimum(reduction, also, oriented, common_options)
+    start = first_minimum.find(given, outliers=bool(robust or snooping))
     problem, minimum = start.problem, start.minimum
-    again = partial(minimise_holding_infinite_points, **told)
+    minimise_again = partial(minimise_holding_infinite_points, **common_options)
     # The statistics need the factor of the normal matrix even where the iterations did without.
-    found = _AdjustmentState(
+    state = _AdjustmentState(
         problem.network, with_factor(problem), minimum, method, problem.reduction
     )
     # Without `progress`: every candidate would begin the bars anew.
@@ -170,21 +174,21 @@ def adjust(  # noqa: PLR0913 - the options of an adjustment
     )
     # Before anything is excluded or downweighted because of residuals of the wrong minimum.
     if second_minimum:
-        found.search_second_minima(search)
+        state.search_second_minima(search)
     if robust:
-        found.weight_robustly(again, robust, significance)
-    if found.inspection:
+        state.weight_robustly(minimise_again, robust, significance)
+    if state.inspection:
         if snooping:
-            found.remove_blunders(again, snooping, significance, doubtful)
+            state.remove_blunders(minimise_again, snooping, significance, doubtful)
         if estimate_components:
-            found.estimate_components(again)
+            state.estimate_components(minimise_again)
         if eliminate:
-            found.eliminate_parameters(again, critical_t)
+            state.eliminate_parameters(minimise_again, critical_t)
         if second_minimum and (robust or snooping or estimate_components or eliminate):
-            found.search_second_minima(search)
-    result = found.adjustment(start.check)
-    sigma0 = sigma0_at_end(found.problem, found.minimum) if found.inspection else None
-    if found.inspection:
+            state.search_second_minima(search)
+    result = state.adjustment(start.check)
+    sigma0 = sigma0_at_end(state.problem, state.minimum) if state.inspection else None
+    if state.inspection:
         result = result.with_changes(
             findings=(*result.findings, *_compare_with_start(given, result))
         )
@@ -192,7 +196,7 @@ def adjust(  # noqa: PLR0913 - the options of an adjustment
     # The causes named so far are guesses from the start values, which fit a mirrored network as
     # well as a true one: only adjusting the mirror image shows it. It costs a second adjustment,
     # so it is tried last, and only when nothing simpler explains the misfit.
-    if misfit and not also and not name_conventions(problem, minimum, found.inspection):
+    if misfit and not also and not name_conventions(problem, minimum, state.inspection):
         if mirrored := mirror(sigma0):
             result = result.with_changes(findings=(mirrored,))
     if not correlated:
@@ -200,10 +204,10 @@ def adjust(  # noqa: PLR0913 - the options of an adjustment
     return result.with_changes(correlations=CORRELATIONS).with_correlated_errors()
 
 
-def _orient(given: Network, mirror: Callable[[float | None], str]) -> Oriented:
+def _orient(network: Network, mirror: Callable[[float | None], str]) -> Oriented:
     """Start values of most of a network; an error names mirrored control if that explains it."""
     try:
-        return require_most_oriented(orient(given))
+        return require_most_oriented(orient(network))
     except NotSolvedError as error:
         if CONTRADICTORY_CONTROL in str(error) and (mirrored := mirror(None)):
             raise NotSolvedError(
@@ -215,11 +219,19 @@ def _orient(given: Network, mirror: Callable[[float | None], str]) -> Oriented:
 def _compare_with_start(given: Network, result: Adjustment) -> tuple[str, ...]:
     """What start values of images show about units and axes of a solution, in words."""
     images = result.problem.network.images
-    known = np.isfinite(given.images.position).all(1) & np.isnan(given.images.sigma).all(1)
-    free = {given.images.id[k] for k in np.flatnonzero(known)}
-    found = {id: X for id, X in zip(images.id, result.image_values[:, :3]) if id in free}
+    has_start = np.isfinite(given.images.position).all(1) & np.isnan(given.images.sigma).all(1)
+    free = {given.images.id[k] for k in np.flatnonzero(has_start)}
+    adjusted_positions = {
+        id: X for id, X in zip(images.id, result.image_values[:, :3]) if id in free
+    }
     return tuple(
-        filter(None, (name_unit_of_positions(given, found), name_other_side(given, found)))
+        filter(
+            None,
+            (
+                name_unit_of_positions(given, adjusted_positions),
+                name_other_side(given, adjusted_positions),
+            ),
+        )
     )
 
 
@@ -227,9 +239,9 @@ def _try_mirrored(
     reduction: str | None, options: Mapping[str, Any], network: Network
 ) -> float | None:
     """σ0 of a network from computed start values; None without a solution."""
-    first = FirstMinimum(reduction, (), require_most_oriented(orient(network)), options)
-    found = first.find(network, outliers=False)
-    return sigma0_at_end(found.problem, found.minimum) if found.is_solved else None
+    first_minimum = FirstMinimum(reduction, (), require_most_oriented(orient(network)), options)
+    minimum = first_minimum.find(network, outliers=False)
+    return sigma0_at_end(minimum.problem, minimum.minimum) if minimum.is_solved else None
 
 
 @dataclasses.dataclass
@@ -248,35 +260,56 @@ class _AdjustmentState:
     @property
     def inspection(self) -> Inspection | None:
         """The solution, if there is one; evaluated once until a step changes it."""
-        seen = self.inspected
-        if seen is None or seen[0] is not self.problem or seen[1] is not self.minimum:
-            seen = self.problem, self.minimum, inspect_solution(self.problem, self.minimum)
-            self.inspected = seen
-        return seen[2]
+        inspected = self.inspected
+        if (
+            inspected is None
+            or inspected[0] is not self.problem
+            or inspected[1] is not self.minimum
+        ):
+            inspected = self.problem, self.minimum, inspect_solution(self.problem, self.minimum)
+            self.inspected = inspected
+        return inspected[2]
 
-    def weight_robustly(self, again: Minimise, robust: str, significance: float) -> None:
-        found, self.minimum = adjust_robustly(self.problem, self.minimum, again, robust)
-        suspects = (name_suspect(self.problem, s) for s in found.suspects(significance))
-        self.problem = cast(NetworkProblem, found.solution.problem)
-        doubt = doubt_of_robust(found.scale, self.problem.counts.redundancy)
-        self.result_fields |= {"robust": robust, "reweighted": found, "suspects": tuple(suspects)}
+    def weight_robustly(self, minimise_again: Minimise, robust: str, significance: float) -> None:
+        reweighted, self.minimum = adjust_robustly(
+            self.problem, self.minimum, minimise_again, robust
+        )
+        suspects = (name_suspect(self.problem, s) for s in reweighted.suspects(significance))
+        self.problem = cast(NetworkProblem, reweighted.solution.problem)
+        doubt = doubt_of_robust(reweighted.scale, self.problem.counts.redundancy)
+        self.result_fields |= {
+            "robust": robust,
+            "reweighted": reweighted,
+            "suspects": tuple(suspects),
+        }
         self.result_fields["doubts"] = (doubt,) if doubt else ()
 
     def remove_blunders(
-        self, again: Minimise, test: str, significance: float, doubtful: Iterable[tuple[str, str]]
+        self,
+        minimise_again: Minimise,
+        test: str,
+        significance: float,
+        initially_removed: Iterable[tuple[str, str]],
     ) -> None:
         self.problem, self.minimum, removed, doubt = snoop_network(
-            not_none(self.inspection), self.minimum, again, test, significance, doubtful
+            not_none(self.inspection),
+            self.minimum,
+            minimise_again,
+            test,
+            significance,
+            initially_removed,
         )
         self.result_fields |= {"removed": tuple(removed), "doubts": (doubt,) if doubt else ()}
 
-    def estimate_components(self, again: Minimise) -> None:
-        self.problem, self.minimum, factors = with_components(self.problem, self.minimum, again)
+    def estimate_components(self, minimise_again: Minimise) -> None:
+        self.problem, self.minimum, factors = with_components(
+            self.problem, self.minimum, minimise_again
+        )
         self.result_fields["sigma_factors"] = factors
 
-    def eliminate_parameters(self, again: Minimise, critical_t: float) -> None:
+    def eliminate_parameters(self, minimise_again: Minimise, critical_t: float) -> None:
         self.problem, self.minimum, names = eliminate_parameters(
-            self.problem, self.minimum, again, critical_t
+            self.problem, self.minimum, minimise_again, critical_t
         )
         self.result_fields["eliminated"] = tuple(names)
 
@@ -285,13 +318,21 @@ class _AdjustmentState:
         if self.inspection is None or not can_have_second(self.problem):
             return
         try:
-            self.problem, self.minimum, found = search(self.inspection, self.minimum)
+            self.problem, self.minimum, minima = search(self.inspection, self.minimum)
         except (InputError, NotSolvedError, np.linalg.LinAlgError):
             # The result is as good as before the search.
             return
-        left = [one for one in self.result_fields.get("second_minima", ()) if one.taken]
-        left = [one for one in left if not is_said(one, found)]
-        self.result_fields["second_minima"] = (*found, *left)
+        superseded = [
+            second_minimum
+            for second_minimum in self.result_fields.get("second_minima", ())
+            if second_minimum.taken
+        ]
+        superseded = [
+            second_minimum
+            for second_minimum in superseded
+            if not is_reported(second_minimum, minima)
+        ]
+        self.result_fields["second_minima"] = (*minima, *superseded)
 
     def adjustment(self, check: tuple[Points, Observations]) -> Adjustment:
         """The result, or the reason why there is none."""

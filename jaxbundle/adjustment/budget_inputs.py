@@ -101,9 +101,9 @@ class BudgetLine:
 def unit_of_parameter(model: str | CameraModel, parameter: str) -> str:
     """The unit of a camera parameter: that of image coordinates of a principal distance and a
     principal point; none of others, whose unit depends on the power of their term."""
-    found = get_model(model)
-    own = (*found.principal_distance, *found.principal_point)
-    return found.unit if parameter in own else ""
+    camera_model = get_model(model)
+    lengths_in_image = (*camera_model.principal_distance, *camera_model.principal_point)
+    return camera_model.unit if parameter in lengths_in_image else ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,8 +122,8 @@ class InputGroup:
 
     def lines(self) -> list[BudgetLine]:
         """One line for each of a few inputs, or one for all."""
-        every = np.arange(len(self.uncertainty))
-        places = every[:, None] if self.single else [every]
+        indices = np.arange(len(self.uncertainty))
+        places = indices[:, None] if self.single else [indices]
         return [self._line(rows) for rows in places if len(rows)]
 
     def _line(self, rows: np.ndarray) -> BudgetLine:
@@ -154,7 +154,7 @@ def groups_of(
     adjustment: Adjustment, part: KindRows, scale: float | None, redundancy: float
 ) -> list[InputGroup]:
     """The inputs of a kind of observation by axis, and of image coordinates by camera."""
-    found, factors = [], adjustment.sigma_factors
+    input_groups, factors = [], adjustment.sigma_factors
     effect = np.stack(part.quantities, -1)
     columns = {name: column(*part[:4]) for name, column in COLUMNS.items()}
     shape = part.inverse_sigma.shape
@@ -163,15 +163,15 @@ def groups_of(
     if part.kind == "image" and len(network.cameras) > 1:
         of_ray = np.asarray(adjustment.problem.camera)
         cameras = [
-            (f", camera {one.id}", of_ray == c)
-            for c, one in enumerate(network.cameras)
+            (f", camera {camera_of_network.id}", of_ray == c)
+            for c, camera_of_network in enumerate(network.cameras)
             if (of_ray == c).any()
         ]
     estimated = _estimated_degrees(adjustment) if scale is None and factors else {}
-    for camera, chosen in cameras:
+    for camera, rays in cameras:
         for k, axis in enumerate(part.axes):
             rows = np.zeros(shape, bool)
-            rows[chosen, k] = True
+            rows[rays, k] = True
             rows &= part.inverse_sigma > 0
             if not rows.any():
                 continue
@@ -181,7 +181,7 @@ def groups_of(
             # Effects are of one σ a priori: c = effect/σ.
             c = effect[rows] * inverse[:, None]
             degrees = redundancy if scale is not None else estimated.get(part.kind, math.inf)
-            found.append(
+            input_groups.append(
                 InputGroup(
                     _words(part.kind, axis) + camera,
                     "A" if scale is not None or part.kind in estimated else "B",
@@ -194,7 +194,7 @@ def groups_of(
                     scale is None and int((part.inverse_sigma > 0).sum()) <= SINGLE_LINES,
                 )
             )
-    return found
+    return input_groups
 
 
 def _words(kind: str, axis: str) -> str:
@@ -207,15 +207,15 @@ def _words(kind: str, axis: str) -> str:
 
 def _estimated_degrees(adjustment: Adjustment) -> dict[str, float]:
     """Σr of the observations whose σ were estimated, by kind: one estimate for all of a kind."""
-    rows, found = adjustment.residuals, {}
+    rows, degrees = adjustment.residuals, {}
     changed = {name for name, f in adjustment.sigma_factors.items() if f != 1}
-    known = {group.name for group in groups(adjustment.problem)}
+    groups_of_weights = {group.name for group in groups(adjustment.problem)}
     for kind in {*rows["kind"].tolist()} - {"image"}:
         # As the groups are named: "control points in X", "distances", "interior orientation".
         part = "orientation" if kind == "prior" else kind.rstrip("s")
-        if any(part in name for name in changed & known):
-            found[kind] = float(rows["r"][rows["kind"] == kind].sum())
-    return found
+        if any(part in name for name in changed & groups_of_weights):
+            degrees[kind] = float(rows["r"][rows["kind"] == kind].sum())
+    return degrees
 
 
 def shared_errors(
@@ -234,12 +234,14 @@ def shared_errors(
         return []
     D = effects(model.solution, slopes)
     lines = []
-    for theta, spread, component in zip(model.theta[1:], model.theta_sigma[1:], model.components):
+    for theta, sigma_theta, component in zip(
+        model.theta[1:], model.theta_sigma[1:], model.components
+    ):
         if not theta > 0 or component.name == OTHERS:
             continue
         size = np.sqrt((component.products(D.T) ** 2).sum(0)) * factor
         # A size that is hardly determined: no estimate has less than one degree of freedom.
-        degrees = max(2 * (theta / spread) ** 2, 1.0) if spread > 0 else math.inf
+        degrees = max(2 * (theta / sigma_theta) ** 2, 1.0) if sigma_theta > 0 else math.inf
         unit = adjustment.image_unit if component.unit == "image" else ""
         lines.append(
             BudgetLine(
@@ -261,26 +263,26 @@ def held_lines(
     adjustment: Adjustment, of: Any, held: Mapping[Any, Any], factor: Float[np.ndarray, " f"]
 ) -> list[BudgetLine]:
     """A line for each input that the adjustment holds."""
-    inputs = {name: _held_input(name, given) for name, given in held.items()}
+    inputs = {name: _held_input(name, amount) for name, amount in held.items()}
     sigmas = {
-        name: given.uncertainty if isinstance(given, HeldInput) else given
-        for name, given in inputs.items()
+        name: amount.uncertainty if isinstance(amount, HeldInput) else amount
+        for name, amount in inputs.items()
     }
     budget = sensitivity(adjustment, sigmas, of)
     lines = []
-    for effect, cause, given in zip(budget.effects, budget.causes, inputs.values()):
-        known = given if isinstance(given, HeldInput) else HeldInput(1.0)
+    for effect, cause, amount in zip(budget.effects, budget.causes, inputs.values()):
+        held_input = amount if isinstance(amount, HeldInput) else HeldInput(1.0)
         # A common error has no single σ: its line has that of its amounts, 1.
-        u = known.uncertainty
+        u = held_input.uncertainty
         scale = adjustment.angle_scale if cause.angle else 1.0
         unit = _unit_of_cause(adjustment, cause.name, cause.angle)
         lines.append(
             BudgetLine(
-                known.words or cause.words,
+                held_input.words or cause.words,
                 len(cause.errors),
                 "B",
-                known.distribution,
-                known.degrees,
+                held_input.distribution,
+                held_input.degrees,
                 u * scale,
                 unit,
                 effect * factor / (u * scale),
@@ -290,10 +292,10 @@ def held_lines(
     return lines
 
 
-def _held_input(name: Any, given: Any) -> "HeldInput | Mapping":
-    if isinstance(given, HeldInput | Mapping):
-        return given
-    return HeldInput(positive(f"the σ of {name}", given))
+def _held_input(name: Any, amount: Any) -> "HeldInput | Mapping":
+    if isinstance(amount, HeldInput | Mapping):
+        return amount
+    return HeldInput(positive(f"the σ of {name}", amount))
 
 
 def _unit_of_cause(adjustment: Adjustment, name: str, angle: bool) -> str:

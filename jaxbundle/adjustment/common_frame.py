@@ -40,45 +40,45 @@ def common_rows(a: Adjustment, b: Adjustment) -> CommonRows:
     """The free camera parameters, images and determined points of both.
 
     **Raises:** `InputError` if there are none."""
-    first, second = a.problem.network, b.problem.network
-    model = {c.id: str(c.model) for c in second.cameras}
+    network_a, network_b = a.problem.network, b.problem.network
+    model = {c.id: str(c.model) for c in network_b.cameras}
     cameras = []
-    for camera in first.cameras:
+    for camera in network_a.cameras:
         if model.get(camera.id) != str(camera.model):
             continue
         free = {*a.camera_cofactor(camera.id)[0], *b.camera_cofactor(camera.id)[0]}
         names = get_model(camera.model).parameters
         cameras += [(camera.id, name) for name in names if name in free]
-    there = lambda r: {
+    determined = lambda r: {
         id for id, X in zip(r.problem.network.points.id, r.point_values) if np.isfinite(X).all()
     }
-    images, points = set(second.images.id), there(a) & there(b)
-    found = CommonRows(
+    images, points = set(network_b.images.id), determined(a) & determined(b)
+    common = CommonRows(
         cameras,
-        [id for id in first.images.id if id in images],
-        [id for id in first.points.id if id in points],
+        [id for id in network_a.images.id if id in images],
+        [id for id in network_a.points.id if id in points],
     )
-    if not (found.cameras or found.images or found.points):
+    if not (common.cameras or common.images or common.points):
         raise InputError("a and b have no camera, image or point of the same name")
-    return found
+    return common
 
 
-def points_that_hold(points: Sequence[str], wanted: Sequence[str]) -> tuple[str, ...]:
+def points_that_hold(points: Sequence[str], requested: Sequence[str]) -> tuple[str, ...]:
     """The ids of the points that hold a similarity: the wanted ones, by default all.
 
     **Raises:** `InputError`."""
-    if isinstance(wanted, str):
+    if isinstance(requested, str):
         raise InputError("held_by must be a list of ids of points, but is a text")
-    missing = [id for id in map(str, wanted) if id not in set(points)]
-    if missing:
-        raise InputError(f"held_by: points {list_some(missing)} are not in both adjustments")
-    held = tuple(map(str, wanted)) or tuple(points)
-    if len(held) < 3:
+    missing_ids = [id for id in map(str, requested) if id not in set(points)]
+    if missing_ids:
+        raise InputError(f"held_by: points {list_some(missing_ids)} are not in both adjustments")
+    holding = tuple(map(str, requested)) or tuple(points)
+    if len(holding) < 3:
         raise InputError(
-            f"a similarity needs three points in common, but there are {len(held)}; "
+            f"a similarity needs three points in common, but there are {len(holding)}; "
             "similarity=False compares coordinates as they are"
         )
-    return held
+    return holding
 
 
 class CommonFrame(eqx.Module):
@@ -91,40 +91,40 @@ class CommonFrame(eqx.Module):
     projection: Float[Array, "7 m"]
 
     def small(self, points: Float[AnyArray, "points 3"]) -> Float[Array, "7"]:
-        there = jax.vmap(transform_point, (None, 0))(self.tau, points[self.held])
-        return self.projection @ (self.reference - there).ravel()
+        transformed = jax.vmap(transform_point, (None, 0))(self.tau, points[self.held])
+        return self.projection @ (self.reference - transformed).ravel()
 
 
 def common_frames(
-    a: Adjustment, b: Adjustment, held: Sequence[str]
+    a: Adjustment, b: Adjustment, holding_points: Sequence[str]
 ) -> tuple[tuple[CommonFrame, CommonFrame], Float[np.ndarray, "7"]]:
     """The frames of both, and τ from a to b; coordinates are relative to the origin of b."""
-    found, origin = [], b.problem.origin
+    rows_and_points, origin = [], b.problem.origin
     for r in (a, b):
         place = {id: k for k, id in enumerate(r.problem.network.points.id)}
-        rows = np.array([place[id] for id in held])
-        found.append((rows, r.point_values[rows] - origin))
-    (rows_a, X), (rows_b, Y) = found
-    first = absolute_orientation(X, Y)
-    if int(first.status):
+        rows = np.array([place[id] for id in holding_points])
+        rows_and_points.append((rows, r.point_values[rows] - origin))
+    (rows_a, X), (rows_b, Y) = rows_and_points
+    orientation = absolute_orientation(X, Y)
+    if int(orientation.status):
         raise InputError("the points of the similarity are on one line, or at one place")
     G = np.asarray(jax.vmap(helmert_point)(jnp.asarray(Y))).reshape(-1, 7).copy()
     if not (_scale_is_open(a.problem) or _scale_is_open(b.problem)):
         G[:, SCALE] = 0.0
     projection = np.linalg.pinv(G)
-    tau = np.array(first.tau)
+    tau = np.array(orientation.tau)
     if not G[:, SCALE].any():
         tau[SCALE] = 0.0
     # The closed solution has a scale; without one it is off, and G is that of b, so that a step
     # leaves a remainder of the size of the misfit times the step. Ten steps leave rounding.
     for _ in range(10):
-        there = np.asarray(_move(tau, X))
-        tau = np.asarray(compose(projection @ (Y - there).ravel(), tau))
-    one = CommonFrame(*map(jnp.asarray, (tau, rows_a, Y, projection)))
+        transformed = np.asarray(_move(tau, X))
+        tau = np.asarray(compose(projection @ (Y - transformed).ravel(), tau))
+    frame_a = CommonFrame(*map(jnp.asarray, (tau, rows_a, Y, projection)))
     # What is left of the points of a stays where it is: only changes are referred to the points.
-    one = dataclasses.replace(one, reference=jnp.asarray(_move(tau, X)))
-    other = CommonFrame(*map(jnp.asarray, (np.zeros(7), rows_b, Y, projection)))
-    return (one, other), tau
+    frame_a = dataclasses.replace(frame_a, reference=jnp.asarray(_move(tau, X)))
+    frame_b = CommonFrame(*map(jnp.asarray, (np.zeros(7), rows_b, Y, projection)))
+    return (frame_a, frame_b), tau
 
 
 _move = compile_once(jax.vmap(transform_point, (None, 0)), ())
@@ -158,11 +158,14 @@ class UnknownsInFrame(eqx.Module):
             for tau in (self.frame.tau, self.frame.small(points)):
                 place, turn = jax.vmap(transform_pose, (None, 0, 0))(tau, place, turn)
                 points = jax.vmap(transform_point, (None, 0))(tau, points)
-        near = lambda q, given: angles_near(q, jnp.zeros(3), given)
-        angles = jax.vmap(near)(turn[self.images], self.angles)
+        angles_near_given = lambda q, given: angles_near(q, jnp.zeros(3), given)
+        angles = jax.vmap(angles_near_given)(turn[self.images], self.angles)
         poses = jnp.concatenate([place[self.images], angles], 1)
-        found = [values[table][at[:, 0], at[:, 1]] for table, at in sorted(self.cameras.items())]
-        cameras = jnp.concatenate([jnp.zeros(0), *found])[self.order]
+        parameters = [
+            values[table][places[:, 0], places[:, 1]]
+            for table, places in sorted(self.cameras.items())
+        ]
+        cameras = jnp.concatenate([jnp.zeros(0), *parameters])[self.order]
         return jnp.concatenate([cameras, poses.ravel(), points[self.points].ravel()])
 
 
@@ -180,7 +183,7 @@ class FramedAdjustment:
     ) -> UnknownsInFrame:
         """The function that gives the unknowns of these rows; angles near the given ones."""
         network = self.problem.network
-        of = lambda ids, table: np.array(
+        rows_of_ids = lambda ids, table: np.array(
             [{id: k for k, id in enumerate(table)}[id] for id in ids], int
         )
         place = {c.id: self.problem.table_of_camera(k) for k, c in enumerate(network.cameras)}
@@ -188,12 +191,12 @@ class FramedAdjustment:
         for k, (id, name) in enumerate(rows.cameras):
             table, row = place[id]
             pairs.setdefault(table.name, []).append((row, table.parameters.index(name), k))
-        order = np.array([k for _, at in sorted(pairs.items()) for *_, k in at], int)
+        order = np.array([k for _, places in sorted(pairs.items()) for *_, k in places], int)
         return UnknownsInFrame(
-            {table: jnp.asarray(np.array(at)[:, :2]) for table, at in pairs.items()},
+            {table: jnp.asarray(np.array(places)[:, :2]) for table, places in pairs.items()},
             jnp.asarray(np.argsort(order)),
-            jnp.asarray(of(rows.images, network.images.id)),
-            jnp.asarray(of(rows.points, network.points.id)),
+            jnp.asarray(rows_of_ids(rows.images, network.images.id)),
+            jnp.asarray(rows_of_ids(rows.points, network.points.id)),
             jnp.asarray(angles),
             jnp.asarray(self.problem.origin - self.like.origin),
             self.frame,
@@ -203,10 +206,10 @@ class FramedAdjustment:
         self, rows: CommonRows, angles: Float[np.ndarray, "images 3"]
     ) -> tuple[np.ndarray, np.ndarray]:
         """The unknowns and their covariance."""
-        chosen = self.choose_rows(rows, angles)
-        return np.asarray(_call(chosen, self.result.values)), self.result.covariance_of(chosen)
+        unknowns = self.choose_rows(rows, angles)
+        return np.asarray(_call(unknowns, self.result.values)), self.result.covariance_of(unknowns)
 
 
 @compile_once
-def _call(chosen: UnknownsInFrame, values: Values) -> Float[Array, " n"]:
-    return chosen(values)
+def _call(unknowns: UnknownsInFrame, values: Values) -> Float[Array, " n"]:
+    return unknowns(values)

@@ -149,8 +149,8 @@ class AdjustmentComparison(TableMethods):
         """What was compared, the tests, and the largest differences in σ."""
         number = lambda kind: len(set(self.id[self.kind == kind]))
         things = {kind: number(kind) for kind in ("camera", "image", "point")}
-        said = ", ".join(count(n, kind) for kind, n in things.items() if n)
-        lines = [f"{said} in common, {count(len(self), 'unknown')}"]
+        counts_in_words = ", ".join(count(n, kind) for kind, n in things.items() if n)
+        lines = [f"{counts_in_words} in common, {count(len(self), 'unknown')}"]
         if self.similarity is not None:
             lines.append(
                 f"a was moved by a similarity found on {count(len(self.held_by), 'point')}"
@@ -210,10 +210,10 @@ def compare(
     **Raises:** `InputError` if they have nothing in common, different units, or too few points for
     a similarity; `NotSolvedError` if one has no result.
     """
-    for name, one in (("a", a), ("b", b)):
-        if not isinstance(one, Adjustment):
+    for name, framed_a in (("a", a), ("b", b)):
+        if not isinstance(framed_a, Adjustment):
             raise InputError(
-                f"{name} must be an Adjustment, but is {show(one)}: jaxbundle.adjust "
+                f"{name} must be an Adjustment, but is {show(framed_a)}: jaxbundle.adjust "
                 "or jaxbundle.load_adjustment gives one"
             )
     if similarity not in (None, True, False):
@@ -232,36 +232,38 @@ def compare(
     rows = common_rows(a, b)
     if similarity is None:
         similarity = len(rows.points) > 0 and bool(a.counts.datum or b.counts.datum)
-    frames, tau, held = (None, None), None, ()
+    frames, tau, holding_points = (None, None), None, ()
     if similarity:
-        held = points_that_hold(rows.points, held_by)
-        frames, tau = common_frames(a, b, held)
+        holding_points = points_that_hold(rows.points, held_by)
+        frames, tau = common_frames(a, b, holding_points)
     elif held_by:
         raise InputError("held_by: no similarity is estimated, so no points hold one")
-    one, other = (FramedAdjustment(r, f, r.problem, b.problem) for r, f in zip((a, b), frames))
-    return _compare(a, b, one, other, rows, tau, held, significance)
+    framed_a, framed_b = (
+        FramedAdjustment(r, f, r.problem, b.problem) for r, f in zip((a, b), frames)
+    )
+    return _compare(a, b, framed_a, framed_b, rows, tau, holding_points, significance)
 
 
 def _compare(
     a: Adjustment,
     b: Adjustment,
-    one: FramedAdjustment,
-    other: FramedAdjustment,
+    framed_a: FramedAdjustment,
+    framed_b: FramedAdjustment,
     rows: CommonRows,
     tau: Float[np.ndarray, "7"] | None,
-    held: tuple[str, ...],
+    holding_points: tuple[str, ...],
     significance: float,
 ) -> AdjustmentComparison:
     # ω, φ, κ of both near those of b, so that a difference is never a whole turn.
     place = {id: k for k, id in enumerate(b.problem.network.images.id)}
-    near = b.image_values[[place[id] for id in rows.images], 3:].reshape(-1, 3)
-    found = []
+    angles_of_b = b.image_values[[place[id] for id in rows.images], 3:].reshape(-1, 3)
+    estimates = []
     for part in _portions(rows, _most_together(a, b)):
-        angles = near if part.images else np.zeros((0, 3))
-        found.append((one.estimate(part, angles), other.estimate(part, angles)))
-    x_a, x_b = (np.concatenate([pair[side][0] for pair in found]) for side in (0, 1))
+        angles = angles_of_b if part.images else np.zeros((0, 3))
+        estimates.append((framed_a.estimate(part, angles), framed_b.estimate(part, angles)))
+    x_a, x_b = (np.concatenate([pair[side][0] for pair in estimates]) for side in (0, 1))
     v_a, v_b = (
-        np.clip(np.concatenate([np.diagonal(pair[side][1]) for pair in found]), 0, None)
+        np.clip(np.concatenate([np.diagonal(pair[side][1]) for pair in estimates]), 0, None)
         for side in (0, 1)
     )
     shared = _count_shared(a, b)
@@ -278,8 +280,10 @@ def _compare(
         p = np.array(
             [np.nan if np.isnan(x) else f_tail(x * x, 1, freedom(y)) for x, y in zip(t, q)]
         )
-        C_a, C_b = (found[0][side][1] for side in (0, 1))
-        tests = _test_together(x_b - x_a, C_a, C_b, rows, len(found) == 1, one.frame, freedom)
+        C_a, C_b = (estimates[0][side][1] for side in (0, 1))
+        tests = _test_together(
+            x_b - x_a, C_a, C_b, rows, len(estimates) == 1, framed_a.frame, freedom
+        )
     tested = np.zeros(0) if shared else table["sigma"]
     level = level_of_one(significance, int((tested > 0).sum()))
     return AdjustmentComparison(
@@ -288,7 +292,7 @@ def _compare(
         probability=p,
         differs=np.nan_to_num(p, nan=1.0) < level,
         similarity=tau,
-        held_by=held,
+        held_by=holding_points,
         tests=tests,
         shared=shared,
         significance=significance,
@@ -301,20 +305,21 @@ def _test_together(
     C_a: Float[np.ndarray, "n n"],
     C_b: Float[np.ndarray, "n n"],
     rows: CommonRows,
-    whole: bool,
+    is_whole: bool,
     frame: CommonFrame | None,
     freedom: Callable[[float], float],
 ) -> dict[str, Congruency]:
-    """The tests of each camera and of all points; of these only if all are in one portion, `whole`.
-    The similarity of the frame has taken its parameters out of the points' differences."""
+    """The tests of each camera and of all points; of these only if all are in one portion,
+    `is_whole`. The similarity of the frame has taken its parameters out of the points'
+    differences."""
     tests = {}
     for camera in dict.fromkeys(id for id, _ in rows.cameras):
-        at = np.array([k for k, (id, _) in enumerate(rows.cameras) if id == camera])
-        tests[f"camera {camera}"] = _congruency(d, C_a, C_b, at, freedom)
-    if whole and rows.points:
-        at = np.arange(len(rows.cameras) + 6 * len(rows.images), len(d))
-        lost = 0 if frame is None else int(np.asarray(frame.projection).any(1).sum())
-        tests["points"] = _congruency(d, C_a, C_b, at, freedom, lost)
+        positions = np.array([k for k, (id, _) in enumerate(rows.cameras) if id == camera])
+        tests[f"camera {camera}"] = _congruency(d, C_a, C_b, positions, freedom)
+    if is_whole and rows.points:
+        positions = np.arange(len(rows.cameras) + 6 * len(rows.images), len(d))
+        rank_lost = 0 if frame is None else int(np.asarray(frame.projection).any(1).sum())
+        tests["points"] = _congruency(d, C_a, C_b, positions, freedom, rank_lost)
     return {name: test for name, test in tests.items() if test is not None}
 
 
@@ -376,16 +381,16 @@ def _congruency(
     d: Float[np.ndarray, " n"],
     C_a: Float[np.ndarray, "n n"],
     C_b: Float[np.ndarray, "n n"],
-    at: Int[np.ndarray, " k"],
+    positions: Int[np.ndarray, " k"],
     freedom: Callable[[float], float],
-    lost: int = 0,
+    rank_lost: int = 0,
     null: float = 1e-9,
 ) -> Congruency | None:
-    """The test that these differences are 0 together; None where nothing is free. `lost`: the rank
-    removed by a similarity; `null`: eigenvalues of the correlation matrix below this part of the
-    largest are 0. Rounding of propagated covariances is about 1e-12 of it, combinations that the
-    observations determine are far above."""
-    C_a, C_b = C_a[np.ix_(at, at)], C_b[np.ix_(at, at)]
+    """The test that these differences are 0 together; None where nothing is free. `rank_lost`: the
+    rank removed by a similarity; `null`: eigenvalues of the correlation matrix below this part of
+    the largest are 0. Rounding of propagated covariances is about 1e-12 of it, combinations that
+    the observations determine are far above."""
+    C_a, C_b = C_a[np.ix_(positions, positions)], C_b[np.ix_(positions, positions)]
     diagonal = np.diagonal(C_a + C_b)
     free = diagonal > 0
     if not free.any():
@@ -395,10 +400,10 @@ def _congruency(
     values, vectors = np.linalg.eigh(scaled(C_a + C_b))
     # The eigenvalues that belong to the similarity are the smallest, and 0 but for rounding; they
     # are counted out by number, since rounding may exceed `null` in a large network.
-    there = (values > null * values[-1]) & (np.arange(len(values)) >= lost)
-    whitened = (vectors[:, there] / np.sqrt(values[there])).T
-    rank = int(there.sum())
-    f = float(((whitened @ (D * d[at][free])) ** 2).sum() / rank)
+    is_determined = (values > null * values[-1]) & (np.arange(len(values)) >= rank_lost)
+    whitened = (vectors[:, is_determined] / np.sqrt(values[is_determined])).T
+    rank = int(is_determined.sum())
+    f = float(((whitened @ (D * d[positions][free])) ** 2).sum() / rank)
     part = float(np.trace(whitened @ scaled(C_a) @ whitened.T) / rank)
     return Congruency(f, rank, freedom(part))
 
@@ -413,11 +418,13 @@ def _count_shared(a: Adjustment, b: Adjustment) -> int:
     # To the last digit: two measurements of a point in one photograph are never equal.
 
     def measured(r: Adjustment) -> set[tuple[str, str, float, float]]:
-        network, given = r.problem.network, r.problem.network.observations
+        network, observations = r.problem.network, r.problem.network.observations
         images, points = network.images.id, network.points.id
         return {
             (images[i], points[p], x, y)
-            for i, p, (x, y) in zip(given.image.tolist(), given.point.tolist(), given.xy.tolist())
+            for i, p, (x, y) in zip(
+                observations.image.tolist(), observations.point.tolist(), observations.xy.tolist()
+            )
         }
 
     return len(measured(a) & measured(b))

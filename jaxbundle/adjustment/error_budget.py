@@ -80,10 +80,16 @@ class Budget(TableMethods):
             unit = self.angle_scale if result.angle else 1.0
             rows.append((result.name, MEASUREMENTS, np.nan, self.sigma[r] * unit, shares[0, r]))
             for c, cause in enumerate(self.causes):
-                own = np.nan if cause.sigma is None else cause.sigma
-                own *= self.angle_scale if cause.angle else 1.0
+                cause_sigma = np.nan if cause.sigma is None else cause.sigma
+                cause_sigma *= self.angle_scale if cause.angle else 1.0
                 rows.append(
-                    (result.name, cause.name, own, self.effects[c, r] * unit, shares[c + 1, r])
+                    (
+                        result.name,
+                        cause.name,
+                        cause_sigma,
+                        self.effects[c, r] * unit,
+                        shares[c + 1, r],
+                    )
                 )
             rows.append((result.name, TOTAL, np.nan, total[r] * unit, 1.0))
         names = ("result", "cause", "sigma", "effect", "share")
@@ -97,17 +103,17 @@ class Budget(TableMethods):
 
     def rows(self) -> list[tuple[str, str, str, str, str]]:
         """`table` as formatted text, under `report.budget.HEADER`."""
-        found, columns = [], self.table()
+        text_rows, columns = [], self.table()
         words = {MEASUREMENTS: "the measurements", TOTAL: "all together"}
         words |= {cause.name: cause.words for cause in self.causes}
-        called, before = {result.name: result.words for result in self.results}, ""
+        words_of, previous = {result.name: result.words for result in self.results}, ""
         for name, cause, sigma, effect, share in zip(*columns.values()):
-            first = called[name] if name != before else ""
-            before = name
+            result_words = words_of[name] if name != previous else ""
+            previous = name
             part = "" if cause == TOTAL else f"{100 * share:.1f}"
-            given = "" if np.isnan(sigma) else f"{sigma:.4g}"
-            found.append((first, words[cause], given, significant(effect), part))
-        return found
+            sigma_text = "" if np.isnan(sigma) else f"{sigma:.4g}"
+            text_rows.append((result_words, words[cause], sigma_text, significant(effect), part))
+        return text_rows
 
     def __str__(self) -> str:
         return "\n".join(table(HEADER, self.rows(), "llrrr"))
@@ -136,13 +142,15 @@ def sensitivity(
     not positive; `NotSolvedError` without a solution.
     """
     inspection, errors, unit = inspection_of(given)
-    found = inspection.solution
-    causes = find_causes(inspection.problem, found.values, held)
+    solution = inspection.solution
+    causes = find_causes(inspection.problem, solution.values, held)
     results = request_results(inspection, errors, of)
     errors = [change for cause in causes for change in cause.errors]
     # dx = −H⁻¹·(∂g/∂θ)·σ for every error at once, then along the results: no adjustment is
     # repeated.
-    parts = [effects_on(results, found.values, tangents) for tangents in follow(found, errors)]
+    parts = [
+        effects_on(results, solution.values, tangents) for tangents in follow(solution, errors)
+    ]
     effects = np.concatenate(parts)
     ends = np.cumsum([0, *(len(cause.errors) for cause in causes)])
     by_cause = np.array(
@@ -159,22 +167,22 @@ def root_sum_of_squares(effects: Float[np.ndarray, " k"]) -> float:
     return float(effects[0]) if len(effects) == 1 else float(np.sqrt((effects**2).sum()))
 
 
-def inspection_of(given: Any) -> tuple[Inspection, Errors, float]:
+def inspection_of(design: Any) -> tuple[Inspection, Errors, float]:
     """The inspection of an adjustment or a design, the errors of its observations (of a design a
     priori), and the factor from radians to its unit of angles.
 
     **Raises:** `InputError` for other arguments, or if no factor fits into memory."""
-    if isinstance(given, NetworkProblem):
-        given = with_factor(given)
-        if given.reduction not in FACTORS:
+    if isinstance(design, NetworkProblem):
+        design = with_factor(design)
+        if design.reduction not in FACTORS:
             raise InputError("the network is too large for its covariance; use a part of it")
         # Residuals of a design are 0: its response has no part of second order.
-        given = with_data(given, predict(given, given.data))
-        found = Inspection(given, given.data.start)
-        unit = 1 / ANGLE_UNITS[given.network.angle_unit]
-        return found, IndependentErrors(found.solution, 1.0), unit
-    if not isinstance(given, Adjustment):
+        design = with_data(design, predict(design, design.data))
+        inspection = Inspection(design, design.data.start)
+        unit = 1 / ANGLE_UNITS[design.network.angle_unit]
+        return inspection, IndependentErrors(inspection.solution, 1.0), unit
+    if not isinstance(design, Adjustment):
         raise InputError(
-            f"expected a result of jaxbundle.adjust or jaxbundle.make_problem, got {show(given)}"
+            f"expected a result of jaxbundle.adjust or jaxbundle.make_problem, got {show(design)}"
         )
-    return given.cofactors, given.errors, given.angle_scale
+    return design.cofactors, design.errors, design.angle_scale

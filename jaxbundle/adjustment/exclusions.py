@@ -97,11 +97,11 @@ def find_collinear(
     narrow, flat = _find_candidates(problem, values, factor)
     if not (narrow.any() or flat.any()):
         return CollinearGeometry()
-    seen = sights(network.replace(cameras=tuple(adjusted_cameras(problem, values).values())))
-    model = _adjusted_model(problem, values, network, seen)
-    points, one_place = rays_coincide(seen, model, narrow, factor or 1.0)
-    images = flat & see_collinear_points(seen, model, factor or 1.0)
-    return CollinearGeometry(_notes(network, seen, points, one_place, images))
+    sighted = sights(network.replace(cameras=tuple(adjusted_cameras(problem, values).values())))
+    model = _adjusted_model(problem, values, network, sighted)
+    points, one_place = rays_coincide(sighted, model, narrow, factor or 1.0)
+    images = flat & see_collinear_points(sighted, model, factor or 1.0)
+    return CollinearGeometry(_notes(network, sighted, points, one_place, images))
 
 
 def may_be_collinear(problem: NetworkProblem, values: Values) -> bool:
@@ -113,11 +113,11 @@ def may_be_collinear(problem: NetworkProblem, values: Values) -> bool:
     # parallel: those points are at any distance from the start (`far_points`), and would drift in
     # the few iterations before the check.
     angle = angle_of_rays(problem, values)
-    near = (angle < FAR_POINTS.narrow) & (
+    is_narrow_enough = (angle < FAR_POINTS.narrow) & (
         _parallax_at_usual_distance(problem, values) < FAR_POINTS.narrow
     )
     parallel = angle < FAR_POINTS.parallel
-    return bool(narrow.any() or flat.any() or (near.any() and not parallel.any()))
+    return bool(narrow.any() or flat.any() or (is_narrow_enough.any() and not parallel.any()))
 
 
 def _parallax_at_usual_distance(
@@ -133,8 +133,8 @@ def _parallax_at_usual_distance(
     s = np.linalg.norm(to_point, axis=1)
     usual = np.full(len(problem.network.images), np.inf)
     order = np.lexsort((s, image))
-    seen, first, number = np.unique(image[order], return_index=True, return_counts=True)
-    usual[seen] = s[order][first + number // 2]
+    seen_images, first, number = np.unique(image[order], return_index=True, return_counts=True)
+    usual[seen_images] = s[order][first + number // 2]
     mean = lambda v: (
         np.stack([np.bincount(point, c, n) for c in v.T], 1)
         / np.maximum(np.bincount(point, minlength=n), 1)[:, None]
@@ -142,9 +142,9 @@ def _parallax_at_usual_distance(
     with np.errstate(divide="ignore", invalid="ignore"):
         u = mean(to_point / s[:, None])
         u /= np.linalg.norm(u, axis=1, keepdims=True)
-        off = np.linalg.norm(np.cross(X0 - mean(X0)[point], u[point]), axis=1) / usual[image]
+        distance = np.linalg.norm(np.cross(X0 - mean(X0)[point], u[point]), axis=1) / usual[image]
     largest = np.zeros(n)
-    np.fmax.at(largest, point, off)
+    np.fmax.at(largest, point, distance)
     return largest
 
 
@@ -159,40 +159,40 @@ def _find_candidates(
     """
     network = problem.network
     ties, images = network.points.has_role("tie"), len(network.images)
-    none = np.zeros(len(ties), bool), np.zeros(images, bool)
+    nothing = np.zeros(len(ties), bool), np.zeros(images, bool)
     noise = noise_of_rays(problem.network)
     if not are_finite(problem, values) or factor is None and noise > largest_sigma:
-        return none
+        return nothing
     noise *= FAR_POINTS.vague * (factor or 1.0)
     free = ties & ~problem.kept_rows & (equations_of(network, "POINTS") == 0)
     free[network.distances.points.ravel()] = False
     narrow = free & (angle_of_rays(problem, values) < noise)
     # Further observations may hold an image through tables of their own: then none is judged.
     if problem.further_sets:
-        return narrow, none[1]
+        return narrow, nothing[1]
     only_rays = np.isnan(network.images.sigma).all(1) & (equations_of(network, "IMAGES") == 0)
     return narrow, only_rays & (_width_of_points(problem, values) < noise)
 
 
 def _notes(
     network: Network,
-    seen: Sights,
+    sighted: Sights,
     points: Bool[np.ndarray, " points"],
     one_place: Bool[np.ndarray, " points"],
     images: Bool[np.ndarray, " images"],
 ) -> tuple[LeftOut, ...]:
-    of = lambda ids, mask: tuple(ids[k] for k in np.flatnonzero(mask))
+    ids_of = lambda ids, mask: tuple(ids[k] for k in np.flatnonzero(mask))
     groups = []
     for mask, where in (
         (points & one_place, "from one place (images {})"),
         (points & ~one_place, "along the line through the projection centres (images {})"),
     ):
-        by = np.unique(seen.image[mask[seen.point]])
-        where = where.format(list_some((network.images.id[k] for k in by), 4))
+        photographs = np.unique(sighted.image[mask[sighted.point]])
+        where = where.format(list_some((network.images.id[k] for k in photographs), 4))
         why = f"whose rays coincide within their noise, {where}: their distance is undetermined"
-        groups.append(LeftOut("tie point", of(network.points.id, mask), why))
+        groups.append(LeftOut("tie point", ids_of(network.points.id, mask), why))
     why = "whose points are on one line, about which their rotation is undetermined"
-    groups.append(LeftOut("image", of(network.images.id, images), why))
+    groups.append(LeftOut("image", ids_of(network.images.id, images), why))
     return tuple(group for group in groups if group.names)
 
 
@@ -203,9 +203,9 @@ def _width_of_points(problem: NetworkProblem, values: Values) -> Float[np.ndarra
     # 0). Weighted by 1/s², since an angle counts, not a distance.
     image, n = problem.image, len(problem.network.images)
     X = np.asarray(coordinates(values))[problem.point]
-    away = np.linalg.norm(X - np.asarray(values["image"].position)[image], axis=1)
+    distance = np.linalg.norm(X - np.asarray(values["image"].position)[image], axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        root = np.nan_to_num(1 / away, posinf=0.0)
+        root = np.nan_to_num(1 / distance, posinf=0.0)
     total = lambda v: np.stack([np.bincount(image, c, n) for c in v.reshape(len(image), -1).T], 1)
     weight = np.maximum(np.bincount(image, root**2, n), 1e-300)[:, None]
     scaled = root[:, None] * (X - (total(root[:, None] ** 2 * X) / weight)[image])
@@ -215,15 +215,15 @@ def _width_of_points(problem: NetworkProblem, values: Values) -> Float[np.ndarra
 
 
 def _adjusted_model(
-    problem: NetworkProblem, values: Values, network: Network, seen: Sights
+    problem: NetworkProblem, values: Values, network: Network, sighted: Sights
 ) -> Model:
     """The adjusted images and points, as rows of `network`."""
-    model = Model.empty(seen)
+    model = Model.empty(sighted)
     images, points = (
-        np.array([place[id] for id in own.id], int)
-        for own, place in (
-            (table, {id: k for k, id in enumerate(whole.id)})
-            for table, whole in (
+        np.array([place[id] for id in part.id], int)
+        for part, place in (
+            (table, {id: k for k, id in enumerate(complete.id)})
+            for table, complete in (
                 (problem.network.images, network.images),
                 (problem.network.points, network.points),
             )
@@ -238,140 +238,164 @@ def _adjusted_model(
 
 
 def readmit(
-    given: Network, current: Network, problem: NetworkProblem, values: Values, factor: float
+    network_as_given: Network,
+    current: Network,
+    problem: NetworkProblem,
+    values: Values,
+    factor: float,
 ) -> Network:
     """The given network with everything that agrees with adjusted images and points, and notes of
     what does not.
 
-    **Arguments:** `current`: the part of `given` that was adjusted, with its check points;
-    `factor`: σ0."""
-    seen, model, straight = _place_left_out(given, problem, values, factor)
-    before = np.isin(np.array(given.points.id, object), np.array(current.points.id, object))
+    **Arguments:** `current`: the part of `network_as_given` that was adjusted, with its check
+    points; `factor`: σ0."""
+    sighted, model, straight = _place_left_out(network_as_given, problem, values, factor)
+    was_adjusted = np.isin(
+        np.array(network_as_given.points.id, object), np.array(current.points.id, object)
+    )
     # An image point that was adjusted stays, even if it misses: its residual is judged by the
     # tests. Only what was left out has to agree first.
-    used = _are_among(given, current)
-    off = misclosures(seen, model) > READMISSION_LIMITS.max_miss * seen.tolerance[seen.image]
-    wrong = off & ~used[seen.row]
-    kept = dataclasses.replace(
-        seen,
-        **{name: getattr(seen, name)[~wrong] for name in ("image", "point", "ray", "sigma", "row")},
+    is_used = _are_among(network_as_given, current)
+    is_off = (
+        misclosures(sighted, model) > READMISSION_LIMITS.max_miss * sighted.tolerance[sighted.image]
     )
-    ties = given.points.has_role("tie") & ~before
-    line, one_place = rays_coincide(kept, model, ties, factor)
-    network = _with_start_values(given, model)
-    images, points = given.images, given.points
+    is_wrong = is_off & ~is_used[sighted.row]
+    agreeing = dataclasses.replace(
+        sighted,
+        **{
+            name: getattr(sighted, name)[~is_wrong]
+            for name in ("image", "point", "ray", "sigma", "row")
+        },
+    )
+    left_out_ties = network_as_given.points.has_role("tie") & ~was_adjusted
+    line, one_place = rays_coincide(agreeing, model, left_out_ties, factor)
+    network = _with_start_values(network_as_given, model)
+    images, points = network_as_given.images, network_as_given.points
     X = network.points.position
     # A tie point that was left out is readmitted if its rays meet, even if it has given
     # coordinates.
-    known = np.isfinite(X).all(1) & (before | model.known | ~given.points.has_role("tie"))
-    missing_images, missing_points = explain_missing(given, seen, model, known | line)
+    is_known = np.isfinite(X).all(1) & (
+        was_adjusted | model.known | ~network_as_given.points.has_role("tie")
+    )
+    missing_images, missing_points = explain_missing(
+        network_as_given, sighted, model, is_known | line
+    )
     # Two points are always on one line; that there are too few of them is reported elsewhere.
-    for k in np.flatnonzero(straight & (np.bincount(seen.image, minlength=seen.images) > 2)):
+    for k in np.flatnonzero(straight & (np.bincount(sighted.image, minlength=sighted.images) > 2)):
         missing_images[images.id[k]] = (
             "its points are on one line, about which its rotation is undetermined"
         )
     network = network.replace(
-        observations=given.observations.take(np.setdiff1d(np.arange(len(used)), seen.row[wrong]))
+        observations=network_as_given.observations.take(
+            np.setdiff1d(np.arange(len(is_used)), sighted.row[is_wrong])
+        )
     )
-    network = keep_points(keep_images(network, model.placed), known & ~line)
-    after = "that the adjusted orientation does not determine either"
-    network = note_missing(network, "image", missing_images, after)
-    network = note_missing(network, "point", missing_points, after)
-    for note in _notes(given, kept, line, one_place, np.zeros(len(images), bool)):
+    network = keep_points(keep_images(network, model.placed), is_known & ~line)
+    reason = "that the adjusted orientation does not determine either"
+    network = note_missing(network, "image", missing_images, reason)
+    network = note_missing(network, "point", missing_points, reason)
+    for note in _notes(network_as_given, agreeing, line, one_place, np.zeros(len(images), bool)):
         network = record_left_out(network, note.thing, note.names, note.why)
-    rays = given.observations
-    names = [f"{points.id[rays.point[k]]} in {images.id[rays.image[k]]}" for k in seen.row[wrong]]
+    rays = network_as_given.observations
+    names = [
+        f"{points.id[rays.point[k]]} in {images.id[rays.image[k]]}" for k in sighted.row[is_wrong]
+    ]
     return record_left_out(
         network, "image point", names, "that contradict the adjusted orientation"
     )
 
 
 def _place_left_out(
-    given: Network, problem: NetworkProblem, values: Values, factor: float
+    network_as_given: Network, problem: NetworkProblem, values: Values, factor: float
 ) -> tuple[Sights, Model, Bool[np.ndarray, " images"]]:
-    """All rays of `given`, the adjusted images and points with those that were left out placed by
-    them, and which images cannot be placed since their points are on a line."""
+    """All rays of `network_as_given`, the adjusted images and points with those that were left out
+    placed by them, and which images cannot be placed since their points are on a line."""
     # The same steps as in `orient` (place images, intersect points), but from adjusted images, and
     # with a narrower tolerance for what is readmitted.
     cameras = adjusted_cameras(problem, values)
-    lens = tuple(cameras.get(camera.id, camera) for camera in given.cameras)
-    seen = sights(given.replace(cameras=lens))
-    model = _adjusted_model(problem, values, given, seen)
-    model.control = are_held(given.points)
+    cameras_as_adjusted = tuple(
+        cameras.get(camera.id, camera) for camera in network_as_given.cameras
+    )
+    sighted = sights(network_as_given.replace(cameras=cameras_as_adjusted))
+    model = _adjusted_model(problem, values, network_as_given, sighted)
+    model.control = are_held(network_as_given.points)
     new = model.control & ~model.known
-    model.X[new], model.known[new] = given.points.position[new], True
-    straight = see_collinear_points(seen, model, factor) & ~model.placed
-    grow(seen, model, ~straight)
-    intersect(seen, model, READMISSION_LIMITS)
-    place_far_points(seen, model)
-    return seen, model, straight
+    model.X[new], model.known[new] = network_as_given.points.position[new], True
+    straight = see_collinear_points(sighted, model, factor) & ~model.placed
+    grow(sighted, model, ~straight)
+    intersect(sighted, model, READMISSION_LIMITS)
+    place_far_points(sighted, model)
+    return sighted, model, straight
 
 
 def _with_start_values(network: Network, model: Model) -> Network:
     """The network with poses and coordinates of a model where it has none."""
     images, points = network.images, network.points
-    given = np.isfinite(np.concatenate([images.position, images.angles], 1)).all(1)
-    lacking = model.placed & ~given
+    is_given = np.isfinite(np.concatenate([images.position, images.angles], 1)).all(1)
+    is_lacking = model.placed & ~is_given
     position, angles = images.position.copy(), images.angles.copy()
-    position[lacking] = model.X0[lacking]
-    if lacking.any():
-        angles[lacking] = batched.angles(model.M[lacking])
-    found = model.known & ~np.isfinite(points.position).all(1)
-    X = np.where(found[:, None], model.X, points.position)
+    position[is_lacking] = model.X0[is_lacking]
+    if is_lacking.any():
+        angles[is_lacking] = batched.angles(model.M[is_lacking])
+    is_new = model.known & ~np.isfinite(points.position).all(1)
+    X = np.where(is_new[:, None], model.X, points.position)
     return network.replace(
         images=dataclasses.replace(images, position=position, angles=angles),
         points=dataclasses.replace(points, position=X),
     )
 
 
-def _are_among(given: Network, current: Network) -> Bool[np.ndarray, " rays"]:
+def _are_among(whole: Network, current: Network) -> Bool[np.ndarray, " rays"]:
     """Which image points of a network are in a part of it."""
     key = lambda network, ids: np.array(
         [
-            ids[0][network.images.id[i]] * len(given.points) + ids[1][network.points.id[p]]
+            ids[0][network.images.id[i]] * len(whole.points) + ids[1][network.points.id[p]]
             for i, p in zip(network.observations.image, network.observations.point)
         ],
         np.int64,
     )
-    places = [{id: k for k, id in enumerate(table.id)} for table in (given.images, given.points)]
-    return np.isin(key(given, places), key(current, places))
+    places = [{id: k for k, id in enumerate(table.id)} for table in (whole.images, whole.points)]
+    return np.isin(key(whole, places), key(current, places))
 
 
 def transfer_start_values(
-    problem: NetworkProblem, before: NetworkProblem, values: Values
+    problem: NetworkProblem, earlier: NetworkProblem, values: Values
 ) -> Values:
     """Start values of a problem: those at which another of the same network ended, by name; its own
     for what that did not have."""
     start = problem.data.start
 
     def transfer_rows(
-        own: Float[AnyArray, "n k"],
+        values_to_fill: Float[AnyArray, "n k"],
         ids: Sequence[str],
-        other: Float[AnyArray, "m k"],
+        earlier_interior: Float[AnyArray, "m k"],
         other_ids: Sequence[str],
         shift: np.ndarray | float = 0.0,
     ) -> Float[Array, "n k"]:
-        own, other = np.array(own), np.asarray(other)
+        values_to_fill, earlier_interior = np.array(values_to_fill), np.asarray(earlier_interior)
         place = {id: k for k, id in enumerate(other_ids)}
         rows = [(k, place[id]) for k, id in enumerate(ids) if id in place]
-        to, source = np.array(rows, int).reshape(-1, 2).T
-        finite = np.isfinite(other[source]).all(1)
-        own[to[finite]] = (other[source] + shift)[finite]
-        return jax.device_put(own)
+        targets, source = np.array(rows, int).reshape(-1, 2).T
+        finite = np.isfinite(earlier_interior[source]).all(1)
+        values_to_fill[targets[finite]] = (earlier_interior[source] + shift)[finite]
+        return jax.device_put(values_to_fill)
 
-    network, old, shift = problem.network, before.network, before.origin - problem.origin
+    network, old, shift = problem.network, earlier.network, earlier.origin - problem.origin
     images, points = (network.images.id, old.images.id), (network.points.id, old.points.id)
     cameras = [c.id for c in network.cameras], [c.id for c in old.cameras]
-    own, other = problem.interior_orientation(start), before.interior_orientation(values)
-    other = np.asarray(other)[:, : own.shape[1]]
-    found = problem.with_interior_orientation(
-        start, transfer_rows(own, cameras[0], other, cameras[1])
+    own, earlier_interior = (
+        problem.interior_orientation(start),
+        earlier.interior_orientation(values),
+    )
+    earlier_interior = np.asarray(earlier_interior)[:, : own.shape[1]]
+    tables = problem.with_interior_orientation(
+        start, transfer_rows(own, cameras[0], earlier_interior, cameras[1])
     )
     position, rotation = start["image"]
-    at, turned = values["image"]
+    start_position, start_rotation = values["image"]
     image = PoseValue(
-        transfer_rows(position, images[0], at, images[1], shift),
-        transfer_rows(rotation, images[0], turned, images[1]),
+        transfer_rows(position, images[0], start_position, images[1], shift),
+        transfer_rows(rotation, images[0], start_rotation, images[1]),
     )
     X = transfer_rows(coordinates(start), points[0], coordinates(values), points[1], shift)
-    return found | {"image": image, "point": with_coordinates(start["point"], X)}
+    return tables | {"image": image, "point": with_coordinates(start["point"], X)}

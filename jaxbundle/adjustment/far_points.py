@@ -83,7 +83,7 @@ def minimise_with_far_points(
     narrow = angle < settings.narrow
     if not narrow.any():
         return problem, find_minimum(problem, start, max_steps=max_steps, **options)
-    are_half = lambda chosen: 2 * chosen.sum() >= (angle < np.pi).sum()
+    are_half = lambda candidates: 2 * candidates.sum() >= (angle < np.pi).sum()
     vague = min(settings.vague * noise_of_rays(problem.network), settings.narrow)
     parallel = angle < max(settings.parallel, vague)
     runs: list[Minimum] = []
@@ -91,27 +91,27 @@ def minimise_with_far_points(
     # other parametrisation costs little, but points at any distance carry no datum. Evaluations of
     # a first attempt that fails are forgotten: the second one has all of `max_steps` again.
     # If these are half of all, none: straight to the second attempt.
-    for chosen in (parallel & ~are_half(parallel), None):
-        if chosen is None:
+    for candidates in (parallel & ~are_half(parallel), None):
+        if candidates is None:
             patience = settings.evaluations_before_release * (2 if are_half(narrow) else 1)
             plain = find_minimum(problem, start, max_steps=min(patience, max_steps), **options)
             if inspect_solution(with_factor(problem), plain) or int(plain.iterations) >= max_steps:
                 return problem, plain
             runs, start = [plain], plain.values
-            chosen = angle_of_rays(problem, start) < settings.narrow
-        left = max_steps - sum(int(run.iterations) for run in runs)
-        far = _with_far_points(problem, start, chosen, make)
-        if far is not None:
-            found, minimum = minimise_holding_infinite_points(
-                *far, max_steps=left, settings=settings, **options
+            candidates = angle_of_rays(problem, start) < settings.narrow
+        remaining_steps = max_steps - sum(int(run.iterations) for run in runs)
+        far_problem = _with_far_points(problem, start, candidates, make)
+        if far_problem is not None:
+            found_problem, minimum = minimise_holding_infinite_points(
+                *far_problem, max_steps=remaining_steps, settings=settings, **options
             )
-            if inspect_solution(with_factor(found), minimum):
-                return found, concatenate_runs([*runs, minimum])
+            if inspect_solution(with_factor(found_problem), minimum):
+                return found_problem, concatenate_runs([*runs, minimum])
     # It ended before the limit without a solution: further evaluations would change nothing.
     if int(runs[0].termination) != LIMIT:
         return problem, runs[0]
     return problem, concatenate_runs(
-        [*runs, find_minimum(problem, start, max_steps=left, **options)]
+        [*runs, find_minimum(problem, start, max_steps=remaining_steps, **options)]
     )
 
 
@@ -128,31 +128,31 @@ def minimise_holding_infinite_points(
     if problem.lengths is None:
         return problem, find_minimum(problem, start, max_steps=max_steps, **options)
     # The third direction of change of such a point is that of its inverse distance.
-    held = problem.table("point").free[:, 2] == 0
-    held &= problem.at_any_distance & ~problem.excluded
-    released, steps = np.zeros(len(held), int), settings.evaluations_between_checks
+    is_held = problem.table("point").free[:, 2] == 0
+    is_held &= problem.at_any_distance & ~problem.excluded
+    released, steps = np.zeros(len(is_held), int), settings.evaluations_between_checks
     runs: list[Minimum] = []
     # An active set: the inverse distance of a point is free, or held at 0 (infinity) while its
     # rays pull it beyond. Holding changes the mask of free columns only, so that all rounds run the
     # same compiled program.
-    problem = _hold_at_infinity(problem, held, start)
+    problem = _hold_at_infinity(problem, is_held, start)
     while True:
-        left = max_steps - sum(int(run.iterations) for run in runs)
-        runs.append(find_minimum(problem, start, max_steps=min(steps, left), **options))
+        remaining_steps = max_steps - sum(int(run.iterations) for run in runs)
+        runs.append(find_minimum(problem, start, max_steps=min(steps, remaining_steps), **options))
         start = runs[-1].values
         to_hold = at_infinity(problem, start)
         if to_hold.any():
             outward = _are_pulled_outward(problem, start)
-            to_hold &= np.where(held, outward | (released >= settings.max_releases), outward)
+            to_hold &= np.where(is_held, outward | (released >= settings.max_releases), outward)
             to_hold &= ~problem.excluded
-        released += held & ~to_hold
-        changed = (to_hold != held).any()
-        if left <= steps or not changed and int(runs[-1].termination) != LIMIT:
+        released += is_held & ~to_hold
+        changed = (to_hold != is_held).any()
+        if remaining_steps <= steps or not changed and int(runs[-1].termination) != LIMIT:
             return problem, concatenate_runs(runs)
         steps = settings.evaluations_between_checks if changed else 2 * steps
         if changed:
-            held = to_hold
-            problem = _hold_at_infinity(problem, held, start)
+            is_held = to_hold
+            problem = _hold_at_infinity(problem, is_held, start)
 
 
 def noise_of_rays(network: Network) -> float:
@@ -177,43 +177,43 @@ def angle_of_rays(problem: NetworkProblem, values: Values) -> Float[np.ndarray, 
     point, image = problem.point[problem.used], problem.image[problem.used]
     X0, X = np.asarray(values["image"].position), np.asarray(coordinates(values))
     ray = _unit_vectors(X[point] - X0[image])
-    first = np.zeros_like(X)
+    first_ray = np.zeros_like(X)
     # Lines, not directions: a point between two images has opposite rays. All are given the side of
     # the first ray of the point, which is assigned last.
-    first[point[::-1]] = ray[::-1]
-    ray *= np.where((ray * first[point]).sum(1) < 0, -1.0, 1.0)[:, None]
+    first_ray[point[::-1]] = ray[::-1]
+    ray *= np.where((ray * first_ray[point]).sum(1) < 0, -1.0, 1.0)[:, None]
     middle = np.zeros_like(X)
     np.add.at(middle, point, ray)
-    off = np.linalg.norm(np.cross(ray, _unit_vectors(middle)[point]), axis=1)
+    distance = np.linalg.norm(np.cross(ray, _unit_vectors(middle)[point]), axis=1)
     widest = np.zeros(len(middle))
-    np.fmax.at(widest, point, off)
+    np.fmax.at(widest, point, distance)
     number = np.bincount(point, minlength=len(middle))
     tie = (number > 1) & problem.network.points.has_role("tie")
     return np.where(tie, 2 * widest, np.pi)
 
 
 def _with_far_points(
-    problem: NetworkProblem, values: Values, chosen: Bool[np.ndarray, " points"], make: Callable
+    problem: NetworkProblem, values: Values, is_far: Bool[np.ndarray, " points"], make: Callable
 ) -> tuple[NetworkProblem, Values] | None:
     """The problem and its values with these points at any distance, except those whose coordinates
     other observations touch; None if none is left, or too few others for the datum.
     """
-    lengths = np.where(chosen & ~problem.kept_rows, _unit(problem), 0.0)
+    lengths = np.where(is_far & ~problem.kept_rows, _unit(problem), 0.0)
     if not lengths.any():
         return None
     try:
-        far = make(lengths=lengths)
+        far_problem = make(lengths=lengths)
     except InputError:
         return None
     # The origin becomes the centroid of the projection centres. Frames and other tables would have
     # to move with it: such networks begin again from their start values.
     if problem.further_tables:
-        return far, far.data.start
-    shift = problem.origin - far.origin
+        return far_problem, far_problem.data.start
+    shift = problem.origin - far_problem.origin
     position, rotation = map(np.asarray, values["image"])
-    moved = values | {"image": PoseValue(position + shift, rotation)}
-    X = _in_front(far, moved, np.asarray(coordinates(values)) + shift)
-    return far, moved | {"point": with_coordinates(far.data.start["point"], X)}
+    shifted = values | {"image": PoseValue(position + shift, rotation)}
+    X = _in_front(far_problem, shifted, np.asarray(coordinates(values)) + shift)
+    return far_problem, shifted | {"point": with_coordinates(far_problem.data.start["point"], X)}
 
 
 def _in_front(
@@ -223,15 +223,15 @@ def _in_front(
     infinity."""
     network = problem.network
     position, rotation = map(np.asarray, values["image"])
-    seen = sights(network.replace(cameras=tuple(adjusted_cameras(problem, values).values())))
-    M = matrices_of_quaternions(rotation)[seen.image]
-    ray = np.einsum("nij,ni->nj", M, seen.ray)
-    depth = (ray * (X[seen.point] - position[seen.image])).sum(1)
-    sides = np.bincount(seen.point, np.sign(depth), len(X))
+    sighted = sights(network.replace(cameras=tuple(adjusted_cameras(problem, values).values())))
+    M = matrices_of_quaternions(rotation)[sighted.image]
+    ray = np.einsum("nij,ni->nj", M, sighted.ray)
+    depth = (ray * (X[sighted.point] - position[sighted.image])).sum(1)
+    sides = np.bincount(sighted.point, np.sign(depth), len(X))
     length = np.linalg.norm(X, axis=1)
-    most = LARGEST_DISTANCE * not_none(problem.lengths)
-    move = (most > 0) & ((sides < 0) | (length > most))
-    factor = np.where(move, np.where(sides < 0, -most, most) / length, 1.0)
+    farthest = LARGEST_DISTANCE * not_none(problem.lengths)
+    move = (farthest > 0) & ((sides < 0) | (length > farthest))
+    factor = np.where(move, np.where(sides < 0, -farthest, farthest) / length, 1.0)
     return X * factor[:, None]
 
 
@@ -243,15 +243,15 @@ def at_infinity(problem: NetworkProblem, values: Values) -> Bool[np.ndarray, " p
 
 
 def _hold_at_infinity(
-    problem: NetworkProblem, held: Bool[np.ndarray, " points"], values: Values
+    problem: NetworkProblem, is_held: Bool[np.ndarray, " points"], values: Values
 ) -> NetworkProblem:
     """These points held at infinity, the others not."""
-    start, far = problem.data.start, problem.at_any_distance & ~problem.excluded
-    point = np.where(held[:, None], np.asarray(values["point"]), np.asarray(start["point"]))
+    start, is_free_to_go = problem.data.start, problem.at_any_distance & ~problem.excluded
+    point = np.where(is_held[:, None], np.asarray(values["point"]), np.asarray(start["point"]))
     start = start | {"point": jax.device_put(point)}
     problem = with_data(problem, dataclasses.replace(problem.data, start=start))
     free = problem.table("point").free.copy()
-    free[:, 2] = np.where(far, ~held, free[:, 2])
+    free[:, 2] = np.where(is_free_to_go, ~is_held, free[:, 2])
     return with_free(problem, "point", free)
 
 
@@ -261,8 +261,8 @@ def _are_pulled_outward(problem: NetworkProblem, values: Values) -> Bool[np.ndar
     free = _hold_at_infinity(problem, np.zeros(number, bool), values)
     solution, slope = Solution(free, values), np.zeros(number)
     for name, rows in problem.image_rows.items():
-        along = solution.residuals[name] * solution.jacobian_eliminated[name][:, :, 2]
-        np.add.at(slope, problem.point[rows], along.sum(1))
+        weighted_slopes = solution.residuals[name] * solution.jacobian_eliminated[name][:, :, 2]
+        np.add.at(slope, problem.point[rows], weighted_slopes.sum(1))
     return slope > 0
 
 

@@ -101,47 +101,56 @@ class FirstMinimum:
     options: Mapping[str, Any]
     settings: RoundSettings = ROUNDS
 
-    def find(self, given: Network, outliers: bool) -> FoundMinimum:
-        """Adjust from the start values of `given`, which may contain `outliers`, or those computed
-        for it."""
-        network = given if self.oriented is None else self.oriented.network
-        found = self._minimise(network)
+    def find(self, network_as_given: Network, outliers: bool) -> FoundMinimum:
+        """Adjust from the start values of `network_as_given`, which may contain `outliers`, or
+        those computed for it."""
+        network = network_as_given if self.oriented is None else self.oriented.network
+        found_minimum = self._minimise(network)
         # Observations excluded because of a wrong principal distance may agree with the adjusted
         # one: start values are computed again with it, as long as that uses more of them.
-        while len(network.observations) < len(given.observations) and is_misjudged(
-            found.problem, found.minimum
+        while len(network.observations) < len(network_as_given.observations) and is_misjudged(
+            found_minimum.problem, found_minimum.minimum
         ):
-            cameras, fewer = adjusted_cameras(found.problem, found.minimum.values), network
-            network = orient_again(given, fewer, cameras)
-            if network is fewer:
+            cameras, unscreened = (
+                adjusted_cameras(found_minimum.problem, found_minimum.minimum.values),
+                network,
+            )
+            network = orient_again(network_as_given, unscreened, cameras)
+            if network is unscreened:
                 break
-            found = self._minimise(network, partial(start_with, cameras=cameras))
+            found_minimum = self._minimise(network, partial(start_with, cameras=cameras))
         # Blunders may keep the iterations from a solution that snooping could start from: those
         # that contradict the start values by far are removed first.
-        if outliers and not found.is_solved:
+        if outliers and not found_minimum.is_solved:
             screened = screen(network)
             if len(screened.observations) < len(network.observations):
-                found, network = self._minimise(screened), screened
-        left_out = network is not given and network.left_out[len(given.left_out) :]
-        return self._try_again(given, found) if left_out or found.collinear else found
+                found_minimum, network = self._minimise(screened), screened
+        left_out = (
+            network is not network_as_given and network.left_out[len(network_as_given.left_out) :]
+        )
+        return (
+            self._try_again(network_as_given, found_minimum)
+            if left_out or found_minimum.collinear
+            else found_minimum
+        )
 
-    def _try_again(self, given: Network, found: FoundMinimum) -> FoundMinimum:
+    def _try_again(self, network_as_given: Network, found_minimum: FoundMinimum) -> FoundMinimum:
         """Adjust again, with everything left out because of start values that agrees with the
         adjusted orientation, until nothing more does."""
         if self.oriented is not None:
-            given = given.note(f"start values found, {self.oriented.frame}")
-            given = given.warn(*filter(None, [self.oriented.finding]))
+            network_as_given = network_as_given.note(f"start values found, {self.oriented.frame}")
+            network_as_given = network_as_given.warn(*filter(None, [self.oriented.finding]))
         # Excluded because of start values is not excluded for good: a point that misses by three
         # tolerances of a rough orientation may fit the adjusted one to its σ. What rays do not
         # determine (`final`) stays out, or it would return and leave in every round.
         rounds, final = 0, CollinearGeometry()
-        while found.is_solved:
-            problem, minimum, _, collinear, current = found
+        while found_minimum.is_solved:
+            problem, minimum, _, collinear, current = found_minimum
             # What the first minimum leaves undetermined may only be so because of what was still
             # missing.
             if rounds:
                 final += collinear
-            candidates, factor = final.leave_out(given), noise_factor(problem, minimum)
+            candidates, factor = final.leave_out(network_as_given), noise_factor(problem, minimum)
             try:
                 larger = readmit(candidates, current, problem, minimum.values, factor)
                 larger = check_network(larger)
@@ -155,10 +164,12 @@ class FirstMinimum:
                     network = problem.network.replace(
                         warnings=larger.warnings, notes=larger.notes, left_out=larger.left_out
                     )
-                    return found._replace(problem=dataclasses.replace(problem, network=network))
-                begin = partial(transfer_start_values, before=problem, values=minimum.values)
-                again = self._minimise(larger, begin, check_early=False)
-                solved = again.is_solved
+                    return found_minimum._replace(
+                        problem=dataclasses.replace(problem, network=network)
+                    )
+                begin = partial(transfer_start_values, earlier=problem, values=minimum.values)
+                tried = self._minimise(larger, begin, check_early=False)
+                solved = tried.is_solved
             except (InputError, NotSolvedError):
                 solved = False
             if not solved:
@@ -166,9 +177,9 @@ class FirstMinimum:
                     "what start values excluded was tried again with the adjusted orientation, "
                     "but with it there is no solution"
                 )
-                return found._replace(problem=dataclasses.replace(problem, network=network))
-            found, rounds = again, rounds + 1
-        return found
+                return found_minimum._replace(problem=dataclasses.replace(problem, network=network))
+            found_minimum, rounds = tried, rounds + 1
+        return found_minimum
 
     def _minimise(
         self,
@@ -185,34 +196,37 @@ class FirstMinimum:
         excluded, factor = CollinearGeometry(), None
         while True:
             current = check_network(excluded.leave_out(network))
-            used, points, observations = split_check_points(current)
-            make = partial(make_problem, used, reduction=self.reduction, also=self.also)
+            used_network, points, observations = split_check_points(current)
+            make = partial(make_problem, used_network, reduction=self.reduction, also=self.also)
             problem = self._make_problem(make)
             start = self._soften(problem) if begin is None else begin(problem)
-            left = self.options["max_steps"]
+            remaining_steps = self.options["max_steps"]
             runs: list[Minimum] = []
             find_more = partial(self._find_more, network, excluded)
-            more = find_more(problem, start, factor) if check_early else CollinearGeometry()
-            if not more and check_early and may_be_collinear(problem, start):
-                check_early, few = False, min(self.settings.evaluations_before_check, left)
-                run = find_minimum(problem, start, **{**self.options, "max_steps": few})
-                runs, left = [run], left - int(run.iterations)
+            newly_found = find_more(problem, start, factor) if check_early else CollinearGeometry()
+            if not newly_found and check_early and may_be_collinear(problem, start):
+                check_early, first_steps = (
+                    False,
+                    min(self.settings.evaluations_before_check, remaining_steps),
+                )
+                run = find_minimum(problem, start, **{**self.options, "max_steps": first_steps})
+                runs, remaining_steps = [run], remaining_steps - int(run.iterations)
                 factor, start = noise_factor(problem, run), run.values
-                more = find_more(problem, start, factor)
-                begin = partial(transfer_start_values, before=problem, values=start)
-            if not more:
-                if left > 0:
-                    options = {**self.options, "max_steps": left}
+                newly_found = find_more(problem, start, factor)
+                begin = partial(transfer_start_values, earlier=problem, values=start)
+            if not newly_found:
+                if remaining_steps > 0:
+                    options = {**self.options, "max_steps": remaining_steps}
                     # Points at any distance make another problem.
                     problem, run = minimise_with_far_points(problem, start, make, **options)
                     runs.append(run)
                 minimum = concatenate_runs(runs)
                 factor = noise_factor(problem, minimum)
-                more = find_more(problem, minimum.values, factor)
-                begin = partial(transfer_start_values, before=problem, values=minimum.values)
-                if not more:
+                newly_found = find_more(problem, minimum.values, factor)
+                begin = partial(transfer_start_values, earlier=problem, values=minimum.values)
+                if not newly_found:
                     return FoundMinimum(problem, minimum, (points, observations), excluded, current)
-            excluded += more
+            excluded += newly_found
 
     def _make_problem(self, make: Callable[[], NetworkProblem]) -> NetworkProblem:
         """`make()`; an error also says why control points were excluded."""
@@ -235,36 +249,42 @@ class FirstMinimum:
         if not (soft < stiff).any():
             return start
         data = dataclasses.replace(problem.data, weight={**weights, KNOWN_SHAPES: soft})
-        found = find_minimum(with_data(problem, data), start, **self.options)
-        return found.values if converged(found.termination) else start
+        softened = find_minimum(with_data(problem, data), start, **self.options)
+        return softened.values if converged(softened.termination) else start
 
     @staticmethod
     def _find_more(network: Network, excluded: CollinearGeometry, *where: Any) -> CollinearGeometry:
         """What rays leave undetermined beside the `excluded`; nothing if together these were most
         of the network."""
-        more = find_collinear(*where)
-        return more if (excluded + more).leaves_majority_of(network) else CollinearGeometry()
+        newly_found = find_collinear(*where)
+        return (
+            newly_found
+            if (excluded + newly_found).leaves_majority_of(network)
+            else CollinearGeometry()
+        )
 
 
-def require_most_oriented(found: Oriented) -> Oriented:
+def require_most_oriented(oriented: Oriented) -> Oriented:
     """The start values unchanged; refused if they exclude half or more of the images or points.
 
     **Raises:** `NotSolvedError`."""
-    network = found.network
+    network = oriented.network
     # A half that is placed may be the wrong half: with so little, what is excluded says more about
     # the network than what is left.
-    for thing, reasons, left in (
-        ("image", found.images_not_placed, len(network.images)),
-        ("point", found.points_not_placed, len(network.points)),
+    for thing, reasons, remaining in (
+        ("image", oriented.images_not_placed, len(network.images)),
+        ("point", oriented.points_not_placed, len(network.points)),
     ):
-        if len(reasons) >= left:
-            said = list_some((f"{thing} {id} ({why})" for id, why in reasons.items()), 5, str)
+        if len(reasons) >= remaining:
+            reasons_in_words = list_some(
+                (f"{thing} {id} ({why})" for id, why in reasons.items()), 5, str
+            )
             causes = filter(None, (name_pixels(network), name_image_extent(network)))
             cause = "; ".join(causes)
             raise NotSolvedError(
                 f"not solved: no start values for {len(reasons)} of "
-                f"{count(len(reasons) + left, thing)}: {said}; jaxbundle orient lists them all"
-                + (f"; {cause}" if cause else ""),
+                f"{count(len(reasons) + remaining, thing)}: {reasons_in_words}; jaxbundle orient "
+                "lists them all" + (f"; {cause}" if cause else ""),
                 [f"{thing} {id}" for id in reasons],
             )
-    return found
+    return oriented

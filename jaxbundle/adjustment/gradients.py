@@ -102,15 +102,15 @@ def check_gradients(
         # mode without any differences.
         d = jnp.asarray(random.normal(size=x.shape)) * sizes
         c = jnp.asarray(random.normal(size=outputs))
-        _, along, pulled = derivatives(x, d, c)
-        scale = max(float(jnp.linalg.norm(along)), 1e-300)
+        _, derivative_along, pulled = derivatives(x, d, c)
+        scale = max(float(jnp.linalg.norm(derivative_along)), 1e-300)
         y = lambda h, d=d, c=c: derivatives(x + h * d, d, c)[0]
         extrapolated, error = _differentiate(y, step, tolerance / 10 * scale)
-        forward.append(float(jnp.linalg.norm(along - extrapolated)) / scale)
+        forward.append(float(jnp.linalg.norm(derivative_along - extrapolated)) / scale)
         differences.append(error / scale)
-        difference = abs(float(jnp.vdot(c, along)) - float(jnp.vdot(pulled, d)))
+        difference = abs(float(jnp.vdot(c, derivative_along)) - float(jnp.vdot(pulled, d)))
         reverse.append(difference / (float(jnp.linalg.norm(c)) * scale))
-    largest = lambda found: float(np.max(found))  # NaN where one of them is
+    largest = lambda values: float(np.max(values))  # NaN where one of them is
     return GradientCheck(largest(forward), largest(reverse), tolerance, largest(differences))
 
 
@@ -160,9 +160,9 @@ def _differentiate(y: Callable, step: float, sufficient: float) -> tuple[jax.Arr
     # Ten halvings, a thousandth of the given step: from 1e-4 to 1e-7, whose differences rounding
     # (1e-16/step) makes less exact again than longer ones.
     for _ in range(10):
-        step, before = step / 2, row
+        step, previous_row = step / 2, row
         row = [(y(step) - y(-step)) / (2 * step)]
-        for j, longer in enumerate(before, 1):
+        for j, longer in enumerate(previous_row, 1):
             row.append(row[-1] + (row[-1] - longer) / (4**j - 1))
             estimate = max(distance(row[j], row[j - 1]), distance(row[j], longer))
             if estimate < error:

@@ -46,7 +46,7 @@ class Influence(ResultMethods):
         kind, image, point, axis, effect, derivative.
 
         **Raises:** `KeyError` for a result that was not requested."""
-        names = [one.name for one in self.results]
+        names = [requested.name for requested in self.results]
         if result is not None and result not in names:
             raise KeyError(f"there is no result {result!r}; known: {', '.join(names)}")
         r = 0 if result is None else names.index(result)
@@ -68,8 +68,8 @@ class Influence(ResultMethods):
     def to_dict(self) -> dict[str, Any]:
         """σ of every result, and the measurements with their influence, largest first."""
         return {
-            one.name: {"sigma": float(sigma), "measurements": rows_of(self.table(one.name))}
-            for one, sigma in zip(self.results, self.sigma)
+            result.name: {"sigma": float(sigma), "measurements": rows_of(self.table(result.name))}
+            for result, sigma in zip(self.results, self.sigma)
         }
 
     def to_pandas(self, result: str | None = None):
@@ -93,13 +93,13 @@ def influence(given: Adjustment | NetworkProblem, of: Any = CAMERAS) -> Influenc
     """
     inspection, errors, _ = inspection_of(given)
     results = request_results(inspection, errors, of)
-    if any(len(range(one.numbers.stop)[one.numbers]) > 1 for one in results.asked):
+    if any(len(range(request.numbers.stop)[request.numbers]) > 1 for request in results.asked):
         raise InputError(
             "influence: name single results, such as point:7:Z; a mean over all has no derivative"
         )
-    found = inspection.solution
+    solution = inspection.solution
     # In reverse: one solution per result gives the derivatives by all measurements.
-    by_set = pull_back(found, found.jacobian_of(results.function))
+    by_set = pull_back(solution, solution.jacobian_of(results.function))
     of_result = [{o: x[r] for o, x in by_set.items()} for r in range(len(results.asked))]
     parts = list(observations(inspection.problem, *of_result))
     inverse_sigma = np.concatenate([np.ravel(part.inverse_sigma) for part in parts])
@@ -110,20 +110,20 @@ def influence(given: Adjustment | NetworkProblem, of: Any = CAMERAS) -> Influenc
         ],
         1,
     )
-    used = inverse_sigma > 0
+    has_weight = inverse_sigma > 0
     columns = {
-        name: np.concatenate([column(*part[:4]) for part in parts])[used]
+        name: np.concatenate([column(*part[:4]) for part in parts])[has_weight]
         for name, column in COLUMNS.items()
     }
     # In units of the classical σ, of which each observation has its share.
-    unit = request_results(inspection, IndependentErrors(found, 1.0), of).sigma
+    unit = request_results(inspection, IndependentErrors(solution, 1.0), of).sigma
     size = np.maximum(unit, 1e-300)
     return Influence(
         results.asked,
         results.sigma,
         columns,
-        (effects / size)[used],
-        (effects * inverse_sigma[:, None])[used],
+        (effects / size)[has_weight],
+        (effects * inverse_sigma[:, None])[has_weight],
     )
 
 

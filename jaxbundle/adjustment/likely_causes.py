@@ -55,9 +55,9 @@ def likely_causes(
 ) -> tuple[str, ...]:
     """Likely causes of a missing solution or a bad fit, in words."""
     network = problem.network
-    tried = int(minimum.iterations)
-    accepted = np.asarray(minimum.history.accepted)[:tried]
-    vtpv = 2 * np.asarray(minimum.history.cost)[:tried][accepted][-1:]
+    steps = int(minimum.iterations)
+    is_accepted = np.asarray(minimum.history.accepted)[:steps]
+    vtpv = 2 * np.asarray(minimum.history.cost)[:steps][is_accepted][-1:]
     largest = largest_sigma0(network)
     # Without redundancy vᵀPv is rounding, and no misfit.
     poor_fit = (vtpv > largest**2 * problem.counts.redundancy).any()
@@ -67,24 +67,24 @@ def likely_causes(
         start_misfit = np.sqrt(
             2 * np.asarray(minimum.history.cost)[0] / problem.rows_and_unknowns.observations
         )
-        far = start_misfit * noise_of_rays(problem.network) > CAUSES.max_start_misfit
+        is_far = start_misfit * noise_of_rays(problem.network) > CAUSES.max_start_misfit
         sigma0 = sigma0_at_end(problem, minimum)
         poor = sigma0 > 1 and contradicts(sigma0, problem.counts.redundancy)
         causes = (
-            name_image_convention(network) if far else "",
+            name_image_convention(network) if is_far else "",
             name_image_extent(network) if poor else "",
             name_sigma_unit(network, sigma0),
         )
         return tuple(filter(None, causes))
     if not inspection and (undefined := name_undefined(problem, minimum)):
         return (undefined,)
-    told = any(CONTRADICTORY_CONTROL in line for line in network.warnings)
+    is_told = any(CONTRADICTORY_CONTROL in line for line in network.warnings)
     conventions = name_conventions(problem, minimum, inspection)
     causes = (
         *conventions,
         # Control fits no mirrored image, and its points would be blamed for it: conventions
         # first.
-        "" if told or conventions else name_contradiction(network),
+        "" if is_told or conventions else name_contradiction(network),
         "" if inspection else name_one_place(network),
         "" if inspection else name_inseparable(problem, minimum),
     )
@@ -124,7 +124,7 @@ def noise_factor(problem: NetworkProblem, minimum: Minimum) -> float:
 def sigma0_at_end(problem: NetworkProblem, minimum: Minimum) -> float:
     """√(vᵀPv/redundancy) where the iterations ended; 1 without redundancy, or a finite vᵀPv."""
     cost = np.asarray(minimum.history.cost)[: int(minimum.iterations)]
-    accepted = np.asarray(minimum.history.accepted)[: int(minimum.iterations)]
-    vtpv, redundancy = 2 * cost[accepted][-1:], problem.counts.redundancy
-    known = len(vtpv) and redundancy > 0 and np.isfinite(vtpv[0])
-    return float(np.sqrt(vtpv[0] / redundancy)) if known else 1.0
+    is_accepted = np.asarray(minimum.history.accepted)[: int(minimum.iterations)]
+    vtpv, redundancy = 2 * cost[is_accepted][-1:], problem.counts.redundancy
+    is_known = len(vtpv) and redundancy > 0 and np.isfinite(vtpv[0])
+    return float(np.sqrt(vtpv[0] / redundancy)) if is_known else 1.0

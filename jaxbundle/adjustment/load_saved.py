@@ -44,12 +44,12 @@ def load_adjustment(
     `RuntimeError` without 64-bit floats.
     """
     given_path("path", path)
-    found = read_tree(path, CLASSES, WHAT)
-    if not isinstance(found, Stored) or found.format != FORMAT:
+    stored = read_tree(path, CLASSES, WHAT)
+    if not isinstance(stored, Stored) or stored.format != FORMAT:
         raise InputError(f"{path}: is not {WHAT} of this version of jaxbundle")
     try:
         with naming_file(path):
-            result = _restored(found, models, also, path)
+            result = _restored(stored, models, also, path)
             sigma0 = result.sigma0
     except (ValueError, TypeError, LookupError) as error:
         if isinstance(error, InputError):
@@ -57,46 +57,46 @@ def load_adjustment(
         raise InputError(f"{path}: is damaged, or of another version of jaxbundle") from None
     # Everything is computed again from measurements and values: σ0 shows whether both are whole. It
     # agrees to rounding, 1e-12; another version may sum or stop differently, to less than 1e-6.
-    if not math.isclose(sigma0, found.sigma0, rel_tol=1e-6) and not math.isnan(found.sigma0):
+    if not math.isclose(sigma0, stored.sigma0, rel_tol=1e-6) and not math.isnan(stored.sigma0):
         raise InputError(
-            f"{path}: its σ0 is {found.sigma0:.6g}, but its measurements and values give "
-            f"{sigma0:.6g}: it is damaged, or was saved by another version ({found.version})"
+            f"{path}: its σ0 is {stored.sigma0:.6g}, but its measurements and values give "
+            f"{sigma0:.6g}: it is damaged, or was saved by another version ({stored.version})"
         )
     return result
 
 
 def _restored(
-    found: Stored,
+    stored: Stored,
     models: Sequence[CameraModel],
     also: Sequence[Table | ObservationSet],
     path: str | Path,
 ) -> Adjustment:
-    missing = sorted(set(found.own_models) - {model.name for model in models})
-    if missing:
+    missing_models = sorted(set(stored.own_models) - {model.name for model in models})
+    if missing_models:
         raise InputError(
-            f"{path}: the camera models {list_some(missing)} are not built in; give "
+            f"{path}: the camera models {list_some(missing_models)} are not built in; give "
             "them as models=[…]"
         )
-    found = dataclasses.replace(found, network=with_own_models(found.network, models))
-    return _restore(found, _problem(found, also, path))
+    stored = dataclasses.replace(stored, network=with_own_models(stored.network, models))
+    return _restore(stored, _problem(stored, also, path))
 
 
 def _problem(
-    found: Stored, also: Sequence[Table | ObservationSet], path: str | Path
+    stored: Stored, also: Sequence[Table | ObservationSet], path: str | Path
 ) -> NetworkProblem:
     """The problem as the adjustment left it: planned anew from the network, with the weights that
     snooping or robust estimation changed, and the columns that elimination held."""
-    state = found.state
+    state = stored.state
     problem = make_problem(
-        found.network, reduction=state.reduction, also=also, lengths=state.lengths
+        stored.network, reduction=state.reduction, also=also, lengths=state.lengths
     )
     tables = tuple(t.name for t in problem.tables)
     kinds = tuple(o.kind.name for o in problem.observations)
     if (tables, kinds) != (state.tables, state.kinds):
-        other = set(state.tables + state.kinds) ^ set(tables + kinds)
+        differing_names = set(state.tables + state.kinds) ^ set(tables + kinds)
         raise InputError(
             f"{path}: was adjusted with other user-defined tables and observations "
-            f"({list_some(sorted(other))}); give the same as also=[…]"
+            f"({list_some(sorted(differing_names))}); give the same as also=[…]"
         )
     start = _tree(problem.data.start, state.start)
     problem = engine.with_data(problem, dataclasses.replace(problem.data, start=start))
@@ -109,22 +109,22 @@ def _problem(
     return engine.with_data(problem, data)
 
 
-def _restore(found: Stored, problem: NetworkProblem) -> Adjustment:
-    state: State = found.state
+def _restore(stored: Stored, problem: NetworkProblem) -> Adjustment:
+    state: State = stored.state
     history = History(*(jax.device_put(column) for column in state.history))
     values = _tree(problem.data.start, state.values)
     termination, iterations = map(np.int64, (state.termination, state.iterations))
     minimum = Minimum(values, jax.device_put(termination), jax.device_put(iterations), history)
-    result = Adjustment(problem.network, problem, minimum, check=found.check, **found.notes)
-    result.weights, result.robust_scale = found.image_weights, found.robust_scale
-    model = _restore_error_model(found, result)
-    halves = found.replication and dataclasses.replace(found.replication, model=model)
+    result = Adjustment(problem.network, problem, minimum, check=stored.check, **stored.notes)
+    result.weights, result.robust_scale = stored.image_weights, stored.robust_scale
+    model = _restore_error_model(stored, result)
+    halves = stored.replication and dataclasses.replace(stored.replication, model=model)
     result.keep(model, halves)
     return result
 
 
-def _restore_error_model(found: Stored, result: Adjustment) -> ErrorModel | None:
-    stored = found.error_model
+def _restore_error_model(stored_adjustment: Stored, result: Adjustment) -> ErrorModel | None:
+    stored = stored_adjustment.error_model
     if stored is None or result.correlations is None:
         return None
     solution = result.cofactors.solution
@@ -137,7 +137,7 @@ def _restore_error_model(found: Stored, result: Adjustment) -> ErrorModel | None
 
 def _tree(like: Any, leaves: Sequence[np.ndarray]) -> Any:
     """Arrays in the structure of others of the same shapes."""
-    known, structure = jax.tree.flatten(like)
-    if [np.shape(x) for x in known] != [np.shape(x) for x in leaves]:
+    known_leaves, structure = jax.tree.flatten(like)
+    if [np.shape(x) for x in known_leaves] != [np.shape(x) for x in leaves]:
         raise ValueError
     return jax.device_put(jax.tree.unflatten(structure, leaves))

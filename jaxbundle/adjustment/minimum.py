@@ -45,10 +45,10 @@ def names_of_defects(problem: NetworkProblem, minimum: Minimum[Values]) -> list[
     values = minimum.values
     if bool(converged(int(minimum.termination))) and (fallen := _find_collapsed(problem, values)):
         return fallen
-    last = _last(problem, minimum)
+    last_values = _last_values(problem, minimum)
     if problem.plan.reduction == "dense" and problem.reduced_size <= MAX_FOR_EIGENVECTORS:
-        return undetermined_unknowns(problem, last)
-    rows = undetermined_eliminated_unknowns(problem, last)
+        return undetermined_unknowns(problem, last_values)
+    rows = undetermined_eliminated_unknowns(problem, last_values)
     if rows:
         return rows
     singular = bool(converged(int(minimum.termination))) or int(minimum.termination) == SINGULAR
@@ -69,7 +69,7 @@ def name_inseparable(
         return ""
     if problem.reduced_size > MAX_FOR_EIGENVECTORS:
         return ""
-    names = undetermined_unknowns(problem, _last(problem, minimum), inseparable)
+    names = undetermined_unknowns(problem, _last_values(problem, minimum), inseparable)
     # Where a camera parameter is open, so are the orientations that follow it: it is the cause.
     names = [name for name in names if " of camera " in name] or names
     if not names:
@@ -85,7 +85,7 @@ def name_undefined(problem: NetworkProblem, minimum: Minimum[Values]) -> str:
     ended, in words; empty if there are none. (Image points have none where a camera model has no
     image: of that other causes are named.)"""
     sets = ("distance", *problem.further_sets)
-    names = list(without_derivatives(problem, _last(problem, minimum), sets))
+    names = list(without_derivatives(problem, _last_values(problem, minimum), sets))
     if not names:
         return ""
     return (
@@ -96,10 +96,10 @@ def name_undefined(problem: NetworkProblem, minimum: Minimum[Values]) -> str:
 
 def weakness_without_solution(problem: NetworkProblem, minimum: Minimum[Values]) -> Weakness:
     """The poorly determined unknowns where the iterations ended."""
-    return weakness_of_unsolved(problem, _last(problem, minimum))
+    return weakness_of_unsolved(problem, _last_values(problem, minimum))
 
 
-def _last(problem: NetworkProblem, minimum: Minimum[Values]) -> Values:
+def _last_values(problem: NetworkProblem, minimum: Minimum[Values]) -> Values:
     """The values at the end of the iterations, or the start values if those are not finite."""
     return minimum.values if are_finite(problem, minimum.values) else problem.data.start
 
@@ -114,8 +114,8 @@ def require_solved(problem: NetworkProblem, minimum: Minimum[Values], when: str)
     """The solution of a repeated adjustment; refused if it was not solved.
 
     **Raises:** `NotSolvedError`."""
-    found = inspect_solution(problem, minimum)
-    if not found:
+    inspection = inspect_solution(problem, minimum)
+    if not inspection:
         names = names_of_defects(problem, minimum)
         reason = int(minimum.termination)
         # Converged, but no solution: some unknowns are undetermined there.
@@ -123,7 +123,7 @@ def require_solved(problem: NetworkProblem, minimum: Minimum[Values], when: str)
         if names:
             why = f"the network is no longer determined: {list_some(names, 8, str)}"
         raise NotSolvedError(f"not solved {when}: {why}", names)
-    return found
+    return inspection
 
 
 def _find_collapsed(problem: NetworkProblem, values: Values) -> list[str]:
@@ -165,9 +165,9 @@ def start_with(problem: NetworkProblem, cameras: Mapping[str, Camera]) -> Values
     start = problem.data.start
     rows = np.array(problem.interior_orientation(start))
     for row, camera in zip(rows, problem.network.cameras):
-        given = cameras.get(camera.id, camera).parameters
+        parameters_of = cameras.get(camera.id, camera).parameters
         for column, name in enumerate(get_model(camera.model).parameters):
-            row[column] = given.get(name, row[column])
+            row[column] = parameters_of.get(name, row[column])
     return problem.with_interior_orientation(start, rows)
 
 
@@ -176,9 +176,9 @@ def _principal_distances(
 ) -> Iterator[tuple[Camera, str, float]]:
     """Camera, name and change factor of all principal distances."""
     interior = lambda values: np.asarray(problem.interior_orientation(values))
-    now, before = interior(values), interior(problem.data.start)
+    adjusted, start = interior(values), interior(problem.data.start)
     for c, camera in enumerate(problem.network.cameras):
         model = get_model(camera.model)
         for parameter in model.principal_distance:
             column = model.parameters.index(parameter)
-            yield camera, parameter, float(now[c, column] / before[c, column])
+            yield camera, parameter, float(adjusted[c, column] / start[c, column])

@@ -42,8 +42,8 @@ def name_mirrored(
     another network, None without a solution; `largest` σ0 of a network without mistakes."""
     # The coordinates of three points: seven hold a similarity, and two can contradict it.
     min_axes = 9
-    given = np.isfinite(network.images.sigma).any()
-    if network.further or given or count_controlled_axes(network.points).sum() < min_axes:
+    has_priors = np.isfinite(network.images.sigma).any()
+    if network.further or has_priors or count_controlled_axes(network.points).sum() < min_axes:
         return ""
     mirrored = _try(_without_start_values(_mirror(network)), try_again)
     if mirrored is None or mirrored > largest:
@@ -72,25 +72,28 @@ def name_other_side(network: Network, images: dict[str, Float[np.ndarray, "3"]])
 
     **Arguments:** `images`: adjusted projection centres by id."""
     points = network.points
-    known = points.has_role("control", "fixed") & np.isfinite(points.position).all(1)
+    is_known = points.has_role("control", "fixed") & np.isfinite(points.position).all(1)
     rows = [k for k, id in enumerate(network.images.id) if id in images]
-    if known.sum() < 3 or not rows:
+    if is_known.sum() < 3 or not rows:
         return ""
     # The side of the plane of the control: a mirrored image of a nearly plane object is where the
     # camera would be on the other side of it.
-    X = points.position[known]
+    X = points.position[is_known]
     normal = np.linalg.svd(X - X.mean(0))[2][2]
-    given = (network.images.position[rows] - X.mean(0)) @ normal
-    found = (np.array([images[network.images.id[k]] for k in rows]) - X.mean(0)) @ normal
+    distance_at_start = (network.images.position[rows] - X.mean(0)) @ normal
+    adjusted_distance = (
+        np.array([images[network.images.id[k]] for k in rows]) - X.mean(0)
+    ) @ normal
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = -found / given
+        ratio = -adjusted_distance / distance_at_start
     # Within a factor of two of the distance: start values of a block are good to a few percent, and
     # those that say nothing (0, 0, 0) are seldom as far.
-    other = (ratio > 1 / 2) & (ratio < 2)
-    if 2 * other.sum() <= len(rows):
+    is_on_other_side = (ratio > 1 / 2) & (ratio < 2)
+    if 2 * is_on_other_side.sum() <= len(rows):
         return ""
     return (
-        f"{count(int(other.sum()), 'image')} of {len(rows)} moved from the start value to the "
+        f"{count(int(is_on_other_side.sum()), 'image')} of {len(rows)} moved from the start value "
+        "to the "
         f"other side of the control points, where their mirror image is seen: {REMEDY}"
     )
 

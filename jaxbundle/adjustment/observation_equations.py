@@ -17,10 +17,10 @@ def residuals(
 ) -> dict[str, Float[Array, "n r"]]:
     """v/σ of every observation and pseudo-observation by set; a pure function of the values and the
     numbers."""
-    given = pad_data(problem, problem.data if data is None else data)
-    laid = lay_out_data(problem.plan, given)
+    padded = pad_data(problem, problem.data if data is None else data)
+    chunked = lay_out_data(problem.plan, padded)
     wide = pad_values(problem, values)
-    parts = residuals_of_parts(problem.declared, problem.plan, wide, laid)
+    parts = residuals_of_parts(problem.declared, problem.plan, wide, chunked)
     rows = restore_order(problem.plan, parts)
     return {o.name: rows[o.name][: o.number] for o in problem.observations}
 
@@ -33,7 +33,7 @@ def design_matrix(
     Rows are ordered by set of observations, columns by table. Rotations change by δθ (radians)
     about the camera axes."""
     places = [(t, row, column) for t in problem.tables for row, column in zip(*np.nonzero(t.free))]
-    still, unravel = ravel_pytree(
+    zero_change, unravel = ravel_pytree(
         {t.name: jnp.zeros((t.rows, t.space.width)) for t in problem.tables}
     )
     # The engine never forms this matrix; here J is one forward pass per unknown, for tests and for
@@ -42,11 +42,11 @@ def design_matrix(
     free = np.flatnonzero(which)
 
     def rows(change: Float[Array, " unknowns"]) -> Float[Array, " rows"]:
-        moved = dict(values)
-        for name, d in unravel(still.at[free].set(change)).items():
+        tables = dict(values)
+        for name, d in unravel(zero_change.at[free].set(change)).items():
             space = problem.declared.spaces[name]
-            moved[name] = jax.vmap(space.retract)(values[name], d)
-        return jnp.concatenate([x.ravel() for x in residuals(problem, moved, data).values()])
+            tables[name] = jax.vmap(space.retract)(values[name], d)
+        return jnp.concatenate([x.ravel() for x in residuals(problem, tables, data).values()])
 
     order = {name: i for i, name in enumerate(sorted(t.name for t in problem.tables))}
     places.sort(key=lambda place: order[place[0].name])

@@ -49,20 +49,22 @@ def orient(
     **Raises:** `InputError` for bad tables; `NotSolvedError` if no image could be oriented.
     """
     require_x64()
-    given = as_network(network, format=format, overrides=overrides, control=control)
-    return find_start_values(given, _adjust, tolerance)
+    network_as_given = as_network(network, format=format, overrides=overrides, control=control)
+    return find_start_values(network_as_given, _adjust, tolerance)
 
 
-def orient_again(given: Network, placed: Network, better: Mapping[str, Camera]) -> Network:
+def orient_again(
+    network_as_given: Network, placed: Network, better: Mapping[str, Camera]
+) -> Network:
     """The given network with start values computed with better cameras, if this uses more image
     points than `placed`; the cameras of the network are kept."""
     try:
-        cameras = tuple(better.get(camera.id, camera) for camera in given.cameras)
-        found = orient(given.replace(cameras=cameras)).network
+        cameras = tuple(better.get(camera.id, camera) for camera in network_as_given.cameras)
+        reoriented = orient(network_as_given.replace(cameras=cameras)).network
     except (InputError, NotSolvedError):
         return placed
-    more = len(found.observations) > len(placed.observations)
-    return found.replace(cameras=given.cameras) if more else placed
+    uses_more = len(reoriented.observations) > len(placed.observations)
+    return reoriented.replace(cameras=network_as_given.cameras) if uses_more else placed
 
 
 def screen(network: Network) -> Network:
@@ -108,8 +110,8 @@ def _part(
     images, points = network.images, network.points
     angles = np.full((len(images), 3), np.nan)
     angles[model.placed] = batched.angles(model.M[model.placed])
-    held = model.control & use
-    roles = tuple("fixed" if h else "tie" for h in held)
+    is_held = model.control & use
+    roles = tuple("fixed" if h else "tie" for h in is_held)
     cameras = tuple(dataclasses.replace(c, free=(), sigma={}, observed={}) for c in network.cameras)
     part = network.replace(
         cameras=cameras,
@@ -121,7 +123,7 @@ def _part(
         ),
         observations=network.observations.take(rows),
         distances=Distances.none(),
-        datum="control" if held.sum() >= 3 else "inner",
+        datum="control" if is_held.sum() >= 3 else "inner",
         datum_points=(),
         warnings=(),
     )

@@ -26,8 +26,8 @@ def orientation_covariance(
         for row, c in enumerate(table.cameras):
             names, columns = problem.free_parameters(c)
             for j in columns:
-                same = [g[1:] for g in network.cameras[c].tie if g[0] == names[j]]
-                for name in (names[j], *(tied for group in same for tied in group)):
+                equal_groups = [g[1:] for g in network.cameras[c].tie if g[0] == names[j]]
+                for name in (names[j], *(tied for group in equal_groups for tied in group)):
                     unknowns.append(("camera", network.cameras[c].id, name))
                     repeated.append(len(places))
                 places.append((table.name, row, j))
@@ -40,14 +40,15 @@ def orientation_covariance(
         rows[name][n, row, column] = 1.0
     # One row of the identity per unknown: the full inverse is never formed, only these columns.
     C = result.errors.propagate_rows(rows)
-    used = np.concatenate([free.ravel(), np.ones(len(places) - free.size)])
+    is_free = np.concatenate([free.ravel(), np.ones(len(places) - free.size)])
     from scipy.linalg import block_diag  # imported here: slow, and rarely needed
 
     # From small rotations δθ to ω, φ, κ; then the rows of tied parameters are repeated.
     turns = (block_diag(np.eye(3), A) for A in result.angle_jacobian)
-    A = block_diag(*turns, np.eye(len(places) - free.size)) * used
+    A = block_diag(*turns, np.eye(len(places) - free.size)) * is_free
     C = (A @ C @ A.T)[np.ix_(repeated, repeated)]
-    there = np.diagonal(C) > 0
+    is_determined = np.diagonal(C) > 0
     return OrientationCovariance(
-        tuple(one for one, use in zip(unknowns, there) if use), C[np.ix_(there, there)]
+        tuple(unknown for unknown, use in zip(unknowns, is_determined) if use),
+        C[np.ix_(is_determined, is_determined)],
     )

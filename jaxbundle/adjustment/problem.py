@@ -106,8 +106,8 @@ class NetworkProblem(engine.Problem):
         """Data with other x and y [rays, 2]."""
         measured = dict(data.measured)
         for name, rows in self.image_rows.items():
-            given = measured[name]
-            measured[name] = (xy[rows], given[1]) if isinstance(given, tuple) else xy[rows]
+            planned = measured[name]
+            measured[name] = (xy[rows], planned[1]) if isinstance(planned, tuple) else xy[rows]
         return dataclasses.replace(data, measured=measured)
 
     def with_image_weights(self, data: Data, weight: AnyArray) -> Data:
@@ -122,14 +122,14 @@ class NetworkProblem(engine.Problem):
             return next(iter(parts.values()))
         shape = np.shape(next(iter(parts.values()), np.zeros((0, 2))))[1:]
         if any(isinstance(part, Tracer) for part in parts.values()):
-            found = jnp.zeros((len(self.image), *shape))
+            all_rays = jnp.zeros((len(self.image), *shape))
             for name, part in parts.items():
-                found = found.at[self.image_rows[name]].set(part)
-            return found
-        found = np.zeros((len(self.image), *shape))
+                all_rays = all_rays.at[self.image_rows[name]].set(part)
+            return all_rays
+        all_rays = np.zeros((len(self.image), *shape))
         for name, part in parts.items():
-            found[self.image_rows[name]] = np.asarray(part)
-        return found
+            all_rays[self.image_rows[name]] = np.asarray(part)
+        return all_rays
 
     @property
     def image_weights(self) -> Float[np.ndarray, "rays 2"]:
@@ -173,8 +173,8 @@ class NetworkProblem(engine.Problem):
         """The parameters free in any camera of the table of a camera, and which of them are free in
         this camera."""
         table, row = self.table_of_camera(c)
-        given = self.table(table.name)
-        return given.parameters, np.flatnonzero(given.free[row])
+        declared_table = self.table(table.name)
+        return declared_table.parameters, np.flatnonzero(declared_table.free[row])
 
     @property
     def at_any_distance(self) -> Bool[np.ndarray, " points"]:
@@ -190,8 +190,8 @@ class NetworkProblem(engine.Problem):
         # Snooping takes the weight of rays and holds the point: without rays, and held although it
         # is not given.
         rays = np.bincount(self.point[self.used], minlength=len(self.network.points))
-        held = ~self.table("point").free.any(1)
-        return ~self.network.points.has_role("fixed") & held & (rays == 0)
+        is_held = ~self.table("point").free.any(1)
+        return ~self.network.points.has_role("fixed") & is_held & (rays == 0)
 
     def cofactors_of_coordinates(
         self, points: Float[AnyArray, "points width"], Q: Float[AnyArray, "points 3 3"]
@@ -264,12 +264,15 @@ def make_problem(
     one_of("reduction", reduction, REDUCTIONS, none=True)
     require_network(network)
     network = order_cameras(split_check_points(network)[0])
-    chosen, origin = _datum_points(network), None
+    carries_datum, origin = _datum_points(network), None
     # Points at any distance are directions from the origin, which is then the mean of the
     # projection centres (in whole units, by which printed coordinates lose no digit); their
     # distance is uncertain by its own size, so that they would carry a datum of no precision.
     if lengths is not None:
-        chosen, origin = chosen & (lengths == 0), np.round(network.images.position.mean(0))
+        carries_datum, origin = (
+            carries_datum & (lengths == 0),
+            np.round(network.images.position.mean(0)),
+        )
     # Points are eliminated: they are many, and two of them share no observation but those of
     # further kinds, which the planner keeps in the reduced system.
     declared = declare(network, origin, also, lengths)
@@ -279,13 +282,13 @@ def make_problem(
             declared.observations,
             "point",
             motions=declared.motions,
-            datum=lambda gauge: _datum(network, gauge, declared.origin, chosen),
+            datum=lambda gauge: _datum(network, gauge, declared.origin, carries_datum),
             reduction=reduction,
             retraction=TurnAboutSeen,
         )
     except CannotHold as error:
         raise InputError(
-            f"the {int(chosen.sum())} datum points cannot fix the datum, of which "
+            f"the {int(carries_datum.sum())} datum points cannot fix the datum, of which "
             f"{error.defect} of 7 parameters are open: give at least three free points that "
             "are not collinear (datum_points), or omit the setting"
         ) from None
@@ -296,9 +299,9 @@ def _of_network(
     problem: engine.Problem, network: Network, declared: DeclaredNetwork
 ) -> NetworkProblem:
     # A problem of the engine with further fields: whatever takes a problem takes this one.
-    own = {field.name: getattr(problem, field.name) for field in dataclasses.fields(problem)}
+    fields = {field.name: getattr(problem, field.name) for field in dataclasses.fields(problem)}
     return NetworkProblem(
-        **own,
+        **fields,
         network=network,
         cameras=declared.cameras,
         image_rows=declared.image_rows,
@@ -316,15 +319,15 @@ def _datum_points(network: Network) -> Bool[np.ndarray, " points"]:
         return np.isin(np.array(points.id, dtype=object), network.datum_points)
     # All tie points: the trace of their covariance is then the smallest of all datums.
     # Control points are weighted by their σ and carry none, unless there is nothing else.
-    chosen = points.has_role("tie")
-    return chosen if chosen.any() else points.has_role("control")
+    carries_datum = points.has_role("tie")
+    return carries_datum if carries_datum.any() else points.has_role("control")
 
 
 def _datum(
     network: Network,
     gauge: Float[np.ndarray, "7 defect"],
     origin: Float[np.ndarray, "3"],
-    chosen: Bool[np.ndarray, " points"],
+    carries_datum: Bool[np.ndarray, " points"],
 ) -> tuple[dict[str, Float[np.ndarray, "points 3"]], bool]:
     """The datum constraints; refused if the setting requires the observations to fix the datum."""
     if network.datum == "control":
@@ -338,32 +341,39 @@ def _datum(
         )
     # With the scale open, all distances shrink to fit a σ that is a length (1 mm from a plane): the
     # minimum would be a network of size 0.
-    sized = [one for one in among(network) if one.needs_scale]
-    if sized and is_scale_open(gauge, network.points.position - origin):
+    needing_scale = [kind for kind in among(network) if kind.needs_scale]
+    if needing_scale and is_scale_open(gauge, network.points.position - origin):
         raise InputError(
-            f"{sized[0].source.name}: a σ of {sized[0].TABLE} is a length, but nothing gives the "
+            f"{needing_scale[0].source.name}: a σ of {needing_scale[0].TABLE} is a length, but "
+            "nothing gives the "
             'network a scale: add a distance or control points, or write "exact" (no σ)'
         )
-    return {"point": np.repeat(chosen[:, None].astype(float), 3, 1)}, network.datum == "minimal"
+    return {
+        "point": np.repeat(carries_datum[:, None].astype(float), 3, 1)
+    }, network.datum == "minimal"
 
 
 def is_scale_open(gauge: Float[np.ndarray, "7 defect"], X: Float[np.ndarray, "points 3"]) -> bool:
     """Whether an open direction of the datum scales points X, whatever its length and the units."""
     size = np.sqrt(np.nanmean((X**2).sum(1)))
     # Shifts move points by 1, rotations and the scale by their distance from the origin.
-    moved = np.abs(gauge) * np.repeat([1.0, size, size], [3, 3, 1])[:, None]
-    return bool((moved[-1] > NEGLIGIBLE_MOTION * moved.max(0)).any())
+    displacement = np.abs(gauge) * np.repeat([1.0, size, size], [3, 3, 1])[:, None]
+    return bool((displacement[-1] > NEGLIGIBLE_MOTION * displacement.max(0)).any())
 
 
 def shifted_problem(network: Network, like: NetworkProblem, values: Values) -> NetworkProblem:
     """A problem of other points of the network with the orientations and cameras of `values`,
     without priors and datum: for excluded points."""
     # Of further kinds those that change where a point is seen.
-    further = tuple(one for one in network.further if one.CHANGES_IMAGE_POINTS)
-    declared = declare(network.replace(further=further), like.origin)
-    known: dict[str, Any] = {name: jax.tree.map(np.asarray, rows) for name, rows in values.items()}
+    kinds = tuple(kind for kind in network.further if kind.CHANGES_IMAGE_POINTS)
+    declared = declare(network.replace(further=kinds), like.origin)
+    start_values: dict[str, Any] = {
+        name: jax.tree.map(np.asarray, rows) for name, rows in values.items()
+    }
     tables = tuple(
-        table if table.name == "point" else dataclasses.replace(table, value=known[table.name])
+        table
+        if table.name == "point"
+        else dataclasses.replace(table, value=start_values[table.name])
         for table in declared.tables
     )
     observations = tuple(o for o in declared.observations if o.name in declared.image_rows)

@@ -42,9 +42,9 @@ Minimise = Callable[[Problem, Values], tuple[NetworkProblem, Minimum]]
 
 
 def snoop_network(
-    found: Inspection,
+    inspection: Inspection,
     minimum: Minimum,
-    again: Minimise,
+    minimise_again: Minimise,
     test: str,
     significance: float,
     doubtful: Iterable[tuple[str, str]] = (),
@@ -54,10 +54,10 @@ def snoop_network(
 
     `doubtful`: image and point, by id, of initially removed image points."""
     # The engine removes and restores in its own terms (sets and rows); names are given at the end.
-    problem, whole, doubt = found.problem, found.solution, None
-    repeat = _Repeat(again, "after data snooping", minimum)
+    problem, solution_with_all, doubt = inspection.problem, inspection.solution, None
+    repeat = _Repeat(minimise_again, "after data snooping", minimum)
     solution, removed = snoop(
-        whole,
+        solution_with_all,
         repeat,
         test=test,
         significance=significance,
@@ -67,7 +67,9 @@ def snoop_network(
     counts = problem.counts
     if test == "baarda" and counts.redundancy > 0:
         # Its own adjustments, whose minima are not that of the result (`repeat`).
-        scale = _scale_of_good(whole, _Repeat(again, "after data snooping", minimum))
+        scale = _scale_of_good(
+            solution_with_all, _Repeat(minimise_again, "after data snooping", minimum)
+        )
         rays = sum(len(r.rows) for r in removed if r.kind == "image")
         doubt = doubt_of_baarda(
             scale,
@@ -79,19 +81,19 @@ def snoop_network(
     return cast(NetworkProblem, solution.problem), repeat.minimum, removed, doubt
 
 
-def _scale_of_good(found: Solution, repeat: "_Repeat") -> float:
+def _scale_of_good(solution: Solution, repeat: "_Repeat") -> float:
     """The robust scale of the image points, whatever the a priori σ.
 
     The observations left by Baarda's test fit too well, because they were selected for it; and
     blunders spread over the residuals of good points. So if the scale of all points is large, the
     scale of those that Tukey's estimator (with a posteriori scale) does not suspect is used.
     """
-    problem = found.problem
-    scale = robust_scale(problem, residual_lengths(found))
+    problem = solution.problem
+    scale = robust_scale(problem, residual_lengths(solution))
     if scale < 1 or not contradicts(scale, problem.counts.redundancy):
         return scale
     try:
-        tukey = reweight(problem, found.values, repeat, "tukey")
+        tukey = reweight(problem, solution.values, repeat, "tukey")
     except NotSolvedError:
         return scale
     # Suspects are only left out of the median: the adjustment keeps the observations it has.
@@ -103,14 +105,14 @@ def _scale_of_good(found: Solution, repeat: "_Repeat") -> float:
 
 
 def adjust_robustly(
-    problem: NetworkProblem, minimum: Minimum, again: Minimise, estimator: str
+    problem: NetworkProblem, minimum: Minimum, minimise_again: Minimise, estimator: str
 ) -> tuple[Reweighted, Minimum]:
     """The solution with the weights of a robust estimator, and its minimum. The first weights come
     from the minimum, or from the start values without a solution."""
-    repeat = _Repeat(again, "by robust estimation", minimum)
+    repeat = _Repeat(minimise_again, "by robust estimation", minimum)
     # Weights of start values are poor, but where blunders prevent a solution there are no others.
-    first = minimum.values if inspect_solution(problem, minimum) else problem.data.start
-    reweighted = reweight(problem, first, repeat, estimator)
+    start = minimum.values if inspect_solution(problem, minimum) else problem.data.start
+    reweighted = reweight(problem, start, repeat, estimator)
     if not reweighted.converged:
         raise NotSolvedError(
             f"not solved by robust estimation: the weights of {estimator} do not converge; use "
@@ -122,8 +124,8 @@ def adjust_robustly(
 class _Repeat:
     """Adjusts a changed problem of the network and keeps the minimum."""
 
-    def __init__(self, again: Minimise, when: str, minimum: Minimum):
-        self.again, self.when, self.minimum = again, when, minimum
+    def __init__(self, minimise_again: Minimise, when: str, minimum: Minimum):
+        self.again, self.when, self.minimum = minimise_again, when, minimum
 
     def __call__(self, problem: Problem, values: Values) -> Solution:
         of_network, self.minimum = self.again(problem, values)
@@ -131,22 +133,22 @@ class _Repeat:
 
 
 def with_components(
-    problem: NetworkProblem, minimum: Minimum, again: Minimise
+    problem: NetworkProblem, minimum: Minimum, minimise_again: Minimise
 ) -> tuple[NetworkProblem, Minimum, dict[str, float]]:
     """The problem with estimated σ of every group, its minimum, and the factors of σ by group."""
-    repeat = _Repeat(again, "with the estimated variance components", minimum)
+    repeat = _Repeat(minimise_again, "with the estimated variance components", minimum)
     # σ̂² of a group is vᵀPv/r of the group (Förstner 1979): iterated, since both depend on all σ.
     # Groups with too little redundancy keep their σ, which is reported in a note.
-    whole, of = Inspection(problem, minimum.values).solution, groups(problem)
-    found, factors, unsettled = estimate(whole, of, repeat)
-    components = variance_components(found, of, factors)
+    solution, variance_groups = Inspection(problem, minimum.values).solution, groups(problem)
+    estimated, factors, unsettled = estimate(solution, variance_groups, repeat)
+    components = variance_components(estimated, variance_groups, factors)
     network = problem.network.note(*_unchanged(components))
     if unsettled:
         network = network.warn(
             f"the variance components did not converge in {ROUNDS} rounds "
             f"({', '.join(unsettled)}): their σ are not final"
         )
-    problem = dataclasses.replace(cast(NetworkProblem, found.problem), network=network)
+    problem = dataclasses.replace(cast(NetworkProblem, estimated.problem), network=network)
     return problem, repeat.minimum, factors
 
 
@@ -159,7 +161,7 @@ def _unchanged(components: dict[str, Component]) -> Iterator[str]:
 
 
 def eliminate_parameters(
-    problem: NetworkProblem, minimum: Minimum, again: Minimise, critical_t: float
+    problem: NetworkProblem, minimum: Minimum, minimise_again: Minimise, critical_t: float
 ) -> tuple[NetworkProblem, Minimum, list[Name]]:
     """Hold insignificant additional parameters at their default (mostly 0), the weakest first."""
     names = []
@@ -176,7 +178,7 @@ def eliminate_parameters(
             return problem, minimum, names
         names.append(weak[0])
         problem, values = _without_parameter(problem, minimum.values, weak[0])
-        problem, minimum = again(problem, values)
+        problem, minimum = minimise_again(problem, values)
         require_solved(problem, minimum, f"without {weak[0]}")
 
 
@@ -188,8 +190,8 @@ def _without_parameter(
     c = [camera.id for camera in problem.network.cameras].index(name.id)
     model = get_model(problem.network.cameras[c].model)
     column = model.parameters.index(name.parameter)
-    tied = next((g for g in problem.network.cameras[c].tie if name.parameter in g), ())
-    columns = np.array([model.parameters.index(n) for n in tied or (name.parameter,)])
+    equal_parameters = next((g for g in problem.network.cameras[c].tie if name.parameter in g), ())
+    columns = np.array([model.parameters.index(n) for n in equal_parameters or (name.parameter,)])
     value = default_parameters(model)[name.parameter]
     table, row = problem.table_of_camera(c)
     rows_with_value = lambda rows: jnp.asarray(rows).at[row, columns].set(value)
@@ -197,8 +199,8 @@ def _without_parameter(
     weight = dict(problem.data.weight)
     if table.interior_set in weight:
         (prior,) = np.nonzero(problem.observations_of(table.interior_set).rows[0] == row)
-        given = jnp.asarray(weight[table.interior_set])
-        weight[table.interior_set] = given.at[np.ix_(prior, columns)].set(0.0)
+        weights = jnp.asarray(weight[table.interior_set])
+        weight[table.interior_set] = weights.at[np.ix_(prior, columns)].set(0.0)
     data = dataclasses.replace(problem.data, start=reset(problem.data.start), weight=weight)
     moving = problem.table(table.name).vector.moving.index(column)
     return hold(with_data(problem, data), table.name, row, [moving]), reset(values)

@@ -71,48 +71,50 @@ def replicate(
     open_one = partial(
         _adjusted, settings, format=format, overrides=overrides, control=control, snooping=snooping
     )
-    several = [*given] if isinstance(given, Sequence) and not isinstance(given, str) else [given]
-    if len(several) != 1:
-        return _compare_jobs([open_one(one) for one in several])
-    return _compare_halves(open_one(several[0]), by, repeat, seed, progress)
+    sources = [*given] if isinstance(given, Sequence) and not isinstance(given, str) else [given]
+    if len(sources) != 1:
+        return _compare_jobs([open_one(source) for source in sources])
+    return _compare_halves(open_one(sources[0]), by, repeat, seed, progress)
 
 
 def _compare_halves(
-    given: Adjustment, by: str, repeat: int, seed: int, progress: Progress | None
+    adjustment: Adjustment, by: str, repeat: int, seed: int, progress: Progress | None
 ) -> Replication:
     """`repeat` splits of one network."""
-    network = given.problem.network
+    network = adjustment.problem.network
     photographs = len(network.images)
     needed = MIN_IMAGES if by == "points" else 2 * MIN_IMAGES
     if photographs < needed:
-        also = f"; halves by points need {MIN_IMAGES}" if photographs >= MIN_IMAGES else ""
+        alternative = f"; halves by points need {MIN_IMAGES}" if photographs >= MIN_IMAGES else ""
         raise InputError(
-            f"{count(photographs, 'photograph')}: halves by {by} need {needed} or more{also}"
+            f"{count(photographs, 'photograph')}: halves by {by} need {needed} or more{alternative}"
         )
-    if not any(given.camera_covariance(camera.id)[0] for camera in network.cameras):
+    if not any(adjustment.camera_covariance(camera.id)[0] for camera in network.cameras):
         raise InputError("no camera has a free parameter: there is nothing to compare")
-    whole = given.cofactors.solution
+    solution = adjustment.cofactors.solution
     splits, failed, of_splits = [], [], []
-    for number, second in enumerate(random_halves(network, by, repeat, seed)):
+    for number, in_second in enumerate(random_halves(network, by, repeat, seed)):
         if progress is not None:
             progress("adjusting halves", number, repeat)
         try:
-            names, D = effects_of_halves(whole, given.problem, second)
+            names, D = effects_of_halves(solution, adjustment.problem, in_second)
         except NotSolvedError as error:
             failed.append(f"split {number + 1}: {error}")
         else:
-            splits.append(difference_of(whole, names, D, given.error_model))
+            splits.append(difference_of(solution, names, D, adjustment.error_model))
             of_splits.append(D)
     if not splits:
         raise NotSolvedError(f"no halves of the network can be adjusted alone: {failed[0]}")
-    band = None if given.error_model is None else expected_band(given.error_model, of_splits)
-    unit = given.image_unit
-    return Replication(by, tuple(splits), tuple(failed), given.error_model, band, unit)
+    band = (
+        None if adjustment.error_model is None else expected_band(adjustment.error_model, of_splits)
+    )
+    unit = adjustment.image_unit
+    return Replication(by, tuple(splits), tuple(failed), adjustment.error_model, band, unit)
 
 
 def _adjusted(
     settings: CorrelationSettings,
-    given: Given,
+    source: Given,
     *,
     format: str | None,
     overrides: Sequence[str],
@@ -120,12 +122,12 @@ def _adjusted(
     snooping: str | None,
 ) -> Adjustment:
     """A result with an error model."""
-    if isinstance(given, str | Path) and Path(given).suffix == ".npz":
-        given = load_adjustment(given)
-    if not isinstance(given, Adjustment):
-        known = as_network(given, format=format, overrides=overrides, control=control)
-        given = adjust(known, snooping=snooping)
-    return given if given.correlations == settings else given.with_changes(correlations=settings)
+    if isinstance(source, str | Path) and Path(source).suffix == ".npz":
+        source = load_adjustment(source)
+    if not isinstance(source, Adjustment):
+        network = as_network(source, format=format, overrides=overrides, control=control)
+        source = adjust(network, snooping=snooping)
+    return source if source.correlations == settings else source.with_changes(correlations=settings)
 
 
 def _compare_jobs(results: Sequence[Adjustment]) -> Replication:
@@ -133,43 +135,43 @@ def _compare_jobs(results: Sequence[Adjustment]) -> Replication:
     if not results:
         raise InputError("no network is given")
     splits, failed = [], []
-    for (i, one), (j, other) in combinations(enumerate(results, 1), 2):
+    for (i, job_a), (j, job_b) in combinations(enumerate(results, 1), 2):
         try:
-            splits.append(_difference_of_jobs(one, other))
+            splits.append(_difference_of_jobs(job_a, job_b))
         except NotSolvedError as error:
             failed.append(f"jobs {i} and {j}: {error}")
     if not splits:
         raise NotSolvedError(f"nothing can be compared: {failed[0]}")
-    model = next((one.error_model for one in results if one.error_model is not None), None)
+    model = next((job_a.error_model for job_a in results if job_a.error_model is not None), None)
     return Replication("jobs", tuple(splits), tuple(failed), model, None, results[0].image_unit)
 
 
-def _difference_of_jobs(one: Adjustment, other: Adjustment) -> HalvesDifference:
+def _difference_of_jobs(job_a: Adjustment, job_b: Adjustment) -> HalvesDifference:
     """Second − first of the free parameters of the cameras of both; two jobs of one camera each are
     of the same one, whatever its name."""
-    ids = [[camera.id for camera in r.problem.network.cameras] for r in (one, other)]
+    ids = [[camera.id for camera in r.problem.network.cameras] for r in (job_a, job_b)]
     pairs = [(id, id) for id in ids[0] if id in ids[1]]
     if len(ids[0]) == len(ids[1]) == 1:
         pairs = [(ids[0][0], ids[1][0])]
     names, difference, classical, correlated = [], [], [], []
     for a, b in pairs:
-        free = [r.camera_covariance(id)[0] for r, id in ((one, a), (other, b))]
+        free = [r.camera_covariance(id)[0] for r, id in ((job_a, a), (job_b, b))]
         common = [name for name in free[0] if name in free[1]]
-        p, q = one.camera_parameters(a), other.camera_parameters(b)
+        p, q = job_a.camera_parameters(a), job_b.camera_parameters(b)
         names += [(a, name) for name in common]
         difference += [q[name] - p[name] for name in common]
-        for blocks, only in ((classical, True), (correlated, False)):
+        for blocks, is_classical in ((classical, True), (correlated, False)):
             C = np.zeros((len(common), len(common)))
-            for result, id in ((one, a), (other, b)):
-                known, own = result.camera_covariance(id, classical=only)
-                at = [list(known).index(name) for name in common]
-                C += own[np.ix_(at, at)]
+            for result, id in ((job_a, a), (job_b, b)):
+                free_names, covariance = result.camera_covariance(id, classical=is_classical)
+                positions = [list(free_names).index(name) for name in common]
+                C += covariance[np.ix_(positions, positions)]
             blocks.append(C)
     if not names:
         raise NotSolvedError("they have no camera of the same name with a free parameter")
     from scipy.linalg import block_diag  # imported here: slow, and rarely needed
 
-    modelled = one.error_model is not None or other.error_model is not None
+    modelled = job_a.error_model is not None or job_b.error_model is not None
     return HalvesDifference(
         tuple(names),
         np.array(difference),

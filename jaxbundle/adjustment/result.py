@@ -245,8 +245,8 @@ class Adjustment:
     def warnings(self) -> tuple[str, ...]:
         """Suspicious data, in words; also poorly determined unknowns, distortions that
         are not one-to-one, and a σ0 far above 1. See also `notes`."""
-        found = self.distortion_reach.values() if self.converged else ()
-        turns = (reach.message for reach in found if reach.message is not None)
+        reach_of_cameras = self.distortion_reach.values() if self.converged else ()
+        turns = (reach.message for reach in reach_of_cameras if reach.message is not None)
         lines = (
             *self.problem.network.warnings,
             *self.findings,
@@ -338,10 +338,10 @@ class Adjustment:
     def _require_solved(self) -> None:
         if not self.converged:
             names = list_some(self.undetermined, 8, str)
-            what = f"; not determined: {names}" if names else ""
-            what += "".join(f"; {line}" for line in (*self.findings, *self.weakness.lines))
+            details = f"; not determined: {names}" if names else ""
+            details += "".join(f"; {line}" for line in (*self.findings, *self.weakness.lines))
             raise NotSolvedError(
-                f"the adjustment did not converge ({self.termination}){what}; it has no result"
+                f"the adjustment did not converge ({self.termination}){details}; it has no result"
             )
 
     # --- precision of the whole -------------------------------------------------------------
@@ -375,8 +375,8 @@ class Adjustment:
         points, images = self.problem.network.points, self.problem.network.images
         # Only the excess over the datum counts: the observations that fix it fit exactly, whatever
         # their σ.
-        held = 3 * int(points.has_role("fixed").sum()) + int((images.sigma == 0).sum())
-        needed = max(len(SIMILARITY_PARAMETERS) - self.counts.datum - held, 0)
+        number_held = 3 * int(points.has_role("fixed").sum()) + int((images.sigma == 0).sum())
+        needed = max(len(SIMILARITY_PARAMETERS) - self.counts.datum - number_held, 0)
         return self.counts.pseudo_observations > needed
 
     def global_test(self, significance: float = 0.05) -> dict:
@@ -418,8 +418,8 @@ class Adjustment:
     def variance_components(self) -> dict[str, Component]:
         """For every group of observations the ratio of σ̂ to the given a priori σ, and σ̂
         itself."""
-        found = self.cofactors.solution
-        return variance_components(found, groups(self.problem), self.sigma_factors)
+        solution = self.cofactors.solution
+        return variance_components(solution, groups(self.problem), self.sigma_factors)
 
     @functools.cached_property
     def check_points(self) -> CheckPoints | None:
@@ -455,10 +455,12 @@ class Adjustment:
         """ω, φ, κ of all images, nearest to the given angles, and their Jacobians by δθ; small
         networks share the program."""
         # The batch is filled up to a shared size, so that small networks use one compiled program.
-        given = self.problem.network.images.angles
-        rows = max(round_up(len(given)), LEAST_IMAGES)
-        wide = (np.resize(x, (rows, x.shape[1])) for x in (self.values["image"].rotation, given))
-        return [np.asarray(x)[: len(given)] for x in _all_angles(*wide)]
+        reference = self.problem.network.images.angles
+        rows = max(round_up(len(reference)), LEAST_IMAGES)
+        wide = (
+            np.resize(x, (rows, x.shape[1])) for x in (self.values["image"].rotation, reference)
+        )
+        return [np.asarray(x)[: len(reference)] for x in _all_angles(*wide)]
 
     @property
     def angle_jacobian(self) -> Float[np.ndarray, "images 3 3"]:
@@ -494,8 +496,8 @@ class Adjustment:
             return None, ""
         why = f"no camera has {self.correlations.min_images} photographs, and no point two rays"
         try:
-            found = self.cofactors.solution
-            return correlated_errors(found, self.problem, self.correlations), why
+            solution = self.cofactors.solution
+            return correlated_errors(solution, self.problem, self.correlations), why
         except NotSolvedError as error:
             return None, str(error)
 
@@ -543,8 +545,8 @@ class Adjustment:
     def assumes_independence(self) -> bool:
         """Whether σ take the errors of image points as independent, though there are photographs
         enough to look for others."""
-        enough = len(self.problem.network.images) >= CORRELATIONS.min_images
-        return self.correlations is None and enough
+        has_enough = len(self.problem.network.images) >= CORRELATIONS.min_images
+        return self.correlations is None and has_enough
 
     @functools.cached_property
     def replication(self) -> Replication | None:
@@ -557,9 +559,9 @@ class Adjustment:
             return None
         failed = []
         # A random half may have all rolled photographs, or none, and not determine the camera.
-        for second in random_halves(self.problem.network, self.halves_by, MAX_SPLITS, 0):
+        for in_second in random_halves(self.problem.network, self.halves_by, MAX_SPLITS, 0):
             try:
-                split = self.compare_halves(second)
+                split = self.compare_halves(in_second)
             except NotSolvedError as error:
                 failed.append(str(error))
             else:
@@ -673,20 +675,24 @@ class Adjustment:
         return [names[i] for i in free], Q[np.ix_(free, free)]
 
     def _camera(self, camera: str) -> int:
-        return place_of(camera, [given.id for given in self.problem.network.cameras], "camera")
+        return place_of(
+            camera,
+            [camera_of_network.id for camera_of_network in self.problem.network.cameras],
+            "camera",
+        )
 
     def insignificant(self, critical: float = 2.0) -> list[tuple[float, Name]]:
         """Free interior parameters with t = |value|/σ below `critical`, the least first.
 
         **Raises:** `InputError` for a critical value that is negative or not a number."""
         critical = at_least_zero("critical", critical)
-        found = [
+        parameters = [
             (entry["t"], Name("camera", camera, parameter))
             for camera, table in self.cameras.items()
             for parameter, entry in table["parameters"].items()
             if parameter in table["free"] and entry["t"] < critical
         ]
-        return sorted(found, key=lambda item: item[0])
+        return sorted(parameters, key=lambda item: item[0])
 
     def covariance(
         self, *names: tuple[str, str, str], classical: bool = False
@@ -697,12 +703,12 @@ class Adjustment:
 
         **Raises:** `InputError` without names, for a name that does not have three parts, or for a
         point excluded by data snooping; `KeyError` for an unknown name."""
-        wanted = find_unknowns(self.problem, names)
-        for name in wanted:
+        unknowns = find_unknowns(self.problem, names)
+        for name in unknowns:
             require_located(self.problem, name)
 
         def pick(values: Values):
-            return jnp.stack([value_of(self.problem, name, values) for name in wanted])
+            return jnp.stack([value_of(self.problem, name, values) for name in unknowns])
 
         return self.covariance_of(pick, classical=classical)
 
@@ -739,8 +745,8 @@ class Adjustment:
         """Values, σ and covariances of a table of unknowns of further kinds of observations (`also`
         of `jaxbundle.adjust`)."""
         if table not in self.problem.further_tables:
-            known = ", ".join(self.problem.further_tables) or "none"
-            raise KeyError(f"there is no further table {table!r}; known: {known}")
+            known_tables = ", ".join(self.problem.further_tables) or "none"
+            raise KeyError(f"there is no further table {table!r}; known: {known_tables}")
         return table_result(self.cofactors.solution, table, self.sigma0)
 
     @functools.cached_property
@@ -780,18 +786,18 @@ class Adjustment:
     def table(self, name: str) -> dict[str, np.ndarray]:
         """A table by name: images, points, residuals, cameras (one row per parameter), checks,
         far_points, or of predicted control, control and control_measurements."""
-        made = {
+        makers = {
             "control": result_tables.control,
             "control_measurements": result_tables.control_measurements,
             "cameras": result_tables.parameters,
             "checks": result_tables.checks,
             "far_points": result_tables.far_points,
         }
-        if name in made:
-            return made[name](self)
+        if name in makers:
+            return makers[name](self)
         if name not in ("images", "points", "residuals"):
-            known = ", ".join(("images", "points", "residuals", *made))
-            raise KeyError(f"tables are {known}; not {name!r}")
+            known_tables = ", ".join(("images", "points", "residuals", *makers))
+            raise KeyError(f"tables are {known_tables}; not {name!r}")
         return getattr(self, name)
 
     # --- as a file --------------------------------------------------------------------------
@@ -872,12 +878,12 @@ class Adjustment:
 @partial(compile_once, static=())
 @jax.vmap
 def _all_angles(
-    rotation: Float[AnyArray, "4"], given: Float[AnyArray, "3"]
+    rotation: Float[AnyArray, "4"], reference: Float[AnyArray, "3"]
 ) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
     """ω, φ, κ of all images nearest to the given ones, and their Jacobians by δθ."""
 
     def angles(d_theta: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-        found = angles_near(rotation, d_theta, given)
-        return found, found
+        angles_after = angles_near(rotation, d_theta, reference)
+        return angles_after, angles_after
 
     return jax.jacfwd(angles, has_aux=True)(jnp.zeros(3))[::-1]

@@ -27,23 +27,23 @@ def cameras(adjustment: "Adjustment") -> dict[str, dict]:
     """Per camera: model, and per parameter value, sigma, free, t, total_correlation; and the
     correlation matrix of the free ones."""
     tables = {}
-    for given in adjustment.problem.network.cameras:
-        values = adjustment.camera_parameters(given.id)
-        free, Q = adjustment.camera_cofactor(given.id)
+    for camera_of_network in adjustment.problem.network.cameras:
+        values = adjustment.camera_parameters(camera_of_network.id)
+        free, Q = adjustment.camera_cofactor(camera_of_network.id)
         sigma = dict(zip(free, adjustment.sigma0 * np.sqrt(np.diagonal(Q))))
-        C = adjustment.correlated_camera_covariance(given.id)
+        C = adjustment.correlated_camera_covariance(camera_of_network.id)
         correlated = {} if C is None else dict(zip(free, np.sqrt(np.diagonal(C))))
         total = dict(zip(free, total_correlation(Q))) if free else {}
         # Tied parameters are one unknown: all have its σ and its correlations.
-        for first, *others in given.tie:
-            if first in sigma:
-                sigma |= dict.fromkeys(others, sigma[first])
-                total |= dict.fromkeys(others, total[first])
-                if first in correlated:
-                    correlated |= dict.fromkeys(others, correlated[first])
-        default = default_parameters(get_model(given.model))
-        tables[given.id] = {
-            "model": str(given.model),
+        for first_name, *equal_names in camera_of_network.tie:
+            if first_name in sigma:
+                sigma |= dict.fromkeys(equal_names, sigma[first_name])
+                total |= dict.fromkeys(equal_names, total[first_name])
+                if first_name in correlated:
+                    correlated |= dict.fromkeys(equal_names, correlated[first_name])
+        default = default_parameters(get_model(camera_of_network.model))
+        tables[camera_of_network.id] = {
+            "model": str(camera_of_network.model),
             "parameters": {
                 name: {
                     "value": value,
@@ -62,7 +62,7 @@ def cameras(adjustment: "Adjustment") -> dict[str, dict]:
                 for name, value in values.items()
             },
             "free": free,
-            "tied": [list(group) for group in given.tie],
+            "tied": [list(group) for group in camera_of_network.tie],
             "correlations": correlation_matrix(Q),
         } | ({} if C is None else {"correlations_correlated": correlation_matrix(C)})
     return tables
@@ -71,9 +71,9 @@ def cameras(adjustment: "Adjustment") -> dict[str, dict]:
 def parameters(adjustment: "Adjustment") -> dict[str, np.ndarray]:
     """The parameters of all cameras, one row each."""
     rows = [
-        {"camera": camera, "model": given["model"], "parameter": parameter, **entry}
-        for camera, given in adjustment.cameras.items()
-        for parameter, entry in given["parameters"].items()
+        {"camera": camera, "model": camera_entry["model"], "parameter": parameter, **entry}
+        for camera, camera_entry in adjustment.cameras.items()
+        for parameter, entry in camera_entry["parameters"].items()
     ]
     keys = dict.fromkeys(key for row in rows for key in row)
     return {key: np.array([row.get(key) for row in rows], dtype=object) for key in keys}
@@ -120,14 +120,18 @@ def far_points(adjustment: "Adjustment") -> dict[str, np.ndarray]:
     """The points at any distance, if any: columns id, uX, uY, uZ (the direction from the centroid
     of the projection centres), su (its largest σ, angle unit), distance, nearer and farther (one σ
     of the inverse distance from it), at_infinity."""
-    found = adjustment.far_points
-    if found is None:
+    distant = adjustment.far_points
+    if distant is None:
         return {}
-    table = {"id": np.array(found.id, dtype=object)}
-    table |= {f"u{axis}": found.direction[:, i] for i, axis in enumerate("XYZ")}
-    table["su"] = found.sigma_direction[:, 0] * adjustment.angle_scale
-    table |= {"distance": found.distance, "nearer": found.reach[:, 0], "farther": found.reach[:, 1]}
-    return table | {"at_infinity": found.at_infinity}
+    table = {"id": np.array(distant.id, dtype=object)}
+    table |= {f"u{axis}": distant.direction[:, i] for i, axis in enumerate("XYZ")}
+    table["su"] = distant.sigma_direction[:, 0] * adjustment.angle_scale
+    table |= {
+        "distance": distant.distance,
+        "nearer": distant.reach[:, 0],
+        "farther": distant.reach[:, 1],
+    }
+    return table | {"at_infinity": distant.at_infinity}
 
 
 def units(adjustment: "Adjustment", columns: Sequence[str], name: str) -> dict[str, str]:
@@ -135,23 +139,25 @@ def units(adjustment: "Adjustment", columns: Sequence[str], name: str) -> dict[s
     if name in ("residuals", "cameras"):
         return {}
     length, angle = adjustment.network.object_unit, adjustment.network.angle_unit
-    known = dict.fromkeys((*"XYZ", *EXTERIOR[:3], "distance", "nearer", "farther"), length)
-    known |= dict.fromkeys((*EXTERIOR[3:], "su"), angle)
-    known |= dict.fromkeys(("rms", "x", "y"), adjustment.image_unit)
-    of = lambda column: known.get(column) or known.get(column[1:] if column[:1] in "sd" else "")
-    return {column: unit for column in columns if (unit := of(column))}
+    unit_of = dict.fromkeys((*"XYZ", *EXTERIOR[:3], "distance", "nearer", "farther"), length)
+    unit_of |= dict.fromkeys((*EXTERIOR[3:], "su"), angle)
+    unit_of |= dict.fromkeys(("rms", "x", "y"), adjustment.image_unit)
+    unit_of_column = lambda column: (
+        unit_of.get(column) or unit_of.get(column[1:] if column[:1] in "sd" else "")
+    )
+    return {column: unit for column in columns if (unit := unit_of_column(column))}
 
 
 def _rays_and_rms(
     adjustment: "Adjustment", of_ray: Int[np.ndarray, " rays"], n: int
 ) -> dict[str, np.ndarray]:
     """Columns rays and rms (of v, image unit) by the index `of_ray` of every ray."""
-    weight, used = adjustment.problem.image_weights, adjustment.problem.used_coordinates
-    v = adjustment.inspection.image_residuals / np.where(used, weight, 1.0)
-    squares = np.bincount(of_ray, (v**2 * used).sum(1), minlength=n)
-    number = np.bincount(of_ray, used.sum(1), minlength=n)
+    weight, has_weight = adjustment.problem.image_weights, adjustment.problem.used_coordinates
+    v = adjustment.inspection.image_residuals / np.where(has_weight, weight, 1.0)
+    squares = np.bincount(of_ray, (v**2 * has_weight).sum(1), minlength=n)
+    number = np.bincount(of_ray, has_weight.sum(1), minlength=n)
     return {
-        "rays": np.bincount(of_ray, used.any(1), minlength=n).astype(int),
+        "rays": np.bincount(of_ray, has_weight.any(1), minlength=n).astype(int),
         "rms": np.sqrt(np.where(number > 0, squares, np.nan) / np.maximum(number, 1)),
     }
 
@@ -160,8 +166,8 @@ def residuals(adjustment: "Adjustment") -> dict[str, np.ndarray]:
     """One row per observation: kind, image, point, axis, unit, v, sigma (a priori), r, w (Baarda),
     tau (Pope), mdb, external, and weight (the factor) after robust estimation; image observations
     first, in the given order."""
-    found = adjustment.reliability
-    parts = observations(adjustment.problem, *(getattr(found, name) for name in TESTED))
+    tests = adjustment.reliability
+    parts = observations(adjustment.problem, *(getattr(tests, name) for name in TESTED))
     return concatenate([residual_rows(adjustment, part) for part in parts])
 
 
@@ -171,10 +177,13 @@ def measured_values(problem: NetworkProblem) -> np.ndarray:
     blank = lambda name: np.full(problem.weights(name).shape, np.nan)
     measured = {o.name: blank(o.name) for o in problem.observations}
     for name in ("control", "distance", *problem.further_sets):
-        given = problem.data.measured.get(name)
-        if isinstance(given, jax.Array | np.ndarray) and given.size == measured[name].size:
+        measured_rows = problem.data.measured.get(name)
+        if (
+            isinstance(measured_rows, jax.Array | np.ndarray)
+            and measured_rows.size == measured[name].size
+        ):
             origin = problem.origin if name == "control" else 0.0
-            measured[name] = np.reshape(given, measured[name].shape) + origin
+            measured[name] = np.reshape(measured_rows, measured[name].shape) + origin
     columns = []
     for part in observations(problem, measured):
         values = problem.image_coordinates() if part.kind == "image" else part.quantities[0]
@@ -200,61 +209,71 @@ class KindRows(NamedTuple):
     units: Sequence[tuple[float, str]]
 
 
-def observations(problem: NetworkProblem, *found: BySet) -> Iterator[KindRows]:
-    """Every kind of observation, with the part of each of `found`."""
+def observations(problem: NetworkProblem, *quantities_by_set: BySet) -> Iterator[KindRows]:
+    """Every kind of observation, with the part of each of `quantities_by_set`."""
     network = problem.network
     images = np.array(network.images.id, dtype=object)
     points = np.array(network.points.id, dtype=object)
     cameras = np.array([c.id for c in network.cameras], dtype=object)
     blank = lambda rows: np.full(rows, "", dtype=object)
-    known = {o.name: o for o in problem.observations}
+    sets = {o.name: o for o in problem.observations}
 
     words = unit_words(network)
 
     def quantities(name: str) -> tuple[np.ndarray, tuple[np.ndarray, ...], list]:
-        weights, units = problem.weights(name), known[name].kind.units
-        every = [units] * weights.shape[1] if isinstance(units, str) else units
-        rows = tuple(np.asarray(rows[name]) for rows in found)
-        return weights, rows, [words.get(unit, (1.0, "")) for unit in every]
+        weights, units = problem.weights(name), sets[name].kind.units
+        unit_of_axis = [units] * weights.shape[1] if isinstance(units, str) else units
+        rows = tuple(np.asarray(rows[name]) for rows in quantities_by_set)
+        return weights, rows, [words.get(unit, (1.0, "")) for unit in unit_of_axis]
 
-    weight, *rows = (np.asarray(problem.image_points(x)) for x in (problem.data.weight, *found))
+    weight, *rows = (
+        np.asarray(problem.image_points(x)) for x in (problem.data.weight, *quantities_by_set)
+    )
     of_image, of_point = images[problem.image], points[problem.point]
     units = [words["image"]] * 2
     yield KindRows("image", of_image, of_point, ("x", "y"), weight, tuple(rows), units)
-    if "control" in known:
-        control = points[known["control"].rows[0]]
+    if "control" in sets:
+        control = points[sets["control"].rows[0]]
         yield KindRows(
             "control", blank(len(control)), control, tuple("XYZ"), *quantities("control")
         )
-    if "exterior" in known:
-        exterior = images[known["exterior"].rows[0]]
+    if "exterior" in sets:
+        exterior = images[sets["exterior"].rows[0]]
         yield KindRows("prior", exterior, blank(len(exterior)), EXTERIOR, *quantities("exterior"))
     for table in problem.cameras:
         name = table.interior_set
-        if name in known:
-            own = cameras[table.cameras[known[name].rows[0]]]
-            yield KindRows("prior", own, blank(len(own)), table.parameters, *quantities(name))
+        if name in sets:
+            camera_names = cameras[table.cameras[sets[name].rows[0]]]
+            yield KindRows(
+                "prior", camera_names, blank(len(camera_names)), table.parameters, *quantities(name)
+            )
     for name in problem.further_sets:
-        yield KindRows(*_of_further_kind(problem, known[name]), *quantities(name))
-    if "distance" in known:
+        yield KindRows(*_of_further_kind(problem, sets[name]), *quantities(name))
+    if "distance" in sets:
         a, b = (points[network.distances.points[:, i]] for i in range(2))
         yield KindRows("distance", a, b, ("d",), *quantities("distance"))
 
 
 def _of_further_kind(
-    problem: NetworkProblem, given: ObservationSet
+    problem: NetworkProblem, observation_set: ObservationSet
 ) -> tuple[str, np.ndarray, np.ndarray, tuple[str, ...]]:
     """The rows that observations of a further kind touch are in the column of the point."""
-    if {*given.kind.of} == {"point"}:
+    if {*observation_set.kind.of} == {"point"}:
         ids = problem.table("point").label
-        touched = [" – ".join(ids(int(row)) for row in rows) for rows in zip(*given.rows)]
+        touched_labels = [
+            " – ".join(ids(int(row)) for row in rows) for rows in zip(*observation_set.rows)
+        ]
     else:
-        touched = [given.label(problem.tables, row) for row in range(given.number)]
-        touched = [label.removeprefix(f"{given.kind.name} of ") for label in touched]
-    width = problem.weights(given.name).shape[1]
-    axes = given.kind.axes or tuple(str(i + 1) for i in range(width))
-    blank = np.full(given.number, "", dtype=object)
-    return given.kind.name, blank, np.array(touched, dtype=object), axes
+        touched_labels = [
+            observation_set.label(problem.tables, row) for row in range(observation_set.number)
+        ]
+        touched_labels = [
+            label.removeprefix(f"{observation_set.kind.name} of ") for label in touched_labels
+        ]
+    width = problem.weights(observation_set.name).shape[1]
+    axes = observation_set.kind.axes or tuple(str(i + 1) for i in range(width))
+    blank = np.full(observation_set.number, "", dtype=object)
+    return observation_set.kind.name, blank, np.array(touched_labels, dtype=object), axes
 
 
 def further_estimates(adjustment: "Adjustment") -> list[Estimate]:
@@ -264,60 +283,60 @@ def further_estimates(adjustment: "Adjustment") -> list[Estimate]:
     if not names:
         return []
     words = unit_words(adjustment.network)
-    found = estimates(adjustment.cofactors.solution, names, adjustment.sigma0, origin)
-    scaled = ((one, *words.get(one.unit, (1.0, ""))) for one in found)
+    all_estimates = estimates(adjustment.cofactors.solution, names, adjustment.sigma0, origin)
+    scaled = ((estimate, *words.get(estimate.unit, (1.0, ""))) for estimate in all_estimates)
     return [
-        one._replace(value=one.value * scale, sigma=one.sigma * scale, unit=word)
-        for one, scale, word in scaled
+        estimate._replace(value=estimate.value * scale, sigma=estimate.sigma * scale, unit=word)
+        for estimate, scale, word in scaled
     ]
 
 
 def further_unknowns(adjustment: "Adjustment") -> dict[str, dict]:
     """By table, row and name: value and sigma, like `Adjustment.further_unknowns`."""
-    found: dict[str, dict] = {}
-    for one in adjustment.further_estimates:
-        row = found.setdefault(one.table, {}).setdefault(one.row, {})
-        row[one.name] = {"value": one.value, "sigma": one.sigma}
-    return found
+    by_table: dict[str, dict] = {}
+    for estimate in adjustment.further_estimates:
+        row = by_table.setdefault(estimate.table, {}).setdefault(estimate.row, {})
+        row[estimate.name] = {"value": estimate.value, "sigma": estimate.sigma}
+    return by_table
 
 
 def checks(adjustment: "Adjustment") -> dict[str, np.ndarray]:
     """The check points, if any: columns id, X, Y, Z, dX, dY, dZ (against the given
     coordinates), sX, sY, sZ, rays."""
-    found = adjustment.check_points
-    if found is None:
+    check_points = adjustment.check_points
+    if check_points is None:
         return {}
-    sigma = _sigma(found.covariance)
-    table = {"id": np.array(found.id, dtype=object)}
-    table |= {axis: found.position[:, i] for i, axis in enumerate("XYZ")}
-    table |= {f"d{axis}": found.difference[:, i] for i, axis in enumerate("XYZ")}
+    sigma = _sigma(check_points.covariance)
+    table = {"id": np.array(check_points.id, dtype=object)}
+    table |= {axis: check_points.position[:, i] for i, axis in enumerate("XYZ")}
+    table |= {f"d{axis}": check_points.difference[:, i] for i, axis in enumerate("XYZ")}
     table |= {f"s{axis}": sigma[:, i] for i, axis in enumerate("XYZ")}
-    return table | {"rays": found.rays}
+    return table | {"rays": check_points.rays}
 
 
 def control(adjustment: "Adjustment") -> dict[str, np.ndarray]:
     """Control points predicted from all other observations, if any: columns id, dX, dY, dZ
     (predicted − given), sX, sY, sZ, probability (of a larger error by chance)."""
-    found = adjustment.control_prediction
-    if found is None:
+    prediction = adjustment.control_prediction
+    if prediction is None:
         return {}
-    table = {"id": np.array(found.id, dtype=object)}
-    table |= {f"d{axis}": found.error[:, i] for i, axis in enumerate("XYZ")}
-    table |= {f"s{axis}": found.sigma[:, i] for i, axis in enumerate("XYZ")}
-    return table | {"probability": found.probability}
+    table = {"id": np.array(prediction.id, dtype=object)}
+    table |= {f"d{axis}": prediction.error[:, i] for i, axis in enumerate("XYZ")}
+    table |= {f"s{axis}": prediction.sigma[:, i] for i, axis in enumerate("XYZ")}
+    return table | {"probability": prediction.probability}
 
 
 def control_measurements(adjustment: "Adjustment") -> dict[str, np.ndarray]:
     """Image measurements of control predicted from all other observations, if any: columns image,
     point, dx, dy (predicted − measured, image unit), sx, sy, probability."""
-    found = adjustment.control_prediction
-    if found is None or not found.measurement:
+    prediction = adjustment.control_prediction
+    if prediction is None or not prediction.measurement:
         return {}
-    image, point = zip(*found.measurement)
+    image, point = zip(*prediction.measurement)
     table = {"image": np.array(image, dtype=object), "point": np.array(point, dtype=object)}
-    table |= {f"d{axis}": found.image_error[:, i] for i, axis in enumerate("xy")}
-    table |= {f"s{axis}": found.image_sigma[:, i] for i, axis in enumerate("xy")}
-    return table | {"probability": found.image_probability}
+    table |= {f"d{axis}": prediction.image_error[:, i] for i, axis in enumerate("xy")}
+    table |= {f"s{axis}": prediction.image_sigma[:, i] for i, axis in enumerate("xy")}
+    return table | {"probability": prediction.image_probability}
 
 
 # Of `Reliability`, what a row of residuals is made of.
@@ -343,8 +362,8 @@ def residual_rows(adjustment: TestedResult, part: KindRows) -> dict[str, np.ndar
     kind, axes = part.kind, part.axes
     free = np.clip(1 - hat, 0, 1)
     unit, words = (np.array(x) for x in zip(*part.units))
-    used = part.inverse_sigma > 0
-    sigma = np.where(used, unit / np.where(used, part.inverse_sigma, 1), np.nan)
+    has_weight = part.inverse_sigma > 0
+    sigma = np.where(has_weight, unit / np.where(has_weight, part.inverse_sigma, 1), np.nan)
     repeat = lambda ids: np.repeat(ids, len(axes))
     columns = {
         "kind": np.full(sigma.size, kind, dtype=object),
@@ -357,13 +376,13 @@ def residual_rows(adjustment: TestedResult, part: KindRows) -> dict[str, np.ndar
         "r": r.ravel(),
         "w": w.ravel(),
         "tau": adjustment.pope(w).ravel(),
-        "mdb": minimal_detectable(sigma / np.where(used, gain, 1.0), free).ravel(),
+        "mdb": minimal_detectable(sigma / np.where(has_weight, gain, 1.0), free).ravel(),
         "external": external_reliability(free).ravel(),
     }
     if adjustment.weights is not None:
         factor = adjustment.weights if kind == "image" else np.ones(len(part.image))
         columns["weight"] = repeat(factor)
-    return {name: column[used.ravel()] for name, column in columns.items()}
+    return {name: column[has_weight.ravel()] for name, column in columns.items()}
 
 
 def _significance(value: float, sigma: float) -> float:

@@ -129,15 +129,15 @@ def network_fingerprint(network: Network) -> str:
 
 def with_named_models(network: Network) -> Network:
     """The network with the names of own camera models for the models."""
-    named = lambda model: model.name if isinstance(model, CameraModel) else model
-    cameras = (dataclasses.replace(c, model=named(c.model)) for c in network.cameras)
+    name_of_model = lambda model: model.name if isinstance(model, CameraModel) else model
+    cameras = (dataclasses.replace(c, model=name_of_model(c.model)) for c in network.cameras)
     return network.replace(cameras=tuple(cameras))
 
 
 def with_own_models(network: Network, models: Sequence[CameraModel]) -> Network:
     """The network with these camera models for their names."""
-    own = {model.name: model for model in models}
-    model = lambda camera: own.get(str(camera.model), camera.model)
+    own_models = {model.name: model for model in models}
+    model = lambda camera: own_models.get(str(camera.model), camera.model)
     cameras = (dataclasses.replace(c, model=model(c)) for c in network.cameras)
     return network.replace(cameras=tuple(cameras))
 
@@ -151,8 +151,8 @@ def store(adjustment: Any, path: str | Path) -> None:
     problem, minimum = adjustment.problem, adjustment.minimum
     network = problem.network
     # Own camera models are functions, which a file cannot hold without executing it when read.
-    own = {get_model(c.model).name for c in network.cameras if is_own(get_model(c.model))}
-    named = (
+    own_models = {get_model(c.model).name for c in network.cameras if is_own(get_model(c.model))}
+    names_of_notes = (
         "removed",
         "eliminated",
         "method",
@@ -165,15 +165,15 @@ def store(adjustment: Any, path: str | Path) -> None:
         "halves_by",
         "second_minima",
     )
-    notes = {name: getattr(adjustment, name) for name in named}
-    found = Stored(
+    notes = {name: getattr(adjustment, name) for name in names_of_notes}
+    stored = Stored(
         FORMAT,
         __version__,
         adjustment.fingerprint,
         adjustment.sigma0,
         with_named_models(network),
         adjustment.check,
-        tuple(sorted(own)),
+        tuple(sorted(own_models)),
         _state(problem, minimum),
         notes | {"doubts": adjustment.given_doubts},
         adjustment.weights,
@@ -181,7 +181,7 @@ def store(adjustment: Any, path: str | Path) -> None:
         _error_model(adjustment),
         adjustment.replication and dataclasses.replace(adjustment.replication, model=None),
     )
-    write_tree(path, found, CLASSES)
+    write_tree(path, stored, CLASSES)
 
 
 def _error_model(adjustment: Any) -> StoredErrorModel | None:

@@ -94,8 +94,8 @@ class UncertaintyBudget(TableMethods):
         share = np.zeros(len(self.measurands))
         for lines in pools.values():
             share += sum(line.contribution**2 for line in lines) ** 2 / lines[0].degrees
-        known = share > 0
-        return np.where(known, self.combined**4 / np.where(known, share, 1.0), np.inf)
+        is_known = share > 0
+        return np.where(is_known, self.combined**4 / np.where(is_known, share, 1.0), np.inf)
 
     @property
     def k(self) -> Float[np.ndarray, " measurands"]:
@@ -111,7 +111,7 @@ class UncertaintyBudget(TableMethods):
         """The index of a measurand; by default the first.
 
         **Raises:** `KeyError` for one that has no budget."""
-        names = [one.name for one in self.measurands]
+        names = [measurand.name for measurand in self.measurands]
         if name is not None and name not in names:
             raise KeyError(f"there is no budget of {name!r}; known: {', '.join(names)}")
         return 0 if name is None else names.index(name)
@@ -122,13 +122,13 @@ class UncertaintyBudget(TableMethods):
         k, expanded (of the whole)."""
         rows, combined, degrees = [], self.combined, self.degrees
         k, expanded, nan = self.k, self.expanded, math.nan
-        for m, one in enumerate(self.measurands):
+        for m, measurand in enumerate(self.measurands):
             total = max(combined[m] ** 2, 1e-300)
             for line in self.lines:
                 u = line.contribution[m]
                 rows.append(
                     (
-                        one.name,
+                        measurand.name,
                         line.words,
                         line.number,
                         line.kind,
@@ -145,14 +145,14 @@ class UncertaintyBudget(TableMethods):
                 )
             rows.append(
                 (
-                    one.name,
+                    measurand.name,
                     TOTAL,
                     sum(line.number for line in self.lines),
                     "",
                     "",
                     degrees[m],
                     nan,
-                    one.unit,
+                    measurand.unit,
                     nan,
                     combined[m],
                     1.0,
@@ -177,10 +177,10 @@ class UncertaintyBudget(TableMethods):
 
     def rows(self, m: int = 0) -> list[tuple[str, ...]]:
         """The lines of a measurand as text, under `HEADER`."""
-        total, found = max(self.combined[m] ** 2, 1e-300), []
+        total, text_rows = max(self.combined[m] ** 2, 1e-300), []
         for line in self.lines:
             u = float(line.contribution[m])
-            found.append(
+            text_rows.append(
                 (
                     f"{line.number} × {line.words}" if line.number > 1 else line.words,
                     line.kind,
@@ -192,28 +192,28 @@ class UncertaintyBudget(TableMethods):
                     f"{100 * u * u / total:.1f}",
                 )
             )
-        return found
+        return text_rows
 
     def result_rows(self) -> list[tuple[str, ...]]:
         """Every measurand with u_c, ν_eff, k and U as text, under `RESULT_HEADER`; U with two
         digits, the value to the same place (GUM 7.2.6)."""
         rows = []
-        for one, u, nu, k, U in zip(
+        for measurand, u, nu, k, U in zip(
             self.measurands, self.combined, self.degrees, self.k, self.expanded
         ):
-            value, said = estimate(one.value, float(U), 2)
-            shown = "∞" if nu > MANY_DEGREES else f"{nu:.0f}"
+            value, value_text = estimate(measurand.value, float(U), 2)
+            degrees_text = "∞" if nu > MANY_DEGREES else f"{nu:.0f}"
             # u in the form of U: both with an exponent, or none
-            combined = f"{u:.2e}" if "e" in said else significant(float(u))
+            combined = f"{u:.2e}" if "e" in value_text else significant(float(u))
             rows.append(
                 (
-                    one.words,
+                    measurand.words,
                     value,
-                    said,
-                    one.unit,
+                    value_text,
+                    measurand.unit,
                     combined,
                     f"{k:.2f}",
-                    shown,
+                    degrees_text,
                 )
             )
         return rows
@@ -232,12 +232,12 @@ class UncertaintyBudget(TableMethods):
             }
             for line in self.lines
         ]
-        found = {}
-        for m, one in enumerate(self.measurands):
+        budgets = {}
+        for m, measurand in enumerate(self.measurands):
             parts = [(line.sensitivity[m], line.contribution[m]) for line in self.lines]
-            found[one.name] = {
-                "value": one.value,
-                "unit": one.unit,
+            budgets[measurand.name] = {
+                "value": measurand.value,
+                "unit": measurand.unit,
                 "combined": float(self.combined[m]),
                 "degrees": float(self.degrees[m]),
                 "k": float(self.k[m]),
@@ -246,7 +246,7 @@ class UncertaintyBudget(TableMethods):
                 "sensitivity": [float(c) for c, _ in parts],
                 "contribution": [float(u) for _, u in parts],
             }
-        return {"coverage": self.coverage, "inputs": lines, "measurands": found}
+        return {"coverage": self.coverage, "inputs": lines, "measurands": budgets}
 
     def __str__(self) -> str:
         percent = f"{100 * self.coverage:.4g} %"
@@ -254,8 +254,8 @@ class UncertaintyBudget(TableMethods):
             f"Expanded uncertainties of {percent}",
             *table(RESULT_HEADER, self.result_rows(), "lrrlrrr"),
         ]
-        for m, one in enumerate(self.measurands):
-            lines += ["", f"Budget of {one.words}", *table(HEADER, self.rows(m), "lllrrrrr")]
+        for m, measurand in enumerate(self.measurands):
+            lines += ["", f"Budget of {measurand.words}", *table(HEADER, self.rows(m), "lllrrrrr")]
         return "\n".join(lines)
 
 
@@ -325,13 +325,13 @@ def uncertainty_budget(
         raise InputError(f"coverage must be between 0 and 1, but is {coverage:g}")
     inspection = adjustment.cofactors
     results = request_results(inspection, IndependentErrors(inspection.solution, 1.0), of)
-    if any(len(range(one.numbers.stop)[one.numbers]) > 1 for one in results.asked):
+    if any(len(range(request.numbers.stop)[request.numbers]) > 1 for request in results.asked):
         raise InputError("name single results, such as point:7:Z; a mean over all has no budget")
     measurands = _measurands(adjustment, results, units)
-    factor = np.array([one.factor for one in measurands])
-    found = inspection.solution
-    slopes = {t: np.asarray(x) for t, x in found.jacobian_of(results.function).items()}
-    by_set = pull_back(found, slopes)
+    factor = np.array([request.factor for request in measurands])
+    solution = inspection.solution
+    slopes = {t: np.asarray(x) for t, x in solution.jacobian_of(results.function).items()}
+    by_set = pull_back(solution, slopes)
     parts = list(
         observations(
             inspection.problem,
@@ -368,26 +368,30 @@ def _measurands(
 ) -> tuple[Measurand, ...]:
     """The requested results with their values and units."""
     values = np.asarray(results.function(adjustment.values))
-    named = [units] * len(results.asked) if isinstance(units, str) else list(units)
-    if len(named) != len(results.asked):
-        raise InputError(f"units: {len(named)} of {len(results.asked)} results are given")
-    found = []
-    for one, unit in zip(results.asked, named):
-        value = float(values[one.numbers][0])
-        if one.angle:
+    units_of_results = [units] * len(results.asked) if isinstance(units, str) else list(units)
+    if len(units_of_results) != len(results.asked):
+        raise InputError(
+            f"units: {len(units_of_results)} of {len(results.asked)} results are given"
+        )
+    measurands = []
+    for request, unit in zip(results.asked, units_of_results):
+        value = float(values[request.numbers][0])
+        if request.angle:
             scale = adjustment.angle_scale
             unit = adjustment.network.angle_unit
-            found.append(Measurand(one.name, one.words, value * scale, unit, scale))
+            measurands.append(Measurand(request.name, request.words, value * scale, unit, scale))
             continue
-        if ":" in one.name:
-            value, unit = _named(adjustment, one, value)
-        found.append(Measurand(one.name, one.words, value, unit))
-    return tuple(found)
+        if ":" in request.name:
+            value, unit = _value_of_name(adjustment, request, value)
+        measurands.append(Measurand(request.name, request.words, value, unit))
+    return tuple(measurands)
 
 
-def _named(adjustment: Adjustment, one: RequestedResult, value: float) -> tuple[float, str]:
+def _value_of_name(
+    adjustment: Adjustment, request: RequestedResult, value: float
+) -> tuple[float, str]:
     """The value of a named result in its frame, and its unit."""
-    kind, id, parameter = split_name(one.name)
+    kind, id, parameter = split_name(request.name)
     if kind == "camera":
         camera = next(c for c in adjustment.problem.network.cameras if c.id == id)
         return value, unit_of_parameter(camera.model, parameter)

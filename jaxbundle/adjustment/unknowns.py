@@ -31,18 +31,18 @@ def find_unknowns(problem: NetworkProblem, names: Sequence[tuple[str, str, str]]
     for an unknown name."""
     if not isinstance(names, list | tuple):
         raise InputError(f"covariance: expected a list of names, got {show(names)}")
-    given: Sequence[Any] = names or (None,)
-    for name in given:
+    requested: Sequence[Any] = names or (None,)
+    for name in requested:
         if name is None or isinstance(name, str) or np.shape(name) != (3,):
-            said = "none is given" if name is None else f"one is {show(name)}"
+            fault = "none is given" if name is None else f"one is {show(name)}"
             raise InputError(
                 'covariance: expected names of unknowns, such as ("camera", "cam", "c") or '
-                f'("point", "7", "Z"), but {said}'
+                f'("point", "7", "Z"), but {fault}'
             )
-    wanted = [Name(*map(str, name)) for name in names]
-    for name in wanted:
+    unknowns = [Name(*map(str, name)) for name in names]
+    for name in unknowns:
         value_of(problem, name, problem.data.start)
-    return wanted
+    return unknowns
 
 
 def require_located(problem: NetworkProblem, name: Name) -> None:
@@ -77,13 +77,13 @@ def value_of(problem: NetworkProblem, name: Name, values: Values):
 
 
 def angles_near(
-    rotation: Float[AnyArray, "4"], d_theta: Float[AnyArray, "3"], given: Float[AnyArray, "3"]
+    rotation: Float[AnyArray, "4"], d_theta: Float[AnyArray, "3"], reference: Float[AnyArray, "3"]
 ) -> Float[Array, "3"]:
     """ω, φ, κ after a small rotation, on the same turn and branch as the given ones."""
     # ω, φ, κ jump by whole turns and have two branches: reported angles stay near those of the
     # network.
     return omega_phi_kappa_near(
-        matrix_from_quaternion(retract_quaternion(rotation, d_theta)), given
+        matrix_from_quaternion(retract_quaternion(rotation, d_theta)), reference
     )
 
 
@@ -92,6 +92,6 @@ def place_of(name: str, names: Sequence[str], thing: str) -> int:
 
     **Raises:** `KeyError` if it is missing, with the closest existing name."""
     if name not in names:
-        known = did_you_mean(name, names, listing=len(names) <= 20)
-        raise KeyError(f"there is no {thing} {name!r}{known}")
+        suggestion = did_you_mean(name, names, listing=len(names) <= 20)
+        raise KeyError(f"there is no {thing} {name!r}{suggestion}")
     return names.index(name)

@@ -9,26 +9,26 @@ from jaxbundle.network.blunders import Removed, Suspect, either_of
 from jaxbundle.types import not_none
 
 
-def name_removed(problem: NetworkProblem, found: snooping.RemovedRow) -> Removed:
+def name_removed(problem: NetworkProblem, removed_row: snooping.RemovedRow) -> Removed:
     """Observations removed by data snooping, with names."""
-    kind, rows = _place(problem, found.set, found.rows)
-    names = [_name(problem, found.set, row, found.residual) for row in found.rows]
+    kind, rows = _place(problem, removed_row.set, removed_row.rows)
+    names = [_name(problem, removed_row.set, row, removed_row.residual) for row in removed_row.rows]
     # Control points lose single axes: their rows count axes, three a point.
     if kind == "control":
-        rows = tuple(3 * row + not_none(found.residual) for row in rows)
-    return Removed(kind, rows[0], either_of(names), found.test, rows[1:])
+        rows = tuple(3 * row + not_none(removed_row.residual) for row in rows)
+    return Removed(kind, rows[0], either_of(names), removed_row.test, rows[1:])
 
 
 def image_points_removed(
-    problem: NetworkProblem, named: Iterable[tuple[str, str]]
+    problem: NetworkProblem, pairs_of_ids: Iterable[tuple[str, str]]
 ) -> list[snooping.RemovedRow]:
     """Image points, by image and point id, as removals for data snooping."""
-    named = set(named)
-    if not named:
+    pairs_of_ids = set(pairs_of_ids)
+    if not pairs_of_ids:
         return []
     images, points = problem.network.images.id, problem.network.points.id
     places = zip(problem.image.tolist(), problem.point.tolist())
-    rows = {k for k, (i, p) in enumerate(places) if (images[i], points[p]) in named}
+    rows = {k for k, (i, p) in enumerate(places) if (images[i], points[p]) in pairs_of_ids}
     return [
         snooping.RemovedRow(name, row, None, math.inf)
         for name, places in problem.image_rows.items()
@@ -37,11 +37,11 @@ def image_points_removed(
     ]
 
 
-def name_suspect(problem: NetworkProblem, found: robust.SuspectRow) -> Suspect:
+def name_suspect(problem: NetworkProblem, suspect_row: robust.SuspectRow) -> Suspect:
     """Suspects of the robust estimation, with names."""
-    kind, rows = _place(problem, found.set, (found.row,))
-    name = _name(problem, found.set, found.row, None)
-    return Suspect(kind, rows[0], name, found.test, found.weight)
+    kind, rows = _place(problem, suspect_row.set, (suspect_row.row,))
+    name = _name(problem, suspect_row.set, suspect_row.row, None)
+    return Suspect(kind, rows[0], name, suspect_row.test, suspect_row.weight)
 
 
 def _place(problem: NetworkProblem, name: str, rows: Sequence[int]) -> tuple[str, tuple[int, ...]]:
@@ -55,14 +55,16 @@ def _place(problem: NetworkProblem, name: str, rows: Sequence[int]) -> tuple[str
 
 def _name(problem: NetworkProblem, name: str, row: int, residual: int | None) -> str:
     kind, (place,) = _place(problem, name, (row,))
-    network, given = problem.network, problem.observations_of(name)
+    network, observation_set = problem.network, problem.observations_of(name)
     points = network.points.id
     if kind == "image":
         image = network.images.id[problem.image[place]]
         return f"point {points[problem.point[place]]} in image {image}"
     if kind == "control":
-        return f"{'XYZ'[not_none(residual)]} of control point {points[given.rows[0][row]]}"
+        return (
+            f"{'XYZ'[not_none(residual)]} of control point {points[observation_set.rows[0][row]]}"
+        )
     if kind == "distance":
         a, b = (points[int(p)] for p in network.distances.points[place])
         return f"distance {a}–{b}"
-    return given.label(problem.tables, row)
+    return observation_set.label(problem.tables, row)

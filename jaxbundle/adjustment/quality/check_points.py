@@ -44,9 +44,9 @@ class CheckPoints:
     @property
     def rms(self) -> Float[np.ndarray, "3"]:
         """RMS of the differences in X, Y, Z, in the object unit; NaN if none is known."""
-        known = np.isfinite(self.difference)
+        is_known = np.isfinite(self.difference)
         with np.errstate(invalid="ignore"):
-            return np.sqrt(np.where(known, self.difference**2, 0.0).sum(0) / known.sum(0))
+            return np.sqrt(np.where(is_known, self.difference**2, 0.0).sum(0) / is_known.sum(0))
 
 
 def intersect_check_points(
@@ -96,22 +96,22 @@ def _modelled_covariance(
     settings: CorrelationSettings,
 ) -> Float[np.ndarray, "points 3 3"]:
     """The covariance of check points by the errors of the network and of their own rays."""
-    own = Solution(checks, determined.values)
+    own_solution = Solution(checks, determined.values)
     components = joint_components(
-        (inspection.solution, inspection.problem), (own, checks), settings
+        (inspection.solution, inspection.problem), (own_solution, checks), settings
     )
     joint = dataclasses.replace(model, components=tuple(components))
-    starts = first_rows(own)
-    size = sum(np.asarray(v).size for v in own.residuals.values())
+    starts = first_rows(own_solution)
+    size = sum(np.asarray(v).size for v in own_solution.residuals.values())
     number = len(determined.inverse)
     D = np.zeros((number, 3, size))
-    for name, E in own.jacobian_eliminated.items():
+    for name, E in own_solution.jacobian_eliminated.items():
         point = checks.point[checks.image_rows[name]]
         for axis in range(E.shape[1]):
             rows = starts[name] + E.shape[1] * np.arange(len(E)) + axis
             D[point, :, rows] = np.einsum("nij,nj->ni", determined.inverse[point], E[:, axis])
-    found = np.zeros((number, 3, 3))
+    covariance = np.zeros((number, 3, 3))
     for k in range(number):
         of_network = effects(inspection.solution, determined.functions[k])
-        found[k] = joint.of_effects(np.concatenate([-of_network, D[k]], 1))
-    return found
+        covariance[k] = joint.of_effects(np.concatenate([-of_network, D[k]], 1))
+    return covariance

@@ -75,9 +75,9 @@ def predict_control(
     if not any(o.name == "control" for o in problem.observations):
         return None
     ids, points = _predict_points(inspection, sigma0, model)
-    most = max_measurements if model is None else max_modelled
+    max_rays = max_measurements if model is None else max_modelled
     rays = np.flatnonzero(problem.network.points.has_role("control", "fixed")[problem.point])
-    rays = rays if len(rays) <= most else rays[:0]
+    rays = rays if len(rays) <= max_rays else rays[:0]
     return ControlPrediction(ids, *points, *predict_measurements(inspection, sigma0, rays, model))
 
 
@@ -97,10 +97,10 @@ def _predict_points(
     v = inspection.residuals["control"]
     C: Any = [None] * len(rows)
     if model is not None:
-        first = first_rows(inspection.solution)["control"]
-        C = model.covariances_of_residuals(first + np.arange(3 * len(rows)).reshape(-1, 3))
-    found = [_delete(v[k], H[k], weight[k], sigma0, freedom, C[k]) for k in range(len(rows))]
-    return tuple(ids[row] for row in rows), _collect(found, 3)
+        first_row = first_rows(inspection.solution)["control"]
+        C = model.covariances_of_residuals(first_row + np.arange(3 * len(rows)).reshape(-1, 3))
+    predictions = [_delete(v[k], H[k], weight[k], sigma0, freedom, C[k]) for k in range(len(rows))]
+    return tuple(ids[row] for row in rows), _collect(predictions, 3)
 
 
 def predict_measurements(
@@ -118,14 +118,16 @@ def predict_measurements(
     v, h, joint = (
         np.asarray(problem.image_points(x)) for x in (tested.residual, tested.hat, tested.joint)
     )
-    found, C = [], None
+    predictions, C = [], None
     if model is not None:
-        first = first_row_of_rays(inspection.solution, problem)[rays]
-        C = model.covariances_of_residuals(first[:, None] + np.arange(2))
+        first_row = first_row_of_rays(inspection.solution, problem)[rays]
+        C = model.covariances_of_residuals(first_row[:, None] + np.arange(2))
     for n, k in enumerate(rays.tolist()):
         H = np.diag(h[k]) + joint[k] * (1 - np.eye(2))
-        found.append(_delete(v[k], H, weight[k], sigma0, freedom, None if C is None else C[n]))
-    return (_names(problem, rays), *_collect(found, 2))
+        predictions.append(
+            _delete(v[k], H, weight[k], sigma0, freedom, None if C is None else C[n])
+        )
+    return (_names(problem, rays), *_collect(predictions, 2))
 
 
 def _names(problem: NetworkProblem, rays: np.ndarray) -> tuple[tuple[str, str], ...]:
@@ -147,37 +149,53 @@ def _delete(
     """Error and σ of the prediction of one group of observations, and the probability of a larger
     T = eᵀ·Q_e⁻¹·e/σ0²; `weight`: 1/σ, 0 of what is no observation; `modelled`: covariance of the
     residuals by an error model."""
-    used = np.flatnonzero(weight > 0)
+    has_weight = np.flatnonzero(weight > 0)
     error, sigma = np.full((2, len(v)), np.nan)
-    remains, directions = np.linalg.eigh(np.eye(len(used)) - H[np.ix_(used, used)])
-    seen = remains > MIN_REDUNDANCY
-    if not seen.any():
+    redundancies, directions = np.linalg.eigh(
+        np.eye(len(has_weight)) - H[np.ix_(has_weight, has_weight)]
+    )
+    is_controlled = redundancies > MIN_REDUNDANCY
+    if not is_controlled.any():
         return error, sigma, np.nan
-    known = (np.abs(directions[:, ~seen]) < OPEN_PART).all(1)
-    E = directions[:, seen]
-    along = E.T @ v[used] / remains[seen]
-    unit = 1 / weight[used]
-    error[used[known]] = (unit * (E @ along))[known]
+    is_predicted = (np.abs(directions[:, ~is_controlled]) < OPEN_PART).all(1)
+    E = directions[:, is_controlled]
+    components = E.T @ v[has_weight] / redundancies[is_controlled]
+    unit = 1 / weight[has_weight]
+    error[has_weight[is_predicted]] = (unit * (E @ components))[is_predicted]
     if modelled is not None:
-        C = E.T @ modelled[np.ix_(used, used)] @ E / np.outer(remains[seen], remains[seen])
-        sigma[used[known]] = (unit * np.sqrt(np.einsum("ik,kl,il->i", E, C, E)))[known]
-        if not known.any():
+        C = (
+            E.T
+            @ modelled[np.ix_(has_weight, has_weight)]
+            @ E
+            / np.outer(redundancies[is_controlled], redundancies[is_controlled])
+        )
+        sigma[has_weight[is_predicted]] = (unit * np.sqrt(np.einsum("ik,kl,il->i", E, C, E)))[
+            is_predicted
+        ]
+        if not is_predicted.any():
             return error, sigma, np.nan
         # The sizes of the components are those of all observations: this group hardly changes them.
-        return error, sigma, chi2_tail(float(along @ np.linalg.solve(C, along)), int(seen.sum()))
-    cofactor = (E**2 / remains[seen]).sum(1)
-    sigma[used[known]] = (sigma0 * unit * np.sqrt(cofactor))[known]
-    T, k = float((along**2 * remains[seen]).sum()) / sigma0**2, int(seen.sum())
+        return (
+            error,
+            sigma,
+            chi2_tail(float(components @ np.linalg.solve(C, components)), int(is_controlled.sum())),
+        )
+    cofactor = (E**2 / redundancies[is_controlled]).sum(1)
+    sigma[has_weight[is_predicted]] = (sigma0 * unit * np.sqrt(cofactor))[is_predicted]
+    T, k = (
+        float((components**2 * redundancies[is_controlled]).sum()) / sigma0**2,
+        int(is_controlled.sum()),
+    )
     # σ0 contains the residuals of the group: it is the larger, the worse the group is
-    rest = freedom - k
-    if rest <= 0 or not known.any():
+    remaining_freedom = freedom - k
+    if remaining_freedom <= 0 or not is_predicted.any():
         return error, sigma, np.nan
-    others = max((freedom - T) / rest, 1e-12)
-    return error, sigma, f_tail(T / k / others, k, rest)
+    variance_of_others = max((freedom - T) / remaining_freedom, 1e-12)
+    return error, sigma, f_tail(T / k / variance_of_others, k, remaining_freedom)
 
 
-def _collect(found: list, width: int) -> Prediction:
-    if not found:
+def _collect(predictions: list, width: int) -> Prediction:
+    if not predictions:
         return np.zeros((0, width)), np.zeros((0, width)), np.zeros(0)
-    error, sigma, probability = zip(*found)
+    error, sigma, probability = zip(*predictions)
     return np.array(error), np.array(sigma), np.array(probability)

@@ -125,69 +125,71 @@ class ImageRows:
         return sp.csr_matrix((data, indices, start), shape=(self.number, width))
 
 
-def first_row_of_rays(found: Solution, problem: NetworkProblem) -> Int[np.ndarray, " rays"]:
+def first_row_of_rays(solution: Solution, problem: NetworkProblem) -> Int[np.ndarray, " rays"]:
     """The row of x of every image point among the rows of all observations; that of y is the
     next."""
-    starts = first_rows(found)
+    starts = first_rows(solution)
     row = np.zeros(len(problem.image), int)
     for name, rays in problem.image_rows.items():
         row[rays] = starts[name] + 2 * np.arange(len(rays))
     return row
 
 
-def image_rows(found: Solution, problem: NetworkProblem) -> ImageRows:
+def image_rows(solution: Solution, problem: NetworkProblem) -> ImageRows:
     """The rows of the image points that take part, at their computed image coordinates.
 
     At the measured ones a component such as x·∂v/∂c would contain the errors themselves, and its
     quadratic form vᵀv: a principal distance that changes between photographs leaves so little in
     residuals that 0.5 pixels of it were found in 1280 views with independent errors of 0.2."""
-    row, weight = first_row_of_rays(found, problem), problem.image_weights
-    used = (weight > 0).all(1)
-    number = sum(np.asarray(v).size for v in found.residuals.values())
-    v = problem.image_points(found.residuals) / np.where(weight > 0, weight, 1.0)
+    row, weight = first_row_of_rays(solution, problem), problem.image_weights
+    has_weight = (weight > 0).all(1)
+    number = sum(np.asarray(v).size for v in solution.residuals.values())
+    v = problem.image_points(solution.residuals) / np.where(weight > 0, weight, 1.0)
     xy = problem.image_coordinates() + v  # computed − measured
     return ImageRows(
-        row[used],
-        problem.image[used],
-        problem.point[used],
-        problem.camera[used],
-        xy[used],
-        1 / weight[used],
+        row[has_weight],
+        problem.image[has_weight],
+        problem.point[has_weight],
+        problem.camera[has_weight],
+        xy[has_weight],
+        1 / weight[has_weight],
         number,
     )
 
 
 def error_components(
-    found: Solution, problem: NetworkProblem, settings: CorrelationSettings = DEFAULTS
+    solution: Solution, problem: NetworkProblem, settings: CorrelationSettings = DEFAULTS
 ) -> list[ErrorComponent]:
     """The components that the image points of a network can show."""
-    rays = image_rows(found, problem)
-    components = components_of(rays, _scene(found), problem.network.cameras, settings)
-    return with_given_points_and_others(components, rays, found, settings)
+    rays = image_rows(solution, problem)
+    components = components_of(rays, _scene(solution), problem.network.cameras, settings)
+    return with_given_points_and_others(components, rays, solution, settings)
 
 
 def with_given_points_and_others(
     components: list[ErrorComponent],
     rays: ImageRows,
-    found: Solution,
+    solution: Solution,
     settings: CorrelationSettings,
 ) -> list[ErrorComponent]:
     """Components of image points, that of given points, and that of all other observations, where
     there are any."""
     import scipy.sparse as sp
 
-    chosen = settings.octaves, settings.min_given_points
-    given = given_points_components(found, rays.row, rays.point, rays.sigma, *chosen)
-    components = [*components, *given]
+    options = settings.octaves, settings.min_given_points
+    given_points = given_points_components(solution, rays.row, rays.point, rays.sigma, *options)
+    components = [*components, *given_points]
 
-    free = _have_weight(found)
-    free[np.concatenate([rays.row, rays.row + 1])] = False
-    others = np.flatnonzero(free)
-    if components and len(others):
+    has_weight = _have_weight(solution)
+    has_weight[np.concatenate([rays.row, rays.row + 1])] = False
+    other_rows = np.flatnonzero(has_weight)
+    if components and len(other_rows):
         # Control, priors, positions: their σ are not those of image points.
-        shape = (rays.number, len(others))
-        one = sp.csr_matrix((np.ones(len(others)), (others, np.arange(len(others)))), shape=shape)
-        return [*components, ErrorComponent(OTHERS, "σ", one)]
+        shape = (rays.number, len(other_rows))
+        unit_root = sp.csr_matrix(
+            (np.ones(len(other_rows)), (other_rows, np.arange(len(other_rows)))), shape=shape
+        )
+        return [*components, ErrorComponent(OTHERS, "σ", unit_root)]
     return components
 
 
@@ -200,22 +202,29 @@ def joint_components(
     points that take no part in it."""
     import scipy.sparse as sp
 
-    known = error_components(*network, settings)
-    rays, more = (image_rows(*one) for one in (network, checks))
-    scene, own = (_scene(one) for one, _ in (network, checks))
+    components_of_network = error_components(*network, settings)
+    rays, check_rays = (image_rows(*part) for part in (network, checks))
+    scene, check_scene = (_scene(part) for part, _ in (network, checks))
     joint = ImageRows(
-        np.concatenate([rays.row, rays.number + more.row]),
-        np.concatenate([rays.image, more.image]),
-        np.concatenate([rays.point, len(scene.points) + more.point]),
-        np.concatenate([rays.camera, more.camera]),
-        np.concatenate([rays.xy, more.xy]),
-        np.concatenate([rays.sigma, more.sigma]),
-        rays.number + more.number,
+        np.concatenate([rays.row, rays.number + check_rays.row]),
+        np.concatenate([rays.image, check_rays.image]),
+        np.concatenate([rays.point, len(scene.points) + check_rays.point]),
+        np.concatenate([rays.camera, check_rays.camera]),
+        np.concatenate([rays.xy, check_rays.xy]),
+        np.concatenate([rays.sigma, check_rays.sigma]),
+        rays.number + check_rays.number,
     )
-    scene = scene._replace(points=np.concatenate([scene.points, own.points]))
-    found = {c.name: c for c in components_of(joint, scene, network[1].network.cameras, settings)}
-    below = lambda root: sp.vstack([root, sp.csr_matrix((more.number, root.shape[1]))]).tocsr()
-    return [found.get(c.name) or c._replace(root=below(c.root)) for c in known]
+    scene = scene._replace(points=np.concatenate([scene.points, check_scene.points]))
+    component_of = {
+        c.name: c for c in components_of(joint, scene, network[1].network.cameras, settings)
+    }
+    padded_below = lambda root: sp.vstack(
+        [root, sp.csr_matrix((check_rays.number, root.shape[1]))]
+    ).tocsr()
+    return [
+        component_of.get(c.name) or c._replace(root=padded_below(c.root))
+        for c in components_of_network
+    ]
 
 
 class StationsAndPoints(NamedTuple):
@@ -225,9 +234,9 @@ class StationsAndPoints(NamedTuple):
     points: Float[np.ndarray, "points 3"]
 
 
-def _scene(found: Solution) -> StationsAndPoints:
-    X = np.asarray(found.values["point"])[:, :3]
-    return StationsAndPoints(np.asarray(found.values["image"].position), X)
+def _scene(solution: Solution) -> StationsAndPoints:
+    X = np.asarray(solution.values["point"])[:, :3]
+    return StationsAndPoints(np.asarray(solution.values["image"].position), X)
 
 
 def components_of(
@@ -238,51 +247,53 @@ def components_of(
 ) -> list[ErrorComponent]:
     """The components of image points."""
     components: list[ErrorComponent] = []
-    several = len(cameras) > 1
+    has_several = len(cameras) > 1
     for c, camera in enumerate(cameras):
-        of = rays.camera == c
-        if len(np.unique(rays.image[of])) < settings.min_images:
+        is_of_camera = rays.camera == c
+        if len(np.unique(rays.image[is_of_camera])) < settings.min_images:
             continue
-        name = f" of {camera.id}" if several else ""
-        here = np.flatnonzero(of)
-        middle, half = _frame(rays.xy[here])
-        at = (rays.xy[here] - middle) / half
-        if len(here) >= settings.min_points_of_field:
-            components.append(_field(rays, here, at, f"field on the sensor{name}", settings))
+        name = f" of {camera.id}" if has_several else ""
+        rays_of_camera = np.flatnonzero(is_of_camera)
+        middle, half_size = _frame(rays.xy[rays_of_camera])
+        normalised = (rays.xy[rays_of_camera] - middle) / half_size
+        if len(rays_of_camera) >= settings.min_points_of_field:
+            components.append(
+                _field(rays, rays_of_camera, normalised, f"field on the sensor{name}", settings)
+            )
         # Displacements at the edge of the measured area, x or y = 1, of size 1.
-        used, image = np.unique(rays.image[here], return_inverse=True)
-        number, (x, y), one = len(used), at.T, np.ones(len(at))
-        first, second = image, number + image
-        for what, columns, values in (
-            ("principal point by photograph", [[first], [second]], [[one], [one]]),
-            ("principal distance by photograph", [[first], [first]], [[x], [y]]),
-            ("affine by photograph", [[first, second]] * 2, [[x, y], [-y, x]]),
+        photographs, image = np.unique(rays.image[rays_of_camera], return_inverse=True)
+        number, (x, y), ones = len(photographs), normalised.T, np.ones(len(normalised))
+        first_column, second_column = image, number + image
+        for effect, columns, values in (
+            ("principal point by photograph", [[first_column], [second_column]], [[ones], [ones]]),
+            ("principal distance by photograph", [[first_column], [first_column]], [[x], [y]]),
+            ("affine by photograph", [[first_column, second_column]] * 2, [[x, y], [-y, x]]),
         ):
             columns, values = (np.moveaxis(np.array(a), 2, 0) for a in (columns, values))
-            width = number * (1 + (what != "principal distance by photograph"))
-            root = rays.root(here, columns, values, width)
-            components.append(ErrorComponent(f"{what}{name}", IMAGE, root))
+            width = number * (1 + (effect != "principal distance by photograph"))
+            root = rays.root(rays_of_camera, columns, values, width)
+            components.append(ErrorComponent(f"{effect}{name}", IMAGE, root))
     if (track := _along_tracks(rays, scene, settings.reach)) is not None:
         components.append(track)
     return components
 
 
-def _have_weight(found: Solution) -> Bool[np.ndarray, " rows"]:
+def _have_weight(solution: Solution) -> Bool[np.ndarray, " rows"]:
     """Which rows of all observations take part."""
-    problem = found.problem
+    problem = solution.problem
     return np.concatenate([problem.weights(o.name).ravel() > 0 for o in problem.observations])
 
 
 def correlated_errors(
-    found: Solution, problem: NetworkProblem, settings: CorrelationSettings = DEFAULTS
+    solution: Solution, problem: NetworkProblem, settings: CorrelationSettings = DEFAULTS
 ) -> ErrorModel | None:
     """The error model of a network; None where its image points cannot show any component."""
-    components = error_components(found, problem, settings)
-    return fit_error_model(found, components, settings.estimation) if components else None
+    components = error_components(solution, problem, settings)
+    return fit_error_model(solution, components, settings.estimation) if components else None
 
 
 def stated_errors(
-    found: Solution,
+    solution: Solution,
     problem: NetworkProblem,
     sizes: Mapping[str, float],
     sigma0: float = 1.0,
@@ -297,7 +308,7 @@ def stated_errors(
     """
     # Nothing is estimated: any number of photographs will do.
     settings = dataclasses.replace(settings, min_images=1, min_points_of_knot=0)
-    components = error_components(found, problem, settings)
+    components = error_components(solution, problem, settings)
     theta, unknown = np.zeros(len(components) + 1), dict(sizes)
     theta[0] = _size(INDEPENDENT, unknown.pop(INDEPENDENT, sigma0)) ** 2
     for k, component in enumerate(components, 1):
@@ -309,12 +320,12 @@ def stated_errors(
             theta[k] = _size(name, sizes[name]) ** 2
             unknown.pop(name, None)
     if unknown:
-        known = [INDEPENDENT, *(c.name for c in components if c.name != OTHERS)]
+        known_names = [INDEPENDENT, *(c.name for c in components if c.name != OTHERS)]
         raise InputError(
             f"errors: no component {list_some([*unknown], 5, str)}; those of this network are "
-            f"{list_some(known, 20, str)}"
+            f"{list_some(known_names, 20, str)}"
         )
-    return stated_error_model(found, components, theta, settings.estimation)
+    return stated_error_model(solution, components, theta, settings.estimation)
 
 
 def _size(name: str, value: Any) -> float:
@@ -350,8 +361,10 @@ def root_of_octaves(settings: CorrelationSettings) -> Float[np.ndarray, "splines
     total = np.eye(finest[0] * finest[1])
     for octave in coarser:
         x, y = (
-            np.linalg.lstsq(cubic_splines(at, n), cubic_splines(at, m), rcond=None)[0]
-            for at, n, m in zip(places, finest, octave)
+            np.linalg.lstsq(
+                cubic_splines(places_on_axis, n), cubic_splines(places_on_axis, m), rcond=None
+            )[0]
+            for places_on_axis, n, m in zip(places, finest, octave)
         )
         total += np.kron(y @ y.T, x @ x.T)
     return np.linalg.cholesky(total)
@@ -359,20 +372,20 @@ def root_of_octaves(settings: CorrelationSettings) -> Float[np.ndarray, "splines
 
 def _field(
     rays: ImageRows,
-    here: Int[np.ndarray, " n"],
-    at: Float[np.ndarray, "n 2"],
+    rays_of_camera: Int[np.ndarray, " n"],
+    normalised: Float[np.ndarray, "n 2"],
     name: str,
     settings: CorrelationSettings,
 ) -> ErrorComponent:
     """A field on the sensor in x and one in y, by the finest splines, of which 16 are not zero at a
     point."""
-    knots, place = settings.knots, (at / _aspect(rays.xy[here]) + 1) / 2
+    knots, place = settings.knots, (normalised / _aspect(rays.xy[rays_of_camera]) + 1) / 2
     (x, of_x), (y, of_y) = (splines_of_point(u, number) for u, number in zip(place.T, knots))
-    values = (y[:, :, None] * x[:, None, :]).reshape(len(at), -1)
-    columns = (knots[0] * of_y[:, :, None] + of_x[:, None, :]).reshape(len(at), -1)
+    values = (y[:, :, None] * x[:, None, :]).reshape(len(normalised), -1)
+    columns = (knots[0] * of_y[:, :, None] + of_x[:, None, :]).reshape(len(normalised), -1)
     number, root = knots[0] * knots[1], root_of_octaves(settings)
-    both = np.stack([columns, number + columns], 1)
-    B = rays.root(here, both, np.stack([values, values], 1), 2 * number)
+    both_columns = np.stack([columns, number + columns], 1)
+    B = rays.root(rays_of_camera, both_columns, np.stack([values, values], 1), 2 * number)
     # √θ is then the RMS of the field, not the σ of its coefficients: Σ_i Σ_j (x_i·y_j)²
     square = 0.0
     for octave in settings.octaves_of_knots:
@@ -408,21 +421,26 @@ def _along_tracks(rays: ImageRows, scene: StationsAndPoints, reach: float) -> Er
     depth = float(np.nanmedian(np.linalg.norm(X[rays.point] - station[rays.image], axis=1)))
     if not (np.isfinite(depth) and depth > 0):
         return None
-    rows, columns, values, first = [], [], [], 0
+    rows, columns, values, first_column = [], [], [], 0
     for k in np.unique(count[count > 1]):
-        of = order[start[count == k][:, None] + np.arange(k)]
-        image = rays.image[of]
+        tracks = order[start[count == k][:, None] + np.arange(k)]
+        image = rays.image[tracks]
         # A root of each block by its eigenvalues: two images of one station are one.
-        apart = np.linalg.norm(station[image][:, :, None] - station[image][:, None], axis=3)
-        w, E = np.linalg.eigh(wendland(apart / (reach * depth)))
+        distances = np.linalg.norm(station[image][:, :, None] - station[image][:, None], axis=3)
+        w, E = np.linalg.eigh(wendland(distances / (reach * depth)))
         root = E * np.sqrt(np.clip(w, 0, None))[:, None, :]
-        column = first + np.arange(of.size).reshape(of.shape)
-        rows.append(np.broadcast_to(rays.row[of][:, :, None], root.shape).ravel())
+        column = first_column + np.arange(tracks.size).reshape(tracks.shape)
+        rows.append(np.broadcast_to(rays.row[tracks][:, :, None], root.shape).ravel())
         columns.append(np.broadcast_to(column[:, None, :], root.shape).ravel())
         values.append(root.ravel())
-        first += of.size
+        first_column += tracks.size
     row, column, value = (np.concatenate(x) for x in (rows, columns, values))
     # x, and y
-    both = np.concatenate([row, row + 1]), np.concatenate([column, first + column])
-    root = sp.csr_matrix((np.tile(value, 2), both), shape=(rays.number, 2 * first))
+    rows_and_columns = (
+        np.concatenate([row, row + 1]),
+        np.concatenate([column, first_column + column]),
+    )
+    root = sp.csr_matrix(
+        (np.tile(value, 2), rows_and_columns), shape=(rays.number, 2 * first_column)
+    )
     return ErrorComponent("along tracks", "σ", root)

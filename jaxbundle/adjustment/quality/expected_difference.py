@@ -40,15 +40,20 @@ def expected_difference(
     **Returns:** NaN where the difference is undefined.
     """
     xy = np.stack(np.meshgrid(comparison.x, comparison.y), -1).reshape(-1, 2)
-    there = xy + comparison.difference.reshape(-1, 2)
+    image_in_b = xy + comparison.difference.reshape(-1, 2)
     frame, total = "rotation" if rotate else "camera", 0.0
-    for (model, given), (names, C), at in ((a, covariances[0], xy), (b, covariances[1], there)):
+    for (model, stated), (names, C), places in (
+        (a, covariances[0], xy),
+        (b, covariances[1], image_in_b),
+    ):
         shift, step = between_frames(model, a[0], image_size, pixel_size)
-        values = {**default_parameters(model), **given}
+        values = {**default_parameters(model), **stated}
         p = np.array([values[name] for name in model.parameters], float)
         free = tuple(model.parameters.index(name) for name in names)
-        own = interior_covariance_of_images(model, p, free, C, (at - shift) / step, frame)
-        total = total + step[:, None] * own * step
-    return np.where(np.isfinite(there)[:, :, None], total, np.nan).reshape(
+        own_covariance = interior_covariance_of_images(
+            model, p, free, C, (places - shift) / step, frame
+        )
+        total = total + step[:, None] * own_covariance * step
+    return np.where(np.isfinite(image_in_b)[:, :, None], total, np.nan).reshape(
         *comparison.length.shape, 2, 2
     )

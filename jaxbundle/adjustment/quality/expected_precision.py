@@ -55,14 +55,14 @@ def expected_precision(
     problem = with_factor(make_problem(check_network(network)))
     if problem.reduction not in FACTORS:
         raise InputError("the planned network is too large for its covariance; plan a part of it")
-    found = Inspection(problem, problem.data.start)
-    if not found.determined:
+    inspection = Inspection(problem, problem.data.start)
+    if not inspection.determined:
         raise InputError("the planned network is not fully determined; plan more overlap")
-    operator: Errors = IndependentErrors(found.solution, 1.0)
+    operator: Errors = IndependentErrors(inspection.solution, 1.0)
     if errors:
         # Of image coordinates as they are expected: components refer to places on the sensor.
-        given = with_data(problem, predict(problem, problem.data))
-        operator = stated_errors(Solution(given, given.data.start), given, errors)
+        predicted = with_data(problem, predict(problem, problem.data))
+        operator = stated_errors(Solution(predicted, predicted.data.start), predicted, errors)
     sigma = lambda C: np.sqrt(np.clip(np.diagonal(np.asarray(C), axis1=1, axis2=2), 0, None))
     points = problem.network.points
     return ExpectedPrecision(

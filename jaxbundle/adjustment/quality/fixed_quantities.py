@@ -56,34 +56,34 @@ def find_causes(problem: NetworkProblem, values: Values, held: Mapping[Any, Any]
             'held: expected σ of held quantities by name, such as {"camera:cam:K3": 1e-6}; '
             f"got {show(held)}"
         )
-    return [_cause(problem, values, name, given) for name, given in held.items()]
+    return [_cause(problem, values, name, amount) for name, amount in held.items()]
 
 
-def _cause(problem: NetworkProblem, values: Values, name: Any, given: Any) -> Cause:
-    if isinstance(given, Mapping):
-        return _common(problem, values, str(name), given)
+def _cause(problem: NetworkProblem, values: Values, name: Any, amount: Any) -> Cause:
+    if isinstance(amount, Mapping):
+        return _common(problem, values, str(name), amount)
     kind, id, parameter = split_name(name)
     text = ":".join((kind, id, parameter))
-    sigma = positive(f"the σ of {text}", given)
-    found = _held_places(problem, kind, id, parameter)
+    sigma = positive(f"the σ of {text}", amount)
+    places = _held_places(problem, kind, id, parameter)
     errors = tuple(
         ((table.name, row, _scale(sigma, _direction(table, values, row, column))),)
-        for table, row, column, _ in found
+        for table, row, column, _ in places
     )
     # σ is that of one error; a name with * stands for as many independent errors.
-    table, row, _, of = found[0]
-    words = f"{of} of {table.title} {table.label(row)}"
-    if len(found) > 1:
-        words = f"{len(found)} × {text}"
-    angle = all(of in ANGLES for *_, of in found)
+    table, row, _, parameter_name = places[0]
+    words = f"{parameter_name} of {table.title} {table.label(row)}"
+    if len(places) > 1:
+        words = f"{len(places)} × {text}"
+    angle = all(parameter_name in ANGLES for *_, parameter_name in places)
     return Cause(text, words, sigma, angle, errors)
 
 
-def _common(problem: NetworkProblem, values: Values, name: str, given: Mapping) -> Cause:
+def _common(problem: NetworkProblem, values: Values, name: str, amounts: Mapping) -> Cause:
     """One error common to many held quantities: by name, the change of each."""
     change = []
-    for one, amount in given.items():
-        kind, id, parameter = split_name(one)
+    for full_name, amount in amounts.items():
+        kind, id, parameter = split_name(full_name)
         amount = number(f"{name}, {':'.join((kind, id, parameter))}", amount)
         change += [
             (table.name, row, _scale(amount, _direction(table, values, row, column)))
@@ -100,8 +100,8 @@ def split_name(name: Any) -> tuple[str, str, str]:
     **Raises:** `InputError`."""
     parts = name
     if isinstance(name, str):
-        kind, _, rest = name.partition(":")
-        id, _, parameter = rest.rpartition(":")
+        kind, _, after_kind = name.partition(":")
+        id, _, parameter = after_kind.rpartition(":")
         parts = kind, id, parameter
     if not isinstance(parts, tuple) or len(parts) != 3 or not all(map(str, parts)):
         raise InputError(f"{show(name)}: expected KIND:ID:NAME, such as camera:cam:K3 or point:*:Z")
@@ -124,36 +124,36 @@ def _held_places(
         raise InputError(
             f"{text}: there is no {kind} {id!r}{did_you_mean(id, ids, listing=len(ids) <= 20)}"
         )
-    known, found = [], []
+    known_names, held_places = [], []
     for table in tables:
         names = _names(problem, table)
-        known += [name for name in names if name not in known]
+        known_names += [name for name in names if name not in known_names]
         for row in rows_of(table):
             if id not in (WILDCARD, table.label(row)):
                 continue
-            for column, of in enumerate(names):
-                if parameter not in (WILDCARD, of):
+            for column, parameter_name in enumerate(names):
+                if parameter not in (WILDCARD, parameter_name):
                     continue
-                place = table, row, column, of
-                (estimated if _is_free(table, row, column) else found).append(place)
-    if not found and not estimated:
-        raise InputError(f"{text}: there is no {parameter!r}{did_you_mean(parameter, known)}")
-    if not found:
+                place = table, row, column, parameter_name
+                (estimated if _is_free(table, row, column) else held_places).append(place)
+    if not held_places and not estimated:
+        raise InputError(f"{text}: there is no {parameter!r}{did_you_mean(parameter, known_names)}")
+    if not held_places:
         raise InputError(
             f"{text}: is estimated, and its σ is in the result; a budget is for held quantities"
         )
-    return found
+    return held_places
 
 
 def _tables_of(problem: NetworkProblem, kind: str) -> list[Table]:
     tables = problem.tables
-    found = [t for t in tables if t.title == kind or t.name == kind]
+    tables_of_kind = [t for t in tables if t.title == kind or t.name == kind]
     if kind == "camera":
-        found = [problem.table(t.name) for t in problem.cameras]
-    if not found:
-        known = dict.fromkeys(["camera", "image", "point", *(t.name for t in tables)])
-        raise InputError(f"held: unknown kind {kind!r}; known: {list_some(known, 12, str)}")
-    return found
+        tables_of_kind = [problem.table(t.name) for t in problem.cameras]
+    if not tables_of_kind:
+        known_kinds = dict.fromkeys(["camera", "image", "point", *(t.name for t in tables)])
+        raise InputError(f"held: unknown kind {kind!r}; known: {list_some(known_kinds, 12, str)}")
+    return tables_of_kind
 
 
 def _names(problem: NetworkProblem, table: Table) -> tuple[str, ...]:
@@ -179,7 +179,7 @@ def _is_free(table: Table, row: int, column: int) -> bool:
     if isinstance(table.space, Pose):
         return bool(free[column] if column < 3 else free[3:].any())
     if isinstance(table.space, Vector):
-        return any(free[k] for moved, k in zip(*table.space.moves) if moved == column)
+        return any(free[k] for moved_column, k in zip(*table.space.moves) if moved_column == column)
     return bool(free.any())
 
 
@@ -188,10 +188,10 @@ def _direction(table: Table, values: Values, row: int, column: int) -> Any:
     quaternion."""
     value = jax.tree.map(lambda x: np.asarray(x)[row], values[table.name])
     if isinstance(value, PoseValue):
-        still = jax.tree.map(np.zeros_like, value)
+        zero = jax.tree.map(np.zeros_like, value)
         if column < 3:
-            return still._replace(position=np.eye(3)[column])
-        return still._replace(rotation=np.asarray(_turns(value.rotation))[column - 3])
+            return zero._replace(position=np.eye(3)[column])
+        return zero._replace(rotation=np.asarray(_turns(value.rotation))[column - 3])
     if isinstance(table.space, Rotation):
         return np.asarray(_turns(value))[column]
     return np.ones(()) if np.ndim(value) == 0 else np.eye(len(value))[column]

@@ -38,26 +38,26 @@ class Estimate(NamedTuple):
 
 
 def estimates(
-    found: Solution, names: Collection[str], sigma0: float, origin: Float[np.ndarray, "3"]
+    solution: Solution, names: Collection[str], sigma0: float, origin: Float[np.ndarray, "3"]
 ) -> list[Estimate]:
     """All unknowns of some tables. Frames and poses are given as X0, Y0, Z0 in object space
     (mountings, ports and cameras of a robot in
     their own frames), ω, φ, κ."""
-    every = []
-    for table in (t for t in found.problem.tables if t.name in names):
-        values, Q = found.values[table.name], np.asarray(found.cofactor(table.name))
-        shown, A = map(np.array, _read_rows(table.space, values))
+    all_estimates = []
+    for table in (t for t in solution.problem.tables if t.name in names):
+        values, Q = solution.values[table.name], np.asarray(solution.cofactor(table.name))
+        numbers, A = map(np.array, _read_rows(table.space, values))
         if isinstance(values, PoseValue) and table.name not in RELATIVE:
-            shown[:, :3] += origin
+            numbers[:, :3] += origin
         variance = np.einsum("nij,njk,nik->ni", A, Q, A)
         sigma = sigma0 * np.sqrt(np.clip(variance, 0, None))
-        labels, units = _names_and_units(table, shown.shape[1])
-        every += [
-            Estimate(table.name, table.label(row), *one)
+        labels, units = _names_and_units(table, numbers.shape[1])
+        all_estimates += [
+            Estimate(table.name, table.label(row), *fields)
             for row in range(table.rows)
-            for one in zip(labels, shown[row].tolist(), sigma[row].tolist(), units)
+            for fields in zip(labels, numbers[row].tolist(), sigma[row].tolist(), units)
         ]
-    return every
+    return all_estimates
 
 
 @partial(compile_once, static=0)
@@ -68,21 +68,21 @@ def _read_rows(
     width]."""
 
     def of_row(value: Any) -> tuple[Float[Array, " n"], Float[Array, "n width"]]:
-        near = _read(space, value, jnp.zeros(3))[-3:]  # of angles, the same after a change
+        reference = _read_row(space, value, jnp.zeros(3))[-3:]  # of angles, the same after a change
         # σ of what is reported, by the derivative of the reported numbers along the changes: a
         # rotation changes by δθ, and is reported as angles.
-        change = lambda d: _read(space, space.retract(value, d), near)
-        return _read(space, value, near), jax.jacfwd(change)(jnp.zeros(space.width))
+        change = lambda d: _read_row(space, space.retract(value, d), reference)
+        return _read_row(space, value, reference), jax.jacfwd(change)(jnp.zeros(space.width))
 
     return jax.vmap(of_row)(values)
 
 
-def _read(space: Space, value: Any, near: Float[Array, "3"]) -> Float[Array, " n"]:
-    """A row as reported numbers; `near`: choose the angles nearest to these."""
+def _read_row(space: Space, value: Any, reference: Float[Array, "3"]) -> Float[Array, " n"]:
+    """A row as reported numbers; `reference`: choose the angles nearest to these."""
     if isinstance(value, PoseValue):
-        return jnp.concatenate([value.position, _angles(value.rotation, near)])
+        return jnp.concatenate([value.position, _angles(value.rotation, reference)])
     if isinstance(space, Rotation):
-        return _angles(value, near)
+        return _angles(value, reference)
     return jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(value)])
 
 
@@ -92,14 +92,14 @@ def _names_and_units(table: Table, size: int) -> tuple[Sequence[str], Sequence[s
         return ("X0", "Y0", "Z0", *ANGLES), ("length",) * 3 + ("angle",) * 3
     if isinstance(table.space, Rotation):
         return ANGLES, ("angle",) * 3
-    named = len(table.parameters) == size
-    names = table.parameters if named else [str(k + 1) for k in range(size)]
+    has_names = len(table.parameters) == size
+    names = table.parameters if has_names else [str(k + 1) for k in range(size)]
     if table.units:
         return names, (table.units,) * size if isinstance(table.units, str) else table.units
-    known: dict[str, str] = dict.fromkeys(LENGTHS, "length")
-    known |= dict.fromkeys(INSTRUMENT_ANGLES, "angle")
-    return names, [known.get(name, "") for name in names]
+    unit_of: dict[str, str] = dict.fromkeys(LENGTHS, "length")
+    unit_of |= dict.fromkeys(INSTRUMENT_ANGLES, "angle")
+    return names, [unit_of.get(name, "") for name in names]
 
 
-def _angles(q: Float[AnyArray, "4"], near: Float[AnyArray, "3"]) -> Float[Array, "3"]:
-    return omega_phi_kappa_near(matrix_from_quaternion(q), near)
+def _angles(q: Float[AnyArray, "4"], reference: Float[AnyArray, "3"]) -> Float[Array, "3"]:
+    return omega_phi_kappa_near(matrix_from_quaternion(q), reference)

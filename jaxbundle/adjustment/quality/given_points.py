@@ -30,7 +30,7 @@ GIVEN_POINTS = ("given points in plane", "given points out of plane")
 
 
 def given_points_components(
-    found: Solution,
+    solution: Solution,
     rows: Int[np.ndarray, " rays"],
     point: Int[np.ndarray, " rays"],
     sigma: Float[np.ndarray, "rays 2"],
@@ -45,29 +45,29 @@ def given_points_components(
     """
     import scipy.sparse as sp
 
-    X = np.asarray(found.values["point"])
-    held = ~np.asarray(found.problem.table("point").free, bool).any(axis=1)
-    given = held & (np.bincount(point, minlength=len(X)) > 1)
-    chosen = np.flatnonzero(given)
-    if X.shape[1] != 3 or len(chosen) < min_points:
+    X = np.asarray(solution.values["point"])
+    is_held = ~np.asarray(solution.problem.table("point").free, bool).any(axis=1)
+    is_given = is_held & (np.bincount(point, minlength=len(X)) > 1)
+    given_rows = np.flatnonzero(is_given)
+    if X.shape[1] != 3 or len(given_rows) < min_points:
         return []
-    apart = np.linalg.norm(X[chosen][:, None] - X[chosen], axis=2)
-    K = correlation_of_points(apart, apart.max(), np.eye(len(chosen)), octaves)
+    distances = np.linalg.norm(X[given_rows][:, None] - X[given_rows], axis=2)
+    K = correlation_of_points(distances, distances.max(), np.eye(len(given_rows)), octaves)
     L = np.linalg.cholesky(K)
-    own = given[point]
-    column = np.searchsorted(chosen, point[own])
-    rows = np.concatenate([rows[own], rows[own] + 1])
-    number = sum(np.asarray(v).size for v in found.residuals.values())
+    is_of_given = is_given[point]
+    column = np.searchsorted(given_rows, point[is_of_given])
+    rows = np.concatenate([rows[is_of_given], rows[is_of_given] + 1])
+    number = sum(np.asarray(v).size for v in solution.residuals.values())
     # The normal of the plane is the last.
-    axes = np.linalg.svd(X[chosen] - X[chosen].mean(0), full_matrices=True)[2]
+    axes = np.linalg.svd(X[given_rows] - X[given_rows].mean(0), full_matrices=True)[2]
     parts = []
     for axis in axes:
-        change = residual_change(found, "point", given[:, None] * axis)
-        shape = (number, len(chosen))
+        change = residual_change(solution, "point", is_given[:, None] * axis)
+        shape = (number, len(given_rows))
         J = sp.csr_matrix((change[rows], (rows, np.tile(column, 2))), shape=shape)
         parts.append(J @ sp.csr_matrix(L))
     return [
-        _scaled(name, sp.hstack(some).tocsr(), rows, sigma[own].T.ravel())
+        _scaled(name, sp.hstack(some).tocsr(), rows, sigma[is_of_given].T.ravel())
         for name, some in zip(GIVEN_POINTS, (parts[:2], parts[2:]))
     ]
 
@@ -81,12 +81,15 @@ def _scaled(
 
 
 def correlation_of_points(
-    apart: Float[AnyArray, "n n"], extent: Scalar, own: Float[AnyArray, "n n"], octaves: int
+    distances: Float[AnyArray, "n n"],
+    extent: Scalar,
+    identity: Float[AnyArray, "n n"],
+    octaves: int,
 ) -> Float[AnyArray, "n n"]:
-    """K from the distances of the points and the extent of the object; `own`: the identity."""
+    """K from the distances of the points and the extent of the object; `identity`: the identity."""
     for k in range(octaves):
-        own = own + wendland(apart / (extent / 2**k))
-    return own / (1 + octaves)
+        identity = identity + wendland(distances / (extent / 2**k))
+    return identity / (1 + octaves)
 
 
 def wendland(distance: Float[AnyArray, "..."]) -> Float[AnyArray, "..."]:

@@ -61,11 +61,11 @@ class Inspection:
     def camera_cofactors(self) -> list[Float[np.ndarray, "k k"]]:
         """Cofactors of the parameters of every camera that are free in any camera of its model."""
         # By camera of the network, not by row of a table of one model.
-        found = [np.zeros((0, 0))] * len(self.problem.network.cameras)
+        cofactors = [np.zeros((0, 0))] * len(self.problem.network.cameras)
         for table in self.problem.cameras:
             for c, Q in zip(table.cameras, self.solution.cofactor(table.name)):
-                found[c] = Q
-        return found
+                cofactors[c] = Q
+        return cofactors
 
     @property
     def reliability(self) -> Reliability:

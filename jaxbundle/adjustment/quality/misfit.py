@@ -24,10 +24,12 @@ def doubt_of_baarda(
     )
     pope = "test with the a posteriori σ (--snooping pope)"
     if contradicts(scale, redundancy):
-        done = "removed good observations with the blunders" if scale > 1 else "passed blunders"
+        consequence = (
+            "removed good observations with the blunders" if scale > 1 else "passed blunders"
+        )
         return (
             f"Baarda's test trusts the a priori σ, but most residuals are {scale:.3g} times as "
-            f"large as they imply: it has {done} ({took}). {_remedy(scale)}, or {pope}"
+            f"large as they imply: it has {consequence} ({took}). {_remedy(scale)}, or {pope}"
         )
     if removed > max(LARGEST_FRACTION_REMOVED * rays, explained_by_chance(rays, by_chance)):
         return (
@@ -64,24 +66,26 @@ def doubt_of_fit(
     """
     if not (redundancy > 0 and contradicts(sigma0, redundancy)):
         return None
-    told = f"χ² test clearly failed: vᵀPv/redundancy is {sigma0**2:.3g} (σ0 {sigma0:.3g}), not 1"
+    beginning = (
+        f"χ² test clearly failed: vᵀPv/redundancy is {sigma0**2:.3g} (σ0 {sigma0:.3g}), not 1"
+    )
     if sigma0 < 1:
-        return f"{told}; likely cause: a priori σ that are too large. {_remedy(sigma0)}"
+        return f"{beginning}; likely cause: a priori σ that are too large. {_remedy(sigma0)}"
     sigma, blunders = "a priori σ that are too small", "blunders (--snooping pope)"
-    missing = "a camera parameter that is missing or held"
+    missing_parameter = "a camera parameter that is missing or held"
     mirrored = "image coordinates with a mirrored axis or in another unit"
     # The median does not see a few blunders, σ0 does: a large σ0 of good residuals are blunders.
     # Half: blunders then make three quarters of the sum of squares.
     if scale < CONTRADICTING_RATIO or scale < sigma0 / 2:
-        causes = [blunders, missing, sigma]
+        causes = [blunders, missing_parameter, sigma]
     elif scale > unrecognisable:
-        causes = [mirrored, missing, sigma, blunders]
+        causes = [mirrored, missing_parameter, sigma, blunders]
     else:
         sigma += f" (multiply them by {scale:.3g}, or --components)"
-        causes = [sigma, blunders, missing, mirrored]
+        causes = [sigma, blunders, missing_parameter, mirrored]
     if in_pixels:
         causes.insert(0, "a principal distance in pixels instead of mm")
-    return f"{told}; likely causes, the likeliest first: {', '.join(causes)}"
+    return f"{beginning}; likely causes, the likeliest first: {', '.join(causes)}"
 
 
 def doubt_of_unit(sigma0: float, redundancy: int, unit: str) -> str | None:

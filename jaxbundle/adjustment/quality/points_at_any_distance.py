@@ -57,21 +57,21 @@ def find_far_points(inspection: Inspection, errors: Errors) -> FarPoints | None:
     # Z.
     X = np.asarray(coordinates(inspection.adjusted))[rows]
     s = not_none(problem.lengths)[rows]
-    across, along = shares(X, s)
+    share_across, share_along = shares(X, s)
     C = errors.covariance("point")[rows]
-    ellipse = np.linalg.eigvalsh(C[:, :2, :2])[:, ::-1] * across[:, None] ** 2
-    there = is_at_infinity(X, s)
+    ellipse = np.linalg.eigvalsh(C[:, :2, :2])[:, ::-1] * share_across[:, None] ** 2
+    at_infinity = is_at_infinity(X, s)
     r = np.linalg.norm(X, axis=1)
-    sigma = along * np.sqrt(np.clip(C[:, 2, 2], 0, None))
+    sigma = share_along * np.sqrt(np.clip(C[:, 2, 2], 0, None))
     ids = problem.network.points.id
     return FarPoints(
         tuple(ids[p] for p in rows),
         problem.origin,
         X / r[:, None],
         np.sqrt(np.clip(ellipse, 0, None)),
-        np.where(there, 0.0, 1 / r),
-        np.where(there & (sigma == 0), np.nan, sigma),
-        there,
+        np.where(at_infinity, 0.0, 1 / r),
+        np.where(at_infinity & (sigma == 0), np.nan, sigma),
+        at_infinity,
     )
 
 

@@ -92,55 +92,61 @@ def precision(
     # Without the factor of the normal matrix there are no cofactors: it is planned for, even where
     # the iterations of an adjustment would do without.
     check_given(problem, data)
-    problem, wanted = with_factor(problem), [] if names == () else find_unknowns(problem, names)
+    problem, unknowns = with_factor(problem), [] if names == () else find_unknowns(problem, names)
     if problem.reduction not in FACTORS:
         raise InputError("precision: the network is too large for its covariance; use a part of it")
     data = problem.data if data is None else data
 
-    def named(values: Values) -> Float[Array, " names"]:
-        return jnp.stack([value_of(problem, name, values) for name in wanted])
+    def values_of_unknowns(values: Values) -> Float[Array, " names"]:
+        return jnp.stack([value_of(problem, name, values) for name in unknowns])
 
     if errors is not None:
-        return _under_errors(problem, data, named if wanted else None, float(sigma0), errors)
-    found = engine_precision(problem, predict(problem, data), named if wanted else None)
-    return _precision_of(problem, data, found.own, found.covariance, sigma0)
+        return _under_errors(
+            problem, data, values_of_unknowns if unknowns else None, float(sigma0), errors
+        )
+    precision_of_tables = engine_precision(
+        problem, predict(problem, data), values_of_unknowns if unknowns else None
+    )
+    return _precision_of(
+        problem, data, precision_of_tables.own, precision_of_tables.covariance, sigma0
+    )
 
 
 def _precision_of(
     problem: NetworkProblem,
     data: Data,
-    own: Mapping[str, Float[AnyArray, "rows width width"]],
+    cofactors: Mapping[str, Float[AnyArray, "rows width width"]],
     covariance: Float[AnyArray, "names names"],
     sigma0: float | Float[AnyArray, ""],
 ) -> Precision:
-    """The precision by the covariance blocks `own` of all tables, for σ0 = 1."""
-    of_points = problem.cofactors_of_coordinates(data.start["point"], own["point"])
+    """The precision by the covariance blocks `cofactors` of all tables, for σ0 = 1."""
+    of_points = problem.cofactors_of_coordinates(data.start["point"], cofactors["point"])
     rotation = data.start["image"].rotation
     return Precision(
-        images=_root(image_variances(problem.network.images.angles, rotation, own["image"]))
+        images=_root(image_variances(problem.network.images.angles, rotation, cofactors["image"]))
         * sigma0,
-        cameras=_camera_sigma(problem, data.start, own) * sigma0,
+        cameras=_camera_sigma(problem, data.start, cofactors) * sigma0,
         points=_root(jnp.diagonal(of_points, axis1=1, axis2=2)) * sigma0,
         covariance=covariance * jnp.square(sigma0),
         point_covariance=of_points * jnp.square(sigma0),
-        centre_covariance=own["image"][:, :3, :3] * jnp.square(sigma0),
+        centre_covariance=cofactors["image"][:, :3, :3] * jnp.square(sigma0),
     )
 
 
 def _under_errors(
     problem: NetworkProblem,
     data: Data,
-    named: Callable[[Values], Array] | None,
+    function: Callable[[Values], Array] | None,
     sigma0: float,
     sizes: Mapping[str, float],
 ) -> Precision:
     """The precision under errors of these sizes that image points share."""
-    given = with_data(problem, predict(problem, data))
-    found = Solution(given, data.start)
-    model = stated_errors(found, given, sizes, sigma0)
-    own = {table.name: model.covariance(table.name) for table in problem.tables}
-    covariance = np.zeros((0, 0)) if named is None else model.propagate(named)
-    return _precision_of(problem, data, own, covariance, 1.0)
+    predicted = with_data(problem, predict(problem, data))
+    solution = Solution(predicted, data.start)
+    model = stated_errors(solution, predicted, sizes, sigma0)
+    covariances = {table.name: model.covariance(table.name) for table in problem.tables}
+    covariance = np.zeros((0, 0)) if function is None else model.propagate(function)
+    return _precision_of(problem, data, covariances, covariance, 1.0)
 
 
 def redundancy(problem: NetworkProblem, data: Data | None = None) -> dict[str, Float[Array, "n r"]]:
@@ -158,9 +164,9 @@ def redundancy(problem: NetworkProblem, data: Data | None = None) -> dict[str, F
     if problem.reduction not in FACTORS:
         raise InputError("redundancy: the network is too large for its cofactors; use a part of it")
     data = problem.data if data is None else data
-    given = complete_data(problem, predict(problem, data))
-    found = engine_redundancy(problem.declared, problem.plan, given)
-    return {o.name: found[o.name][: o.number] for o in problem.observations}
+    predicted = complete_data(problem, predict(problem, data))
+    numbers = engine_redundancy(problem.declared, problem.plan, predicted)
+    return {o.name: numbers[o.name][: o.number] for o in problem.observations}
 
 
 def predict(problem: NetworkProblem, data: Data) -> Data:
@@ -171,20 +177,24 @@ def predict(problem: NetworkProblem, data: Data) -> Data:
             continue
         # A rolling shutter has further tables between image and camera; the prediction is that of
         # the middle line. Those of a refracting interface bend the ray.
-        seen = problem.observations_of(table.image_set)
-        image, *between, camera, point = seen.rows
+        image_points = problem.observations_of(table.image_set)
+        image, *touched, camera, point = image_points.rows
         interior, bend = data.start[table.name], None
-        if isinstance(seen.kind.residual, RefractedImagePoint):
-            bend = RayBending(seen.kind.residual.refraction, problem.table(seen.kind.of[1]).space)
-        found = _project(
+        if isinstance(image_points.kind.residual, RefractedImagePoint):
+            bend = RayBending(
+                image_points.kind.residual.refraction, problem.table(image_points.kind.of[1]).space
+            )
+        predicted = _project(
             cameras.get_model(table.model),
             bend,
             data.start,
             interior,
-            (image, camera, point, *(between[:1] if bend else ())),
+            (image, camera, point, *(touched[:1] if bend else ())),
         )
-        given = measured[table.image_set]
-        measured[table.image_set] = (found, given[1]) if isinstance(given, tuple) else found
+        planned = measured[table.image_set]
+        measured[table.image_set] = (
+            (predicted, planned[1]) if isinstance(planned, tuple) else predicted
+        )
     return dataclasses.replace(data, measured=measured)
 
 
@@ -206,20 +216,22 @@ def _project(
     """The image coordinates of a set of image points: `rows` of image, camera, point, and of the
     interface where there is one."""
 
-    def project_point(pose: Any, interior: Any, X: Any, *through: Any) -> Float[Array, "2"]:
+    def project_point(pose: Any, interior: Any, X: Any, *refraction: Any) -> Float[Array, "2"]:
         ray = Pose().prepare(pose).ray(X)
         if bend is not None:
-            interface, medium = through
+            interface, medium = refraction
             block = bend.space.prepare(interface)
             ray = bend.refraction(Pose().prepare(pose), block, tuple(medium), tuple(X))
         return jnp.stack(cameras.project(model, interior, *ray))
 
     image, camera, point, *interface = rows
-    of = lambda name, row: jax.tree.map(lambda rows: jnp.asarray(rows)[row], values[name])
+    rows_of = lambda name, row: jax.tree.map(lambda rows: jnp.asarray(rows)[row], values[name])
     points = jnp.asarray(values["point"])[point, :3]
-    through = [of(name, interface[0]) for name in (bend.refraction.table, MEDIA)] if bend else []
+    refraction = (
+        [rows_of(name, interface[0]) for name in (bend.refraction.table, MEDIA)] if bend else []
+    )
     return jax.vmap(project_point)(
-        of("image", image), jnp.asarray(interior)[camera], points, *through
+        rows_of("image", image), jnp.asarray(interior)[camera], points, *refraction
     )
 
 
@@ -230,9 +242,9 @@ def _root(variance: Float[AnyArray, "..."], rounding: float = 1e-14) -> Float[Ar
     difference of equal numbers there, about 1e-16 of the largest; the σ that is lost is below 1e-7
     of the largest."""
     # √ has an infinite derivative at 0, and 0·∞ is NaN in reverse mode: take the root of 1 there.
-    none = variance <= 0
-    none |= variance <= rounding * jax.lax.stop_gradient(jnp.max(variance, initial=0.0))
-    return jnp.where(none, 0.0, jnp.sqrt(jnp.where(none, 1.0, variance)))
+    is_zero = variance <= 0
+    is_zero |= variance <= rounding * jax.lax.stop_gradient(jnp.max(variance, initial=0.0))
+    return jnp.where(is_zero, 0.0, jnp.sqrt(jnp.where(is_zero, 1.0, variance)))
 
 
 @partial(compile_once, static=())
@@ -251,12 +263,12 @@ def image_variances(
 
 
 def _camera_sigma(
-    problem: NetworkProblem, values: Values, own: Mapping[str, Float[AnyArray, "rows k k"]]
+    problem: NetworkProblem, values: Values, cofactors: Mapping[str, Float[AnyArray, "rows k k"]]
 ) -> Float[Array, "cameras parameters"]:
     sigma = jnp.zeros_like(problem.interior_orientation(values))
     for table in problem.cameras:
         moves = (np.array(x, int) for x in problem.table(table.name).vector.moves)
-        sigma = _with_cameras(sigma, own[table.name], np.asarray(table.cameras), *moves)
+        sigma = _with_cameras(sigma, cofactors[table.name], np.asarray(table.cameras), *moves)
     return sigma
 
 
@@ -266,8 +278,8 @@ def _with_cameras(
     Q: Float[AnyArray, "rows k k"],
     rows: Int[np.ndarray, " rows"],
     columns: Int[np.ndarray, " columns"],
-    of: Int[np.ndarray, " columns"],
+    columns_of_root: Int[np.ndarray, " columns"],
 ) -> Float[Array, "cameras parameters"]:
     """σ of all cameras with those of a table."""
     root = _root(jnp.diagonal(Q, axis1=1, axis2=2), 0.0)
-    return sigma.at[rows[:, None], columns].set(root[:, of])
+    return sigma.at[rows[:, None], columns].set(root[:, columns_of_root])

@@ -147,16 +147,16 @@ class Replication(TableMethods):
     @property
     def sentence(self) -> str:
         """The factor in words; why there is none."""
-        what = "jobs" if self.by == "jobs" else f"halves by {self.by}"
+        subject = "jobs" if self.by == "jobs" else f"halves by {self.by}"
         if not self.splits:
-            return f"{what} cannot be compared: {'; '.join(self.failed)}"
-        said = f"{what} differ by {np.sqrt(self.ratio):.2f} times their classical σ"
+            return f"{subject} cannot be compared: {'; '.join(self.failed)}"
+        beginning = f"{subject} differ by {np.sqrt(self.ratio):.2f} times their classical σ"
         if self.model is not None:
-            said += f", {np.sqrt(self.ratio_correlated):.2f} times σ under correlated errors"
+            beginning += f", {np.sqrt(self.ratio_correlated):.2f} times σ under correlated errors"
         # As times of σ, the root of d²/n; the quantiles of a root are the roots of the quantiles.
         low, high = (1.0, 1.0) if self.band is None else np.sqrt(self.band)
         expected = f"{low:.2f} to {high:.2f}" if low < high else "1"
-        return f"{said} (RMS of {count(self.dof, 'parameter')}; {expected} expected)"
+        return f"{beginning} (RMS of {count(self.dof, 'parameter')}; {expected} expected)"
 
     def table(self) -> dict[str, np.ndarray]:
         """One row a parameter of a split: columns split, camera, parameter, difference, sigma,
@@ -197,11 +197,11 @@ class Replication(TableMethods):
 
     def __str__(self) -> str:
         number = count(len(self.splits), "split")
-        what = f"Halves by {self.by}: {number}"
+        title = f"Halves by {self.by}: {number}"
         if self.by == "jobs":
-            what = f"Jobs of one camera: {count(len(self.splits), 'pair')}"
+            title = f"Jobs of one camera: {count(len(self.splits), 'pair')}"
         lines = [
-            f"{what}, {count(self.dof, 'parameter')}; d²/n: square of their difference in σ, 1 "
+            f"{title}, {count(self.dof, 'parameter')}; d²/n: square of their difference in σ, 1 "
             "where σ are right",
             f"d²/n with classical σ              {self.ratio:.2f}",
         ]
@@ -229,8 +229,8 @@ class Replication(TableMethods):
 
 
 def _mean(values: Iterator[float]) -> float:
-    found = list(values)
-    return float(np.mean(found)) if found else float("nan")
+    numbers = list(values)
+    return float(np.mean(numbers)) if numbers else float("nan")
 
 
 def random_halves(
@@ -242,18 +242,18 @@ def random_halves(
     exposure = _exposures(network)
     if by == "runs":
         # Of each camera by itself: photographs of several may follow each other.
-        camera, later = network.images.camera, np.zeros(len(network.images), bool)
+        camera, is_later = network.images.camera, np.zeros(len(network.images), bool)
         for c in np.unique(camera):
-            own = np.flatnonzero(camera == c)
-            times = exposure[own]
-            later[own] = times >= np.sort(times)[len(own) // 2]
-        yield later[rays.image]
+            images_of_camera = np.flatnonzero(camera == c)
+            times = exposure[images_of_camera]
+            is_later[images_of_camera] = times >= np.sort(times)[len(images_of_camera) // 2]
+        yield is_later[rays.image]
         return
-    number, of = len(network.points), rays.point
+    number, group_of_ray = len(network.points), rays.point
     if by != "points":
-        number, of = int(exposure.max(initial=-1)) + 1, exposure[rays.image]
+        number, group_of_ray = int(exposure.max(initial=-1)) + 1, exposure[rays.image]
     for _ in range(repeat):
-        yield (rng.permutation(number) % 2 == 1)[of]
+        yield (rng.permutation(number) % 2 == 1)[group_of_ray]
 
 
 def _exposures(network: Network) -> Int[np.ndarray, " images"]:
@@ -268,41 +268,41 @@ def _exposures(network: Network) -> Int[np.ndarray, " images"]:
 
 
 def compare_halves(
-    whole: Solution,
+    solution: Solution,
     problem: NetworkProblem,
-    second: Bool[np.ndarray, " rays"],
+    in_second: Bool[np.ndarray, " rays"],
     model: ErrorModel | None,
 ) -> HalvesDifference:
     """The interior orientations of two halves of a solved network, each adjusted alone.
 
-    **Arguments:** `second`: the image points of the second half; `model`: of the errors of the
+    **Arguments:** `in_second`: the image points of the second half; `model`: of the errors of the
     whole network.
 
     **Raises:** `NotSolvedError` if a half has too few photographs, or is not determined.
     """
-    return difference_of(whole, *effects_of_halves(whole, problem, second), model)
+    return difference_of(solution, *effects_of_halves(solution, problem, in_second), model)
 
 
 def difference_of(
-    whole: Solution,
+    solution: Solution,
     names: tuple[tuple[str, str], ...],
     effects: Float[np.ndarray, "n rows"],
     model: ErrorModel | None,
 ) -> HalvesDifference:
     """The difference of two halves from its `effects_of_halves`."""
     correlated = None if model is None else model.of_effects(effects)
-    difference = -effects @ stack_rows(whole, whole.residuals)
-    return HalvesDifference(names, difference, whole.sigma0**2 * effects @ effects.T, correlated)
+    difference = -effects @ stack_rows(solution, solution.residuals)
+    return HalvesDifference(names, difference, solution.sigma0**2 * effects @ effects.T, correlated)
 
 
 def effects_of_halves(
-    whole: Solution, problem: NetworkProblem, second: Bool[np.ndarray, " rays"]
+    solution: Solution, problem: NetworkProblem, in_second: Bool[np.ndarray, " rays"]
 ) -> tuple[tuple[tuple[str, str], ...], Float[np.ndarray, "n rows"]]:
     """Camera and name of the parameters that both halves determine, and D of their differences: the
     effects of one σ of every observation.
 
     **Raises:** `NotSolvedError` as `compare_halves`."""
-    halves = [problem.used & ~second, problem.used & second]
+    halves = [problem.used & ~in_second, problem.used & in_second]
     names = compared_parameters(problem, halves)
     if not names:
         raise NotSolvedError(
@@ -313,11 +313,11 @@ def effects_of_halves(
         scale = np.where(keep, 1.0, FAINT)[:, None]
         data = problem.with_image_weights(problem.data, problem.image_weights * scale)
         half = engine.with_data(problem, data)
-        alone = Solution(half, whole.values)
-        if not alone.determined:
+        half_solution = Solution(half, solution.values)
+        if not half_solution.determined:
             raise NotSolvedError("a half does not determine its unknowns")
-        of_half = effects(alone, _unit_rows(problem, names))
-        D.append(of_half * _row_scale(whole, problem, scale))
+        of_half = effects(half_solution, _unit_rows(problem, names))
+        D.append(of_half * _row_scale(solution, problem, scale))
     return tuple((camera, name) for camera, name, _ in names), D[0] - D[1]
 
 
@@ -335,8 +335,8 @@ def expected_band(
     rng = np.random.default_rng(seed)
     parts = [model.parts_of(D) for D in effects]
     ratios = []
-    for first in range(0, draws, PORTION):
-        errors, theta = model.draw(min(PORTION, draws - first), rng)
+    for begin in range(0, draws, PORTION):
+        errors, theta = model.draw(min(PORTION, draws - begin), rng)
         of_splits = [
             [
                 squared_difference(D @ e, np.tensordot(t, C, 1)) / len(D)
@@ -354,7 +354,7 @@ def compared_parameters(
 ) -> list[tuple[str, str, tuple[Any, int, int]]]:
     """Camera and name of the free parameters of the cameras that are in both halves; their table,
     row, and column among the unknowns of the row."""
-    found = []
+    compared = []
     for c, camera in enumerate(problem.network.cameras):
         rays = [
             np.bincount(problem.image[keep & (problem.camera == c)]) >= MIN_RAYS_OF_IMAGE
@@ -364,8 +364,8 @@ def compared_parameters(
             continue
         table, row = problem.table_of_camera(c)
         parameters, free = problem.free_parameters(c)
-        found += [(camera.id, parameters[k], (table, row, int(k))) for k in free]
-    return found
+        compared += [(camera.id, parameters[k], (table, row, int(k))) for k in free]
+    return compared
 
 
 def _unit_rows(
@@ -374,17 +374,19 @@ def _unit_rows(
     """One for the parameter of each name, by table."""
     rows: dict[str, np.ndarray] = {}
     for n, (*_, (of_camera, row, k)) in enumerate(names):
-        given = problem.table(of_camera.name)
-        rows.setdefault(of_camera.name, np.zeros((len(names), given.rows, given.space.width)))
+        declared_table = problem.table(of_camera.name)
+        rows.setdefault(
+            of_camera.name, np.zeros((len(names), declared_table.rows, declared_table.space.width))
+        )
         rows[of_camera.name][n, row, k] = 1.0
     return rows
 
 
 def _row_scale(
-    whole: Solution, problem: NetworkProblem, scale: Float[np.ndarray, "rays 1"]
+    solution: Solution, problem: NetworkProblem, scale: Float[np.ndarray, "rays 1"]
 ) -> Float[np.ndarray, " rows"]:
     """σ of the whole network over those of a half, of all rows of observations."""
-    by_set = {o.name: np.ones_like(whole.residuals[o.name]) for o in problem.observations}
+    by_set = {o.name: np.ones_like(solution.residuals[o.name]) for o in problem.observations}
     for name, rays in problem.image_rows.items():
         by_set[name] = by_set[name] * scale[rays]
     return np.concatenate([by_set[o.name].ravel() for o in problem.observations])

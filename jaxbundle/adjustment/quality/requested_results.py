@@ -41,8 +41,12 @@ class RequestedResult:
 
     def combine(self, effects: Float[np.ndarray, "k numbers"]) -> Float[np.ndarray, " k"]:
         """The effect on the result, from the effects on all numbers."""
-        own = effects[:, self.numbers]
-        return own[:, 0] if own.shape[1] == 1 else np.sqrt(np.mean(own**2, 1))
+        effects_on_numbers = effects[:, self.numbers]
+        return (
+            effects_on_numbers[:, 0]
+            if effects_on_numbers.shape[1] == 1
+            else np.sqrt(np.mean(effects_on_numbers**2, 1))
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,29 +66,33 @@ def request_results(inspection: Inspection, errors: Errors, of: Any = WORDS) -> 
     if callable(of):
         return _of_function(errors, of)
     single = isinstance(of, tuple) and len(of) == 3 and of[0] in ("camera", "image", "point")
-    given = (of,) if isinstance(of, str) or single else of
-    if not isinstance(given, Sequence):
+    requests = (of,) if isinstance(of, str) or single else of
+    if not isinstance(requests, Sequence):
         raise InputError(f"of: expected names of results, got {show(of)}")
     # All results are one function of the values, so that one solution per held quantity (or one per
     # result, in the other direction) gives the effects on all of them.
-    parts, asked, sigmas, first = [], [], [], 0
-    words = given == WORDS
-    for one in given:
-        found = _part(inspection, errors, one)
-        if found is None:
+    parts, results, sigmas, first_number = [], [], [], 0
+    words = requests == WORDS
+    for request in requests:
+        results_of_request = _part(inspection, errors, request)
+        if results_of_request is None:
             if words:
                 continue
-            raise InputError(f"of: {one} are all held")
-        for k, (name, text, angle) in enumerate(found.names):
-            at = slice(first + k, first + found.size, len(found.names))
-            asked.append(RequestedResult(name, text, angle, at))
-        parts.append(found.function)
-        sigmas.append(found.sigma)
-        first += found.size
+            raise InputError(f"of: {request} are all held")
+        for k, (name, text, angle) in enumerate(results_of_request.names):
+            numbers = slice(
+                first_number + k,
+                first_number + results_of_request.size,
+                len(results_of_request.names),
+            )
+            results.append(RequestedResult(name, text, angle, numbers))
+        parts.append(results_of_request.function)
+        sigmas.append(results_of_request.sigma)
+        first_number += results_of_request.size
     if not parts:
         raise InputError("of: no result is requested, or the network has no unknowns")
     function = lambda values: jnp.concatenate([part(values) for part in parts])
-    return RequestedResults(tuple(asked), function, np.concatenate(sigmas))
+    return RequestedResults(tuple(results), function, np.concatenate(sigmas))
 
 
 class _Part(NamedTuple):
@@ -98,16 +106,16 @@ class _Part(NamedTuple):
     sigma: Float[np.ndarray, " results"]
 
 
-def _part(inspection: Inspection, errors: Errors, one: Any) -> _Part | None:
+def _part(inspection: Inspection, errors: Errors, request: Any) -> _Part | None:
     """The results of a word or a name; None if all of them are held."""
     problem = inspection.problem
-    if one == CAMERAS:
+    if request == CAMERAS:
         return _of_cameras(inspection, errors)
-    if one == IMAGES:
+    if request == IMAGES:
         return _of_images(inspection, errors)
-    if one == POINTS:
+    if request == POINTS:
         return _of_points(inspection, errors)
-    name = Name(*split_name(one))
+    name = Name(*split_name(request))
     try:
         value_of(problem, name, inspection.adjusted)
     except KeyError as error:
@@ -116,18 +124,18 @@ def _part(inspection: Inspection, errors: Errors, one: Any) -> _Part | None:
     function = lambda values: jnp.atleast_1d(value_of(problem, name, values))
     sigma = np.sqrt(np.clip(np.diagonal(errors.propagate(function)), 0, None))
     angle = name.kind == "image" and name.parameter in EXTERIOR[3:]
-    return _Part(function, [(":".join(split_name(one)), str(name), angle)], 1, sigma)
+    return _Part(function, [(":".join(split_name(request)), str(name), angle)], 1, sigma)
 
 
 def _of_cameras(inspection: Inspection, errors: Errors) -> _Part | None:
     problem, places, names, sigmas = inspection.problem, [], [], []
     for c, camera in enumerate(problem.network.cameras):
         parameters, free = problem.free_parameters(c)
-        every = get_model(camera.model).parameters
+        all_parameters = get_model(camera.model).parameters
         table, row = problem.table_of_camera(c)
         C = errors.covariance(table.name)[row]
         for k in free:
-            places.append((c, every.index(parameters[k])))
+            places.append((c, all_parameters.index(parameters[k])))
             name = Name("camera", camera.id, parameters[k])
             names.append((f"camera:{camera.id}:{parameters[k]}", str(name), False))
             sigmas.append(np.sqrt(max(C[k, k], 0.0)))
@@ -145,11 +153,11 @@ def _of_images(inspection: Inspection, errors: Errors) -> _Part | None:
     rows = np.flatnonzero((problem.table("image").free > 0).any(1))
     if not len(rows):
         return None
-    given = jnp.asarray(problem.network.images.angles[rows])
+    reference = jnp.asarray(problem.network.images.angles[rows])
 
     def poses(values: Values) -> Float[Array, " 6*images"]:
         position, rotation = values["image"]
-        angles = jax.vmap(angles_near, (0, None, 0))(rotation[rows], jnp.zeros(3), given)
+        angles = jax.vmap(angles_near, (0, None, 0))(rotation[rows], jnp.zeros(3), reference)
         return jnp.concatenate([position[rows], angles], 1).ravel()
 
     angles, rotation = problem.network.images.angles, inspection.adjusted["image"].rotation
@@ -176,14 +184,14 @@ def _of_points(inspection: Inspection, errors: Errors) -> _Part | None:
     return _Part(lambda values: coordinates(values)[rows].ravel(), names, 3 * len(rows), sigma)
 
 
-def _of_function(errors: Errors, of: Callable[..., Any]) -> RequestedResults:
-    function = lambda values: jnp.ravel(of(values))
+def _of_function(errors: Errors, user_function: Callable[..., Any]) -> RequestedResults:
+    function = lambda values: jnp.ravel(user_function(values))
     sigma = np.sqrt(np.clip(np.diagonal(errors.propagate(function)), 0, None))
     number = range(len(sigma))
-    asked = tuple(
+    results = tuple(
         RequestedResult(str(k + 1), f"result {k + 1}", False, slice(k, k + 1)) for k in number
     )
-    return RequestedResults(asked, function, sigma)
+    return RequestedResults(results, function, sigma)
 
 
 def effects_on(

@@ -16,43 +16,45 @@ def groups(problem: NetworkProblem) -> list[Group]:
     words = unit_words(network)
     length, angle, image = (words[kind] for kind in ("length", "angle", "image"))
     # A camera for each image has too few observations for a component of its own: one for all.
-    own = np.array_equal(network.images.camera, np.arange(len(network.cameras)))
-    if len(network.cameras) == 1 or own:
+    one_image_each = np.array_equal(network.images.camera, np.arange(len(network.cameras)))
+    if len(network.cameras) == 1 or one_image_each:
         parts = [(name, np.s_[:]) for name in problem.image_rows]
-        found = [Group("image coordinates", parts, *image)]
+        variance_groups = [Group("image coordinates", parts, *image)]
     else:
-        found = [
+        variance_groups = [
             Group(
-                f"image coordinates, camera {given.id}",
+                f"image coordinates, camera {camera.id}",
                 [
                     (name, np.flatnonzero(problem.camera[rows] == c))
                     for name, rows in problem.image_rows.items()
                 ],
                 *image,
             )
-            for c, given in enumerate(network.cameras)
+            for c, camera in enumerate(network.cameras)
         ]
-    given = [o.name for o in problem.observations]
+    camera = [o.name for o in problem.observations]
     interior = [table.interior_set for table in problem.cameras]
 
-    def every(*names: str, columns: Any = None) -> list[tuple[str, Any]]:
+    def whole_sets(*names: str, columns: Any = None) -> list[tuple[str, Any]]:
         place = np.s_[:] if columns is None else np.s_[:, columns]
-        return [(name, place) for name in names if name in given]
+        return [(name, place) for name in names if name in camera]
 
     # Heights of control are often of another precision than its position.
     for i, axis in enumerate("XYZ"):
-        found.append(Group(f"control points in {axis}", every("control", columns=i), *length))
-    found += [
-        Group("exterior orientation, position", every("exterior", columns=np.s_[:3]), *length),
-        Group("exterior orientation, angles", every("exterior", columns=np.s_[3:]), *angle),
-        Group("interior orientation", every(*interior), np.nan),
-        Group("distances", every("distance"), *length),
+        variance_groups.append(
+            Group(f"control points in {axis}", whole_sets("control", columns=i), *length)
+        )
+    variance_groups += [
+        Group("exterior orientation, position", whole_sets("exterior", columns=np.s_[:3]), *length),
+        Group("exterior orientation, angles", whole_sets("exterior", columns=np.s_[3:]), *angle),
+        Group("interior orientation", whole_sets(*interior), np.nan),
+        Group("distances", whole_sets("distance"), *length),
     ]
     # Of kinds with several units the factor has none.
-    further: dict[str, tuple[list, tuple[float, str]]] = {}
+    kinds: dict[str, tuple[list, tuple[float, str]]] = {}
     for name in problem.further_sets:
         kind = problem.observations_of(name).kind
         units = kind.units if isinstance(kind.units, str) else "several"
-        parts, _ = further.setdefault(kind.name, ([], words.get(units, (np.nan, ""))))
+        parts, _ = kinds.setdefault(kind.name, ([], words.get(units, (np.nan, ""))))
         parts.append((name, np.s_[:]))
-    return found + [Group(name, parts, *unit) for name, (parts, unit) in further.items()]
+    return variance_groups + [Group(name, parts, *unit) for name, (parts, unit) in kinds.items()]

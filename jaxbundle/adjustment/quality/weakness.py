@@ -62,8 +62,8 @@ class Weakness:
     @property
     def notes(self) -> tuple[str, ...]:
         """What does not spoil the network: its georeference, a few weak points."""
-        few = self._of_points() if self.few_points else ()
-        return (*filter(None, (self.georeference,)), *few)
+        weak_points = self._of_points() if self.few_points else ()
+        return (*filter(None, (self.georeference,)), *weak_points)
 
     @property
     def lines(self) -> tuple[str, ...]:
@@ -84,8 +84,10 @@ class Weakness:
 
     def _of_points(self) -> tuple[str, ...]:
         if self.points:
-            most = 2 * len(self.points) > self.judged
-            where = "images taken from one place, or nearly" if most else "rays almost parallel"
+            is_majority = 2 * len(self.points) > self.judged
+            where = (
+                "images taken from one place, or nearly" if is_majority else "rays almost parallel"
+            )
             number = count(self.judged, "point")
             return (
                 f"poorly determined: X, Y, Z of {len(self.points)} of {number} "
@@ -101,22 +103,26 @@ def weakness(inspection: Inspection, sigma0: float) -> Weakness:
     The uncertainty of the common position, rotation and scale of all points, which loose control
     leaves, is none of the images': they are judged without it, and it is stated for itself."""
     problem, extents = inspection.problem, _extents(inspection)
-    found = find_weak(inspection.solution, extents, sigma0)
+    weak = find_weak(inspection.solution, extents, sigma0)
     # With a datum of inner constraints there is no georeference. Without one, an image σ is that of
     # its position in the block and that of the block: Q = Q_relative + G·Q_ττ·Gᵀ.
-    if not any(" of image " in name for name in found.names) or problem.counts.datum:
-        return _in_words(problem, found)
+    if not any(" of image " in name for name in weak.names) or problem.counts.datum:
+        return _in_words(problem, weak)
     georeference = find_georeference(inspection)
     # A linear similarity does not describe a block that may turn by more than a tenth of a radian.
     if georeference is None or sigma0 * georeference.rotation > 1 / NONLINEAR_RATIO:
-        return _in_words(problem, found)
-    own = find_weak(inspection.solution, extents, sigma0, {"image": georeference.of_images})
-    said = (
+        return _in_words(problem, weak)
+    weak_without_frame = find_weak(
+        inspection.solution, extents, sigma0, {"image": georeference.of_images}
+    )
+    georeference_words = (
         ""
-        if own.names == found.names
+        if weak_without_frame.names == weak.names
         else georeference.in_words(sigma0, problem.network.object_unit)
     )
-    return dataclasses.replace(_in_words(problem, own), georeference=said)
+    return dataclasses.replace(
+        _in_words(problem, weak_without_frame), georeference=georeference_words
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,11 +163,11 @@ def find_georeference(inspection: Inspection) -> Georeference | None:
     inverse = np.linalg.pinv(of_points.reshape(-1, of_points.shape[2]))
     estimate = eqx.Partial(_similarity_of, jnp.asarray(inverse), jnp.asarray(rows))
     Q = inspection.propagate(estimate)
-    whole = of_points.mean(0)
+    mean_of_points = of_points.mean(0)
     largest = lambda C: float(np.sqrt(max(np.linalg.eigvalsh(C)[-1], 0.0)))
     G = np.asarray(moves["image"])[: len(problem.network.images)]
     return Georeference(
-        largest(whole @ Q @ whole.T),
+        largest(mean_of_points @ Q @ mean_of_points.T),
         largest(Q[3:6, 3:6]),
         largest(Q[6:, 6:]),
         np.einsum("iaj,jk,iak->ia", G, Q, G),
@@ -177,13 +183,13 @@ def _similarity_of(
 
 def weakness_of_unsolved(problem: NetworkProblem, values: Values) -> Weakness:
     """The weak directions where an adjustment ended without a solution, by a priori σ."""
-    there = Inspection(problem, values)
-    return _in_words(problem, find_weak_unsolved(there.solution, _extents(there)))
+    inspection = Inspection(problem, values)
+    return _in_words(problem, find_weak_unsolved(inspection.solution, _extents(inspection)))
 
 
-def _in_words(problem: NetworkProblem, found: Weak) -> Weakness:
+def _in_words(problem: NetworkProblem, weak: Weak) -> Weakness:
     ids = problem.network.points.id
-    return Weakness(found.names, found.worst, tuple(ids[p] for p in found.rows), found.judged)
+    return Weakness(weak.names, weak.worst, tuple(ids[p] for p in weak.rows), weak.judged)
 
 
 def _extents(inspection: Inspection) -> Extents:
@@ -191,24 +197,24 @@ def _extents(inspection: Inspection) -> Extents:
     problem, values = inspection.problem, inspection.adjusted
     of_image, of_point = _ray_lengths(inspection)
     pose = np.where(of_image > 0, of_image, 1.0)[:, None]
-    found = {"image": np.concatenate([np.repeat(1 / pose, 3, 1), np.ones((len(pose), 3))], 1)}
+    extents = {"image": np.concatenate([np.repeat(1 / pose, 3, 1), np.ones((len(pose), 3))], 1)}
     for table in problem.cameras:
         model = get_model(table.model)
         moving = problem.table(table.name).vector.moving
-        at = [model.parameters.index(name) for name in model.principal_distance]
+        columns = [model.parameters.index(name) for name in model.principal_distance]
         judged = np.array([model.parameters[j] in model.core for j in moving], bool)
-        shortest = np.abs(np.asarray(values[table.name])[:, at]).min(1)
+        shortest = np.abs(np.asarray(values[table.name])[:, columns]).min(1)
         shortest = np.maximum(shortest, np.finfo(float).tiny)
-        found[table.name] = judged / shortest[:, None]
+        extents[table.name] = judged / shortest[:, None]
     mean = float(of_image[of_image > 0].mean()) if (of_image > 0).any() else 1.0
     for name in problem.further_tables:
-        given = problem.table(name)
-        judged = [(p in LENGTHS) / mean + (p in ANGLES | RATIOS) for p in given.parameters]
+        declared_table = problem.table(name)
+        judged = [(p in LENGTHS) / mean + (p in ANGLES | RATIOS) for p in declared_table.parameters]
         if any(judged):
-            found[name] = np.tile(judged, (given.rows, 1))
+            extents[name] = np.tile(judged, (declared_table.rows, 1))
         if name == READ_OUT:
-            found[name] = 1 / np.maximum(np.abs(given.value), np.finfo(float).tiny)
-    return found | {"point": of_point * ~problem.at_any_distance}
+            extents[name] = 1 / np.maximum(np.abs(declared_table.value), np.finfo(float).tiny)
+    return extents | {"point": of_point * ~problem.at_any_distance}
 
 
 def _ray_lengths(
@@ -222,8 +228,8 @@ def _ray_lengths(
     ray = X[point] - X0[image]
     length = np.linalg.norm(ray, axis=1)
 
-    def mean(of: Int[np.ndarray, " rays"], number: int) -> Float[np.ndarray, " n"]:
-        total, rays = np.bincount(of, length, number), np.bincount(of, minlength=number)
+    def mean(index: Int[np.ndarray, " rays"], number: int) -> Float[np.ndarray, " n"]:
+        total, rays = np.bincount(index, length, number), np.bincount(index, minlength=number)
         return total / np.maximum(rays, 1)
 
     return mean(image, len(X0)), mean(point, len(X))

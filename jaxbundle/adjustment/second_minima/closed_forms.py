@@ -72,31 +72,31 @@ def scene_of(values: Values) -> NetworkScene:
 
 def rays_of(problem: NetworkProblem) -> ImageRays:
     """The image points that take part in an adjustment."""
-    used, network = problem.used, problem.network
+    is_used, network = problem.used, problem.network
     c = [
         min((abs(camera.parameters[n]) for n in names), default=1.0)
         for camera in network.cameras
         for names in [get_model(camera.model).principal_distance]
     ]
     # σ of the better coordinate: effects that are compared with it must not look too small.
-    weight = problem.image_weights.max(1)[used] * np.array(c)[problem.camera[used]]
-    return ImageRays(problem.image[used], problem.point[used], 1 / weight)
+    weight = problem.image_weights.max(1)[is_used] * np.array(c)[problem.camera[is_used]]
+    return ImageRays(problem.image[is_used], problem.point[is_used], 1 / weight)
 
 
-def sample(rays: ImageRays, images: int, most: int) -> ImageRays:
-    """At most `most` rays of every image, evenly, with the weight of all of them: sums over an
+def sample(rays: ImageRays, images: int, max_rays: int) -> ImageRays:
+    """At most `max_rays` rays of every image, evenly, with the weight of all of them: sums over an
     image stay about the same, in a time that does not grow with its points."""
     order = np.argsort(rays.image, kind="stable")
     number = np.bincount(rays.image, minlength=images)
-    first = np.cumsum(number) - number
-    place = np.arange(len(order)) - first[rays.image[order]]
+    first_place = np.cumsum(number) - number
+    place = np.arange(len(order)) - first_place[rays.image[order]]
     total = number[rays.image[order]]
     # Those at which place·most/total passes an integer.
-    chosen = (place * most) // total != ((place - 1) * most) // total
-    kept = order[chosen | (total <= most)]
-    weight = number / np.maximum(np.bincount(rays.image[kept], minlength=images), 1)
-    image = rays.image[kept]
-    return ImageRays(image, rays.point[kept], rays.sigma[kept] / np.sqrt(weight[image]))
+    is_chosen = (place * max_rays) // total != ((place - 1) * max_rays) // total
+    kept_rays = order[is_chosen | (total <= max_rays)]
+    weight = number / np.maximum(np.bincount(rays.image[kept_rays], minlength=images), 1)
+    image = rays.image[kept_rays]
+    return ImageRays(image, rays.point[kept_rays], rays.sigma[kept_rays] / np.sqrt(weight[image]))
 
 
 def turn_over(scene: NetworkScene, rays: ImageRays) -> NetworkScene:
@@ -106,26 +106,26 @@ def turn_over(scene: NetworkScene, rays: ImageRays) -> NetworkScene:
 
 
 def reverse_depth(
-    scene: NetworkScene, rays: ImageRays, known: Bool[np.ndarray, " points"] | None = None
+    scene: NetworkScene, rays: ImageRays, is_known: Bool[np.ndarray, " points"] | None = None
 ) -> NetworkScene:
-    """Equation (2); the `known` points stay. The plane is theirs if they have one, otherwise it is
-    across the mean line of sight, so that the images stay about where they are."""
-    known = np.zeros(len(scene.X), bool) if known is None else known
-    normal, o = plane_of_known(scene, known)
+    """Equation (2); the known points stay. The plane is theirs if they have one, otherwise it
+    is across the mean line of sight, so that the images stay about where they are."""
+    is_known = np.zeros(len(scene.X), bool) if is_known is None else is_known
+    normal, o = plane_of_known(scene, is_known)
     c = _means(scene.X, rays, len(scene.X0))
     if normal is None:
         sight = np.nan_to_num(unit(c - scene.X0)).sum(0)
-        normal, o = unit(sight), o if known.any() else scene.X[np.unique(rays.point)].mean(0)
-    X = np.where(known[:, None], scene.X, _reflect(scene.X, normal, o))
-    there = _means(X, rays, len(scene.X0))
-    return NetworkScene(*_reflect_poses(scene, np.tile(normal, (len(c), 1)), c, there), X)
+        normal, o = unit(sight), o if is_known.any() else scene.X[np.unique(rays.point)].mean(0)
+    X = np.where(is_known[:, None], scene.X, _reflect(scene.X, normal, o))
+    centre_after = _means(X, rays, len(scene.X0))
+    return NetworkScene(*_reflect_poses(scene, np.tile(normal, (len(c), 1)), c, centre_after), X)
 
 
-def mirror(scene: NetworkScene, known: Bool[np.ndarray, " points"]) -> NetworkScene:
-    """Equation (3) on the plane of the `known` points, or without one on any."""
-    normal, o = plane_of_known(scene, known)
+def mirror(scene: NetworkScene, is_known: Bool[np.ndarray, " points"]) -> NetworkScene:
+    """Equation (3) on the plane of the known points, or without one on any."""
+    normal, o = plane_of_known(scene, is_known)
     normal = np.array([0.0, 0.0, 1.0]) if normal is None else normal
-    X = np.where(known[:, None], scene.X, _reflect(scene.X, normal, o))
+    X = np.where(is_known[:, None], scene.X, _reflect(scene.X, normal, o))
     return NetworkScene(_reflect(scene.X0, normal, o), -scene.M @ _reflection(normal), X)
 
 
@@ -136,17 +136,17 @@ def mirror_images(
     stay."""
     c, normal = _planes(scene, rays)
     X0 = scene.X0 - 2 * ((scene.X0 - c) * normal).sum(1, keepdims=True) * normal
-    M, chosen = -scene.M @ _reflection(normal), images[:, None]
+    M, is_chosen = -scene.M @ _reflection(normal), images[:, None]
     return NetworkScene(
-        np.where(chosen, X0, scene.X0), np.where(chosen[:, None], M, scene.M), scene.X
+        np.where(is_chosen, X0, scene.X0), np.where(is_chosen[:, None], M, scene.M), scene.X
     )
 
 
 def plane_of_known(
-    scene: NetworkScene, known: Bool[np.ndarray, " points"]
+    scene: NetworkScene, is_known: Bool[np.ndarray, " points"]
 ) -> tuple[Float[np.ndarray, "3"] | None, Float[np.ndarray, "3"]]:
     """Normal and a point of the plane of the known points; no normal of fewer than three."""
-    X = scene.X[known]
+    X = scene.X[is_known]
     if not len(X):
         return None, np.zeros(3)
     o = X.mean(0)
@@ -161,7 +161,7 @@ def share_behind(scene: NetworkScene, rays: ImageRays) -> Float[np.ndarray, " im
 
 
 def perspective_effect(
-    scene: NetworkScene, other: NetworkScene, rays: ImageRays
+    scene: NetworkScene, other_scene: NetworkScene, rays: ImageRays
 ) -> Float[np.ndarray, " images"]:
     """Σ(δ/σ)² of every image, δ: what distinguishes another solution beside shift, scale and roll.
 
@@ -169,7 +169,7 @@ def perspective_effect(
     of sight, after the similarity that fits them best: what is left is the effect of perspective,
     which no pose of the second solution can hide but by turning back to the first one."""
     images = len(scene.X0)
-    z, w = (_in_tangent_plane(s, rays, images) for s in (scene, other))
+    z, w = (_in_tangent_plane(s, rays, images) for s in (scene, other_scene))
     p = 1 / rays.sigma**2
     total = lambda value: np.bincount(rays.image, value, images)
     complex_total = lambda value: total(value.real) + 1j * total(value.imag)
@@ -192,10 +192,10 @@ def _in_tangent_plane(scene: NetworkScene, rays: ImageRays, images: int) -> np.n
     # Any rotation that takes the axis to −z, the same for neighbouring axes: the shortest one.
     a, b, c = np.nan_to_num(axis).T
     f = 1 / np.maximum(1 - c, 1e-9)
-    first = np.stack([1 - a * a * f, -a * b * f, a], 1)
-    second = np.stack([-a * b * f, 1 - b * b * f, b], 1)
-    along = np.maximum((axis[rays.image] * d).sum(1), np.cos(np.deg2rad(80)))
-    x, y = ((basis[rays.image] * d).sum(1) / along for basis in (first, second))
+    axis_x = np.stack([1 - a * a * f, -a * b * f, a], 1)
+    axis_y = np.stack([-a * b * f, 1 - b * b * f, b], 1)
+    depth = np.maximum((axis[rays.image] * d).sum(1), np.cos(np.deg2rad(80)))
+    x, y = ((basis[rays.image] * d).sum(1) / depth for basis in (axis_x, axis_y))
     return np.nan_to_num(x) + 1j * np.nan_to_num(y)
 
 
@@ -204,8 +204,8 @@ def _planes(
 ) -> tuple[Float[np.ndarray, "images 3"], Float[np.ndarray, "images 3"]]:
     """A point and the normal of the plane fitted to the points of every image."""
     c = _means(scene.X, rays, len(scene.X0))
-    off = scene.X[rays.point] - c[rays.image]
-    columns = (off[:, :, None] * off[:, None, :]).reshape(-1, 9).T
+    centred = scene.X[rays.point] - c[rays.image]
+    columns = (centred[:, :, None] * centred[:, None, :]).reshape(-1, 9).T
     scatter = np.stack([np.bincount(rays.image, x, len(scene.X0)) for x in columns], 1)
     scatter = scatter.reshape(-1, 3, 3)
     return c, np.linalg.eigh(scatter)[1][:, :, 0]
@@ -215,12 +215,12 @@ def _reflect_poses(
     scene: NetworkScene,
     normal: Float[np.ndarray, "images 3"],
     c: Float[np.ndarray, "images 3"],
-    there: Float[np.ndarray, "images 3"],
+    centres_after: Float[np.ndarray, "images 3"],
 ) -> tuple[Float[np.ndarray, "images 3"], Float[np.ndarray, "images 3 3"]]:
-    """Equation (1) about the centres `c` of the points, which afterwards are at `there`."""
+    """Equation (1) about the centres `c` of the points, which afterwards are at `centres_after`."""
     local = np.einsum("nij,nj->ni", scene.M, c - scene.X0)
     M = _reflection(unit(local)) @ scene.M @ _reflection(normal)
-    return there - np.einsum("nji,nj->ni", M, local), M
+    return centres_after - np.einsum("nji,nj->ni", M, local), M
 
 
 def _reflection(a: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
@@ -244,9 +244,9 @@ def unit(v: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
         return v / np.linalg.norm(v, axis=-1, keepdims=True)
 
 
-def turns(one: NetworkScene, two: NetworkScene) -> Float[np.ndarray, " images"]:
+def turns(scene_a: NetworkScene, scene_b: NetworkScene) -> Float[np.ndarray, " images"]:
     """The angle between both rotations of every image, radians."""
-    return angles(one.M @ two.M.transpose(0, 2, 1))
+    return angles(scene_a.M @ scene_b.M.transpose(0, 2, 1))
 
 
 def angles(M: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:

@@ -63,21 +63,22 @@ class SecondMinimum:
 
     def in_words(self, unit: str) -> str:
         """A sentence; `unit` of object coordinates."""
-        whole = f"{self.ambiguity} ({list_some(self.images, 5, str)})"
-        both = f"vᵀPv {self.vtpv:.6g}, of the other {self.other_vtpv:.6g}"
-        apart = (
+        subject = f"{self.ambiguity} ({list_some(self.images, 5, str)})"
+        both_fits = f"vᵀPv {self.vtpv:.6g}, of the other {self.other_vtpv:.6g}"
+        difference = (
             f"rotations differ by up to {math.degrees(self.turn):.3g}°, projection centres by "
             f"{self.shift:.3g} {unit}"
         )
         if self.ambiguous:
             begin = "the iterations ended in the other one, " if self.taken else ""
             return (
-                f"{whole}: {begin}both fit, {both} (the other with a probability of "
-                f"{100 * self.probability:.2g} %); {apart}"
+                f"{subject}: {begin}both fit, {both_fits} (the other with a probability of "
+                f"{100 * self.probability:.2g} %); {difference}"
             )
         return (
-            f"{whole}: the iterations ended in the other one; the better one is taken, {both}; "
-            f"{apart}"
+            f"{subject}: the iterations ended in the other one; the better one is taken, "
+            f"{both_fits}; "
+            f"{difference}"
         )
 
 
@@ -147,10 +148,12 @@ class SecondMinimumSettings:
 SECOND_MINIMUM = SecondMinimumSettings()
 
 
-def evidence(vtpv: float, other: float, redundancy: int, stated: bool, rounding: float) -> float:
+def evidence(
+    vtpv: float, other_vtpv: float, redundancy: int, stated: bool, rounding: float
+) -> float:
     """E of the module; `rounding`: the vᵀPv that rounding leaves of exact data."""
-    if redundancy <= 0 or abs(other - vtpv) <= rounding:
+    if redundancy <= 0 or abs(other_vtpv - vtpv) <= rounding:
         return 0.0
     if stated:
-        return (other - vtpv) / max(1.0, vtpv / redundancy)
-    return redundancy * math.log((other + rounding) / (vtpv + rounding))
+        return (other_vtpv - vtpv) / max(1.0, vtpv / redundancy)
+    return redundancy * math.log((other_vtpv + rounding) / (vtpv + rounding))

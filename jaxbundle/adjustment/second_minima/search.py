@@ -81,52 +81,65 @@ def can_have_second(problem: NetworkProblem) -> bool:
 
 
 def find_second_minima(
-    first: Inspection,
+    inspection: Inspection,
     minimum: Minimum,
     minimise: Minimise,
     settings: SecondMinimumSettings = SECOND_MINIMUM,
 ) -> tuple[NetworkProblem, Minimum, tuple[SecondMinimum, ...]]:
     """The best minimum of a solved problem, the given one unless another one fits better; and the
     second minima that the observations cannot distinguish from it, or that it has replaced."""
-    superseded, problem = [], first.problem
+    superseded, problem = [], inspection.problem
     for round in range(settings.max_rounds + 1):
-        state = _State(first, minimise, settings)
-        found = list(state.adjust_candidates())
-        better = [one for one in found if state.is_better(one)]
-        if not better or round == settings.max_rounds:
+        state = _State(inspection, minimise, settings)
+        other_minima = list(state.adjust_candidates())
+        better_minima = [
+            minimum_found for minimum_found in other_minima if state.is_better(minimum_found)
+        ]
+        if not better_minima or round == settings.max_rounds:
             break
-        best = min(better, key=lambda one: one.inspection.vtpv)
-        superseded.append((best, first.vtpv))
-        problem, first = best.problem, best.inspection
+        best = min(better_minima, key=lambda minimum_found: minimum_found.inspection.vtpv)
+        superseded.append((best, inspection.vtpv))
+        problem, inspection = best.problem, best.inspection
         minimum = concatenate_runs([minimum, best.minimum])
-    records = [state.record_superseded(*one) for one in superseded]
-    said = [
-        dataclasses.replace(one, taken=is_said(one, records))
-        for one in map(state.record, found)
-        if one.ambiguous
+    records = [state.record_superseded(*minimum_found) for minimum_found in superseded]
+    reported = [
+        dataclasses.replace(minimum_found, taken=is_reported(minimum_found, records))
+        for minimum_found in map(state.record, other_minima)
+        if minimum_found.ambiguous
     ]
-    said += [one for one in records if not is_said(one, said)]
-    if len(state.untried) and said:
+    reported += [
+        minimum_found for minimum_found in records if not is_reported(minimum_found, reported)
+    ]
+    if len(state.untried) and reported:
         ids = [str(problem.network.images.id[k]) for k in np.sort(state.untried)]
         words = f"the second minimum of {count(len(ids), 'further image')} was not adjusted"
         network = problem.network.note(f"{words}: {list_some(ids, 5, str)}")
         problem = dataclasses.replace(problem, network=network)
-    return problem, minimum, tuple(sorted(said, key=lambda one: one.evidence))
+    return (
+        problem,
+        minimum,
+        tuple(sorted(reported, key=lambda minimum_found: minimum_found.evidence)),
+    )
 
 
-def is_said(one: SecondMinimum, others: Iterable[SecondMinimum]) -> bool:
+def is_reported(second_minimum: SecondMinimum, known_minima: Iterable[SecondMinimum]) -> bool:
     """Whether all images of a second minimum are among those of others of its kind."""
-    images = {id for other in others if other.ambiguity == one.ambiguity for id in other.images}
-    return images.issuperset(one.images)
+    images = {
+        id
+        for known_minimum in known_minima
+        if known_minimum.ambiguity == second_minimum.ambiguity
+        for id in known_minimum.images
+    }
+    return images.issuperset(second_minimum.images)
 
 
 class _State:
     """One minimum, and what is needed to look for others."""
 
-    def __init__(self, first: Inspection, minimise: Minimise, settings: SecondMinimumSettings):
-        self.first, self.problem, self.settings = first, first.problem, settings
+    def __init__(self, inspection: Inspection, minimise: Minimise, settings: SecondMinimumSettings):
+        self.first, self.problem, self.settings = inspection, inspection.problem, settings
         self.minimise = minimise
-        self.scene, self.all_rays = scene_of(first.adjusted), rays_of(first.problem)
+        self.scene, self.all_rays = scene_of(inspection.adjusted), rays_of(inspection.problem)
         self.rays = sample(self.all_rays, len(self.scene.X0), batched.SLOTS)
         free = lambda table: np.asarray(self.problem.table(table).free).max(1) > 0
         self.free, self.free_points = free("image"), free("point")
@@ -135,14 +148,14 @@ class _State:
         self.stated = network.observations.sigma_origin != UNIT
         # vᵀPv of rounding: 1e-10 of the principal distance in every observation.
         self.rounding = counts.observations * (1e-10 / noise_of_rays(network)) ** 2
-        vtpv, r = first.vtpv, max(counts.redundancy, 1)
+        vtpv, r = inspection.vtpv, max(counts.redundancy, 1)
         self.scale = max(vtpv / r, 1.0 if self.stated else self.rounding)
         self._poses = SecondPoses(
             problem=self.problem,
             scene=self.scene,
             rays=self.rays,
             all_rays=self.all_rays,
-            squares=(first.image_residuals[self.problem.used] ** 2).sum(1),
+            squares=(inspection.image_residuals[self.problem.used] ** 2).sum(1),
             free=self.free,
             scale=self.scale,
             stated=self.stated,
@@ -188,87 +201,95 @@ class _State:
         if the plane is possible in all of them."""
         images, points = len(self.scene.X0), len(self.scene.X)
         rays = self.all_rays
-        first = int(np.argmax(np.bincount(rays.image, minlength=images)))
+        first_image = int(np.argmax(np.bincount(rays.image, minlength=images)))
         common = np.zeros(points, bool)
-        common[rays.point[rays.image == first]] = True
+        common[rays.point[rays.image == first_image]] = True
         shared = np.bincount(rays.image, common[rays.point], images)
-        shared[first] = 0
+        shared[first_image] = 0
         partners = np.argsort(-shared, kind="stable")[: batched.LANES]
         partners = partners[shared[partners] >= 6]
-        if not len(partners) or not self._is_plane(first, partners):
+        if not len(partners) or not self._is_plane(first_image, partners):
             return
-        seen = self._sights
-        pairs = [_common_rays(seen, first, int(k)) for k in partners]
+        sighted = self._sights
+        pairs = [_common_rays(sighted, first_image, int(k)) for k in partners]
         if any(len(xy1) < 6 for xy1, _ in pairs):
             return
         M, b, _, possible = batched.orient_planes(*zip(*pairs))
-        relative = self.scene.M[partners] @ self.scene.M[first].T
+        relative = self.scene.M[partners] @ self.scene.M[first_image].T
         # The solution that is farther from the present one.
         turn = np.stack([angles(M[:, k] @ relative.transpose(0, 2, 1)) for k in (0, 1)], 1)
-        base = self.scene.M[first] @ (self.scene.X0[partners] - self.scene.X0[first]).T
-        across = np.stack(
+        base = self.scene.M[first_image] @ (self.scene.X0[partners] - self.scene.X0[first_image]).T
+        shift = np.stack(
             [
                 np.linalg.norm(b[:, k] - base.T / np.linalg.norm(base, axis=0)[:, None], axis=1)
                 for k in (0, 1)
             ],
             1,
         )
-        other = np.argmax(turn + across, axis=1)
+        second_solution = np.argmax(turn + shift, axis=1)
         lane = np.arange(len(partners))
-        if not possible[lane, other].all():
+        if not possible[lane, second_solution].all():
             return
         best = int(np.argmax(np.linalg.norm(base, axis=0)))
         scene = self._grow(
-            seen, first, int(partners[best]), M[best, other[best]], b[best, other[best]]
+            sighted,
+            first_image,
+            int(partners[best]),
+            M[best, second_solution[best]],
+            b[best, second_solution[best]],
         )
         if scene is not None:
             yield OtherSolution(OTHER_PLANE, np.arange(images), scene)
 
-    def _is_plane(self, first: int, partners: Int[np.ndarray, " n"]) -> bool:
+    def _is_plane(self, first_image: int, partners: Int[np.ndarray, " n"]) -> bool:
         """Whether the points of an image are so near to a plane that the second orientation of a
         plane may fit: by the parallax that `partners` see of points off it."""
         rays, scene = self.all_rays, self.scene
-        seen = self.rays.point[self.rays.image == first]
-        X = scene.X[seen]
+        seen_points = self.rays.point[self.rays.image == first_image]
+        X = scene.X[seen_points]
         o = X.mean(0)
         normal = np.linalg.svd(X - o)[2][2]
-        sight = X - scene.X0[first]
+        sight = X - scene.X0[first_image]
         with np.errstate(divide="ignore", invalid="ignore"):
-            along = ((o - scene.X0[first]) @ normal) / (sight @ normal)
+            distance = ((o - scene.X0[first_image]) @ normal) / (sight @ normal)
         flat = scene.X.copy()
-        flat[seen] = scene.X0[first] + along[:, None] * sight
+        flat[seen_points] = scene.X0[first_image] + distance[:, None] * sight
         of_point, of_image = np.zeros(len(scene.X), bool), np.zeros(len(scene.X0), bool)
-        of_point[seen], of_image[partners] = True, True
-        chosen = of_image[rays.image] & of_point[rays.point]
-        image, point = rays.image[chosen], rays.point[chosen]
-        one, two = (unit(X[point] - scene.X0[image]) for X in (scene.X, flat))
-        effect = np.nansum((np.linalg.norm(one - two, axis=1) / rays.sigma[chosen]) ** 2)
+        of_point[seen_points], of_image[partners] = True, True
+        is_chosen = of_image[rays.image] & of_point[rays.point]
+        image, point = rays.image[is_chosen], rays.point[is_chosen]
+        direction, direction_to_plane = (unit(X[point] - scene.X0[image]) for X in (scene.X, flat))
+        effect = np.nansum(
+            (np.linalg.norm(direction - direction_to_plane, axis=1) / rays.sigma[is_chosen]) ** 2
+        )
         share = self.settings.min_reversed_share / self.settings.safety
-        return bool(np.isfinite(along).all() and share * effect < self.settings.limit * self.scale)
+        return bool(
+            np.isfinite(distance).all() and share * effect < self.settings.limit * self.scale
+        )
 
     def _grow(
         self,
-        seen: Sights,
-        first: int,
-        second: int,
+        sighted: Sights,
+        first_image: int,
+        second_image: int,
         M: Float[np.ndarray, "3 3"],
         b: Float[np.ndarray, "3"],
     ) -> NetworkScene | None:
         """All images and points from a pair of images, in the present frame."""
-        model = Model.empty(seen)
-        model.place(first, np.zeros(3), np.eye(3))
-        model.place(second, b, M)
-        grow(seen, model)
-        intersect(seen, model, START_VALUE_LIMITS)
-        used = np.unique(self.all_rays.point)
-        if not model.placed.all() or not model.known[used].all():
+        model = Model.empty(sighted)
+        model.place(first_image, np.zeros(3), np.eye(3))
+        model.place(second_image, b, M)
+        grow(sighted, model)
+        intersect(sighted, model, START_VALUE_LIMITS)
+        used_points = np.unique(self.all_rays.point)
+        if not model.placed.all() or not model.known[used_points].all():
             return None
-        held = self.known[used]
-        rows = used[held] if held.sum() >= 3 else used
-        moved = batched.similarity(model.X[rows], self.scene.X[rows], np.ones(len(rows)))
-        if moved is None:
+        is_held = self.known[used_points]
+        rows = used_points[is_held] if is_held.sum() >= 3 else used_points
+        similarity = batched.similarity(model.X[rows], self.scene.X[rows], np.ones(len(rows)))
+        if similarity is None:
             return None
-        model = model.transform(*moved)
+        model = model.transform(*similarity)
         X = np.where(np.isfinite(model.X) & ~self.known[:, None], model.X, self.scene.X)
         return NetworkScene(model.X0, model.M, X)
 
@@ -283,43 +304,45 @@ class _State:
     def adjust_candidates(self) -> Iterator[Found]:
         """The candidates that lead to another minimum, each minimum once, unless its vᵀPv is above
         the present one by more than `limit` times the variance factor."""
-        seen: list[Found] = []
+        earlier_minima: list[Found] = []
         for candidate in self.candidates():
-            found = self._adjust(candidate)
-            if found is None or any(_are_same(found, other, self.rounding) for other in seen):
+            other_minimum = self._adjust(candidate)
+            if other_minimum is None or any(
+                _are_same(other_minimum, earlier, self.rounding) for earlier in earlier_minima
+            ):
                 continue
-            seen.append(found)
-            yield found
+            earlier_minima.append(other_minimum)
+            yield other_minimum
 
     def _adjust(self, candidate: OtherSolution) -> Found | None:
         settings, limit = self.settings, self.settings.limit * self.scale
         start = self._values(candidate.scene)
-        few = settings.evaluations_before_rejection
-        problem, minimum = self.minimise(self.problem, start, max_steps=few)
+        first_steps = settings.evaluations_before_rejection
+        problem, minimum = self.minimise(self.problem, start, max_steps=first_steps)
         if int(minimum.termination) == LIMIT:
             # `not … <`: NaN is rejected, too.
             if not _cost(minimum) - self.first.vtpv < settings.early_limit * limit:
                 return None
             runs = [minimum]
             while int(runs[-1].termination) == LIMIT and len(runs) <= settings.max_runs:
-                problem, rest = self.minimise(problem, runs[-1].values)
-                runs.append(rest)
-                if not _cost(rest) - self.first.vtpv < limit:
+                problem, remaining = self.minimise(problem, runs[-1].values)
+                runs.append(remaining)
+                if not _cost(remaining) - self.first.vtpv < limit:
                     return None
             minimum = concatenate_runs(runs)
         if not _cost(minimum) - self.first.vtpv < limit:
             return None
-        found = inspect_solution(problem, minimum)
-        if found is None:
+        inspection = inspect_solution(problem, minimum)
+        if inspection is None:
             return None
-        there = scene_of(found.adjusted)
+        other_scene = scene_of(inspection.adjusted)
         # Never a solution with its points behind the cameras.
-        if self._behind(there) > self._behind(self.scene) or not self._differs(there):
+        if self._behind(other_scene) > self._behind(self.scene) or not self._differs(other_scene):
             return None
         images = candidate.images
-        turn = float(turns(self.scene, there)[images].max())
-        shift = float(np.linalg.norm(there.X0 - self.scene.X0, axis=1)[images].max())
-        return Found(candidate, problem, minimum, found, turn, shift)
+        turn = float(turns(self.scene, other_scene)[images].max())
+        shift = float(np.linalg.norm(other_scene.X0 - self.scene.X0, axis=1)[images].max())
+        return Found(candidate, problem, minimum, inspection, turn, shift)
 
     def _behind(self, scene: NetworkScene) -> int:
         """Images with most of their points behind them."""
@@ -337,16 +360,16 @@ class _State:
         values["point"] = with_coordinates(values["point"], X)
         return values
 
-    def _differs(self, there: NetworkScene) -> bool:
+    def _differs(self, other_scene: NetworkScene) -> bool:
         """Whether the pose of an image, or a point, differs significantly from the present one:
         outside of the ellipsoid of its covariance that holds all but the error probability."""
-        here, first = self.scene, self.first
-        turn = rotation_vectors(there.M @ here.M.transpose(0, 2, 1))
-        poses = np.concatenate([there.X0 - here.X0, turn], 1)
+        scene, first = self.scene, self.first
+        turn = rotation_vectors(other_scene.M @ scene.M.transpose(0, 2, 1))
+        poses = np.concatenate([other_scene.X0 - scene.X0, turn], 1)
         if self._outside(poses, first.image_cofactors):
             return True
         located = self.free_points & ~self.problem.at_any_distance & ~self.problem.excluded
-        return self._outside((there.X - here.X)[located], first.point_cofactors[located])
+        return self._outside((other_scene.X - scene.X)[located], first.point_cofactors[located])
 
     def _outside(self, change: Float[np.ndarray, "n k"], Q: Float[np.ndarray, "n k k"]) -> bool:
         # Of unit size, whatever the units of coordinates and angles.
@@ -357,41 +380,47 @@ class _State:
         limit = chi2_quantile(1 - self.settings.error_probability, change.shape[1])
         return bool((distance > limit * self.scale).any())
 
-    def is_better(self, found: Found) -> bool:
+    def is_better(self, other_minimum: Found) -> bool:
         """Whether another minimum takes the place of the present one: it fits better, or as well
         with more points in front of the cameras."""
-        difference = found.inspection.vtpv - self.first.vtpv
-        if found.candidate.ambiguity == MIRRORED:
-            fewer = self._behind(scene_of(found.inspection.adjusted)) < self._behind(self.scene)
+        difference = other_minimum.inspection.vtpv - self.first.vtpv
+        if other_minimum.candidate.ambiguity == MIRRORED:
+            fewer = self._behind(scene_of(other_minimum.inspection.adjusted)) < self._behind(
+                self.scene
+            )
             return fewer and difference < self.settings.threshold * self.scale
         return difference < -max(1e-9 * self.first.vtpv, self.rounding)
 
-    def record(self, found: Found) -> SecondMinimum:
+    def record(self, other_minimum: Found) -> SecondMinimum:
         """The other minimum as reported for the present one."""
-        return self._record(found, self.first.vtpv, found.inspection.vtpv, taken=False)
+        return self._record(
+            other_minimum, self.first.vtpv, other_minimum.inspection.vtpv, taken=False
+        )
 
-    def record_superseded(self, found: Found, other: float) -> SecondMinimum:
-        """A minimum that the present one has replaced; `other`: its vᵀPv."""
-        return self._record(found, self.first.vtpv, other, taken=True)
+    def record_superseded(self, other_minimum: Found, other_vtpv: float) -> SecondMinimum:
+        """A minimum that the present one has replaced; `other_vtpv`: its vᵀPv."""
+        return self._record(other_minimum, self.first.vtpv, other_vtpv, taken=True)
 
-    def _record(self, found: Found, vtpv: float, other: float, *, taken: bool) -> SecondMinimum:
+    def _record(
+        self, other_minimum: Found, vtpv: float, other_vtpv: float, *, taken: bool
+    ) -> SecondMinimum:
         """`taken`: whether the iterations ended in the other one first."""
         counts = self.problem.counts
-        E = evidence(vtpv, other, counts.redundancy, self.stated, self.rounding)
+        E = evidence(vtpv, other_vtpv, counts.redundancy, self.stated, self.rounding)
         ids = self.problem.network.images.id
-        images = tuple(str(ids[k]) for k in found.candidate.images)
-        mirrored = found.candidate.ambiguity == MIRRORED
+        images = tuple(str(ids[k]) for k in other_minimum.candidate.images)
+        mirrored = other_minimum.candidate.ambiguity == MIRRORED
         ambiguous = E < self.settings.threshold and not mirrored
         return SecondMinimum(
-            found.candidate.ambiguity,
+            other_minimum.candidate.ambiguity,
             images,
             vtpv,
-            other,
+            other_vtpv,
             E,
             ambiguous,
             taken,
-            found.turn,
-            found.shift,
+            other_minimum.turn,
+            other_minimum.shift,
         )
 
 
@@ -399,26 +428,30 @@ def _cost(minimum: Minimum) -> float:
     """vᵀPv where iterations ended."""
     steps = int(minimum.iterations)
     cost = np.asarray(minimum.history.cost)[:steps]
-    accepted = np.asarray(minimum.history.accepted)[:steps]
-    return float(2 * cost[accepted][-1]) if accepted.any() else np.inf
+    is_accepted = np.asarray(minimum.history.accepted)[:steps]
+    return float(2 * cost[is_accepted][-1]) if is_accepted.any() else np.inf
 
 
-def _are_same(found: Found, other: Found, rounding: float) -> bool:
+def _are_same(minimum_a: Found, minimum_b: Found, rounding: float) -> bool:
     """Whether two candidates led to one minimum; `rounding`: of vᵀPv."""
-    one, two = (scene_of(f.inspection.adjusted) for f in (found, other))
-    vtpv = found.inspection.vtpv
+    scene_a, scene_b = (scene_of(f.inspection.adjusted) for f in (minimum_a, minimum_b))
+    vtpv = minimum_a.inspection.vtpv
     # `<=`: minima that differ in points alone are not turned at all.
-    near = abs(vtpv - other.inspection.vtpv) <= max(1e-6 * vtpv, rounding)
-    return bool(near and turns(one, two).max() <= 0.01 * min(found.turn, other.turn))
+    is_near = abs(vtpv - minimum_b.inspection.vtpv) <= max(1e-6 * vtpv, rounding)
+    return bool(
+        is_near and turns(scene_a, scene_b).max() <= 0.01 * min(minimum_a.turn, minimum_b.turn)
+    )
 
 
 def _common_rays(
-    seen: Sights, first: int, second: int
+    sighted: Sights, first_image: int, second_image: int
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
     """x, y with c = 1 of the points that two images have in common."""
-    one, two = (seen.rows_of(k) for k in (first, second))
-    _, a, b = np.intersect1d(seen.point[one], seen.point[two], return_indices=True)
-    rays = seen.ray[one][a], seen.ray[two][b]
+    rows_of_first, rows_of_second = (sighted.rows_of(k) for k in (first_image, second_image))
+    _, a, b = np.intersect1d(
+        sighted.point[rows_of_first], sighted.point[rows_of_second], return_indices=True
+    )
+    rays = sighted.ray[rows_of_first][a], sighted.ray[rows_of_second][b]
     front = (rays[0][:, 2] < -MIN_COSINE) & (rays[1][:, 2] < -MIN_COSINE)
     xy = tuple(ray[front, :2] / -ray[front, 2:] for ray in rays)
     return xy[0], xy[1]
