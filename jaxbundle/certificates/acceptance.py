@@ -70,9 +70,9 @@ class AcceptanceRow:
         """Three digits, or as many as show on which side of the limit the value is."""
         limit = self.criterion.limit
         for digits in range(3, 16):
-            shown = float(f"{self.value:.{digits - 1}e}")
-            if self.criterion.holds(shown) == self.criterion.holds(self.value) and (
-                shown != limit or self.value == limit
+            rounded = float(f"{self.value:.{digits - 1}e}")
+            if self.criterion.holds(rounded) == self.criterion.holds(self.value) and (
+                rounded != limit or self.value == limit
             ):
                 return digits
         return 15
@@ -100,29 +100,29 @@ class Acceptance(TableMethods):
 
     def meets_all(self, inputs: Sequence[str]) -> Bool[np.ndarray, " inputs"]:
         """Which inputs of a batch meet every criterion; none if one cannot be decided of any."""
-        failed = {one for row in self.rows for one in row.failed}
+        failing = {key for row in self.rows for key in row.failed}
         undecided = any(row.why and not row.failed for row in self.rows)
-        return np.array([not undecided and one not in failed for one in inputs], bool)
+        return np.array([not undecided and key not in failing for key in inputs], bool)
 
     @property
     def sentence(self) -> str:
         """The result in words."""
-        failed = sum(not row.met for row in self.rows)
-        if not failed:
+        number_failed = sum(not row.met for row in self.rows)
+        if not number_failed:
             return f"{count(len(self.rows), 'criterion')} met".replace("criterions", "criteria")
-        return f"{failed} of {len(self.rows)} criteria not met"
+        return f"{number_failed} of {len(self.rows)} criteria not met"
 
     def table(self) -> dict[str, np.ndarray]:
         """A row a criterion: criterion, quantity, value, comparison, limit, unit, of, met, why."""
         text = lambda words: np.array(list(words), dtype=object)
-        of = [row.criterion for row in self.rows]
+        criteria = [row.criterion for row in self.rows]
         return {
-            "criterion": text(one.text for one in of),
-            "quantity": text(one.quantity for one in of),
+            "criterion": text(criterion.text for criterion in criteria),
+            "quantity": text(criterion.quantity for criterion in criteria),
             "value": np.array([row.value for row in self.rows]),
-            "comparison": text(one.comparison for one in of),
-            "limit": np.array([one.limit for one in of]),
-            "unit": text(one.unit for one in of),
+            "comparison": text(criterion.comparison for criterion in criteria),
+            "limit": np.array([criterion.limit for criterion in criteria]),
+            "unit": text(criterion.unit for criterion in criteria),
             "of": text(row.of for row in self.rows),
             "met": np.array([row.met for row in self.rows]),
             "why": text(row.why for row in self.rows),
@@ -144,8 +144,8 @@ class Acceptance(TableMethods):
         """The rows as plain dicts and numbers, as in JSON."""
         columns = {name: column.tolist() for name, column in self.table().items()}
         rows = [dict(zip(columns, r)) for r in zip(*columns.values())]
-        for found, row in zip(self.rows, rows):
-            row["failed"] = len(found.failed)
+        for known_row, row in zip(self.rows, rows):
+            row["failed"] = len(known_row.failed)
         return {"met": self.met, "criteria": rows}
 
     def __str__(self) -> str:
@@ -186,12 +186,12 @@ def accept(
 def accept_known(result: Any, criteria: Iterable[str]) -> Acceptance:
     """`accept`, in which a criterion that is refused is not met, with the reason."""
 
-    def judge(subject: Any, test: LengthTest | None, one: Criterion) -> AcceptanceRow:
+    def judge(subject: Any, test: LengthTest | None, criterion: Criterion) -> AcceptanceRow:
         try:
-            return _judge(subject, test, one)
+            return _judge(subject, test, criterion)
         except InputError as error:
-            why = str(error).removeprefix(f"criterion {one.text!r}: ")
-            return AcceptanceRow(one, math.nan, why=why)
+            why = str(error).removeprefix(f"criterion {criterion.text!r}: ")
+            return AcceptanceRow(criterion, math.nan, why=why)
 
     return _accept(result, criteria, None, judge)
 
@@ -199,19 +199,19 @@ def accept_known(result: Any, criteria: Iterable[str]) -> Acceptance:
 def _accept(
     result: Any, criteria: Iterable[str] | str, lengths: Any, judge: Callable[..., AcceptanceRow]
 ) -> Acceptance:
-    found = read_criteria(criteria)
+    read = read_criteria(criteria)
     population = getattr(result, "population", result)
     if isinstance(population, Population):
-        if all(one.name != SOLVED for one in found):
+        if all(criterion.name != SOLVED for criterion in read):
             # An input without a result has no numbers that could fail.
-            found.append(read_criterion(f"{SOLVED} >= 100 %"))
-        return Acceptance(tuple(judge(population, None, one) for one in found))
+            read.append(read_criterion(f"{SOLVED} >= 100 %"))
+        return Acceptance(tuple(judge(population, None, criterion) for criterion in read))
     if not np.all(getattr(result, "converged", True)):
         raise NotSolvedError("the result has no solution: there is nothing to accept")
     test = lengths
     if lengths is not None and not isinstance(lengths, LengthTest):
         test = length_test_of(result, lengths)
-    return Acceptance(tuple(judge(result, test, one) for one in found))
+    return Acceptance(tuple(judge(result, test, criterion) for criterion in read))
 
 
 def length_test_of(result: Any, lengths: Any, **options: Any) -> LengthTest:
@@ -221,37 +221,39 @@ def length_test_of(result: Any, lengths: Any, **options: Any) -> LengthTest:
     parts = getattr(result, "parts", None)
     if not parts:
         return length_errors(result, lengths, **options)
-    known = read_lengths(lengths)
+    calibrated = read_lengths(lengths)
     for part in parts[:-1]:
         try:
-            return length_errors(part.adjustment, known, **options)
+            return length_errors(part.adjustment, calibrated, **options)
         except InputError:
             continue
-    return length_errors(parts[-1].adjustment, known, **options)
+    return length_errors(parts[-1].adjustment, calibrated, **options)
 
 
-def _judge(result: Any, test: LengthTest | None, one: Criterion) -> AcceptanceRow:
+def _judge(result: Any, test: LengthTest | None, criterion: Criterion) -> AcceptanceRow:
     try:
-        found = find_quantity(result, test, one.name, one.argument)
-        in_unit_of_limit = lambda value: convert(value, found.unit, one.unit, found.pitch)
-        values = {name: in_unit_of_limit(value) for name, value in found.values.items()}
+        quantity = find_quantity(result, test, criterion.name, criterion.argument)
+        in_unit_of_limit = lambda value: convert(
+            value, quantity.unit, criterion.unit, quantity.pitch
+        )
+        values = {name: in_unit_of_limit(value) for name, value in quantity.values.items()}
     except InputError as error:
-        raise InputError(f"criterion {one.text!r}: {error}") from None
+        raise InputError(f"criterion {criterion.text!r}: {error}") from None
     except (LookupError, NotSolvedError) as error:
         why = str(error.args[0] if error.args else error)
-        return AcceptanceRow(one, math.nan, why=why, failed=getattr(error, "inputs", ()))
+        return AcceptanceRow(criterion, math.nan, why=why, failed=getattr(error, "inputs", ()))
     # NaN decides: what cannot be compared is not accepted
-    worst = max if one.upper else min
+    worst = max if criterion.upper else min
     unknown = [name for name, value in values.items() if math.isnan(value)]
-    of = unknown[0] if unknown else worst(values, key=lambda name: values[name])
-    failed = [name for name, value in values.items() if not one.holds(value)]
-    owners = [found.owners.get(name, name) for name in failed]
+    name_of_worst = unknown[0] if unknown else worst(values, key=lambda name: values[name])
+    failing = [name for name, value in values.items() if not criterion.holds(value)]
+    owners = [quantity.owners.get(name, name) for name in failing]
     return AcceptanceRow(
-        one,
-        values[of],
-        of,
+        criterion,
+        values[name_of_worst],
+        name_of_worst,
         len(values),
-        not failed,
+        not failing,
         "it is not a number" if unknown else "",
         tuple(dict.fromkeys(k for o in owners for k in ([o] if isinstance(o, str) else o))),
     )
@@ -269,32 +271,32 @@ def check_criteria(
     they are known.
 
     **Raises:** `InputError` naming the criterion, and what is known."""
-    criteria, known = read_criteria(texts or ()), offered(command)
-    if not known:
+    criteria, known_quantities = read_criteria(texts or ()), offered(command)
+    if not known_quantities:
         return criteria
-    for one in criteria:
+    for criterion in criteria:
         try:
-            if one.name not in known:
-                forms = [quantity.form for quantity in known.values()]
-                raise InputError(unknown_quantity(one.name, forms))
+            if criterion.name not in known_quantities:
+                forms = [quantity.form for quantity in known_quantities.values()]
+                raise InputError(unknown_quantity(criterion.name, forms))
             cameras = [Camera("", model) for model in models]
             cameras = cameras if network is None else network.cameras
-            if one.name in OF_UNKNOWNS and command != "pushbroom refine":
-                _check_unknown(one, cameras, network, command)
-            known[one.name].check_argument(one.argument)
-            _check_unit(one, known[one.name].unit, network)
+            if criterion.name in OF_UNKNOWNS and command != "pushbroom refine":
+                _check_unknown(criterion, cameras, network, command)
+            known_quantities[criterion.name].check_argument(criterion.argument)
+            _check_unit(criterion, known_quantities[criterion.name].unit, network)
         except InputError as error:
-            raise InputError(f"--accept {one.text!r}: {error}") from None
+            raise InputError(f"--accept {criterion.text!r}: {error}") from None
     return criteria
 
 
 def _check_unknown(
-    one: Criterion, cameras: Sequence[Camera], network: Network | None, command: str
+    criterion: Criterion, cameras: Sequence[Camera], network: Network | None, command: str
 ) -> None:
     """Refuse the name of an unknown that no camera, image or point has."""
-    if not one.argument:
+    if not criterion.argument:
         raise InputError("expected a parameter in parentheses, such as (c), (X0) or (Z)")
-    name = one.argument.rpartition(":")[2]
+    name = criterion.argument.rpartition(":")[2]
     if command == "calibrate-rig" and name in ("base", "rotation"):
         return
     if name in (*EXTERIOR, *AXES) and command != "calibrate-rig":
@@ -302,52 +304,54 @@ def _check_unknown(
     if not cameras:
         return
     require_parameter(cameras, name)
-    if network is None or one.argument.count(":") == 1:
+    if network is None or criterion.argument.count(":") == 1:
         return
-    kind, _, rest = one.argument.partition(":")
-    id = rest.rpartition(":")[0]
+    kind, _, after_kind = criterion.argument.partition(":")
+    id = after_kind.rpartition(":")[0]
     ids = [camera.id for camera in network.cameras]
-    if rest and kind == "camera" and id not in ("*", *ids):
+    if after_kind and kind == "camera" and id not in ("*", *ids):
         raise InputError(f"there is no camera {id!r}; known: {', '.join(ids)}")
-    chosen = [c for c in network.cameras if id in ("", "*", c.id)]
-    if one.name != "value" and not any(name in (*c.free, *c.unknowns) for c in chosen):
+    chosen_cameras = [c for c in network.cameras if id in ("", "*", c.id)]
+    if criterion.name != "value" and not any(
+        name in (*c.free, *c.unknowns) for c in chosen_cameras
+    ):
         raise InputError(f"{name} is held, and not estimated: add it to free")
 
 
-def _check_unit(one: Criterion, words: str, network: Network | None) -> None:
+def _check_unit(criterion: Criterion, words: str, network: Network | None) -> None:
     """Refuse a unit of another kind than the quantity has."""
     if words == "of NAME":
-        name = one.argument.rpartition(":")[2]
+        name = criterion.argument.rpartition(":")[2]
         if name in EXTERIOR[3:] or name == "rotation":
             words = "angle"
         elif name in (*EXTERIOR[:3], *AXES, "base"):
             words = "length"
         else:
-            _check_unit_of_parameter(one, name, network)
+            _check_unit_of_parameter(criterion, name, network)
             return
     if words == "length, angle":
-        words = "angle" if one.argument == "rotation" else "length"
-    kind = kind_of(one.unit)
+        words = "angle" if criterion.argument == "rotation" else "length"
+    kind = kind_of(criterion.unit)
     if words == "length":
         unit = "m" if network is None else network.object_unit
-        convert(1.0, unit, one.unit)
+        convert(1.0, unit, criterion.unit)
         return
     expected = {"": ("number",), "px": ("image", "length"), "angle": ("angle",)}
     expected["px, length"] = ("image", "length")
     if kind not in expected[words]:
-        given = {"": "", "px": "px", "px, length": "px", "angle": "deg"}[words]
-        convert(1.0, given, one.unit)
+        unit_of_quantity = {"": "", "px": "px", "px, length": "px", "angle": "deg"}[words]
+        convert(1.0, unit_of_quantity, criterion.unit)
 
 
-def _check_unit_of_parameter(one: Criterion, name: str, network: Network | None) -> None:
+def _check_unit_of_parameter(criterion: Criterion, name: str, network: Network | None) -> None:
     if network is None:
         return
     for camera in network.cameras:
         model = get_model(camera.model)
         if name not in model.parameters:
             continue
-        own = name in (*model.principal_distance, *model.principal_point)
-        unit = model.unit if own else ""
+        is_length_in_image = name in (*model.principal_distance, *model.principal_point)
+        unit = model.unit if is_length_in_image else ""
         square = camera.pixel_size is not None
-        if not (square and {kind_of(unit), kind_of(one.unit)} == {"image", "length"}):
-            convert(1.0, unit, one.unit)
+        if not (square and {kind_of(unit), kind_of(criterion.unit)} == {"image", "length"}):
+            convert(1.0, unit, criterion.unit)

@@ -34,35 +34,35 @@ def check_point_quantities(
     check points."""
 
     def number(result: Any) -> int:
-        found = differences_of(result)
-        return 0 if found is None else len(found.id)
+        differences = differences_of(result)
+        return 0 if differences is None else len(differences.id)
 
     def known_differences(subject: Subject, argument: str) -> tuple[CheckDifferences, list[int]]:
         """The differences, and the axes of the argument on which some are known: what is not known
         does not count as 0."""
-        found = differences_of(subject.result)
-        if found is None:
+        differences = differences_of(subject.result)
+        if differences is None:
             raise LookupError("the result has no check points")
-        known = np.asarray(np.isfinite(found.difference).any(0))
-        axes = [i for i, axis in enumerate(AXES) if axis in PARTS[argument] and known[i]]
+        is_known = np.asarray(np.isfinite(differences.difference).any(0))
+        axes = [i for i, axis in enumerate(AXES) if axis in PARTS[argument] and is_known[i]]
         if not axes:
             raise LookupError("no check point has this difference")
-        return found, axes
+        return differences, axes
 
     def rms(subject: Subject, argument: str) -> QuantityValues:
-        found, axes = known_differences(subject, argument)
-        square = np.nanmean(found.difference[:, axes] ** 2, axis=0).sum()
-        return one_value(math.sqrt(square), found.unit)
+        differences, axes = known_differences(subject, argument)
+        square = np.nanmean(differences.difference[:, axes] ** 2, axis=0).sum()
+        return one_value(math.sqrt(square), differences.unit)
 
     def largest(subject: Subject, argument: str) -> QuantityValues:
-        found, axes = known_differences(subject, argument)
+        differences, axes = known_differences(subject, argument)
         values = {
             f"{AXES[i]} of check point {id}": abs(float(d))
             for i in axes
-            for id, d in zip(found.id, found.difference[:, i])
+            for id, d in zip(differences.id, differences.difference[:, i])
             if math.isfinite(d)
         }
-        return QuantityValues(values, found.unit)
+        return QuantityValues(values, differences.unit)
 
     return (
         Quantity(

@@ -66,18 +66,18 @@ def read_criterion(text: str) -> Criterion:
     **Raises:** `InputError`, with the form that is expected."""
     # Of a locale without UTF-8 a command line has bytes for ≤ and µ.
     text = in_utf8(text) if isinstance(text, str) else text
-    found = PATTERN.fullmatch(text) if isinstance(text, str) else None
-    if found is None:
+    match = PATTERN.fullmatch(text) if isinstance(text, str) else None
+    if match is None:
         raise InputError(f"criterion {show(text)}: {FORM}")
-    unit = (found["unit"] or "").replace("µ", "u").replace("μ", "u")
-    limit = float(found["limit"])
+    unit = (match["unit"] or "").replace("µ", "u").replace("μ", "u")
+    limit = float(match["limit"])
     if not math.isfinite(limit):
         raise InputError(f"criterion {show(text)}: the limit must be a finite number")
     return Criterion(
         " ".join(text.split()),
-        found["name"],
-        found["argument"] or "",
-        COMPARISONS[found["comparison"]],
+        match["name"],
+        match["argument"] or "",
+        COMPARISONS[match["comparison"]],
         limit,
         unit,
     )
@@ -87,10 +87,10 @@ def read_criteria(texts: Iterable[str] | str) -> list[Criterion]:
     """Criteria from their texts, one or several.
 
     **Raises:** `InputError`; also for one that is given twice."""
-    given: Sequence[str] = [texts] if isinstance(texts, str) else list(texts)
-    found = [read_criterion(text) for text in given]
-    texts_of = [one.text for one in found]
+    texts_given: Sequence[str] = [texts] if isinstance(texts, str) else list(texts)
+    criteria = [read_criterion(text) for text in texts_given]
+    texts_of = [criterion.text for criterion in criteria]
     for text in texts_of:
         if texts_of.count(text) > 1:
             raise InputError(f"criterion {text!r}: is given twice")
-    return found
+    return criteria

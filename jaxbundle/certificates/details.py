@@ -108,111 +108,113 @@ class CertificateDetails:
 
     def held(self, angle_unit: str) -> dict[str, HeldInput]:
         """The held inputs, angles in radians."""
-        found = {}
-        for name, one in self.inputs.items():
+        inputs = {}
+        for name, held_input in self.inputs.items():
             angle = split_name(name)[2] in ANGLES
             scale = ANGLE_UNITS[angle_unit] if angle else 1.0
-            found[name] = dataclasses.replace(one, uncertainty=one.uncertainty * scale)
-        return found
+            inputs[name] = dataclasses.replace(
+                held_input, uncertainty=held_input.uncertainty * scale
+            )
+        return inputs
 
 
 NO_DETAILS = CertificateDetails()
 
 
-def read_details(given: Any) -> CertificateDetails:
+def read_details(source: Any) -> CertificateDetails:
     """Details from the path of a TOML file, or its content as a dict.
 
     **Raises:** `InputError` naming file, section and key."""
-    if given is None:
+    if source is None:
         return NO_DETAILS
-    if isinstance(given, CertificateDetails):
-        return given
+    if isinstance(source, CertificateDetails):
+        return source
     where = "details"
-    if isinstance(given, str | Path):
-        where, given = str(given), read_toml(Path(given))
-    if not isinstance(given, Mapping):
-        raise InputError(f"details: expected the path of a TOML file, got {show(given)}")
-    _check_keys(given, ("certificate", "evaluation", "input"), where)
-    stated = _section(given, "certificate", where)
-    _check_keys(stated, FIELDS, f"{where}, [certificate]")
-    evaluation = _section(given, "evaluation", where)
+    if isinstance(source, str | Path):
+        where, source = str(source), read_toml(Path(source))
+    if not isinstance(source, Mapping):
+        raise InputError(f"details: expected the path of a TOML file, got {show(source)}")
+    _check_keys(source, ("certificate", "evaluation", "input"), where)
+    fields_stated = _section(source, "certificate", where)
+    _check_keys(fields_stated, FIELDS, f"{where}, [certificate]")
+    evaluation = _section(source, "evaluation", where)
     _check_keys(evaluation, EVALUATION, f"{where}, [evaluation]")
-    inputs = given.get("input", [])
-    if not isinstance(inputs, list) or not all(isinstance(one, Mapping) for one in inputs):
+    inputs = source.get("input", [])
+    if not isinstance(inputs, list) or not all(isinstance(entry, Mapping) for entry in inputs):
         raise InputError(f"{where}: expected [[input]] sections")
     return CertificateDetails(
-        fields={name: str(value) for name, value in stated.items()},
+        fields={name: str(value) for name, value in fields_stated.items()},
         inputs=_inputs(inputs, where),
         **_evaluation(evaluation, f"{where}, [evaluation]"),
     )
 
 
-def _section(given: Mapping[str, Any], name: str, where: str) -> Mapping[str, Any]:
-    found = given.get(name, {})
-    if not isinstance(found, Mapping):
+def _section(document: Mapping[str, Any], name: str, where: str) -> Mapping[str, Any]:
+    section = document.get(name, {})
+    if not isinstance(section, Mapping):
         raise InputError(f"{where}: expected a section [{name}]")
-    return found
+    return section
 
 
-def _check_keys(given: Mapping[str, Any], known: Any, where: str) -> None:
-    for key in given:
-        refuse_unknown(key, known, f"{where}: ")
+def _check_keys(section: Mapping[str, Any], known_keys: Any, where: str) -> None:
+    for key in section:
+        refuse_unknown(key, known_keys, f"{where}: ")
 
 
-def _evaluation(given: Mapping[str, Any], where: str) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    if "coverage" in given:
-        found["coverage"] = number(f"{where}, coverage", given["coverage"])
-        if not 0 < found["coverage"] < 1:
+def _evaluation(section: Mapping[str, Any], where: str) -> dict[str, Any]:
+    options: dict[str, Any] = {}
+    if "coverage" in section:
+        options["coverage"] = number(f"{where}, coverage", section["coverage"])
+        if not 0 < options["coverage"] < 1:
             raise InputError(f"{where}, coverage: expected a probability between 0 and 1")
-    if "rule" in given and given["rule"] not in RULES:
+    if "rule" in section and section["rule"] not in RULES:
         raise InputError(f"{where}, rule: expected one of {', '.join(RULES)}")
     for name in ("mpe", "rule"):
-        if name in given:
-            found[name] = str(given[name])
+        if name in section:
+            options[name] = str(section[name])
     for name in ("horizontal_class", "vertical_class"):
-        if name in given:
-            found[name] = positive(f"{where}, {name}", given[name])
-    if "measurands" in given:
-        names = given["measurands"]
+        if name in section:
+            options[name] = positive(f"{where}, {name}", section[name])
+    if "measurands" in section:
+        names = section["measurands"]
         if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
             raise InputError(f"{where}, measurands: expected a list of names KIND:ID:NAME")
         for name in names:
             split_name(name)
-        found["measurands"] = tuple(names)
-    if "volume" in given:
-        sides = given["volume"]
+        options["measurands"] = tuple(names)
+    if "volume" in section:
+        sides = section["volume"]
         if not isinstance(sides, list) or len(sides) != 3:  # noqa: PLR2004 - width, depth, height
             raise InputError(f"{where}, volume: expected three sides, such as [2.0, 2.0, 1.5]")
-        found["volume"] = tuple(positive(f"{where}, volume", side) for side in sides)
-    return found
+        options["volume"] = tuple(positive(f"{where}, volume", side) for side in sides)
+    return options
 
 
-def _inputs(given: list[Mapping[str, Any]], where: str) -> dict[str, HeldInput]:
-    found: dict[str, HeldInput] = {}
-    for row, one in enumerate(given, 1):
+def _inputs(entries: list[Mapping[str, Any]], where: str) -> dict[str, HeldInput]:
+    inputs: dict[str, HeldInput] = {}
+    for row, entry in enumerate(entries, 1):
         place = f"{where}, input {row}"
-        _check_keys(one, INPUT, place)
-        if "name" not in one:
+        _check_keys(entry, INPUT, place)
+        if "name" not in entry:
             raise InputError(f"{place}: name is missing, such as camera:cam:K3")
-        name = ":".join(split_name(str(one["name"])))
-        if name in found:
+        name = ":".join(split_name(str(entry["name"])))
+        if name in inputs:
             raise InputError(f"{place}: {name} is given twice")
-        found[name] = _input(one, place)
-    return found
+        inputs[name] = _input(entry, place)
+    return inputs
 
 
-def _input(one: Mapping[str, Any], place: str) -> HeldInput:
-    given = [key for key in ("sigma", "limits", "expanded") if key in one]
-    if len(given) != 1:
+def _input(entry: Mapping[str, Any], place: str) -> HeldInput:
+    forms = [key for key in ("sigma", "limits", "expanded") if key in entry]
+    if len(forms) != 1:
         raise InputError(f"{place}: expected one of sigma, limits, expanded")
-    distribution = str(one.get("distribution", "rectangular" if "limits" in one else "normal"))
+    distribution = str(entry.get("distribution", "rectangular" if "limits" in entry else "normal"))
     if distribution not in DIVISORS:
         raise InputError(f"{place}, distribution: expected one of {', '.join(DIVISORS)}")
-    value = positive(f"{place}, {given[0]}", one[given[0]])
-    if given[0] == "limits":
+    value = positive(f"{place}, {forms[0]}", entry[forms[0]])
+    if forms[0] == "limits":
         value /= DIVISORS[distribution]
-    if given[0] == "expanded":
-        value /= positive(f"{place}, k", one.get("k", 2.0))
-    degrees = positive(f"{place}, degrees", one["degrees"]) if "degrees" in one else math.inf
-    return HeldInput(value, distribution, degrees, str(one.get("words", "")))
+    if forms[0] == "expanded":
+        value /= positive(f"{place}, k", entry.get("k", 2.0))
+    degrees = positive(f"{place}, degrees", entry["degrees"]) if "degrees" in entry else math.inf
+    return HeldInput(value, distribution, degrees, str(entry.get("words", "")))

@@ -140,20 +140,27 @@ def certificate(
     **Raises:** `InputError` for other results, details or criteria; `NotSolvedError` without a
     solution.
     """
-    known = read_details(details)
-    named = _adjustments(result)
+    certificate_details = read_details(details)
+    adjustments = _adjustments(result)
     if not result.converged:
         raise NotSolvedError("the result has no solution: there is nothing to certify")
     test = lengths
     if lengths is not None and not isinstance(lengths, LengthTest):
         test = length_test_of(
-            result, lengths, mpe=known.mpe or None, rule=known.rule, volume=known.volume
+            result,
+            lengths,
+            mpe=certificate_details.mpe or None,
+            rule=certificate_details.rule,
+            volume=certificate_details.volume,
         )
-    parts = tuple(_part(name, one, known) for name, one in named.items())
+    parts = tuple(
+        _part(name, adjustment_of_part, certificate_details)
+        for name, adjustment_of_part in adjustments.items()
+    )
     criteria = [criteria] if isinstance(criteria, str) else list(criteria)
-    accepted = accept(result, criteria, lengths=test) if criteria else None
+    acceptance = accept(result, criteria, lengths=test) if criteria else None
     rig = result if isinstance(result, RigCalibration) else getattr(result, "rig", None)
-    return Certificate(result, known, parts, rig, test, accepted, origin)
+    return Certificate(result, certificate_details, parts, rig, test, acceptance, origin)
 
 
 def _adjustments(result: Any) -> dict[str, Adjustment | Calibration]:
@@ -161,24 +168,28 @@ def _adjustments(result: Any) -> dict[str, Adjustment | Calibration]:
     if isinstance(result, Adjustment | Calibration):
         return {"": result}
     if isinstance(result, RigCalibration | Calibrations):
-        one = len(result.cameras) == 1
-        return {"" if one else name: found for name, found in result.cameras.items()}
+        is_single = len(result.cameras) == 1
+        return {
+            "" if is_single else name: calibration for name, calibration in result.cameras.items()
+        }
     if isinstance(result, Reconstruction):
-        one = len(result.parts) == 1
-        return {"" if one else part.name: part.adjustment for part in result.parts}
+        is_single = len(result.parts) == 1
+        return {"" if is_single else part.name: part.adjustment for part in result.parts}
     raise InputError(
         "expected a result of jaxbundle.adjust, calibrate, calibrate_rig or reconstruct, got "
         f"{show(result)}"
     )
 
 
-def _part(name: str, one: Adjustment | Calibration, details: CertificateDetails) -> CertifiedPart:
-    calibration = one if isinstance(one, Calibration) else None
-    adjustment = one.adjustment if isinstance(one, Calibration) else one
+def _part(
+    name: str, certified: Adjustment | Calibration, details: CertificateDetails
+) -> CertifiedPart:
+    calibration = certified if isinstance(certified, Calibration) else None
+    adjustment = certified.adjustment if isinstance(certified, Calibration) else certified
     budget, why = None, ""
-    of: Any = details.measurands or "cameras"
+    measurands: Any = details.measurands or "cameras"
     free = any(len(adjustment.cameras[c]["free"]) for c in adjustment.cameras)
-    if of == "cameras" and not free:
+    if measurands == "cameras" and not free:
         why = (
             "The cameras are held: they are inputs, not results. Name the quantities of the budget "
             "as measurands in the details."
@@ -187,7 +198,7 @@ def _part(name: str, one: Adjustment | Calibration, details: CertificateDetails)
         try:
             budget = uncertainty_budget(
                 adjustment,
-                of,
+                measurands,
                 held=details.held(adjustment.network.angle_unit),
                 coverage=details.coverage,
             )

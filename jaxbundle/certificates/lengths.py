@@ -84,21 +84,21 @@ def read_mpe(text: str, unit: str) -> PermissibleError:
     "10 um + L/25000, max 80 um", in an object unit.
 
     **Raises:** `InputError`."""
-    found = MPE_FORM.fullmatch(text) if isinstance(text, str) else None
-    if found is None:
+    match = MPE_FORM.fullmatch(text) if isinstance(text, str) else None
+    if match is None:
         raise InputError(
             f"MPE {show(text)}: expected A UNIT + L/K, such as '20 um + L/50000', or '50 um'"
         )
     if unit not in LENGTHS:
         raise InputError(f"MPE {text!r}: the object unit {unit!r} is no length")
     try:
-        constant = convert(float(found["a"]), found["unit"].replace("µ", "u"), unit)
+        constant = convert(float(match["a"]), match["unit"].replace("µ", "u"), unit)
         ceiling = math.inf
-        if found["b"]:
-            ceiling = convert(float(found["b"]), found["b_unit"].replace("µ", "u"), unit)
+        if match["b"]:
+            ceiling = convert(float(match["b"]), match["b_unit"].replace("µ", "u"), unit)
     except InputError as error:
         raise InputError(f"MPE {text!r}: {error}") from None
-    per_length = 1 / positive("K of the MPE", float(found["k"])) if found["k"] else 0.0
+    per_length = 1 / positive("K of the MPE", float(match["k"])) if match["k"] else 0.0
     return PermissibleError(constant, per_length, ceiling, " ".join(text.split()))
 
 
@@ -117,19 +117,19 @@ class CalibratedLengths:
         return len(self.ends)
 
 
-def read_lengths(given: Any) -> CalibratedLengths:
+def read_lengths(source: Any) -> CalibratedLengths:
     """Calibrated lengths from a table with the columns from, to, value, sigma and, if wanted, line:
     the path of a CSV file, a dict of columns, a data frame.
 
     **Raises:** `InputError` naming file and row."""
-    if isinstance(given, CalibratedLengths):
-        return given
+    if isinstance(source, CalibratedLengths):
+        return source
     name = "lengths"
-    if isinstance(given, str | Path):
-        name = str(given)
-        columns = read_csv(Path(given))
+    if isinstance(source, str | Path):
+        name = str(source)
+        columns = read_csv(Path(source))
     else:
-        columns = as_columns(given, name)
+        columns = as_columns(source, name)
     columns.check_names(("from", "to", "value", "sigma"), ("line",))
     value = columns.numbers("value", required=True)
     sigma = columns.numbers("sigma", required=True)
@@ -145,15 +145,15 @@ def read_lengths(given: Any) -> CalibratedLengths:
     return CalibratedLengths(ends, value, sigma, line, name)
 
 
-def require_points(lengths: CalibratedLengths, known: Sequence[str]) -> None:
+def require_points(lengths: CalibratedLengths, known_points: Sequence[str]) -> None:
     """Refuse lengths of points that a network does not have.
 
     **Raises:** `InputError`."""
-    there = set(known)
+    known_set = set(known_points)
     for name in (end for ends in lengths.ends for end in ends):
-        if name not in there:
+        if name not in known_set:
             raise InputError(
-                f"{lengths.source}: there is no point {name!r}{did_you_mean(name, known)}"
+                f"{lengths.source}: there is no point {name!r}{did_you_mean(name, known_points)}"
             )
 
 
@@ -217,10 +217,10 @@ class LengthTest(TableMethods):
     def verdict(self) -> str:
         """The verdict on the test: nonconformity if one length proves it, conformity if all do;
         empty without an MPE."""
-        found = self.verdicts
-        if not found:
+        verdicts = self.verdicts
+        if not verdicts:
             return ""
-        return FAILS if FAILS in found else OPEN if OPEN in found else CONFORMS
+        return FAILS if FAILS in verdicts else OPEN if OPEN in verdicts else CONFORMS
 
     @property
     def converged(self) -> bool:
@@ -235,18 +235,18 @@ class LengthTest(TableMethods):
         lines = {name: n for name, n in per_line.items() if name}
         reach = float(self.lengths.value.max()) / self.diagonal if self.diagonal > 0 else math.nan
         fewest = min(lines.values(), default=0)
-        stated = "not stated (column line)"
+        not_stated = "not stated (column line)"
         return [
             (
                 "measuring lines",
                 f"≥ {LEAST_LINES}",
-                str(len(lines)) if lines else stated,
+                str(len(lines)) if lines else not_stated,
                 len(lines) >= LEAST_LINES,
             ),
             (
                 "test lengths of a line",
                 f"≥ {LEAST_LENGTHS}",
-                str(fewest) if lines else stated,
+                str(fewest) if lines else not_stated,
                 fewest >= LEAST_LENGTHS,
             ),
             (
@@ -262,7 +262,7 @@ class LengthTest(TableMethods):
         error, mpe, guard_band, verdict."""
         a, b = zip(*self.lengths.ends)
         text = lambda words: np.array(list(words), dtype=object)
-        none = np.full(len(self.lengths), np.nan)
+        blank = np.full(len(self.lengths), np.nan)
         return {
             "from": text(a),
             "to": text(b),
@@ -272,7 +272,7 @@ class LengthTest(TableMethods):
             "measured": self.measured,
             "sigma_measured": self.sigma,
             "error": self.error,
-            "mpe": none if self.limit is None else self.limit,
+            "mpe": blank if self.limit is None else self.limit,
             "guard_band": self.guard_band,
             "verdict": text(self.verdicts or ("",) * len(self.lengths)),
         }
@@ -328,8 +328,8 @@ HEADER = ("from", "to", "line", "calibrated", "measured", "E", "MPE", "σ cal.",
 
 def _places(test: LengthTest) -> int:
     """Decimals: two digits of the smallest uncertainty, or of the largest error without any."""
-    known = test.lengths.sigma[test.lengths.sigma > 0]
-    size = float(known.min()) if len(known) else max(test.largest, 1e-12)
+    stated = test.lengths.sigma[test.lengths.sigma > 0]
+    size = float(stated.min()) if len(stated) else max(test.largest, 1e-12)
     return int(np.clip(1 - math.floor(math.log10(size)), 0, 9))
 
 
@@ -363,45 +363,47 @@ def length_errors(
     if not isinstance(adjustment, Adjustment):
         raise InputError(f"expected a result of jaxbundle.adjust, got {show(given)}")
     one_of("rule", rule, RULES)
-    known = read_lengths(lengths)
+    calibrated = read_lengths(lengths)
     if adjustment.counts.datum == 7:  # noqa: PLR2004 - three shifts, three rotations, scale
         raise InputError(
-            f"{known.source}: the network has no scale: add a distance or control points"
+            f"{calibrated.source}: the network has no scale: add a distance or control points"
         )
     unit = adjustment.network.object_unit
     limit = read_mpe(mpe, unit) if isinstance(mpe, str) else mpe
     rows_of = {
         id: row
-        for row, (id, there) in enumerate(
+        for row, (id, has_result) in enumerate(
             zip(adjustment.problem.network.points.id, adjustment.located)
         )
-        if there
+        if has_result
     }
-    _refuse_observed(adjustment, known)
-    there = [i for i, ends in enumerate(known.ends) if all(end in rows_of for end in ends)]
-    missing = tuple(ends for i, ends in enumerate(known.ends) if i not in set(there))
-    if not there:
+    _refuse_observed(adjustment, calibrated)
+    has_result = [
+        i for i, ends in enumerate(calibrated.ends) if all(end in rows_of for end in ends)
+    ]
+    missing = tuple(ends for i, ends in enumerate(calibrated.ends) if i not in set(has_result))
+    if not has_result:
         raise InputError(
-            f"{known.source}: no length has both points in the result; missing are "
+            f"{calibrated.source}: no length has both points in the result; missing are "
             f"{list_some(sorted({e for ends in missing for e in ends if e not in rows_of}))}"
         )
-    chosen = CalibratedLengths(
-        tuple(known.ends[i] for i in there),
-        known.value[there],
-        known.sigma[there],
-        tuple((known.line or ("",) * len(known))[i] for i in there),
-        known.source,
+    tested = CalibratedLengths(
+        tuple(calibrated.ends[i] for i in has_result),
+        calibrated.value[has_result],
+        calibrated.sigma[has_result],
+        tuple((calibrated.line or ("",) * len(calibrated))[i] for i in has_result),
+        calibrated.source,
     )
-    rows = np.array([[rows_of[end] for end in ends] for ends in chosen.ends])
-    between = lambda values: _distances(values, rows)
-    variance = np.diagonal(adjustment.covariance_of(between, classical=True))
+    rows = np.array([[rows_of[end] for end in ends] for ends in tested.ends])
+    lengths_between = lambda values: _distances(values, rows)
+    variance = np.diagonal(adjustment.covariance_of(lengths_between, classical=True))
     if adjustment.error_model is not None:
-        variance = np.fmax(variance, np.diagonal(adjustment.covariance_of(between)))
+        variance = np.fmax(variance, np.diagonal(adjustment.covariance_of(lengths_between)))
     ends = adjustment.point_values[rows].reshape(-1, 3)
     sides = np.ptp(ends, axis=0) if volume is None else np.asarray(volume, float)
     return LengthTest(
-        chosen,
-        np.asarray(between(adjustment.values)),
+        tested,
+        np.asarray(lengths_between(adjustment.values)),
         np.sqrt(np.clip(variance, 0, None)),
         unit,
         float(np.linalg.norm(sides)),
@@ -433,24 +435,27 @@ def join_length_tests(tests: Sequence[LengthTest] | Mapping[str, LengthTest]) ->
     """Repetitions as one test, such as the three of ISO 10360-2: errors of all of them.
 
     **Raises:** `InputError` without tests, or for different units, limits or rules."""
-    given = list(tests.values()) if isinstance(tests, Mapping) else list(tests)
-    if not given:
+    repetitions = list(tests.values()) if isinstance(tests, Mapping) else list(tests)
+    if not repetitions:
         raise InputError("tests: expected at least one")
-    first = given[0]
-    if any((t.unit, t.mpe, t.rule) != (first.unit, first.mpe, first.rule) for t in given):
+    first_test = repetitions[0]
+    if any(
+        (t.unit, t.mpe, t.rule) != (first_test.unit, first_test.mpe, first_test.rule)
+        for t in repetitions
+    ):
         raise InputError("expected tests of one unit, MPE and decision rule")
     lengths = CalibratedLengths(
-        tuple(ends for t in given for ends in t.lengths.ends),
-        np.concatenate([t.lengths.value for t in given]),
-        np.concatenate([t.lengths.sigma for t in given]),
-        tuple(line for t in given for line in t.lengths.line),
-        first.lengths.source,
+        tuple(ends for t in repetitions for ends in t.lengths.ends),
+        np.concatenate([t.lengths.value for t in repetitions]),
+        np.concatenate([t.lengths.sigma for t in repetitions]),
+        tuple(line for t in repetitions for line in t.lengths.line),
+        first_test.lengths.source,
     )
     return dataclasses.replace(
-        first,
+        first_test,
         lengths=lengths,
-        measured=np.concatenate([t.measured for t in given]),
-        sigma=np.concatenate([t.sigma for t in given]),
-        diagonal=max(t.diagonal for t in given),
-        missing=tuple(dict.fromkeys(ends for t in given for ends in t.missing)),
+        measured=np.concatenate([t.measured for t in repetitions]),
+        sigma=np.concatenate([t.sigma for t in repetitions]),
+        diagonal=max(t.diagonal for t in repetitions),
+        missing=tuple(dict.fromkeys(ends for t in repetitions for ends in t.missing)),
     )

@@ -83,12 +83,12 @@ def _first(certificate: "Certificate") -> Section:
 
 
 def _cards(cards: Sequence[Card]) -> str:
-    inside = "".join(
+    content = "".join(
         f'<div class="card {card.state}"><small>{text(card.title)}</small>'
         f"<b>{text(card.value)}</b><small>{text(card.note)}</small></div>\n"
         for card in cards
     )
-    return f'<div class="cards">\n{inside}</div>\n'
+    return f'<div class="cards">\n{content}</div>\n'
 
 
 STATES = {GOOD: "good", BAD: "bad", "doubtful": "open"}
@@ -97,23 +97,23 @@ STATES = {GOOD: "good", BAD: "bad", "doubtful": "open"}
 def find_cards(certificate: "Certificate") -> list[Card]:
     """Verdicts first, then key figures."""
     cards = []
-    if (accepted := certificate.acceptance) is not None:
-        state = "good" if accepted.met else "bad"
-        verdict = "accepted" if accepted.met else "not accepted"
-        cards.append(Card("Acceptance criteria", verdict, accepted.sentence, state))
+    if (acceptance := certificate.acceptance) is not None:
+        state = "good" if acceptance.met else "bad"
+        verdict = "accepted" if acceptance.met else "not accepted"
+        cards.append(Card("Acceptance criteria", verdict, acceptance.sentence, state))
     if (test := certificate.lengths) is not None:
-        said = {
+        verdict_words = {
             length_tests.CONFORMS: ("conforms", "good"),
             length_tests.FAILS: ("does not conform", "bad"),
             length_tests.OPEN: ("not decided", "open"),
             "": ("no MPE stated", ""),
         }[test.verdict]
         note = f"MPE {test.mpe.text or significant(test.mpe.constant)}" if test.mpe else ""
-        cards.append(Card("Length measurement", said[0], note, said[1]))
+        cards.append(Card("Length measurement", verdict_words[0], note, verdict_words[1]))
     for part in certificate.parts[:1]:
-        found = part.adjustment.verdict
-        state = STATES.get(found.state, "")
-        cards.append(Card("Tests of the adjustment", found.state, "see report", state))
+        adjustment_verdict = part.adjustment.verdict
+        state = STATES.get(adjustment_verdict.state, "")
+        cards.append(Card("Tests of the adjustment", adjustment_verdict.state, "see report", state))
     if test is not None:
         rms = readable_length(test.rms, test.unit)
         note = f"largest of {count(len(test.lengths), 'length')}, RMS {rms}"
@@ -125,28 +125,28 @@ def find_cards(certificate: "Certificate") -> list[Card]:
 
 def _figures(part: "CertifiedPart") -> list[Card]:
     name = f"{clean(part.name)}: " if part.name else ""
-    found = [
+    cards = [
         Card(
             f"{name}σ0", f"{part.adjustment.sigma0:.3f}", f"redundancy {part.adjustment.redundancy}"
         )
     ]
     if part.calibration is not None:
         note = f"{len(part.calibration.views)} photographs"
-        found.append(Card(f"{name}RMS of an image point", f"{part.calibration.rms:.3f} px", note))
+        cards.append(Card(f"{name}RMS of an image point", f"{part.calibration.rms:.3f} px", note))
     if part.accuracy is not None:
         accuracy = part.accuracy
         state = {"met": "good", "not met": "bad", "": ""}[accuracy.verdict]
-        whole = accuracy.rmse_3d if all(accuracy.number) else accuracy.rmse_v
-        value = readable_length(whole, accuracy.unit)
+        rmse = accuracy.rmse_3d if all(accuracy.number) else accuracy.rmse_v
+        value = readable_length(rmse, accuracy.unit)
         note = count(max(accuracy.number), "check point")
         title = "RMSE_3D" if all(accuracy.number) else "RMSE_V"
-        found.append(Card(f"{name}{title}", value, note, state))
+        cards.append(Card(f"{name}{title}", value, note, state))
     if part.budget is not None:
         value, U, unit = part.budget.result_rows()[0][1:4]
-        first = part.budget.measurands[0].words
+        first_measurand = part.budget.measurands[0].words
         note = f"± {U} {unit}, {100 * part.budget.coverage:.4g} %"
-        found.append(Card(first, f"{value} {unit}".strip(), note))
-    return found
+        cards.append(Card(first_measurand, f"{value} {unit}".strip(), note))
+    return cards
 
 
 def readable_length(value: float, unit: str) -> str:
@@ -159,11 +159,11 @@ def readable_length(value: float, unit: str) -> str:
 
 def _identity(certificate: "Certificate") -> str:
     """What the laboratory states, with lines to fill in where it did not."""
-    given = certificate.details.fields
+    stated = certificate.details.fields
     rows = []
     for name, title in FIELDS.items():
-        if name in given:
-            cell = text(given[name])
+        if name in stated:
+            cell = text(stated[name])
         elif name in WANTED:
             cell = '<span class="blank"></span>'
         else:
@@ -175,9 +175,9 @@ def _identity(certificate: "Certificate") -> str:
 def _picture(part: "CertifiedPart") -> str:
     """A camera's uncertainty over its image; else the network in plan."""
     if part.calibration is not None:
-        found = part.calibration.uncertainty()
+        uncertainty = part.calibration.uncertainty()
         return figure(
-            draw_field(found.sigma),
+            draw_field(uncertainty.sigma),
             f"Camera {part.calibration.name}: σ of a projected point at infinity over the image, "
             "from corner to corner, pixels",
         )
@@ -188,12 +188,12 @@ def draw_network(adjustment: "Adjustment") -> str:
     """Stations and points in plan, with error ellipses of the points; nothing without points."""
     points, C = adjustment.point_values[:, :2], adjustment.point_covariance[:, :2, :2]
     stations = adjustment.image_values[:, :2]
-    there = np.isfinite(points).all(1) & np.isfinite(C).all((1, 2))
-    points, C = points[there], C[there]
+    is_finite = np.isfinite(points).all(1) & np.isfinite(C).all((1, 2))
+    points, C = points[is_finite], C[is_finite]
     if not len(points):
         return ""
     extent = float(np.ptp(np.concatenate([points, stations]), axis=0).max()) or 1.0
-    roots = [_ellipse_root(one) for one in C]
+    roots = [_ellipse_root(block) for block in C]
     largest = max((float(np.linalg.norm(root)) for root in roots), default=0.0)
     # The largest ellipse a twentieth of the network, times a round number.
     factor = round_down(0.05 * extent / largest) if largest > 0 else 0.0
@@ -281,22 +281,22 @@ def _rig(certificate: "Certificate") -> Iterator[Section]:
 
 
 def _budgets(certificate: "Certificate") -> Iterator[Section]:
-    parts, left = [], MOST_BUDGETS
+    parts, remaining = [], MOST_BUDGETS
     for part in certificate.parts:
         if part.budget is None:
             continue
-        for m, one in enumerate(part.budget.measurands):
-            if left == 0:
+        for m, measurand in enumerate(part.budget.measurands):
+            if remaining == 0:
                 break
-            left -= 1
+            remaining -= 1
             where = f", {part.name}" if part.name else ""
             row = part.budget.result_rows()[m]
             parts += [
-                f"<h3>{text(one.words + where)}</h3>\n",
+                f"<h3>{text(measurand.words + where)}</h3>\n",
                 grid(BUDGET_HEADER, part.budget.rows(m), "budget"),
                 paragraph(
                     f"u = {row[4]}, ν_eff = {row[6]}, k = {row[5]}, "
-                    f"U = {f'{row[2]} {one.unit}'.strip()}; σ of "
+                    f"U = {f'{row[2]} {measurand.unit}'.strip()}; σ of "
                     f"the adjustment {significant(float(part.budget.sigma[m]))}."
                 ),
             ]
@@ -322,9 +322,9 @@ def _acceptance(certificate: "Certificate") -> Iterator[Section]:
     yield acceptance_section(certificate.acceptance)
 
 
-def acceptance_section(found: "Acceptance") -> Section:
+def acceptance_section(acceptance: "Acceptance") -> Section:
     """The criteria, with what was found."""
-    content = grid(ACCEPTANCE_HEADER, found.text_rows(), "words")
+    content = grid(ACCEPTANCE_HEADER, acceptance.text_rows(), "words")
     return Section("acceptance", "Acceptance criteria", content, "Acceptance")
 
 
@@ -349,20 +349,20 @@ def lengths_section(test: "LengthTest") -> Section:
         ("Decision rule", rule),
         ("Verdict", test.verdict or "none: no maximum permissible error is stated"),
     ]
-    wanted = [
-        (about, asked, found, "met" if met else "not met")
-        for about, asked, found, met in test.requirements()
+    requirements = [
+        (about, wanted, met_by, "met" if is_met else "not met")
+        for about, wanted, met_by, is_met in test.requirements()
     ]
     parts = [
         _draw_errors(test),
         facts(rows),
         "<h3>Arrangement</h3>\n",
-        grid(("VDI/VDE 2634-1", "wanted", "found", ""), wanted, "words"),
+        grid(("VDI/VDE 2634-1", "wanted", "found", ""), requirements, "words"),
         f"<h3>Lengths in {text(unit)}</h3>\n",
         grid(length_tests.HEADER, test.rows(), "remarks"),
     ]
     if test.missing:
-        ends = [" – ".join(one) for one in test.missing]
+        ends = [" – ".join(ends_of_length) for ends_of_length in test.missing]
         parts += ["<h3>Not measured</h3>\n", items(ends)]
     title = "Length measurement errors (VDI/VDE 2634-1)"
     return Section("lengths", title, "".join(parts), "Length errors")
@@ -381,16 +381,18 @@ def _draw_errors(test: "LengthTest") -> str:
     size = 0.006 * (float(np.ptp(x)) or float(x[0]))
     u = 2 * test.lengths.sigma[order]
     curves = []
-    for length, error, half in zip(x, test.error[order], u):
+    for length, error, half_width in zip(x, test.error[order], u):
         ends = np.array([length - size, length + size])
         curves.append(Curve("E", ends, np.full(2, error)))
-        if half > 0:
-            upright = np.array([error - half, error + half])
+        if half_width > 0:
+            upright = np.array([error - half_width, error + half_width])
             curves.append(Curve("± 2u of the calibration", np.full(2, length), upright))
     if test.limit is not None:
-        over = np.linspace(0.0, float(x[-1]), 60)
-        limit = (test.mpe or (lambda _: over))(over)
-        curves += [Curve("± MPE", over, sign * limit, kind="second") for sign in (1.0, -1.0)]
+        lengths_drawn = np.linspace(0.0, float(x[-1]), 60)
+        limit = (test.mpe or (lambda _: lengths_drawn))(lengths_drawn)
+        curves += [
+            Curve("± MPE", lengths_drawn, sign * limit, kind="second") for sign in (1.0, -1.0)
+        ]
     unit = clean(test.unit)
     drawing = draw_curves(curves, f"calibrated length [{unit}]", f"E [{unit}]")
     return figure(drawing, "Length measurement errors E = measured − calibrated, bars ± 2u")
@@ -398,15 +400,15 @@ def _draw_errors(test: "LengthTest") -> str:
 
 def _accuracy(certificate: "Certificate") -> Iterator[Section]:
     for part in certificate.parts:
-        if (found := part.accuracy) is None:
+        if (accuracy := part.accuracy) is None:
             continue
         where = f", {part.name}" if part.name else ""
-        rows = found.rows()
+        rows = accuracy.rows()
         parts = [
-            grid(SUMMARY_HEADER, found.summary()),
-            items(found.statements()),
-            *([items(found.remarks())] if found.remarks() else []),
-            f"<h3>Check points: product − check point, in {text(found.unit)}</h3>\n",
+            grid(SUMMARY_HEADER, accuracy.summary()),
+            items(accuracy.statements()),
+            *([items(accuracy.remarks())] if accuracy.remarks() else []),
+            f"<h3>Check points: product − check point, in {text(accuracy.unit)}</h3>\n",
             grid(positional.HEADER, rows[:MOST_ROWS]),
             paragraph(f"Standard: {positional.STANDARD}."),
         ]
@@ -455,18 +457,18 @@ CONTROL_HEADER = ("point", "X", "Y", "Z", "vX", "vY", "vZ", "σX", "σY", "σZ")
 def control_rows(adjustment: "Adjustment") -> list[tuple[str, ...]]:
     """Control points: adjusted coordinates, adjusted − given, and the given σ."""
     points = adjustment.problem.network.points
-    chosen = np.flatnonzero(points.has_role("control"))
-    if not len(chosen):
+    control_points = np.flatnonzero(points.has_role("control"))
+    if not len(control_points):
         return []
-    given, sigma = points.position[chosen], points.sigma[chosen]
-    adjusted = adjustment.point_values[chosen]
-    v = np.where(np.isposinf(sigma), np.nan, adjusted - given)
+    given_coordinates, sigma = points.position[control_points], points.sigma[control_points]
+    adjusted = adjustment.point_values[control_points]
+    v = np.where(np.isposinf(sigma), np.nan, adjusted - given_coordinates)
     places = column_decimals(np.concatenate([sigma.ravel(), adjustment.points["sX"]]))
     cell = lambda x: fixed(float(x), places)
-    shown = lambda s: "free" if np.isposinf(s) else "held" if not s > 0 else cell(s)
+    sigma_text = lambda s: "free" if np.isposinf(s) else "held" if not s > 0 else cell(s)
     return [
-        (points.id[row], *map(cell, (*a, *d)), *map(shown, s))
-        for row, a, d, s in zip(chosen, adjusted, v, sigma)
+        (points.id[row], *map(cell, (*a, *d)), *map(sigma_text, s))
+        for row, a, d, s in zip(control_points, adjusted, v, sigma)
     ]
 
 

@@ -58,8 +58,8 @@ class PositionalAccuracy(TableMethods):
     @property
     def number(self) -> tuple[int, int]:
         """Horizontal and vertical check points."""
-        known = np.isfinite(self.difference)
-        return int(known[:, :2].all(1).sum()), int(known[:, 2].sum())
+        is_known = np.isfinite(self.difference)
+        return int(is_known[:, :2].all(1).sum()), int(is_known[:, 2].sum())
 
     @property
     def rmse_axes(self) -> Float[np.ndarray, "3"]:
@@ -69,15 +69,15 @@ class PositionalAccuracy(TableMethods):
     @property
     def mean(self) -> Float[np.ndarray, "3"]:
         """The mean differences."""
-        known = np.isfinite(self.difference)
+        is_known = np.isfinite(self.difference)
         with np.errstate(invalid="ignore"):
-            return np.where(known, self.difference, 0.0).sum(0) / known.sum(0)
+            return np.where(is_known, self.difference, 0.0).sum(0) / is_known.sum(0)
 
     @property
     def survey(self) -> tuple[float, float]:
         """RMSE_H2 and RMSE_V2, of the survey of the check points; 0 where no σ is stated."""
-        known = np.isfinite(self.difference)
-        s = np.nan_to_num(_rms(np.where(known, np.nan_to_num(self.sigma), np.nan)))
+        is_known = np.isfinite(self.difference)
+        s = np.nan_to_num(_rms(np.where(is_known, np.nan_to_num(self.sigma), np.nan)))
         return float(np.hypot(s[0], s[1])), float(s[2])
 
     @property
@@ -108,56 +108,59 @@ class PositionalAccuracy(TableMethods):
             (self.rmse_h, self.horizontal_class),
             (self.rmse_v, self.vertical_class),
         ]
-        given = [value <= limit for value, limit in tested if limit is not None]
-        return "" if not given else "met" if all(given) else "not met"
+        within_classes = [value <= limit for value, limit in tested if limit is not None]
+        return "" if not within_classes else "met" if all(within_classes) else "not met"
 
     def statements(self) -> list[str]:
         """The accuracy in the words of the standard."""
-        found = []
-        for what, value, limit, number in (
+        sentences = []
+        for direction, value, limit, number in (
             ("horizontal", self.rmse_h, self.horizontal_class, self.number[0]),
             ("vertical", self.rmse_v, self.vertical_class, self.number[1]),
         ):
             if not number:
                 continue
-            symbol = "RMSE_H" if what == "horizontal" else "RMSE_V"
-            tested = f"Tested {what} positional accuracy: {symbol} = {self._centimetres(value)}"
+            symbol = "RMSE_H" if direction == "horizontal" else "RMSE_V"
+            tested = (
+                f"Tested {direction} positional accuracy: {symbol} = {self._centimetres(value)}"
+            )
             if limit is not None:
                 verb = "meets" if value <= limit else "does not meet"
-                tested += (
-                    f"; {verb} the {what} accuracy class of {self._centimetres(limit)} {symbol}"
-                )
-            found.append(f"{tested}, of {count(number, 'check point')}.")
+                tested += f"; {verb} the {direction} accuracy class of {self._centimetres(limit)} {symbol}"
+            sentences.append(f"{tested}, of {count(number, 'check point')}.")
         if all(self.number):
-            found.append(f"Three-dimensional: RMSE_3D = {self._centimetres(self.rmse_3d)}.")
+            sentences.append(f"Three-dimensional: RMSE_3D = {self._centimetres(self.rmse_3d)}.")
         if not self.enough:
-            found.append(
+            sentences.append(
                 f"Fewer check points than the {LEAST_POINTS} that the standard wants: the figures "
                 "are of these points, and no statement on the class of the whole."
             )
-        return found
+        return sentences
 
     def remarks(self) -> list[str]:
         """What the standard wants to be looked at: mean errors, the survey of the check points."""
-        found = []
+        sentences = []
         for axis, mean, rms in zip("XYZ", self.mean, self.rmse_axes):
             if rms > 0 and abs(mean) > MEAN_SHARE * rms:
-                found.append(
+                sentences.append(
                     f"mean error in {axis} {significant(float(mean))} {self.unit}: more than a "
                     f"quarter of its RMSE {significant(float(rms))}; look for its cause"
                 )
-        for what, survey, product in (
+        for direction, survey, product in (
             ("horizontal", self.survey[0], self.rmse_h),
             ("vertical", self.survey[1], self.rmse_v),
         ):
             if survey == 0:
-                found.append(f"no σ of the {what} survey of the check points is stated: taken as 0")
+                sentences.append(
+                    f"no σ of the {direction} survey of the check points is stated: taken as 0"
+                )
             elif survey > product / 2:
-                found.append(
-                    f"the {what} survey of the check points ({significant(survey)} {self.unit}) is "
+                sentences.append(
+                    f"the {direction} survey of the check points ({significant(survey)} "
+                    f"{self.unit}) is "
                     "not twice as accurate as the product"
                 )
-        return found
+        return sentences
 
     def _centimetres(self, value: float) -> str:
         if self.unit not in LENGTHS:
@@ -214,8 +217,8 @@ class PositionalAccuracy(TableMethods):
 
     def __str__(self) -> str:
         lines = table(SUMMARY_HEADER, self.summary(), "lrrr")
-        said = [*self.statements(), *self.remarks()]
-        return "\n".join([f"Positional accuracy in {self.unit}", *lines, *said])
+        sentences = [*self.statements(), *self.remarks()]
+        return "\n".join([f"Positional accuracy in {self.unit}", *lines, *sentences])
 
 
 SUMMARY_HEADER = ("", "fit to check points", "survey of check points", "accuracy")
@@ -223,14 +226,16 @@ HEADER = ("check point", "dX", "dY", "dZ", "σX", "σY", "σZ")
 
 
 def _rms(x: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
-    known = np.isfinite(x)
+    is_known = np.isfinite(x)
     with np.errstate(invalid="ignore"):
-        return np.sqrt(np.where(known, x**2, 0.0).sum(0) / known.sum(0))
+        return np.sqrt(np.where(is_known, x**2, 0.0).sum(0) / is_known.sum(0))
 
 
 def _places(rmse: Float[np.ndarray, "3"]) -> int:
-    known = rmse[np.isfinite(rmse) & (rmse > 0)]
-    return int(np.clip(2 - math.floor(math.log10(known.min())), 0, 9)) if len(known) else 4
+    known_rmse = rmse[np.isfinite(rmse) & (rmse > 0)]
+    return (
+        int(np.clip(2 - math.floor(math.log10(known_rmse.min())), 0, 9)) if len(known_rmse) else 4
+    )
 
 
 def positional_accuracy(
@@ -248,8 +253,8 @@ def positional_accuracy(
     adjustment = getattr(given, "adjustment", given)
     if not isinstance(adjustment, Adjustment):
         raise InputError(f"expected a result of jaxbundle.adjust, got {show(given)}")
-    found = adjustment.check_points
-    if found is None or not np.isfinite(found.difference).any():
+    check_points = adjustment.check_points
+    if check_points is None or not np.isfinite(check_points.difference).any():
         raise InputError(
             "there are no check points with given coordinates: give some the role check, or "
             "choose them by check"
@@ -263,5 +268,5 @@ def positional_accuracy(
     sigma = np.array(not_none(adjustment.check)[0].sigma, float)
     sigma[~np.isfinite(sigma)] = np.nan
     return PositionalAccuracy(
-        found.id, found.difference, sigma, unit, horizontal_class, vertical_class
+        check_points.id, check_points.difference, sigma, unit, horizontal_class, vertical_class
     )

@@ -48,7 +48,7 @@ from jaxbundle.types import not_none
 def offered(kind: str) -> dict[str, Quantity]:
     """The quantities of a command's result, by name; none of a command whose quantities are the
     numbers of its JSON."""
-    every = {
+    groups_of_quantities = {
         "adjust": (OF_ADJUSTMENT,),
         "calibrate": (OF_CALIBRATION, OF_ADJUSTMENT),
         "calibrate-rig": (OF_RIG,),
@@ -57,11 +57,11 @@ def offered(kind: str) -> dict[str, Quantity]:
         "hand-eye": (OF_HAND_EYE, OF_ADJUSTMENT),
         "pushbroom refine": (OF_REFINEMENT,),
     }.get(kind, ())
-    found: dict[str, Quantity] = {}
-    for quantities in every:
-        for one in quantities:
-            found.setdefault(one.name, one)
-    return found
+    by_name: dict[str, Quantity] = {}
+    for quantities in groups_of_quantities:
+        for quantity in quantities:
+            by_name.setdefault(quantity.name, quantity)
+    return by_name
 
 
 def find_quantity(
@@ -73,18 +73,18 @@ def find_quantity(
     the result does not have it."""
     groups = _parts_of(result)
     for quantities, subjects in groups:
-        known = {one.name: one for one in quantities}
-        if name in known:
-            known[name].check_argument(argument)
+        by_name = {quantity.name: quantity for quantity in quantities}
+        if name in by_name:
+            by_name[name].check_argument(argument)
             parts = {
-                label: known[name].find(Subject(one, lengths), argument)
-                for label, one in subjects.items()
+                label: by_name[name].find(Subject(quantity, lengths), argument)
+                for label, quantity in subjects.items()
             }
             return _join(parts)
     if not groups:
         return find_by_path(result, name, argument)
-    known = {one.form for quantities, _ in groups for one in quantities}
-    raise InputError(unknown_quantity(name, sorted(known)))
+    by_name = {quantity.form for quantities, _ in groups for quantity in quantities}
+    raise InputError(unknown_quantity(name, sorted(by_name)))
 
 
 def _parts_of(result: Any) -> list[tuple[tuple[Quantity, ...], dict[str, Any]]]:
@@ -98,13 +98,15 @@ def _parts_of(result: Any) -> list[tuple[tuple[Quantity, ...], dict[str, Any]]]:
     if isinstance(result, Calibrations):
         if result.rig is not None:
             return [(OF_RIG, {"": result.rig})]
-        one = len(result.cameras) == 1
-        named = {"" if one else name: found for name, found in result.cameras.items()}
-        adjusted = {name: found.adjustment for name, found in named.items()}
-        return [(OF_CALIBRATION, named), (OF_ADJUSTMENT, adjusted)]
+        is_single = len(result.cameras) == 1
+        calibrations = {
+            "" if is_single else name: calibration for name, calibration in result.cameras.items()
+        }
+        adjusted = {name: calibration.adjustment for name, calibration in calibrations.items()}
+        return [(OF_CALIBRATION, calibrations), (OF_ADJUSTMENT, adjusted)]
     if isinstance(result, Reconstruction):
-        one = len(result.parts) == 1
-        parts = {"" if one else part.name: part.adjustment for part in result.parts}
+        is_single = len(result.parts) == 1
+        parts = {"" if is_single else part.name: part.adjustment for part in result.parts}
         return [(OF_RECONSTRUCTION, {"": result}), (OF_ADJUSTMENT, parts)]
     if isinstance(result, Population):
         return [(OF_BATCH, {"": result})]
@@ -118,16 +120,16 @@ def _parts_of(result: Any) -> list[tuple[tuple[Quantity, ...], dict[str, Any]]]:
 
 def _join(parts: Mapping[str, QuantityValues]) -> QuantityValues:
     """Values of several parts; their units are the same, or it is said."""
-    units = {found.unit for found in parts.values()}
+    units = {part.unit for part in parts.values()}
     if len(units) > 1:
         raise LookupError(f"its parts have different units: {', '.join(sorted(units))}")
-    pitches = {found.pitch for found in parts.values()}
+    pitches = {part.pitch for part in parts.values()}
     values = {
         " ".join(word for word in (name, label) if word): value
-        for label, found in parts.items()
-        for name, value in found.values.items()
+        for label, part in parts.items()
+        for name, value in part.values.items()
     }
-    owners = {name: owner for found in parts.values() for name, owner in found.owners.items()}
+    owners = {name: owner for part in parts.values() for name, owner in part.owners.items()}
     pitch = pitches.pop() if len(pitches) == 1 else NO_PITCH
     return QuantityValues(values, units.pop(), pitch, owners)
 
@@ -146,9 +148,9 @@ def _pitch(cameras: Any) -> PixelPitch:
 def _split(argument: str) -> tuple[str, str, str]:
     """KIND, ID and NAME of an argument: a parameter alone is that of all cameras, images or
     points."""
-    kind, mark, rest = argument.partition(":")
-    id, second, name = rest.rpartition(":")
-    if mark and second and name and kind in ("camera", "image", "point"):
+    kind, mark, after_kind = argument.partition(":")
+    id, second_mark, name = after_kind.rpartition(":")
+    if mark and second_mark and name and kind in ("camera", "image", "point"):
         return kind, id, name
     if mark:
         raise InputError(
@@ -181,21 +183,21 @@ def _parameters(
         raise InputError("only parameters of cameras have it, such as c")
     rows = adjustment.images if kind == "image" else adjustment.points
     if name not in (EXTERIOR if kind == "image" else AXES):
-        known = ", ".join(EXTERIOR if kind == "image" else AXES)
-        raise InputError(f"there is no {name!r} of an {kind}; known: {known}")
+        known_names = ", ".join(EXTERIOR if kind == "image" else AXES)
+        raise InputError(f"there is no {name!r} of an {kind}; known: {known_names}")
     values, ids = of_table(rows, name), [str(x) for x in rows["id"]]
     if id not in ("*", *ids):
         raise LookupError(f"there is no {kind} {id!r}")
     free = stated_sigma(rows, name) > 0
-    chosen = {
+    named_unknowns = {
         f"{name} of {kind} {k}": float(v)
         for k, v, is_free in zip(ids, values, free)
         if is_free and id in ("*", k) and math.isfinite(v)
     }
-    if not chosen:
+    if not named_unknowns:
         raise LookupError(f"no {name} of an {kind} is estimated")
     angle = name in EXTERIOR[3:]
-    return QuantityValues(chosen, network.angle_unit if angle else network.object_unit)
+    return QuantityValues(named_unknowns, network.angle_unit if angle else network.object_unit)
 
 
 def _of_cameras(
@@ -243,9 +245,9 @@ def _total_correlation(subject: Subject, argument: str) -> QuantityValues:
 
 
 def _rms_sigma(subject: Subject, argument: str) -> QuantityValues:
-    found = _sigma(subject, argument)
-    values = np.array(list(found.values.values()))
-    return dataclasses.replace(found, values={"": float(np.sqrt(np.mean(values**2)))})
+    sigmas = _sigma(subject, argument)
+    values = np.array(list(sigmas.values.values()))
+    return dataclasses.replace(sigmas, values={"": float(np.sqrt(np.mean(values**2)))})
 
 
 def _image_rms(subject: Subject, _: str) -> QuantityValues:
@@ -274,13 +276,13 @@ def _differences(result: Adjustment) -> CheckDifferences | None:
 def _control_rms(subject: Subject, argument: str) -> QuantityValues:
     adjustment: Adjustment = subject.result
     rows = adjustment.residuals
-    own = rows["kind"] == "control"
-    if not own.any():
+    is_control = rows["kind"] == "control"
+    if not is_control.any():
         raise LookupError("the result has no control points with σ")
     mean = [
         np.mean(rows["v"][chosen] ** 2)
         for axis in AXES
-        if argument in ("", axis) and (chosen := own & (rows["axis"] == axis)).any()
+        if argument in ("", axis) and (chosen := is_control & (rows["axis"] == axis)).any()
     ]
     if not mean:
         raise LookupError(f"no control point has a σ in {argument}")
@@ -418,8 +420,8 @@ def _rig_rms(subject: Subject, argument: str) -> QuantityValues:
     rig: RigCalibration = subject.result
     if argument and argument not in rig.rms:
         raise InputError(f"there is no camera {argument!r}{did_you_mean(argument, rig.rms)}")
-    chosen = {f"camera {n}": v for n, v in rig.rms.items() if argument in ("", n)}
-    return QuantityValues(chosen, "px", _pitch([rig.camera(n) for n in rig.names]))
+    rms_of_cameras = {f"camera {n}": v for n, v in rig.rms.items() if argument in ("", n)}
+    return QuantityValues(rms_of_cameras, "px", _pitch([rig.camera(n) for n in rig.names]))
 
 
 def _rig_sigma(subject: Subject, argument: str) -> QuantityValues:
@@ -443,8 +445,8 @@ def _rig_sigma(subject: Subject, argument: str) -> QuantityValues:
     return QuantityValues(values, units.pop(), _pitch(cameras.values()))
 
 
-def _mountings(rig: RigCalibration, what: str) -> QuantityValues:
-    if what == "base":
+def _mountings(rig: RigCalibration, kind: str) -> QuantityValues:
+    if kind == "base":
         values = {f"base of {n}": m.length_sigma for n, m in rig.mountings.items()}
         return QuantityValues(values, rig.object_unit)
     # Angles of a mounting are in degrees.

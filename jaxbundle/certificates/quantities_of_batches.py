@@ -24,57 +24,61 @@ class MissingNumber(LookupError):
         self.inputs = inputs
 
 
-def _require_of_all(found: Population, name: str, known: Bool[np.ndarray, " inputs"]) -> None:
+def _require_of_all(
+    population: Population, name: str, is_known: Bool[np.ndarray, " inputs"]
+) -> None:
     """Refuse a number that an input with a result lacks: what a result does not have is not
     accepted.
 
     **Raises:** `LookupError` naming the inputs."""
-    if not found.solved.any():
+    if not population.solved.any():
         raise LookupError("no input has a result")
-    missing = found.keys[found.solved & ~known]
-    if len(missing):
-        words = f"the result of {list_some(missing.tolist(), as_text=str)} has no {name}"
-        raise MissingNumber(words, tuple(missing.tolist()))
+    missing_keys = population.keys[population.solved & ~is_known]
+    if len(missing_keys):
+        words = f"the result of {list_some(missing_keys.tolist(), as_text=str)} has no {name}"
+        raise MissingNumber(words, tuple(missing_keys.tolist()))
 
 
 def _number(name: str, unit: str = "") -> Callable[[Subject, str], QuantityValues]:
     def find(subject: Subject, _: str) -> QuantityValues:
-        found: Population = subject.result
-        values = found.numbers[name]
-        _require_of_all(found, name, np.asarray(np.isfinite(values)))
-        chosen = zip(found.keys[found.solved].tolist(), values[found.solved].tolist())
-        return QuantityValues(dict(chosen), unit)
+        population: Population = subject.result
+        values = population.numbers[name]
+        _require_of_all(population, name, np.asarray(np.isfinite(values)))
+        solved = zip(
+            population.keys[population.solved].tolist(), values[population.solved].tolist()
+        )
+        return QuantityValues(dict(solved), unit)
 
     return find
 
 
-def _parameter(what: str) -> Callable[[Subject, str], QuantityValues]:
+def _parameter(column: str) -> Callable[[Subject, str], QuantityValues]:
     def find(subject: Subject, argument: str) -> QuantityValues:
         """The values or σ of a parameter; of an input with several cameras ("left fx") of each."""
-        found: Population = subject.result
-        columns = {"value": found.values, "sigma": found.sigma}[what]
+        population: Population = subject.result
+        columns = {"value": population.values, "sigma": population.sigma}[column]
         # A rig has "left fx", "right fx": fx is that of every camera.
         names = [n for n in columns if argument in (n, n.rpartition(" ")[2])]
         if not names:
-            known = ", ".join(columns) or "none"
-            raise LookupError(f"no input has an estimated {argument}; known: {known}")
+            known_columns = ", ".join(columns) or "none"
+            raise LookupError(f"no input has an estimated {argument}; known: {known_columns}")
         numbers = np.array([columns[name] for name in names])
-        _require_of_all(found, argument, np.asarray(np.isfinite(numbers).any(0)))
-        chosen = {
+        _require_of_all(population, argument, np.asarray(np.isfinite(numbers).any(0)))
+        named_values = {
             (name, key): float(value)
             for name, row in zip(names, numbers)
-            for key, value in zip(found.keys, row)
+            for key, value in zip(population.keys, row)
             if np.isfinite(value)
         }
         label = lambda name, key: f"{name} of {key}"
         # Cameras of several models may share a file of results.
-        units = {unit_of_parameter(m, argument.rpartition(" ")[2]) for m in found.models}
+        units = {unit_of_parameter(m, argument.rpartition(" ")[2]) for m in population.models}
         if len(units) > 1:
             raise LookupError(f"{argument} has different units: {', '.join(sorted(units))}")
         return QuantityValues(
-            {label(*of): value for of, value in chosen.items()},
+            {label(*camera_and_key): value for camera_and_key, value in named_values.items()},
             units.pop() if units else "",
-            owners={label(*of): of[1] for of in chosen},
+            owners={label(*camera_and_key): camera_and_key[1] for camera_and_key in named_values},
         )
 
     return find
@@ -83,21 +87,25 @@ def _parameter(what: str) -> Callable[[Subject, str], QuantityValues]:
 def _share(which: str) -> Callable[[Subject, str], QuantityValues]:
     def find(subject: Subject, _: str) -> QuantityValues:
         """The share of the inputs, and which are missing."""
-        found: Population = subject.result
-        good = {"solved": found.solved, "converged": found.fit}[which]
+        population: Population = subject.result
+        good = {"solved": population.solved, "converged": population.fit}[which]
         if not len(good):
             raise LookupError("there are no inputs")
         # Named, because a share alone says nobody which input to look at.
-        others = found.keys[~good].tolist()
-        words = f"all but {list_some(others, as_text=str)}" if others else f"all {len(good)} inputs"
-        return QuantityValues({words: float(good.mean())}, owners={words: others})
+        other_keys = population.keys[~good].tolist()
+        words = (
+            f"all but {list_some(other_keys, as_text=str)}"
+            if other_keys
+            else f"all {len(good)} inputs"
+        )
+        return QuantityValues({words: float(good.mean())}, owners={words: other_keys})
 
     return find
 
 
 def _outlying(subject: Subject, _: str) -> QuantityValues:
-    found: Population = subject.result
-    return one_value(len(found.outlying()))
+    population: Population = subject.result
+    return one_value(len(population.outlying()))
 
 
 SOLVED = "solved"

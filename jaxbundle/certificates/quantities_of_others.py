@@ -45,18 +45,18 @@ def find_by_path(result: Any, name: str, argument: str) -> QuantityValues:
     if to_dict is None:
         raise InputError(f"expected a result of jaxbundle, got {type(result).__name__}")
     refuse_argument(argument)
-    found = dict(_walk(to_dict(), name.split("."), name, ""))
-    if not found:
+    numbers = dict(_walk(to_dict(), name.split("."), name, ""))
+    if not numbers:
         raise LookupError(f"{name}: the result has none")
-    return QuantityValues(found)
+    return QuantityValues(numbers)
 
 
-def _walk(document: Any, path: Sequence[str], name: str, of: str) -> Iterator[tuple[str, float]]:
+def _walk(document: Any, path: Sequence[str], name: str, rows: str) -> Iterator[tuple[str, float]]:
     """The numbers below a part of a document, each with the rows of the lists that lead to it."""
     if isinstance(document, list | tuple):
         for number, row in enumerate(document, 1):
-            own = str(row.get("id", number)) if isinstance(row, Mapping) else str(number)
-            yield from _walk(row, path, name, f"{of} {own}".strip())
+            row_name = str(row.get("id", number)) if isinstance(row, Mapping) else str(number)
+            yield from _walk(row, path, name, f"{rows} {row_name}".strip())
     elif path:
         if not isinstance(document, Mapping) or path[0] not in document:
             entries = document.items() if isinstance(document, Mapping) else ()
@@ -64,14 +64,14 @@ def _walk(document: Any, path: Sequence[str], name: str, of: str) -> Iterator[tu
             raise InputError(
                 unknown_quantity(name, [k for k, v in entries if isinstance(v, kinds)])
             )
-        yield from _walk(document[path[0]], path[1:], name, of)
+        yield from _walk(document[path[0]], path[1:], name, rows)
     elif document is None:
         # A number that is not finite is null in JSON; it is not accepted.
-        yield of, math.nan
+        yield rows, math.nan
     elif isinstance(document, bool) or not isinstance(document, int | float):
         raise InputError(f"{name}: is not a number of the result")
     else:
-        yield of, float(document)
+        yield rows, float(document)
 
 
 # --- a camera on a robot --------------------------------------------------------------------
@@ -83,8 +83,8 @@ def _mounting(subject: Subject, argument: str) -> QuantityValues:
     network = adjustment.problem.network
     table = subject.result.table()
     values = {
-        f"{name} of {of}": float(sigma)
-        for of, name, sigma in zip(table["of"], table["unknown"], table["sigma"])
+        f"{name} of {pose}": float(sigma)
+        for pose, name, sigma in zip(table["of"], table["unknown"], table["sigma"])
         if (name in (*EXTERIOR[:3], *AXES)) == (argument == "position")
     }
     unit = network.angle_unit if argument == "rotation" else network.object_unit
@@ -115,17 +115,19 @@ OF_HAND_EYE: tuple[Quantity, ...] = (
 
 
 def _differences(result: Refinement) -> CheckDifferences | None:
-    found = result.check
-    return None if found is None else CheckDifferences(found.id, found.difference, METRES)
+    check = result.check
+    return None if check is None else CheckDifferences(check.id, check.difference, METRES)
 
 
 def _point_sigma(subject: Subject, argument: str) -> QuantityValues:
     result: Refinement = subject.result
     sigma = np.asarray(result.inspection.point_sigma)[:, AXES.index(argument)]
-    chosen = {f"{argument} of point {k}": float(s) for k, s in zip(result.point_ids, sigma) if s}
-    if not chosen:
+    sigma_of_points = {
+        f"{argument} of point {k}": float(s) for k, s in zip(result.point_ids, sigma) if s
+    }
+    if not sigma_of_points:
         raise LookupError(f"no {argument} of a point is estimated")
-    return QuantityValues(chosen, METRES)
+    return QuantityValues(sigma_of_points, METRES)
 
 
 OF_REFINEMENT: tuple[Quantity, ...] = (

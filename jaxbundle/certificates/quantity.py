@@ -51,8 +51,8 @@ class Quantity:
     @property
     def arguments(self) -> tuple[str, ...]:
         """The arguments it may have; names of them in capitals."""
-        inside = self.form.partition("(")[2].rstrip(")]")
-        return tuple(inside.split("|")) if inside else ()
+        argument_words = self.form.partition("(")[2].rstrip(")]")
+        return tuple(argument_words.split("|")) if argument_words else ()
 
     def check_argument(self, argument: str) -> None:
         """Refuse an argument that is none of those, where they are not names of a result.
@@ -61,7 +61,7 @@ class Quantity:
         expected = self.arguments
         if not expected:
             refuse_argument(argument)
-        open_ones = any("NAME" in one or one == "CAMERA" for one in expected)
+        open_ones = any("NAME" in word or word == "CAMERA" for word in expected)
         may_be_omitted = not expected or "[" in self.form
         if open_ones or argument in expected or (not argument and may_be_omitted):
             return
@@ -91,12 +91,13 @@ def require_parameter(cameras: Any, name: str) -> None:
 
     **Raises:** `InputError`."""
     models = [get_model(c.model) for c in cameras]
-    known = dict.fromkeys(p for model in models for p in model.parameters)
-    if name not in known:
-        hint = did_you_mean(name, known, listing=False)
+    known_parameters = dict.fromkeys(p for model in models for p in model.parameters)
+    if name not in known_parameters:
+        hint = did_you_mean(name, known_parameters, listing=False)
         if any(name in names for names in PRINCIPAL_DISTANCES):  # that of other models
             distances = dict.fromkeys(p for model in models for p in model.principal_distance)
             hint = f"; the principal distance of this model is {' and '.join(distances)}"
         raise InputError(
-            f"there is no parameter {name!r}{hint}; known: {', '.join([*known, *EXTERIOR, *AXES])}"
+            f"there is no parameter {name!r}{hint}; known: "
+            f"{', '.join([*known_parameters, *EXTERIOR, *AXES])}"
         )

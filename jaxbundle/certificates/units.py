@@ -45,35 +45,35 @@ NO_PITCH = PixelPitch()
 
 def kind_of(unit: str) -> str:
     """ "length", "angle", "number" or "image"; empty for a unit that is only a label."""
-    return next((kind for kind, known in KINDS.items() if unit in known), "")
+    return next((kind for kind, known_units in KINDS.items() if unit in known_units), "")
 
 
-def convert(value: float, given: str, wanted: str, pitch: PixelPitch = NO_PITCH) -> float:
+def convert(value: float, from_unit: str, to_unit: str, pitch: PixelPitch = NO_PITCH) -> float:
     """A value in another unit; lengths in the image and pixels by the pixel size.
 
     **Raises:** `InputError` naming the units that would do."""
-    if given == wanted:
+    if from_unit == to_unit:
         return value
-    kinds = kind_of(given), kind_of(wanted)
+    kinds = kind_of(from_unit), kind_of(to_unit)
     if kinds[0] and kinds[0] == kinds[1]:
         units = KINDS[kinds[0]]
-        return value * units[given] / units[wanted]
+        return value * units[from_unit] / units[to_unit]
     if {*kinds} == {"length", "image"} and pitch.mm is not None:
         if kinds[0] == "image":
-            return value * PIXELS[given] * pitch.mm * 1e-3 / LENGTHS[wanted]
-        return value * LENGTHS[given] / (pitch.mm * 1e-3) / PIXELS[wanted]
-    raise InputError(_refusal(given, wanted))
+            return value * PIXELS[from_unit] * pitch.mm * 1e-3 / LENGTHS[to_unit]
+        return value * LENGTHS[from_unit] / (pitch.mm * 1e-3) / PIXELS[to_unit]
+    raise InputError(_refusal(from_unit, to_unit))
 
 
-def _refusal(given: str, wanted: str) -> str:
-    expected = KINDS.get(kind_of(given))
-    known = [name for name in expected or () if name.isascii() and name]
-    said = "no unit" if not wanted else f"the unit {wanted!r}"
+def _refusal(from_unit: str, to_unit: str) -> str:
+    expected = KINDS.get(kind_of(from_unit))
+    known_units = [name for name in expected or () if name.isascii() and name]
+    given_words = "no unit" if not to_unit else f"the unit {to_unit!r}"
     if expected is None:
-        return f"its unit is {given!r}, which is no length, but {said} is given"
-    if given == "" and wanted:
-        return f"it is a number without unit, but {said} is given"
-    more = ""
-    if {kind_of(given), kind_of(wanted)} == {"length", "image"}:
-        more = "; pixels and lengths need one pixel_size of all cameras"
-    return f"expected one of {', '.join(known)}, but {said} is given{more}"
+        return f"its unit is {from_unit!r}, which is no length, but {given_words} is given"
+    if from_unit == "" and to_unit:
+        return f"it is a number without unit, but {given_words} is given"
+    remark = ""
+    if {kind_of(from_unit), kind_of(to_unit)} == {"length", "image"}:
+        remark = "; pixels and lengths need one pixel_size of all cameras"
+    return f"expected one of {', '.join(known_units)}, but {given_words} is given{remark}"

@@ -77,40 +77,46 @@ class Aim:
     def __str__(self) -> str:
         if self.measure == "reliability":
             return "1/√r of the worst controlled image coordinate"
-        what = (
+        subject = (
             self.of
             if isinstance(self.of, str)
             else "functions"
             if callable(self.of)
             else (", ".join(" ".join(name) for name in self.of))
         )
-        return f"{self.measure} σ of {what}"
+        return f"{self.measure} σ of {subject}"
 
 
 def functions_of(problem: NetworkProblem, aim: Aim) -> Functions | None:
     """The quantities of the aim as a function of the unknowns; None for points and reliability.
 
     **Raises:** `InputError` if no camera has a free parameter, `KeyError` for unknown names."""
-    of = aim.of
-    if aim.measure != "reliability" and of == "points" and not points_of_interest(problem).any():
+    quantities = aim.of
+    if (
+        aim.measure != "reliability"
+        and quantities == "points"
+        and not points_of_interest(problem).any()
+    ):
         raise InputError("aim: all points are held, and their σ is 0; aim at the cameras")
-    if aim.measure == "reliability" or of == "points":
+    if aim.measure == "reliability" or quantities == "points":
         return None
-    if callable(of):
-        return lambda values: jnp.ravel(of(values))
-    if isinstance(of, str):
-        of = [("camera", c.id, name) for c in problem.network.cameras for name in c.unknowns]
-        if not of:
+    if callable(quantities):
+        return lambda values: jnp.ravel(quantities(values))
+    if isinstance(quantities, str):
+        quantities = [
+            ("camera", c.id, name) for c in problem.network.cameras for name in c.unknowns
+        ]
+        if not quantities:
             raise InputError(
                 "aim: no camera has a free parameter; say what is free, or aim at points"
             )
-        if aim.measure != "determinant" and len({name for *_, name in of}) > 1:
+        if aim.measure != "determinant" and len({name for *_, name in quantities}) > 1:
             raise InputError(
                 f"aim: the {aim.measure} σ of camera parameters of different units; choose the "
                 "determinant, or name one parameter"
             )
-    wanted = find_unknowns(problem, of)
-    return lambda values: jnp.stack([value_of(problem, name, values) for name in wanted])
+    unknowns = find_unknowns(problem, quantities)
+    return lambda values: jnp.stack([value_of(problem, name, values) for name in unknowns])
 
 
 def points_of_interest(problem: NetworkProblem) -> Bool[np.ndarray, " points"]:
@@ -142,16 +148,16 @@ def task_of(problem: NetworkProblem, aim: Aim) -> Task:
     functions = functions_of(problem, aim)
     if problem.reduction not in FACTORS:
         raise InputError("design: the network is too large for its covariance; use a part of it")
-    of = None
+    function = None
     if functions is not None:
-        of = lambda tables: functions(without_filling(problem, tables))
+        function = lambda tables: functions(without_filling(problem, tables))
     rows = points_of_interest(problem)
     mask = np.zeros(problem.sizes["table", "point"])
     mask[: len(rows)] = rows
     index = np.asarray(AIMS.index(aim.measure))
     reliable = aim.measure == "reliability"
     return Task(
-        problem.declared, problem.plan, of, reliable, index, mask, tuple(problem.image_rows)
+        problem.declared, problem.plan, function, reliable, index, mask, tuple(problem.image_rows)
     )
 
 
@@ -173,13 +179,13 @@ def log_aim(task: Task, data: Data) -> tuple[Float[Array, ""], Data]:
                 for o, w in zip(task.image_sets, roots)
             ]
             return jnp.log(_norm(jnp.concatenate(inverse))) / 2
-        functions, still = task.functions, zero_tangent(plan)
+        functions, zero_change = task.functions, zero_tangent(plan)
         if functions is None:
-            none = jax.tree.map(lambda x: x[None][:0], still)
-            of_tables, _ = covariances(declared, plan, data, none)
+            no_rows = jax.tree.map(lambda x: x[None][:0], zero_change)
+            of_tables, _ = covariances(declared, plan, data, no_rows)
             return _log_measure(task.measure, of_tables["point"], task.mask)
-        of = lambda change: functions(retract(declared, plan, data.start, change))
-        _, C = covariances(declared, plan, data, jax.jacrev(of)(still))
+        changed = lambda change: functions(retract(declared, plan, data.start, change))
+        _, C = covariances(declared, plan, data, jax.jacrev(changed)(zero_change))
         return _log_measure(task.measure, C[None], jnp.ones(1))
 
     # By all numbers of the data, not by the variables of a design: so this program, the largest by
@@ -197,9 +203,9 @@ def smallest_redundancy(problem: NetworkProblem) -> float:
     """The smallest redundancy number of an image coordinate."""
     problem = with_factor(problem)
     data = pad_data(problem, problem.data)
-    found = redundancy(problem.declared, problem.plan, data)
-    there = {o: diagonal_of(data.weight[o]) > 0 for o in problem.image_rows}
-    return min(float(found[o][used].min()) for o, used in there.items())
+    numbers = redundancy(problem.declared, problem.plan, data)
+    has_weight = {o: diagonal_of(data.weight[o]) > 0 for o in problem.image_rows}
+    return min(float(numbers[o][is_used].min()) for o, is_used in has_weight.items())
 
 
 def measure(aim: Aim, blocks: Float[AnyArray, "blocks k k"]) -> float:
@@ -215,17 +221,17 @@ def _log_measure(
 ) -> Float[Array, ""]:
     """The logarithm of the measure of this number, of the blocks whose mask is 1."""
     size = jnp.sum(mask) * blocks.shape[1]
-    there = mask[:, None, None] > 0
-    blocks = jnp.where(there, blocks, jnp.eye(blocks.shape[1]))
+    is_included = mask[:, None, None] > 0
+    blocks = jnp.where(is_included, blocks, jnp.eye(blocks.shape[1]))
     variances = jnp.diagonal(blocks, axis1=1, axis2=2)
     single = len(blocks) == 1
 
     def mean() -> Float[Array, ""]:
-        return jnp.log(jnp.sum(jnp.where(there[..., 0], variances, 0.0)) / size) / 2
+        return jnp.log(jnp.sum(jnp.where(is_included[..., 0], variances, 0.0)) / size) / 2
 
     def worst() -> Float[Array, ""]:
         of_blocks = variances if single else variances.mean(1, keepdims=True)
-        return jnp.log(_norm(jnp.where(there[..., 0], of_blocks, 0.0))) / 2
+        return jnp.log(_norm(jnp.where(is_included[..., 0], of_blocks, 0.0))) / 2
 
     def determinant() -> Float[Array, ""]:
         # Of the correlations, since units differ by many powers of ten (c in mm, K3 in mm⁻⁶).
@@ -286,8 +292,8 @@ def refuse_arbitrary(aim: Aim, problem: NetworkProblem) -> None:
 def _move(values: Values, t: Float[AnyArray, "7"]) -> Values:
     """The unknowns after a small similarity: shifts, rotations, scale."""
     turn = matrix_from_quaternion(quaternion_from_rotation_vector(t[3:6]))
-    moved = lambda x: (1 + t[6]) * (x @ turn.T) + t[:3]
+    move_points = lambda x: (1 + t[6]) * (x @ turn.T) + t[:3]
     in_camera = jax.vmap(lambda q: retract_quaternion(q, -matrix_from_quaternion(q) @ t[3:6]))
     position, rotation = values["image"]
-    image = PoseValue(moved(position), in_camera(jnp.asarray(rotation)))
-    return values | {"image": image, "point": moved(values["point"])}
+    image = PoseValue(move_points(position), in_camera(jnp.asarray(rotation)))
+    return values | {"image": image, "point": move_points(values["point"])}

@@ -53,14 +53,14 @@ class Conditions:
 
     def __post_init__(self) -> None:
         # Frozen: what is given is normalised once here, so that all else reads tuples of floats.
-        put = lambda name, value: object.__setattr__(self, name, value)
+        set_field = lambda name, value: object.__setattr__(self, name, value)
         for name in ("room", "targets"):
             if getattr(self, name) is not None:
-                put(name, box(name, getattr(self, name)))
-        put("obstacles", tuple(box("obstacles", given) for given in self.obstacles))
+                set_field(name, box(name, getattr(self, name)))
+        set_field("obstacles", tuple(box("obstacles", obstacle) for obstacle in self.obstacles))
         for name in ("distance", "focus"):
             if getattr(self, name) is not None:
-                put(name, interval(name, getattr(self, name)))
+                set_field(name, interval(name, getattr(self, name)))
         number("edge", self.edge, "a part of the format from 0, below 0.5", lambda x: 0 <= x < 0.5)
         at_least_zero("apart", self.apart)
         if self.incidence is not None:
@@ -70,7 +70,7 @@ class Conditions:
                     "incidence needs the normals of the targets: give normals, [P, 3] or one [3]"
                 )
         if self.normals is not None:
-            put("normals", unit_vectors(self.normals))
+            set_field("normals", unit_vectors(self.normals))
 
     def of_points(self, points: int) -> Float[np.ndarray, "points 3"] | None:
         """The normal of every target, None if none are given.
@@ -87,13 +87,13 @@ class Conditions:
         return np.broadcast_to(normals, (points, 3))
 
 
-def box(name: str, given: ArrayLike) -> Box:
+def box(name: str, corners_given: ArrayLike) -> Box:
     """Lowest and highest corner of a box.
 
     **Raises:** `InputError`."""
-    corners = numeric_array(name, given, "two corners X, Y, Z").astype(float)
+    corners = numeric_array(name, corners_given, "two corners X, Y, Z").astype(float)
     if corners.shape != (2, 3) or not np.isfinite(corners).all():
-        raise InputError(f"{name}: expected two corners X, Y, Z, got {show(given)}")
+        raise InputError(f"{name}: expected two corners X, Y, Z, got {show(corners_given)}")
     if not (corners[0] < corners[1]).all():
         raise InputError(
             f"{name}: the box from {corners[0].tolist()} to {corners[1].tolist()} is empty; the "
@@ -103,23 +103,23 @@ def box(name: str, given: ArrayLike) -> Box:
     return tuple(low), tuple(high)
 
 
-def interval(name: str, given: ArrayLike) -> tuple[float, float]:
+def interval(name: str, ends_given: ArrayLike) -> tuple[float, float]:
     """A smallest and a largest length; the largest may be infinite.
 
     **Raises:** `InputError`."""
-    ends = numeric_array(name, given, "a smallest and a largest length").astype(float)
+    ends = numeric_array(name, ends_given, "a smallest and a largest length").astype(float)
     if ends.shape != (2,) or not (0 <= ends[0] < ends[1]):
         raise InputError(
-            f"{name}: expected a smallest and a larger largest length, got {show(given)}"
+            f"{name}: expected a smallest and a larger largest length, got {show(ends_given)}"
         )
     return float(ends[0]), float(ends[1])
 
 
-def unit_vectors(given: ArrayLike) -> Float[np.ndarray, "*points 3"]:
+def unit_vectors(directions: ArrayLike) -> Float[np.ndarray, "*points 3"]:
     """Directions of length 1.
 
     **Raises:** `InputError`."""
-    normals = numeric_array("normals", given, "directions X, Y, Z").astype(float)
+    normals = numeric_array("normals", directions, "directions X, Y, Z").astype(float)
     if normals.ndim not in (1, 2) or normals.shape[-1] != 3:
         raise InputError(f"normals must have the shape [3] or [points, 3], not {normals.shape}")
     length = np.linalg.norm(normals, axis=-1, keepdims=True)

@@ -44,7 +44,7 @@ def design_configuration(
     boxes = room_of(conditions, pairs), targets_of(conditions, pairs)
     ends = lambda start: bounds(variables, start, *boxes)
     program = make_program(pairs, configuration(pairs, variables))
-    before = state_of(pairs, network, start.values, seed)
+    start_state = state_of(pairs, network, start.values, seed)
     best, path, converged = None, [], True
     for attempt in range(starts):
         begin = _roll(
@@ -53,12 +53,14 @@ def design_configuration(
             seed + attempt,
             settings.initial_roll,
         )
-        end, steps, done = search(pairs, variables, begin, program, ends, max_iterations, settings)
+        end, steps, has_converged = search(
+            pairs, variables, begin, program, ends, max_iterations, settings
+        )
         if not satisfies(conditions, variables, origin, end, settings.edge_sharpness):
             continue
-        after = state_of(pairs, network, end.values, seed)
-        if best is None or is_better(after, best):
-            best, path, converged = after, steps, done
+        end_state = state_of(pairs, network, end.values, seed)
+        if best is None or is_better(end_state, best):
+            best, path, converged = end_state, steps, has_converged
     if best is None:
         raise NotSolvedError(
             "design: the stations cannot satisfy their conditions (apart, obstacles); "
@@ -67,12 +69,12 @@ def design_configuration(
     # The result is never worse than the start, if that satisfies the conditions of stations.
     low, high = boxes[0]
     position = start.values["image"].position
-    inside = bool(((position >= low) & (position <= high)).all())
-    if is_better(before, best) and inside:
-        allowed = satisfies(conditions, variables, origin, start, settings.edge_sharpness)
-        best = before if allowed else best
+    is_inside = bool(((position >= low) & (position <= high)).all())
+    if is_better(start_state, best) and is_inside:
+        is_allowed = satisfies(conditions, variables, origin, start, settings.edge_sharpness)
+        best = start_state if is_allowed else best
     require_determined(best)
-    return Design("first", pairs.aim, conditions, before, best, tuple(path), converged)
+    return Design("first", pairs.aim, conditions, start_state, best, tuple(path), converged)
 
 
 def _roll(start: Configuration, variables: Variables, seed: int, sigma: float) -> Configuration:
@@ -96,10 +98,10 @@ def _place_at_random(
     return start
 
 
-def _rows_of(ids: Sequence[str] | None, known: tuple[str, ...]) -> np.ndarray:
+def _rows_of(ids: Sequence[str] | None, known_ids: tuple[str, ...]) -> np.ndarray:
     if ids is None:
-        return np.arange(len(known))
+        return np.arange(len(known_ids))
     for id in ids:
-        if id not in known:
-            raise InputError(f"stations: there is no image {id!r}{did_you_mean(id, known)}")
-    return np.array([known.index(id) for id in ids], int)
+        if id not in known_ids:
+            raise InputError(f"stations: there is no image {id!r}{did_you_mean(id, known_ids)}")
+    return np.array([known_ids.index(id) for id in ids], int)

@@ -30,12 +30,15 @@ def design_datum(
     inner = network.replace(datum="inner", datum_points=())
     pairs = make_pairs(inner, aim, conditions, sigma)
     values = start_at(pairs).values
-    after = state_of(pairs, inner, values, seed)
-    require_determined(after)
-    given = {"datum": network.datum, "datum_points": network.datum_points}
-    noisy, exact = after.network.replace(**given), after.exact.replace(**given)
-    problem = problem_of(exact)
-    before = DesignState(
-        noisy, exact, np.nan if problem is None else aim_of(problem, aim), after.lost
+    inner_state = state_of(pairs, inner, values, seed)
+    require_determined(inner_state)
+    datum_of_network = {"datum": network.datum, "datum_points": network.datum_points}
+    noisy, exact = (
+        inner_state.network.replace(**datum_of_network),
+        inner_state.exact.replace(**datum_of_network),
     )
-    return Design("zero", aim, conditions, before, after)
+    problem = problem_of(exact)
+    given_state = DesignState(
+        noisy, exact, np.nan if problem is None else aim_of(problem, aim), inner_state.lost
+    )
+    return Design("zero", aim, conditions, given_state, inner_state)

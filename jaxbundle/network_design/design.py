@@ -81,10 +81,10 @@ def design(  # noqa: PLR0913 (public: a table of options, all but two by name)
         raise InputError(f"conditions must be Conditions, but is {show(conditions)}")
     conditions = Conditions() if conditions is None else conditions
     # Check points have no part in an adjustment, and so none in its σ.
-    given = as_network(network, oriented=True)
+    given_network = as_network(network, oriented=True)
     if sigma_image is None and isinstance(network, str | os.PathLike):
-        sigma_image = _sigma_of_project(Path(network), given)
-    network = use_prior_tables(split_check_points(given)[0])
+        sigma_image = _sigma_of_project(Path(network), given_network)
+    network = use_prior_tables(split_check_points(given_network)[0])
     sigma = _sigma(network, sigma_image)
     integer("starts", starts)
     if order == "zero":
@@ -94,9 +94,9 @@ def design(  # noqa: PLR0913 (public: a table of options, all but two by name)
             network, aim, conditions, sigma, photographs, max_iterations, seed, settings
         )
     if order == "third":
-        more = 1 if photographs is None else integer("photographs", photographs)
+        number_added = 1 if photographs is None else integer("photographs", photographs)
         return add_photographs(
-            network, aim, conditions, sigma, more, max_iterations, seed, settings
+            network, aim, conditions, sigma, number_added, max_iterations, seed, settings
         )
     if photographs is not None:
         raise InputError('photographs: their number is designed by order "second" or "third"')
@@ -106,9 +106,9 @@ def design(  # noqa: PLR0913 (public: a table of options, all but two by name)
     )
 
 
-def _sigma(network: Network, given: float | None) -> float:
-    if given is not None:
-        return positive("sigma_image", given)
+def _sigma(network: Network, stated: float | None) -> float:
+    if stated is not None:
+        return positive("sigma_image", stated)
     sigma = network.observations.sigma
     if not len(sigma) or not np.isfinite(sigma).any():
         raise InputError("sigma_image: the network has no image points; give the σ they will have")
@@ -120,7 +120,7 @@ def _sigma_of_project(path: Path, network: Network) -> float | None:
     it."""
     if len(network.observations) or recognise_format(path) != "project":
         return None
-    given = read_toml(project_file(path))["project"].get("sigma_image")
-    if given is None or network.image_unit != units_of(network.cameras):
+    stated = read_toml(project_file(path))["project"].get("sigma_image")
+    if stated is None or network.image_unit != units_of(network.cameras):
         return None
-    return positive("sigma_image", given)
+    return positive("sigma_image", stated)

@@ -51,42 +51,42 @@ def try_stations(
     room, values = room_of(pairs.conditions, pairs), pairs.problem.data.start
     position = random.uniform(room[0], room[1], (number, 3))
     for low, high in np.array(pairs.conditions.obstacles).reshape(-1, 2, 3) - pairs.problem.origin:
-        inside = ((position > low) & (position < high)).all(1)
-        position = position[~inside]
+        is_in_obstacle = ((position > low) & (position < high)).all(1)
+        position = position[~is_in_obstacle]
     if not len(position):
         raise InputError("conditions: no station is possible: the obstacles fill the whole room")
     # Every target is looked at in turn: with a narrow camera a station sees only what it looks at.
     targets = np.resize(np.arange(len(values["point"])), len(position))
-    away = np.asarray(values["point"])[targets] - position
+    sight = np.asarray(values["point"])[targets] - position
     upright = np.tile([1.0, 0.0, 0.0, 0.0], (len(position), 1))
-    return position, np.asarray(_turned(upright, away)), targets
+    return position, np.asarray(_turned(upright, sight)), targets
 
 
-def check_feasible(pairs: StationTargetPairs, tried: int = 1024) -> None:
+def check_feasible(pairs: StationTargetPairs, trials: int = 1024) -> None:
     """Refuse conditions that no station satisfies, and targets visible from none.
 
-    **Arguments:** `tried`: positions all over the room. A part of the room of 0.5 % that satisfies
+    **Arguments:** `trials`: positions all over the room. A part of the room of 0.5 % that satisfies
     the conditions is found with a probability of 99 % (1 − 0.995¹⁰²⁴).
 
     **Raises:** `InputError` naming the condition, or the targets."""
     start = pairs.problem.data.start
-    position, rotation, _ = try_stations(pairs, tried)
+    position, rotation, _ = try_stations(pairs, trials)
     position = np.concatenate([position, start["image"].position])
     rotation = np.concatenate([rotation, start["image"].rotation])
-    found = {}
+    satisfied = {}
     for c in range(len(pairs.views)):
-        seen = _test_conditions(pairs, c, start, position, rotation)
-        for name, rows in seen.items():
-            found[name] = found.get(name, False) | rows
-        both = np.logical_and.reduce(list(seen.values()))
-        found["all"] = found.get("all", False) | both
-    everything = found.pop("all")
+        by_condition = _test_conditions(pairs, c, start, position, rotation)
+        for name, rows in by_condition.items():
+            satisfied[name] = satisfied.get(name, False) | rows
+        all_conditions = np.logical_and.reduce(list(by_condition.values()))
+        satisfied["all"] = satisfied.get("all", False) | all_conditions
+    everything = satisfied.pop("all")
     interest = np.flatnonzero(pairs.interest)
     if not everything.any():
-        raise InputError(_why(found, len(position)))
+        raise InputError(_why(satisfied, len(position)))
     # Targets measured already (third order) need no further visibility.
-    known = pairs.problem.point[np.nan_to_num(pairs.given_visibility) > 0]
-    measured = np.bincount(known, minlength=len(pairs.interest)) >= MIN_RAYS
+    measured_points = pairs.problem.point[np.nan_to_num(pairs.given_visibility) > 0]
+    measured = np.bincount(measured_points, minlength=len(pairs.interest)) >= MIN_RAYS
     hidden = ~everything[:, interest].any(0) & ~measured[interest]
     if hidden.any():
         ids = [pairs.problem.network.points.id[interest[k]] for k in np.flatnonzero(hidden)]
@@ -97,25 +97,27 @@ def check_feasible(pairs: StationTargetPairs, tried: int = 1024) -> None:
         )
 
 
-def _why(found: dict[str, Bool[np.ndarray, "stations points"]], tried: int) -> str:
+def _why(satisfied: dict[str, Bool[np.ndarray, "stations points"]], trials: int) -> str:
     """A message on the condition that no ray satisfies, or on contradictory conditions."""
-    places = f"({tried} places in the room tried)"
-    if "obstacles" in found and not found["obstacles"].any():
+    places = f"({trials} places in the room tried)"
+    if "obstacles" in satisfied and not satisfied["obstacles"].any():
         return f"conditions: all targets are hidden by the obstacles from everywhere {places}"
-    for name, rows in found.items():
+    for name, rows in satisfied.items():
         if not rows.any():
             return (
                 f'conditions: no station can satisfy the condition "{name}" for any target '
                 f"{places}; widen it, or the room"
             )
-    names = ", ".join(found)
+    names = ", ".join(satisfied)
     without = (
         [
             name
-            for name in found
-            if np.logical_and.reduce([rows for other, rows in found.items() if other != name]).any()
+            for name in satisfied
+            if np.logical_and.reduce(
+                [rows for other, rows in satisfied.items() if other != name]
+            ).any()
         ]
-        if len(found) > 1
+        if len(satisfied) > 1
         else []
     )
     hint = f'; without "{without[0]}" they could' if without else ""
@@ -144,13 +146,13 @@ def _test_conditions(
 
     of_points = jax.vmap(test_ray, (None, None, 0, None if pairs.normals is None else 0))
     of_all = jax.jit(jax.vmap(of_points, (0, 0, None, None)))
-    found = of_all(
+    by_condition = of_all(
         jnp.asarray(position),
         jnp.asarray(rotation),
         jnp.asarray(start["point"]),
         None if pairs.normals is None else jnp.asarray(pairs.normals),
     )
-    return {name: np.asarray(rows) for name, rows in found.items()}
+    return {name: np.asarray(rows) for name, rows in by_condition.items()}
 
 
 def start_at(pairs: StationTargetPairs) -> Configuration:
@@ -162,5 +164,5 @@ def start_at(pairs: StationTargetPairs) -> Configuration:
 def lost_targets(pairs: StationTargetPairs, measured: Bool[np.ndarray, " rays"]) -> tuple[str, ...]:
     """The ids of targets of interest undetermined by too few rays."""
     rays = np.bincount(pairs.problem.point[measured], minlength=len(pairs.interest))
-    lost = pairs.interest & (rays < MIN_RAYS)
-    return tuple(pairs.problem.network.points.id[k] for k in np.flatnonzero(lost))
+    is_lost = pairs.interest & (rays < MIN_RAYS)
+    return tuple(pairs.problem.network.points.id[k] for k in np.flatnonzero(is_lost))

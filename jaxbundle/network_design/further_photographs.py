@@ -28,7 +28,7 @@ def add_photographs(
     aim: Aim,
     conditions: Conditions,
     sigma: float,
-    more: int,
+    number_added: int,
     max_iterations: int,
     seed: int,
     settings: DesignSettings,
@@ -36,18 +36,20 @@ def add_photographs(
     """Third order: further photographs, one after the other."""
     # Greedily: each is a search in six variables. Together they would be one in 6·n, with as many
     # more local minima as there are ways to distribute photographs over good places.
-    states, path, added, tried, converged = [], [], [], [], True
-    for k in range(more):
+    states, path, added_ids, places_tried, converged = [], [], [], [], True
+    for k in range(number_added):
         measured = bool(len(network.observations))
         network, id = _with_another(network)
         new = np.arange(len(network.images)) == len(network.images) - 1
         pairs = make_pairs(network, aim, conditions, sigma, new if measured else None)
         check_feasible(pairs)
-        start, steps, done, places = _best_place(pairs, new, max_iterations, seed + k, settings)
+        start, steps, has_converged, places = _best_place(
+            pairs, new, max_iterations, seed + k, settings
+        )
         path += steps
-        converged = converged and done
-        added.append(id)
-        tried.append(places)
+        converged = converged and has_converged
+        added_ids.append(id)
+        places_tried.append(places)
         if not states:
             without = pairs.measured(start.values) & ~new[pairs.problem.image]
             states.append(state_of(pairs, network, start.values, seed, without))
@@ -62,8 +64,8 @@ def add_photographs(
         states[-1],
         tuple(path),
         converged,
-        tried=tried[0],
-        added=tuple(added),
+        tried=places_tried[0],
+        added=tuple(added_ids),
     )
 
 
@@ -94,14 +96,14 @@ def _best_place(
     # seen, which a search from one of them does not leave.
     best = None
     for k in np.argsort(aims)[: settings.refined]:
-        end, steps, done = search(
+        end, steps, has_converged = search(
             pairs, variables, begins[k], program, ends, max_iterations, settings
         )
         value = program(variables.vector(end), end, settings.softness[-1])[0]
         if satisfies(pairs.conditions, variables, origin, end, settings.edge_sharpness) and (
             best is None or value < best[0]
         ):
-            best = value, end, steps, done
+            best = value, end, steps, has_converged
     if best is None:
         raise NotSolvedError("design: no place for a further photograph satisfies the conditions")
     return *best[1:], (position + origin, np.exp(aims))
@@ -112,13 +114,13 @@ def _with_another(network: Network) -> tuple[Network, str]:
     images, number = network.images, len(network.images) + 1
     while (id := f"new {number}") in images.id:
         number += 1
-    again = lambda x: np.concatenate([x, x[-1:]])
-    more = Images(
+    repeat_last = lambda x: np.concatenate([x, x[-1:]])
+    extended = Images(
         (*images.id, id),
-        again(images.camera),
-        again(images.position),
-        again(images.angles),
+        repeat_last(images.camera),
+        repeat_last(images.position),
+        repeat_last(images.angles),
         np.concatenate([images.sigma, np.full((1, 6), np.nan)]),
         images.source,
     )
-    return network.replace(images=more), id
+    return network.replace(images=extended), id

@@ -82,7 +82,7 @@ class StationTargetPairs:
     def each_ray(self, function: Callable[..., PyTree], values: Values) -> Any:
         """`function(view, position, rotation, interior, point, normal)` of every ray, stacked in
         their order."""
-        image, point, found, order = self.problem.image, self.problem.point, [], []
+        image, point, by_view, order = self.problem.image, self.problem.point, [], []
         for c, view in enumerate(self.views):
             rows = self.of_camera(c)
             table, row = self.problem.table_of_camera(c)
@@ -91,7 +91,7 @@ class StationTargetPairs:
             axes = 0, 0, None, 0, None if normal is None else 0
             mapped = jax.vmap(partial(function, view), axes)
             take = lambda x, index, rows=rows: jnp.asarray(x)[index[rows]]
-            found.append(
+            by_view.append(
                 mapped(
                     take(values["image"].position, image),
                     take(values["image"].rotation, image),
@@ -101,8 +101,8 @@ class StationTargetPairs:
                 )
             )
             order.append(rows)
-        back = np.argsort(np.concatenate(order))
-        return jax.tree.map(lambda *x: jnp.concatenate(x)[back], *found)
+        inverse_order = np.argsort(np.concatenate(order))
+        return jax.tree.map(lambda *x: jnp.concatenate(x)[inverse_order], *by_view)
 
     def visibilities(
         self, values: Values, softness: float | Float[AnyArray, ""]
@@ -154,8 +154,8 @@ class StationTargetPairs:
 
     def measured(self, values: Values) -> Bool[np.ndarray, " rays"]:
         """Which rays are measured: those that satisfy all conditions, and already measured ones."""
-        seen = np.logical_and.reduce([np.asarray(v) for v in self._test_all(values).values()])
-        return np.where(self.soft, seen, self.given_visibility > 0)
+        is_visible = np.logical_and.reduce([np.asarray(v) for v in self._test_all(values).values()])
+        return np.where(self.soft, is_visible, self.given_visibility > 0)
 
 
 def make_pairs(
@@ -220,10 +220,10 @@ def _refuse(network: Network) -> None:
                 f"{table.source(row)}: {table.id[row]!r} has no start values; a "
                 f"design starts from {words}"
             )
-    others = [rows for rows in network.further if not isinstance(rows, CameraParameters)]
-    if others:
+    other_kinds = [rows for rows in network.further if not isinstance(rows, CameraParameters)]
+    if other_kinds:
         raise InputError(
-            f"{others[0].source.name}: a design uses image points, distances, control "
+            f"{other_kinds[0].source.name}: a design uses image points, distances, control "
             "points and priors; omit the other observations"
         )
     if len(network.points) < 3 or len(network.images) < 1:

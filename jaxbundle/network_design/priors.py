@@ -21,30 +21,30 @@ def use_prior_tables(network: Network) -> Network:
     """The network with the priors of its cameras and of its tables `exterior_priors` and
     `camera_parameters` at its own values."""
     cameras = tuple(dataclasses.replace(camera, observed={}) for camera in network.cameras)
-    further = []
+    other_tables = []
     for rows in network.further:
         if isinstance(rows, ExteriorPriors):
             network = _move_to_images(network, rows)
         elif isinstance(rows, CameraParameters):
-            further.append(_observe_present_values(network, rows))
+            other_tables.append(_observe_present_values(network, rows))
         else:
-            further.append(rows)
-    return network.replace(cameras=cameras, further=tuple(further))
+            other_tables.append(rows)
+    return network.replace(cameras=cameras, further=tuple(other_tables))
 
 
-def _move_to_images(network: Network, given: ExteriorPriors) -> Network:
+def _move_to_images(network: Network, priors: ExteriorPriors) -> Network:
     """σ of orientations in the table of images; two of the same element are combined."""
     # Independent observations of one element: their weights p = 1/σ² add. σ = 0 is fixed, and
     # stays.
     sigma = network.images.sigma.copy()
     weight = np.where(sigma > 0, 1 / np.where(sigma > 0, sigma, 1.0) ** 2, 0.0)
-    np.add.at(weight, rows_of(given.image, network.images), 1 / given.sigma**2)
+    np.add.at(weight, rows_of(priors.image, network.images), 1 / priors.sigma**2)
     new = (weight > 0) & (sigma != 0)
     sigma[new] = 1 / np.sqrt(weight[new])
     return network.replace(images=dataclasses.replace(network.images, sigma=sigma))
 
 
-def _observe_present_values(network: Network, given: CameraParameters) -> CameraParameters:
+def _observe_present_values(network: Network, priors: CameraParameters) -> CameraParameters:
     values = {
         camera.id: {**default_parameters(get_model(camera.model)), **camera.parameters}
         for camera in network.cameras
@@ -52,8 +52,8 @@ def _observe_present_values(network: Network, given: CameraParameters) -> Camera
 
     def value(camera: str, parameter: str) -> float:
         name, _, divisor = parameter.partition(RATIO)
-        of = values[camera]
-        return float(of[name] / of[divisor] if divisor else of[name])
+        parameters = values[camera]
+        return float(parameters[name] / parameters[divisor] if divisor else parameters[name])
 
-    found = [value(*row) for row in zip(given.camera, given.parameter, strict=True)]
-    return dataclasses.replace(given, value=np.array(found))
+    present = [value(*row) for row in zip(priors.camera, priors.parameter, strict=True)]
+    return dataclasses.replace(priors, value=np.array(present))

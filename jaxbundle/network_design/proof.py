@@ -50,9 +50,10 @@ class Proof:
         return not self.failed and abs(self.ratio - 1) <= self.limit
 
     def __str__(self) -> str:
-        failed = f", {self.failed} of them not solved" if self.failed else ""
+        failures = f", {self.failed} of them not solved" if self.failed else ""
         return (
-            f"{self.found:.4g} from {self.draws} simulated networks{failed}, {self.predicted:.4g} "
+            f"{self.found:.4g} from {self.draws} simulated networks{failures}, "
+            f"{self.predicted:.4g} "
             f"predicted: ratio {self.ratio:.3f} (limit 1 ± {self.limit:.3f}) "
             f"{'agrees' if self.agrees else 'DOES NOT AGREE'}"
         )
@@ -69,17 +70,17 @@ def prove(problem: NetworkProblem, aim: Aim, draws: int = 200, seed: int = 0) ->
     functions = functions_of(problem, aim)
     interest = np.flatnonzero(points_of_interest(problem))
     points = lambda values: np.asarray(coordinates(values))[interest]
-    of = points if functions is None else lambda values: functions(values)[None]
+    quantities = points if functions is None else lambda values: functions(values)[None]
     random = np.random.default_rng(seed)
     # Adjusted, not propagated: the linear propagation is what is to be proved.
-    found = []
+    errors = []
     for _ in range(draws):
         minimum = find_minimum(with_data(problem, _measure(exact, random)))
         if bool(converged(minimum.termination)):
-            found.append(np.asarray(of(minimum.values)) - np.asarray(of(truth)))
-    if not found:
+            errors.append(np.asarray(quantities(minimum.values)) - np.asarray(quantities(truth)))
+    if not errors:
         raise NotSolvedError("design: none of the simulated networks could be adjusted")
-    d = np.array(found)
+    d = np.array(errors)
     # Redundancy numbers do not show in deviations: a reliability is proved by the mean σ of the
     # same network.
     shape = aim if aim.measure != "reliability" else Aim("mean")

@@ -46,32 +46,34 @@ def realise(
     observations = dataclasses.replace(
         rays.take(rows), xy=xy[rows], source=Source("simulated image points")
     )
-    moved = network.replace(
+    displaced = network.replace(
         images=images,
         points=points,
         observations=observations,
         residuals=residuals,
         distances=_distances(network, points.position, seed),
     )
-    seen = np.bincount(rays.image[rows], minlength=len(images))
-    return keep_images(moved, seen >= MIN_TARGETS)
+    rays_by_image = np.bincount(rays.image[rows], minlength=len(images))
+    return keep_images(displaced, rays_by_image >= MIN_TARGETS)
 
 
 def _distances(
     network: Network, points: Float[np.ndarray, "points 3"], seed: int | None
 ) -> Distances:
     """Distances simulated after targets have moved."""
-    given = network.distances
-    ends = points[given.points], network.points.position[given.points]
-    length, before = (np.linalg.norm(e[:, 0] - e[:, 1], axis=1) for e in ends)
-    moved = np.abs(length - before) > 1e-12 * before  # beyond rounding
+    distances = network.distances
+    ends = points[distances.points], network.points.position[distances.points]
+    length, length_before = (np.linalg.norm(e[:, 0] - e[:, 1], axis=1) for e in ends)
+    has_changed = np.abs(length - length_before) > 1e-12 * length_before  # beyond rounding
     # A stream of its own: the noise of image points does not depend on whether there are distances.
     noise = (
-        np.zeros(len(given))
+        np.zeros(len(distances))
         if seed is None
-        else (given.sigma * np.random.default_rng([seed, 1]).standard_normal(len(given)))
+        else (distances.sigma * np.random.default_rng([seed, 1]).standard_normal(len(distances)))
     )
-    return dataclasses.replace(given, value=np.where(moved, length + noise, given.value))
+    return dataclasses.replace(
+        distances, value=np.where(has_changed, length + noise, distances.value)
+    )
 
 
 def problem_of(network: Network) -> NetworkProblem | None:

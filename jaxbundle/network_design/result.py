@@ -123,11 +123,11 @@ class Design(TableMethods):
         # From y up and z backwards, as in photogrammetry, to y down and z forwards, as in computer
         # vision.
         images, flip = self.network.images, np.diag([1.0, -1.0, -1.0])
-        found = np.tile(np.eye(4), (len(images), 1, 1))
-        for pose, X0, angles in zip(found, images.position, images.angles):
+        poses = np.tile(np.eye(4), (len(images), 1, 1))
+        for pose, X0, angles in zip(poses, images.position, images.angles):
             M = flip @ np.asarray(matrix_from_omega_phi_kappa(angles))
             pose[:3, :3], pose[:3, 3] = M, -M @ X0
-        return found
+        return poses
 
     def __str__(self) -> str:
         points = self.aim.of == "points" and self.aim.measure != "reliability"

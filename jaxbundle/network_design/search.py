@@ -46,24 +46,24 @@ def make_program(
     In three programs; the largest by far, that of the aim, is shared by all designs
     of one shape. An undetermined aim has the worst value, with zero gradient."""
 
-    def data(x: Float[Array, " variables"], given: tuple[PyTree, ...]) -> EngineData:
-        return pairs.data(*design(x, *given))
+    def data(x: Float[Array, " variables"], constants: tuple[PyTree, ...]) -> EngineData:
+        return pairs.data(*design(x, *constants))
 
     forward = eqx.filter_jit(data)
 
     @eqx.filter_jit
-    def back(
-        x: Float[Array, " variables"], given: tuple[PyTree, ...], slopes: EngineData
+    def pull_back(
+        x: Float[Array, " variables"], constants: tuple[PyTree, ...], slopes: EngineData
     ) -> Float[Array, " variables"]:
-        return jax.vjp(lambda x: data(x, given), x)[1](slopes)[0]
+        return jax.vjp(lambda x: data(x, constants), x)[1](slopes)[0]
 
     def program(
-        x: Float[AnyArray, " variables"], *given: PyTree
+        x: Float[AnyArray, " variables"], *constants: PyTree
     ) -> tuple[float, Float[np.ndarray, " variables"]]:
         # A Python number as softness would cause a new compilation.
-        x, given = jnp.asarray(x), jax.tree.map(jnp.asarray, given)
-        value, slopes = log_aim(pairs.task, forward(x, given))
-        slope = np.asarray(back(x, given, slopes))
+        x, constants = jnp.asarray(x), jax.tree.map(jnp.asarray, constants)
+        value, slopes = log_aim(pairs.task, forward(x, constants))
+        slope = np.asarray(pull_back(x, constants, slopes))
         if not (np.isfinite(value) and np.isfinite(slope).all()):
             return UNDETERMINED_AIM, np.zeros(len(x))
         return float(value), slope
@@ -94,24 +94,24 @@ def station_margins(
     if not (conditions.apart > 0 or conditions.obstacles):
         return None
     boxes = np.array(conditions.obstacles).reshape(-1, 2, 3) - origin
-    middle, half = boxes.mean(1), (boxes[:, 1] - boxes[:, 0]) / 2
-    sharp = edge_sharpness / half.mean(1)
+    middle, half_size = boxes.mean(1), (boxes[:, 1] - boxes[:, 0]) / 2
+    sharp = edge_sharpness / half_size.mean(1)
 
     def margins(x: Float[AnyArray, " variables"], start: Configuration) -> Float[Array, " margins"]:
         position = variables.place(start, x).values["image"].position
         images = len(position)
         i, j = np.triu_indices(images, 1)
         moves = np.isin(i, variables.images) | np.isin(j, variables.images)
-        found = [jnp.zeros(0)]
+        margin_parts = [jnp.zeros(0)]
         if conditions.apart > 0:
-            away = position[i[moves]] - position[j[moves]]
-            found.append(jnp.sum(away**2, 1) / conditions.apart**2 - 1)
+            difference = position[i[moves]] - position[j[moves]]
+            margin_parts.append(jnp.sum(difference**2, 1) / conditions.apart**2 - 1)
         # Outside of a box is outside of one of its faces: the largest of three distances, smooth.
         # Less log 3, so that it is never more than the largest.
-        out = jnp.abs(position[variables.images][:, None] - middle) - half
-        nearest = (logsumexp(sharp[:, None] * out, axis=2) - np.log(3)) / sharp
-        found.append((nearest / variables.unit).ravel())
-        return jnp.concatenate(found)
+        outside_by = jnp.abs(position[variables.images][:, None] - middle) - half_size
+        nearest = (logsumexp(sharp[:, None] * outside_by, axis=2) - np.log(3)) / sharp
+        margin_parts.append((nearest / variables.unit).ravel())
+        return jnp.concatenate(margin_parts)
 
     return margins
 
@@ -141,9 +141,9 @@ def search(
     steps: list[Step] = []
     converged = False
     for softness in settings.softness:
-        function = lambda x, at=start, s=softness: program(x, at, s)
-        record = lambda x, aim, at=start, s=softness: steps.append(
-            Step(s, aim, variables.positions(at, x) + origin)
+        function = lambda x, start_values=start, s=softness: program(x, start_values, s)
+        record = lambda x, aim, start_values=start, s=softness: steps.append(
+            Step(s, aim, variables.positions(start_values, x) + origin)
         )
         bound = [{**c, "args": (start,)} for c in conditions]
         begin, limits = variables.vector(start), ends(start)
@@ -182,7 +182,7 @@ def _minimise(
     x = np.clip(x, low, high)
     if with_start:
         keep(x)
-    found = minimize(
+    minimum = minimize(
         log_aim,
         x,
         jac=True,
@@ -192,7 +192,7 @@ def _minimise(
         constraints=constraints,
         options=options,
     )
-    return np.clip(found.x, low, high), bool(found.success)
+    return np.clip(minimum.x, low, high), bool(minimum.success)
 
 
 def satisfies(

@@ -43,28 +43,28 @@ def select_photographs(
         network = keep_images(network, seeing)
         pairs = make_pairs(network, aim, conditions, sigma)
         values = start_at(pairs).values
-    lost = lost_targets(pairs, pairs.measured(values))
-    if lost:
+    lost_ids = lost_targets(pairs, pairs.measured(values))
+    if lost_ids:
         raise InputError(
-            f"targets {', '.join(lost[:10])}: fewer than two of the candidates see "
+            f"targets {', '.join(lost_ids[:10])}: fewer than two of the candidates see "
             "them; give further candidates, or leave these targets out"
         )
-    before = state_of(pairs, network, values, seed)
-    found = select(pairs, integer("photographs", photographs), max_iterations, settings)
+    state_of_all = state_of(pairs, network, values, seed)
+    selection = select(pairs, integer("photographs", photographs), max_iterations, settings)
     ids = network.images.id
-    taken = pairs.measured(values) & found.chosen[pairs.problem.image]
-    after = state_of(pairs, network, values, seed, taken)
-    require_determined(after)
-    path = tuple(Step(0.0, aim, np.zeros((0, 3))) for aim in found.aims)
+    is_taken = pairs.measured(values) & selection.chosen[pairs.problem.image]
+    state_of_selection = state_of(pairs, network, values, seed, is_taken)
+    require_determined(state_of_selection)
+    path = tuple(Step(0.0, aim, np.zeros((0, 3))) for aim in selection.aims)
     return Design(
         "second",
         aim,
         conditions,
-        before,
-        after,
+        state_of_all,
+        state_of_selection,
         path,
-        found.converged,
-        bound=found.bound or None,
-        dropped=tuple(id for id in candidates if id not in after.network.images.id),
-        weights=dict(zip(ids, found.weight.tolist())),
+        selection.converged,
+        bound=selection.bound or None,
+        dropped=tuple(id for id in candidates if id not in state_of_selection.network.images.id),
+        weights=dict(zip(ids, selection.weight.tolist())),
     )

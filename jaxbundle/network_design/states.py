@@ -29,13 +29,13 @@ def state_of(
     # photogrammetrist will.
     measured = pairs.measured(values) if measured is None else measured
     exact = realise(pairs, values, measured, None, network.residuals)
-    lost, aim = lost_targets(pairs, measured), float("nan")
-    if not lost:
+    lost_ids, aim = lost_targets(pairs, measured), float("nan")
+    if not lost_ids:
         aim = pairs.aim_at(measured, values)
     if not np.isfinite(aim) and (problem := problem_of(exact)) is not None:
         aim = aim_of(problem, pairs.aim)  # Of the remaining targets.
     noisy = realise(pairs, values, measured, seed, network.residuals)
-    return DesignState(noisy, exact, aim, lost)
+    return DesignState(noisy, exact, aim, lost_ids)
 
 
 def is_better(a: DesignState, b: DesignState) -> bool:

@@ -49,16 +49,18 @@ class Variables:
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Rows and columns of every part of the vector."""
         i, p = len(self.images), len(self.points)
-        every = {"position": (i, 3), "direction": (i, 3), "roll": (i, 1), "targets": (p, 3)}
-        return {name: every[name] for name in DESIGNED if name in self.free and every[name][0]}
+        all_sizes = {"position": (i, 3), "direction": (i, 3), "roll": (i, 1), "targets": (p, 3)}
+        return {
+            name: all_sizes[name] for name in DESIGNED if name in self.free and all_sizes[name][0]
+        }
 
     def parts(self, x: Shaped[AnyArray, " variables"]) -> dict[str, AnyArray]:
         """The vector by name, [rows, columns]."""
-        found, begin = {}, 0
+        by_name, begin = {}, 0
         for name, (rows, columns) in self.sizes.items():
-            found[name] = x[begin : begin + rows * columns].reshape(rows, columns)
+            by_name[name] = x[begin : begin + rows * columns].reshape(rows, columns)
             begin += rows * columns
-        return found
+        return by_name
 
     def vector(self, start: Configuration) -> Float[np.ndarray, " variables"]:
         """The variables of the start: roll 0."""
@@ -74,10 +76,10 @@ class Variables:
         self, start: Configuration, x: Float[np.ndarray, " variables"]
     ) -> Float[np.ndarray, "images 3"]:
         """Projection centres at these variables."""
-        found = np.array(start.values["image"].position)
+        positions = np.array(start.values["image"].position)
         if "position" in self.sizes:
-            found[self.images] = self.parts(x)["position"] * self.unit
-        return found
+            positions[self.images] = self.parts(x)["position"] * self.unit
+        return positions
 
     @cached_property
     def compiled_place(

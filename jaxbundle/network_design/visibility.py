@@ -64,8 +64,8 @@ def view_of(camera: Camera, edge: float) -> UsableFormat:
         low, high = image_area(model, camera.image_size, camera.pixel_size)
         if camera.image_size is None:
             raise ValueError("image_size is not given")
-        given = {**default_parameters(model), **camera.parameters}
-        field = field_of_view_of_rays(model, given, camera.image_size, camera.pixel_size)
+        values = {**default_parameters(model), **camera.parameters}
+        field = field_of_view_of_rays(model, values, camera.image_size, camera.pixel_size)
     except ValueError as error:
         raise InputError(
             f"camera {camera.id}: its field of view is not known: {error}; a design needs "
@@ -85,7 +85,7 @@ def view_of(camera: Camera, edge: float) -> UsableFormat:
 
 def rules_of(conditions: Conditions, origin: Float[np.ndarray, "3"]) -> Rules:
     """The conditions of rays of a network with this origin."""
-    pair = lambda given: None if given is None else np.array(given)
+    pair = lambda limits: None if limits is None else np.array(limits)
     incidence, boxes = conditions.incidence, conditions.obstacles
     return Rules(
         pair(conditions.distance),
@@ -119,37 +119,42 @@ def margins(
     softness: float | Float[AnyArray, ""] = 0.0,
 ) -> dict[str, Float[Array, " margins"]]:
     """The margins of one ray by condition; obstacles with this softness, 0: exact."""
-    away = point - position
-    length = jnp.sqrt(jnp.sum(away**2))
-    x, y, z = matrix_from_quaternion(rotation) @ away
-    found: dict[str, Array] = {"field of view": _in_view(view, interior, x, y, -z)}
+    sight = point - position
+    length = jnp.sqrt(jnp.sum(sight**2))
+    x, y, z = matrix_from_quaternion(rotation) @ sight
+    by_condition: dict[str, Array] = {"field of view": _in_view(view, interior, x, y, -z)}
     if rules.distance is not None:
-        found["distance"] = _within(length, rules.distance)
+        by_condition["distance"] = _within(length, rules.distance)
     if rules.focus is not None:
-        found["focus"] = _within(-z, rules.focus)
+        by_condition["focus"] = _within(-z, rules.focus)
     if rules.cos_incidence is not None and normal is not None:
-        cosine = -(away @ normal) / length
-        found["incidence"] = jnp.asarray(cosine - rules.cos_incidence)[None]
+        cosine = -(sight @ normal) / length
+        by_condition["incidence"] = jnp.asarray(cosine - rules.cos_incidence)[None]
     if rules.obstacles is not None:
         hidden = lambda box: _outside(box, point, position, softness)
-        found["obstacles"] = jax.vmap(hidden)(rules.obstacles)
-    return found
+        by_condition["obstacles"] = jax.vmap(hidden)(rules.obstacles)
+    return by_condition
 
 
-def visibility(found: dict[str, Array], softness: float | Float[AnyArray, ""]) -> Float[Array, ""]:
+def visibility(
+    margins_of_ray: dict[str, Array], softness: float | Float[AnyArray, ""]
+) -> Float[Array, ""]:
     """The smooth weight of a ray, 0 to 1, from its margins at this softness."""
     # A target on the surface of an obstacle widened by 3·s has the margin −3·s; four more make it
     # 1/(1 + e⁻¹) = 0.73 visible, and one behind a thin wall (−6·s) 0.12.
     spared = lambda name: 4.0 if name == "obstacles" else 0.0
     return jnp.exp(
-        sum(jnp.sum(jax.nn.log_sigmoid(m / softness + spared(name))) for name, m in found.items())
+        sum(
+            jnp.sum(jax.nn.log_sigmoid(m / softness + spared(name)))
+            for name, m in margins_of_ray.items()
+        )
     )
 
 
-def visible(found: dict[str, Array]) -> dict[str, Bool[Array, ""]]:
+def visible(margins_of_ray: dict[str, Array]) -> dict[str, Bool[Array, ""]]:
     """Which conditions a ray satisfies, by its margins."""
     # Rounding: targets on the surface of an obstacle have the margin 0.
-    return {name: jnp.all(m >= -1e-9) for name, m in found.items()}
+    return {name: jnp.all(m >= -1e-9) for name, m in margins_of_ray.items()}
 
 
 def _in_view(
@@ -164,14 +169,16 @@ def _in_view(
     # camera would else lie within the format.
     xy, angle = _image(view, interior, x, y, depth)
     low, high = jnp.array(view.low), jnp.array(view.high)
-    half = (high - low) / 2
+    half_size = (high - low) / 2
     if view.angle < WIDE_ANGLE:
         flat = jnp.minimum(angle, LARGEST_ANGLE)
-        off = (jnp.tan(flat) + angle - flat) / np.tan(view.angle)
+        off_axis = (jnp.tan(flat) + angle - flat) / np.tan(view.angle)
     else:
-        off = angle / view.angle
+        off_axis = angle / view.angle
     # The corners themselves are in view: 1e-6 beyond them is rounding.
-    return jnp.concatenate([(xy - low) / half, (high - xy) / half, (1 + 1e-6 - off)[None]])
+    return jnp.concatenate(
+        [(xy - low) / half_size, (high - xy) / half_size, (1 + 1e-6 - off_axis)[None]]
+    )
 
 
 def _image(
@@ -184,12 +191,12 @@ def _image(
     """The image of a ray, or of the nearest one inside the field of view, and its angle off the
     axis."""
     # The 1e-18 keeps the root differentiable on the axis: 1e-9 rad.
-    across = jnp.sqrt(x * x + y * y + 1e-18 * (x * x + y * y + depth * depth))
-    angle = jnp.arctan2(across, depth)
-    inside = jnp.minimum(angle, view.angle)
-    aside = jnp.sin(inside) / across
+    distance_from_axis = jnp.sqrt(x * x + y * y + 1e-18 * (x * x + y * y + depth * depth))
+    angle = jnp.arctan2(distance_from_axis, depth)
+    angle_inside = jnp.minimum(angle, view.angle)
+    factor = jnp.sin(angle_inside) / distance_from_axis
     p = cast(Parameters, interior)  # an array unpacks like a tuple
-    xy = project(view.model, p, x * aside, y * aside, -jnp.cos(inside))
+    xy = project(view.model, p, x * factor, y * factor, -jnp.cos(angle_inside))
     return jnp.stack(xy), angle
 
 
@@ -215,7 +222,7 @@ def _outside(
     direction = position - point
     length = jnp.sqrt(jnp.sum(direction**2))
     safe = jnp.where(jnp.abs(direction) < 1e-12 * length, 1e-12 * length, direction)
-    first, second = (box[0] - wider - point) / safe, (box[1] + wider - point) / safe
-    enters = jnp.maximum(jnp.max(jnp.minimum(first, second)), 0.0)
-    leaves = jnp.minimum(jnp.min(jnp.maximum(first, second)), 1.0)
+    near_planes, far_planes = (box[0] - wider - point) / safe, (box[1] + wider - point) / safe
+    enters = jnp.maximum(jnp.max(jnp.minimum(near_planes, far_planes)), 0.0)
+    leaves = jnp.minimum(jnp.min(jnp.maximum(near_planes, far_planes)), 1.0)
     return (enters - leaves) * length / scale

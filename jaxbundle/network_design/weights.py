@@ -69,7 +69,7 @@ def select(
     record(start)
     if program(start)[0] >= 2 * UNDETERMINED_AIM:
         raise NotSolvedError("design: all candidates together do not determine the network")
-    found = minimize(
+    minimum = minimize(
         program,
         start,
         jac=True,
@@ -82,27 +82,31 @@ def select(
         # The problem is convex and its gradient cheap: to the end, since the bound depends on it.
         options={"maxiter": max_iterations, "ftol": 1e-8},
     )
-    weight = np.clip(found.x, IDLE_WEIGHT, 1.0)
-    chosen = np.zeros(images, bool)
-    chosen[np.argsort(-weight, kind="stable")[:photographs]] = True
-    chosen = _exchange(program, chosen, settings.max_exchanges)
+    weight = np.clip(minimum.x, IDLE_WEIGHT, 1.0)
+    is_chosen = np.zeros(images, bool)
+    is_chosen[np.argsort(-weight, kind="stable")[:photographs]] = True
+    is_chosen = _exchange(program, is_chosen, settings.max_exchanges)
     # The smallest ∇T·w' of n whole photographs is the sum of the n smallest slopes.
     value, slope = program(weight)
     square, slope = np.exp(value), np.exp(value) * slope
     lowest = square + np.sort(slope)[:photographs].sum() - slope @ weight
     bound = float(np.sqrt(max(lowest, 0.0))) if pairs.aim.convex else 0.0
     return Selection(
-        np.where(weight > 10 * IDLE_WEIGHT, weight, 0.0), chosen, aims, bound, bool(found.success)
+        np.where(weight > 10 * IDLE_WEIGHT, weight, 0.0),
+        is_chosen,
+        aims,
+        bound,
+        bool(minimum.success),
     )
 
 
 def _program(pairs: StationTargetPairs) -> Squared:
     """`weights -> (log aim², gradient)`."""
     values = pairs.problem.data.start
-    seen = pairs.measured(values).astype(float)
+    is_measured = pairs.measured(values).astype(float)
     image = pairs.problem.image
     # Visibilities multiply 1/σ, w the weight 1/σ².
-    program = make_program(pairs, lambda w: (values, seen * jnp.sqrt(w)[image]))
+    program = make_program(pairs, lambda w: (values, is_measured * jnp.sqrt(w)[image]))
 
     def squared(w: Float[AnyArray, " images"]) -> tuple[float, Float[np.ndarray, " images"]]:
         value, slope = program(np.maximum(w, IDLE_WEIGHT))
@@ -112,26 +116,26 @@ def _program(pairs: StationTargetPairs) -> Squared:
 
 
 def _exchange(
-    program: Squared, chosen: Bool[np.ndarray, " images"], max_exchanges: int
+    program: Squared, is_chosen: Bool[np.ndarray, " images"], max_exchanges: int
 ) -> Bool[np.ndarray, " images"]:
     """Photographs exchanged, the best pair at a time, while the aim falls."""
-    aim = lambda chosen: program(chosen.astype(float))[0]
-    best = aim(chosen)
+    aim = lambda is_chosen: program(is_chosen.astype(float))[0]
+    best = aim(is_chosen)
     for _ in range(max_exchanges):
-        found = best, chosen
+        best_exchange = best, is_chosen
         # The slope at nearly zero weight tells what a photograph adds; at zero the derivative of √w
         # is infinite. The eight that add most are tried in place of every chosen one; all pairs
         # would cost candidates times chosen evaluations.
-        slope = program(np.maximum(chosen.astype(float), 1e-3))[1]
-        coming = np.flatnonzero(~chosen)[np.argsort(slope[~chosen])][:8]
-        for new in coming:
-            for old in np.flatnonzero(chosen):
-                tried = chosen.copy()
-                tried[[new, old]] = True, False
-                value = aim(tried)
-                if value < found[0] - 1e-9:  # better beyond rounding, so that exchanges end
-                    found = value, tried
-        if found[1] is chosen:
-            return chosen
-        best, chosen = found
-    return chosen
+        slope = program(np.maximum(is_chosen.astype(float), 1e-3))[1]
+        candidates = np.flatnonzero(~is_chosen)[np.argsort(slope[~is_chosen])][:8]
+        for new in candidates:
+            for old in np.flatnonzero(is_chosen):
+                trial = is_chosen.copy()
+                trial[[new, old]] = True, False
+                value = aim(trial)
+                if value < best_exchange[0] - 1e-9:  # better beyond rounding, so that exchanges end
+                    best_exchange = value, trial
+        if best_exchange[1] is is_chosen:
+            return is_chosen
+        best, is_chosen = best_exchange
+    return is_chosen
