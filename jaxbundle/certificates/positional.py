@@ -126,7 +126,8 @@ class PositionalAccuracy(TableMethods):
             )
             if limit is not None:
                 verb = "meets" if value <= limit else "does not meet"
-                tested += f"; {verb} the {direction} accuracy class of {self._centimetres(limit)} {symbol}"
+                accuracy_class = f"accuracy class of {self._centimetres(limit)} {symbol}"
+                tested += f"; {verb} the {direction} {accuracy_class}"
             sentences.append(f"{tested}, of {count(number, 'check point')}.")
         if all(self.number):
             sentences.append(f"Three-dimensional: RMSE_3D = {self._centimetres(self.rmse_3d)}.")

@@ -117,14 +117,14 @@ def make_network(  # noqa: PLR0913 - the tables of a network
 
     **Raises:** `InputError` naming table, row and column. `check_network` makes the other checks.
     """
-    given: dict[str, Any] = {
+    settings: dict[str, Any] = {
         "datum": datum,
         "residuals": residuals,
         "angle_unit": angle_unit,
         "image_unit": image_unit,
     }
     for key, choices in CHOICES.items():
-        check_choice(key, given[key], choices)
+        check_choice(key, settings[key], choices)
     if sigma_image is not None:
         check_sigma_image(sigma_image)
     if sigma_origin is not None:
@@ -150,17 +150,17 @@ def make_network(  # noqa: PLR0913 - the tables of a network
         images=images,
         points=points,
         observations=dataclasses.replace(observations, xy=xy, sigma=sigma),
-        distances=Distances.none()
+        distances=Distances.empty()
         if distances is None
         else _make_distances(as_columns(distances, "distances"), points),
         datum_points=tuple(str(id) for id in datum_points),
         object_unit=object_unit,
         name=name,
         further=make_further(further, ANGLE_UNITS[angle_unit]),
-        **given,
+        **settings,
     )
-    for one in network.further:
-        one.check(network)
+    for kind in network.further:
+        kind.check(network)
     if mixed:
         network = network.warn(
             f"{count(int(lacking.sum()), 'image coordinate')} of {lacking.size} without σ: theirs "
@@ -183,39 +183,40 @@ def add_further(network: Network, *, angle_unit: str | None = None, **further: A
 
     **Raises:** `InputError` naming table, row and column.
     """
-    own = require_network(network).angle_unit
-    angle_unit = own if angle_unit is None else angle_unit
+    angle_unit_of_network = require_network(network).angle_unit
+    angle_unit = angle_unit_of_network if angle_unit is None else angle_unit
     check_choice("angle_unit", angle_unit, CHOICES["angle_unit"])
-    made = make_further(further, ANGLE_UNITS[angle_unit])
-    for one in made:
-        if angle_unit != own and one.ANGLES_IN_SETTINGS and one.settings:
+    new_kinds = make_further(further, ANGLE_UNITS[angle_unit])
+    for kind in new_kinds:
+        if angle_unit != angle_unit_of_network and kind.ANGLES_IN_SETTINGS and kind.settings:
             raise InputError(
-                f"add_further: the settings of [{one.SECTION}] are in the unit of the network, "
-                f"{own}: expected the table in {own} too, got angle_unit {angle_unit!r}"
+                f"add_further: the settings of [{kind.SECTION}] are in the unit of the network, "
+                f"{angle_unit_of_network}: expected the table in {angle_unit_of_network} too, got "
+                f"angle_unit {angle_unit!r}"
             )
-    new = {one.TABLE for one in made}
-    kept = tuple(one for one in network.further if one.TABLE not in new)
-    network = network.replace(further=(*kept, *made))
-    for one in made:
-        one.check(network)
+    new = {kind.TABLE for kind in new_kinds}
+    other_kinds = tuple(kind for kind in network.further if kind.TABLE not in new)
+    network = network.replace(further=(*other_kinds, *new_kinds))
+    for kind in new_kinds:
+        kind.check(network)
     return network
 
 
-def make_further(given: Mapping[str, Any], radians: float) -> tuple[ObservationTable, ...]:
+def make_further(tables: Mapping[str, Any], radians: float) -> tuple[ObservationTable, ...]:
     """Observations of further kinds from their tables and the settings of their sections.
 
     **Raises:** `InputError`, also for an unknown name, and for settings without a table."""
-    known = (*KINDS, *SECTIONS)
-    for name in given:
-        refuse_unknown(name, known, "", "table")
-    made = []
+    known_names = (*KINDS, *SECTIONS)
+    for name in tables:
+        refuse_unknown(name, known_names, "", "table")
+    kinds = []
     for name, kind in KINDS.items():
-        settings = given.get(kind.SECTION, {})
-        if given.get(name) is not None:
-            made.append(kind.from_columns(as_columns(given[name], name), settings, radians))
+        settings = tables.get(kind.SECTION, {})
+        if tables.get(name) is not None:
+            kinds.append(kind.from_columns(as_columns(tables[name], name), settings, radians))
         elif settings:
             raise InputError(f"[{kind.SECTION}] is given, but no table {name}")
-    return tuple(made)
+    return tuple(kinds)
 
 
 def make_cameras(
@@ -238,17 +239,17 @@ def make_cameras(
             f"{where}cameras: expected Camera objects, dict rows or a data frame of pandas, not "
             f"{show(cameras)}"
         )
-    made = tuple(
+    cameras_made = tuple(
         camera if isinstance(camera, Camera) else _camera(camera, number, where, models)
         for number, camera in enumerate(cameras, 1)
     )
-    if not made:
+    if not cameras_made:
         raise InputError(f"{where}no camera is given; give at least one")
-    for camera in made:
+    for camera in cameras_made:
         check_camera(camera, where)
-    check_unique([camera.id for camera in made], Source(f"{where}cameras"), "camera")
-    check_models(made, where)
-    return made
+    check_unique([camera.id for camera in cameras_made], Source(f"{where}cameras"), "camera")
+    check_models(cameras_made, where)
+    return cameras_made
 
 
 def _camera(
@@ -258,17 +259,17 @@ def _camera(
     if not id:
         raise InputError(f"{where}camera {number}: id is missing")
     model = row.get("model", "brown")
-    model = next((own for own in models if own.name == model), model)
+    model = next((own_model for own_model in models if own_model.name == model), model)
     where = f"{where}camera {id!r}: "
     parameters = {key: value for key, value in row.items() if key not in CAMERA_FIELDS}
     if isinstance(model, CameraModel) or is_known(model):
-        known = model_of(model, where).parameters
+        known_parameters = model_of(model, where).parameters
         for key in parameters:
-            refuse_unknown(key, (*CAMERA_FIELDS, *known), where)
+            refuse_unknown(key, (*CAMERA_FIELDS, *known_parameters), where)
     sigma, observed = row.get("sigma", {}), row.get("observed", {})
-    for key, given in (("sigma", sigma), ("observed", observed)):
-        if not isinstance(given, Mapping):
-            raise InputError(f"{where}{key} is {given!r}; expected a table such as {{ c = 0.1 }}")
+    for key, values in (("sigma", sigma), ("observed", observed)):
+        if not isinstance(values, Mapping):
+            raise InputError(f"{where}{key} is {values!r}; expected a table such as {{ c = 0.1 }}")
     free = row.get("free", ())
     if isinstance(free, str):
         free = [name.strip() for name in free.split(",") if name.strip()]
@@ -287,14 +288,14 @@ def _camera(
     )
 
 
-def _ties(where: str, given: Any) -> tuple[tuple[str, ...], ...]:
+def _ties(where: str, groups: Any) -> tuple[tuple[str, ...], ...]:
     """Groups of names of parameters."""
     listed = lambda g: isinstance(g, Sequence) and not isinstance(g, str)
-    if not listed(given) or not all(listed(g) and len(g) > 1 for g in given):
+    if not listed(groups) or not all(listed(g) and len(g) > 1 for g in groups):
         raise InputError(
-            f'{where}tie is {show(given)}; expected groups of names such as [["fx", "fy"]]'
+            f'{where}tie is {show(groups)}; expected groups of names such as [["fx", "fy"]]'
         )
-    return tuple(tuple(map(str, group)) for group in given)
+    return tuple(tuple(map(str, group)) for group in groups)
 
 
 def _number(where: str, key: str, value: Any) -> float:
@@ -311,10 +312,10 @@ def _pair(where: str, key: str, value: Any, kind: type) -> tuple | None:
         return None
     if isinstance(value, str) or not isinstance(value, Sequence | np.ndarray) or len(value) != 2:
         raise InputError(f"{where}{key} is {value!r}; expected two numbers [horizontal, vertical]")
-    first, second = (_number(where, key, v) for v in value)
-    if kind is int and not (first.is_integer() and second.is_integer()):
+    first_number, second_number = (_number(where, key, v) for v in value)
+    if kind is int and not (first_number.is_integer() and second_number.is_integer()):
         raise InputError(f"{where}{key} is {list(value)}; expected whole numbers of pixels")
-    return kind(first), kind(second)
+    return kind(first_number), kind(second_number)
 
 
 def _index(ids: Sequence[str]) -> dict[str, int]:
@@ -384,32 +385,32 @@ def _make_observations(
     table.check_names(OBSERVATION_COLUMNS, OBSERVATION_SIGMAS)
     if table.values.keys().isdisjoint(OBSERVATION_SIGMAS):
         # Millions of rows of other programs have none.
-        sigma, missing = np.full((len(table), 2), sigma_image or 1.0), len(table) > 0
+        sigma, lacks_sigma = np.full((len(table), 2), sigma_image or 1.0), len(table) > 0
     else:
-        stated = _matrix(table, OBSERVATION_SIGMAS)
-        sigma = np.where(np.isnan(stated), sigma_image or 1.0, stated)
-        missing = bool(np.isnan(stated).any())
+        stated_sigma = _matrix(table, OBSERVATION_SIGMAS)
+        sigma = np.where(np.isnan(stated_sigma), sigma_image or 1.0, stated_sigma)
+        lacks_sigma = bool(np.isnan(stated_sigma).any())
     return Observations(
         image=_rows_in(images, table, "image"),
         point=_rows_in(points, table, "point"),
         xy=_matrix(table, ("x", "y"), required=True),
         sigma=sigma,
         source=table.source,
-        sigma_origin=origin or (UNIT if sigma_image is None and missing else STATED),
+        sigma_origin=origin or (UNIT if sigma_image is None and lacks_sigma else STATED),
     )
 
 
-def _rows_in(of: Images | Points, table: Columns, name: str) -> Int[np.ndarray, " rays"]:
+def _rows_in(table_of_ids: Images | Points, table: Columns, name: str) -> Int[np.ndarray, " rays"]:
     """The rows of images or points that a column names."""
     values = table.column(name)
     if isinstance(values, RepeatedIds) and values.are_rows:
         return values.codes
-    return table.indices(name, name, _index(of.id), of.source.name)
+    return table.indices(name, name, _index(table_of_ids.id), table_of_ids.source.name)
 
 
 def _make_distances(table: Columns, points: Points) -> Distances:
     if not len(table):
-        return Distances.none()
+        return Distances.empty()
     table.check_names(DISTANCE_COLUMNS)
     index = _index(points.id)
     ends = [table.indices(name, "point", index, points.source.name) for name in ("from", "to")]

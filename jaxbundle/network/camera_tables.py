@@ -39,25 +39,25 @@ class CameraTable:
 
     def unknowns(self, cameras: Sequence[Camera]) -> ls.Table:
         """The table; only parameters that are free in some camera are unknowns."""
-        own = [cameras[c] for c in self.cameras]
-        unknowns = [camera.unknowns for camera in own]
+        own_cameras = [cameras[c] for c in self.cameras]
+        unknowns = [camera.unknowns for camera in own_cameras]
         free = np.array([[name in names for name in self.parameters] for names in unknowns])
         # Columns that are free in no camera are constants of the formula, not unknowns held at 0:
         # the reduced matrix is smaller.
         moving = tuple(np.flatnonzero(free.any(0)).tolist())
-        at = self.parameters.index
-        tied = tuple(
-            (at(name), moving.index(at(group[0])))
+        column_of = self.parameters.index
+        equal_columns = tuple(
+            (column_of(name), moving.index(column_of(group[0])))
             for group in self.tie
-            if at(group[0]) in moving
+            if column_of(group[0]) in moving
             for name in group[1:]
         )
         return ls.Table(
             self.name,
             self.start(cameras),
-            Vector(len(self.parameters), moving, tied),
+            Vector(len(self.parameters), moving, equal_columns),
             free[:, moving],
-            [camera.id for camera in own],
+            [camera.id for camera in own_cameras],
             tuple(self.parameters[j] for j in moving),
             "camera",
         )
@@ -69,10 +69,10 @@ def camera_tables(cameras: Sequence[Camera]) -> tuple[CameraTable, ...]:
     # part of the space of a table, so cameras with other ties have their own.
     sorts = [(get_model(c.model), c.tie) for c in cameras]
     different = tuple(dict.fromkeys(sorts))
-    named = lambda model, tie: ", ".join(["camera", model.name, *(" = ".join(g) for g in tie)])
+    name_of = lambda model, tie: ", ".join(["camera", model.name, *(" = ".join(g) for g in tie)])
     return tuple(
         CameraTable(
-            "camera" if len(different) == 1 else named(model, tie),
+            "camera" if len(different) == 1 else name_of(model, tie),
             key_of(model),
             model.parameters,
             np.array([c for c, s in enumerate(sorts) if s == (model, tie)]),

@@ -63,8 +63,10 @@ def check_network(network: Network) -> Network:
     network = check_single_strip(network)
     network = warn_of_repetitions(network)
     network = _note_points_behind(network)
-    once = lambda lines: tuple(dict.fromkeys(lines))
-    return network.replace(warnings=once(network.warnings), notes=once(network.notes))
+    without_repetition = lambda lines: tuple(dict.fromkeys(lines))
+    return network.replace(
+        warnings=without_repetition(network.warnings), notes=without_repetition(network.notes)
+    )
 
 
 def check_tables(network: Network) -> Network:
@@ -89,10 +91,11 @@ def _check_sizes(network: Network) -> None:
         raise InputError("the network has no camera; give at least one")
     images, points, observations = network.images, network.points, network.observations
     tables = (images, "images"), (points, "points"), (observations, "image points")
-    for table, things in tables:
+    for table, rows_in_words in tables:
         if not len(table):
             raise InputError(
-                f"{table.source.name}: the table is empty: there are no {things}; give at least one"
+                f"{table.source.name}: the table is empty: there are no {rows_in_words}; give at "
+                "least one"
             )
     n, p, r, d = len(images), len(points), len(observations), len(network.distances)
     shapes = (
@@ -108,7 +111,7 @@ def _check_sizes(network: Network) -> None:
                     f"{table.source.name}: {name} has the shape "
                     f"{np.shape(getattr(table, name))}, expected {shape}"
                 )
-    for table, name, things, size in (
+    for table, name, rows_in_words, size in (
         (images, "camera", "cameras", len(network.cameras)),
         (observations, "image", "images", n),
         (observations, "point", "points", p),
@@ -117,19 +120,20 @@ def _check_sizes(network: Network) -> None:
         index = np.asarray(getattr(table, name))
         for row, *_ in np.argwhere((index < 0) | (index >= size))[:1]:
             raise InputError(
-                f"{table.source(row)}: {name} index {index[row]} is not among the {size} {things}"
+                f"{table.source(row)}: {name} index {index[row]} is not among the {size} "
+                f"{rows_in_words}"
             )
 
 
 def _refuse(
     table: Images | Points,
     mask: Bool[np.ndarray, "rows columns"],
-    thing: str,
+    noun: str,
     message: Callable[[int, int], str],
 ) -> None:
     """Refuse the first entry of a mask [rows, columns]; `message(row, column)` says why."""
     for row, k in np.argwhere(mask)[:1]:
-        raise InputError(f"{table.source(row)}: {thing} {table.id[row]!r}: {message(row, k)}")
+        raise InputError(f"{table.source(row)}: {noun} {table.id[row]!r}: {message(row, k)}")
 
 
 def _sighting(network: Network, row: SupportsIndex) -> str:
@@ -143,15 +147,15 @@ def _check_cameras(network: Network) -> Network:
         check_camera(camera)
     check_unique([camera.id for camera in network.cameras], Source("cameras"), "camera")
     check_models(network.cameras)
-    used, index = np.unique(network.images.camera, return_inverse=True)
-    if len(used) == len(network.cameras):
+    used_cameras, index = np.unique(network.images.camera, return_inverse=True)
+    if len(used_cameras) == len(network.cameras):
         return network
-    unused = [c.id for i, c in enumerate(network.cameras) if i not in used]
+    unused = [c.id for i, c in enumerate(network.cameras) if i not in used_cameras]
     images = network.images
     images = Images(
         images.id, index.reshape(-1), images.position, images.angles, images.sigma, images.source
     )
-    cameras = tuple(network.cameras[i] for i in used)
+    cameras = tuple(network.cameras[i] for i in used_cameras)
     return network.replace(cameras=cameras, images=images).note(
         f"left out {count(len(unused), 'camera')} without images: {list_some(unused)}"
     )
@@ -194,10 +198,10 @@ def _check_images(network: Network) -> None:
         lambda _row, k: f"{EXTERIOR[k]} has a σ but no value; give the value, or leave the σ empty",
     )
     # A rotation changes by a vector δθ in the camera frame: no column of it is one angle.
-    held = (sigma[:, 3:] == 0).sum(1, keepdims=True)
+    number_held = (sigma[:, 3:] == 0).sum(1, keepdims=True)
     _refuse(
         images,
-        (held > 0) & (held < 3),
+        (number_held > 0) & (number_held < 3),
         "image",
         lambda _row, _k: (
             "omega, phi, kappa can be held fixed only all three together; give the "
@@ -229,7 +233,10 @@ def _check_points(network: Network) -> Network:
         lambda row, k: f"{AXES[k]} is missing; a {points.role[row]} point needs its coordinates",
     )
     control = points.has_role("control")
-    none, loose = control & np.isnan(sigma).all(1), control & np.isposinf(sigma).all(1)
+    without_sigma, without_axis = (
+        control & np.isnan(sigma).all(1),
+        control & np.isposinf(sigma).all(1),
+    )
     _refuse(
         points,
         control[:, None] & (sigma <= 0),
@@ -241,7 +248,7 @@ def _check_points(network: Network) -> Network:
     )
     _refuse(
         points,
-        (control & ~none)[:, None] & np.isnan(sigma),
+        (control & ~without_sigma)[:, None] & np.isnan(sigma),
         "control point",
         lambda _row, k: (
             f"σ of {AXES[k]} is missing while another axis has one; give all three, "
@@ -249,16 +256,18 @@ def _check_points(network: Network) -> Network:
         ),
     )
     unused = points.has_role("tie", "fixed") & ~np.isnan(sigma).all(1)
-    network = network.replace(points=with_roles(with_roles(points, none, "fixed"), loose, "tie"))
+    network = network.replace(
+        points=with_roles(with_roles(points, without_sigma, "fixed"), without_axis, "tie")
+    )
     if unused.any():
         network = network.note(
             f"σ of {count(unused.sum(), 'tie or fixed point')} not used (only control points "
             f"have one): {_names(points, unused)}"
         )
-    if loose.any():
+    if without_axis.any():
         network = network.note(
-            f"{count(loose.sum(), 'control point')} with all axes free taken as tie: "
-            f"{_names(points, loose)}"
+            f"{count(without_axis.sum(), 'control point')} with all axes free taken as tie: "
+            f"{_names(points, without_axis)}"
         )
     return network
 
@@ -281,21 +290,22 @@ def _check_observations(network: Network) -> None:
             f"{sigma[row, k]:g}; it must be finite and positive: correct it, or leave it empty to "
             "use sigma_image"
         )
-    least = np.finfo(float).eps * np.abs(observations.xy).max()
-    for row, k in np.argwhere(sigma < least)[:1]:
+    smallest_sigma = np.finfo(float).eps * np.abs(observations.xy).max()
+    for row, k in np.argwhere(sigma < smallest_sigma)[:1]:
         raise InputError(
             f"{observations.source(row)}: σ of {'xy'[k]} of {_sighting(network, row)} is "
-            f"{sigma[row, k]:g}, less than the last digit of the image coordinates ({least:.1g}); "
+            f"{sigma[row, k]:g}, less than the last digit of the image coordinates "
+            f"({smallest_sigma:.1g}); "
             "give it, or sigma_image, in the unit of the coordinates"
         )
     # One number for image and point, so that millions of rows are compared by a sort.
     key = observations.image.astype(np.int64) * len(network.points) + observations.point
     order = np.argsort(key, kind="stable")
     for k in np.flatnonzero(np.diff(key[order]) == 0)[:1]:
-        first, second = int(order[k]), int(order[k + 1])
+        first_row, second_row = int(order[k]), int(order[k + 1])
         raise InputError(
-            f"{observations.source(second)}: {_sighting(network, second)} "
-            f"is already in {observations.source(first)}; remove one of them"
+            f"{observations.source(second_row)}: {_sighting(network, second_row)} "
+            f"is already in {observations.source(first_row)}; remove one of them"
         )
 
 
@@ -331,13 +341,14 @@ def _check_distances(network: Network) -> Network:
 def _note_rows_of_check_points(network: Network) -> Network:
     """Say which rows of further kinds are about check points, which take no part."""
     check = {id for id, role in zip(network.points.id, network.points.role) if role == "check"}
-    for one in network.further if check else ():
-        about = np.zeros(len(one), bool)
-        for field in one.POINTS:
-            about |= np.array([id in check for id in getattr(one, field)], bool)
-        if about.any():
+    for kind in network.further if check else ():
+        is_about_check = np.zeros(len(kind), bool)
+        for field in kind.POINTS:
+            is_about_check |= np.array([id in check for id in getattr(kind, field)], bool)
+        if is_about_check.any():
             network = network.note(
-                f"{one.source(int(about.argmax()))}: {about.sum()} of {len(one)} {one.TABLE} are "
+                f"{kind.source(int(is_about_check.argmax()))}: {is_about_check.sum()} of "
+                f"{len(kind)} {kind.TABLE} are "
                 "about check points, which take no part in the adjustment, and are left out"
             )
     return network
@@ -376,17 +387,17 @@ def _refuse_missing(
     table: Images | Points,
     values: Float[np.ndarray, "rows columns"],
     names: Sequence[str],
-    thing: str,
+    noun: str,
 ) -> None:
-    missing = np.isnan(values)
-    more = missing.any(1).sum() - 1
-    also = f" (and {more} more)" if more > 0 else ""
+    is_missing = np.isnan(values)
+    number_of_others = is_missing.any(1).sum() - 1
+    others_in_words = f" (and {number_of_others} more)" if number_of_others > 0 else ""
     _refuse(
         table,
-        missing,
-        thing,
+        is_missing,
+        noun,
         lambda _row, k: (
-            f"{names[k]} has no start value{also}; give start values, or find them with "
+            f"{names[k]} has no start value{others_in_words}; give start values, or find them with "
             "jaxbundle.orient"
         ),
     )
@@ -401,12 +412,13 @@ def _note_points_behind(network: Network) -> Network:
     omega, phi, _ = images.angles.T
     axis = np.stack([np.sin(phi), -np.cos(phi) * np.sin(omega), np.cos(phi) * np.cos(omega)], 1)
     ray = network.points.position[rays.point] - images.position[rays.image]
-    before = (axis[rays.image] * ray).sum(1) < 0
-    behind = np.flatnonzero(~before & np.array(plain)[images.camera[rays.image]])
-    if not len(behind):
+    is_before = (axis[rays.image] * ray).sum(1) < 0
+    rows_behind = np.flatnonzero(~is_before & np.array(plain)[images.camera[rays.image]])
+    if not len(rows_behind):
         return network
-    first = "; ".join(_sighting(network, row) for row in behind[:3])
+    examples = "; ".join(_sighting(network, row) for row in rows_behind[:3])
     return network.note(
-        f"the start values put {count(len(behind), 'image point')} behind the camera: {first}"
-        f"{' …' if len(behind) > 3 else ''}; check the start values and the angle unit"
+        f"the start values put {count(len(rows_behind), 'image point')} behind the camera: "
+        f"{examples}"
+        f"{' …' if len(rows_behind) > 3 else ''}; check the start values and the angle unit"
     )

@@ -69,11 +69,11 @@ class Columns:
 
     def check_names(self, required: Sequence[str], optional: Sequence[str] = ()) -> None:
         """Refuse missing and unknown columns, and a table without rows."""
-        known = (*required, *optional)
+        known_names = (*required, *optional)
         for name in self.values:
-            if name not in known:
+            if name not in known_names:
                 raise InputError(
-                    f"{self.source.name}: unknown column {name!r}{did_you_mean(name, known)}"
+                    f"{self.source.name}: unknown column {name!r}{did_you_mean(name, known_names)}"
                 )
         for name in required:
             if name not in self.values:
@@ -144,9 +144,9 @@ class Columns:
         return number
 
     def indices(
-        self, name: str, thing: str, of: Mapping[str, int], where: str
+        self, name: str, noun: str, index_of: Mapping[str, int], where: str
     ) -> Int[np.ndarray, " rows"]:
-        """A column of ids as indices into another table (`thing`s in `where`)."""
+        """A column of ids as indices into another table (`noun`s in `where`)."""
         # Millions of rows: looked up at once, and searched for the unknown id only if there is one.
         values = self.column(name)
         try:
@@ -154,19 +154,19 @@ class Columns:
                 different, codes = np.unique(values, return_inverse=True)
                 values = RepeatedIds(different, codes)
             if isinstance(values, RepeatedIds):
-                found = [of.get(label, -1) for label in values.texts()]
-                indices = np.array(found, np.int64)[values.codes]
+                positions = [index_of.get(label, -1) for label in values.texts()]
+                indices = np.array(positions, np.int64)[values.codes]
                 if indices.size and indices.min() < 0:
                     raise KeyError
                 return indices
             ids = self.ids(name)
-            return np.fromiter(map(of.__getitem__, ids), np.int64, len(ids))
+            return np.fromiter(map(index_of.__getitem__, ids), np.int64, len(ids))
         except KeyError:
             ids = self.ids(name)
-            row = next(row for row, id in enumerate(ids) if id not in of)
+            row = next(row for row, id in enumerate(ids) if id not in index_of)
             raise InputError(
-                f"{self.source(row)}: {name} {ids[row]!r} is unknown: no such {thing} in {where}"
-                f"{did_you_mean(ids[row], list(of), listing=False)}"
+                f"{self.source(row)}: {name} {ids[row]!r} is unknown: no such {noun} in {where}"
+                f"{did_you_mean(ids[row], list(index_of), listing=False)}"
             ) from None
 
 
@@ -183,8 +183,8 @@ def as_columns(table: Any, name: str) -> Columns:
         if len(set(lengths.values())) > 1:
             raise InputError(f"{name}: the columns differ in length: {lengths}")
         return Columns(columns, source)
-    one = isinstance(table, np.ndarray) and not table.ndim
-    rows: list[Any] = list(table) if isinstance(table, Iterable) and not one else [table]
+    is_scalar = isinstance(table, np.ndarray) and not table.ndim
+    rows: list[Any] = list(table) if isinstance(table, Iterable) and not is_scalar else [table]
     if not all(isinstance(row, Mapping) for row in rows):
         raise InputError(
             f"{name}: expected a data frame of pandas, a dict of columns, or a list of dict rows, "
@@ -236,27 +236,27 @@ def is_missing(value: Any) -> bool:
     return bool(np.isnan(value)) if number else type(value).__name__ in ("NAType", "NaTType")
 
 
-def did_you_mean(name: str, known: Iterable[str], *, listing: bool = True) -> str:
+def did_you_mean(name: str, known_names: Iterable[str], *, listing: bool = True) -> str:
     """The end of a message about an unknown name: the closest known one, or all of them."""
-    known = list(known)
-    close = closest_name(name, known)
+    known_names = list(known_names)
+    close = closest_name(name, known_names)
     if close is not None:
         return f"; did you mean {close!r}?"
-    return f"; known: {', '.join(known)}" if listing and known else ""
+    return f"; known: {', '.join(known_names)}" if listing and known_names else ""
 
 
-def refuse_unknown(name: str, known: Iterable[str], where: str, noun: str = "key") -> None:
-    """Refuse a name other than the `known` ones, as a probable typing error: a setting that is
-    silently ignored would give another result than the user expects.
+def refuse_unknown(name: str, known_names: Iterable[str], where: str, noun: str = "key") -> None:
+    """Refuse a name other than the `known_names` ones, as a probable typing error: a setting that
+    is silently ignored would give another result than the user expects.
 
     **Arguments:** `where` begins the message; `noun`: what the name is of, `section` in brackets.
 
     **Raises:** `InputError`.
     """
-    known = tuple(known)
-    if name not in known:
-        shown = f"[{name}]" if noun == "section" else repr(name)
-        raise InputError(f"{where}unknown {noun} {shown}{did_you_mean(name, known)}")
+    known_names = tuple(known_names)
+    if name not in known_names:
+        shown_name = f"[{name}]" if noun == "section" else repr(name)
+        raise InputError(f"{where}unknown {noun} {shown_name}{did_you_mean(name, known_names)}")
 
 
 def quote(name: Any) -> str:
@@ -271,9 +271,9 @@ def list_some(names: Iterable[Any], most: int = 5, as_text: Callable[[Any], str]
     return f"{text} and {len(names) - most} more" if len(names) > most else text
 
 
-def count(number: SupportsIndex, thing: str, rest: str = "") -> str:
+def count(number: SupportsIndex, noun: str, ending: str = "") -> str:
     """A count in words: "1 image", "3 images", "3 images held"."""
-    return f"{number} {thing}{'' if index(number) == 1 else 's'}{rest}"
+    return f"{number} {noun}{'' if index(number) == 1 else 's'}{ending}"
 
 
 def _id(value: Any) -> str:

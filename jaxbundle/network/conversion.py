@@ -53,42 +53,47 @@ def convert_cameras(
     rays = network.observations
     xy, sigma = rays.xy.copy(), rays.sigma.copy()
     of_ray = network.images.camera[rays.image]
-    cameras, done = [], {}
+    cameras, conversions = [], {}
     for c, camera in enumerate(network.cameras):
         if camera.model == model or (only is not None and camera.id not in only):
             cameras.append(camera)
             continue
-        mine = of_ray == c
-        made, conversion, shift, step = _convert(camera, model, r0, xy[mine], measured)
-        xy[mine], sigma[mine] = shift + step * xy[mine], np.abs(step) * sigma[mine]
-        cameras.append(made)
-        done[camera.id] = conversion
+        is_of_camera = of_ray == c
+        converted_camera, conversion, shift, step = _convert(
+            camera, model, r0, xy[is_of_camera], measured
+        )
+        xy[is_of_camera], sigma[is_of_camera] = (
+            shift + step * xy[is_of_camera],
+            np.abs(step) * sigma[is_of_camera],
+        )
+        cameras.append(converted_camera)
+        conversions[camera.id] = conversion
     units = {get_model(camera.model).unit for camera in cameras}
     converted = network.replace(
         cameras=tuple(cameras),
         observations=dataclasses.replace(rays, xy=xy, sigma=sigma),
-        image_unit=units.pop() if done and len(units) == 1 else network.image_unit,
+        image_unit=units.pop() if conversions and len(units) == 1 else network.image_unit,
     )
-    kept = tuple(one for one in network.further if not isinstance(one, Edges))
-    if done and len(kept) < len(network.further):
-        converted = converted.replace(further=kept).warn(
+    kept_kinds = tuple(kind for kind in network.further if not isinstance(kind, Edges))
+    if conversions and len(kept_kinds) < len(network.further):
+        converted = converted.replace(further=kept_kinds).warn(
             "edges are dropped: their image points refer to the models before the conversion"
         )
-    dropped = [c.id for c in network.cameras if c.id in done and c.sigma]
+    dropped = [c.id for c in network.cameras if c.id in conversions and c.sigma]
     if dropped:
         converted = converted.warn(
             f"prior σ of the parameters of {', '.join(dropped)} are dropped: they refer to the "
             "model before the conversion"
         )
-    return converted, done
+    return converted, conversions
 
 
 def convert_one(
     camera: Camera, model: str | CameraModel, r0: float = 0.0
 ) -> tuple[Camera, Conversion]:
     """A camera in the model with this name, or a given one, and its `Conversion`."""
-    made, conversion, _, _ = _convert(camera, model, r0, np.zeros((0, 2)))
-    return made, conversion
+    converted_camera, conversion, _, _ = _convert(camera, model, r0, np.zeros((0, 2)))
+    return converted_camera, conversion
 
 
 def _convert(
@@ -117,7 +122,7 @@ def _convert(
         size = next((name for name in SIZES if str(error).startswith(name)), None)
         remedy = f"; give --{size.replace('_', '-')} WIDTH,HEIGHT" if size else ""
         raise InputError(f"camera {camera.id!r}: {error}{remedy}") from None
-    made = dataclasses.replace(
+    converted_camera = dataclasses.replace(
         camera,
         model=model,
         parameters=conversion.parameters,
@@ -126,7 +131,7 @@ def _convert(
         free=_counterparts(camera.free, source, target),
         tie=camera.tie if source == target else (),
     )
-    return made, conversion, shift - step * centre, step
+    return converted_camera, conversion, shift - step * centre, step
 
 
 def _centre(camera: Camera):
@@ -146,9 +151,11 @@ def _counterparts(free: Sequence[str], source: CameraModel, target: CameraModel)
     counterparts: to or from such a model either all default free parameters are free, or none."""
     if is_own(source) or is_own(target):
         fields = "principal_distance", "principal_point"
-        wanted = {n for f in fields if {*getattr(source, f)} & {*free} for n in getattr(target, f)}
-        more = {*free} - {*source.core} and {*target.free} - {*target.core}
-        return tuple(name for name in target.parameters if name in wanted | more)
+        counterparts = {
+            n for f in fields if {*getattr(source, f)} & {*free} for n in getattr(target, f)
+        }
+        added = {*free} - {*source.core} and {*target.free} - {*target.core}
+        return tuple(name for name in target.parameters if name in counterparts | added)
     groups: Mapping[str, tuple[str, ...]] = {n: group for group in COUNTERPARTS for n in group}
-    wanted = {other for name in free for other in groups.get(name, (name,))}
-    return tuple(name for name in target.parameters if name in wanted)
+    counterparts = {counterpart for name in free for counterpart in groups.get(name, (name,))}
+    return tuple(name for name in target.parameters if name in counterparts)

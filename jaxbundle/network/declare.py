@@ -34,7 +34,7 @@ from jaxbundle.leastsquares.indexing.indices import round_up
 from jaxbundle.leastsquares.problem import distinct_names
 from jaxbundle.leastsquares.spaces import Pose, PoseValue, Vector
 from jaxbundle.network.camera_tables import CameraTable, camera_tables
-from jaxbundle.network.kinds.base import among
+from jaxbundle.network.kinds.base import present_kinds
 from jaxbundle.network.kinds.control_points import declare_control_points
 from jaxbundle.network.kinds.distances import declare_distances
 from jaxbundle.network.kinds.exterior_orientation import declare_exterior_orientation
@@ -42,7 +42,7 @@ from jaxbundle.network.kinds.image_points import declare_image_points
 from jaxbundle.network.kinds.interior_orientation import declare_interior_orientation
 from jaxbundle.network.motions import SIMILARITY, SIMILARITY_AT_ANY_DISTANCE
 from jaxbundle.network.tables import EXTERIOR, Network
-from jaxbundle.network.user_observations import place, split
+from jaxbundle.network.user_observations import place, split_by_type
 from jaxbundle.system.programs import compile_once
 
 # Smallest batch of rotations, so that networks of fewer images share one compiled program:
@@ -95,30 +95,32 @@ def declare(
         *declare_distances(network),
     ]
     # What image points touch is declared even where all of its rows are left out.
-    touched = [one.among(network) for one in network.further if one.CHANGES_IMAGE_POINTS]
-    others = [one for one in among(network) if not one.CHANGES_IMAGE_POINTS]
-    declared = [one.declare(network, origin) for one in (*touched, *others)]
+    changing_image_points = [
+        kind.among(network) for kind in network.further if kind.CHANGES_IMAGE_POINTS
+    ]
+    other_kinds = [kind for kind in present_kinds(network) if not kind.CHANGES_IMAGE_POINTS]
+    declared = [kind.declare(network, origin) for kind in (*changing_image_points, *other_kinds)]
     # Observations of users come last, and resolve ids of any table above.
-    own_tables, own_observations = split(also)
-    further = own_tables + [table for one in declared for table in one.tables]
+    user_tables, user_observations = split_by_type(also)
+    further_tables = user_tables + [table for kind in declared for table in kind.tables]
     tables = [
         _table_of_images(network, origin),
         *(table.unknowns(network.cameras) for table in cameras),
         _table_of_points(network, origin, lengths),
-        *further,
+        *further_tables,
     ]
-    others = [place(one, origin).resolve_labels(tables) for one in own_observations]
-    others += [one for of_kind in declared for one in of_kind.observations]
-    observations = distinct_names([*standard, *others])
+    other_kinds = [place(kind, origin).resolve_labels(tables) for kind in user_observations]
+    other_kinds += [kind for of_kind in declared for kind in of_kind.observations]
+    observations = distinct_names([*standard, *other_kinds])
     similarity = SIMILARITY if lengths is None else SIMILARITY_AT_ANY_DISTANCE
-    actions = (*similarity.actions, *(action for one in declared for action in one.actions))
+    actions = (*similarity.actions, *(action for kind in declared for action in kind.actions))
     return DeclaredNetwork(
         tuple(tables),
         observations,
         cameras,
         image_rows,
-        tuple(one.name for one in observations[len(standard) :]),
-        tuple(table.name for table in further),
+        tuple(kind.name for kind in observations[len(standard) :]),
+        tuple(table.name for table in further_tables),
         origin,
         lengths,
         dataclasses.replace(similarity, actions=actions),
@@ -149,10 +151,14 @@ def _table_of_points(
 def order_cameras(network: Network) -> Network:
     """The same network with its cameras in the order of the images, if each image has its own: the
     engine then uses one block for an image and its camera."""
-    used = network.images.camera
-    if len(used) == len(network.cameras) and len(set(used)) == len(used):
-        images = dataclasses.replace(network.images, camera=np.arange(len(used)))
-        network = network.replace(cameras=tuple(network.cameras[c] for c in used), images=images)
+    camera_of_image = network.images.camera
+    if len(camera_of_image) == len(network.cameras) and len(set(camera_of_image)) == len(
+        camera_of_image
+    ):
+        images = dataclasses.replace(network.images, camera=np.arange(len(camera_of_image)))
+        network = network.replace(
+            cameras=tuple(network.cameras[c] for c in camera_of_image), images=images
+        )
     return network
 
 

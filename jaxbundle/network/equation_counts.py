@@ -10,7 +10,7 @@ from jaxtyping import Int
 
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.columns import count, list_some
-from jaxbundle.network.kinds.base import among, rows_of
+from jaxbundle.network.kinds.base import present_kinds, rows_of
 from jaxbundle.network.subsets import keep_images, keep_points, record_left_out
 from jaxbundle.network.tables import (
     EXTERIOR,
@@ -25,14 +25,14 @@ def count_controlled_axes(points: Points) -> Int[np.ndarray, " points"]:
     return np.where(points.has_role("fixed"), 3, np.where(points.has_role("control"), axes, 0))
 
 
-def equations_of(network: Network, things: str) -> Int[np.ndarray, " things"]:
+def equations_of(network: Network, table_name: str) -> Int[np.ndarray, " things"]:
     """The number of equations of further kinds that touch every image ("IMAGES") or point
     ("POINTS")."""
-    table = network.images if things == "IMAGES" else network.points
+    table = network.images if table_name == "IMAGES" else network.points
     number = np.zeros(len(table), int)
-    for one in among(network):
-        for field in getattr(one, things):
-            np.add.at(number, rows_of(getattr(one, field), table), one.number_of_equations())
+    for kind in present_kinds(network):
+        for field in getattr(kind, table_name):
+            np.add.at(number, rows_of(getattr(kind, field), table), kind.number_of_equations())
     return number
 
 
@@ -44,61 +44,65 @@ def leave_out_with_too_few_rays(network: Network) -> Network:
     points, images, distances = network.points, network.images, network.distances
     image, point = network.observations.image, network.observations.point
     fixed, check = points.has_role("fixed"), points.has_role("check")
-    known = count_controlled_axes(points) + equations_of(network, "POINTS")
-    given = (~np.isnan(images.sigma)).sum(1) + equations_of(network, "IMAGES")
-    keep, used = np.ones(len(points), bool), np.ones(len(images), bool)
+    known_coordinates = count_controlled_axes(points) + equations_of(network, "POINTS")
+    priors_of_image = (~np.isnan(images.sigma)).sum(1) + equations_of(network, "IMAGES")
+    keep, is_used = np.ones(len(points), bool), np.ones(len(images), bool)
     # Points and images depend on each other: without a point an image may have too few, without the
     # image other points lose a ray. Everything is counted again until nothing changes.
-    first = None
+    first_reason = None
     while True:
-        rays = np.bincount(point[used[image]], minlength=len(points))
+        rays = np.bincount(point[is_used[image]], minlength=len(points))
         ends = distances.points[keep[distances.points].all(1)]
-        tied = np.bincount(ends.ravel(), minlength=len(points))
-        determined = fixed | (2 * rays + tied + known >= 3)
+        distances_of_point = np.bincount(ends.ravel(), minlength=len(points))
+        determined = fixed | (2 * rays + distances_of_point + known_coordinates >= 3)
         # Fixed points that no image sees add nothing, nor do images without points, whatever is
         # known of them.
-        kept = keep & np.where(check, rays >= 2, (rays + tied > 0) & determined)
-        taking_part = (kept & ~check)[point]
-        seen = np.bincount(image[taking_part], minlength=len(images))
-        still = used & (seen > 0) & (2 * seen + given >= 6)
-        if (kept == keep).all() and (still == used).all():
+        keep_now = keep & np.where(check, rays >= 2, (rays + distances_of_point > 0) & determined)
+        taking_part = (keep_now & ~check)[point]
+        points_of_image = np.bincount(image[taking_part], minlength=len(images))
+        used_now = is_used & (points_of_image > 0) & (2 * points_of_image + priors_of_image >= 6)
+        if (keep_now == keep).all() and (used_now == is_used).all():
             break
         # Only the first image: those that follow are left out because of it.
-        if first is None and (still != used).any():
+        if first_reason is None and (used_now != is_used).any():
             measured = np.bincount(image, minlength=len(images))
-            worst = int(np.where(still, np.inf, measured).argmin())
-            first = _too_few_points(network, worst, seen)
-        keep, used = kept, still
+            worst = int(np.where(used_now, np.inf, measured).argmin())
+            first_reason = _too_few_points(network, worst, points_of_image)
+        keep, is_used = keep_now, used_now
     # So many say that something is wrong with the network, not with these images.
-    if first is not None and 2 * (~used).sum() >= len(images):
-        raise first
+    if first_reason is not None and 2 * (~is_used).sum() >= len(images):
+        raise first_reason
     out, notes = ~keep, []
-    for mask, thing, why in (
+    for mask, noun, why in (
         (out & ~check & (rays == 0), "point", "without any ray"),
         (out & ~check & (rays > 0), "tie point", "with a single ray"),
         (out & check, "check point", "with fewer than two rays"),
     ):
-        notes.append((thing, [points.id[row] for row in np.flatnonzero(mask)], why))
-    names = [images.id[row] for row in np.flatnonzero(~used)]
+        notes.append((noun, [points.id[row] for row in np.flatnonzero(mask)], why))
+    names = [images.id[row] for row in np.flatnonzero(~is_used)]
     notes.append(("image", names, "with too few points that other images or control determine"))
-    left = keep_images(keep_points(network, keep), used)
-    for thing, those, why in notes:
-        left = record_left_out(left, thing, those, why, measured=thing == "image")
+    remaining = keep_images(keep_points(network, keep), is_used)
+    for noun, missing_names, why in notes:
+        remaining = record_left_out(remaining, noun, missing_names, why, measured=noun == "image")
     messages = []
-    for one in network.further:
-        gone = len(one) - len(one.among(left))
-        if gone:
-            messages.append(f"{one.TABLE}: left out {count(gone, 'row')} about excluded objects")
-    lost = (~keep[distances.points].all(1)).sum()
-    if lost:
-        messages.append(f"left out {count(lost, 'distance')} to a point that was left out")
-    left = left.note(*messages)
-    if network.datum_points and not keep[np.isin(points.id, network.datum_points)].any():
-        said = left.notes[len(network.notes) :]
-        raise InputError(
-            f"datum_points: none is left ({'; '.join(said)}); name points with two rays"
+    for kind in network.further:
+        number_of_rows = len(kind) - len(kind.among(remaining))
+        if number_of_rows:
+            messages.append(
+                f"{kind.TABLE}: left out {count(number_of_rows, 'row')} about excluded objects"
+            )
+    number_of_distances = (~keep[distances.points].all(1)).sum()
+    if number_of_distances:
+        messages.append(
+            f"left out {count(number_of_distances, 'distance')} to a point that was left out"
         )
-    return left
+    remaining = remaining.note(*messages)
+    if network.datum_points and not keep[np.isin(points.id, network.datum_points)].any():
+        reasons = remaining.notes[len(network.notes) :]
+        raise InputError(
+            f"datum_points: none is left ({'; '.join(reasons)}); name points with two rays"
+        )
+    return remaining
 
 
 def _too_few_points(
@@ -108,20 +112,27 @@ def _too_few_points(
     images, points, rays = network.images, network.points, network.observations
     rays_of_point = np.bincount(rays.point, minlength=len(points))
     place = f"{images.source(row)}: image {images.id[row]!r}: "
-    seen = rays.point[rays.image == row]
-    if not len(seen):
+    points_of_image = rays.point[rays.image == row]
+    if not len(points_of_image):
         return InputError(f"{place}an image with no rays; measure points in it or remove the image")
-    lone = [points.id[p] for p in seen if rays_of_point[p] == 1 and points.role[p] == "tie"]
-    if len(seen) >= 3 and lone:
+    points_with_one_ray = [
+        points.id[p] for p in points_of_image if rays_of_point[p] == 1 and points.role[p] == "tie"
+    ]
+    if len(points_of_image) >= 3 and points_with_one_ray:
         return NotSolvedError(
             f"{place}not solved: it shares too few points with other images, so that neither "
             f"X0, Y0, Z0, omega, phi, kappa of image {images.id[row]} nor X, Y, Z of points "
-            f"{list_some(lone)} can be determined; add images of the same points, or "
+            f"{list_some(points_with_one_ray)} can be determined; add images of the same points, "
+            "or "
             "control points",
             [f"{name} of image {images.id[row]}" for name in EXTERIOR]
-            + [f"X, Y, Z of point {id}" for id in lone],
+            + [f"X, Y, Z of point {id}" for id in points_with_one_ray],
         )
-    part = "" if usable[row] == len(seen) else f" of the {len(seen)} measured ones"
+    part = (
+        ""
+        if usable[row] == len(points_of_image)
+        else f" of the {len(points_of_image)} measured ones"
+    )
     why = "" if not part else " (the others are check points or seen in one image only)"
     return InputError(
         f"{place}only {count(usable[row], 'point')}{part} can be used{why}; an image needs at "
@@ -132,16 +143,18 @@ def _too_few_points(
 def check_parts(network: Network) -> None:
     """Refuse parts of the network that are neither connected nor positioned."""
     images, points, rays = network.images, network.points, network.observations
-    known = count_controlled_axes(points) == 3
-    ties = ~(known | points.has_role("check"))[rays.point]
+    is_known = count_controlled_axes(points) == 3
+    tie_rays = ~(is_known | points.has_role("check"))[rays.point]
     # Only tie points connect: known ones have their coordinates in each part, and check points
     # take no part in the adjustment.
-    part = label_connected_parts(rays.image[ties], rays.point[ties], len(images), len(points))
+    part = label_connected_parts(
+        rays.image[tie_rays], rays.point[tie_rays], len(images), len(points)
+    )
     labels, part = np.unique(part, return_inverse=True)
     if len(labels) == 1:
         return
     known_in_part = np.unique(
-        np.stack([part[rays.image], rays.point])[:, known[rays.point]], axis=1
+        np.stack([part[rays.image], rays.point])[:, is_known[rays.point]], axis=1
     )
     known_points = np.bincount(known_in_part[0], minlength=len(labels))
     priors = (~np.isnan(images.sigma)).sum(1) + equations_of(network, "IMAGES")
@@ -207,13 +220,14 @@ def check_redundancy(network: Network) -> None:
     # problem has been made, and a count says what is missing in numbers that a reader can check.
     conditions = 0
     if network.datum != "control":
-        known = count_controlled_axes(points).sum() + (~np.isnan(images.sigma)).sum()
-        conditions = max(0, 7 - known - (len(network.distances) > 0))
-    missing = unknowns - rows - conditions
-    if missing > 0:
+        known_numbers = count_controlled_axes(points).sum() + (~np.isnan(images.sigma)).sum()
+        conditions = max(0, 7 - known_numbers - (len(network.distances) > 0))
+    number_missing = unknowns - rows - conditions
+    if number_missing > 0:
         with_datum = f" with {conditions} datum conditions" if conditions else ""
         raise InputError(
             f"{network.observations.source.name}: {rows} observations{with_datum} are too few "
-            f"for {unknowns} unknowns: {missing} missing; measure more points, free fewer camera "
+            f"for {unknowns} unknowns: {number_missing} missing; measure more points, free fewer "
+            "camera "
             "parameters" + ("" if conditions else ', or, without control, set datum = "inner"')
         )

@@ -24,7 +24,7 @@ def is_outside(camera: Camera, xy: Float[np.ndarray, "any 2"]) -> Bool[np.ndarra
 
 def outside_warnings(cameras: Sequence[Camera], network: Network | None = None) -> tuple[str, ...]:
     """A message for every camera whose principal point or image points are outside."""
-    found = []
+    warnings = []
     for c, camera in enumerate(cameras):
         model, size = get_model(camera.model), camera.image_size
         if size is None:
@@ -33,22 +33,24 @@ def outside_warnings(cameras: Sequence[Camera], network: Network | None = None) 
         point = np.array([[camera.parameters.get(name, 0.0) for name in model.principal_point]])
         where = f"camera {camera.id!r}: "
         if point.size and is_outside(camera, point).any():
-            found.append(
+            warnings.append(
                 f"{where}the principal point ({point[0, 0]:.6g}, {point[0, 1]:.6g}) {model.unit} "
                 f"is outside the image of {size[0]} × {size[1]} pixels; relative to the {origin}"
             )
         if network is None:
             continue
         rays, images = network.observations, network.images
-        mine = np.flatnonzero(images.camera[rays.image] == c)
-        out = mine[is_outside(camera, rays.xy[mine])]
-        if len(out):
-            x, y = rays.xy[out[0]]
-            found.append(
-                f"{where}{len(out)} of {count(len(mine), 'image point')} outside the image of "
+        rows_of_camera = np.flatnonzero(images.camera[rays.image] == c)
+        rows_outside = rows_of_camera[is_outside(camera, rays.xy[rows_of_camera])]
+        if len(rows_outside):
+            x, y = rays.xy[rows_outside[0]]
+            warnings.append(
+                f"{where}{len(rows_outside)} of {count(len(rows_of_camera), 'image point')} "
+                "outside the image of "
                 f"{size[0]} × {size[1]} pixels, such as point "
-                f"{network.points.id[rays.point[out[0]]]!r} of image "
-                f"{images.id[rays.image[out[0]]]!r} at ({x:.6g}, {y:.6g}) {model.unit} from the "
+                f"{network.points.id[rays.point[rows_outside[0]]]!r} of image "
+                f"{images.id[rays.image[rows_outside[0]]]!r} at ({x:.6g}, {y:.6g}) {model.unit} "
+                "from the "
                 f"{origin}; check the origin of the coordinates and the image size"
             )
-    return tuple(found)
+    return tuple(warnings)

@@ -20,14 +20,14 @@ def check_coordinates(
     thousandth the object is lost. Where nothing of the extent is left, a unit is taken for it.
 
     **Raises:** `InputError` for coordinates that cannot be computed with."""
-    for table, thing, axes in (
+    for table, noun, axes in (
         (network.points, "point", ("X", "Y", "Z")),
         (network.images, "image", ("X0", "Y0", "Z0")),
     ):
         x = table.position
         for row, k in np.argwhere(np.isfinite(x) & (np.abs(x) > LARGEST))[:1]:
             raise InputError(
-                f"{table.source(row)}: {thing} {table.id[row]!r}: expected {axes[k]} within "
+                f"{table.source(row)}: {noun} {table.id[row]!r}: expected {axes[k]} within "
                 f"±{LARGEST:g}, got {x[row, k]:g}"
             )
     position = np.concatenate([network.points.position, network.images.position])
@@ -43,11 +43,11 @@ def check_coordinates(
     # Equal coordinates may be poor start values, or all that is left of others.
     if step <= noticed_step * extent or extent == 0 and step < refused_step:
         return network
-    what = (
+    finding = (
         f"coordinates of {largest:.3g} are held in steps of {step:.2g} {network.object_unit}, and "
         f"the network is {extent:.3g} {network.object_unit} wide: subtract a common offset from "
         "all of them"
     )
     if step > refused_step * extent:
-        raise InputError(f"{network.points.source.name}: {what}")
-    return network.warn(what)
+        raise InputError(f"{network.points.source.name}: {finding}")
+    return network.warn(finding)

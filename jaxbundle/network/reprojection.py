@@ -40,8 +40,8 @@ def point_errors(network: Network) -> tuple[Float[np.ndarray, " points"], str]:
                 if in_pixels and model.unit == "mm":
                     pitch[c] = camera.pixel_size
         rows = np.flatnonzero(np.array([camera.model == name for camera in cameras])[of_ray])
-        off = (_project(model, network, rows, values) - rays.xy[rows]) / pitch[of_ray[rows]]
-        length[rows] = np.linalg.norm(off, axis=1)
+        difference = (_project(model, network, rows, values) - rays.xy[rows]) / pitch[of_ray[rows]]
+        length[rows] = np.linalg.norm(difference, axis=1)
     good = np.isfinite(length)
     number = np.bincount(rays.point[good], minlength=len(network.points))
     total = np.bincount(rays.point[good], length[good], minlength=len(network.points))
@@ -57,24 +57,24 @@ def _project(
 ) -> Float[np.ndarray, "n 2"]:
     """The images of the points of some rays, a portion at a time."""
     images, rays = network.images, network.observations
-    found = np.zeros((len(rows), 2))
+    projected = np.zeros((len(rows), 2))
     # Portions of one size, padded: all networks share one program per camera model. Larger: small
     # networks project padding; smaller: large ones make more calls.
     portion = 4096
     with local_x64():
-        for first in range(0, len(rows), portion):
-            mine = rows[first : first + portion]
-            all = np.pad(mine, (0, portion - len(mine)), mode="edge")
-            image = rays.image[all]
+        for begin in range(0, len(rows), portion):
+            rows_of_portion = rows[begin : begin + portion]
+            padded = np.pad(rows_of_portion, (0, portion - len(rows_of_portion)), mode="edge")
+            image = rays.image[padded]
             part = _portion(
                 model,
                 values[images.camera[image]],
                 images.position[image],
                 images.angles[image],
-                network.points.position[rays.point[all]],
+                network.points.position[rays.point[padded]],
             )
-            found[first : first + portion] = np.asarray(part)[: len(mine)]
-    return found
+            projected[begin : begin + portion] = np.asarray(part)[: len(rows_of_portion)]
+    return projected
 
 
 @partial(compile_once, static=0)

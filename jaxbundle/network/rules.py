@@ -38,15 +38,15 @@ def check_choice(key: str, value: str, choices: Sequence[str], where: str = "") 
     one_of(f"{where}{key}", value, choices)
 
 
-def check_unique(ids: Sequence[str], source: Source, thing: str) -> None:
+def check_unique(ids: Sequence[str], source: Source, noun: str) -> None:
     """Refuse an id that occurs in two rows of a table."""
     if len(set(ids)) == len(ids):
         return
-    first: dict[str, int] = {}
+    first_row: dict[str, int] = {}
     for row, id in enumerate(ids):
-        if first.setdefault(id, row) != row:
+        if first_row.setdefault(id, row) != row:
             raise InputError(
-                f"{source(row)}: {thing} {id!r} is already in {source(first[id])}; "
+                f"{source(row)}: {noun} {id!r} is already in {source(first_row[id])}; "
                 "an id must be unique"
             )
 
@@ -56,10 +56,10 @@ def model_of(model: str | CameraModel, where: str = "") -> CameraModel:
 
     **Raises:** `InputError` for an unknown name, or the name of another model."""
     if not isinstance(model, CameraModel) and not is_known(model):
-        known = did_you_mean(model, (*MODEL_NAMES, *FAMILIES))
+        suggestion = did_you_mean(model, (*MODEL_NAMES, *FAMILIES))
         raise InputError(
-            f"{where}unknown {'' if where else 'camera '}model {show(model)}{known}"
-            f"{'' if known.endswith('?') else ';'} pass your own as a CameraModel, for a "
+            f"{where}unknown {'' if where else 'camera '}model {show(model)}{suggestion}"
+            f"{'' if suggestion.endswith('?') else ';'} pass your own as a CameraModel, for a "
             "file that names it by read_network(path, models=[…])"
         )
     try:
@@ -71,12 +71,13 @@ def model_of(model: str | CameraModel, where: str = "") -> CameraModel:
 def check_models(cameras: Sequence[Camera], where: str = "") -> None:
     """Refuse two different models with the same name: files and reports could not distinguish
     them."""
-    first: dict[str, Camera] = {}
+    first_camera: dict[str, Camera] = {}
     for camera in cameras:
-        other = first.setdefault(str(camera.model), camera)
-        if other.model != camera.model:
+        earlier_camera = first_camera.setdefault(str(camera.model), camera)
+        if earlier_camera.model != camera.model:
             raise InputError(
-                f"{where}cameras {other.id!r} and {camera.id!r} have different models named "
+                f"{where}cameras {earlier_camera.id!r} and {camera.id!r} have different models "
+                "named "
                 f"{str(camera.model)!r}; rename one of them, or give both the same object"
             )
 
@@ -133,10 +134,10 @@ def _check_fields(camera: Camera, where: str) -> None:
     if not isinstance(camera.model, str | CameraModel):
         raise InputError(f"{where}model is {show(camera.model)}; expected a name or a CameraModel")
     for field in ("parameters", "sigma", "observed"):
-        given = getattr(camera, field)
-        if not isinstance(given, Mapping):
+        values = getattr(camera, field)
+        if not isinstance(values, Mapping):
             raise InputError(
-                f"{where}{field} is {show(given)}; expected numbers by name, such as {{'c': 20.0}}"
+                f"{where}{field} is {show(values)}; expected numbers by name, such as {{'c': 20.0}}"
             )
     if not _are_names(camera.free):
         raise InputError(
@@ -148,18 +149,19 @@ def _check_fields(camera: Camera, where: str) -> None:
         )
 
 
-def _are_names(given: Any) -> bool:
-    return isinstance(given, list | tuple) and all(isinstance(name, str) for name in given)
+def _are_names(value: Any) -> bool:
+    return isinstance(value, list | tuple) and all(isinstance(name, str) for name in value)
 
 
 def _check_ties(camera: Camera, values: Mapping[str, float], where: str) -> None:
     """Refuse ties of unknown parameters, of one in two groups, of different start values."""
     names = [name for group in camera.tie for name in group]
-    known = get_model(camera.model).parameters
+    known_parameters = get_model(camera.model).parameters
     for name in names:
-        if name not in known:
+        if name not in known_parameters:
             raise InputError(
-                f"{where}tie names the unknown parameter {name!r}{did_you_mean(name, known)}"
+                f"{where}tie names the unknown parameter "
+                f"{name!r}{did_you_mean(name, known_parameters)}"
             )
         if names.count(name) > 1:
             raise InputError(f"{where}tie names {name} twice")

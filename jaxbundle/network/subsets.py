@@ -40,7 +40,7 @@ def keep_points(network: Network, keep: Bool[np.ndarray, " points"]) -> Network:
     index = np.cumsum(keep) - 1
     observations = network.observations.take(keep[network.observations.point])
     network = keep_distances(network, np.all(keep[network.distances.points], axis=1))
-    dropped = {id for id, kept in zip(network.points.id, keep) if not kept}
+    dropped = {id for id, is_kept in zip(network.points.id, keep) if not is_kept}
     return network.replace(
         points=network.points.take(keep),
         observations=dataclasses.replace(observations, point=index[observations.point]),
@@ -80,13 +80,13 @@ def with_roles(points: Points, mask: Bool[np.ndarray, " points"], role: str) -> 
 
 
 def record_left_out(
-    network: Network, thing: str, names: Iterable[str], why: str, measured: bool = True
+    network: Network, noun: str, names: Iterable[str], why: str, measured: bool = True
 ) -> Network:
     """The network with a note that these were left out; see `LeftOut`."""
     names = tuple(names)
     if not names:
         return network
-    text = f"left out {count(len(names), thing)} {why}: {list_some(names)}"
+    text = f"left out {count(len(names), noun)} {why}: {list_some(names)}"
     return network.note(text).replace(
-        left_out=(*network.left_out, LeftOut(thing, names, why, measured))
+        left_out=(*network.left_out, LeftOut(noun, names, why, measured))
     )

@@ -83,9 +83,9 @@ def _obj(content: bytes) -> Mesh:
         if key == "v":
             vertices.append([float(word) for word in words[:3]])
         elif key == "f":
-            found = [int(word.split("/")[0]) for word in words]
+            indices = [int(word.split("/")[0]) for word in words]
             # Counted from 1, or backwards from the last.
-            faces.append([k - 1 if k > 0 else len(vertices) + k for k in found])
+            faces.append([k - 1 if k > 0 else len(vertices) + k for k in indices])
     return Mesh(np.array(vertices, float).reshape(-1, 3), _fans(faces))
 
 
@@ -105,7 +105,7 @@ def _ply(content: bytes) -> Mesh:
         elif words[:1] == ["property"]:
             elements[-1][2].append(words[1:])
     order = ">" if form == "binary_big_endian" else "<"
-    at, vertices, faces = 0, np.zeros((0, 3)), []
+    offset, vertices, faces = 0, np.zeros((0, 3)), []
     texts = iter(body.split()) if form == "ascii" else None
     for name, number, properties in elements:
         if not 0 <= number <= len(body) or not properties:
@@ -116,10 +116,10 @@ def _ply(content: bytes) -> Mesh:
             rows = [[_text_value(texts, p) for p in properties] for _ in range(number)]
         elif plain:
             dtype = np.dtype([(f"f{k}", t) for k, t in enumerate(types)])
-            rows = [list(row) for row in np.frombuffer(body, dtype, number, at).tolist()]
-            at += number * dtype.itemsize
+            rows = [list(row) for row in np.frombuffer(body, dtype, number, offset).tolist()]
+            offset += number * dtype.itemsize
         else:
-            rows, at = _binary_rows(body, at, number, properties, order)
+            rows, offset = _binary_rows(body, offset, number, properties, order)
         names = [p[-1] for p in properties]
         if name == "vertex":
             columns = [names.index(axis) for axis in "xyz"]
@@ -137,7 +137,7 @@ def _text_value(texts: Iterator[bytes], property: list[str]) -> float | list[int
 
 
 def _binary_rows(
-    body: bytes, at: int, number: int, properties: list, order: str
+    body: bytes, offset: int, number: int, properties: list, order: str
 ) -> tuple[list, int]:
     rows = []
     for _ in range(number):
@@ -146,14 +146,14 @@ def _binary_rows(
             count = 1
             if p[0] == "list":
                 size = np.dtype(order + PLY_TYPES[p[1]])
-                count = int(np.frombuffer(body, size, 1, at)[0])
-                at += size.itemsize
+                count = int(np.frombuffer(body, size, 1, offset)[0])
+                offset += size.itemsize
             dtype = np.dtype(order + PLY_TYPES[p[-2]])
-            values = np.frombuffer(body, dtype, count, at).tolist()
-            at += count * dtype.itemsize
+            values = np.frombuffer(body, dtype, count, offset).tolist()
+            offset += count * dtype.itemsize
             row.append(values if p[0] == "list" else values[0])
         rows.append(row)
-    return rows, at
+    return rows, offset
 
 
 def read_grid(path: str | Path) -> TerrainGrid:
@@ -168,8 +168,8 @@ def read_grid(path: str | Path) -> TerrainGrid:
 
 @lru_cache(maxsize=4)
 def _read_grid(path: str, _: int) -> TerrainGrid:
-    found = read_heights(path)
-    return TerrainGrid(found.heights, found.origin, found.step)
+    model = read_heights(path)
+    return TerrainGrid(model.heights, model.origin, model.step)
 
 
 def surface_near(
@@ -191,14 +191,18 @@ def surface_near(
         return (triangles_near(mesh, X) - origin,), nowhere
     grid = surface["dem"]
     grid = read_grid(grid) if isinstance(grid, str) else TerrainGrid(*grid)
-    heights, first = heights_near(grid, X)
+    heights, first_node = heights_near(grid, X)
     middle = heights.shape[1] // 2
     cells = heights[:, middle - 1 : middle + 1, middle - 1 : middle + 1]
     void = np.array([np.isnan(cell).any() for cell in cells], bool)
     # Beyond a void or an edge the surface goes on level. A point over a void has no mean.
-    near = np.nanmean(np.where(void[:, None, None], 0.0, heights), (1, 2), keepdims=True)
-    heights = np.where(np.isfinite(heights), heights, near) - origin[2]
-    return (heights, first - origin[:2], np.tile(np.array(grid.step, float), (len(X), 1))), void
+    mean_height = np.nanmean(np.where(void[:, None, None], 0.0, heights), (1, 2), keepdims=True)
+    heights = np.where(np.isfinite(heights), heights, mean_height) - origin[2]
+    return (
+        heights,
+        first_node - origin[:2],
+        np.tile(np.array(grid.step, float), (len(X), 1)),
+    ), void
 
 
 def have_common_point(places: Sequence, normals: Sequence) -> bool:
@@ -218,14 +222,18 @@ def triangles_near(
     corners = mesh.vertices[mesh.triangles]
     middle = corners.mean(1)
     reach = np.linalg.norm(corners - middle[:, None], axis=2).max(1)
-    chosen = []
+    nearest_triangles = []
     for P in X:
         bound = np.linalg.norm(middle - P, axis=1) - reach
-        some = np.argpartition(bound, min(BOUNDED, len(bound)) - 1)[:BOUNDED]
-        near = some[np.argsort(squared_distances_to_triangles(P, corners[some], np))[:CANDIDATES]]
+        candidates = np.argpartition(bound, min(BOUNDED, len(bound)) - 1)[:BOUNDED]
+        nearest = candidates[
+            np.argsort(squared_distances_to_triangles(P, corners[candidates], np))[:CANDIDATES]
+        ]
         # A small mesh: the last one again.
-        chosen.append(np.resize(near, CANDIDATES) if len(near) < CANDIDATES else near)
-    return corners[np.array(chosen, int)]
+        nearest_triangles.append(
+            np.resize(nearest, CANDIDATES) if len(nearest) < CANDIDATES else nearest
+        )
+    return corners[np.array(nearest_triangles, int)]
 
 
 def heights_near(
@@ -235,8 +243,8 @@ def heights_near(
     padded = np.pad(grid.heights, REACH, constant_values=np.nan)
     cell = np.floor((X[:, :2] - grid.origin) / grid.step).astype(int)
     shape = np.array(grid.heights.shape[::-1])
-    inside = np.clip(cell, -1, shape - 1)
-    parts, first = [], inside - REACH + 1
-    for column, row in inside + 1:
+    inside_cell = np.clip(cell, -1, shape - 1)
+    parts, first_column_and_row = [], inside_cell - REACH + 1
+    for column, row in inside_cell + 1:
         parts.append(padded[row : row + 2 * REACH, column : column + 2 * REACH])
-    return np.array(parts), np.array(grid.origin) + first * np.array(grid.step)
+    return np.array(parts), np.array(grid.origin) + first_column_and_row * np.array(grid.step)

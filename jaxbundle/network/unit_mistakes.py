@@ -78,18 +78,18 @@ def check_units(network: Network) -> Network:
     if degrees := name_degrees(network.points):
         raise InputError(f"{network.points.source.name}: {degrees}")
     of_camera = network.images.camera[network.observations.image]
-    said = []
+    messages = []
     for c, camera in enumerate(network.cameras):
         xy = network.observations.xy[of_camera == c]
         if len(xy):
-            said.append(_check_field(camera, xy))
-    return network.warn(*filter(None, [*said, *name_lengths(network)]))
+            messages.append(_check_field(camera, xy))
+    return network.warn(*filter(None, [*messages, *name_lengths(network)]))
 
 
 def name_lengths(network: Network) -> list[str]:
     """Lengths that seem to be in mm and in m in one network, in words."""
-    said = _control_against_ties(network), _distances_against_control(network)
-    return [line for line in said if line]
+    messages = _control_against_ties(network), _distances_against_control(network)
+    return [line for line in messages if line]
 
 
 def name_unit_of_positions(network: Network, images: dict[str, Float[np.ndarray, "3"]]) -> str:
@@ -98,16 +98,17 @@ def name_unit_of_positions(network: Network, images: dict[str, Float[np.ndarray,
     rows = [k for k, id in enumerate(network.images.id) if id in images]
     if not rows:
         return ""
-    given = np.linalg.norm(network.images.position[rows], axis=1)
-    found = np.linalg.norm([images[network.images.id[k]] for k in rows], axis=1)
+    distance_at_start = np.linalg.norm(network.images.position[rows], axis=1)
+    adjusted_distance = np.linalg.norm([images[network.images.id[k]] for k in rows], axis=1)
     # Start values that are wrong in their unit only are good to a tenth; poor ones are not 1000
     # times too small all together.
     with np.errstate(divide="ignore", invalid="ignore"):
-        decades = np.abs(np.log10(found / given))
+        decades = np.abs(np.log10(adjusted_distance / distance_at_start))
     if not (np.abs(decades - 3) < np.log10(1.1)).all():
         return ""
     return (
-        f"the adjusted projection centres are {found[0] / given[0]:.4g} times their start values: "
+        f"the adjusted projection centres are {adjusted_distance[0] / distance_at_start[0]:.4g} "
+        "times their start values: "
         f"is the control in mm, or the start values in m? Expected is one unit of object "
         f"coordinates, {network.object_unit}"
     )
@@ -145,10 +146,10 @@ def name_degrees(points: Points) -> str:
 
     They are within ±180 and ±90, hardly differ for their distance from 0, and the heights differ by
     more: a degree is 111 km, so that any ground is steep in these numbers."""
-    known = points.has_role("control", "fixed", "check") & np.isfinite(points.position).all(1)
-    if known.sum() < 2:
+    is_known = points.has_role("control", "fixed", "check") & np.isfinite(points.position).all(1)
+    if is_known.sum() < 2:
         return ""
-    low, high = points.position[known].min(0), points.position[known].max(0)
+    low, high = points.position[is_known].min(0), points.position[is_known].max(0)
     extent = max((high - low)[:2])
     largest = np.maximum(np.abs(low), np.abs(high))
     swapped = largest[0] <= 90 and largest[1] <= 180
@@ -157,7 +158,8 @@ def name_degrees(points: Points) -> str:
     if not (largest[:2].max() > LIMITS.far * extent and high[2] - low[2] > LIMITS.steep * extent):
         return ""
     return (
-        f"X and Y of the {count(int(known.sum()), 'known point')} look like longitude and latitude "
+        f"X and Y of the {count(int(is_known.sum()), 'known point')} look like longitude and "
+        "latitude "
         f"in degrees (X {low[0]:.8g} to {high[0]:.8g}, Y {low[1]:.8g} to {high[1]:.8g}, Z "
         f"{low[2]:.4g} to {high[2]:.4g}): expected coordinates in one unit of length; convert "
         "them to a map projection, such as UTM, or to a local system"
@@ -176,19 +178,26 @@ def name_sigma_unit(network: Network, sigma0: float) -> str:
     if network.image_unit == "px" and unit == "mm" and pitch:  # Converted where it was read.
         unit, sigma = "px", sigma / pitch
     if unit == "mm":
-        meant = {"µm": 1e-3} | ({"pixels": pitch} if pitch else {})
+        factor_of_unit = {"µm": 1e-3} | ({"pixels": pitch} if pitch else {})
         if sigma < LIMITS.min_sigma * (pitch or LIMITS.min_pixel):
-            meant["m"] = 1e3
+            factor_of_unit["m"] = 1e3
     else:
-        meant = {"mm": 1 / pitch} if pitch else {"mm": sigma0} if sigma < LIMITS.min_sigma else {}
-    near = {u: f for u, f in meant.items() if 1 / LIMITS.agreement < sigma0 / f < LIMITS.agreement}
-    if not near:
+        factor_of_unit = (
+            {"mm": 1 / pitch} if pitch else {"mm": sigma0} if sigma < LIMITS.min_sigma else {}
+        )
+    possible_units = {
+        u: f
+        for u, f in factor_of_unit.items()
+        if 1 / LIMITS.agreement < sigma0 / f < LIMITS.agreement
+    }
+    if not possible_units:
         return ""
-    other = min(near, key=lambda u: abs(np.log(sigma0 / near[u])))
+    likely_unit = min(possible_units, key=lambda u: abs(np.log(sigma0 / possible_units[u])))
     return (
         f"σ0 is {sigma0:.3g}: the a priori σ of the image coordinates, {sigma:.4g} {unit}, looks "
-        f"like one in {other}; it is expected in {unit}: {sigma * near[other]:.3g} (times "
-        f"{near[other]:.4g})"
+        f"like one in {likely_unit}; it is expected in {unit}: "
+        f"{sigma * possible_units[likely_unit]:.3g} (times "
+        f"{possible_units[likely_unit]:.4g})"
     )
 
 
@@ -197,31 +206,41 @@ def name_pixels(network: Network) -> str:
     cause: without pixel size it cannot be distinguished from a telescope."""
     of_camera = network.images.camera[network.observations.image]
     rows = (network.observations.xy[of_camera == c] for c in range(len(network.cameras)))
-    first, *more = [
+    first_message, *other_messages = [
         line
         for camera, xy in zip(network.cameras, rows, strict=True)
         if len(xy) and (line := _in_pixels(camera, xy))
     ] or [""]
-    return first + (f"; so with {count(len(more), 'other camera')}" if more else "")
+    return first_message + (
+        f"; so with {count(len(other_messages), 'other camera')}" if other_messages else ""
+    )
 
 
 def _in_pixels(camera: Camera, xy: Float[np.ndarray, "rays 2"]) -> str:
     model = get_model(camera.model)
     name, c = model.principal_distance[0], float(camera.parameters[model.principal_distance[0]])
-    spread = float(np.median(np.hypot(*(xy - np.median(xy, axis=0)).T)))
-    if model.unit != "mm" or c < LIMITS.min_pixels or not 0 < spread < LIMITS.narrow_field * c:
+    spread_of_points = float(np.median(np.hypot(*(xy - np.median(xy, axis=0)).T)))
+    if (
+        model.unit != "mm"
+        or c < LIMITS.min_pixels
+        or not 0 < spread_of_points < LIMITS.narrow_field * c
+    ):
         return ""
     expected = "multiplied by the size of a pixel"
     pixels = None
     if camera.pixel_size is not None:
-        pixels, expected = spread / max(camera.pixel_size), f"{c * max(camera.pixel_size):.4g}"
+        pixels, expected = (
+            spread_of_points / max(camera.pixel_size),
+            f"{c * max(camera.pixel_size):.4g}",
+        )
     elif camera.image_size is not None:
         pixels = LIMITS.half_of_points * max(camera.image_size)
     if pixels is not None and not LIMITS.usual_fields[0] < pixels / c < LIMITS.usual_fields[1]:
         return ""
     return (
         f"camera {camera.id!r}: {name} is {c:g} mm and half of its image points lie within "
-        f"{spread:.3g} mm of their centre, {np.degrees(np.arctan(spread / c)):.2g}° for such a "
+        f"{spread_of_points:.3g} mm of their centre, "
+        f"{np.degrees(np.arctan(spread_of_points / c)):.2g}° for such a "
         f"lens: is {name} in pixels? It is expected in mm ({expected})"
     )
 
@@ -247,9 +266,9 @@ def _remedy(camera: Camera, unit: str, name: str, c: float, usual: float) -> str
 def _control_against_ties(network: Network) -> str:
     """Control in millimetres and start values in metres, or vice versa."""
     points = network.points
-    there = np.isfinite(points.position).all(1)
-    control = there & points.has_role("control", "fixed")
-    tie = there & points.has_role("tie")
+    has_position = np.isfinite(points.position).all(1)
+    control = has_position & points.has_role("control", "fixed")
+    tie = has_position & points.has_role("tie")
     if min(control.sum(), tie.sum()) < 3:
         return ""
     extents = [float(np.ptp(points.position[rows], axis=0).max()) for rows in (control, tie)]
@@ -265,21 +284,21 @@ def _control_against_ties(network: Network) -> str:
 def _distances_against_control(network: Network) -> str:
     """Distances in millimetres between control points in metres, or vice versa."""
     points, distances = network.points, network.distances
-    known = points.has_role("control", "fixed") & np.isfinite(points.position).all(1)
+    is_known = points.has_role("control", "fixed") & np.isfinite(points.position).all(1)
     if not len(distances):
         return ""
     a, b = points.position[distances.points].transpose(1, 0, 2)
     length = np.linalg.norm(a - b, axis=1)
-    off = [
+    contradictions = [
         f"{points.id[i]} to {points.id[j]}"
         for row, (i, j) in enumerate(distances.points)
-        if known[i] and known[j] and _thousand(distances.value[row], length[row])
+        if is_known[i] and is_known[j] and _thousand(distances.value[row], length[row])
     ]
-    if not off:
+    if not contradictions:
         return ""
     return (
         f"distances a thousand times those of the control points, or a thousandth: "
-        f"{list_some(off)}; are they in {network.object_unit}, like the control points?"
+        f"{list_some(contradictions)}; are they in {network.object_unit}, like the control points?"
     )
 
 

@@ -45,7 +45,9 @@ class InObjectSpace:
         return block
 
 
-def split(also: Sequence[Table | ObservationSet]) -> tuple[list[Table], list[ObservationSet]]:
+def split_by_type(
+    also: Sequence[Table | ObservationSet],
+) -> tuple[list[Table], list[ObservationSet]]:
     """The tables and the observations of them.
 
     **Raises:** `InputError` for anything else, and for the name of a table of the network."""
@@ -63,10 +65,10 @@ def split(also: Sequence[Table | ObservationSet]) -> tuple[list[Table], list[Obs
     return tables, observations
 
 
-def place(given: ObservationSet, origin: Float[np.ndarray, "3"]) -> ObservationSet:
+def place(observation_set: ObservationSet, origin: Float[np.ndarray, "3"]) -> ObservationSet:
     """The observations in the coordinates of the arrays."""
-    kind, (X, Y, Z) = given.kind, (float(x) for x in origin)
+    kind, (X, Y, Z) = observation_set.kind, (float(x) for x in origin)
     if not {"image", "point"} & set(kind.of):
-        return given
+        return observation_set
     residual = InObjectSpace(kind.residual, kind.of, (X, Y, Z))
-    return dataclasses.replace(given, kind=dataclasses.replace(kind, residual=residual))
+    return dataclasses.replace(observation_set, kind=dataclasses.replace(kind, residual=residual))

@@ -25,16 +25,16 @@ def move_to_given_frame(network: Network, sights: Sights, model: Model) -> Model
     points, images = network.points, network.images
     control = are_controlled(points) & model.known
     stations = model.placed & np.isfinite(images.position).all(1)
-    found = similarity(
+    transformation = similarity(
         np.concatenate([model.X[control], model.X0[stations]]),
         np.concatenate([points.position[control], images.position[stations]]),
     )
-    if found is None:
-        found = _by_rays(network, sights, model)
-    if found is None:
+    if transformation is None:
+        transformation = _by_rays(network, sights, model)
+    if transformation is None:
         tie = np.isfinite(points.position).all(1) & model.known & ~points.has_role("check")
-        found = similarity(model.X[tie], points.position[tie])
-    return None if found is None else model.transform(*found)
+        transformation = similarity(model.X[tie], points.position[tie])
+    return None if transformation is None else model.transform(*transformation)
 
 
 def _by_rays(network: Network, sights: Sights, model: Model) -> Similarity | None:
@@ -49,20 +49,22 @@ def _by_rays(network: Network, sights: Sights, model: Model) -> Similarity | Non
         return None
     image, point = sights.image[rows], sights.point[rows]
     rays = np.einsum("nij,ni->nj", model.M[image], sights.ray[rows])
-    seen = model.known[sights.point] & model.placed[sights.image]
-    off = model.X[sights.point[seen]] - model.X0[sights.image[seen]]
-    usual = np.median(np.linalg.norm(off, axis=1))
-    there = np.where(model.known[point, None], model.X[point], model.X0[image] + usual * rays)
-    start = similarity(points.position[point], there)
+    is_seen = model.known[sights.point] & model.placed[sights.image]
+    sight = model.X[sights.point[is_seen]] - model.X0[sights.image[is_seen]]
+    usual_distance = np.median(np.linalg.norm(sight, axis=1))
+    point_on_ray = np.where(
+        model.known[point, None], model.X[point], model.X0[image] + usual_distance * rays
+    )
+    start = similarity(points.position[point], point_on_ray)
     if start is None:
         return None
     # From the control points to the model, not back: the misclosures are then angles at the
     # projection centres of the model, and the inverse is exact.
-    A, t, off = batched.similarity_by_rays(points.position[point], model.X0[image], rays, *start)
-    if not np.median(off) < np.median(sights.tolerance[image]):
+    A, t, sight = batched.similarity_by_rays(points.position[point], model.X0[image], rays, *start)
+    if not np.median(sight) < np.median(sights.tolerance[image]):
         return None
-    back = np.linalg.inv(A)
-    return back, -back @ t
+    inverse = np.linalg.inv(A)
+    return inverse, -inverse @ t
 
 
 def to_scale(network: Network, model: Model) -> tuple[Model, str]:
@@ -83,11 +85,11 @@ def scale_of_lengths(network: Network, model: Model) -> float | None:
 def scale_of_distances(network: Network, model: Model) -> float | None:
     """The median of measured distances by those in the model."""
     distances = network.distances
-    there = model.known[distances.points].all(1) if len(distances) else np.zeros(0, bool)
-    if not there.any():
+    has_both = model.known[distances.points].all(1) if len(distances) else np.zeros(0, bool)
+    if not has_both.any():
         return None
-    a, b = model.X[distances.points[there]].transpose(1, 0, 2)
-    return float(np.median(distances.value[there] / np.linalg.norm(a - b, axis=1)))
+    a, b = model.X[distances.points[has_both]].transpose(1, 0, 2)
+    return float(np.median(distances.value[has_both] / np.linalg.norm(a - b, axis=1)))
 
 
 def _scale_of_other_lengths(network: Network, model: Model) -> float | None:
@@ -101,7 +103,7 @@ def _scale_of_other_lengths(network: Network, model: Model) -> float | None:
         images, position=model.X0[placed], angles=batched.angles(model.M[placed])
     )
     part = network.replace(images=oriented)
-    ratios = [ratio for one in network.further for ratio in one.among(part).scales(part)]
+    ratios = [ratio for kind in network.further for ratio in kind.among(part).scales(part)]
     return float(np.median(ratios)) if ratios else None
 
 
@@ -110,27 +112,31 @@ def join(network: Network, sights: Sights, model: Model, part: Model) -> Model |
 
     The similarity is found from common points, or from the pose of a common image and the distances
     to common points, without these from known lengths in either."""
-    both = model.known & part.known
+    in_both = model.known & part.known
     shared = np.flatnonzero(model.placed & part.placed)
-    if not both.any():
+    if not in_both.any():
         # Two pairs of a chain have an image in common and no point: the ratio of their bases is in
         # no image point, only in known lengths of both.
-        own, other = scale_of_lengths(network, model), scale_of_lengths(network, part)
-        if not len(shared) or own is None or other is None:
+        own_scale, other_scale = scale_of_lengths(network, model), scale_of_lengths(network, part)
+        if not len(shared) or own_scale is None or other_scale is None:
             return None
-        found = _by_an_image(model, part, shared[0], other / own)
+        transformation = _by_an_image(model, part, shared[0], other_scale / own_scale)
     elif len(shared):
         # The common image gives all but the scale. A similarity by the points would also take
         # rotation and shift from them, and of two bundles points are known worst in depth.
-        seen = np.bincount(sights.image, both[sights.point], minlength=sights.images)
-        image = shared[seen[shared].argmax()]
-        to, off = (np.linalg.norm(m.X[both] - m.X0[image], axis=1) for m in (model, part))
-        found = _by_an_image(model, part, image, np.median(to / off))
+        common_by_image = np.bincount(sights.image, in_both[sights.point], minlength=sights.images)
+        image = shared[common_by_image[shared].argmax()]
+        distance_in_model, distance_in_part = (
+            np.linalg.norm(m.X[in_both] - m.X0[image], axis=1) for m in (model, part)
+        )
+        transformation = _by_an_image(
+            model, part, image, np.median(distance_in_model / distance_in_part)
+        )
     else:
-        found = similarity(part.X[both], model.X[both])
-    if found is None:
+        transformation = similarity(part.X[in_both], model.X[in_both])
+    if transformation is None:
         return None
-    part = part.transform(*found)
+    part = part.transform(*transformation)
     image, point = part.placed & ~model.placed, part.known & ~model.known
     choose = lambda rows, new, old: np.where(rows.reshape(-1, *[1] * (old.ndim - 1)), new, old)
     return Model(
@@ -158,16 +164,17 @@ def describe_mirror(network: Network, model: Model, settings: StartValueSettings
     source, target = model.X[control], points.position[control]
     if len(source) < 4:  # a triangle turned over is its own mirror image
         return ""
-    off = [_misfit(source, target * axes) for axes in ([1, 1, 1], [-1, 1, 1])]
+    misfits = [_misfit(source, target * axes) for axes in ([1, 1, 1], [-1, 1, 1])]
     extent = float(np.ptp(target, axis=0).max())
     # Five times better as a mirror image: in 18 000 trials with 4 to 8 points and noise of 0.5 % of
     # their extent no right model was called one (with 2.5 two were); of mirror images with heights
     # of half the extent 81 to 99 % are found (with ten 61 to 96 %), of flat ones hardly any.
-    if not off[1] < min(off[0] / 5, extent / settings.extent_to_misfit):
+    if not misfits[1] < min(misfits[0] / 5, extent / settings.extent_to_misfit):
         return ""
     return (
         f"the {len(source)} control points fit the images only as a mirror image (by "
-        f"{off[1]:.3g} {network.object_unit}, otherwise {off[0]:.3g}): X and Y are exchanged, or "
+        f"{misfits[1]:.3g} {network.object_unit}, otherwise {misfits[0]:.3g}): X and Y are "
+        "exchanged, or "
         "one of X, Y, Z has the wrong sign, or the image coordinates count y downward; reverse one "
         "axis"
     )
@@ -175,10 +182,10 @@ def describe_mirror(network: Network, model: Model, settings: StartValueSettings
 
 def _misfit(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> float:
     """The median distance of points after the similarity that takes one list to the other."""
-    found = similarity(source, target)
-    if found is None:
+    transformation = similarity(source, target)
+    if transformation is None:
         return np.inf
-    A, t = found
+    A, t = transformation
     return float(np.median(np.linalg.norm(source @ A.T + t - target, axis=1)))
 
 
@@ -189,16 +196,18 @@ def similarity(
     good = np.ones(len(source), bool)
     # The first round uses all points, the second those near its result; a third settles which.
     for _ in range(3):
-        found = batched.similarity(source, target, good.astype(float)) if good.sum() >= 3 else None
+        transformation = (
+            batched.similarity(source, target, good.astype(float)) if good.sum() >= 3 else None
+        )
         # Of fewer than six points an outlier draws the seven unknowns so far that it does not show.
-        if found is None or len(source) < 6:
-            return found
-        A, t = found
-        off = np.linalg.norm(source @ A.T + t - target, axis=1)
+        if transformation is None or len(source) < 6:
+            return transformation
+        A, t = transformation
+        distance = np.linalg.norm(source @ A.T + t - target, axis=1)
         # The median of a distance in space is 1.54 σ of a coordinate: beyond three medians is one
         # good point in ten thousand. The 1e-9 is rounding: of exact points the median is zero.
-        good = off <= 3 * np.median(off) + 1e-9 * np.ptp(target, axis=0).max()
-    return found
+        good = distance <= 3 * np.median(distance) + 1e-9 * np.ptp(target, axis=0).max()
+    return transformation
 
 
 def similarity_of_most(
@@ -216,16 +225,20 @@ def similarity_of_most(
     triples = list(itertools.islice(itertools.combinations(range(n), 3), number + 1))
     if len(triples) > number:
         triples = [rng.choice(n, 3, replace=False) for _ in range(number)]
-    best, least = None, np.inf
+    best, least_median = None, np.inf
     for triple in triples:
-        found = batched.similarity(source, target, np.isin(np.arange(n), triple).astype(float))
-        if found is not None:
-            off = np.linalg.norm(source @ found[0].T + found[1] - target, axis=1)
+        transformation = batched.similarity(
+            source, target, np.isin(np.arange(n), triple).astype(float)
+        )
+        if transformation is not None:
+            distance = np.linalg.norm(
+                source @ transformation[0].T + transformation[1] - target, axis=1
+            )
             # Not the median: the three points of the triple fit nearly exactly, and would make half
             # of few points.
-            if (middle := np.sort(off)[min(n, n // 2 + 2) - 1]) < least:
-                best, least = off, middle
+            if (middle := np.sort(distance)[min(n, n // 2 + 2) - 1]) < least_median:
+                best, least_median = distance, middle
     if best is None:
         return None
-    limit = max(OUTLIER_LIMIT * NORMAL_SIGMA_BY_MAD * least, np.sort(best)[2])
+    limit = max(OUTLIER_LIMIT * NORMAL_SIGMA_BY_MAD * least_median, np.sort(best)[2])
     return batched.similarity(source, target, (best <= limit).astype(float))

@@ -17,22 +17,22 @@ from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
 def name_angle_unit(network: Network, settings: StartValueSettings = DEFAULTS) -> str:
     """The unit in which the start values of the images fit the measurements, in words; empty if the
     given one fits, or no other does."""
-    seen, images = sights(network), network.images
+    sighted, images = sights(network), network.images
     poses = np.concatenate([images.position, images.angles], axis=1)
-    there = np.all(np.isfinite(poses), axis=1)
-    known = np.all(np.isfinite(network.points.position), axis=1)
-    rows = there[seen.image] & known[seen.point]
-    given = ANGLE_UNITS[network.angle_unit]
+    has_pose = np.all(np.isfinite(poses), axis=1)
+    is_known = np.all(np.isfinite(network.points.position), axis=1)
+    rows = has_pose[sighted.image] & is_known[sighted.point]
+    given_factor = ANGLE_UNITS[network.angle_unit]
     if not rows.any():
         return ""
     missed = {}
     for unit, factor in ANGLE_UNITS.items():
-        model = Model.empty(seen)
-        M = batched.matrices(images.angles[there] * factor / given)
-        model.place(there, images.position[there], M)
-        model.X[known] = network.points.position[known]
-        off = misclosures(seen, model)[rows] / seen.tolerance[seen.image[rows]]
-        missed[unit] = float(np.median(off))
+        model = Model.empty(sighted)
+        M = batched.matrices(images.angles[has_pose] * factor / given_factor)
+        model.place(has_pose, images.position[has_pose], M)
+        model.X[is_known] = network.points.position[is_known]
+        misclosure = misclosures(sighted, model)[rows] / sighted.tolerance[sighted.image[rows]]
+        missed[unit] = float(np.median(misclosure))
     best = min(missed, key=missed.__getitem__)
     # Half of the image points out of the question in the given unit, half within the tolerance in
     # another; start values that are only poor are neither.

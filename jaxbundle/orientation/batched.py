@@ -167,8 +167,8 @@ def similarity_by_rays(
     rows = [spread(len(X))]
     filled = (_gather_slots([a], rows) for a in (X, X0, rays))
     weights = _weights(rows)
-    A, t, off = run_in_lanes(_similarity_by_rays, 1, *filled, weights, A[None], t[None])
-    return A[0], t[0], off[0][: len(rows[0])]
+    A, t, distances = run_in_lanes(_similarity_by_rays, 1, *filled, weights, A[None], t[None])
+    return A[0], t[0], distances[0][: len(rows[0])]
 
 
 def matrices(angles: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
@@ -217,10 +217,10 @@ def _resect(
 ) -> tuple[AnyArray, AnyArray, AnyArray]:
     # One key for all: equal data give equal start values, whatever else is in the network.
     key = jax.random.key(0)
-    found, good = robust_resection(key, xy, X, weights, threshold=tolerance)
-    sound = (found.status == int(Status.SOUND)) & jnp.all(jnp.isfinite(found.pose.X0))
+    resected, good = robust_resection(key, xy, X, weights, threshold=tolerance)
+    is_sound = (resected.status == int(Status.SOUND)) & jnp.all(jnp.isfinite(resected.pose.X0))
     share = jnp.sum(good) / jnp.sum(weights > 0)
-    return found.pose.X0, found.pose.M, jnp.where(sound, share, 0.0)
+    return resected.pose.X0, resected.pose.M, jnp.where(is_sound, share, 0.0)
 
 
 @quick_jit
@@ -232,9 +232,9 @@ def _refine(
     X: Float[Array, "slots 3"],
     weights: Float[Array, " slots"],
 ) -> tuple[Array, Array]:
-    found = refine_resection(CameraPose(X0, M), xy, X, weights).pose
-    good = jnp.all(jnp.isfinite(found.X0)) & jnp.all(jnp.isfinite(found.M))
-    return jnp.where(good, found.X0, X0), jnp.where(good, found.M, M)
+    refined = refine_resection(CameraPose(X0, M), xy, X, weights).pose
+    good = jnp.all(jnp.isfinite(refined.X0)) & jnp.all(jnp.isfinite(refined.M))
+    return jnp.where(good, refined.X0, X0), jnp.where(good, refined.M, M)
 
 
 @quick_jit
@@ -246,14 +246,16 @@ def _orient_pair(
     tolerance: Float[Array, ""],
 ) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
     key = jax.random.key(0)
-    found, good = robust_relative_orientation(key, xy1, xy2, weights, threshold=tolerance)
+    oriented, good = robust_relative_orientation(key, xy1, xy2, weights, threshold=tolerance)
     ray = lambda xy: jnp.append(xy, -1.0) / jnp.sqrt(1 + xy @ xy)
-    one, two = jax.vmap(ray)(xy1), jax.vmap(ray)(xy2) @ found.M
-    angle = jnp.arctan2(jnp.linalg.norm(jnp.cross(one, two), axis=1), jnp.sum(one * two, 1))
+    rays_1, rays_2 = jax.vmap(ray)(xy1), jax.vmap(ray)(xy2) @ oriented.M
+    angle = jnp.arctan2(
+        jnp.linalg.norm(jnp.cross(rays_1, rays_2), axis=1), jnp.sum(rays_1 * rays_2, 1)
+    )
     number = jnp.sum(good)
     ordered = jnp.sort(jnp.where(good, angle, jnp.inf))
-    share = jnp.where(found.status == int(Status.SOUND), number / jnp.sum(weights > 0), 0.0)
-    return found.M, found.b, share, jnp.where(number > 0, ordered[number // 2], 0.0)
+    share = jnp.where(oriented.status == int(Status.SOUND), number / jnp.sum(weights > 0), 0.0)
+    return oriented.M, oriented.b, share, jnp.where(number > 0, ordered[number // 2], 0.0)
 
 
 @partial(compile_once, static=())
@@ -261,8 +263,8 @@ def _orient_pair(
 def _intersect(
     X0: Float[Array, "rays 3"], rays: Float[Array, "rays 3"], weights: Float[Array, " rays"]
 ) -> tuple[AnyArray, AnyArray, AnyArray]:
-    found = intersection(X0, rays, weights)
-    return found.X, found.angle, found.status
+    intersected = intersection(X0, rays, weights)
+    return intersected.X, intersected.angle, intersected.status
 
 
 @quick_jit
@@ -272,8 +274,8 @@ def _similarity(
     target: Float[Array, "slots 3"],
     weights: Float[Array, " slots"],
 ) -> tuple[AnyArray, AnyArray, AnyArray]:
-    found = absolute_orientation(source, target, weights)
-    return (*_as_matrix(found.tau), found.status)
+    absolute = absolute_orientation(source, target, weights)
+    return (*_as_matrix(absolute.tau), absolute.status)
 
 
 @quick_jit
@@ -293,14 +295,14 @@ def _similarity_by_rays(
     def misclosures(
         tau: Float[Array, "7"], X: Array, X0: Array, rays: Array, sqrt_weight: Array
     ) -> Float[Array, " 2n"]:
-        moved = jax.vmap(transform_point, (None, 0))(tau, X)
-        return jax.vmap(misclosure)(moved, X0, rays, sqrt_weight).ravel()
+        transformed = jax.vmap(transform_point, (None, 0))(tau, X)
+        return jax.vmap(misclosure)(transformed, X0, rays, sqrt_weight).ravel()
 
     # Weights are 0 or 1, their own roots. The start guesses a depth for points seen once, so that
     # more steps are allowed than the 30 of a closed form.
     tau, _ = minimise(misclosures, jnp.add, start, (X, X0, rays, weights), 7, 40)
-    off = misclosures(tau, X, X0, rays, weights).reshape(-1, 2)
-    return (*_as_matrix(tau), jnp.linalg.norm(off, axis=1))
+    differences = misclosures(tau, X, X0, rays, weights).reshape(-1, 2)
+    return (*_as_matrix(tau), jnp.linalg.norm(differences, axis=1))
 
 
 def _as_matrix(tau: Float[AnyArray, "7"]) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
@@ -338,8 +340,13 @@ def _angles(M: Float[Array, "3 3"]) -> tuple[Float[Array, "3"]]:
 def _orient_plane(
     xy1: Float[Array, "slots 2"], xy2: Float[Array, "slots 2"], weights: Float[Array, " slots"]
 ) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
-    found = planar_orientations(xy1, xy2, weights)
-    return found.M, found.b, found.normal, found.possible & (found.status == int(Status.SOUND))
+    orientations = planar_orientations(xy1, xy2, weights)
+    return (
+        orientations.M,
+        orientations.b,
+        orientations.normal,
+        orientations.possible & (orientations.status == int(Status.SOUND)),
+    )
 
 
 def _gather_slots(
@@ -362,7 +369,7 @@ def run_in_lanes(
     """The program applied to items, `lanes` at a time; missing ones repeat the last."""
     number = len(arrays[0])
     parts = []
-    for first in range(0, number, lanes):
-        chosen = np.minimum(np.arange(first, first + lanes), number - 1)
-        parts.append(jax.device_get(program(*(np.asarray(a)[chosen] for a in arrays))))
+    for begin in range(0, number, lanes):
+        items = np.minimum(np.arange(begin, begin + lanes), number - 1)
+        parts.append(jax.device_get(program(*(np.asarray(a)[items] for a in arrays))))
     return tuple(np.concatenate(column)[:number] for column in zip(*parts))

@@ -31,7 +31,7 @@ from jaxbundle.orientation.rays import Sights
 
 
 def rays_coincide(
-    seen: Sights,
+    sighted: Sights,
     model: Model,
     points: Bool[np.ndarray, " points"],
     factor: float = 1.0,
@@ -42,72 +42,75 @@ def rays_coincide(
 
     **Arguments:** `factor`: of the a priori σ of the rays, such as σ0; `significance`: probability
     that parallel rays are taken for converging ones, that of the tests of single observations."""
-    none = np.zeros(seen.points, bool)
-    rows = np.flatnonzero(model.placed[seen.image] & points[seen.point] & (seen.sigma > 0))
-    image, point = seen.image[rows], seen.point[rows]
-    number = np.bincount(point, minlength=seen.points)
+    no_points = np.zeros(sighted.points, bool)
+    rows = np.flatnonzero(model.placed[sighted.image] & points[sighted.point] & (sighted.sigma > 0))
+    image, point = sighted.image[rows], sighted.point[rows]
+    number = np.bincount(point, minlength=sighted.points)
     if not (number > 1).any() or not factor > 0:
-        return none, none
+        return no_points, no_points
     total = lambda values: np.stack(
-        [np.bincount(point, v, seen.points) for v in values.reshape(len(rows), -1).T], 1
+        [np.bincount(point, v, sighted.points) for v in values.reshape(len(rows), -1).T], 1
     )
-    d = np.einsum("nij,ni->nj", model.M[image], seen.ray[rows])
-    measured = np.bincount(seen.image[seen.sigma > 0], minlength=seen.images)[image]
-    p = 1 / ((factor * seen.sigma[rows]) ** 2 * (1 + 3 / measured))
+    d = np.einsum("nij,ni->nj", model.M[image], sighted.ray[rows])
+    measured = np.bincount(sighted.image[sighted.sigma > 0], minlength=sighted.images)[image]
+    p = 1 / ((factor * sighted.sigma[rows]) ** 2 * (1 + 3 / measured))
     S = total(p[:, None, None] * d[:, :, None] * d[:, None, :]).reshape(-1, 3, 3)
     u = np.linalg.eigh(S)[1][:, :, 2]
-    sum_of_p = np.maximum(np.bincount(point, p, seen.points), 1e-300)[:, None]
-    away = model.X0[image] - (total(p[:, None] * model.X0[image]) / sum_of_p)[point]
+    sum_of_p = np.maximum(np.bincount(point, p, sighted.points), 1e-300)[:, None]
+    from_mean_station = model.X0[image] - (total(p[:, None] * model.X0[image]) / sum_of_p)[point]
     u = u[point]
-    across = lambda v: v - (v * u).sum(1, keepdims=True) * u
-    r, off = across(away), across(d) * np.sign((d * u).sum(1, keepdims=True))
-    usual = usual_distances(seen, model)[image, None]
-    misses = lambda v: np.bincount(point, p * np.square(v).sum(1), seen.points)
+    across_line = lambda v: v - (v * u).sum(1, keepdims=True) * u
+    r, direction_across = (
+        across_line(from_mean_station),
+        across_line(d) * np.sign((d * u).sum(1, keepdims=True)),
+    )
+    usual = usual_distances(sighted, model)[image, None]
+    misses = lambda v: np.bincount(point, p * np.square(v).sum(1), sighted.points)
     limit = _quantiles(2 * number - 2, significance)
     one_line = number > 1
     # One value of s is not enough: rays that converge at the usual distance by chance, or because
     # the point is there, pass its test too.
     for distance in (0.5 * usual, usual, 2 * usual):
-        one_line &= misses(r / distance + off) < limit
-    return one_line, one_line & (misses(away / usual) < limit)
+        one_line &= misses(r / distance + direction_across) < limit
+    return one_line, one_line & (misses(from_mean_station / usual) < limit)
 
 
 def see_collinear_points(
-    seen: Sights, model: Model, factor: float = 1.0, significance: float = 0.001
+    sighted: Sights, model: Model, factor: float = 1.0, significance: float = 0.001
 ) -> Bool[np.ndarray, " images"]:
     """Which images see known points on a line only, or fewer than three. Images that are not placed
     count as at the usual distance.
 
     **Arguments:** as of `rays_coincide`."""
-    rows = np.flatnonzero(model.known[seen.point] & (seen.sigma > 0))
-    image = seen.image[rows]
-    number = np.bincount(image, minlength=seen.images)
-    X, placed = model.X[seen.point[rows]], model.placed[image]
-    away = np.linalg.norm(X - model.X0[image], axis=1)
-    away = np.where(placed, away, usual_distances(seen, model)[image])
+    rows = np.flatnonzero(model.known[sighted.point] & (sighted.sigma > 0))
+    image = sighted.image[rows]
+    number = np.bincount(image, minlength=sighted.images)
+    X, placed = model.X[sighted.point[rows]], model.placed[image]
+    distance = np.linalg.norm(X - model.X0[image], axis=1)
+    distance = np.where(placed, distance, usual_distances(sighted, model)[image])
     # Distances of the points from the image weigh their offsets; the line is that of least squares.
-    sqrt_p = 1 / (factor * seen.sigma[rows] * away)
+    sqrt_p = 1 / (factor * sighted.sigma[rows] * distance)
     total = lambda values: np.stack(
-        [np.bincount(image, v, seen.images) for v in values.reshape(len(rows), -1).T], 1
+        [np.bincount(image, v, sighted.images) for v in values.reshape(len(rows), -1).T], 1
     )
-    sum_of_p = np.maximum(np.bincount(image, sqrt_p**2, seen.images), 1e-300)[:, None]
-    away = X - (total(sqrt_p[:, None] ** 2 * X) / sum_of_p)[image]
-    scaled = sqrt_p[:, None] * away
+    sum_of_p = np.maximum(np.bincount(image, sqrt_p**2, sighted.images), 1e-300)[:, None]
+    distance = X - (total(sqrt_p[:, None] ** 2 * X) / sum_of_p)[image]
+    scaled = sqrt_p[:, None] * distance
     C = total(scaled[:, :, None] * scaled[:, None, :]).reshape(-1, 3, 3)
-    off = np.linalg.eigvalsh(C)[:, :2].sum(1)
-    return (number > 0) & (off < _quantiles(2 * number - 4, significance))
+    across_line = np.linalg.eigvalsh(C)[:, :2].sum(1)
+    return (number > 0) & (across_line < _quantiles(2 * number - 4, significance))
 
 
-def usual_distances(seen: Sights, model: Model) -> Float[np.ndarray, " images"]:
+def usual_distances(sighted: Sights, model: Model) -> Float[np.ndarray, " images"]:
     """The median distance from every image to its known points; where it has none, that of all."""
-    rows = np.flatnonzero(model.placed[seen.image] & model.known[seen.point])
-    image = seen.image[rows]
-    s = np.linalg.norm(model.X[seen.point[rows]] - model.X0[image], axis=1)
-    found = np.full(seen.images, np.median(s) if len(s) else np.inf)
+    rows = np.flatnonzero(model.placed[sighted.image] & model.known[sighted.point])
+    image = sighted.image[rows]
+    s = np.linalg.norm(model.X[sighted.point[rows]] - model.X0[image], axis=1)
+    usual = np.full(sighted.images, np.median(s) if len(s) else np.inf)
     order = np.lexsort((s, image))
-    first, number = np.unique(image[order], return_index=True, return_counts=True)[1:]
-    found[image[order][first]] = s[order][first + number // 2]
-    return found
+    begin, number = np.unique(image[order], return_index=True, return_counts=True)[1:]
+    usual[image[order][begin]] = s[order][begin + number // 2]
+    return usual
 
 
 def _quantiles(degrees: Int[np.ndarray, " n"], significance: float) -> Float[np.ndarray, " n"]:

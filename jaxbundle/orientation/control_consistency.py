@@ -79,7 +79,7 @@ class Assessment:
     factor: float = 1.0
 
 
-def assess(found: Discrepancies, assumed: float, significance: float = 0.05) -> Assessment:
+def assess(discrepancies: Discrepancies, assumed: float, significance: float = 0.05) -> Assessment:
     """Find the control points that contradict the others.
 
     The most improbable point, or pair of points, is left out while its probability is below the
@@ -90,76 +90,90 @@ def assess(found: Discrepancies, assumed: float, significance: float = 0.05) -> 
     **Arguments:** `assumed`: σ if the points do not determine it, and the smallest estimated one;
     `significance`: probability of suspecting any point of control without contradictions.
     """
-    if not len(found):
+    if not len(discrepancies):
         nothing, lacking = np.zeros((0, 3)), (True, True)
         return Assessment(
             np.zeros(0, bool), nothing, (0.0, 0.0), nothing, nothing, np.zeros(0), lacking
         )
-    used = _search(found, assumed, significance)
+    is_used = _search(discrepancies, assumed, significance)
     factor = 1.0
-    if 2 * (~used).sum() >= len(found) and np.isfinite(found.sigma).any():
-        everything = np.ones(len(found), bool)
-        sigma, *_ = _resolve(found, everything, assumed)
-        W, d, rows = _weight_matrix(found, sigma, everything)
-        redundancy = len(rows) - found.open.shape[2]
+    if 2 * (~is_used).sum() >= len(discrepancies) and np.isfinite(discrepancies.sigma).any():
+        everything = np.ones(len(discrepancies), bool)
+        sigma, *_ = _resolve(discrepancies, everything, assumed)
+        W, d, rows = _weight_matrix(discrepancies, sigma, everything)
+        redundancy = len(rows) - discrepancies.open.shape[2]
         factor = float(np.sqrt(max(d @ W @ d / max(redundancy, 1), 1.0)))
-        scaled = np.where(np.isfinite(found.sigma), found.sigma * factor, found.sigma)
-        found = dataclasses.replace(found, sigma=scaled)
-        used = _search(found, assumed, significance)
-    sigma, redundancy, guessed = _resolve(found, used, assumed)
-    error, spread = np.full((2, len(found), 3), np.nan)
-    probability = np.full(len(found), np.nan)
-    common = _linearise(found, used, used, assumed) if used.sum() > MAX_POINTS_FOR_PAIRS else None
-    for i in range(len(found)):
-        test = _predict(found, used, [i], assumed, common if used[i] else None)
+        scaled = np.where(
+            np.isfinite(discrepancies.sigma), discrepancies.sigma * factor, discrepancies.sigma
+        )
+        discrepancies = dataclasses.replace(discrepancies, sigma=scaled)
+        is_used = _search(discrepancies, assumed, significance)
+    sigma, redundancy, guessed = _resolve(discrepancies, is_used, assumed)
+    error, sigma_of_error = np.full((2, len(discrepancies), 3), np.nan)
+    probability = np.full(len(discrepancies), np.nan)
+    common = (
+        _linearise(discrepancies, is_used, is_used, assumed)
+        if is_used.sum() > MAX_POINTS_FOR_PAIRS
+        else None
+    )
+    for i in range(len(discrepancies)):
+        test = _predict(discrepancies, is_used, [i], assumed, common if is_used[i] else None)
         if test is not None:
-            error[i], spread[i], probability[i] = test
-    return Assessment(used, sigma, redundancy, error, spread, probability, guessed, factor)
+            error[i], sigma_of_error[i], probability[i] = test
+    return Assessment(
+        is_used, sigma, redundancy, error, sigma_of_error, probability, guessed, factor
+    )
 
 
-def _search(found: Discrepancies, assumed: float, significance: float) -> Bool[np.ndarray, " n"]:
+def _search(
+    discrepancies: Discrepancies, assumed: float, significance: float
+) -> Bool[np.ndarray, " n"]:
     """Which points do not contradict the others."""
-    used = np.ones(len(found), bool)
-    fewest = max(MIN_AGREEING, (len(found) + 1) // 2)
-    while worst := _most_improbable(found, used, assumed, significance, used.sum() - fewest):
-        used[worst] = False
-    left_out = np.flatnonzero(~used).tolist()
-    for i in sorted(left_out, key=lambda i: -_probability(found, used, [i], assumed)):
-        if _probability(found, used, [i], assumed) > level_of_one(significance, len(found)):
-            used[i] = True
-    return used
+    is_used = np.ones(len(discrepancies), bool)
+    fewest = max(MIN_AGREEING, (len(discrepancies) + 1) // 2)
+    while worst := _most_improbable(
+        discrepancies, is_used, assumed, significance, is_used.sum() - fewest
+    ):
+        is_used[worst] = False
+    left_out = np.flatnonzero(~is_used).tolist()
+    for i in sorted(left_out, key=lambda i: -_probability(discrepancies, is_used, [i], assumed)):
+        if _probability(discrepancies, is_used, [i], assumed) > level_of_one(
+            significance, len(discrepancies)
+        ):
+            is_used[i] = True
+    return is_used
 
 
 def _most_improbable(
-    found: Discrepancies,
-    used: Bool[np.ndarray, " n"],
+    discrepancies: Discrepancies,
+    is_used: Bool[np.ndarray, " n"],
     assumed: float,
     significance: float,
-    most: int,
+    max_points: int,
 ) -> list[int]:
     """The point, or else the two points, of at most this number, that are most improbable; none if
     chance explains all."""
-    rows = np.flatnonzero(used).tolist()
-    few = len(rows) <= MAX_POINTS_FOR_PAIRS
+    rows = np.flatnonzero(is_used).tolist()
+    is_few = len(rows) <= MAX_POINTS_FOR_PAIRS
     # Of many points one changes the estimated σ by too little to matter.
-    common = None if few else _linearise(found, used, used, assumed)
-    for tests in ([[i] for i in rows], [list(p) for p in itertools.combinations(rows, 2)] * few):
-        if tests and len(tests[0]) <= most:
-            p = [_probability(found, used, test, assumed, common) for test in tests]
+    common = None if is_few else _linearise(discrepancies, is_used, is_used, assumed)
+    for tests in ([[i] for i in rows], [list(p) for p in itertools.combinations(rows, 2)] * is_few):
+        if tests and len(tests[0]) <= max_points:
+            p = [_probability(discrepancies, is_used, test, assumed, common) for test in tests]
             if min(p) < level_of_one(significance, len(tests)):
                 return tests[int(np.argmin(p))]
     return []
 
 
 def _probability(
-    found: Discrepancies,
-    used: Bool[np.ndarray, " n"],
+    discrepancies: Discrepancies,
+    is_used: Bool[np.ndarray, " n"],
     tested: Sequence[int],
     assumed: float,
     model: "_WeightedDiscrepancies | None" = None,
 ) -> float:
     """The probability of a larger T by chance; 1 of points that cannot be tested."""
-    test = _predict(found, used, tested, assumed, model)
+    test = _predict(discrepancies, is_used, tested, assumed, model)
     return 1.0 if test is None else test[2]
 
 
@@ -175,20 +189,20 @@ class _WeightedDiscrepancies(NamedTuple):
 
 
 def _linearise(
-    found: Discrepancies,
-    others: Bool[np.ndarray, " n"],
+    discrepancies: Discrepancies,
+    other_points: Bool[np.ndarray, " n"],
     points: Bool[np.ndarray, " n"],
     assumed: float,
 ) -> _WeightedDiscrepancies:
-    """W and W·d of `points`, with σ estimated from `others`."""
-    sigma, redundancy, _ = _resolve(found, others, assumed)
-    W, d, rows = _weight_matrix(found, sigma, points)
+    """W and W·d of `points`, with σ estimated from `other_points`."""
+    sigma, redundancy, _ = _resolve(discrepancies, other_points, assumed)
+    W, d, rows = _weight_matrix(discrepancies, sigma, points)
     return _WeightedDiscrepancies(sigma, redundancy, W, W @ d, rows)
 
 
 def _predict(
-    found: Discrepancies,
-    used: Bool[np.ndarray, " n"],
+    discrepancies: Discrepancies,
+    is_used: Bool[np.ndarray, " n"],
     tested: Sequence[int],
     assumed: float,
     model: _WeightedDiscrepancies | None = None,
@@ -198,23 +212,23 @@ def _predict(
 
     **Arguments:** `model`: of all used points, instead of one with σ from the others."""
     if model is None:
-        others, points = used.copy(), used.copy()
-        others[list(tested)], points[list(tested)] = False, True
-        model = _linearise(found, others, points, assumed)
+        other_points, points = is_used.copy(), is_used.copy()
+        other_points[list(tested)], points[list(tested)] = False, True
+        model = _linearise(discrepancies, other_points, points, assumed)
     rows = model.rows
-    mine = np.flatnonzero(np.isin(rows // 3, tested))
-    if not len(mine):
+    rows_tested = np.flatnonzero(np.isin(rows // 3, tested))
+    if not len(rows_tested):
         return None
-    W_tested = model.W[np.ix_(mine, mine)]
+    W_tested = model.W[np.ix_(rows_tested, rows_tested)]
     # W_DD is singular where the others leave D open, by G: then it is zero but for rounding.
     scale = np.abs(np.diag(W_tested)).max(initial=0.0)
     if not scale or np.linalg.eigvalsh(W_tested)[0] < 1e-9 * scale:
         return None
     covariance = np.linalg.inv(W_tested)
-    e = covariance @ model.Wd[mine]
-    unknown, p = np.isnan(found.sigma).ravel()[rows[mine]], []
+    e = covariance @ model.Wd[rows_tested]
+    unknown, p = np.isnan(discrepancies.sigma).ravel()[rows[rows_tested]], []
     for height, freedom in enumerate(model.redundancy):
-        part = np.flatnonzero((rows[mine] % 3 == 2) == height)
+        part = np.flatnonzero((rows[rows_tested] % 3 == 2) == height)
         if not len(part) or (unknown[part].any() and freedom < MIN_REDUNDANCY):
             continue  # an assumed σ tests nothing
         T = float(e[part] @ np.linalg.solve(covariance[np.ix_(part, part)], e[part]))
@@ -225,64 +239,68 @@ def _predict(
         )
     # Bonferroni: the smaller of two probabilities counts twice. Nothing tested: chance explains it.
     p = min(1.0, len(p) * min(p)) if p else 1.0
-    error, spread = np.full(3, np.nan), np.full(3, np.nan)
-    first = rows[mine] // 3 == tested[0]
-    axes = rows[mine][first] % 3
-    error[axes], spread[axes] = e[first], np.sqrt(np.diag(covariance))[first]
-    return error, spread, p
+    error, sigma_of_error = np.full(3, np.nan), np.full(3, np.nan)
+    is_first = rows[rows_tested] // 3 == tested[0]
+    axes = rows[rows_tested][is_first] % 3
+    error[axes], sigma_of_error[axes] = e[is_first], np.sqrt(np.diag(covariance))[is_first]
+    return error, sigma_of_error, p
 
 
 def _weight_matrix(
-    found: Discrepancies, sigma: Float[np.ndarray, "n 3"], used: Bool[np.ndarray, " n"]
+    discrepancies: Discrepancies, sigma: Float[np.ndarray, "n 3"], is_used: Bool[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, " m"], Int[np.ndarray, " m"]]:
     """W and d of the controlled axes of the used points; their rows among all axes."""
-    rows = np.flatnonzero((used[:, None] & np.isfinite(sigma)).ravel())
-    n = 3 * len(found)
-    S = found.covariance.reshape(n, n)[np.ix_(rows, rows)] + np.diag(sigma.ravel()[rows] ** 2)
+    rows = np.flatnonzero((is_used[:, None] & np.isfinite(sigma)).ravel())
+    n = 3 * len(discrepancies)
+    S = discrepancies.covariance.reshape(n, n)[np.ix_(rows, rows)] + np.diag(
+        sigma.ravel()[rows] ** 2
+    )
     W = np.linalg.inv(S)
-    G = found.open.reshape(n, -1)[rows]
+    G = discrepancies.open.reshape(n, -1)[rows]
     if G.shape[1]:
         U = W @ G
         W = W - U @ np.linalg.pinv(G.T @ U, hermitian=True) @ U.T
-    return W, found.difference.ravel()[rows], rows
+    return W, discrepancies.difference.ravel()[rows], rows
 
 
 def _resolve(
-    found: Discrepancies, used: Bool[np.ndarray, " n"], assumed: float
+    discrepancies: Discrepancies, is_used: Bool[np.ndarray, " n"], assumed: float
 ) -> tuple[Float[np.ndarray, "n 3"], tuple[float, float], tuple[bool, bool]]:
     """σ of control with the unknown ones estimated from the used points, their redundancy in the
     plane and in height, and whether they had to be assumed."""
-    unknown = np.isnan(found.sigma)
+    unknown = np.isnan(discrepancies.sigma)
     groups = [unknown & np.array([True, True, False]), unknown & np.array([False, False, True])]
-    sigma = np.where(unknown, assumed, found.sigma)
-    here = [g for g in groups if (g & used[:, None]).any()]
+    sigma = np.where(unknown, assumed, discrepancies.sigma)
+    groups_used = [g for g in groups if (g & is_used[:, None]).any()]
     redundancy = [0.0, 0.0]
-    if not here:
+    if not groups_used:
         return sigma, (0.0, 0.0), (bool(groups[0].any()), bool(groups[1].any()))
-    start = np.abs(found.difference - np.median(found.difference[used], axis=0))
-    for group in here:
-        sigma[group] = max(NORMAL_SIGMA_BY_MAD * np.median(start[group & used[:, None]]), assumed)
+    start = np.abs(discrepancies.difference - np.median(discrepancies.difference[is_used], axis=0))
+    for group in groups_used:
+        sigma[group] = max(
+            NORMAL_SIGMA_BY_MAD * np.median(start[group & is_used[:, None]]), assumed
+        )
     # The fixed point converges linearly, slowly where C dominates; a σ to 0.1 % is far more than
     # its own σ of 10 to 40 % deserves, and after 200 rounds the last one is good enough.
     for number in range(200):
-        W, d, rows = _weight_matrix(found, sigma, used)
-        Wd, before = W @ d, sigma.copy()
-        for group in here:
-            mine = group.ravel()[rows]
-            trace = np.diag(W)[mine].sum()
+        W, d, rows = _weight_matrix(discrepancies, sigma, is_used)
+        Wd, previous = W @ d, sigma.copy()
+        for group in groups_used:
+            is_of_group = group.ravel()[rows]
+            trace = np.diag(W)[is_of_group].sum()
             if trace > 0:
-                s = sigma[group][0] * np.sqrt((Wd[mine] ** 2).sum() / trace)
+                s = sigma[group][0] * np.sqrt((Wd[is_of_group] ** 2).sum() / trace)
                 sigma[group] = max(s, assumed)
             if number == 0:
                 # With a σ that dominates C; where the estimate is small, its share is hardly any.
-                redundancy[0 if group[:, :2].any() else 1] = float(before[group][0] ** 2 * trace)
-        if np.abs(sigma[unknown] / before[unknown] - 1).max() < 1e-3:
+                redundancy[0 if group[:, :2].any() else 1] = float(previous[group][0] ** 2 * trace)
+        if np.abs(sigma[unknown] / previous[unknown] - 1).max() < 1e-3:
             break
     plane, height = (
         bool(g.any()) and (r < MIN_REDUNDANCY or bool(np.all(sigma[g] <= assumed)))
         for g, r in zip(groups, redundancy)
     )
-    for group, few in zip(groups, (plane, height)):
-        if few:
+    for group, is_few in zip(groups, (plane, height)):
+        if is_few:
             sigma[group] = assumed
     return sigma, (redundancy[0], redundancy[1]), (plane, height)

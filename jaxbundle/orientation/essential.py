@@ -87,10 +87,10 @@ def five_solutions(
     times_x = jnp.asarray(_TAKE_CUBIC) @ -reduced + jnp.asarray(_TAKE_BASIS)
     x, vectors = jnp.linalg.eig(jnp.where(jnp.isfinite(times_x), times_x, 0))
     # An eigenvector holds the values of the basis at a solution: its last entries are x, y, z, 1.
-    last = vectors[9]
-    xyz = vectors[6:9] / jnp.where(jnp.abs(last) > 0, last, 1)
+    scale = vectors[9]
+    xyz = vectors[6:9] / jnp.where(jnp.abs(scale) > 0, scale, 1)
     size = 1 + jnp.sum(jnp.abs(xyz), 0)
-    usable = (jnp.abs(last) > 0) & jnp.all(jnp.isfinite(times_x))
+    usable = (jnp.abs(scale) > 0) & jnp.all(jnp.isfinite(times_x))
     # Rounding moves a double root by the root of 1e-16, 1e-8 of its length, off the real axis;
     # 1e-6 leaves room for the elimination before. Truly complex pairs of noisy points are farther
     # off, and serve as start values in `relative_orientation` all the same.
@@ -114,8 +114,8 @@ def _to_normalised(
 ) -> Float[Array, "3 3"]:
     """T with T·(x, y, −1) = (x', y', −1), of mean 0 and mean square 1 a coordinate."""
     (x, y), size = normalisation(xy, weights)
-    nil, one = jnp.zeros_like(x), jnp.ones_like(x)
-    return jnp.array([[one / size, nil, x / size], [nil, one / size, y / size], [nil, nil, one]])
+    nil, unit = jnp.zeros_like(x), jnp.ones_like(x)
+    return jnp.array([[unit / size, nil, x / size], [nil, unit / size, y / size], [nil, nil, unit]])
 
 
 def _coplanarity(
@@ -155,9 +155,9 @@ def _times_x() -> tuple[Float[np.ndarray, "10 10"], Float[np.ndarray, "10 10"]]:
     """Where x times the basis is found: among the cubic monomials, or in the basis again."""
     cubic, basis = np.zeros((10, 10)), np.zeros((10, 10))
     for row, (i, j, k) in enumerate(_BASIS):
-        found = (i + 1, j, k)
-        table, names = (cubic, _CUBIC) if sum(found) == 3 else (basis, _BASIS)
-        table[row, names.index(found)] = 1
+        monomial = (i + 1, j, k)
+        table, names = (cubic, _CUBIC) if sum(monomial) == 3 else (basis, _BASIS)
+        table[row, names.index(monomial)] = 1
     return cubic, basis
 
 

@@ -87,11 +87,11 @@ def interior_from_homographies(
     H = H / jnp.linalg.norm(H, axis=(1, 2), keepdims=True)
     v = jax.vmap(_products, (0, None, None))
     rows = jnp.concatenate([v(H, 0, 1), v(H, 0, 0) - v(H, 1, 1)]) * jnp.tile(p, 2)[:, None]
-    used = jnp.array([0, 1, 2, 3, 4, 5] if skew else [0, 2, 3, 4, 5])
-    b, singular = null_vector(rows[:, used])
+    columns = jnp.array([0, 1, 2, 3, 4, 5] if skew else [0, 2, 3, 4, 5])
+    b, singular = null_vector(rows[:, columns])
     # K from B = K⁻ᵀ·K⁻¹ in closed form (Zhang, 2000, appendix B); with noise B need not be positive
     # definite, and then there is no camera.
-    b11, b12, b22, b13, b23, b33 = jnp.zeros(6, b.dtype).at[used].set(b)
+    b11, b12, b22, b13, b23, b33 = jnp.zeros(6, b.dtype).at[columns].set(b)
     minor = b11 * b22 - b12**2
     y0 = (b12 * b13 - b11 * b23) / minor
     scale = b33 - (b13**2 + y0 * (b12 * b13 - b11 * b23)) / b11
@@ -110,24 +110,24 @@ def pose_from_homography(H: Float[AnyArray, "3 3"], interior: Float[AnyArray, "5
     first two axes are made perpendicular, the error shared.
     """
     fx, fy, s, x0, y0 = interior
-    nil, one = jnp.zeros_like(fx), jnp.ones_like(fx)
-    K = jnp.array([[fx, s, x0], [nil, fy, y0], [nil, nil, one]])
+    nil, unit_scale = jnp.zeros_like(fx), jnp.ones_like(fx)
+    K = jnp.array([[fx, s, x0], [nil, fy, y0], [nil, nil, unit_scale]])
     A = jnp.diag(jnp.array([1.0, 1.0, -1.0])) @ jnp.linalg.solve(K, H)
     length = jnp.linalg.norm(A[:, :2], axis=0)
     unit = lambda a: a / jnp.linalg.norm(a)
-    first, second = (A[:, :2] / length).T
+    axis_1, axis_2 = (A[:, :2] / length).T
     # The bisectors of two unit vectors are perpendicular; so are the vectors at 45° to them, each
     # turned by half of the error.
-    p, q = unit(first + second), unit(first - second)
-    first, second = (p + q) / jnp.sqrt(2.0), (p - q) / jnp.sqrt(2.0)
-    M = jnp.stack([first, second, jnp.cross(first, second)], 1)
+    p, q = unit(axis_1 + axis_2), unit(axis_1 - axis_2)
+    axis_1, axis_2 = (p + q) / jnp.sqrt(2.0), (p - q) / jnp.sqrt(2.0)
+    M = jnp.stack([axis_1, axis_2, jnp.cross(axis_1, axis_2)], 1)
     return CameraPose(-M.T @ A[:, 2] * 2 / jnp.sum(length), M)
 
 
 def _similarity(scale: Float[Array, ""], shift: Float[Array, "2"]) -> Float[Array, "3 3"]:
     """The matrix of scale·[x, y] + shift in homogeneous coordinates."""
-    nil, one = jnp.zeros_like(scale), jnp.ones_like(scale)
-    return jnp.array([[scale, nil, shift[0]], [nil, scale, shift[1]], [nil, nil, one]])
+    nil, unit = jnp.zeros_like(scale), jnp.ones_like(scale)
+    return jnp.array([[scale, nil, shift[0]], [nil, scale, shift[1]], [nil, nil, unit]])
 
 
 def _products(H: Float[AnyArray, "3 3"], i: int, j: int) -> Float[Array, "6"]:

@@ -103,12 +103,12 @@ def are_held(
     control (`extent_to_misfit`). Less exact ones, such as those of handheld receivers, are
     intersected like tie points; with them the model is moved to control, but no ray contradicts
     them."""
-    known = are_controlled(points)
-    if known.sum() < 3:  # they have no extent to compare with
-        return known
-    extent = np.ptp(points.position[known], axis=0).max()
+    is_known = are_controlled(points)
+    if is_known.sum() < 3:  # they have no extent to compare with
+        return is_known
+    extent = np.ptp(points.position[is_known], axis=0).max()
     sigma = np.where(points.has_role("fixed")[:, None], 0.0, np.nan_to_num(points.sigma))
-    return known & (sigma.max(1) * settings.extent_to_misfit <= extent)
+    return is_known & (sigma.max(1) * settings.extent_to_misfit <= extent)
 
 
 # Adjusts the images and points of a model among themselves, in place.
@@ -129,21 +129,28 @@ def grow(
     cost less than twice the last one."""
     candidates = np.ones(sights.images, bool) if candidates is None else candidates
     # Known points at the last try: an image is tried again only when it has more.
-    tried = np.zeros(sights.images, int)
+    known_when_tried = np.zeros(sights.images, int)
     due = max(settings.first_improvement, settings.improvement_growth * model.placed.sum())
     intersect(sights, model, RESECTION_LIMITS)
     while True:
-        known = np.bincount(sights.image, model.known[sights.point], minlength=sights.images)
-        waiting = candidates & ~model.placed & (known >= settings.min_points) & (known > tried)
-        if not waiting.any():
+        number_known = np.bincount(sights.image, model.known[sights.point], minlength=sights.images)
+        is_waiting = (
+            candidates
+            & ~model.placed
+            & (number_known >= settings.min_points)
+            & (number_known > known_when_tried)
+        )
+        if not is_waiting.any():
             break
         # Several at a time, those with the most points first; on repeated structures the images
         # with few points are those most easily placed wrongly, and later they have more.
-        most = known[waiting].max()
-        enough = min(max(settings.sufficient_points, settings.waiting_share * most), most)
-        chosen = np.flatnonzero(waiting & (known >= enough))
-        tried[chosen] = known[chosen]
-        if _place_images(sights, model, chosen, settings):
+        largest_number = number_known[is_waiting].max()
+        sufficient = min(
+            max(settings.sufficient_points, settings.waiting_share * largest_number), largest_number
+        )
+        images = np.flatnonzero(is_waiting & (number_known >= sufficient))
+        known_when_tried[images] = number_known[images]
+        if _place_images(sights, model, images, settings):
             intersect(sights, model, RESECTION_LIMITS)
         if improve is not None and model.placed.sum() >= due:
             improve(sights, model)
@@ -174,14 +181,14 @@ def place_far_points(sights: Sights, model: Model, settings: StartValueSettings 
     direction /= np.where(number > 0, np.linalg.norm(direction, axis=1), 1.0)[:, None]
     widest = np.zeros(sights.points)
     np.fmax.at(widest, point, np.linalg.norm(np.cross(ray, direction[point]), axis=1))
-    far = (number >= 3) & (widest < settings.parallel_angle) & ~model.control
-    if not far.any() or 2 * far.sum() > model.known.sum():
+    is_far = (number >= 3) & (widest < settings.parallel_angle) & ~model.control
+    if not is_far.any() or 2 * is_far.sum() > model.known.sum():
         return
     centres = model.X0[model.placed]
     middle = centres.mean(0)
-    spread = np.sqrt(((centres - middle) ** 2).sum(1).mean())
-    model.X[far] = middle + settings.far_distance * spread * direction[far]
-    model.known[far] = True
+    spread_of_stations = np.sqrt(((centres - middle) ** 2).sum(1).mean())
+    model.X[is_far] = middle + settings.far_distance * spread_of_stations * direction[is_far]
+    model.known[is_far] = True
 
 
 def _place_images(
@@ -212,18 +219,18 @@ def _in_planes(
 ]:
     """For each of the images with enough known points: their rows, and their coordinates in a
     camera turned by R (`sights.in_plane`)."""
-    usable, chosen, R, xy = [], [], [], []
+    usable, rows_of_images, R, xy = [], [], [], []
     for image in images:
         rows = np.arange(sights.image.size)[sights.rows_of(image)]
         rows = rows[model.known[sights.point[rows]]]
-        turn, at = in_plane(sights.ray[rows])
-        there = np.isfinite(at).all(1)
-        if there.sum() >= settings.min_points:
+        turn, in_image_plane = in_plane(sights.ray[rows])
+        is_finite = np.isfinite(in_image_plane).all(1)
+        if is_finite.sum() >= settings.min_points:
             usable.append(image)
-            chosen.append(rows[there])
+            rows_of_images.append(rows[is_finite])
             R.append(turn)
-            xy.append(at[there])
-    return np.array(usable, int), chosen, np.reshape(R, (-1, 3, 3)), xy
+            xy.append(in_image_plane[is_finite])
+    return np.array(usable, int), rows_of_images, np.reshape(R, (-1, 3, 3)), xy
 
 
 def _refine(sights: Sights, model: Model, settings: StartValueSettings) -> None:
@@ -253,10 +260,10 @@ def misclosures(sights: Sights, model: Model) -> Float[np.ndarray, " n"]:
     behind the ray, NaN if not placed."""
     to_point = model.X[sights.point] - model.X0[sights.image]
     ray = np.einsum("nij,ni->nj", model.M[sights.image], sights.ray)
-    along = (to_point * ray).sum(1)
+    depth = (to_point * ray).sum(1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        error = np.linalg.norm(np.cross(to_point, ray), axis=1) / along
-    return np.where(along <= 0, np.inf, error)
+        error = np.linalg.norm(np.cross(to_point, ray), axis=1) / depth
+    return np.where(depth <= 0, np.inf, error)
 
 
 def intersect(
@@ -269,34 +276,39 @@ def intersect(
     rows = np.flatnonzero(model.placed[sights.image])
     rows = rows[np.argsort(sights.point[rows], kind="stable")]
     point = sights.point[rows]
-    first = np.searchsorted(point, np.arange(sights.points))
+    first_ray = np.searchsorted(point, np.arange(sights.points))
     number = np.bincount(point, minlength=sights.points)
-    wanted = np.flatnonzero((number >= 2) & ~model.control & (again | ~model.known))
-    if not len(wanted):
+    points_to_intersect = np.flatnonzero((number >= 2) & ~model.control & (again | ~model.known))
+    if not len(points_to_intersect):
         return
-    place = np.minimum(np.arange(batched.RAYS), number[wanted, None] - 1)
-    scale = np.maximum((number[wanted, None] - 1) / (batched.RAYS - 1), 1.0)
-    row = rows[first[wanted, None] + (place * scale).astype(int)]
-    weights = (np.arange(batched.RAYS) < number[wanted, None]).astype(float)
+    place = np.minimum(np.arange(batched.RAYS), number[points_to_intersect, None] - 1)
+    scale = np.maximum((number[points_to_intersect, None] - 1) / (batched.RAYS - 1), 1.0)
+    row = rows[first_ray[points_to_intersect, None] + (place * scale).astype(int)]
+    weights = (np.arange(batched.RAYS) < number[points_to_intersect, None]).astype(float)
     X0 = model.X0[sights.image[row]]
     rays = np.einsum("nkij,nki->nkj", model.M[sights.image[row]], sights.ray[row])
     tolerance = limits.max_miss * sights.tolerance[sights.image[row]]
 
-    X, good = np.full((len(wanted), 3), np.nan), np.zeros(len(wanted), bool)
-    todo = np.arange(len(wanted))
+    X, good = (
+        np.full((len(points_to_intersect), 3), np.nan),
+        np.zeros(len(points_to_intersect), bool),
+    )
+    todo = np.arange(len(points_to_intersect))
     while len(todo):
-        found, angle, status = batched.intersect(X0[todo], rays[todo], weights[todo])
-        off = _across(found[:, None] - X0[todo], rays[todo]) / tolerance[todo] * weights[todo]
+        intersected, angle, status = batched.intersect(X0[todo], rays[todo], weights[todo])
+        misclosure = (
+            _across(intersected[:, None] - X0[todo], rays[todo]) / tolerance[todo] * weights[todo]
+        )
         sound = status == int(Status.SOUND)
-        agree = sound & (off.max(1) < 1)
-        X[todo], good[todo] = found, agree & (angle > limits.min_angle)
+        agree = sound & (misclosure.max(1) < 1)
+        X[todo], good[todo] = intersected, agree & (angle > limits.min_angle)
         # One ray a round: the worst one draws the point to itself, so that good rays miss it as
         # well. Of two contradicting rays either may be wrong.
-        more = ~agree & (weights[todo].sum(1) > 2) & np.isfinite(off).all(1)
-        weights[todo[more], off[more].argmax(1)] = 0.0
-        todo = todo[more]
-    model.known[wanted] = good
-    model.X[wanted] = np.where(good[:, None], X, np.nan)
+        has_outlier = ~agree & (weights[todo].sum(1) > 2) & np.isfinite(misclosure).all(1)
+        weights[todo[has_outlier], misclosure[has_outlier].argmax(1)] = 0.0
+        todo = todo[has_outlier]
+    model.known[points_to_intersect] = good
+    model.X[points_to_intersect] = np.where(good[:, None], X, np.nan)
 
 
 def _across(
@@ -304,7 +316,7 @@ def _across(
 ) -> Float[np.ndarray, "n rays"]:
     """Tangent of the angle between a direction and a unit ray; 1000, above all tolerances but
     finite (a ray from there is dropped like others), if it points backwards."""
-    along = np.einsum("nkj,nkj->nk", d, rays)
-    across = np.linalg.norm(np.cross(d, rays), axis=-1)
+    depth = np.einsum("nkj,nkj->nk", d, rays)
+    distance = np.linalg.norm(np.cross(d, rays), axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(along > 0, across / along, 1e3)
+        return np.where(depth > 0, distance / depth, 1e3)

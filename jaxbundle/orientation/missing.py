@@ -14,7 +14,9 @@ from jaxbundle.orientation.rays import Sights
 from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
 
 
-def note_missing(network: Network, thing: str, reasons: Mapping[str, str], what: str) -> Network:
+def note_missing(
+    network: Network, noun: str, reasons: Mapping[str, str], beginning: str
+) -> Network:
     """The network with notes that images or points were left out, by name with the reasons."""
     if not reasons:
         return network
@@ -23,21 +25,23 @@ def note_missing(network: Network, thing: str, reasons: Mapping[str, str], what:
         why: tuple(id for id, reason in reasons.items() if reason == why)
         for why in dict.fromkeys(reasons.values())
     }
-    network = network.note(f"left out {count(len(reasons), thing)} {what}: {names}")
-    notes = (LeftOut(thing, ids, f"{what}: {why}") for why, ids in groups.items())
+    network = network.note(f"left out {count(len(reasons), noun)} {beginning}: {names}")
+    notes = (LeftOut(noun, ids, f"{beginning}: {why}") for why, ids in groups.items())
     return network.replace(left_out=(*network.left_out, *notes))
 
 
 def explain_missing(
     network: Network,
-    seen: Sights,
+    sighted: Sights,
     model: Model,
-    known: Bool[np.ndarray, " points"],
+    is_known: Bool[np.ndarray, " points"],
     settings: StartValueSettings = DEFAULTS,
 ) -> tuple[dict[str, str], dict[str, str]]:
-    """By id, why images are not placed, and why points are not `known`."""
-    rays = np.bincount(seen.image, minlength=seen.images)
-    of_known = np.bincount(seen.image, model.known[seen.point], minlength=seen.images).astype(int)
+    """By id, why images are not placed, and why points are not `is_known`."""
+    rays = np.bincount(sighted.image, minlength=sighted.images)
+    of_known = np.bincount(
+        sighted.image, model.known[sighted.point], minlength=sighted.images
+    ).astype(int)
     images = {}
     for image in np.flatnonzero(~model.placed):
         if of_known[image] < settings.min_points:
@@ -52,13 +56,13 @@ def explain_missing(
                 "principal distance"
             )
         images[network.images.id[image]] = why
-    placed = model.placed[seen.image]
-    by_point = np.bincount(seen.point[placed], minlength=seen.points)
-    outside = np.ones(len(network.observations), bool)
-    outside[seen.row] = False
-    no_ray = np.bincount(network.observations.point[outside], minlength=seen.points)
+    placed = model.placed[sighted.image]
+    by_point = np.bincount(sighted.point[placed], minlength=sighted.points)
+    without_ray = np.ones(len(network.observations), bool)
+    without_ray[sighted.row] = False
+    no_ray = np.bincount(network.observations.point[without_ray], minlength=sighted.points)
     points = {}
-    for point in np.flatnonzero(~known):
+    for point in np.flatnonzero(~is_known):
         if by_point[point] < 2 and no_ray[point]:
             number = count(no_ray[point], "image point")
             why = f"{number} of it outside the range of the camera model, where there are no rays"

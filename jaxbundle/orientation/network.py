@@ -83,11 +83,11 @@ class Oriented(TableMethods):
     def table(self) -> dict[str, np.ndarray]:
         """One row an image or a point: columns kind, id, oriented, reason (of those that could not
         be oriented)."""
-        found = [("image", id, True, "") for id in self.network.images.id]
-        found += [("image", id, False, why) for id, why in self.images_not_placed.items()]
-        found += [("point", id, True, "") for id in self.network.points.id]
-        found += [("point", id, False, why) for id, why in self.points_not_placed.items()]
-        kind, id, oriented, reason = zip(*found) if found else ((), (), (), ())
+        rows = [("image", id, True, "") for id in self.network.images.id]
+        rows += [("image", id, False, why) for id, why in self.images_not_placed.items()]
+        rows += [("point", id, True, "") for id in self.network.points.id]
+        rows += [("point", id, False, why) for id, why in self.points_not_placed.items()]
+        kind, id, oriented, reason = zip(*rows) if rows else ((), (), (), ())
         return {
             "kind": np.array(kind, dtype=object),
             "id": np.array(id, dtype=object),
@@ -96,16 +96,17 @@ class Oriented(TableMethods):
         }
 
     def __str__(self) -> str:
-        placed, known = len(self.network.images), len(self.network.points)
+        placed, number_known = len(self.network.images), len(self.network.points)
         lines = [
             f"placed {count(placed, 'image')} of {placed + len(self.images_not_placed)} and "
-            f"{count(known, 'point')} of {known + len(self.points_not_placed)}, {self.frame}"
+            f"{count(number_known, 'point')} of {number_known + len(self.points_not_placed)}, "
+            f"{self.frame}"
         ]
-        for thing, reasons in (
+        for noun, reasons in (
             ("image", self.images_not_placed),
             ("point", self.points_not_placed),
         ):
-            lines += [f"{thing} {id} not placed: {why}" for id, why in reasons.items()]
+            lines += [f"{noun} {id} not placed: {why}" for id, why in reasons.items()]
         if self.left_out:
             names = list_some(self.left_out, 5, str)
             number = count(len(self.left_out), "image point")
@@ -132,19 +133,21 @@ def without_placeholders(network: Network) -> Network:
     observations, and stay.)"""
     images, points = network.images, network.points
     position, angles, X = images.position, images.angles, points.position
-    said = []
+    messages = []
     tie = points.has_role("tie")
     if tie.sum() > 1 and (X[tie] == X[tie][0]).all():
-        said.append(f"all {int(tie.sum())} tie points have one start value, {_numbers(X[tie][0])}")
+        messages.append(
+            f"all {int(tie.sum())} tie points have one start value, {_numbers(X[tie][0])}"
+        )
         X = np.where(tie[:, None], np.nan, X)
     pose = np.concatenate([position, angles], 1)
     if len(pose) > 1 and np.isnan(images.sigma).all() and (pose == pose[0]).all():
-        said.append(f"all {len(pose)} images have one start value, {_numbers(pose[0])}")
+        messages.append(f"all {len(pose)} images have one start value, {_numbers(pose[0])}")
         position, angles = np.full_like(position, np.nan), np.full_like(angles, np.nan)
-    if not said:
+    if not messages:
         return network
     computed = "; start values are computed: leave such columns empty"
-    return network.warn(*(f"{line}{computed}" for line in said)).replace(
+    return network.warn(*(f"{line}{computed}" for line in messages)).replace(
         images=dataclasses.replace(images, position=position, angles=angles),
         points=dataclasses.replace(points, position=X),
     )
@@ -170,29 +173,31 @@ def find_start_values(
     # Observations of further kinds may give start values, as satellite positions do.
     for rows in network.further:
         network = rows.begin(network)
-    seen = sights(network, tolerance)
-    model, frame = _orient(network, seen, improve and partial(improve, network), settings)
+    sighted = sights(network, tolerance)
+    model, frame = _orient(network, sighted, improve and partial(improve, network), settings)
     if not model.placed.any():
-        why = _describe_mirror(network, seen, settings) or _why_nothing(network, seen, settings)
+        why = _describe_mirror(network, sighted, settings) or _why_nothing(
+            network, sighted, settings
+        )
         raise _no_start_values(network, why)
-    found = _result(network, seen, model, frame, settings)
+    oriented = _result(network, sighted, model, frame, settings)
     # Control points that most of their rays miss grossly.
-    wrong = np.bincount(seen.point, _are_gross(seen, model, settings), seen.points)
-    rays = _rays_of(seen, model)
+    wrong = np.bincount(sighted.point, _are_gross(sighted, model, settings), sighted.points)
+    rays = _rays_of(sighted, model)
     missed = are_held(network.points, settings) & (2 * wrong > rays)
-    finding = name_contradiction(network, seen, model, settings) if missed.any() else ""
-    left = (are_controlled(network.points) & ~missed & (rays > 0)).sum()
+    finding = name_contradiction(network, sighted, model, settings) if missed.any() else ""
+    control_left = (are_controlled(network.points) & ~missed & (rays > 0)).sum()
     why = ""
-    if _control_contradicts(network, seen, model, settings):
+    if _control_contradicts(network, sighted, model, settings):
         # A datum needs three control points; with as many left the wrong ones are only excluded.
-        why = _describe_mirror(network, seen, settings) or (finding if left < 3 else "")
+        why = _describe_mirror(network, sighted, settings) or (finding if control_left < 3 else "")
     if why:
         raise _no_start_values(network, why)
-    if missed.any() and left < 3:
+    if missed.any() and control_left < 3:
         finding = name_suspects(network, missed)
     if not finding:
-        return found
-    return dataclasses.replace(found, network=found.network.warn(finding), finding=finding)
+        return oriented
+    return dataclasses.replace(oriented, network=oriented.network.warn(finding), finding=finding)
 
 
 def _no_start_values(network: Network, why: str) -> NotSolvedError:
@@ -203,21 +208,21 @@ def _no_start_values(network: Network, why: str) -> NotSolvedError:
     )
 
 
-def _rays_of(seen: Sights, model: Model) -> Int[np.ndarray, " points"]:
+def _rays_of(sighted: Sights, model: Model) -> Int[np.ndarray, " points"]:
     """Rays of every point from oriented images."""
-    return np.bincount(seen.point[model.placed[seen.image]], minlength=seen.points)
+    return np.bincount(sighted.point[model.placed[sighted.image]], minlength=sighted.points)
 
 
 def _control_contradicts(
-    network: Network, seen: Sights, model: Model, settings: StartValueSettings
+    network: Network, sighted: Sights, model: Model, settings: StartValueSettings
 ) -> bool:
     """Whether many rays miss their control points grossly, or many points have rays that do not
     intersect."""
     control = are_controlled(network.points)
-    placed = model.placed[seen.image]
-    rays = control[seen.point] & placed
-    wrong = _are_gross(seen, model, settings)
-    seen_twice = _rays_of(seen, model) > 1
+    placed = model.placed[sighted.image]
+    rays = control[sighted.point] & placed
+    wrong = _are_gross(sighted, model, settings)
+    seen_twice = _rays_of(sighted, model) > 1
     unmet = seen_twice & ~model.known
     return bool(control.any()) and bool(
         wrong[rays].sum() > settings.contradicted_share * rays.sum()
@@ -225,48 +230,48 @@ def _control_contradicts(
     )
 
 
-def _describe_mirror(network: Network, seen: Sights, settings: StartValueSettings) -> str:
+def _describe_mirror(network: Network, sighted: Sights, settings: StartValueSettings) -> str:
     """Whether a model without control fits it only as a mirror image, in words."""
-    model = _grow_from_a_pair(network, seen, Model.empty(seen), None, settings)
+    model = _grow_from_a_pair(network, sighted, Model.empty(sighted), None, settings)
     return "" if model is None else describe_mirror(network, model, settings)
 
 
 def _orient(
-    network: Network, seen: Sights, improve: Improve | None, settings: StartValueSettings
+    network: Network, sighted: Sights, improve: Improve | None, settings: StartValueSettings
 ) -> tuple[Model, str]:
     """The model of steps 1 to 4 (see above), and its frame in words."""
-    model, frame = _start_from_given(network, seen, settings), "in the frame given"
-    grow(seen, model, improve=improve, settings=settings)
+    model, frame = _start_from_given(network, sighted, settings), "in the frame given"
+    grow(sighted, model, improve=improve, settings=settings)
     if not model.placed.any():
         approximate = _with_approximate_points(network, model, settings)
-        grow(seen, approximate, improve=improve, settings=settings)
+        grow(sighted, approximate, improve=improve, settings=settings)
         model = approximate if approximate.placed.any() else model
     fixed = model.placed.any()
     while not model.placed.all():
-        part = _grow_from_a_pair(network, seen, model, improve, settings)
+        part = _grow_from_a_pair(network, sighted, model, improve, settings)
         if part is None:
             break
         # A part of its own frame and scale: images that see too few known points for a resection
         # have points in common with one oriented image, or lengths that are known.
         if model.placed.any():
-            part = join(network, seen, model, part)
+            part = join(network, sighted, model, part)
             assert part is not None, "a pair is taken only if it can be joined"
         model = part
-        grow(seen, model, improve=improve, settings=settings)
+        grow(sighted, model, improve=improve, settings=settings)
         # As soon as control is reached, it carries the rest: points that are held do not drift.
-        if not fixed and (moved := move_to_given_frame(network, seen, model)):
+        if not fixed and (in_given_frame := move_to_given_frame(network, sighted, model)):
             fixed, frame = True, "in the frame given"
-            model = _with_control(network, moved, settings)
-            grow(seen, model, improve=improve, settings=settings)
-    finish(seen, model, settings)
-    model = _place_doubtful_again(network, seen, model, improve, settings)
-    place_far_points(seen, model, settings)
+            model = _with_control(network, in_given_frame, settings)
+            grow(sighted, model, improve=improve, settings=settings)
+    finish(sighted, model, settings)
+    model = _place_doubtful_again(network, sighted, model, improve, settings)
+    place_far_points(sighted, model, settings)
     return (model, frame) if fixed else to_scale(network, model)
 
 
 def _place_doubtful_again(
     network: Network,
-    seen: Sights,
+    sighted: Sights,
     model: Model,
     improve: Improve | None,
     settings: StartValueSettings,
@@ -278,25 +283,25 @@ def _place_doubtful_again(
     # The points of an image are checked by two others.
     if placed.sum() < 3:
         return model
-    agreeing, share = _count_agreeing(seen, model)
+    agreeing, share = _count_agreeing(sighted, model)
     limit = settings.doubtful_share * np.median(share[placed])
     doubtful = placed & ~_have_poses(network) & (share < limit)
     if not doubtful.any() or (placed & ~doubtful).sum() < 2:
         return model
-    other = model.copy_without(doubtful)
-    grow(seen, other, improve=improve, settings=settings)
-    finish(seen, other, settings)
-    lost = placed & ~other.placed & ~doubtful
-    return model if lost.any() or _count_agreeing(seen, other)[0] <= agreeing else other
+    replaced = model.copy_without(doubtful)
+    grow(sighted, replaced, improve=improve, settings=settings)
+    finish(sighted, replaced, settings)
+    is_lost = placed & ~replaced.placed & ~doubtful
+    return model if is_lost.any() or _count_agreeing(sighted, replaced)[0] <= agreeing else replaced
 
 
-def _count_agreeing(seen: Sights, model: Model) -> tuple[int, Float[np.ndarray, " images"]]:
+def _count_agreeing(sighted: Sights, model: Model) -> tuple[int, Float[np.ndarray, " images"]]:
     """The number of agreeing rays; and their share of those of every placed image that belong to
     known control or to points with two rays."""
-    checked = model.control | (_rays_of(seen, model) > 1)
-    rays = model.placed[seen.image] & checked[seen.point]
-    agree = rays & (misclosures(seen, model) < seen.tolerance[seen.image])
-    number, good = (np.bincount(seen.image, r, seen.images) for r in (rays, agree))
+    checked = model.control | (_rays_of(sighted, model) > 1)
+    rays = model.placed[sighted.image] & checked[sighted.point]
+    agree = rays & (misclosures(sighted, model) < sighted.tolerance[sighted.image])
+    number, good = (np.bincount(sighted.image, r, sighted.images) for r in (rays, agree))
     return int(agree.sum()), good / np.maximum(number, 1)
 
 
@@ -306,33 +311,33 @@ def _have_poses(network: Network) -> Bool[np.ndarray, " images"]:
     return np.all(np.isfinite(np.concatenate([images.position, images.angles], 1)), axis=1)
 
 
-def _start_from_given(network: Network, seen: Sights, settings: StartValueSettings) -> Model:
+def _start_from_given(network: Network, sighted: Sights, settings: StartValueSettings) -> Model:
     """Images with all six start values, points with all three coordinates known."""
-    model, images = Model.empty(seen), network.images
-    there = _have_poses(network)
-    if there.any():
-        model.place(there, images.position[there], batched.matrices(images.angles[there]))
+    model, images = Model.empty(sighted), network.images
+    has_pose = _have_poses(network)
+    if has_pose.any():
+        model.place(has_pose, images.position[has_pose], batched.matrices(images.angles[has_pose]))
     return _with_control(network, model, settings)
 
 
 def _with_control(network: Network, model: Model, settings: StartValueSettings) -> Model:
-    held = are_held(network.points, settings)
-    X = np.where(held[:, None], network.points.position, model.X)
-    return dataclasses.replace(model, X=X, known=model.known | held, control=held)
+    is_held = are_held(network.points, settings)
+    X = np.where(is_held[:, None], network.points.position, model.X)
+    return dataclasses.replace(model, X=X, known=model.known | is_held, control=is_held)
 
 
 def _with_approximate_points(network: Network, model: Model, settings: StartValueSettings) -> Model:
     points = network.points
-    given = np.isfinite(points.position).all(1) & ~points.has_role("check")
-    given &= are_held(points, settings) | ~are_controlled(points)
-    X = np.where(given[:, None], points.position, model.X)
+    is_given = np.isfinite(points.position).all(1) & ~points.has_role("check")
+    is_given &= are_held(points, settings) | ~are_controlled(points)
+    X = np.where(is_given[:, None], points.position, model.X)
     # A copy: `grow` changes it in place, and this attempt may be discarded.
-    return dataclasses.replace(model, X=X, known=model.known | given, placed=model.placed.copy())
+    return dataclasses.replace(model, X=X, known=model.known | is_given, placed=model.placed.copy())
 
 
 def _grow_from_a_pair(
     network: Network,
-    seen: Sights,
+    sighted: Sights,
     model: Model,
     improve: Improve | None,
     settings: StartValueSettings,
@@ -341,37 +346,39 @@ def _grow_from_a_pair(
     oriented, from pairs with one of them, to a model that can be joined to theirs."""
     new, linked = ~model.placed, bool(model.placed.any())
     # Placed images that share enough points with unplaced ones.
-    of_new = np.zeros(seen.points, bool)
-    of_new[seen.point[new[seen.image]]] = True
-    shared = np.bincount(seen.image, of_new[seen.point], minlength=seen.images)
+    of_new = np.zeros(sighted.points, bool)
+    of_new[sighted.point[new[sighted.image]]] = True
+    shared = np.bincount(sighted.image, of_new[sighted.point], minlength=sighted.images)
     old = (shared >= settings.min_common_points) & model.placed
-    best, most = None, 0
-    for image, other, first, second, b in good_pairs(seen, new | old, old, linked, settings):
-        part = Model.empty(seen)
-        part.place(image, np.zeros(3), first)
-        part.place(other, b, second)
-        grow(seen, part, new | old, improve, settings)
-        rows = new[seen.image]
-        good = int((misclosures(seen, part) < seen.tolerance[seen.image])[rows].sum())
-        if good > most and not (linked and join(network, seen, model, part) is None):
-            best, most = part, good
-        if most >= settings.sufficient_share * rows.sum():
+    best, largest_number = None, 0
+    for image, partner, rotation_1, rotation_2, b in good_pairs(
+        sighted, new | old, old, linked, settings
+    ):
+        part = Model.empty(sighted)
+        part.place(image, np.zeros(3), rotation_1)
+        part.place(partner, b, rotation_2)
+        grow(sighted, part, new | old, improve, settings)
+        rows = new[sighted.image]
+        good = int((misclosures(sighted, part) < sighted.tolerance[sighted.image])[rows].sum())
+        if good > largest_number and not (linked and join(network, sighted, model, part) is None):
+            best, largest_number = part, good
+        if largest_number >= settings.sufficient_share * rows.sum():
             break
     return best
 
 
 def _result(
-    network: Network, seen: Sights, model: Model, frame: str, settings: StartValueSettings
+    network: Network, sighted: Sights, model: Model, frame: str, settings: StartValueSettings
 ) -> Oriented:
     """The network with the start values of a model, and reasons where there are none."""
     images, points = network.images, network.points
     position, angles = images.position.copy(), images.angles.copy()
     lacking = model.placed & ~np.isfinite(np.concatenate([position, angles], 1)).all(1)
     # Images with too few consistent known points.
-    gross = _are_gross(seen, model, settings)
-    of_image = lambda rows: np.bincount(seen.image, rows, minlength=seen.images)
+    gross = _are_gross(sighted, model, settings)
+    of_image = lambda rows: np.bincount(sighted.image, rows, minlength=sighted.images)
     wrong_share = 1 - settings.agreeing_share
-    disagrees = of_image(gross) > wrong_share * of_image(model.known[seen.point])
+    disagrees = of_image(gross) > wrong_share * of_image(model.known[sighted.point])
     # In the model itself: `find_start_values` counts only the images left.
     model.placed[lacking & disagrees] = False
     lacking &= model.placed
@@ -381,56 +388,63 @@ def _result(
     X = np.where(
         (model.known & ~np.isfinite(points.position).all(1))[:, None], model.X, points.position
     )
-    wrong = seen.row[gross]
+    wrong = sighted.row[gross]
     keep = model.placed
-    known = np.all(np.isfinite(X), axis=1)
-    reasons = explain_missing(network, seen, model, known, settings)
+    is_known = np.all(np.isfinite(X), axis=1)
+    reasons = explain_missing(network, sighted, model, is_known, settings)
     rays = network.observations
     network = network.replace(
         images=dataclasses.replace(images, position=position, angles=angles),
         points=dataclasses.replace(points, position=X),
         observations=rays.take(np.setdiff1d(np.arange(len(rays)), wrong)),
     )
-    network = keep_points(keep_images(network, keep), known)
+    network = keep_points(keep_images(network, keep), is_known)
     network = network.note(f"start values found, {frame}")
-    for thing, found in zip(("image", "point"), reasons):
-        network = note_missing(network, thing, found, "for which no start values were found")
+    for noun, reasons_of_missing in zip(("image", "point"), reasons):
+        network = note_missing(
+            network, noun, reasons_of_missing, "for which no start values were found"
+        )
     names = tuple(f"{points.id[rays.point[k]]} in {images.id[rays.image[k]]}" for k in wrong)
     network = record_left_out(network, "image point", names, CONTRADICTION)
     return Oriented(network, frame, *reasons, names)
 
 
 def _are_gross(
-    seen: Sights, model: Model, settings: StartValueSettings
+    sighted: Sights, model: Model, settings: StartValueSettings
 ) -> Bool[np.ndarray, " sights"]:
     """Which rays of known points in oriented images miss them grossly."""
-    return misclosures(seen, model) > settings.gross_ratio * seen.tolerance[seen.image]
+    return misclosures(sighted, model) > settings.gross_ratio * sighted.tolerance[sighted.image]
 
 
-def _why_nothing(network: Network, seen: Sights, settings: StartValueSettings) -> str:
+def _why_nothing(network: Network, sighted: Sights, settings: StartValueSettings) -> str:
     """What is lacking if no image could be oriented."""
     fewest = settings.min_common_points
-    known = are_controlled(network.points)
-    control = np.bincount(seen.image, known[seen.point], minlength=seen.images)
+    is_known = are_controlled(network.points)
+    control = np.bincount(sighted.image, is_known[sighted.point], minlength=sighted.images)
     best = int(control.argmax())
     begin = (
         f"no image sees {settings.min_points} control points that agree ({int(control[best])} in "
         f"{network.images.id[best]!r} at most), and "
     )
-    one, other, most = 0, 0, 0
-    pairs, number = all_pairs(seen, np.ones(seen.images, bool))
+    image_a, image_b, largest_number = 0, 0, 0
+    pairs, number = all_pairs(sighted, np.ones(sighted.images, bool))
     if len(number):
-        most = int(number.max())
-        one, other = pairs[number.argmax()]
-    if most < fewest:
-        pair = f" ({network.images.id[one]!r}, {network.images.id[other]!r})" if most else ""
+        largest_number = int(number.max())
+        image_a, image_b = pairs[number.argmax()]
+    if largest_number < fewest:
+        pair = (
+            f" ({network.images.id[image_a]!r}, {network.images.id[image_b]!r})"
+            if largest_number
+            else ""
+        )
         return (
             f"{begin}no two images have the {fewest} points in common that a relative "
-            f"orientation needs: {most} at most{pair}; measure more points in the same images, or "
+            f"orientation needs: {largest_number} at most{pair}; measure more points in the same "
+            "images, or "
             "give start values"
         )
     return (
-        f"{begin}no two images share {fewest} points whose rays meet at an angle ({most} "
+        f"{begin}no two images share {fewest} points whose rays meet at an angle ({largest_number} "
         "points in common at most): take images from different positions, look for wrong point "
         "numbers, or give start values"
     )

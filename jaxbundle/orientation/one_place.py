@@ -25,15 +25,15 @@ MAX_SIGMA_RATIO = 3.0
 def name_one_place(network: Network) -> str:
     """Which images were taken from one place, in words; empty if they were not, or if there are
     images from other places."""
-    seen = sights(network)
-    number = np.bincount(seen.image, minlength=seen.images)
+    sighted = sights(network)
+    number = np.bincount(sighted.image, minlength=sighted.images)
     base = int(number.argmax())
     # Two hundred images that differ from the first by a rotation only are from one place, however
     # many follow; the message then names all images.
-    others = [image for image in np.flatnonzero(number).tolist() if image != base][:200]
-    if not others or not all(_is_rotation(seen, base, image) for image in others):
+    other_images = [image for image in np.flatnonzero(number).tolist() if image != base][:200]
+    if not other_images or not all(_is_rotation(sighted, base, image) for image in other_images):
         return ""
-    names = [network.images.id[image] for image in sorted([base, *others])]
+    names = [network.images.id[image] for image in sorted([base, *other_images])]
     return (
         f"images {list_some(names)} were taken from one place, as far as their measurements show: "
         "a rotation alone maps one to the other, and points have no depth; add images from other "
@@ -41,20 +41,20 @@ def name_one_place(network: Network) -> str:
     )
 
 
-def _is_rotation(seen: Sights, first: int, second: int) -> bool:
+def _is_rotation(sighted: Sights, image_a: int, image_b: int) -> bool:
     """Whether a rotation maps the rays of an image to those of another."""
-    a, b = seen.rows_of(first), seen.rows_of(second)
-    _, k, l = np.intersect1d(seen.point[a], seen.point[b], return_indices=True)
+    a, b = sighted.rows_of(image_a), sighted.rows_of(image_b)
+    _, k, l = np.intersect1d(sighted.point[a], sighted.point[b], return_indices=True)
     if len(k) < 5:  # a rotation has 3 parameters, five points 10 coordinates
         return False
-    noise = np.sqrt(2 * (seen.sigma[a][k] ** 2 + seen.sigma[b][l] ** 2))
-    rays = [seen.ray[a][k], seen.ray[b][l]]
+    noise = np.sqrt(2 * (sighted.sigma[a][k] ** 2 + sighted.sigma[b][l] ** 2))
+    rays = [sighted.ray[a][k], sighted.ray[b][l]]
     if min(map(_field, rays)) ** 3 < MAX_SIGMA_RATIO * np.median(noise):
         return False
     U, _, V = np.linalg.svd(rays[0].T @ rays[1])
     turn = U @ np.diag([1, 1, np.linalg.det(U @ V)]) @ V
-    off = np.linalg.norm(rays[0] @ turn - rays[1], axis=1)
-    return bool(np.median(off / noise) < MAX_SIGMA_RATIO)
+    difference = np.linalg.norm(rays[0] @ turn - rays[1], axis=1)
+    return bool(np.median(difference / noise) < MAX_SIGMA_RATIO)
 
 
 def _field(rays: Float[np.ndarray, "n 3"]) -> float:

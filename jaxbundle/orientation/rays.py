@@ -57,8 +57,8 @@ class Sights:
 
     def rows_of(self, image: Index) -> slice:
         """The rows of an image."""
-        first, last = np.searchsorted(self.image, [int(image), int(image) + 1])
-        return slice(first, last)
+        begin, end = np.searchsorted(self.image, [int(image), int(image) + 1])
+        return slice(begin, end)
 
 
 def sights(network: Network, tolerance: float = TOLERANCE) -> Sights:
@@ -77,10 +77,10 @@ def sights(network: Network, tolerance: float = TOLERANCE) -> Sights:
         for interfaces in network.further:
             if isinstance(interfaces, Interfaces):
                 d[rows] = interfaces.directions(camera.id, d[rows])
-        away = np.arctan2(np.hypot(d[rows, 0], d[rows, 1]), -d[rows, 2])
+        off_axis = np.arctan2(np.hypot(d[rows, 0], d[rows, 1]), -d[rows, 2])
         # The 95 % quantile: a few image points far outside are blunders, not the extent.
-        if np.isfinite(away).any():
-            extent[images.camera == c] = np.nanquantile(away, 0.95)
+        if np.isfinite(off_axis).any():
+            extent[images.camera == c] = np.nanquantile(off_axis, 0.95)
     rows = np.flatnonzero(np.isfinite(d).all(1))
     rows = rows[np.argsort(rays.image[rows], kind="stable")]
     return Sights(
@@ -100,15 +100,15 @@ def rays_of(
     """Unit rays in the camera frame of points measured in the unit and axes of the camera's model,
     NaN outside its range; and the σ of their directions, RMS of both axes, radians."""
     model = get_model(camera.model)
-    given = {**default_parameters(model), **camera.parameters}
-    p = np.array([given[name] for name in model.parameters])
+    parameters = {**default_parameters(model), **camera.parameters}
+    p = np.array([parameters[name] for name in model.parameters])
     # In batches of one size, so that one program serves all networks. Larger ones make small
     # networks wait for rays they do not have, smaller ones cost calls.
     batch = 4096
     batches = -(-len(xy) // batch)
     fill = lambda a: np.resize(a, (batches * batch, 2)).reshape(batches, batch, 2)
-    found = [_rays_of_batch(model, p, *parts) for parts in zip(fill(xy), fill(sigma))]
-    d, noise = (np.concatenate([np.asarray(part[k]) for part in found]) for k in (0, 1))
+    rays_by_batch = [_rays_of_batch(model, p, *parts) for parts in zip(fill(xy), fill(sigma))]
+    d, noise = (np.concatenate([np.asarray(part[k]) for part in rays_by_batch]) for k in (0, 1))
     return d[: len(xy)], noise[: len(xy)]
 
 
@@ -129,17 +129,19 @@ def in_plane(
         return np.eye(3), _in_plane(rays)
     axis = -rays.mean(0)
     # The rotation that takes the axis to z; about x or y, whichever is farther from it.
-    other = np.eye(3)[np.argmin(np.abs(axis[:2]))]
+    helper_axis = np.eye(3)[np.argmin(np.abs(axis[:2]))]
     z = axis / np.linalg.norm(axis)
-    x = other - (other @ z) * z
+    x = helper_axis - (helper_axis @ z) * z
     x /= np.linalg.norm(x)
     R = np.stack([x, np.cross(z, x), z])
     return R, _in_plane(rays @ R.T)
 
 
 def _in_plane(ray: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
-    there = -ray[:, 2] > MIN_COSINE
-    return np.where(there[:, None], ray[:, :2] / np.where(there, -ray[:, 2], 1.0)[:, None], np.nan)
+    is_in_front = -ray[:, 2] > MIN_COSINE
+    return np.where(
+        is_in_front[:, None], ray[:, :2] / np.where(is_in_front, -ray[:, 2], 1.0)[:, None], np.nan
+    )
 
 
 @partial(compile_once, static=0)
@@ -156,7 +158,7 @@ def _rays_of_batch(
     ) -> tuple[Float[Array, "3"], Float[Array, ""]]:
         d = ray(*xy)
         # σ is small beside the image: the rays one σ away are as good as a derivative.
-        moved = jnp.stack([ray(xy[0] + sigma[0], xy[1]), ray(xy[0], xy[1] + sigma[1])])
-        return d, jnp.sqrt(jnp.sum((moved - d) ** 2) / 2)
+        shifted = jnp.stack([ray(xy[0] + sigma[0], xy[1]), ray(xy[0], xy[1] + sigma[1])])
+        return d, jnp.sqrt(jnp.sum((shifted - d) ** 2) / 2)
 
     return jax.vmap(ray_and_sigma)(xy, sigma)

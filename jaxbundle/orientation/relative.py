@@ -92,8 +92,8 @@ def relative_orientation(
         E = jnp.concatenate([E, five_solutions(*points)[0]])
     M, b = (a.reshape(-1, *a.shape[2:]) for a in jax.vmap(orientations)(E))
     data = (xy1, xy2, jnp.sqrt(p))
-    chosen, score = _refine_best(M, b, stop_gradient(data), p)
-    fit = finish(coplanarity_misclosures, retract, chosen, data, 5)
+    best_candidate, score = _refine_best(M, b, stop_gradient(data), p)
+    fit = finish(coplanarity_misclosures, retract, best_candidate, data, 5)
     M, b = fit.estimate
     front = _in_front((M, b), xy1, xy2, p)
     vtpv = stop_gradient(fit.vtpv)
@@ -131,10 +131,10 @@ def distances_along_rays(
     """(s₁, s₂) of the nearest points s₁·a₁ and b + s₂·Mᵀ·a₂ of two rays; positive: in front."""
     a1, a2 = _rays(xy1, xy2)
     a2, base = rotate_back(rows_of_matrix(M), a2), unpack(b)
-    aa, cc, both = dot(a1, a1), dot(a2, a2), dot(a1, a2)
-    first, second = dot(base, a1), dot(base, a2)
-    determinant = aa * cc - both * both
-    s = jnp.stack([cc * first - both * second, both * first - aa * second])
+    aa, cc, a_c = dot(a1, a1), dot(a2, a2), dot(a1, a2)
+    b_a, b_c = dot(base, a1), dot(base, a2)
+    determinant = aa * cc - a_c * a_c
+    s = jnp.stack([cc * b_a - a_c * b_c, a_c * b_a - aa * b_c])
     return s / jnp.where(determinant > 0, determinant, 1)
 
 
@@ -163,11 +163,11 @@ def _refine_best(
         value = (square / jnp.sum(p) + ROUNDING_VARIANCE) * (1 + 100 * behind)
         return jnp.where(jnp.isfinite(value), value, jnp.inf)
 
-    first = lambda M, b: score((M, b), jnp.sum(coplanarity_misclosures((M, b), *data) ** 2))
+    first_score = lambda M, b: score((M, b), jnp.sum(coplanarity_misclosures((M, b), *data) ** 2))
     # Of up to 44 candidates. Of 400 pairs of images with eight points and noise of 1e-3, 3 % ended
     # above the best vᵀPv by more than 1 % with two, 2 % with four, 0.7 % with eight, which cost
     # twice the time; of a nearly flat object 6, 1.5 and 0.5 %.
-    _, best = jax.lax.top_k(-jax.vmap(first)(M, b), 4)
+    _, best = jax.lax.top_k(-jax.vmap(first_score)(M, b), 4)
     refine = lambda M, b: minimise(coplanarity_misclosures, retract, (M, b), data, 5)
     refined, squares = jax.vmap(refine)(M[best], b[best])
     scores = jax.vmap(score)(refined, squares)
@@ -175,10 +175,10 @@ def _refine_best(
     return jax.tree.map(lambda a: a[k], refined), scores[k]
 
 
-def _after(done: Float[AnyArray, "..."], arrays: PyTree) -> PyTree:
-    """The arrays, which wait for `done`: adds zero. Decompositions that run side by side can hang
-    jaxlib 0.10 on two cores; a barrier does not order them."""
-    nothing = jnp.where(jnp.sum(done) > 1e300, 1.0, 0.0)
+def _after(waited_for: Float[AnyArray, "..."], arrays: PyTree) -> PyTree:
+    """The arrays, which wait for `waited_for`: adds zero. Decompositions that run side by side can
+    hang jaxlib 0.10 on two cores; a barrier does not order them."""
+    nothing = jnp.where(jnp.sum(waited_for) > 1e300, 1.0, 0.0)
     return jax.tree.map(lambda a: a + nothing, arrays)
 
 
@@ -204,9 +204,9 @@ def retract(pair: Motion, delta: Float[AnyArray, "5"]) -> Motion:
 def _across(b: Float[AnyArray, "3"]) -> Float[Array, "2 3"]:
     """Two unit vectors perpendicular to b, of length 1, and to one another."""
     axis = jnp.eye(3, dtype=b.dtype)[jnp.argmin(jnp.abs(stop_gradient(b)))]
-    first = jnp.cross(b, axis)
-    first = first / jnp.linalg.norm(first)
-    return jnp.stack([first, jnp.cross(b, first)])
+    axis_1 = jnp.cross(b, axis)
+    axis_1 = axis_1 / jnp.linalg.norm(axis_1)
+    return jnp.stack([axis_1, jnp.cross(b, axis_1)])
 
 
 def _in_front(
@@ -239,8 +239,8 @@ def _find_simpler(
     def variance_of(computed: Float[AnyArray, "n 2"], unknowns: int) -> Float[Array, ""]:
         """The differences contain the errors of both images: twice the variance."""
         redundancy = 2 * n - unknowns
-        spread = jnp.sum(p[:, None] * (computed - xy2) ** 2)
-        variance = spread / (2 * jnp.where(redundancy > 0, redundancy, 1))
+        sum_of_squares = jnp.sum(p[:, None] * (computed - xy2) ** 2)
+        variance = sum_of_squares / (2 * jnp.where(redundancy > 0, redundancy, 1))
         return jnp.where(redundancy > 0, variance, jnp.inf)
 
     rotation, plane = variance_of(by_rotation, 3), variance_of(by_plane, 8)

@@ -50,9 +50,11 @@ def resection(
     more), `BEHIND_THE_CAMERA`. The cofactors of a centre near it show this.
     """
     p = ones_unless(weights, xy)
-    chosen = wide_triangle(xy, p)
+    three_rows = wide_triangle(xy, p)
     # With noise, the pose nearest to a solution may be all there is, and a good start.
-    starts, _ = three_points(jax.vmap(ray_of)(stop_gradient(xy[chosen])), stop_gradient(X[chosen]))
+    starts, _ = three_points(
+        jax.vmap(ray_of)(stop_gradient(xy[three_rows])), stop_gradient(X[three_rows])
+    )
     data = (xy, X, jnp.sqrt(p))
     refine = lambda start: minimise(_misclosures, retract_pose, start, data, 6)
     poses, squares = jax.vmap(refine)(starts)
@@ -94,12 +96,12 @@ def refine_resection(
 def wide_triangle(xy: Float[AnyArray, "n 2"], weights: Float[AnyArray, " n"]) -> Int[Array, "3"]:
     """Three of the points of weight > 0, far apart: outermost, farthest from it, largest area."""
     xy = stop_gradient(xy)
-    most = lambda value: jnp.argmax(jnp.where(weights > 0, value, -1.0))
+    row_of_largest = lambda value: jnp.argmax(jnp.where(weights > 0, value, -1.0))
     distance = lambda point: jnp.sum((xy - point) ** 2, 1)
-    i = most(distance(normalisation(xy, weights)[0]))
-    j = most(distance(xy[i]))
-    along, across = xy[j] - xy[i], xy - xy[i]
-    k = most(jnp.abs(along[0] * across[:, 1] - along[1] * across[:, 0]))
+    i = row_of_largest(distance(normalisation(xy, weights)[0]))
+    j = row_of_largest(distance(xy[i]))
+    side, from_corner = xy[j] - xy[i], xy - xy[i]
+    k = row_of_largest(jnp.abs(side[0] * from_corner[:, 1] - side[1] * from_corner[:, 0]))
     return jnp.stack([i, j, k])
 
 

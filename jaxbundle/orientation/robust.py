@@ -90,8 +90,8 @@ def consensus(
     n = present.shape[0]
     draws = jax.random.uniform(key, (samples, n))
     # The `size` largest of uniform numbers: a sample without repetition; absent ones come last.
-    _, chosen = jax.lax.top_k(jnp.where(present, draws, -1), size)
-    models, valid = jax.vmap(lambda k: solve(*(a[k] for a in data)))(chosen)
+    _, sample_rows = jax.lax.top_k(jnp.where(present, draws, -1), size)
+    models, valid = jax.vmap(lambda k: solve(*(a[k] for a in data)))(sample_rows)
     models = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), models)
 
     def score(model: PyTree, valid: Bool[Array, ""]) -> Float[Array, ""]:
@@ -144,14 +144,14 @@ def robust_resection(
         return jnp.where(q < 0, e, IMPOSSIBLE_ERROR)
 
     solve = lambda xy, X: three_points(jax.vmap(ray_of)(xy), X)
-    found = consensus(key, solve, errors, (xy, X), 3, samples, threshold, p)
-    pose, good = found.model, found.inliers
+    consensus_model = consensus(key, solve, errors, (xy, X), 3, samples, threshold, p)
+    pose, good = consensus_model.model, consensus_model.inliers
 
     def adjust(pose: CameraPose, good: Bool[AnyArray, " n"]) -> tuple[Resection, Bool[Array, " n"]]:
-        found = refine_resection(pose, xy, X, p * good)
-        return found, _are_good(errors(found.pose, xy, X), p > 0, 3, threshold)
+        consensus_model = refine_resection(pose, xy, X, p * good)
+        return consensus_model, _are_good(errors(consensus_model.pose, xy, X), p > 0, 3, threshold)
 
-    return _repeat(adjust, good, pose, lambda found: found.pose)
+    return _repeat(adjust, good, pose, lambda consensus_model: consensus_model.pose)
 
 
 def robust_relative_orientation(
@@ -184,14 +184,16 @@ def robust_relative_orientation(
 
         def in_front(E: Float[Array, "3 3"]) -> tuple[Array, Array]:
             pairs = orientations(E)
-            along = lambda M, b: jax.vmap(distances_along_rays, (None, None, 0, 0))(M, b, xy1, xy2)
-            best = jnp.argmax(jnp.sum(jax.vmap(along)(*pairs) > 0, (1, 2)))
+            distances = lambda M, b: jax.vmap(distances_along_rays, (None, None, 0, 0))(
+                M, b, xy1, xy2
+            )
+            best = jnp.argmax(jnp.sum(jax.vmap(distances)(*pairs) > 0, (1, 2)))
             return jax.tree.map(lambda a: a[best], pairs)
 
         E, valid = five_solutions(xy1, xy2)
         return jax.vmap(in_front)(E), valid
 
-    found = consensus(key, solve, errors, (xy1, xy2), 5, samples, threshold, p)
+    consensus_model = consensus(key, solve, errors, (xy1, xy2), 5, samples, threshold, p)
 
     def adjust(
         _: None, good: Bool[AnyArray, " n"]
@@ -199,7 +201,7 @@ def robust_relative_orientation(
         result = relative_orientation(xy1, xy2, p * good)
         return result, _are_good(errors((result.M, result.b), xy1, xy2), p > 0, 5, threshold)
 
-    return _repeat(adjust, found.inliers)
+    return _repeat(adjust, consensus_model.inliers)
 
 
 def robust_homography(
@@ -216,11 +218,11 @@ def robust_homography(
     """
 
     def errors(
-        found: tuple[Array, Array],
+        matrices: tuple[Array, Array],
         source: Float[AnyArray, "n 2"],
         target: Float[AnyArray, "n 2"],
     ) -> Float[Array, " n"]:
-        image = jax.vmap(apply_homography, (None, 0))(found[0], source)
+        image = jax.vmap(apply_homography, (None, 0))(matrices[0], source)
         return jnp.linalg.norm(image - target, axis=1)
 
     data = (source, target)
@@ -241,12 +243,12 @@ def robust_absolute_orientation(
     """
 
     def errors(
-        found: AbsoluteOrientation,
+        absolute: AbsoluteOrientation,
         source: Float[AnyArray, "n 3"],
         target: Float[AnyArray, "n 3"],
     ) -> Float[Array, " n"]:
-        moved = jax.vmap(transform_point, (None, 0))(found.tau, source)
-        return jnp.linalg.norm(moved - target, axis=1)
+        transformed = jax.vmap(transform_point, (None, 0))(absolute.tau, source)
+        return jnp.linalg.norm(transformed - target, axis=1)
 
     data = (source, target)
     return _robust_weighted(key, absolute_orientation, errors, data, weights, 3, samples, threshold)
@@ -267,9 +269,9 @@ def robust_direct_linear_transformation(
     """
 
     def errors(
-        found: tuple[Array, Array], xy: Float[AnyArray, "n 2"], X: Float[AnyArray, "n 3"]
+        solution: tuple[Array, Array], xy: Float[AnyArray, "n 2"], X: Float[AnyArray, "n 3"]
     ) -> Float[Array, " n"]:
-        x, y, w = found[0] @ jnp.pad(X, ((0, 0), (0, 1)), constant_values=1).T
+        x, y, w = solution[0] @ jnp.pad(X, ((0, 0), (0, 1)), constant_values=1).T
         return jnp.where(w > 0, jnp.hypot(x / w - xy[:, 0], y / w - xy[:, 1]), IMPOSSIBLE_ERROR)
 
     solve = direct_linear_transformation
@@ -290,12 +292,12 @@ def robust_intersection(
     """
 
     def errors(
-        found: Intersection, X0: Float[AnyArray, "n 3"], rays: Float[AnyArray, "n 3"]
+        intersected: Intersection, X0: Float[AnyArray, "n 3"], rays: Float[AnyArray, "n 3"]
     ) -> Float[Array, " n"]:
-        d = found.X - X0
-        along = jnp.sum(d * rays, 1)
-        angle = jnp.arctan2(jnp.linalg.norm(jnp.cross(d, rays), axis=1), along)
-        return jnp.where(along > 0, angle, IMPOSSIBLE_ERROR)
+        d = intersected.X - X0
+        depth = jnp.sum(d * rays, 1)
+        angle = jnp.arctan2(jnp.linalg.norm(jnp.cross(d, rays), axis=1), depth)
+        return jnp.where(depth > 0, angle, IMPOSSIBLE_ERROR)
 
     return _robust_weighted(key, intersection, errors, (X0, rays), weights, 2, samples, threshold)
 
@@ -314,16 +316,16 @@ def _robust_weighted(
     p = ones_unless(weights, data[0])
 
     def solve_sample(*sample: AnyArray) -> tuple[PyTree, Bool[Array, "1"]]:
-        found = solve(*sample)
-        status = found[1] if isinstance(found, tuple) else found.status
-        models = jax.tree.map(lambda a: jnp.asarray(a)[None], found)
+        solution = solve(*sample)
+        status = solution[1] if isinstance(solution, tuple) else solution.status
+        models = jax.tree.map(lambda a: jnp.asarray(a)[None], solution)
         return models, (status == int(Status.SOUND))[None]
 
     good = consensus(key, solve_sample, errors, data, size, samples, threshold, p).inliers
 
     def adjust(_: None, good: Bool[AnyArray, " n"]) -> tuple[PyTree, Bool[Array, " n"]]:
-        found = solve(*data, p * good)
-        return found, _are_good(errors(found, *data), p > 0, size, threshold)
+        solution = solve(*data, p * good)
+        return solution, _are_good(errors(solution, *data), p > 0, size, threshold)
 
     return _repeat(adjust, good)
 
@@ -344,14 +346,14 @@ def _repeat(
         state: tuple[PyTree, Bool[AnyArray, " n"]], _: None
     ) -> tuple[tuple[PyTree, Bool[Array, " n"]], tuple[Any, Bool[AnyArray, " n"]]]:
         model, good = state
-        found, better = adjust(model, good)
-        return (model_of(found), better), (found, good)
+        models_and_good, better = adjust(model, good)
+        return (model_of(models_and_good), better), (models_and_good, good)
 
     # Of 100 resections of 30 points with 35 % of gross errors, without a round 1 % of the good
     # points were missed; one, three and six gave the same points. Three are for the few that move
     # on.
-    _, found = jax.lax.scan(choose_again, (model, good), length=3 + 1)
-    return jax.tree.map(lambda rounds: rounds[-1], found)
+    _, models_and_good = jax.lax.scan(choose_again, (model, good), length=3 + 1)
+    return jax.tree.map(lambda rounds: rounds[-1], models_and_good)
 
 
 def _are_good(

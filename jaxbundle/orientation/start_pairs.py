@@ -16,7 +16,7 @@ from jaxbundle.types import Index
 
 
 def good_pairs(
-    seen: Sights,
+    sighted: Sights,
     candidates: Bool[np.ndarray, " images"],
     old: Bool[np.ndarray, " images"],
     linked: bool,
@@ -32,16 +32,20 @@ def good_pairs(
 ]:
     """Pairs, the rotations of both and the base between them, the most promising first; `linked`:
     of an old image and another."""
-    pairs, common = _pairs_in_common(seen, candidates, old, linked, settings)
+    pairs, common = _pairs_in_common(sighted, candidates, old, linked, settings)
     if not len(pairs):
         return
-    turned = [_common_points(seen, *pair) for pair in pairs]
-    enough = [len(xy) >= settings.min_common_points for *_, xy, _ in turned]
-    turned, pairs, common = list(itertools.compress(turned, enough)), pairs[enough], common[enough]
-    if not turned:
+    common_points = [_common_points(sighted, *pair) for pair in pairs]
+    has_enough = [len(xy) >= settings.min_common_points for *_, xy, _ in common_points]
+    common_points, pairs, common = (
+        list(itertools.compress(common_points, has_enough)),
+        pairs[has_enough],
+        common[has_enough],
+    )
+    if not common_points:
         return
-    R, Q, xy, other_xy = zip(*turned)
-    tolerance = seen.tolerance[pairs].mean(1)
+    R, Q, xy, other_xy = zip(*common_points)
+    tolerance = sighted.tolerance[pairs].mean(1)
     M, b, share, angle = batched.orient_pairs(xy, other_xy, tolerance)
     # 1/σ of the depth of a pair: with the root of the number of points and with the angle. Beyond
     # `good_angle` images differ so much that many points are seen in one only.
@@ -52,7 +56,7 @@ def good_pairs(
 
 
 def _pairs_in_common(
-    seen: Sights,
+    sighted: Sights,
     candidates: Bool[np.ndarray, " images"],
     old: Bool[np.ndarray, " images"],
     linked: bool,
@@ -60,7 +64,7 @@ def _pairs_in_common(
 ) -> tuple[Int[np.ndarray, "pairs 2"], Int[np.ndarray, " pairs"]]:
     """Up to `max_pairs` pairs of images, and the number of their points: those with the most, and
     others with enough points and wider bases."""
-    pairs, number = all_pairs(seen, candidates)
+    pairs, number = all_pairs(sighted, candidates)
     use = (number >= settings.min_common_points) & (
         (old[pairs[:, 0]] != old[pairs[:, 1]]) | (not linked)
     )
@@ -69,29 +73,29 @@ def _pairs_in_common(
     # The pairs with the most points often have the shortest bases. So half of the pairs are spread
     # over all that have 0.3 of the most points: with 60 % overlap along a strip, the next image but
     # one still has 0.33 of the points of the next (20 % of the format beside 60 %).
-    enough = order[number[order] >= 0.3 * number.max(initial=0)]
-    half = settings.max_pairs // 2
-    spread = batched.spread(len(enough), settings.max_pairs - half)
-    chosen = np.unique(np.concatenate([order[:half], enough[spread]]))
-    return pairs[chosen], number[chosen]
+    sufficient = order[number[order] >= 0.3 * number.max(initial=0)]
+    half_number = settings.max_pairs // 2
+    spread_rows = batched.spread(len(sufficient), settings.max_pairs - half_number)
+    chosen_pairs = np.unique(np.concatenate([order[:half_number], sufficient[spread_rows]]))
+    return pairs[chosen_pairs], number[chosen_pairs]
 
 
 def all_pairs(
-    seen: Sights, candidates: Bool[np.ndarray, " images"]
+    sighted: Sights, candidates: Bool[np.ndarray, " images"]
 ) -> tuple[Int[np.ndarray, "pairs 2"], Int[np.ndarray, " pairs"]]:
     """Pairs of these images that share points [pairs, 2], and how many."""
     from scipy.sparse import coo_array, triu
 
-    rows = candidates[seen.image]
-    shape = (seen.images, seen.points)
-    sees = coo_array((np.ones(rows.sum(), int), (seen.image[rows], seen.point[rows])), shape)
+    rows = candidates[sighted.image]
+    shape = (sighted.images, sighted.points)
+    sees = coo_array((np.ones(rows.sum(), int), (sighted.image[rows], sighted.point[rows])), shape)
     sees = sees.tocsr()
     common = triu(sees @ sees.T, k=1)
     return np.stack([common.row, common.col], 1), common.data
 
 
 def _common_points(
-    seen: Sights, image: Index, other: Index
+    sighted: Sights, image: Index, partner: Index
 ) -> tuple[
     Float[np.ndarray, "3 3"],
     Float[np.ndarray, "3 3"],
@@ -99,8 +103,8 @@ def _common_points(
     Float[np.ndarray, "common 2"],
 ]:
     """The common points of two images: of each the rotation and the coordinates of `in_plane`."""
-    one, two = seen.rows_of(image), seen.rows_of(other)
-    _, k, l = np.intersect1d(seen.point[one], seen.point[two], return_indices=True)
-    (R, xy), (Q, other_xy) = in_plane(seen.ray[one][k]), in_plane(seen.ray[two][l])
-    there = np.isfinite(xy).all(1) & np.isfinite(other_xy).all(1)
-    return R, Q, xy[there], other_xy[there]
+    rows_1, rows_2 = sighted.rows_of(image), sighted.rows_of(partner)
+    _, k, l = np.intersect1d(sighted.point[rows_1], sighted.point[rows_2], return_indices=True)
+    (R, xy), (Q, other_xy) = in_plane(sighted.ray[rows_1][k]), in_plane(sighted.ray[rows_2][l])
+    is_finite = np.isfinite(xy).all(1) & np.isfinite(other_xy).all(1)
+    return R, Q, xy[is_finite], other_xy[is_finite]

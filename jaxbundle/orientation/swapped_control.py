@@ -28,7 +28,7 @@ MAX_POINTS_FOR_TRIALS = 12
 
 def name_contradiction(
     network: Network,
-    seen: Sights | None = None,
+    sighted: Sights | None = None,
     model: Model | None = None,
     settings: StartValueSettings = DEFAULTS,
 ) -> str:
@@ -36,36 +36,42 @@ def name_contradiction(
     none do, or if no swap and no single point explains it.
 
     `model`: images oriented in any frame; default: those of the start values."""
-    seen = sights(network) if seen is None else seen
+    sighted = sights(network) if sighted is None else sighted
     points = network.points
     # The points determined by the images alone.
-    alone = Model.empty(seen)
+    images_alone = Model.empty(sighted)
     if model is not None:
-        alone.place(model.placed, model.X0[model.placed], model.M[model.placed])
+        images_alone.place(model.placed, model.X0[model.placed], model.M[model.placed])
     else:
         images = network.images
-        there = np.all(np.isfinite(np.concatenate([images.position, images.angles], 1)), axis=1)
-        if there.any():
-            alone.place(there, images.position[there], batched.matrices(images.angles[there]))
-    intersect(seen, alone, START_VALUE_LIMITS)
-    control = np.flatnonzero(are_controlled(points) & alone.known)
-    found = contradiction(
-        alone.X[control], points.position[control], points.sigma[control], settings
+        has_pose = np.all(np.isfinite(np.concatenate([images.position, images.angles], 1)), axis=1)
+        if has_pose.any():
+            images_alone.place(
+                has_pose, images.position[has_pose], batched.matrices(images.angles[has_pose])
+            )
+    intersect(sighted, images_alone, START_VALUE_LIMITS)
+    control = np.flatnonzero(are_controlled(points) & images_alone.known)
+    contradiction_found = contradiction(
+        images_alone.X[control], points.position[control], points.sigma[control], settings
     )
-    if found is None:
+    if contradiction_found is None:
         return ""
     ids, unit = [points.id[p] for p in control], network.object_unit
-    causes = [f"{ids[i]!r} and {ids[j]!r} are exchanged" for i, j in found.exchanges]
-    causes += [f"the coordinates or the number of {ids[k]!r} are wrong" for k in found.wrong]
-    shown = [*causes[:5], *(["…"] if len(causes) > 5 else [])]
-    begin = f"the {len(ids)} {CONTRADICTORY_CONTROL} by {found.before:.2g} {unit}"
-    if found.together or len(causes) == 1:
+    causes = [f"{ids[i]!r} and {ids[j]!r} are exchanged" for i, j in contradiction_found.exchanges]
+    causes += [
+        f"the coordinates or the number of {ids[k]!r} are wrong" for k in contradiction_found.wrong
+    ]
+    shown_causes = [*causes[:5], *(["…"] if len(causes) > 5 else [])]
+    begin = f"the {len(ids)} {CONTRADICTORY_CONTROL} by {contradiction_found.before:.2g} {unit}"
+    if contradiction_found.together or len(causes) == 1:
         return (
-            f"{begin}, and fit to {found.after:.2g} {unit} if {' and '.join(shown)}: correct the "
+            f"{begin}, and fit to {contradiction_found.after:.2g} {unit} if "
+            f"{' and '.join(shown_causes)}: correct the "
             "control points, or the numbers in the image points"
         )
     return (
-        f"{begin}, and fit to {found.after:.2g} {unit} if {', or if '.join(shown)}; with so few "
+        f"{begin}, and fit to {contradiction_found.after:.2g} {unit} if "
+        f"{', or if '.join(shown_causes)}; with so few "
         "points more than one explanation is possible: look at the images"
     )
 
@@ -111,13 +117,13 @@ def contradiction(
     # 99.9 % quantile of χ² with three degrees of freedom is 4.03).
     extent = np.ptp(target, axis=0).max()
     tolerance = float(np.hypot(extent / settings.extent_to_misfit, 4 * largest))
-    off = _misfits(source, target, np.ones(n, bool))
-    if off is None or off.max() < tolerance:
+    misfit = _misfits(source, target, np.ones(n, bool))
+    if misfit is None or misfit.max() < tolerance:
         return None
     good = _agreeing(source, target, tolerance)
     if good.sum() >= max(MIN_AGREEING, n / 2):
-        return _by_majority(source, target, good, tolerance, off.max())
-    return _by_trial(source, target, tolerance, off.max())
+        return _by_majority(source, target, good, tolerance, misfit.max())
+    return _by_trial(source, target, tolerance, misfit.max())
 
 
 def _by_majority(
@@ -125,31 +131,33 @@ def _by_majority(
     target: Float[np.ndarray, "n 3"],
     good: Bool[np.ndarray, " n"],
     tolerance: float,
-    before: float,
+    largest_misfit: float,
 ) -> Contradiction | None:
     """Two of the points outside the largest consistent group are exchanged if both fit when
     swapped; the others are wrong."""
-    found = batched.similarity(source, target, good.astype(float))
-    if found is None:
+    transformation = batched.similarity(source, target, good.astype(float))
+    if transformation is None:
         return None
-    A, t = found
-    moved, suspects = source @ A.T + t, set(np.flatnonzero(~good).tolist())
-    off = [np.linalg.norm(moved - target, axis=1)[good].max()]
+    A, t = transformation
+    transformed, suspects = source @ A.T + t, set(np.flatnonzero(~good).tolist())
+    misfits = [np.linalg.norm(transformed - target, axis=1)[good].max()]
     exchanges = []
     for i, j in itertools.combinations(sorted(suspects), 2):
-        miss = max(np.linalg.norm(moved[i] - target[j]), np.linalg.norm(moved[j] - target[i]))
+        miss = max(
+            np.linalg.norm(transformed[i] - target[j]), np.linalg.norm(transformed[j] - target[i])
+        )
         if miss < tolerance and {i, j} <= suspects:
             exchanges.append((i, j))
             suspects -= {i, j}
-            off.append(miss)
-    return Contradiction(before, max(off), exchanges, sorted(suspects), together=True)
+            misfits.append(miss)
+    return Contradiction(largest_misfit, max(misfits), exchanges, sorted(suspects), together=True)
 
 
 def _by_trial(
     source: Float[np.ndarray, "n 3"],
     target: Float[np.ndarray, "n 3"],
     tolerance: float,
-    before: float,
+    largest_misfit: float,
 ) -> Contradiction | None:
     """Every swap of two, and every point left out: those after which all points fit."""
     n = len(source)
@@ -157,23 +165,23 @@ def _by_trial(
         return None
     trials = [(pair, ()) for pair in itertools.combinations(range(n), 2)]
     trials += [((), (k,)) for k in range(n) if n >= MIN_AGREEING]
-    found = []
+    solutions = []
     for pair, left_out in trials:
         order = np.arange(n)
         order[list(pair)] = pair[::-1]
         use = ~np.isin(np.arange(n), left_out)
-        off = _misfits(source, target[order], use)
-        if off is not None and off[use].max() < tolerance:
-            found.append((off[use].max(), pair, left_out))
-    if not found:
+        misfit = _misfits(source, target[order], use)
+        if misfit is not None and misfit[use].max() < tolerance:
+            solutions.append((misfit[use].max(), pair, left_out))
+    if not solutions:
         return None
     # Of few points several explanations fit. Their misfits are of a few redundant coordinates each,
     # whose chance differs by a factor of three easily; what fits worse than that is no equal.
-    best = min(found)[0]
-    found = [entry for entry in sorted(found) if entry[0] <= 3 * best]
-    exchanges = [pair for _, pair, _ in found if pair]
-    wrong = [k for *_, left_out in found for k in left_out]
-    return Contradiction(before, best, exchanges, wrong, together=False)
+    best = min(solutions)[0]
+    solutions = [entry for entry in sorted(solutions) if entry[0] <= 3 * best]
+    exchanges = [pair for _, pair, _ in solutions if pair]
+    wrong = [k for *_, left_out in solutions for k in left_out]
+    return Contradiction(largest_misfit, best, exchanges, wrong, together=False)
 
 
 def _agreeing(
@@ -189,11 +197,11 @@ def _agreeing(
     best = np.zeros(len(source), bool)
     for triple in triples:
         use = np.isin(np.arange(len(source)), triple)
-        off = _misfits(source, target, use)
-        if off is not None and (off < tolerance).sum() > best.sum():
-            best = off < tolerance
-    off = _misfits(source, target, best) if best.sum() >= 3 else None
-    return best if off is None else off < tolerance
+        misfit = _misfits(source, target, use)
+        if misfit is not None and (misfit < tolerance).sum() > best.sum():
+            best = misfit < tolerance
+    misfit = _misfits(source, target, best) if best.sum() >= 3 else None
+    return best if misfit is None else misfit < tolerance
 
 
 def _misfits(
@@ -202,8 +210,8 @@ def _misfits(
     use: Bool[np.ndarray, " n"],
 ) -> Float[np.ndarray, " n"] | None:
     """Distances of points after the similarity of some of them; None: these are on a line."""
-    found = batched.similarity(source, target, use.astype(float))
-    if found is None:
+    transformation = batched.similarity(source, target, use.astype(float))
+    if transformation is None:
         return None
-    A, t = found
+    A, t = transformation
     return np.linalg.norm(source @ A.T + t - target, axis=1)

@@ -52,13 +52,13 @@ def _distances(
     Q = jnp.stack([_law_of_cosines(i, j, cosines[i, j]) for i, j in SIDES])
     # Two vectors μ across the sides: from any vector that is not along them. Squared sides are
     # positive, so that one with a negative component never is.
-    first = jnp.cross(sides, jnp.array([0.3, -0.5, 0.8]))
-    second = jnp.cross(sides, first)
-    A, B = (jnp.tensordot(m / jnp.linalg.norm(m), Q, 1) for m in (first, second))
+    direction_1 = jnp.cross(sides, jnp.array([0.3, -0.5, 0.8]))
+    direction_2 = jnp.cross(sides, direction_1)
+    A, B = (jnp.tensordot(m / jnp.linalg.norm(m), Q, 1) for m in (direction_1, direction_2))
     t, w, v = _pair_of_lines(A, B)
     plus, minus = jnp.sqrt(jnp.maximum(w[2], 0)), jnp.sqrt(jnp.maximum(-w[0], 0))
-    other = B - t * A
-    on_lines = [_meets(other, v[:, 1], minus * v[:, 2] + k * plus * v[:, 0]) for k in (1, -1)]
+    remainder = B - t * A
+    on_lines = [_meets(remainder, v[:, 1], minus * v[:, 2] + k * plus * v[:, 0]) for k in (1, -1)]
     s = jnp.concatenate(on_lines)
     s = s * jnp.where(jnp.sum(s, 1) < 0, -1, 1)[:, None]
     length = jnp.einsum("ni,kij,nj->n", s, Q, s)

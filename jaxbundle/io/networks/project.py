@@ -67,7 +67,7 @@ from jaxbundle.network.build import (
 )
 from jaxbundle.network.columns import Columns, as_columns, refuse_unknown
 from jaxbundle.network.kinds import KINDS, SECTIONS
-from jaxbundle.network.kinds.base import among
+from jaxbundle.network.kinds.base import present_kinds
 from jaxbundle.network.rules import AXES
 from jaxbundle.network.tables import STATED, UNIT, Camera, Network, Source, require_network
 from jaxbundle.network.units import ANGLE_UNITS, to_image_unit
@@ -263,7 +263,7 @@ def fill_project(network: Network, folder: Path) -> None:
         ends = [[points.id[p] for p in column] for column in distances.points.T]
         values = np.stack([distances.value, distances.sigma], 1)
         _write_table(folder / "distances.csv", DISTANCE_COLUMNS, ends, values, (), values, {})
-    for kind in among(network):
+    for kind in present_kinds(network):
         columns = {
             name: column
             if isinstance(column, tuple)
@@ -309,7 +309,7 @@ def _document_text(network: Network, origin: str) -> str:
     settings = {key: getattr(network, key) for key in SETTINGS if key not in in_tables}
     if origin != STATED:
         settings["sigma_origin"] = origin
-    further = among(network)
+    further = present_kinds(network)
     distances = ["distances"] * (len(network.distances) > 0)
     tables = [*REQUIRED_TABLES, *distances, *(f.TABLE for f in further)]
     settings |= {table: f"{table}.csv" for table in tables}

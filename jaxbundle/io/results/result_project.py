@@ -15,7 +15,7 @@ from jaxbundle.network.kinds import (
     ObservationTable,
     RobotPoses,
 )
-from jaxbundle.network.kinds.base import among
+from jaxbundle.network.kinds.base import present_kinds
 from jaxbundle.network.subsets import keep_distances, keep_points
 from jaxbundle.network.tables import ESTIMATED, Camera, Images, Network, Points
 
@@ -230,7 +230,7 @@ def _further(adjustment: "Adjustment") -> list[ObservationTable]:
     problem = adjustment.problem
     network = problem.network
     # The engine's sets in the order of declaration, the user's own before those of the network.
-    kinds = sorted(among(network), key=lambda table: not table.CHANGES_IMAGE_POINTS)
+    kinds = sorted(present_kinds(network), key=lambda table: not table.CHANGES_IMAGE_POINTS)
     numbers = [len(table.declare(network, problem.origin).observations) for table in kinds]
     own = len(problem.further_sets) - sum(numbers)
     names, tables = iter(problem.further_sets[own:]), []

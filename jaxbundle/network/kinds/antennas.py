@@ -53,13 +53,13 @@ SECTION = "antenna"
 
 
 def antenna(
-    pose: Posed, arm: Triple, strip: Change, clock: Change, given: tuple[Triple, Scalar, Triple]
+    pose: Posed, arm: Triple, strip: Change, clock: Change, observed: tuple[Triple, Scalar, Triple]
 ) -> Triple:
-    """The position of an antenna minus the measured one; `given`: the measured one, the time since
-    the mean of the strip, the velocity."""
-    measured, since, velocity = given
+    """The position of an antenna minus the measured one; `observed`: the measured one, the time
+    since the mean of the strip, the velocity."""
+    measured, time_in_strip, velocity = observed
     return tuple(
-        x + strip[k] + strip[3 + k] * since + velocity[k] * clock[0] - measured[k]
+        x + strip[k] + strip[3 + k] * time_in_strip + velocity[k] * clock[0] - measured[k]
         for k, x in enumerate(pose.place(arm))
     )
 
@@ -96,7 +96,7 @@ class Antennas(ObservationTable):
         sigmas, pairs = [f"s{a}" for a in AXES], [f"r{AXES[i]}{AXES[j]}" for i, j in PAIRS]
         table.check_names(("image", *AXES, *sigmas), (*pairs, "strip", "t"))
         check_settings(SECTION, settings, ("lever_arm", "free", "sigma"))
-        chosen = Parameters.from_settings(SECTION, settings, FREE)
+        parameters = Parameters.from_settings(SECTION, settings, FREE)
         position = np.stack([table.numbers(a, required=True) for a in AXES], 1)
         sigma = np.stack([positive_sigma(table, s) for s in sigmas], 1)
         R = np.tile(np.eye(3), (len(table), 1, 1))
@@ -108,7 +108,7 @@ class Antennas(ObservationTable):
                 f"{table.source(row)}: the correlations {', '.join(pairs)} are impossible together"
             )
         time = table.numbers("t")
-        if {"drift", "time_offset"} & {*chosen.free} and np.isnan(time).any():
+        if {"drift", "time_offset"} & {*parameters.free} and np.isnan(time).any():
             row = int(np.isnan(time).argmax())
             raise InputError(f"{table.source(row)}: t is missing; drift and time_offset need it")
         strip = table.ids("strip") if "strip" in table.values else ("all",) * len(table)
@@ -155,10 +155,10 @@ class Antennas(ObservationTable):
         strips, strip = np.unique(np.array(self.strip, dtype=object), return_inverse=True)
         parameters = _by_axis(Parameters.from_settings(SECTION, self.settings, FREE))
         cameras = [network.cameras[c].id for c in camera]
-        given = self.settings.get("lever_arm", [0.0, 0.0, 0.0])
+        start = self.settings.get("lever_arm", [0.0, 0.0, 0.0])
         arm = Table(
             "lever arm",
-            three_by_camera(SECTION, "lever_arm", given, cameras),
+            three_by_camera(SECTION, "lever_arm", start, cameras),
             Vector(3),
             parameters.mask(ARM),
             cameras,
@@ -190,7 +190,7 @@ class Antennas(ObservationTable):
             ["offset"],
             ("seconds",),
         )
-        seen = POSITION(
+        observations = POSITION(
             (image, of_camera, strip, np.zeros(len(self), int)),
             (self.position - origin, since, velocity),
             covariance=self.covariance,
@@ -200,14 +200,16 @@ class Antennas(ObservationTable):
             *parameters.priors(shift, groups, "length"),
             *parameters.priors(clock, ["time_offset"]),
         )
-        return Contribution((arm, shift, clock), (seen, *priors), (("GNSS strip", _shift_back),))
+        return Contribution(
+            (arm, shift, clock), (observations, *priors), (("GNSS strip", _shift_back),)
+        )
 
 
-def _by_axis(given: Parameters) -> Parameters:
+def _by_axis(parameters: Parameters) -> Parameters:
     """The parameters with a shift of all axes as one of each."""
     names = lambda name: SHIFTS if name == "shift" else (name,)
-    free = tuple(dict.fromkeys(n for name in given.free for n in names(name)))
-    sigma = {n: s for name, s in given.sigma.items() for n in names(name)}
+    free = tuple(dict.fromkeys(n for name in parameters.free for n in names(name)))
+    sigma = {n: s for name, s in parameters.sigma.items() for n in names(name)}
     return Parameters(FREE, free, sigma)
 
 

@@ -93,7 +93,7 @@ class ObservationTable(abc.ABC):
 
     @abc.abstractmethod
     def declare(self, network: Network, origin: Float[np.ndarray, "3"]) -> Contribution:
-        """The tables and observations for a network that contains all rows (`among`)."""
+        """The tables and observations for a network that contains all rows (`present_kinds`)."""
 
     def __len__(self) -> int:
         return len(getattr(self, (*self.IMAGES, *self.POINTS)[0]))
@@ -102,38 +102,43 @@ class ObservationTable(abc.ABC):
         """The chosen rows (a mask or indices)."""
         rows = row_indices(rows)
         names = [f.name for f in dataclasses.fields(self) if f.name not in ("settings", "source")]
-        cut = lambda x: x[rows] if isinstance(x, np.ndarray) else tuple(x[row] for row in rows)
-        chosen = {name: cut(getattr(self, name)) for name in names}
-        return dataclasses.replace(self, source=self.source.take(rows), **chosen)
+        take_rows = lambda x: (
+            x[rows] if isinstance(x, np.ndarray) else tuple(x[row] for row in rows)
+        )
+        taken = {name: take_rows(getattr(self, name)) for name in names}
+        return dataclasses.replace(self, source=self.source.take(rows), **taken)
 
-    def among(self, network: Network) -> Self:
+    def present_kinds(self, network: Network) -> Self:
         """The rows whose images and points are all in the network."""
         return self.take(self._present(network))
 
     def _present(self, network: Network) -> np.ndarray:
         # Rows about objects that were left out go with them, without an error.
         keep = np.ones(len(self), bool)
-        for fields, known in ((self.IMAGES, network.images.id), (self.POINTS, network.points.id)):
-            known = set(known)
+        for fields, known_ids in (
+            (self.IMAGES, network.images.id),
+            (self.POINTS, network.points.id),
+        ):
+            known_ids = set(known_ids)
             for field in fields:
-                keep &= np.array([id in known for id in getattr(self, field)], bool)
+                keep &= np.array([id in known_ids for id in getattr(self, field)], bool)
         return keep
 
     def check(self, network: Network) -> None:
         """Refuse rows about unknown images and points.
 
         **Raises:** `InputError`."""
-        for fields, table, thing in (
+        for fields, table, noun in (
             (self.IMAGES, network.images, "image"),
             (self.POINTS, network.points, "point"),
         ):
-            known = set(table.id)
+            known_ids = set(table.id)
             for field in fields:
                 for row, id in enumerate(getattr(self, field)):
-                    if id not in known:
+                    if id not in known_ids:
                         raise InputError(
-                            f"{self.source(row)}: {thing} {id!r} is unknown: no such {thing} in "
-                            f"{table.source.name}{did_you_mean(id, known, listing=False)}"
+                            f"{self.source(row)}: {noun} {id!r} is unknown: no such {noun} in "
+                            f"{table.source.name}{did_you_mean(id, known_ids, listing=False)}"
                         )
 
     def begin(self, network: Network) -> Network:
@@ -178,17 +183,17 @@ class SingleValues(ObservationTable):
         table.check_names((*names.values(), "value", "sigma"))
         ids: dict[str, Any] = {field: table.ids(name) for field, name in names.items()}
         unit = radians if cls.KIND.units == "angle" else 1.0
-        made = cls(
+        observations = cls(
             value=unit * table.numbers("value", required=True),
             sigma=unit * positive_sigma(table, "sigma"),
             source=table.source,
             **ids,
         )
-        for row, objects in enumerate(zip(*(getattr(made, field) for field in cls.POINTS))):
+        for row, objects in enumerate(zip(*(getattr(observations, field) for field in cls.POINTS))):
             if len({*objects}) < len(objects):
                 raise InputError(f"{table.source(row)}: expected {len(objects)} different points")
-        made.check_values(radians)
-        return made
+        observations.check_values(radians)
+        return observations
 
     def check_values(self, radians: float) -> None:
         """Refuse values that cannot be measured; all are accepted by default.
@@ -217,10 +222,10 @@ def rows_of(ids: Sequence[str], table: Images | Points) -> Int[np.ndarray, " n"]
     return np.array([row[id] for id in ids], int)
 
 
-def among(network: Network) -> list[ObservationTable]:
+def present_kinds(network: Network) -> list[ObservationTable]:
     """The observations of further kinds of a network whose images and points are all included."""
-    present = (one.among(network) for one in network.further)
-    return [one for one in present if len(one)]
+    with_present_rows = (kind.among(network) for kind in network.further)
+    return [kind for kind in with_present_rows if len(kind)]
 
 
 def positive_sigma(
@@ -235,12 +240,12 @@ def positive_sigma(
     return sigma
 
 
-def check_settings(section: str, given: Mapping[str, Any], known: Sequence[str]) -> None:
+def check_settings(section: str, settings: Mapping[str, Any], known_keys: Sequence[str]) -> None:
     """Refuse settings of a section that are not known."""
-    if not isinstance(given, Mapping):
-        raise InputError(f"[{section}]: expected a section of settings, got {show(given)}")
-    for key in given:
-        refuse_unknown(key, known, f"[{section}]: ")
+    if not isinstance(settings, Mapping):
+        raise InputError(f"[{section}]: expected a section of settings, got {show(settings)}")
+    for key in settings:
+        refuse_unknown(key, known_keys, f"[{section}]: ")
 
 
 def numbers(section: str, key: str, value: Any, length: int) -> Float[np.ndarray, " length"]:
@@ -248,26 +253,26 @@ def numbers(section: str, key: str, value: Any, length: int) -> Float[np.ndarray
 
     **Raises:** `InputError`."""
     try:
-        found = np.array(value, float)
+        array = np.array(value, float)
     except (TypeError, ValueError):
-        found = np.zeros(0)
-    if found.shape != (length,) or not np.isfinite(found).all():
+        array = np.zeros(0)
+    if array.shape != (length,) or not np.isfinite(array).all():
         raise InputError(f"[{section}]: {key} is {show(value)}; expected {length} numbers")
-    return found
+    return array
 
 
 def three_by_camera(
-    section: str, key: str, given: Any, cameras: Sequence[str]
+    section: str, key: str, setting: Any, cameras: Sequence[str]
 ) -> Float[np.ndarray, "cameras 3"]:
     """Three numbers of a setting, the same for all cameras or a table by camera.
 
     **Raises:** `InputError`, also for a camera that the table lacks."""
-    if not isinstance(given, Mapping):
-        return np.tile(numbers(section, key, given, 3), (len(cameras), 1))
+    if not isinstance(setting, Mapping):
+        return np.tile(numbers(section, key, setting, 3), (len(cameras), 1))
     for camera in cameras:
-        if camera not in given:
+        if camera not in setting:
             raise InputError(f"[{section}]: {key} of camera {camera!r} is missing")
-    return np.array([numbers(section, f"{key} of {c}", given[c], 3) for c in cameras])
+    return np.array([numbers(section, f"{key} of {c}", setting[c], 3) for c in cameras])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -324,6 +329,6 @@ class Parameters:
         return [kind((np.arange(table.rows),), table.value, sigma=sigma)]
 
 
-def computed_minus_given(value: Any, given: Any) -> Any:
+def computed_minus_given(value: Any, observed: Any) -> Any:
     """Computed minus given."""
-    return value - given
+    return value - observed

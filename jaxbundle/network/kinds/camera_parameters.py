@@ -75,8 +75,8 @@ class CameraParameters(ObservationTable):
         return len(self.camera)
 
     def _present(self, network: Network) -> Bool[np.ndarray, " n"]:
-        known = {camera.id for camera in network.cameras}
-        return np.array([id in known for id in self.camera], bool)
+        known_ids = {camera.id for camera in network.cameras}
+        return np.array([id in known_ids for id in self.camera], bool)
 
     def check(self, network: Network) -> None:
         cameras = {camera.id: camera for camera in network.cameras}
@@ -86,25 +86,30 @@ class CameraParameters(ObservationTable):
                     f"{self.source(row)}: camera {id!r} is unknown{did_you_mean(id, cameras)}"
                 )
             camera = cameras[id]
-            known, names = get_model(camera.model).parameters, parameter.split(RATIO)
+            known_parameters, names = get_model(camera.model).parameters, parameter.split(RATIO)
             if len(names) > 2:
                 raise InputError(
                     f"{self.source(row)}: expected a parameter or a ratio of two, "
                     f"such as fy/fx, got {parameter!r}"
                 )
             for name in names:
-                if name not in known:
+                if name not in known_parameters:
                     raise InputError(
                         f"{self.source(row)}: camera {id!r} has no {name!r}"
-                        f"{did_you_mean(name, known)}"
+                        f"{did_you_mean(name, known_parameters)}"
                     )
             groups = {name: group for group in camera.tie for name in group}
             # A ratio of two tied parameters is a constant, and a held parameter no unknown.
-            one = len(names) == 2 and groups.get(names[0], {*names}) == groups.get(names[1])
-            if one or not {*camera.free} & {m for n in names for m in groups.get(n, (n,))}:
+            is_ratio_of_equal = len(names) == 2 and groups.get(names[0], {*names}) == groups.get(
+                names[1]
+            )
+            if is_ratio_of_equal or not {*camera.free} & {
+                m for n in names for m in groups.get(n, (n,))
+            }:
                 raise InputError(
                     f"{self.source(row)}: {parameter} of camera {id!r} cannot change: expected "
-                    f"{' or '.join(names)} to be free" + (" and not tied" if one else "")
+                    f"{' or '.join(names)} to be free"
+                    + (" and not tied" if is_ratio_of_equal else "")
                 )
 
     def declare(self, network: Network, origin: Float[np.ndarray, "3"]) -> Contribution:
@@ -126,11 +131,11 @@ class CameraParameters(ObservationTable):
         return Contribution(
             (),
             tuple(
-                kind(*of)(
+                kind(*tables)(
                     (np.array([place[index[self.camera[row]]][1] for row in rows]),),
                     self.value[rows],
                     sigma=self.sigma[rows],
                 )
-                for of, rows in sets.items()
+                for tables, rows in sets.items()
             ),
         )

@@ -54,21 +54,21 @@ class Instant(NamedTuple):
 
 def place_on_spline(controls: Sequence[Posed], u: Scalar, X: Triple) -> Triple:
     """p + Mᵀ·X at a place u between the knots."""
-    at = spline_position([one.centre for one in controls], u)
+    position = spline_position([control.centre for control in controls], u)
     # M(t)ᵀ·X = M_iᵀ·(M_i·M(t)ᵀ·X): only steps between controls have parts of the basis
-    turns = [one.rotation for one in controls]
-    turned = turn_back_by_steps([_step(*pair) for pair in zip(turns, turns[1:])], u, X)
-    return tuple(a + b for a, b in zip(at, turns[0].apply_inverse(turned)))
+    turns = [control.rotation for control in controls]
+    turned_ray = turn_back_by_steps([_step(*pair) for pair in zip(turns, turns[1:])], u, X)
+    return tuple(a + b for a, b in zip(position, turns[0].apply_inverse(turned_ray)))
 
 
-def _step(one: Turned, other: Turned) -> Triple:
+def _step(rotation_a: Turned, rotation_b: Turned) -> Triple:
     """The Gibbs vector of the rotation from one to the other; of the small rotations that both
     have besides, θ/2 to second order."""
-    h = gibbs_vector(other.rows, one.rows)
-    if other.turn is not None:
-        h = compose_gibbs(tuple(t / 2 for t in other.turn), h)
-    if one.turn is not None:
-        h = compose_gibbs(h, tuple(-t / 2 for t in one.turn))
+    h = gibbs_vector(rotation_b.rows, rotation_a.rows)
+    if rotation_b.turn is not None:
+        h = compose_gibbs(tuple(t / 2 for t in rotation_b.turn), h)
+    if rotation_a.turn is not None:
+        h = compose_gibbs(h, tuple(-t / 2 for t in rotation_a.turn))
     return h
 
 
@@ -80,8 +80,8 @@ class TimedImagePoint:
     model: str | cameras.CameraModel
     domain: str
 
-    def __call__(self, *touched: Any) -> Change:
-        *poses, clock, mounting, interior, ray, (xy, instant) = touched
+    def __call__(self, *blocks: Any) -> Change:
+        *poses, clock, mounting, interior, ray, (xy, instant) = blocks
         board, controls = poses[:-4], poses[-4:]
         for pose in board:
             ray = pose.ray(ray)
@@ -99,10 +99,10 @@ def timed_image_points(
     """Image points of the cameras of one model, whose table is `camera`, on a `mounting`, of a
     target that moves along a spline; `board`: the table of boards on bodies. Measured are x, y and
     the `Instant`."""
-    before = () if board is None else (board,)
-    of = (*before, *[TRAJECTORY] * 4, CLOCK, mounting, camera, "point")
+    tables_of_board = () if board is None else (board,)
+    tables = (*tables_of_board, *[TRAJECTORY] * 4, CLOCK, mounting, camera, "point")
     name = "image coordinates"
     if camera != "camera":
         name += f" of {cameras.get_model(model).name}"
     residual = TimedImagePoint(model, domain)
-    return Kind(name, residual, of, ("x", "y"), "image", scalars=True, invariant=True)
+    return Kind(name, residual, tables, ("x", "y"), "image", scalars=True, invariant=True)

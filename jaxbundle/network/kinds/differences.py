@@ -36,12 +36,15 @@ def difference(
 
 
 def angle(
-    a: Float[Array, "3"], at: Float[Array, "3"], b: Float[Array, "3"], measured: Float[Array, ""]
+    a: Float[Array, "3"],
+    vertex: Float[Array, "3"],
+    b: Float[Array, "3"],
+    measured: Float[Array, ""],
 ) -> Float[Array, ""]:
     """The angle at a point between two others minus the measured one, radians."""
     # The tangent keeps its digits near 0 and 180°, where the arc cosine loses them. At these two
     # angles the one in space has no derivative.
-    u, v = a - at, b - at
+    u, v = a - vertex, b - vertex
     sine = jnp.sqrt(jnp.sum(jnp.cross(u, v) ** 2))
     return jnp.arctan2(sine, u @ v) - measured
 
@@ -71,8 +74,8 @@ class Differences(ObservationTable):
         table.check_names(("from", "to"), (*AXES, *(f"s{a}" for a in AXES)))
         value = np.stack([table.numbers(a) for a in AXES], 1)
         sigma = np.stack([positive_sigma(table, f"s{a}", required=False) for a in AXES], 1)
-        given = ~np.isnan(value)
-        for row in np.flatnonzero((given != ~np.isnan(sigma)).any(1) | ~given.any(1))[:1]:
+        is_given = ~np.isnan(value)
+        for row in np.flatnonzero((is_given != ~np.isnan(sigma)).any(1) | ~is_given.any(1))[:1]:
             raise InputError(
                 f"{table.source(row)}: expected a difference dX, dY or dZ with its σ sdX, sdY or "
                 "sdZ, both or neither"
@@ -80,14 +83,14 @@ class Differences(ObservationTable):
         return cls(
             start=table.ids("from"),
             to=table.ids("to"),
-            value=np.where(given, value, 0.0),
-            sigma=np.where(given, sigma, np.inf),
+            value=np.where(is_given, value, 0.0),
+            sigma=np.where(is_given, sigma, np.inf),
             source=table.source,
         )
 
     def columns(self, radians: float) -> dict:
-        given = np.isfinite(self.sigma)
-        value, sigma = (np.where(given, x, np.nan) for x in (self.value, self.sigma))
+        is_given = np.isfinite(self.sigma)
+        value, sigma = (np.where(is_given, x, np.nan) for x in (self.value, self.sigma))
         columns = {"from": self.start, "to": self.to}
         columns |= {a: value[:, k] for k, a in enumerate(AXES)}
         return columns | {f"s{a}": sigma[:, k] for k, a in enumerate(AXES)}

@@ -12,9 +12,9 @@ if TYPE_CHECKING:
     from jaxbundle.network.tables import Network
 
 
-def distance(a: Float[Array, "3"], b: Float[Array, "3"], given: Scalar) -> Scalar:
+def distance(a: Float[Array, "3"], b: Float[Array, "3"], observed: Scalar) -> Scalar:
     """The distance of two points minus the given one."""
-    return jnp.sqrt(jnp.sum((a - b) ** 2)) - given
+    return jnp.sqrt(jnp.sum((a - b) ** 2)) - observed
 
 
 DISTANCES = Kind("distances", distance, ("point", "point"), ("d",), "length", snooped="single")
@@ -22,7 +22,11 @@ DISTANCES = Kind("distances", distance, ("point", "point"), ("d",), "length", sn
 
 def declare_distances(network: "Network") -> list[ObservationSet]:
     """The set "distance", one row a distance, if there are any."""
-    given = network.distances
-    if not len(given):
+    distances = network.distances
+    if not len(distances):
         return []
-    return [DISTANCES(tuple(given.points.T), given.value, sigma=given.sigma, name="distance")]
+    return [
+        DISTANCES(
+            tuple(distances.points.T), distances.value, sigma=distances.sigma, name="distance"
+        )
+    ]

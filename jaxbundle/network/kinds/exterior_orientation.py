@@ -34,11 +34,11 @@ if TYPE_CHECKING:
     from jaxbundle.network.tables import Network
 
 
-def exterior(pose: Posed, given: Float[Array, "6"]) -> Float[Array, "6"]:
+def exterior(pose: Posed, observed: Float[Array, "6"]) -> Float[Array, "6"]:
     """Projection centre and ω, φ, κ (on the branch of the given ones) minus the given values
     [6]."""
-    angles = omega_phi_kappa_near(pose.rotation.matrix(), given[3:])
-    return jnp.concatenate([jnp.stack(pose.centre), angles]) - given
+    angles = omega_phi_kappa_near(pose.rotation.matrix(), observed[3:])
+    return jnp.concatenate([jnp.stack(pose.centre), angles]) - observed
 
 
 EXTERIOR_ORIENTATION = Kind(
@@ -93,8 +93,8 @@ class ExteriorPriors(ObservationTable):
 
     def columns(self, radians: float) -> dict:
         unit = np.array([1, 1, 1, radians, radians, radians])
-        given = np.isfinite(self.sigma)
-        value, sigma = (np.where(given, x, np.nan) / unit for x in (self.value, self.sigma))
+        is_given = np.isfinite(self.sigma)
+        value, sigma = (np.where(is_given, x, np.nan) / unit for x in (self.value, self.sigma))
         columns: dict[str, Any] = {"image": self.image}
         columns |= {name: value[:, k] for k, name in enumerate(EXTERIOR)}
         return columns | {f"s{name}": sigma[:, k] for k, name in enumerate(EXTERIOR)}

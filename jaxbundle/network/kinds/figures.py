@@ -59,33 +59,33 @@ DIRECTIONS = ("shift x", "shift y", "shift z", "turn x", "turn y", "turn z")
 ROUND = ("circle", "sphere", "cylinder")
 
 
-def on_plane(frame: Posed, point: Triple, given: Scalar) -> Scalar:
-    return frame.ray(point)[2] - given
+def on_plane(frame: Posed, point: Triple, observed: Scalar) -> Scalar:
+    return frame.ray(point)[2] - observed
 
 
-def on_line(frame: Posed, point: Triple, given: Float[Array, "2"]) -> Float[Array, "2"]:
-    return jnp.stack(frame.ray(point)[:2]) - given
+def on_line(frame: Posed, point: Triple, observed: Float[Array, "2"]) -> Float[Array, "2"]:
+    return jnp.stack(frame.ray(point)[:2]) - observed
 
 
 def on_circle(
-    frame: Posed, radius: Scalar, point: Triple, given: Float[Array, "2"]
+    frame: Posed, radius: Scalar, point: Triple, observed: Float[Array, "2"]
 ) -> Float[Array, "2"]:
     x, y, z = frame.ray(point)
-    return jnp.stack([jnp.sqrt(x * x + y * y) - radius, z]) - given
+    return jnp.stack([jnp.sqrt(x * x + y * y) - radius, z]) - observed
 
 
-def on_sphere(frame: Posed, radius: Scalar, point: Triple, given: Scalar) -> Scalar:
-    return jnp.sqrt(sum(x * x for x in frame.ray(point))) - radius - given
+def on_sphere(frame: Posed, radius: Scalar, point: Triple, observed: Scalar) -> Scalar:
+    return jnp.sqrt(sum(x * x for x in frame.ray(point))) - radius - observed
 
 
-def on_cylinder(frame: Posed, radius: Scalar, point: Triple, given: Scalar) -> Scalar:
+def on_cylinder(frame: Posed, radius: Scalar, point: Triple, observed: Scalar) -> Scalar:
     x, y, _ = frame.ray(point)
-    return jnp.sqrt(x * x + y * y) - radius - given
+    return jnp.sqrt(x * x + y * y) - radius - observed
 
 
-def in_shape(frame: Posed, point: Triple, given: Float[Array, "3"]) -> Float[Array, "3"]:
+def in_shape(frame: Posed, point: Triple, observed: Float[Array, "3"]) -> Float[Array, "3"]:
     """A point in the frame of a shape of known coordinates."""
-    return jnp.stack(frame.ray(point)) - given
+    return jnp.stack(frame.ray(point)) - observed
 
 
 RESIDUALS = {
@@ -113,7 +113,7 @@ class Figures(ObservationTable):
     @classmethod
     def from_columns(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Figures":
         table.check_names(("figure", "type", "point"), ("sigma", "radius"))
-        made = cls(
+        figures = cls(
             figure=table.ids("figure"),
             type=table.ids("type"),
             point=table.ids("point"),
@@ -121,22 +121,22 @@ class Figures(ObservationTable):
             radius=positive_sigma(table, "radius", required=False),
             source=table.source,
         )
-        for row, word in enumerate(made.type):
+        for row, word in enumerate(figures.type):
             if word not in TYPES:
                 raise InputError(
                     f"{table.source(row)}: type is {show(word)}{did_you_mean(word, TYPES)}"
                 )
-        first: dict[str, int] = {}
-        for row, name in enumerate(made.figure):
-            other = first.setdefault(name, row)
-            if made.type[row] != made.type[other]:
+        first_row: dict[str, int] = {}
+        for row, name in enumerate(figures.figure):
+            earlier_row = first_row.setdefault(name, row)
+            if figures.type[row] != figures.type[earlier_row]:
                 raise InputError(
-                    f"{table.source(row)}: {name!r} is a {made.type[row]} here, but a "
-                    f"{made.type[other]} in {table.source(other)}"
+                    f"{table.source(row)}: {name!r} is a {figures.type[row]} here, but a "
+                    f"{figures.type[earlier_row]} in {table.source(earlier_row)}"
                 )
-            if made.type[row] not in ROUND and not np.isnan(made.radius[row]):
-                raise InputError(f"{table.source(row)}: a {made.type[row]} has no radius")
-        return made
+            if figures.type[row] not in ROUND and not np.isnan(figures.radius[row]):
+                raise InputError(f"{table.source(row)}: a {figures.type[row]} has no radius")
+        return figures
 
     @property
     def needs_scale(self) -> bool:
@@ -169,14 +169,16 @@ class Figures(ObservationTable):
         rows = np.flatnonzero(np.array(self.type, dtype=object) == type)
         names, figure = np.unique(np.array(self.figure, dtype=object)[rows], return_inverse=True)
         members = [rows[figure == k] for k in range(len(names))]
-        for name, own in zip(names, members):
-            if len(np.unique(point[own])) < FEWEST[type]:
+        for name, rows_of_figure in zip(names, members):
+            if len(np.unique(point[rows_of_figure])) < FEWEST[type]:
                 raise InputError(
-                    f"{self.source(own[0])}: {type} {name!r} has {len(own)} usable points; "
+                    f"{self.source(rows_of_figure[0])}: {type} {name!r} has {len(rows_of_figure)} "
+                    "usable points; "
                     f"at least {FEWEST[type]} are needed"
                 )
         centre, M, radius = (
-            np.array(x) for x in zip(*(fit(type, place[point[own]]) for own in members))
+            np.array(x)
+            for x in zip(*(fit(type, place[point[rows_of_figure]]) for rows_of_figure in members))
         )
         q = np.array([np.asarray(quaternion_from_matrix(m)) for m in M])
         columns = MOVES[type]
@@ -191,25 +193,31 @@ class Figures(ObservationTable):
         # Figures of a known and of an unknown radius are two sets: with a radius their scale is
         # known, without one a figure only has the shape of its points.
         if type not in ROUND:
-            seen = self._observe_points(type, (type,), (figure,), point[rows], sigma)
-            return Contribution((frame,), (seen,), ((type, move_pose),))
-        known = np.array([np.nanmax([*self.radius[own], -1.0]) for own in members])
+            observations = self._observe_points(type, (type,), (figure,), point[rows], sigma)
+            return Contribution((frame,), (observations,), ((type, move_pose),))
+        known_radius = np.array(
+            [np.nanmax([*self.radius[rows_of_figure], -1.0]) for rows_of_figure in members]
+        )
         size = Table(
             f"radius of {type}",
-            np.where(known > 0, known, radius),
-            free=known <= 0,
+            np.where(known_radius > 0, known_radius, radius),
+            free=known_radius <= 0,
             labels=list(names),
             parameters=("R",),
         )
-        seen = []
-        for given in (False, True):
-            those = np.flatnonzero((known > 0)[figure] == given)
-            if len(those):
-                tables, touched = (type, size.name), (figure[those],) * 2
-                of, own_sigma = point[rows[those]], sigma[those]
-                seen.append(self._observe_points(type, tables, touched, of, own_sigma, not given))
+        observations = []
+        for has_radius in (False, True):
+            figures_of_case = np.flatnonzero((known_radius > 0)[figure] == has_radius)
+            if len(figures_of_case):
+                tables, touched_rows = (type, size.name), (figure[figures_of_case],) * 2
+                points_of_case, own_sigma = point[rows[figures_of_case]], sigma[figures_of_case]
+                observations.append(
+                    self._observe_points(
+                        type, tables, touched_rows, points_of_case, own_sigma, not has_radius
+                    )
+                )
         actions = (type, move_pose), (size.name, scale_length)
-        return Contribution((frame, size), tuple(seen), actions)
+        return Contribution((frame, size), tuple(observations), actions)
 
     @staticmethod
     def _observe_points(
@@ -267,13 +275,14 @@ class Shapes(ObservationTable):
         places = network.points.position - origin
         centre, rotation = [], []
         for k, name in enumerate(names):
-            own = np.flatnonzero(shape == k)
-            if len(own) < 3:
+            rows_of_shape = np.flatnonzero(shape == k)
+            if len(rows_of_shape) < 3:
                 raise InputError(
-                    f"{self.source(own[0])}: shape {name!r}: {len(own)} points, "
+                    f"{self.source(rows_of_shape[0])}: shape {name!r}: {len(rows_of_shape)} "
+                    "points, "
                     "at least 3 are needed"
                 )
-            X0, M = _place(self.place[own], places[point[own]])
+            X0, M = _place(self.place[rows_of_shape], places[point[rows_of_shape]])
             centre.append(X0)
             rotation.append(np.asarray(quaternion_from_matrix(M)))
         frame = Table(
@@ -285,8 +294,8 @@ class Shapes(ObservationTable):
         )
         sigma = np.where(self.sigma > 0, self.sigma, EXACT_SIGMA * across_rays(network))
         kind = Kind(KNOWN_SHAPES, in_shape, ("shape", "point"), ("x", "y", "z"), "length")
-        seen = kind((shape, point), self.place, sigma=sigma)
-        return Contribution((frame,), (seen,), (("shape", move_pose),))
+        observations = kind((shape, point), self.place, sigma=sigma)
+        return Contribution((frame,), (observations,), (("shape", move_pose),))
 
 
 def _place(
@@ -308,9 +317,9 @@ def across_rays(network: Network) -> float:
         model = get_model(camera.model)
         shortest.append(min(abs(camera.parameters.get(p, 0.0)) for p in model.principal_distance))
     # σ·s/c: an image point's σ projected to the distance of the object point.
-    away = network.points.position[rays.point] - images.position[rays.image]
+    sight = network.points.position[rays.point] - images.position[rays.image]
     c = np.array(shortest)[images.camera[rays.image]]
-    return float(np.median(np.linalg.norm(away, axis=1) * rays.sigma.min(1) / c))
+    return float(np.median(np.linalg.norm(sight, axis=1) * rays.sigma.min(1) / c))
 
 
 def sigma_or_exact(table: Columns):

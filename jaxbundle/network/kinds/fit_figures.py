@@ -23,8 +23,8 @@ def fit(type: str, X: Float[np.ndarray, "n 3"]):
         return _about(Vt[2], X)[:3]
     # The axis of a cylinder has no closed form: the best of 400 directions, 7° apart, from which an
     # adjustment converges; and of the principal axes, which long and short cylinders have.
-    every = (*Vt, *_hemisphere(400))
-    axis = min(every, key=lambda n: _about(n, X)[3])
+    directions = (*Vt, *_hemisphere(400))
+    axis = min(directions, key=lambda n: _about(n, X)[3])
     return _about(axis, X)[:3]
 
 
@@ -42,11 +42,11 @@ def _circle(x: Float[np.ndarray, "n d"]) -> tuple[Float[np.ndarray, " d"], float
     # |x − m|² = r² is linear in m and r² − m²: 2x·m + (r² − m²) = x². Biased for short arcs, but
     # start values need no more.
     A = np.concatenate([2 * x, np.ones((len(x), 1))], 1)
-    *centre, rest = np.linalg.lstsq(A, (x**2).sum(1), rcond=None)[0]
+    *centre, constant = np.linalg.lstsq(A, (x**2).sum(1), rcond=None)[0]
     centre = np.array(centre)
-    radius = np.sqrt(max(rest + centre @ centre, 0.0))
-    away = np.linalg.norm(x - centre, axis=1) - radius
-    return centre, radius, float(np.sqrt((away**2).mean()))
+    radius = np.sqrt(max(constant + centre @ centre, 0.0))
+    difference = np.linalg.norm(x - centre, axis=1) - radius
+    return centre, radius, float(np.sqrt((difference**2).mean()))
 
 
 def _frame(z: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:

@@ -27,14 +27,14 @@ class Rigid(NamedTuple):
     R: Float[np.ndarray, "*n 3 3"]
     t: Float[np.ndarray, "*n 3"]
 
-    def of(self, other: "Rigid") -> "Rigid":
+    def of(self, inner: "Rigid") -> "Rigid":
         """This one after the other."""
-        return Rigid(self.R @ other.R, (self.R @ other.t[..., None])[..., 0] + self.t)
+        return Rigid(self.R @ inner.R, (self.R @ inner.t[..., None])[..., 0] + self.t)
 
     @property
     def inverse(self) -> "Rigid":
-        back = np.swapaxes(self.R, -1, -2)
-        return Rigid(back, -(back @ self.t[..., None])[..., 0])
+        transposed = np.swapaxes(self.R, -1, -2)
+        return Rigid(transposed, -(transposed @ self.t[..., None])[..., 0])
 
 
 def rotation_vectors(R: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3"]:
@@ -53,10 +53,10 @@ def motions(A: Rigid, B: Rigid) -> tuple[Rigid, Rigid]:
     n = len(A.t)
     steps = np.unique(np.linspace(1, n - 1, min(n - 1, MOST_PARTNERS)).astype(int))
     pairs = [np.arange(n - step) for step in steps]
-    i = np.concatenate([first + step for first, step in zip(pairs, steps)])
+    i = np.concatenate([begin + step for begin, step in zip(pairs, steps)])
     j = np.concatenate(pairs)
-    between = lambda T: Rigid(T.R[j], T.t[j]).inverse.of(Rigid(T.R[i], T.t[i]))
-    return between(A), between(B)
+    motions_of = lambda T: Rigid(T.R[j], T.t[j]).inverse.of(Rigid(T.R[i], T.t[i]))
+    return motions_of(A), motions_of(B)
 
 
 class Turns(NamedTuple):
@@ -72,25 +72,27 @@ def turns(A: Rigid) -> Turns:
     """About which axes a hand turns."""
     alpha = rotation_vectors(motions(A, A)[0].R)
     size, axes = np.linalg.eigh(alpha.T @ alpha / max(len(alpha), 1))
-    most, across = np.sqrt(np.maximum(size[::-1][:2], 0.0))
+    largest_turn, second_turn = np.sqrt(np.maximum(size[::-1][:2], 0.0))
     axis = axes[:, -1]
-    return Turns(float(most), float(across), axis if axis[np.abs(axis).argmax()] > 0 else -axis)
+    return Turns(
+        float(largest_turn), float(second_turn), axis if axis[np.abs(axis).argmax()] > 0 else -axis
+    )
 
 
 def solve(A: Rigid, B: Rigid) -> tuple[Rigid, Rigid, float]:
     """X, Y, and the scale by which lengths of B are multiplied to be those of A (1 is expected
     where B has its own)."""
-    one, other = motions(A, B)
-    alpha, beta = rotation_vectors(one.R), rotation_vectors(other.R)
+    hand, camera = motions(A, B)
+    alpha, beta = rotation_vectors(hand.R), rotation_vectors(camera.R)
     turned = np.linalg.norm(alpha, axis=1)
     good = turned < LARGEST_TURN
     good = good if good.any() else np.ones_like(good)
     R = nearest_rotation(alpha[good].T @ beta[good])
     # (R_A − 1)·t_X − s·R_X·t_B = −t_A
-    eye, scaled = one.R - np.eye(3), -(R @ other.t.T).T[..., None]
+    eye, scaled = hand.R - np.eye(3), -(R @ camera.t.T).T[..., None]
     rows = np.concatenate([eye, scaled], 2).reshape(-1, 4)
-    *_, scale = np.linalg.lstsq(rows, -one.t.ravel())[0]
-    t = np.linalg.lstsq(eye.reshape(-1, 3), (-scaled[..., 0] - one.t).ravel())[0]
+    *_, scale = np.linalg.lstsq(rows, -hand.t.ravel())[0]
+    t = np.linalg.lstsq(eye.reshape(-1, 3), (-scaled[..., 0] - hand.t).ravel())[0]
     X = Rigid(R, t)
     return X, other_side(A, X, B), float(scale)
 

@@ -34,8 +34,8 @@ class ImagePoint:
     model: str | cameras.CameraModel
     domain: str
 
-    def __call__(self, *touched: Any) -> Change:
-        *poses, interior, ray, xy = touched
+    def __call__(self, *blocks: Any) -> Change:
+        *poses, interior, ray, xy = blocks
         for pose in poses:
             ray = pose.ray(ray)
         return cameras.residual(cameras.get_model(self.model), self.domain, interior, ray, xy)
@@ -47,8 +47,8 @@ class ColumnsOfImagePoint:
 
     model: str | cameras.CameraModel
 
-    def __call__(self, *touched: Any) -> Change:
-        *poses, p, ray, _ = touched
+    def __call__(self, *blocks: Any) -> Change:
+        *poses, p, ray, _ = blocks
         model = cameras.get_model(self.model)
         return not_none(model.local).columns(p, *model.ideal(p, *_transform_ray(poses, ray)))
 
@@ -59,11 +59,11 @@ class LocalImagePoint:
 
     model: str | cameras.CameraModel
 
-    def __call__(self, *touched: Any) -> Change:
-        *poses, p, ray, columns, values, xy = touched
+    def __call__(self, *blocks: Any) -> Change:
+        *poses, p, ray, columns, values, xy = blocks
         model = cameras.get_model(self.model)
-        at = model.ideal(p, *_transform_ray(poses, ray))
-        x, y = not_none(model.local).distort(p, columns, values, *at)
+        ideal = model.ideal(p, *_transform_ray(poses, ray))
+        x, y = not_none(model.local).distort(p, columns, values, *ideal)
         return x - xy[0], y - xy[1]
 
 
@@ -107,23 +107,29 @@ def image_points(
     """Image points of the cameras of one model, whose table is `camera`; `domain`: "corrected" or
     "measured"; `poses`: the tables of poses on the way from the object to the camera; `moving`: for
     cameras with a rolling shutter; `refraction`: through interfaces."""
-    between = (VELOCITIES, READ_OUT) if moving else ()
+    tables_between = (VELOCITIES, READ_OUT) if moving else ()
     if refraction is not None:
-        between = (refraction.table, MEDIA)
-    of = (*poses, *between, camera, "point")
-    only = camera == "camera"
-    name = "image coordinates" if only else f"image coordinates of {cameras.get_model(model).name}"
+        tables_between = (refraction.table, MEDIA)
+    tables = (*poses, *tables_between, camera, "point")
+    is_only_table = camera == "camera"
+    name = (
+        "image coordinates"
+        if is_only_table
+        else f"image coordinates of {cameras.get_model(model).name}"
+    )
     residual: Any = (MovingImagePoint if moving else ImagePoint)(model, domain)
     if refraction is not None:
         residual = RefractedImagePoint(model, domain, refraction)
     # A spline of hundreds of parameters: an image point depends on a few of them, and only those
     # get derivatives and blocks (`leastsquares.equations.local`).
     formula, local = cameras.get_model(model).local, None
-    if formula is not None and domain == "measured" and not between:
+    if formula is not None and domain == "measured" and not tables_between:
         local = Local(
-            of.index(camera), formula.number, ColumnsOfImagePoint(model), LocalImagePoint(model)
+            tables.index(camera), formula.number, ColumnsOfImagePoint(model), LocalImagePoint(model)
         )
-    return Kind(name, residual, of, ("x", "y"), "image", scalars=True, invariant=True, local=local)
+    return Kind(
+        name, residual, tables, ("x", "y"), "image", scalars=True, invariant=True, local=local
+    )
 
 
 def declare_image_points(
@@ -152,14 +158,14 @@ def declare_image_points(
             moving=line is not None,
             refraction=refraction,
         )
-        between = () if line is None else (rays.image, camera)
+        rows_between = () if line is None else (rays.image, camera)
         if interfaces is not None:
-            between = (interfaces.rows_of_cameras(network)[camera],) * 2
-        touched = (rays.image, *between, row_of_camera[camera], rays.point)
+            rows_between = (interfaces.rows_of_cameras(network)[camera],) * 2
+        touched_rows = (rays.image, *rows_between, row_of_camera[camera], rays.point)
         measured = rays.xy[rows] if line is None else (rays.xy[rows], line[rows])
         sets.append(
             kind(
-                tuple(index[rows] for index in touched),
+                tuple(index[rows] for index in touched_rows),
                 measured,
                 sigma=rays.sigma[rows],
                 name=table.image_set,

@@ -75,19 +75,19 @@ class Refraction:
         z = interface.rotation.apply_inverse((0.0, 0.0, 1.0))
         normal = tuple(-x for x in z)
         if self.table == PORT:
-            ray, before = pose.ray(point), interface.centre
-            distance = sum(n * x for n, x in zip(normal, before))
+            ray, from_centre = pose.ray(point), interface.centre
+            distance = sum(n * x for n, x in zip(normal, from_centre))
             return refract_flat(ray, normal, distance, thickness, indices)
         ray = tuple(a - b for a, b in zip(point, pose.centre))
-        before = (a - b for a, b in zip(interface.centre, pose.centre))
-        distance = sum(n * x for n, x in zip(normal, before))
+        from_centre = (a - b for a, b in zip(interface.centre, pose.centre))
+        distance = sum(n * x for n, x in zip(normal, from_centre))
         return pose.rotation.apply(refract_flat(ray, normal, distance, thickness, indices))
 
 
-def given_plane(frame: Posed, given: tuple[Array, Array]) -> Float[Array, "3"]:
+def given_plane(frame: Posed, observed: tuple[Array, Array]) -> Float[Array, "3"]:
     """The shift of a plane along its normal, and its tilts, against the given point and rotation.
     Of the plane alone, not of where its frame is on it, which has no derivative."""
-    X0, M = given
+    X0, M = observed
     z = jnp.stack(frame.rotation.apply_inverse((0.0, 0.0, 1.0)))
     x, y, _ = M @ z
     return jnp.stack([z @ (jnp.stack(frame.centre) - X0), y, -x])
@@ -123,7 +123,7 @@ class Interfaces(ObservationTable):
         for row, k in np.argwhere(sigma <= 0)[:1]:
             raise InputError(f"{table.source(row)}: {sigmas[k]} is not positive; expected a σ")
         cells = table.values.get("camera", [None] * len(table))
-        made = cls(
+        interfaces = cls(
             interface=table.ids("interface"),
             type=table.ids("type"),
             camera=tuple("" if is_missing(cell) else str(cell).strip() for cell in cells),
@@ -131,25 +131,25 @@ class Interfaces(ObservationTable):
             sigma=sigma,
             source=table.source,
         )
-        for row in range(len(made)):
-            made._check_row(row)
-        check_unique(made.interface, made.source, "interface")
+        for row in range(len(interfaces)):
+            interfaces._check_row(row)
+        check_unique(interfaces.interface, interfaces.source, "interface")
         value = np.where(np.isnan(value), NO_INTERFACE, value)
         # A layer of thickness 0 has the index behind it: its two planes are one.
         window, thickness = COLUMNS.index("index_window"), COLUMNS.index("thickness")
         single = value[:, thickness] == 0
         value[single, window] = value[single, COLUMNS.index("index")]
-        return dataclasses.replace(made, value=value)
+        return dataclasses.replace(interfaces, value=value)
 
     def _check_row(self, row: int) -> None:
         where, type = self.source(row), self.type[row]
-        given = dict(zip(COLUMNS, ~np.isnan(self.value[row])))
-        spread = dict(zip(COLUMNS, ~np.isnan(self.sigma[row])))
+        has_value = dict(zip(COLUMNS, ~np.isnan(self.value[row])))
+        has_sigma = dict(zip(COLUMNS, ~np.isnan(self.sigma[row])))
         value = dict(zip(COLUMNS, self.value[row].tolist()))
         if type not in TYPES:
             raise InputError(f"{where}: type is {type!r}{did_you_mean(type, TYPES)}")
         layer = value["thickness"] > 0
-        if given["index_window"] != layer or spread["thickness"] and not layer:
+        if has_value["index_window"] != layer or has_sigma["thickness"] and not layer:
             raise InputError(
                 f"{where}: a window has a thickness, a positive number, and an index_window; "
                 "expected both or neither"
@@ -157,10 +157,10 @@ class Interfaces(ObservationTable):
         # σ of what an interface of this type does not have
         lacking = ("radius", "sX", "sY") if type == "flat" else (*TILT, "somega", "sphi")
         for name in lacking:
-            if given.get(name, False) or spread.get(name[1:], False) and name[0] == "s":
+            if has_value.get(name, False) or has_sigma.get(name[1:], False) and name[0] == "s":
                 raise InputError(f"{where}: a {type} interface has no {name}")
         for name in ("radius", "index_window", "index_camera", "index", "thickness"):
-            if spread[name] and not given[name]:
+            if has_sigma[name] and not has_value[name]:
                 raise InputError(f"{where}: s{name} is given, but no {name}")
         self._check_indices(row)
         if type == "dome":
@@ -187,10 +187,10 @@ class Interfaces(ObservationTable):
             raise InputError(f"{where}: camera is missing: a dome is before one camera")
         if not radius > 0:
             raise InputError(f"{where}: radius is missing, of the inner sphere, positive")
-        off = np.linalg.norm(np.nan_to_num(self.value[row, :3]))
-        if off >= radius:
+        distance = np.linalg.norm(np.nan_to_num(self.value[row, :3]))
+        if distance >= radius:
             raise InputError(
-                f"{where}: the camera is {off:g} from the centre of its dome, outside of the "
+                f"{where}: the camera is {distance:g} from the centre of its dome, outside of the "
                 f"radius {radius:g}; X, Y, Z are relative to the camera"
             )
 
@@ -206,29 +206,30 @@ class Interfaces(ObservationTable):
 
     def columns(self, radians: float) -> dict[str, Sequence[Any]]:
         unit = np.where([name in TILT for name in COLUMNS], radians, 1.0)
-        found: dict = {"interface": self.interface, "type": self.type, "camera": self.camera}
+        columns: dict = {"interface": self.interface, "type": self.type, "camera": self.camera}
         flat = np.array([type == "flat" for type in self.type])
         plain = self.value[:, COLUMNS.index("thickness")] == 0
         for k, name in enumerate(COLUMNS):
             lacking = (plain & (name in ("index_window", "thickness"))) | (
                 flat if name == "radius" else ~flat & (name in TILT)
             )
-            found[name] = np.where(lacking, np.nan, self.value[:, k] / unit[k])
+            columns[name] = np.where(lacking, np.nan, self.value[:, k] / unit[k])
         for k, name in enumerate(COLUMNS):
             sigma = (self.sigma[:, k] / unit[k]).tolist()
-            found[f"s{name}"] = [x if np.isfinite(x) else "free" if x > 0 else x for x in sigma]
-        return {name: x for name, x in found.items() if not _is_empty(x)}
+            columns[f"s{name}"] = [x if np.isfinite(x) else "free" if x > 0 else x for x in sigma]
+        return {name: x for name, x in columns.items() if not _is_empty(x)}
 
     def at(self, unknowns: Mapping[str, Mapping], radians: float) -> "Interfaces":
         """The interfaces held at the values of a result (`Adjustment.further_unknowns`)."""
         geometry, media = (unknowns[name] for name in (self._table(0), MEDIA))
         value = self.value.copy()
         for row, name in enumerate(self.interface):
-            known = {k.removesuffix("0"): v["value"] for k, v in geometry[name].items()}
-            known |= {k: v["value"] for k, v in media[name].items()}
+            adjusted = {k.removesuffix("0"): v["value"] for k, v in geometry[name].items()}
+            adjusted |= {k: v["value"] for k, v in media[name].items()}
             scale = {k: radians if k in TILT else 1.0 for k in COLUMNS}
             value[row] = [
-                known[k] * scale[k] if k in known else old for k, old in zip(COLUMNS, value[row])
+                adjusted[k] * scale[k] if k in adjusted else old
+                for k, old in zip(COLUMNS, value[row])
             ]
         return dataclasses.replace(self, value=value, sigma=np.full_like(self.sigma, np.nan))
 
@@ -236,8 +237,8 @@ class Interfaces(ObservationTable):
         return len(self.interface)
 
     def _present(self, network: Network) -> np.ndarray:
-        known = {"", *(camera.id for camera in network.cameras)}
-        return np.array([id in known for id in self.camera], bool)
+        known_ids = {"", *(camera.id for camera in network.cameras)}
+        return np.array([id in known_ids for id in self.camera], bool)
 
     def number_of_equations(self) -> int:
         return 0
@@ -256,18 +257,19 @@ class Interfaces(ObservationTable):
                     f"{self.source(row)}: a {table}, but a {tables[0]} in {self.source(0)}: "
                     "expected all interfaces of a network of one type"
                 )
-        own = [id for id in self.camera if id] if tables[0] != SURFACE else [*self.camera]
-        if len({*own}) < len(own):
+        camera_ids = [id for id in self.camera if id] if tables[0] != SURFACE else [*self.camera]
+        if len({*camera_ids}) < len(camera_ids):
             raise InputError(
                 f"{self.source.name}: two interfaces "
                 + ("in object space" if tables[0] == SURFACE else "before one camera")
                 + "; expected one (a window is one interface with a thickness)"
             )
-        for other in network.further:
-            if other.TABLE in ("velocities", "edges"):
+        for other_kind in network.further:
+            if other_kind.TABLE in ("velocities", "edges"):
                 raise InputError(
-                    f"{self.source.name}: {other.TABLE} are for straight rays; expected a network "
-                    f"with either {self.TABLE} or {other.TABLE}"
+                    f"{self.source.name}: {other_kind.TABLE} are for straight rays; expected a "
+                    "network "
+                    f"with either {self.TABLE} or {other_kind.TABLE}"
                 )
 
     def _table(self, row: int) -> str:
@@ -291,17 +293,19 @@ class Interfaces(ObservationTable):
         neglect that they do not meet in one point. NaN beyond total reflection."""
         for row in [row for row, id in enumerate(self.camera) if id == camera]:
             value = dict(zip(COLUMNS, self.value[row].tolist()))
-            at, normal = np.zeros_like(rays), self._normal(row)
+            point_on_port, normal = np.zeros_like(rays), self._normal(row)
             for radius, n, n_next in (
                 (value["radius"], value["index_camera"], value["index_window"]),
                 (value["radius"] + value["thickness"], value["index_window"], value["index"]),
             ):
                 if self.type[row] == "dome":
-                    away = self.value[row, :3] - at
-                    along = (rays * away).sum(1)
-                    beyond = along**2 - (away**2).sum(1) + radius**2
-                    at = at + rays * (along + np.sqrt(beyond))[:, None]
-                    normal = (at - self.value[row, :3]) / radius
+                    to_centre = self.value[row, :3] - point_on_port
+                    distance_along = (rays * to_centre).sum(1)
+                    chord = distance_along**2 - (to_centre**2).sum(1) + radius**2
+                    point_on_port = (
+                        point_on_port + rays * (distance_along + np.sqrt(chord))[:, None]
+                    )
+                    normal = (point_on_port - self.value[row, :3]) / radius
                 rays = _refract(rays, normal, n / n_next)
         return rays
 
@@ -364,8 +368,8 @@ def _observe(
         units,
         snooped="",
     )
-    spread = np.where(np.isnan(sigma[rows]), np.inf, sigma[rows])
-    return (kind((rows,), np.asarray(table.value)[rows], sigma=spread),)
+    sigma_observed = np.where(np.isnan(sigma[rows]), np.inf, sigma[rows])
+    return (kind((rows,), np.asarray(table.value)[rows], sigma=sigma_observed),)
 
 
 def _planes(
@@ -375,18 +379,18 @@ def _planes(
     labels: Sequence[str],
 ) -> tuple[Table, tuple[ObservationSet, ...]]:
     """The table of flat interfaces, and the observations of those that have a σ."""
-    X0, spread = value[:, :3], sigma[:, 2:5]
+    X0, sigma_of_plane = value[:, :3], sigma[:, 2:5]
     angles = np.pad(value[:, 3:5], ((0, 0), (0, 1)))
     M = np.stack([np.asarray(matrix_from_omega_phi_kappa(a)) for a in angles])
     q = np.stack([np.asarray(quaternion_from_matrix(m)) for m in M])
-    free = ~np.isnan(spread)
+    free = ~np.isnan(sigma_of_plane)
     table = Table(name, PoseValue(X0, q), Frame((2, 3, 4)), free, labels, PLANE, name)
-    rows = np.flatnonzero(np.isfinite(spread).any(1))
+    rows = np.flatnonzero(np.isfinite(sigma_of_plane).any(1))
     if not len(rows):
         return table, ()
     kind = Kind(f"prior of {name}", given_plane, (name,), PLANE, PLANE_PRIOR, snooped="")
-    spread = np.where(np.isnan(spread[rows]), np.inf, spread[rows])
-    return table, (kind((rows,), (X0[rows], M[rows]), sigma=spread),)
+    sigma_of_plane = np.where(np.isnan(sigma_of_plane[rows]), np.inf, sigma_of_plane[rows])
+    return table, (kind((rows,), (X0[rows], M[rows]), sigma=sigma_of_plane),)
 
 
 def _scale_thicknesses(motion: Float[Array, "7"], value: Float[Array, " n"]) -> Float[Array, " n"]:

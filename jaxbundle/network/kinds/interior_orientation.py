@@ -30,25 +30,25 @@ def declare_interior_orientation(
     network: "Network", tables: "tuple[CameraTable, ...]"
 ) -> list[ObservationSet]:
     """A set for every table of cameras of which one has a σ, one row a camera that has."""
-    found = []
+    sets = []
     observed = [
         dataclasses.replace(camera, parameters={**camera.parameters, **camera.observed})
         for camera in network.cameras
     ]
     for table in tables:
-        own = [network.cameras[c] for c in table.cameras]
+        own_cameras = [network.cameras[c] for c in table.cameras]
         sigma = np.array(
             [
                 [
                     camera.sigma.get(p, np.inf) if p in camera.free else np.inf
                     for p in table.parameters
                 ]
-                for camera in own
+                for camera in own_cameras
             ]
         )
         rows = np.flatnonzero(np.isfinite(sigma).any(1))
         if len(rows):
             kind = interior_orientation(table.name, table.parameters)
             value = table.start(observed)[rows]
-            found.append(kind((rows,), value, sigma=sigma[rows], name=table.interior_set))
-    return found
+            sets.append(kind((rows,), value, sigma=sigma[rows], name=table.interior_set))
+    return sets

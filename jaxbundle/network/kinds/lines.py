@@ -49,12 +49,12 @@ class OnLine:
         # The plane through the projection centre and the line has the normal n = (P − X0) ×
         # direction; a ray r in it has n·r = 0. Divided by its length across, and at the distance c,
         # this is the distance of the image point from the image of the line.
-        along = pose.rotation.apply(line.rotation.apply_inverse((0.0, 0.0, 1.0)))
-        n = cross(pose.ray(line.centre), along)
+        direction = pose.rotation.apply(line.rotation.apply_inverse((0.0, 0.0, 1.0)))
+        n = cross(pose.ray(line.centre), direction)
         r = cameras.image_ray(model, interior, *xy)
         c = interior[model.parameters.index(model.principal_distance[0])]
-        across = (n[0] ** 2 + n[1] ** 2) ** 0.5
-        return (c * sum(a * b for a, b in zip(n, r)) / (r[2] * across),)
+        length = (n[0] ** 2 + n[1] ** 2) ** 0.5
+        return (c * sum(a * b for a, b in zip(n, r)) / (r[2] * length),)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -96,9 +96,9 @@ class Edges(ObservationTable):
         camera = images.camera[image]
         sigma = np.where(np.isnan(self.sigma), np.median(network.observations.sigma), self.sigma)
         unit = network.image_unit if network.image_unit in ("mm", "px") else "mm"
-        both = np.stack([self.sigma] * 2, 1)
-        xy, own = from_image_unit(network.cameras, camera, self.xy, both, unit)
-        sigma = np.where(np.isnan(self.sigma), sigma, own[:, 0])
+        sigma_xy = np.stack([self.sigma] * 2, 1)
+        xy, own_sigma = from_image_unit(network.cameras, camera, self.xy, sigma_xy, unit)
+        sigma = np.where(np.isnan(self.sigma), sigma, own_sigma[:, 0])
         names, line = np.unique(np.array(self.line, dtype=object), return_inverse=True)
         start = [
             self._start(network, origin, np.flatnonzero(line == k), image, xy)
@@ -146,9 +146,9 @@ class Edges(ObservationTable):
         whose direction is mostly noise."""
         normals, through = [], []
         for i in np.unique(image[rows]):
-            own = rows[image[rows] == i]
+            rows_of_image = rows[image[rows] == i]
             # Two points of the line in an image give a plane; one point only helps the adjustment.
-            if len(own) < 2:
+            if len(rows_of_image) < 2:
                 continue
             c = network.images.camera[i]
             table = next(t for t in camera_tables(network.cameras) if c in t.cameras)
@@ -156,7 +156,9 @@ class Edges(ObservationTable):
             r = np.stack(
                 [
                     np.asarray(x)
-                    for x in cameras.image_ray(cameras.get_model(table.model), p, *xy[own].T)
+                    for x in cameras.image_ray(
+                        cameras.get_model(table.model), p, *xy[rows_of_image].T
+                    )
                 ],
                 1,
             )

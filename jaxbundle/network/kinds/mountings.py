@@ -38,16 +38,16 @@ def turn_of(D: Float[Array, "3 3"]) -> Float[Array, "3"]:
     return 0.5 * jnp.stack([D[1, 2] - D[2, 1], D[2, 0] - D[0, 2], D[0, 1] - D[1, 0]])
 
 
-def given_mounting(mounting: Posed, given: Float[Array, "6"]) -> Float[Array, "6"]:
+def given_mounting(mounting: Posed, observed: Float[Array, "6"]) -> Float[Array, "6"]:
     """Position and rotation of a mounting minus the given position and ω, φ, κ; the rotation as a
     vector about the axes of the camera, which has no singular attitude."""
-    turn = turn_of(mounting.rotation.matrix() @ matrix_from_omega_phi_kappa(given[3:]).T)
-    return jnp.concatenate([jnp.stack(mounting.centre) - given[:3], turn])
+    turn = turn_of(mounting.rotation.matrix() @ matrix_from_omega_phi_kappa(observed[3:]).T)
+    return jnp.concatenate([jnp.stack(mounting.centre) - observed[:3], turn])
 
 
-def given_base(one: Posed, other: Posed, length: Float[Array, ""]) -> Float[Array, ""]:
+def given_base(camera_a: Posed, camera_b: Posed, length: Float[Array, ""]) -> Float[Array, ""]:
     """The distance of two cameras of a rig minus the given one."""
-    return jnp.linalg.norm(jnp.stack(one.centre) - jnp.stack(other.centre)) - length
+    return jnp.linalg.norm(jnp.stack(camera_a.centre) - jnp.stack(camera_b.centre)) - length
 
 
 GIVEN_MOUNTINGS = Kind("given mountings", given_mounting, (MOUNTING,), AXES, POSE_UNITS, snooped="")
@@ -68,8 +68,8 @@ class GivenMounting(NamedTuple):
     @property
     def length(self) -> float | None:
         """The base to the reference camera; None if it is not determined."""
-        known = self.held[0] or np.isfinite(self.sigma[:3]).all()
-        length = 0.0 if self.position is None or not known else np.linalg.norm(self.position)
+        is_known = self.held[0] or np.isfinite(self.sigma[:3]).all()
+        length = 0.0 if self.position is None or not is_known else np.linalg.norm(self.position)
         return float(length) if length > 0 else None
 
 
@@ -81,66 +81,68 @@ class Base(NamedTuple):
     sigma: float
 
 
-def read_mountings(section: str, given: Any, radians: float) -> dict[str, GivenMounting]:
+def read_mountings(
+    section: str, section_of_cameras: Any, radians: float
+) -> dict[str, GivenMounting]:
     """The given mountings by camera; `radians` per angle unit.
 
     **Raises:** `InputError`."""
-    if not isinstance(given, Mapping):
+    if not isinstance(section_of_cameras, Mapping):
         raise InputError(
-            f"[{section}]: mounting is {show(given)}; expected what is known of the "
+            f"[{section}]: mounting is {show(section_of_cameras)}; expected what is known of the "
             "mounting of each camera, such as mounting.right = { position = [0.5, 0, 0] }"
         )
     return {
-        name: _read_mounting(f"{section}.mounting.{name}", one, radians)
-        for name, one in given.items()
+        name: _read_mounting(f"{section}.mounting.{name}", entry, radians)
+        for name, entry in section_of_cameras.items()
     }
 
 
-def _read_mounting(section: str, given: Any, radians: float) -> GivenMounting:
-    check_settings(section, given, KEYS)
+def _read_mounting(section: str, entry: Any, radians: float) -> GivenMounting:
+    check_settings(section, entry, KEYS)
     unit = np.repeat([1.0, radians], 3)
-    position = numbers(section, "position", given["position"], 3) if "position" in given else None
-    angles = numbers(section, "angles", given["angles"], 3) * radians if "angles" in given else None
+    position = numbers(section, "position", entry["position"], 3) if "position" in entry else None
+    angles = numbers(section, "angles", entry["angles"], 3) * radians if "angles" in entry else None
     if position is None and angles is None:
         raise InputError(f"[{section}]: give position, angles, or both")
-    if "covariance" in given:
-        if {"sigma_position", "sigma_angle"} & {*given}:
+    if "covariance" in entry:
+        if {"sigma_position", "sigma_angle"} & {*entry}:
             raise InputError(f"[{section}]: give covariance, or sigma_position and sigma_angle")
         if angles is None or position is None:
             raise InputError(f"[{section}]: covariance is of position and angles; give both")
-        C = _covariance(section, given["covariance"]) * np.outer(unit, unit)
+        C = _covariance(section, entry["covariance"]) * np.outer(unit, unit)
         C = _of_rotation_vector(C, angles)
         return GivenMounting(position, angles, np.sqrt(np.diag(C)), C, (False, False))
     sigma = np.full(6, np.inf)
-    held = []
+    is_held = []
     for k, (name, value) in enumerate((("position", position), ("angle", angles))):
         key = f"sigma_{name}"
-        if key in given and value is None:
+        if key in entry and value is None:
             raise InputError(f"[{section}]: {key} without {'position' if not k else 'angles'}")
-        held.append(value is not None and key not in given)
-        if key in given:
-            sigma[3 * k : 3 * k + 3] = _sigmas(section, key, given[key]) * unit[3 * k]
-    return GivenMounting(position, angles, sigma, None, (held[0], held[1]))
+        is_held.append(value is not None and key not in entry)
+        if key in entry:
+            sigma[3 * k : 3 * k + 3] = _sigmas(section, key, entry[key]) * unit[3 * k]
+    return GivenMounting(position, angles, sigma, None, (is_held[0], is_held[1]))
 
 
-def _sigmas(section: str, key: str, given: Any) -> Float[np.ndarray, "3"]:
+def _sigmas(section: str, key: str, setting: Any) -> Float[np.ndarray, "3"]:
     """One σ for all axes, or three; inf: an axis of which nothing is known."""
     try:
-        found = np.broadcast_to(np.asarray(given, float), 3)
+        sigma = np.broadcast_to(np.asarray(setting, float), 3)
     except (TypeError, ValueError):
-        found = np.zeros(3)
+        sigma = np.zeros(3)
     # NaN is not positive either
-    if not (found > 0).all():
+    if not (sigma > 0).all():
         raise InputError(
-            f"[{section}]: {key} is {show(given)}; expected a positive number, or three (inf: "
+            f"[{section}]: {key} is {show(setting)}; expected a positive number, or three (inf: "
             "nothing is known of an axis)"
         )
-    return found
+    return sigma
 
 
-def _covariance(section: str, given: Any) -> Float[np.ndarray, "6 6"]:
+def _covariance(section: str, setting: Any) -> Float[np.ndarray, "6 6"]:
     try:
-        C = np.array(given, float)
+        C = np.array(setting, float)
         # 1e-9: rounding of numbers printed with nine digits
         scale = np.sqrt(np.outer(np.diag(C), np.diag(C)))
         good = C.shape == (6, 6) and (np.abs(C - C.T) <= 1e-9 * scale).all()
@@ -165,52 +167,58 @@ def _of_rotation_vector(
     return J @ C @ J.T
 
 
-def read_bases(section: str, given: Any) -> tuple[Base, ...]:
+def read_bases(section: str, entries: Any) -> tuple[Base, ...]:
     """The given bases.
 
     **Raises:** `InputError`."""
-    if not isinstance(given, Sequence) or isinstance(given, str):
+    if not isinstance(entries, Sequence) or isinstance(entries, str):
         raise InputError(
-            f"[{section}]: bases is {show(given)}; expected a list, such as "
+            f"[{section}]: bases is {show(entries)}; expected a list, such as "
             '[{ cameras = ["left", "right"], length = 0.5, sigma = 0.001 }]'
         )
-    found = []
-    for k, one in enumerate(given, 1):
+    bases = []
+    for k, entry in enumerate(entries, 1):
         where = f"{section}.bases, {k}"
-        check_settings(where, one, ("cameras", "length", "sigma"))
-        cameras = one.get("cameras")
+        check_settings(where, entry, ("cameras", "length", "sigma"))
+        cameras = entry.get("cameras")
         pair = isinstance(cameras, list | tuple) and len(cameras) == 2
         if not pair or not all(isinstance(c, str) for c in cameras) or cameras[0] == cameras[1]:
             raise InputError(f"[{where}]: cameras is {show(cameras)}; expected two names")
         length, sigma = (
-            positive(f"[{where}]: {key}", one.get(key, np.nan)) for key in ("length", "sigma")
+            positive(f"[{where}]: {key}", entry.get(key, np.nan)) for key in ("length", "sigma")
         )
-        found.append(Base((cameras[0], cameras[1]), length, sigma))
-    return tuple(found)
+        bases.append(Base((cameras[0], cameras[1]), length, sigma))
+    return tuple(bases)
 
 
-def observe_mountings(rows: Sequence[int], given: Sequence[GivenMounting]) -> list[ObservationSet]:
+def observe_mountings(
+    rows: Sequence[int], mountings: Sequence[GivenMounting]
+) -> list[ObservationSet]:
     """The observations of mountings (rows of the table) that have a σ: those whose axes are
     independent, and those with a covariance."""
-    found = []
+    sets = []
     for name, correlated in (("given mountings", False), ("correlated mountings", True)):
-        chosen = [
-            (row, one)
-            for row, one in zip(rows, given)
-            if (one.covariance is not None) == correlated and np.isfinite(one.sigma).any()
+        rows_and_mountings = [
+            (row, mounting)
+            for row, mounting in zip(rows, mountings)
+            if (mounting.covariance is not None) == correlated and np.isfinite(mounting.sigma).any()
         ]
-        if not chosen:
+        if not rows_and_mountings:
             continue
-        at, ones = zip(*chosen)
-        measured = np.stack([_as_measured(one) for one in ones])
-        spread: dict[str, Any] = {"sigma": np.stack([one.sigma for one in ones])}
+        rows_observed, mountings_observed = zip(*rows_and_mountings)
+        measured = np.stack([_as_measured(mounting) for mounting in mountings_observed])
+        uncertainty: dict[str, Any] = {
+            "sigma": np.stack([mounting.sigma for mounting in mountings_observed])
+        }
         if correlated:
-            spread = {"covariance": np.stack([one.covariance for one in ones])}
-        found.append(GIVEN_MOUNTINGS((np.array(at),), measured, name=name, **spread))
-    return found
+            uncertainty = {
+                "covariance": np.stack([mounting.covariance for mounting in mountings_observed])
+            }
+        sets.append(GIVEN_MOUNTINGS((np.array(rows_observed),), measured, name=name, **uncertainty))
+    return sets
 
 
-def _as_measured(one: GivenMounting) -> Float[np.ndarray, "6"]:
+def _as_measured(mounting: GivenMounting) -> Float[np.ndarray, "6"]:
     # What is not given has an infinite σ.
-    parts = (np.zeros(3) if part is None else part for part in (one.position, one.angles))
+    parts = (np.zeros(3) if part is None else part for part in (mounting.position, mounting.angles))
     return np.concatenate([*parts])

@@ -51,24 +51,24 @@ KEYS = ("reference", "sigma_position", "sigma_angle", "mounting", "bases")
 
 
 def mounting_misclosure(
-    one: Posed,
-    other: Posed,
+    pose_a: Posed,
+    pose_b: Posed,
     mounting_of_one: Posed,
     mounting_of_other: Posed,
-    given: Float[Array, "6"],
+    observed: Float[Array, "6"],
 ) -> Float[Array, "6"]:
     """Difference of position and rotation of the reference camera derived from two cameras, in the
     frame of the first; the rotation as a vector. The reference has no mounting.
     """
     R1, R2 = mounting_of_one.rotation.matrix(), mounting_of_other.rotation.matrix()
-    M1, M2 = one.rotation.matrix(), other.rotation.matrix()
+    M1, M2 = pose_a.rotation.matrix(), pose_b.rotation.matrix()
     # Both cameras give the rotation of the reference camera, M_ref = Rᵀ·M, and its place. The
     # difference is symmetric in them and needs no image of the reference at this epoch.
     base1, base2 = R1.T @ M1, R2.T @ M2
-    apart = jnp.stack(other.centre) - jnp.stack(one.centre)
+    base_in_space = jnp.stack(pose_b.centre) - jnp.stack(pose_a.centre)
     t1, t2 = jnp.stack(mounting_of_one.centre), jnp.stack(mounting_of_other.centre)
-    shift = base1 @ apart - (t2 - t1)
-    return jnp.concatenate([shift, turn_of(base2 @ base1.T)]) - given
+    shift = base1 @ base_in_space - (t2 - t1)
+    return jnp.concatenate([shift, turn_of(base2 @ base1.T)]) - observed
 
 
 # Invariant: residuals of a condition at the start scale with the network but define no scale.
@@ -149,21 +149,22 @@ class Rigs(ObservationTable):
         images = network.images
         mountings, bases = self.given(network)
         camera = {id: network.cameras[c].id for id, c in zip(images.id, images.camera)}
-        seen: dict[tuple[str, ...], int] = {}
+        first_row: dict[tuple[str, ...], int] = {}
         for row, key in enumerate(zip(self.rig, self.epoch, map(camera.__getitem__, self.image))):
-            if seen.setdefault(key, row) != row:
+            if first_row.setdefault(key, row) != row:
                 raise InputError(
                     f"{self.source(row)}: camera {key[2]!r} has two images at epoch {key[1]!r} of "
-                    f"rig {key[0]!r}; the other is in {self.source(seen[key])}"
+                    f"rig {key[0]!r}; the other is in {self.source(first_row[key])}"
                 )
 
-        there = {camera[id] for id in self.image}
-        named = [(f"mounting.{name}", name) for name in mountings]
-        named += [("bases", name) for base in bases for name in base.cameras]
-        for key, name in named:
-            if name not in there:
+        cameras_of_rigs = {camera[id] for id in self.image}
+        named_cameras = [(f"mounting.{name}", name) for name in mountings]
+        named_cameras += [("bases", name) for base in bases for name in base.cameras]
+        for key, name in named_cameras:
+            if name not in cameras_of_rigs:
                 raise InputError(
-                    f"[{SECTION}]: {key}: no rig has a camera {name!r}{did_you_mean(name, there)}"
+                    f"[{SECTION}]: {key}: no rig has a camera "
+                    f"{name!r}{did_you_mean(name, cameras_of_rigs)}"
                 )
 
     def given(self, network: Network) -> tuple[dict[str, GivenMounting], tuple[Base, ...]]:
@@ -174,41 +175,45 @@ class Rigs(ObservationTable):
 
     def declare(self, network: Network, origin: Float[np.ndarray, "3"]) -> Contribution:
         images, radians = network.images, ANGLE_UNITS[network.angle_unit]
-        given, bases = self.given(network)
+        given_mountings, bases = self.given(network)
         labels, places, turns, free, pairs = [], [], [], [], []
-        observed, between = [], []
+        observed, bases_of_rows = [], []
         for rig, (reference, mountings, all_epochs) in self.mounted(network).items():
             if len(mountings) < 2:
                 continue
-            first = len(labels)
+            first_row = len(labels)
             # The reference first; its mounting is the identity and held, so that all others are
             # relative to it.
-            at = {c: first + k for k, c in enumerate(mountings)}
+            row_of = {c: first_row + k for k, c in enumerate(mountings)}
             for c, mounting in mountings.items():
                 name = network.cameras[c].id
-                known = given.get(name, NOTHING_GIVEN)
-                if c == reference and name in given:
+                given_mounting = given_mountings.get(name, NOTHING_GIVEN)
+                if c == reference and name in given_mountings:
                     raise InputError(
                         f"[{SECTION}]: mounting.{name}: {name!r} is the reference camera of rig "
                         f"{rig!r}, which the others are mounted to; give theirs, or name another "
                         "reference"
                     )
-                t, R = _start(mounting, known)
+                t, R = _start(mounting, given_mounting)
                 labels.append(f"{name} of {rig}")
                 places.append(t)
                 turns.append(np.asarray(quaternion_from_matrix(R)))
-                free.append(c != reference and ~np.repeat(known.held, 3))
-                observed.append((at[c], known))
-            ids = {network.cameras[c].id: at[c] for c in mountings}
-            between += [
+                free.append(c != reference and ~np.repeat(given_mounting.held, 3))
+                observed.append((row_of[c], given_mounting))
+            ids = {network.cameras[c].id: row_of[c] for c in mountings}
+            bases_of_rows += [
                 (*(ids[name] for name in base.cameras), base)
                 for base in bases
                 if {*base.cameras} <= {*ids}
             ]
             for epoch in all_epochs.values():
                 if len(epoch) > 1:
-                    one = reference if reference in epoch else min(epoch)
-                    pairs += [(epoch[one], i, at[one], at[c]) for c, i in epoch.items() if c != one]
+                    base_camera = reference if reference in epoch else min(epoch)
+                    pairs += [
+                        (epoch[base_camera], i, row_of[base_camera], row_of[c])
+                        for c, i in epoch.items()
+                        if c != base_camera
+                    ]
         if not pairs:
             raise InputError(f"{self.source.name}: no epoch has images of two cameras")
         mounting = Table(
@@ -222,8 +227,8 @@ class Rigs(ObservationTable):
         )
         # Exact: a thousandth of what image points give, as a length and as an angle at the median
         # distance, so that the normal equations stay well conditioned.
-        across = across_rays(network)
-        length = self.settings.get("sigma_position", EXACT_SIGMA * across)
+        sigma_across_rays = across_rays(network)
+        length = self.settings.get("sigma_position", EXACT_SIGMA * sigma_across_rays)
         depth = np.median(
             np.linalg.norm(
                 network.points.position[network.observations.point]
@@ -232,38 +237,52 @@ class Rigs(ObservationTable):
             )
         )
         # The setting is in the unit of angles, its default in radians.
-        angle = self.settings.get("sigma_angle", EXACT_SIGMA * across / depth / radians) * radians
+        angle = (
+            self.settings.get("sigma_angle", EXACT_SIGMA * sigma_across_rays / depth / radians)
+            * radians
+        )
         sigma = np.repeat([length, angle], 3) * np.ones((len(pairs), 1))
-        seen = MOUNTED(tuple(np.array(pairs).T), np.zeros((len(pairs), 6)), sigma=sigma)
-        sets = [seen, *observe_mountings(*zip(*observed))]
-        if between:
-            one, other, base = zip(*between)
-            length, spread = (np.array([getattr(b, n) for b in base]) for n in ("length", "sigma"))
-            sets.append(BASES((np.array(one), np.array(other)), length, sigma=spread))
+        mounted = MOUNTED(tuple(np.array(pairs).T), np.zeros((len(pairs), 6)), sigma=sigma)
+        sets = [mounted, *observe_mountings(*zip(*observed))]
+        if bases_of_rows:
+            base_camera, other_rows, base = zip(*bases_of_rows)
+            length, sigma_of_lengths = (
+                np.array([getattr(b, n) for b in base]) for n in ("length", "sigma")
+            )
+            sets.append(
+                BASES((np.array(base_camera), np.array(other_rows)), length, sigma=sigma_of_lengths)
+            )
         return Contribution((mounting,), sets, ((MOUNTING, scale_position),))
 
     def scales(self, network: Network) -> list[float]:
         """The given bases, by those of the orientations of the images."""
-        given, bases = self.given(network)
-        found = []
+        given_mountings, bases = self.given(network)
+        ratios = []
         for rig in self.mounted(network).values():
-            at = {
+            position_of = {
                 network.cameras[c].id: mounting.position
                 for c, mounting in rig.mountings.items()
                 if mounting is not None
             }
             lengths = [
-                (known.length, np.linalg.norm(at[name]))
-                for name, known in given.items()
-                if name in at and known.length is not None
+                (given_mounting.length, np.linalg.norm(position_of[name]))
+                for name, given_mounting in given_mountings.items()
+                if name in position_of and given_mounting.length is not None
             ]
             lengths += [
-                (base.length, np.linalg.norm(at[base.cameras[0]] - at[base.cameras[1]]))
+                (
+                    base.length,
+                    np.linalg.norm(position_of[base.cameras[0]] - position_of[base.cameras[1]]),
+                )
                 for base in bases
-                if {*base.cameras} <= {*at}
+                if {*base.cameras} <= {*position_of}
             ]
-            found += [float(length / now) for length, now in lengths if now > 0]
-        return found
+            ratios += [
+                float(length / present_length)
+                for length, present_length in lengths
+                if present_length > 0
+            ]
+        return ratios
 
     def mounted(self, network: Network) -> dict[str, MountedCameras]:
         """The rigs by name, with the mountings that the orientations of the images give."""
@@ -274,36 +293,38 @@ class Rigs(ObservationTable):
         for rig, epoch, id in zip(self.rig, self.epoch, self.image):
             of_epoch = rigs.setdefault(rig, {}).setdefault(epoch, {})
             of_epoch[int(images.camera[row[id]])] = row[id]
-        made = {}
+        mounted = {}
         for rig, epochs in rigs.items():
-            together = [epoch for epoch in epochs.values() if len(epoch) > 1]
-            reference = self._reference(together or [*epochs.values()], network)
-            mountings = _mountings(together, reference, images.position, M)
-            made[rig] = MountedCameras(reference, mountings, epochs)
-        return made
+            epochs_of_several = [epoch for epoch in epochs.values() if len(epoch) > 1]
+            reference = self._reference(epochs_of_several or [*epochs.values()], network)
+            mountings = _mountings(epochs_of_several, reference, images.position, M)
+            mounted[rig] = MountedCameras(reference, mountings, epochs)
+        return mounted
 
     def _reference(self, epochs: Sequence[Mapping[int, int]], network: Network) -> int:
         ids = [camera.id for camera in network.cameras]
         cameras = Counter(c for epoch in epochs for c in epoch)
-        named = self.settings.get("reference")
-        if named in ids and ids.index(named) in cameras:
-            return ids.index(named)
-        if named is not None and named not in ids:
-            raise InputError(f"[{SECTION}]: reference is {named!r}, but there is no such camera")
+        named_reference = self.settings.get("reference")
+        if named_reference in ids and ids.index(named_reference) in cameras:
+            return ids.index(named_reference)
+        if named_reference is not None and named_reference not in ids:
+            raise InputError(
+                f"[{SECTION}]: reference is {named_reference!r}, but there is no such camera"
+            )
         return max(sorted(cameras), key=cameras.__getitem__, default=0)
 
 
 NOTHING_GIVEN = GivenMounting(None, None, np.full(6, np.inf), None, (False, False))
 
 
-def _start(mounting: MountedPose | None, known: GivenMounting) -> MountedPose:
+def _start(mounting: MountedPose | None, given: GivenMounting) -> MountedPose:
     """The start value of a mounting: that of the orientations of the images, except for what is
     held; of a camera that nothing connects with the reference what is given, or its place."""
     t, R = mounting or MountedPose(np.zeros(3), np.eye(3))
-    if known.position is not None and (mounting is None or known.held[0]):
-        t = known.position
-    if known.angles is not None and (mounting is None or known.held[1]):
-        R = np.asarray(matrix_from_omega_phi_kappa(known.angles))
+    if given.position is not None and (mounting is None or given.held[0]):
+        t = given.position
+    if given.angles is not None and (mounting is None or given.held[1]):
+        R = np.asarray(matrix_from_omega_phi_kappa(given.angles))
     return MountedPose(t, R)
 
 
@@ -315,38 +336,41 @@ def _mountings(
 ) -> dict[int, MountedPose | None]:
     """The mountings of the cameras; one that has no epoch with the reference by way of another."""
     cameras = sorted({c for epoch in epochs for c in epoch}, key=lambda c: c != reference)
-    found: dict[int, MountedPose | None] = dict.fromkeys(cameras)
-    found[reference] = MountedPose(np.zeros(3), np.eye(3))
+    mounting_of: dict[int, MountedPose | None] = dict.fromkeys(cameras)
+    mounting_of[reference] = MountedPose(np.zeros(3), np.eye(3))
     to_visit = [reference]
-    for known in to_visit:
-        base = found[known]
+    for known_camera in to_visit:
+        base = mounting_of[known_camera]
         assert base is not None
         for c in cameras:
-            if found[c] is None and (step := _between(epochs, known, c, position, M)):
+            if mounting_of[c] is None and (step := _between(epochs, known_camera, c, position, M)):
                 # x_c = R·(M_known·(X − X_known) − t), and M_known = R_known·M_reference
                 place = base.position + base.rotation.T @ step.position
-                found[c] = MountedPose(place, step.rotation @ base.rotation)
+                mounting_of[c] = MountedPose(place, step.rotation @ base.rotation)
                 to_visit.append(c)
-    return found
+    return mounting_of
 
 
 def _between(
     epochs: Sequence[Mapping[int, int]],
-    one: int,
-    other: int,
+    camera_a: int,
+    camera_b: int,
     position: Float[np.ndarray, "images 3"],
     M: Float[np.ndarray, "images 3 3"],
 ) -> MountedPose | None:
     """A camera in the frame of another, at the epoch with the median position; None without an
     epoch of both."""
-    found = [
-        MountedPose(M[e[one]] @ (position[e[other]] - position[e[one]]), M[e[other]] @ M[e[one]].T)
+    mountings = [
+        MountedPose(
+            M[e[camera_a]] @ (position[e[camera_b]] - position[e[camera_a]]),
+            M[e[camera_b]] @ M[e[camera_a]].T,
+        )
         for e in epochs
-        if one in e and other in e
+        if camera_a in e and camera_b in e
     ]
-    if not found:
+    if not mountings:
         return None
     # Of a whole epoch, not a mean of all: position and rotation of one epoch belong together, and a
     # mean of rotations from poor start values is none of them.
-    t = np.array([t for t, _ in found])
-    return found[np.linalg.norm(t - np.median(t, axis=0), axis=1).argmin()]
+    t = np.array([t for t, _ in mountings])
+    return mountings[np.linalg.norm(t - np.median(t, axis=0), axis=1).argmin()]

@@ -104,8 +104,8 @@ class RollingShutter(ObservationTable):
     def check(self, network: Network) -> None:
         super().check(network)
         check_unique(self.image, self.source, "image")
-        given, ids = self.settings["line_time"], [camera.id for camera in network.cameras]
-        for id in given if isinstance(given, Mapping) else ():
+        line_time, ids = self.settings["line_time"], [camera.id for camera in network.cameras]
+        for id in line_time if isinstance(line_time, Mapping) else ():
             if id not in ids:
                 raise InputError(
                     f"[{SECTION}]: line_time names no camera {id!r}{did_you_mean(id, ids)}"
@@ -113,9 +113,9 @@ class RollingShutter(ObservationTable):
 
     def line_times(self, network: Network) -> Float[np.ndarray, " cameras"]:
         """Seconds per line of every camera, 0 for a global shutter."""
-        given = self.settings["line_time"]
+        line_time = self.settings["line_time"]
         ids = [camera.id for camera in network.cameras]
-        by_camera = given if isinstance(given, Mapping) else {id: given for id in ids}
+        by_camera = line_time if isinstance(line_time, Mapping) else {id: line_time for id in ids}
         for value in by_camera.values():
             if isinstance(value, bool) or not isinstance(value, int | float):
                 raise InputError(f"[{SECTION}]: line_time is {show(value)}; expected a number")
@@ -123,27 +123,30 @@ class RollingShutter(ObservationTable):
 
     def lines(self, network: Network) -> Float[np.ndarray, " rays"]:
         """The line of every image point relative to the middle one."""
-        rays, of = network.observations, network.images.camera[network.observations.image]
+        rays, camera_of_ray = (
+            network.observations,
+            network.images.camera[network.observations.image],
+        )
         # Relative to the middle line, so that the pose of an image is that of its middle exposure.
-        moving = self.line_times(network)[of] != 0
+        moving = self.line_times(network)[camera_of_ray] != 0
         lines = np.zeros(len(rays))
-        for c in np.unique(of[moving]):
-            camera, own = network.cameras[c], of == c
+        for c in np.unique(camera_of_ray[moving]):
+            camera, is_of_camera = network.cameras[c], camera_of_ray == c
             if camera.image_size is None:
                 raise InputError(
                     f"camera {camera.id!r}: image_size is needed for the exposure time of a line"
                 )
-            xy, sigma = rays.xy[own], rays.sigma[own]
-            uv, _ = to_image_unit(network.cameras, of[own], xy, sigma, "px")
-            lines[own] = uv[:, 1] - (camera.image_size[1] - 1) / 2
+            xy, sigma = rays.xy[is_of_camera], rays.sigma[is_of_camera]
+            uv, _ = to_image_unit(network.cameras, camera_of_ray[is_of_camera], xy, sigma, "px")
+            lines[is_of_camera] = uv[:, 1] - (camera.image_size[1] - 1) / 2
         return lines
 
     def declare(self, network: Network, origin: Float[np.ndarray, "3"]) -> Contribution:
         images, parameters = network.images, Parameters.from_settings(SECTION, self.settings, FREE)
         times = self.line_times(network)
         velocity, sigma = np.zeros((len(images), 6)), np.full((len(images), 6), np.nan)
-        given = rows_of(self.image, images)
-        velocity[given], sigma[given] = self.velocity, self.sigma
+        image_rows = rows_of(self.image, images)
+        velocity[image_rows], sigma[image_rows] = self.velocity, self.sigma
         common = np.array([parameters.sigma.get(name, np.inf) for name in VELOCITY])
         sigma = np.where(np.isnan(sigma), common, sigma)
         # A camera with a global shutter is in the same tables with a read-out of 0: held, it has no
@@ -152,12 +155,12 @@ class RollingShutter(ObservationTable):
         moves = Table(
             VELOCITIES, velocity, Vector(6), free, images.id, VELOCITY, "velocity of image"
         )
-        known = parameters.mask(["line_time"]) & (times != 0)[:, None]
+        is_known = parameters.mask(["line_time"]) & (times != 0)[:, None]
         read_out = Table(
             READ_OUT,
             times[:, None],
             Vector(1),
-            known,
+            is_known,
             [camera.id for camera in network.cameras],
             ("line_time",),
             "read-out of camera",
@@ -174,47 +177,47 @@ class RollingShutter(ObservationTable):
         self, network: Network, free: Bool[np.ndarray, "images 6"]
     ) -> list[ObservationSet]:
         """Velocities between the preceding and following images, as observations."""
-        given = self.settings.get("neighbours", {})
-        sigma = np.repeat([given.get("v", np.inf), given.get("w", np.inf)], 3)
+        neighbour_sigma = self.settings.get("neighbours", {})
+        sigma = np.repeat([neighbour_sigma.get("v", np.inf), neighbour_sigma.get("w", np.inf)], 3)
         image, rows = rows_of(self.image, network.images), []
         camera = network.images.camera[image]
         # Within a strip of one camera: between strips the platform turns.
-        for one in sorted({*zip(camera.tolist(), self.strip)} if given else ()):
-            own = np.array([pair == one for pair in zip(camera.tolist(), self.strip)])
-            order = np.flatnonzero(own)[np.argsort(self.time[own], kind="stable")]
+        for strip in sorted({*zip(camera.tolist(), self.strip)} if neighbour_sigma else ()):
+            is_of_strip = np.array([pair == strip for pair in zip(camera.tolist(), self.strip)])
+            order = np.flatnonzero(is_of_strip)[np.argsort(self.time[is_of_strip], kind="stable")]
             if len(order) > 1:
-                before, after = (order[0], *order[:-1]), (*order[1:], order[-1])
-                rows.append(np.stack([order, before, after]))
+                preceding, following = (order[0], *order[:-1]), (*order[1:], order[-1])
+                rows.append(np.stack([order, preceding, following]))
         if not rows:
             return []
-        this, before, after = np.concatenate(rows, 1)
+        middle, preceding, following = np.concatenate(rows, 1)
         # Equal times (bursts written to the second) give no velocity.
-        moves = free[image[this]].any(1) & (self.time[after] > self.time[before])
-        this, before, after = this[moves], before[moves], after[moves]
-        sigma = np.where(free[image[this]] > 0, sigma, np.inf)
-        time = self.time[after] - self.time[before]
-        return [NEIGHBOURS((image[this], image[before], image[after]), time, sigma=sigma)]
+        moves = free[image[middle]].any(1) & (self.time[following] > self.time[preceding])
+        middle, preceding, following = middle[moves], preceding[moves], following[moves]
+        sigma = np.where(free[image[middle]] > 0, sigma, np.inf)
+        time = self.time[following] - self.time[preceding]
+        return [NEIGHBOURS((image[middle], image[preceding], image[following]), time, sigma=sigma)]
 
 
 def between_neighbours(
-    velocity: Float[Array, "6"], before: Posed, after: Posed, time: Float[Array, ""]
+    velocity: Float[Array, "6"], preceding: Posed, following: Posed, time: Float[Array, ""]
 ) -> Float[Array, "6"]:
     """A velocity minus that from the preceding to the following pose."""
-    shift = jnp.stack([b - a for a, b in zip(before.centre, after.centre)])
-    turn = rotation_vector_from_matrix(after.rotation.matrix() @ before.rotation.matrix().T)
+    shift = jnp.stack([b - a for a, b in zip(preceding.centre, following.centre)])
+    turn = rotation_vector_from_matrix(following.rotation.matrix() @ preceding.rotation.matrix().T)
     return velocity - jnp.concatenate([shift, turn]) / time
 
 
-def _check_neighbours(given: Any, table: Columns) -> None:
-    if not isinstance(given, Mapping) or set(given) - {"v", "w"}:
+def _check_neighbours(setting: Any, table: Columns) -> None:
+    if not isinstance(setting, Mapping) or set(setting) - {"v", "w"}:
         raise InputError(
-            f"[{SECTION}]: neighbours is {show(given)}; expected the σ of velocities and turns, "
+            f"[{SECTION}]: neighbours is {show(setting)}; expected the σ of velocities and turns, "
             f"{{ v = 0.5, w = 0.02 }}"
         )
-    for name, value in given.items():
+    for name, value in setting.items():
         positive(f"[{SECTION}]: neighbours, σ of {name}", value)
     for row in np.flatnonzero(np.isnan(table.numbers("t")))[:1]:
-        if given:
+        if setting:
             raise InputError(
                 f"{table.source(row)}: t, the time of exposure, is missing, which "
                 f"[{SECTION}] neighbours needs"

@@ -44,21 +44,25 @@ from jaxbundle.network.tables import Network
 SECTION = "surfaces"
 
 
-def on_plane(X: Float[Array, "3"], given: tuple[Array, Array, Array]) -> Float[Array, ""]:
+def on_plane(
+    X: Float[Array, "3"], observed_and_plane: tuple[Array, Array, Array]
+) -> Float[Array, ""]:
     """The distance of a point from a plane, minus the observed one."""
-    observed, *plane = given
+    observed, *plane = observed_and_plane
     return distance_to_plane(X, *plane) - observed
 
 
-def on_mesh(X: Float[Array, "3"], given: tuple[Array, Array]) -> Float[Array, ""]:
+def on_mesh(X: Float[Array, "3"], observed_and_corners: tuple[Array, Array]) -> Float[Array, ""]:
     """The distance of a point from the plane of the nearest triangle, minus the observed one."""
-    observed, corners = given
+    observed, corners = observed_and_corners
     return distance_to_nearest_triangle(X, corners) - observed
 
 
-def above_grid(X: Float[Array, "3"], given: tuple[Array, Array, Array, Array]) -> Float[Array, ""]:
+def above_grid(
+    X: Float[Array, "3"], observed_and_grid: tuple[Array, Array, Array, Array]
+) -> Float[Array, ""]:
     """The height of a point above a grid, minus the observed one."""
-    observed, *grid = given
+    observed, *grid = observed_and_grid
     return height_above_grid(X, *grid) - observed
 
 
@@ -86,8 +90,8 @@ class SurfacePoints(ObservationTable):
         cls, table: Columns, settings: Mapping[str, Any], radians: float
     ) -> "SurfacePoints":
         table.check_names(("surface", "point"), ("sigma",))
-        for name, one in settings.items():
-            _check_surface(f"{SECTION}.{name}", one)
+        for name, setting in settings.items():
+            _check_surface(f"{SECTION}.{name}", setting)
         surface = table.ids("surface")
         for row, name in enumerate(surface):
             if name not in settings:
@@ -112,13 +116,22 @@ class SurfacePoints(ObservationTable):
     def _check_scale(self, network: Network) -> None:
         """Refuse planes with a common point in a network without a scale: it would shrink to that
         point, where all residuals are 0. Off the planes the derivatives do not show it."""
-        used = [self.settings[name] for name in dict.fromkeys(self.surface)]
-        other = any(one.GIVES_SCALE for one in network.further if one.TABLE != self.TABLE)
-        held = network.points.has_role("control", "fixed").sum() > 1
-        held |= bool(np.isfinite(network.images.sigma).any())
-        if other or held or len(network.distances) or any("plane" not in one for one in used):
+        surfaces = [self.settings[name] for name in dict.fromkeys(self.surface)]
+        has_other_scale = any(
+            surface.GIVES_SCALE for surface in network.further if surface.TABLE != self.TABLE
+        )
+        is_held = network.points.has_role("control", "fixed").sum() > 1
+        is_held |= bool(np.isfinite(network.images.sigma).any())
+        if (
+            has_other_scale
+            or is_held
+            or len(network.distances)
+            or any("plane" not in surface for surface in surfaces)
+        ):
             return
-        if have_common_point([one["plane"] for one in used], [one["normal"] for one in used]):
+        if have_common_point(
+            [surface["plane"] for surface in surfaces], [surface["normal"] for surface in surfaces]
+        ):
             raise InputError(
                 f"{self.source.name}: planes with a common point give no scale, and nothing else "
                 "does: expected a distance or control points as well"
@@ -131,32 +144,32 @@ class SurfacePoints(ObservationTable):
         sigma = np.where(self.sigma > 0, self.sigma, EXACT_SIGMA * across_rays(network))
         sets: list[ObservationSet] = []
         for name in dict.fromkeys(self.surface):
-            rows = np.flatnonzero([of == name for of in self.surface])
-            near, outside = surface_near(self.settings[name], X[rows], origin)
-            for row in rows[outside][:1]:
+            rows = np.flatnonzero([surface_name == name for surface_name in self.surface])
+            nearest_parts, is_outside = surface_near(self.settings[name], X[rows], origin)
+            for row in rows[is_outside][:1]:
                 raise InputError(
                     f"{self.source(row)}: point {self.point[row]!r} is outside of the surface "
                     f"{name!r}, or over a void of it, at X {X[row, 0]:g}, Y {X[row, 1]:g}"
                 )
             kind = KINDS[next(form for form in KINDS if form in self.settings[name])]
             # The distance is what is observed: 0, for points on the surface.
-            measured = (np.zeros(len(rows)), *near)
+            measured = (np.zeros(len(rows)), *nearest_parts)
             label = f"{kind.name}, {name}"
             sets.append(kind((point[rows],), measured, sigma=sigma[rows], name=label))
         return Contribution((), sets)
 
 
-def _check_surface(where: str, given: Any) -> None:
+def _check_surface(where: str, surface: Any) -> None:
     """Refuse what is no surface."""
-    check_settings(where, given, (*KINDS, "normal"))
-    forms = [form for form in KINDS if form in given]
-    if len(forms) != 1 or ("normal" in given) != (forms == ["plane"]):
+    check_settings(where, surface, (*KINDS, "normal"))
+    forms = [form for form in KINDS if form in surface]
+    if len(forms) != 1 or ("normal" in surface) != (forms == ["plane"]):
         raise InputError(
-            f"[{where}]: {show(dict(given))}; expected plane and normal, or mesh, or dem"
+            f"[{where}]: {show(dict(surface))}; expected plane and normal, or mesh, or dem"
         )
     if forms == ["plane"]:
-        numbers(where, "plane", given["plane"], 3)
-        if not numbers(where, "normal", given["normal"], 3).any():
+        numbers(where, "plane", surface["plane"], 3)
+        if not numbers(where, "normal", surface["normal"], 3).any():
             raise InputError(f"[{where}]: normal is 0; expected a direction")
-    elif not isinstance(given[forms[0]], str | tuple | list):
-        raise InputError(f"[{where}]: {forms[0]} is {show(given[forms[0]])}; expected a file")
+    elif not isinstance(surface[forms[0]], str | tuple | list):
+        raise InputError(f"[{where}]: {forms[0]} is {show(surface[forms[0]])}; expected a file")

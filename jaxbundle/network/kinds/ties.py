@@ -35,8 +35,8 @@ class SameParameter:
     one: int
     other: int
 
-    def __call__(self, a: Change, b: Change, given: Scalar) -> Scalar:
-        return b[self.other] - a[self.one] - given
+    def __call__(self, a: Change, b: Change, observed: Scalar) -> Scalar:
+        return b[self.other] - a[self.one] - observed
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -74,8 +74,8 @@ class Ties(ObservationTable):
         return len(self.camera)
 
     def _present(self, network: Network) -> Bool[np.ndarray, " n"]:
-        known = {camera.id for camera in network.cameras}
-        return np.array([{*ids} <= known for ids in zip(self.camera, self.other)], bool)
+        known_ids = {camera.id for camera in network.cameras}
+        return np.array([{*ids} <= known_ids for ids in zip(self.camera, self.other)], bool)
 
     def check(self, network: Network) -> None:
         cameras = {camera.id: camera for camera in network.cameras}
@@ -85,11 +85,11 @@ class Ties(ObservationTable):
                     raise InputError(
                         f"{self.source(row)}: camera {id!r} is unknown{did_you_mean(id, cameras)}"
                     )
-                known = get_model(cameras[id].model).parameters
-                if name not in known:
+                known_parameters = get_model(cameras[id].model).parameters
+                if name not in known_parameters:
                     raise InputError(
                         f"{self.source(row)}: camera {id!r} has no {name!r}"
-                        f"{did_you_mean(name, known)}"
+                        f"{did_you_mean(name, known_parameters)}"
                     )
             if ids[0] == ids[1]:
                 raise InputError(f"{self.source(row)}: expected two different cameras")
@@ -113,32 +113,34 @@ class Ties(ObservationTable):
         sigma = np.where(self.sigma > 0, self.sigma, EXACT_SIGMA * self._from_rays(network, index))
         sets: dict[tuple, list] = {}
         for row, (a, b, name) in enumerate(zip(self.camera, self.other, self.parameter)):
-            (one, k), (other, m) = place[index[a]], place[index[b]]
-            residual = SameParameter(one.parameters.index(name), other.parameters.index(name))
-            sets.setdefault((one.name, other.name, name, residual), []).append((k, m, sigma[row]))
-        kind = lambda one, other, name, residual: Kind(
-            "same parameters", residual, (one, other), (name,), snooped="", invariant=True
+            (table_a, k), (table_b, m) = place[index[a]], place[index[b]]
+            residual = SameParameter(table_a.parameters.index(name), table_b.parameters.index(name))
+            sets.setdefault((table_a.name, table_b.name, name, residual), []).append(
+                (k, m, sigma[row])
+            )
+        kind = lambda table_a, table_b, name, residual: Kind(
+            "same parameters", residual, (table_a, table_b), (name,), snooped="", invariant=True
         )
         return Contribution(
             (),
             tuple(
-                kind(one, other, name, residual)(
+                kind(table_a, table_b, name, residual)(
                     (np.array([r[0] for r in rows]), np.array([r[1] for r in rows])),
                     np.zeros(len(rows)),
                     sigma=np.array([r[2] for r in rows]),
                 )
-                for (one, other, name, residual), rows in sets.items()
+                for (table_a, table_b, name, residual), rows in sets.items()
             ),
         )
 
     def _from_rays(self, network: Network, index: Mapping[str, int]) -> Float[np.ndarray, " n"]:
         """σ of the parameters from the rays of their cameras, all else given; the smaller of the
         two."""
-        used = {index[id] for id in (*self.camera, *self.other)}
-        of = {c: parameter_sigmas(network, c) for c in used}
+        used_cameras = {index[id] for id in (*self.camera, *self.other)}
+        sigma_of = {c: parameter_sigmas(network, c) for c in used_cameras}
         return np.array(
             [
-                min(of[index[id]][name] for id in (a, b))
+                min(sigma_of[index[id]][name] for id in (a, b))
                 for a, b, name in zip(self.camera, self.other, self.parameter)
             ]
         )
@@ -148,15 +150,15 @@ def parameter_sigmas(network: Network, c: int) -> dict[str, float]:
     """By parameter of a camera, its σ from all its image points, all else given."""
     camera, rays = network.cameras[c], network.observations
     model = get_model(camera.model)
-    own = np.flatnonzero(network.images.camera[rays.image] == c)
+    rays_of_camera = np.flatnonzero(network.images.camera[rays.image] == c)
     # A mean over the image, for a σ that only has to have the right size: 256 rays, evenly chosen,
     # give it to 1/√256 of its scatter.
     rays_of_sample = 256
-    sample = own[np.linspace(0, len(own) - 1, rays_of_sample).astype(int)]
+    sample = rays_of_camera[np.linspace(0, len(rays_of_camera) - 1, rays_of_sample).astype(int)]
     # σ of one parameter with all else given: 1/√(Σ(∂x/∂p)²/σ²), the scale of an exact condition.
     slope = np.asarray(_slopes(model, np.array(start_of(camera)), rays.xy[sample]))
     weight = np.nan_to_num(slope / rays.sigma[sample, :, None])
-    information = (weight**2).sum((0, 1)) * len(own) / rays_of_sample
+    information = (weight**2).sum((0, 1)) * len(rays_of_camera) / rays_of_sample
     sigma = 1 / np.sqrt(np.maximum(information, np.finfo(float).tiny))
     return dict(zip(model.parameters, sigma.tolist()))
 

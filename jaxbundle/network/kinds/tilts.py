@@ -42,13 +42,15 @@ ZEROS = tuple(f"zero {axis}" for axis in AXES)
 STEEPEST = np.deg2rad(80.0)
 
 
-def elevations(pose: Posed, zero: Float[Array, "3"], read: Float[Array, "3"]) -> Float[Array, "3"]:
+def elevations(
+    pose: Posed, zero: Float[Array, "3"], readings: Float[Array, "3"]
+) -> Float[Array, "3"]:
     """Elevations of the axes of a camera minus the readings."""
-    along = [pose.rotation.apply_inverse(axis) for axis in CAMERA_AXES.values()]
+    axes_in_space = [pose.rotation.apply_inverse(axis) for axis in CAMERA_AXES.values()]
     # The root has no derivative at 0: an axis that is exactly vertical, which is not read.
-    level = [jnp.sqrt(jnp.maximum(x * x + y * y, 1e-30)) for x, y, _ in along]
-    found = [jnp.arctan2(z, h) for (_, _, z), h in zip(along, level)]
-    return jnp.stack(found) + zero - read
+    horizontal = [jnp.sqrt(jnp.maximum(x * x + y * y, 1e-30)) for x, y, _ in axes_in_space]
+    computed = [jnp.arctan2(z, h) for (_, _, z), h in zip(axes_in_space, horizontal)]
+    return jnp.stack(computed) + zero - readings
 
 
 TILT = Kind("tilts", elevations, ("image", "clinometer"), AXES, "angle")
@@ -71,30 +73,33 @@ class Tilts(ObservationTable):
         table.check_names(("image",), (*AXES, *(f"s{axis}" for axis in AXES)))
         check_settings(cls.SECTION, settings, ("free", "sigma"))
         Parameters.from_settings(cls.SECTION, settings, AXES)
-        read = np.stack([table.numbers(axis) for axis in AXES], 1) * radians
+        readings = np.stack([table.numbers(axis) for axis in AXES], 1) * radians
         sigma = np.stack([positive_sigma(table, f"s{a}", required=False) for a in AXES], 1)
-        for row, k in np.argwhere(np.isnan(read) != np.isnan(sigma))[:1]:
-            both = f"{AXES[k]} and s{AXES[k]}"
-            raise InputError(f"{table.source(row)}: expected {both}, got one of them")
-        for row in np.flatnonzero(np.isnan(read).all(1))[:1]:
+        for row, k in np.argwhere(np.isnan(readings) != np.isnan(sigma))[:1]:
+            both_columns = f"{AXES[k]} and s{AXES[k]}"
+            raise InputError(f"{table.source(row)}: expected {both_columns}, got one of them")
+        for row in np.flatnonzero(np.isnan(readings).all(1))[:1]:
             raise InputError(f"{table.source(row)}: nothing was read: expected {', '.join(AXES)}")
-        for row, k in np.argwhere(np.abs(read) > STEEPEST)[:1]:
+        for row, k in np.argwhere(np.abs(readings) > STEEPEST)[:1]:
             raise InputError(
-                f"{table.source(row)}: {AXES[k]} is {read[row, k] / radians:g}: an axis so near to "
+                f"{table.source(row)}: {AXES[k]} is {readings[row, k] / radians:g}: an axis so "
+                "near to "
                 "the vertical does not show the tilt; expected the readings of the two others"
             )
         return cls(
             image=table.ids("image"),
-            elevation=np.nan_to_num(read),
+            elevation=np.nan_to_num(readings),
             sigma=np.where(np.isnan(sigma), np.inf, sigma * radians),
             settings=dict(settings),
             source=table.source,
         )
 
     def columns(self, radians: float) -> dict:
-        gone = np.isinf(self.sigma)
-        read, sigma = (np.where(gone, np.nan, x / radians).T for x in (self.elevation, self.sigma))
-        columns = dict(zip(AXES, read)) | {f"s{a}": s for a, s in zip(AXES, sigma)}
+        is_missing = np.isinf(self.sigma)
+        readings, sigma = (
+            np.where(is_missing, np.nan, x / radians).T for x in (self.elevation, self.sigma)
+        )
+        columns = dict(zip(AXES, readings)) | {f"s{a}": s for a, s in zip(AXES, sigma)}
         return {"image": self.image} | columns
 
     def number_of_equations(self) -> int:
@@ -116,5 +121,5 @@ class Tilts(ObservationTable):
             "zero error of the clinometer of camera",
         )
         priors = dataclasses.replace(parameters, sigma=radians).priors(zero, AXES, "angle")
-        seen = TILT((image, of_camera), self.elevation, sigma=self.sigma)
-        return Contribution((zero,), (seen, *priors))
+        observations = TILT((image, of_camera), self.elevation, sigma=self.sigma)
+        return Contribution((zero,), (observations, *priors))
