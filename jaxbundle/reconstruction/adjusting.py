@@ -129,8 +129,8 @@ def leave_out_features(
     of_image = lambda some: np.bincount(
         rays.image, information * some, minlength=len(network.images)
     )
-    few = of_image(superfluous) < settings.feature_share * of_image(np.ones(len(rays)))
-    keep = ~(superfluous & few[rays.image])
+    is_in_few = of_image(superfluous) < settings.feature_share * of_image(np.ones(len(rays)))
+    keep = ~(superfluous & is_in_few[rays.image])
     return network.replace(observations=rays.take(keep)), keep
 
 
@@ -152,50 +152,56 @@ def adjust_weighted(
     **Raises:** as `jaxbundle.adjust`; `NotSolvedError` if, with very many gross errors, points of
     three rays do not confirm the result.
     """
-    every, failed, many = None, None, settings.many_errors
+    with_all, first_error, many = None, None, settings.many_errors
     weight = lambda network, measurement_class: _weight(
         network, measurement_class, class_names, significance, tell, settings
     )
     try:
-        every = weight(network, measurement_class)
+        with_all = weight(network, measurement_class)
         # Two photographs have no points of three rays to compare with.
-        few = len(network.images) < 3
-        if every.adjustment.converged and (few or not _is_doubtful(every, settings)):
-            return every
+        are_few = len(network.images) < 3
+        if with_all.adjustment.converged and (are_few or not _is_doubtful(with_all, settings)):
+            return with_all
     except NotSolvedError as error:
-        failed = error
-    solved = every is not None and every.adjustment.converged
+        first_error = error
+    solved = with_all is not None and with_all.adjustment.converged
     rays = network.observations
     # Points of another role than tie are checked by their coordinates.
     number = np.bincount(rays.point, minlength=len(network.points))
-    several = (number > 2) | ~network.points.has_role("tie")
-    clear, measurement_class = keep_points(network, several), measurement_class[several[rays.point]]
+    has_several = (number > 2) | ~network.points.has_role("tie")
+    clear_network, measurement_class = (
+        keep_points(network, has_several),
+        measurement_class[has_several[rays.point]],
+    )
     try:
-        clearer = weight(clear, measurement_class)
+        clearer = weight(clear_network, measurement_class)
     except (InputError, NotSolvedError):
         # A photograph has hardly any of these points, or they do not determine it.
-        if failed is not None:
-            raise failed from None
+        if first_error is not None:
+            raise first_error from None
     else:
         if not clearer.adjustment.converged and not solved:
-            return every or clearer
+            return with_all or clearer
         if clearer.adjustment.converged and (
-            every is None or not solved or _removed_more(every, many) or clearer.worst < every.worst
+            with_all is None
+            or not solved
+            or _removed_more(with_all, many)
+            or clearer.worst < with_all.worst
         ):
             return dataclasses.replace(
                 clearer,
                 agreeing_rays=_count_agreeing(network, clearer, settings.agreeing_ray),
-                unused_points=len(network.points) - len(clear.points),
+                unused_points=len(network.points) - len(clear_network.points),
             )
-    assert every is not None, "an attempt ends with a result or an error"
-    if solved and _removed_more(every, many):
+    assert with_all is not None, "an attempt ends with a result or an error"
+    if solved and _removed_more(with_all, many):
         raise NotSolvedError(
-            f"not solved: {len(every.adjustment.removed)} of {len(rays)} measurements are gross "
+            f"not solved: {len(with_all.adjustment.removed)} of {len(rays)} measurements are gross "
             "errors, and the points of three rays alone do not confirm the others: the object "
             "repeats itself; take photographs with shorter bases",
             list(network.images.id),
         )
-    return every
+    return with_all
 
 
 def _is_doubtful(weighted: WeightedAdjustment, settings: WeightingSettings) -> bool:
@@ -241,15 +247,15 @@ def adjust_determined(
         try:
             result = adjust_again()
         except NotSolvedError as error:
-            kept = _are_determined(network, error.undetermined)
-            if kept.all():
+            is_determined = _are_determined(network, error.undetermined)
+            if is_determined.all():
                 raise
         else:
-            kept = _are_determined(network, result.undetermined)
-            if kept.all():
+            is_determined = _are_determined(network, result.undetermined)
+            if is_determined.all():
                 return result, network, rows
-        rows = rows[kept[network.observations.point]]
-        network = keep_points(network, kept)
+        rows = rows[is_determined[network.observations.point]]
+        network = keep_points(network, is_determined)
     return adjust_again(), network, rows
 
 
@@ -264,9 +270,9 @@ def limit_iterations(network: Network) -> int:
 def _are_determined(network: Network, undetermined: Iterable[str]) -> Bool[np.ndarray, " points"]:
     """False for tie points named among the undetermined."""
     # As `leastsquares.quality.names` writes them: "X of point 17".
-    lost = {name.partition(" of point ")[2] for name in undetermined}
+    undetermined_ids = {name.partition(" of point ")[2] for name in undetermined}
     tie = network.points.has_role("tie")
-    return ~(tie & np.isin(np.array(network.points.id, object), [*lost]))
+    return ~(tie & np.isin(np.array(network.points.id, object), [*undetermined_ids]))
 
 
 def _weight(
@@ -279,9 +285,9 @@ def _weight(
 ) -> WeightedAdjustment:
     """The steps of the module, for the points of a network."""
     tell("adjustment")
-    result, network, kept = adjust_determined(network)
-    measurement_class, sigma = measurement_class[kept], network.observations.sigma
-    factor_so_far, suspects = np.ones(len(kept)), []
+    result, network, is_kept = adjust_determined(network)
+    measurement_class, sigma = measurement_class[is_kept], network.observations.sigma
+    factor_so_far, suspects = np.ones(len(is_kept)), []
     if result.converged:
         (v, r), rows = _approximate_redundancy(result), _rows(result, network)
         factor_so_far[rows] = _factors(
@@ -297,16 +303,16 @@ def _weight(
     for _ in range(settings.max_rounds):
         tell("data snooping")
         weighted = dataclasses.replace(network.observations, sigma=sigma * factor_so_far[:, None])
-        result, network, kept = adjust_determined(
+        result, network, is_kept = adjust_determined(
             network.replace(observations=weighted),
             snooping="pope",
             significance=significance,
             doubtful=suspects,
         )
         measurement_class, sigma, factor_so_far = (
-            measurement_class[kept],
-            sigma[kept],
-            factor_so_far[kept],
+            measurement_class[is_kept],
+            sigma[is_kept],
+            factor_so_far[is_kept],
         )
         if not result.converged:
             break

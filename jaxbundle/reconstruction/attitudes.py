@@ -49,27 +49,30 @@ def with_attitudes(
     if attitudes is None:
         return network, ""
     rows = np.array([names.index(id) for id in network.images.id])
-    known = np.isfinite(attitudes.sigma[rows]) & np.isfinite(network.images.angles).all(1)
-    if known.sum() < MIN_ATTITUDES:
+    is_known = np.isfinite(attitudes.sigma[rows]) & np.isfinite(network.images.angles).all(1)
+    if is_known.sum() < MIN_ATTITUDES:
         return network, ""
-    M, sigma = attitudes.M[rows[known]], attitudes.sigma[rows[known]]
-    oriented = np.asarray(batched.matrices(network.images.angles[known]))
+    M, sigma = attitudes.M[rows[is_known]], attitudes.sigma[rows[is_known]]
+    oriented = np.asarray(batched.matrices(network.images.angles[is_known]))
     # The angle of M·M'ᵀ: 2·cos α + 1 = tr(M·M'ᵀ).
     cosine = (np.einsum("nij,nij->n", M, oriented) - 1) / 2
-    off = np.arccos(np.clip(cosine, -1, 1))
+    deviation = np.arccos(np.clip(cosine, -1, 1))
     # Angles of right attitudes with σ about three axes have the median 1.54 σ; one constant
     # rotation, as of a mounting, makes all of them large.
-    if np.median(off / sigma) > 3:
+    if np.median(deviation / sigma) > 3:
         return network, (
-            f"attitudes in the files are off by {np.degrees(np.median(off)):.0f} degrees (median) "
+            f"attitudes in the files are off by {np.degrees(np.median(deviation)):.0f} degrees "
+            "(median) "
             "from those of the photographs and their positions: not used"
         )
     # One σ about all axes: the largest that the file states.
     angles = np.asarray(batched.angles(M))
-    columns = {"image": [network.images.id[k] for k in np.flatnonzero(known)]}
+    columns = {"image": [network.images.id[k] for k in np.flatnonzero(is_known)]}
     columns |= {axis: angles[:, k] for k, axis in enumerate(("omega", "phi", "kappa"))}
     columns |= {f"s{axis}": sigma for axis in ("omega", "phi", "kappa")}
-    further = make_further({"attitudes": columns}, 1.0)
-    differences = f"{np.degrees(np.median(off)):.1f} degrees"
-    note = f"attitudes of {known.sum()} photographs in the files; median difference {differences}"
-    return network.replace(further=(*network.further, *further)), note
+    kinds = make_further({"attitudes": columns}, 1.0)
+    differences = f"{np.degrees(np.median(deviation)):.1f} degrees"
+    note = (
+        f"attitudes of {is_known.sum()} photographs in the files; median difference {differences}"
+    )
+    return network.replace(further=(*network.further, *kinds)), note

@@ -35,10 +35,10 @@ class CameraPositions:
     def contradictions(self, prior: Sequence[float], unit: str) -> list[str]:
         """How the positions contradict control and their own σ, in words; `prior`: σ of the
         offset before the adjustment."""
-        said, limit = [], 3.0  # σ: by chance one in 370, for each of six figures
+        sentences, limit = [], 3.0  # σ: by chance one in 370, for each of six figures
         for axis, value, s in zip("XYZ", self.offset, prior):
             if np.isfinite(value) and abs(value) > limit * s:
-                said.append(
+                sentences.append(
                     f"satellite positions and control contradict each other: their offset "
                     f"in {axis} is {value:+.1f} {unit}, its prior σ {s:g} {unit}; compare "
                     "their coordinate systems"
@@ -46,10 +46,10 @@ class CameraPositions:
         for axis, value, s in zip("XYZ", self.rms, self.sigma):
             if value > limit * s:
                 numbers = f"{significant(value)} {unit}, their σ {significant(s)} {unit}"
-                said.append(
+                sentences.append(
                     f"satellite positions contradict the photographs: RMS in {axis} {numbers}"
                 )
-        return said
+        return sentences
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,8 +76,8 @@ class BlockFacts:
         area = self.unit + "²"
         rows = [("Photographs", str(self.photographs))]
         if self.taken is not None:
-            first, last = (t.strftime("%Y-%m-%d %H:%M") for t in self.taken)
-            rows.append(("Taken", first if first == last else f"{first} to {last}"))
+            begin, end = (t.strftime("%Y-%m-%d %H:%M") for t in self.taken)
+            rows.append(("Taken", begin if begin == end else f"{begin} to {end}"))
         rows += [
             ("Computed", in_words(self.computed)),
             ("Coordinate system", self.system),
@@ -164,11 +164,11 @@ def describe_block(result: Adjustment, exif: Mapping[str, Exif], system: str) ->
     **Arguments:** `exif` by photograph; `system` of the coordinates, empty: arbitrary."""
     network, values = result.problem.network, result.image_values
     X0, M = values[:, :3], np.asarray(batched.matrices(values[:, 3:]))
-    used = result.problem.used
-    image, point = result.problem.image[used], result.problem.point[used]
+    is_used = result.problem.used
+    image, point = result.problem.image[is_used], result.problem.point[is_used]
     X = result.point_values
-    known = np.isfinite(X[point]).all(1)
-    image, point = image[known], point[known]
+    is_known = np.isfinite(X[point]).all(1)
+    image, point = image[is_known], point[is_known]
     depth = -np.einsum("nj,nj->n", M[image, 2], X[point] - X0[image])
     # By photograph first: one with many points does not decide for all.
     of_image = np.array(
@@ -178,26 +178,26 @@ def describe_block(result: Adjustment, exif: Mapping[str, Exif], system: str) ->
     pixel = 1 / c[network.images.camera]
     # Within 45 degrees of the vertical: in an oblique block the middle of a photograph is not below
     # the camera, and footprints reach to the horizon.
-    down = bool(system) and float(np.median(M[:, 2, 2])) > 0.7
+    looks_down = bool(system) and float(np.median(M[:, 2, 2])) > 0.7
     height = area = places = None
     tie = network.points.has_role("tie")
     ground = X[np.unique(point[tie[point]])]
-    if down and len(ground) > 3:
-        above = [
+    if looks_down and len(ground) > 3:
+        flying_heights = [
             X0[k, 2] - np.median(X[point[image == k], 2])
             for k in range(len(X0))
             if (image == k).any()
         ]
-        height, area = float(np.median(above)), _hull_area(_inner(ground[:, :2]))
+        height, area = float(np.median(flying_heights)), _hull_area(_inner(ground[:, :2]))
         # As much ground as the photographs cover, by how much there is.
         footprints = [_hull_area(_inner(X[point[image == k], :2])) for k in range(len(X0))]
         places = sum(footprints) / area if area else None
     times = [exif[id].time for id in network.images.id if id in exif]
-    taken = sorted(t for t in times if t is not None)
+    times_taken = sorted(t for t in times if t is not None)
     on_ties = tie[point]
     return BlockFacts(
         len(X0),
-        (taken[0], taken[-1]) if taken else None,
+        (times_taken[0], times_taken[-1]) if times_taken else None,
         now(),
         system
         or (
@@ -252,23 +252,23 @@ def camera_positions(result: Adjustment) -> CameraPositions | None:
     priors of the images."""
     network, X0 = result.problem.network, result.image_values[:, :3]
     nothing = np.full(3, np.nan)
-    antennas = next((one for one in network.further if isinstance(one, Antennas)), None)
+    antennas = next((kind for kind in network.further if isinstance(kind, Antennas)), None)
     if antennas is not None:
         # The shift of the one strip is the offset of the system; not estimated axes have none.
         row = {id: k for k, id in enumerate(network.images.id)}
         (strip,) = result.further_unknowns.get("GNSS strip", {"": {}}).values()
-        found = [strip.get(f"shift {axis}", {}) for axis in "XYZ"]
-        shift = np.array([one.get("value", 0.0) for one in found])
-        sigma = np.array([one.get("sigma") or np.nan for one in found])
+        shifts = [strip.get(f"shift {axis}", {}) for axis in "XYZ"]
+        shift = np.array([kind.get("value", 0.0) for kind in shifts])
+        sigma = np.array([kind.get("sigma") or np.nan for kind in shifts])
         offset = np.where(np.isfinite(sigma), shift, np.nan)
-        given = zip(antennas.image, antennas.position)
-        difference = {id: X0[row[id]] + shift - X for id, X in given if id in row}
+        positions_given = zip(antennas.image, antennas.position)
+        difference = {id: X0[row[id]] + shift - X for id, X in positions_given if id in row}
         s = np.median(np.sqrt(np.diagonal(antennas.covariance, axis1=1, axis2=2)), axis=0)
         return CameraPositions(difference, s, offset, sigma) if difference else None
     images = network.images
-    given = (np.isfinite(images.sigma[:, :3]) & (images.sigma[:, :3] > 0)).all(1)
-    if not given.any():
+    positions_given = (np.isfinite(images.sigma[:, :3]) & (images.sigma[:, :3] > 0)).all(1)
+    if not positions_given.any():
         return None
-    difference = {images.id[k]: X0[k] - images.position[k] for k in np.flatnonzero(given)}
-    s = np.median(images.sigma[given, :3], axis=0)
+    difference = {images.id[k]: X0[k] - images.position[k] for k in np.flatnonzero(positions_given)}
+    s = np.median(images.sigma[positions_given, :3], axis=0)
     return CameraPositions(difference, s, nothing, nothing)

@@ -42,7 +42,7 @@ LENS_PARAMETERS = ("fx", "k1", "k2", "k3")
 
 def with_camera_priors(
     network: Network,
-    stated: Sequence[StatedDistance | None],
+    stated_distances: Sequence[StatedDistance | None],
     lens: Sequence[int],
     of_lens: Sequence[str],
     aspect_sigma: float,
@@ -50,7 +50,7 @@ def with_camera_priors(
     """The network with what is known of its unknown cameras as observations; what is common to the
     cameras of one lens is observed once."""
     rows = []
-    for k, (camera, file) in enumerate(zip(network.cameras, stated)):
+    for k, (camera, file) in enumerate(zip(network.cameras, stated_distances)):
         side = max(camera.image_size or (1, 1))
         for name, relative in PRIORS.items():
             # Equal parameters are one unknown: a second observation would count its prior twice.
@@ -72,24 +72,24 @@ def with_camera_priors(
 
 def observed_parameters(network: Network) -> CameraParameters | None:
     """The observed parameters of the cameras."""
-    return next((one for one in network.further if isinstance(one, CameraParameters)), None)
+    return next((kind for kind in network.further if isinstance(kind, CameraParameters)), None)
 
 
 def with_observed(network: Network, observed: CameraParameters) -> Network:
     """The network with other observed parameters of its cameras."""
-    others = [one for one in network.further if not isinstance(one, CameraParameters)]
-    return network.replace(further=(*others, observed))
+    other_kinds = [kind for kind in network.further if not isinstance(kind, CameraParameters)]
+    return network.replace(further=(*other_kinds, observed))
 
 
 def with_common_lens_parameters(
     network: Network, lens: Sequence[int], of_lens: Sequence[str]
 ) -> Network:
     """The network with the lens parameters of cameras with one lens made equal (table `ties`)."""
-    first, rows = {}, []
+    first_of_lens, rows = {}, []
     for camera, number in zip(network.cameras, lens):
-        other = first.setdefault(number, camera)
-        if other is not camera:
-            rows += [(other.id, camera.id, name) for name in of_lens]
+        first_camera = first_of_lens.setdefault(number, camera)
+        if first_camera is not camera:
+            rows += [(first_camera.id, camera.id, name) for name in of_lens]
     if not rows:
         return network
     columns = dict(zip(("camera", "other", "parameter"), map(list, zip(*rows))))

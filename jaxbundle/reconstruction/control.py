@@ -82,9 +82,9 @@ def read_control_measurements(path: str | Path) -> Control:
     head = [cell.strip().lower() for cell in rows[0][1].split(",")]
     if {"image", "u", "v", "x", "y", "z", "id"} <= set(head):
         return _read_table(path, head, rows[1:])
-    first = rows[0][1].strip()
-    if first.upper().startswith(("EPSG:", "WGS84", "+PROJ", "PROJCS", "GEOGCS")):
-        return _read_gcp_list(path, first, rows[1:])
+    first_line = rows[0][1].strip()
+    if first_line.upper().startswith(("EPSG:", "WGS84", "+PROJ", "PROJCS", "GEOGCS")):
+        return _read_gcp_list(path, first_line, rows[1:])
     points = read_control(path)
     return Control(points, (), np.zeros((0, 2)), np.zeros(0))
 
@@ -163,7 +163,7 @@ def _collect(
             raise InputError(f"{path}, line {number}: point {name} has other coordinates above")
         position[name] = X
         numbers.setdefault(name, number)
-    X, said = to_map(np.array(list(position.values())), system, str(path))
+    X, system_words = to_map(np.array(list(position.values())), system, str(path))
     # Control without a σ, NaN, gets one from --control-sigma or from its residuals.
     sigma = np.array([sigmas.get(n, ([math.nan] * 3, ""))[0] for n in position])
     roles = tuple(sigmas.get(n, ((), "control"))[1] for n in position)
@@ -173,5 +173,5 @@ def _collect(
         tuple((image, name) for name, _, image, *_ in records),
         np.array([place for *_, place, _, _ in records]),
         np.array([sigma for *_, sigma, _ in records]),
-        said,
+        system_words,
     )

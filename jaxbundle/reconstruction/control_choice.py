@@ -40,7 +40,7 @@ class ControlChoice:
 
     def remarks(self) -> list[str]:
         """What is wrong, by point."""
-        wrong = [f"{id} in {said}" for id, lines in self.errors.items() for said in lines]
+        wrong = [f"{id} in {remark}" for id, lines in self.errors.items() for remark in lines]
         return [*wrong, *(f"{id} is not used: {why}" for id, why in self.reasons.items())]
 
 
@@ -48,8 +48,8 @@ def has_doubtful_heights(points: Points) -> bool:
     """Whether the heights of control are all 0, several, and no σ is stated for them: spreadsheets
     and forms write 0 for what is not known."""
     heights = points.position[:, 2]
-    stated = np.isfinite(points.sigma[:, 2]) | (np.array(points.role) == "fixed")
-    return len(points) >= MIN_CONTROL and not heights.any() and not stated.any()
+    has_stated_height = np.isfinite(points.sigma[:, 2]) | (np.array(points.role) == "fixed")
+    return len(points) >= MIN_CONTROL and not heights.any() and not has_stated_height.any()
 
 
 def without_unknown_heights(block: OrientedBlock) -> tuple[Points, str]:
@@ -64,8 +64,8 @@ def without_unknown_heights(block: OrientedBlock) -> tuple[Points, str]:
             "below that in the plane (state sZ for heights that are 0)"
         )
     rows = [block.row_of_determined[id] for id in points.id if id in block.row_of_determined]
-    spread = block.network.images.sigma[:, 2]
-    sigma = float(np.nanmedian(spread[np.isfinite(spread)]))
+    sigma_of_heights = block.network.images.sigma[:, 2]
+    sigma = float(np.nanmedian(sigma_of_heights[np.isfinite(sigma_of_heights)]))
     middle = float(np.median(block.X[rows, 2])) if rows else 0.0
     if abs(middle) <= block.settings.contradictory_heights * sigma:
         return points, (
@@ -89,7 +89,7 @@ def assess_control(
     of the groups by their redundancy, σ² = Σ r·σ²/Σ r, and assumed if those of all groups are; the
     factor of stated σ is the largest."""
     number = max(1, -(-len(usable) // block.settings.compared_together))
-    groups = [list(usable[first::number]) for first in range(number)]
+    groups = [list(usable[begin::number]) for begin in range(number)]
     of_groups = [assess(block.compare(group, control), assumed) for group in groups]
     join = lambda name: np.concatenate([getattr(of_group, name) for of_group in of_groups])
     order, sigma = [k for group in groups for k in group], join("sigma")
@@ -183,9 +183,9 @@ def choose_control(
 
 def _describe_error(assessed: Assessment, n: int) -> str:
     error, sigma = assessed.error[n], assessed.error_sigma[n]
-    there = np.isfinite(error)
+    is_finite = np.isfinite(error)
     parts = (f"{axis} {e:+.2f}" for axis, e in zip("XYZ", error) if np.isfinite(e))
-    ratio, length = np.max(np.abs(error / sigma)[there]), np.linalg.norm(error[there])
+    ratio, length = np.max(np.abs(error / sigma)[is_finite]), np.linalg.norm(error[is_finite])
     return (
         f"the other points and the photographs put it {length:.2f} m from its "
         f"coordinates ({', '.join(parts)} m), {ratio:.1f} times the σ of this prediction"
@@ -207,11 +207,13 @@ def _settle_by_coordinates(
     if np.isinf(control.sigma[k, 2]):
         heights = [block.X[row, 2] for row in block.row_of_determined.values()]
         X[2] = np.median(heights) if heights else X[2]
-    spread = np.sqrt((np.where(np.isfinite(choice.sigma[k]), choice.sigma[k], 0.0) ** 2).sum())
-    off = block.misses(point, X)
+    sigma_of_coordinates = np.sqrt(
+        (np.where(np.isfinite(choice.sigma[k]), choice.sigma[k], 0.0) ** 2).sum()
+    )
+    misses = block.misses(point, X)
     # σ of the measurement and, in pixels, of the coordinates
-    sigma = np.hypot(point.sigma, spread / block.pixel_length(point, X))
-    agree = off < block.settings.wrong_ray * sigma
+    sigma = np.hypot(point.sigma, sigma_of_coordinates / block.pixel_length(point, X))
+    agree = misses < block.settings.wrong_ray * sigma
     # If exactly one of several rays that do not meet passes the coordinates, that one is right.
     if control.role[k] == "check" or (len(point.rows) > 1 and agree.sum() != 1):
         number = count(len(point.rows), "ray")
@@ -227,7 +229,7 @@ def _settle_by_coordinates(
         passes = block.distances(point, X)[0]
         choice.reasons[id] = (
             f"its only ray, in {block.name_of(point, 0)}, misses its coordinates by "
-            f"{off[0]:.0f} px, {passes:.1f} m"
+            f"{misses[0]:.0f} px, {passes:.1f} m"
         )
 
 
@@ -237,16 +239,17 @@ def _name_wrong(block: OrientedBlock, choice: ControlChoice, id: str) -> None:
     X = point.position
     if not np.isfinite(X).all():
         return
-    off, passes = block.misses(point, X), block.distances(point, X)
+    misses, passes = block.misses(point, X), block.distances(point, X)
     for n in np.flatnonzero(~point.good).tolist():
-        said = (
-            f"{block.name_of(point, n)} is a wrong measurement and not used: {off[n]:.0f} px "
+        message = (
+            f"{block.name_of(point, n)} is a wrong measurement and not used: {misses[n]:.0f} px "
             "from where the other photographs see it, and its ray misses the point by "
             f"{passes[n]:.2f} m"
         )
-        other = block.seen_there(point, n, id, choice.points)
+        other_point = block.seen_there(point, n, id, choice.points)
         choice.errors.setdefault(id, []).append(
-            said + (f"; it is at the place of {other}: a wrong name" if other else "")
+            message
+            + (f"; it is at the place of {other_point}: a wrong name" if other_point else "")
         )
 
 
@@ -263,9 +266,9 @@ def _name_exchanged(
         # σ² of the prediction without that of the coordinates of this point
         of_prediction = np.maximum(assessed.error_sigma[n] ** 2 - choice.sigma[i] ** 2, 0.0)
         for j in bad:
-            off, sigma = predicted - control.position[j], choice.sigma[j]
+            difference, sigma = predicted - control.position[j], choice.sigma[j]
             # Axes that are not controlled at both points tell nothing.
-            told = np.isfinite(off) & np.isfinite(sigma)
-            within = np.abs(off) < fitting * np.sqrt(of_prediction + sigma**2)
-            if i != j and told.any() and within[told].all():
+            is_comparable = np.isfinite(difference) & np.isfinite(sigma)
+            is_within = np.abs(difference) < fitting * np.sqrt(of_prediction + sigma**2)
+            if i != j and is_comparable.any() and is_within[is_comparable].all():
                 choice.reasons[control.id[i]] += f"; it fits the coordinates of {control.id[j]}"

@@ -53,7 +53,11 @@ class ControlPoint:
         # The verdict decides: measurements of a point that takes no part are not wrong by that.
         if "wrong measurement" not in self.verdict:
             return []
-        return [one.image for one in self.measurements if f"{one.image} is a wrong" in self.verdict]
+        return [
+            measurement.image
+            for measurement in self.measurements
+            if f"{measurement.image} is a wrong" in self.verdict
+        ]
 
     def cells(self, places: int) -> tuple[str, ...]:
         """The row of the table as text, in the order of `HEADER`; decimal `places` of lengths."""
@@ -82,7 +86,7 @@ class ControlPoint:
             "image_residual": self.image_residual if np.isfinite(self.image_residual) else None,
             "verdict": self.verdict,
             "prediction": {"error": axes(self.prediction), "sigma": axes(self.prediction_sigma)},
-            "measurements": [dataclasses.asdict(one) for one in self.measurements],
+            "measurements": [dataclasses.asdict(measurement) for measurement in self.measurements],
         }
 
 
@@ -100,14 +104,16 @@ class ControlTable:
         """RMS residual in X, Y, Z of the used control points, or of the check points; NaN without
         any."""
         if role == "check":
-            chosen = [p.residual for p in self.points if p.role == "check"]
+            residuals = [p.residual for p in self.points if p.role == "check"]
         else:
             # Without those left out: the fit of what the result rests on.
-            chosen = [p.residual for p in self.points if p.used]
-        there = np.array(chosen).reshape(-1, 3)
-        number = np.isfinite(there).sum(0)
+            residuals = [p.residual for p in self.points if p.used]
+        residual_rows = np.array(residuals).reshape(-1, 3)
+        number = np.isfinite(residual_rows).sum(0)
         with np.errstate(invalid="ignore"):
-            return np.sqrt(np.where(np.isfinite(there), there**2, 0).sum(0) / number)
+            return np.sqrt(
+                np.where(np.isfinite(residual_rows), residual_rows**2, 0).sum(0) / number
+            )
 
     def rows(self) -> list[tuple[str, ...]]:
         """The table as text, the RMS last."""
@@ -115,9 +121,9 @@ class ControlTable:
         places = column_decimals(np.concatenate([point.sigma for point in self.points]), 2, 4)
         rows = [point.cells(places) for point in self.points]
         for role, words in (("control", "RMS, used control"), ("check", "RMS, check points")):
-            found = self.rms(role)
-            if np.isfinite(found).any():
-                rows.append((words, "", *(fixed(x, places) for x in found), *[""] * 5))
+            rms = self.rms(role)
+            if np.isfinite(rms).any():
+                rows.append((words, "", *(fixed(x, places) for x in rms), *[""] * 5))
         return rows
 
     def as_dict(self) -> dict:
@@ -140,7 +146,7 @@ class ControlTable:
 
 
 def describe_sigma(
-    given: Float[np.ndarray, "n 3"],
+    stated_sigma: Float[np.ndarray, "n 3"],
     assessed: Assessment,
     fixed: Sequence[str],
     unit: str,
@@ -148,20 +154,20 @@ def describe_sigma(
 ) -> str:
     """Where the σ of control come from, in one line.
 
-    **Arguments:** `given` σ, NaN: not given; `fixed`: ids of points that are held;
+    **Arguments:** `stated_sigma` σ, NaN: not given; `fixed`: ids of points that are held;
     `heights_as_in_plane`: σ of heights that are all 0 is that in the plane."""
     words = []
-    unknown = np.isnan(given)
-    stated = given[np.isfinite(given)]
-    if len(stated):
-        ends = dict.fromkeys(significant(s, 2) for s in (stated.min(), stated.max()))
-        said = f"σ of control as stated ({' to '.join(ends)} {unit})"
+    unknown = np.isnan(stated_sigma)
+    finite_sigma = stated_sigma[np.isfinite(stated_sigma)]
+    if len(finite_sigma):
+        ends = dict.fromkeys(significant(s, 2) for s in (finite_sigma.min(), finite_sigma.max()))
+        sentence = f"σ of control as stated ({' to '.join(ends)} {unit})"
         if assessed.factor > 1:
-            said += (
+            sentence += (
                 f", multiplied by {significant(assessed.factor)}: most points contradict "
                 "each other by more than the stated σ"
             )
-        words.append(said)
+        words.append(sentence)
     # One σ for X and Y: the residuals of few points do not determine two.
     for k, name in ((0, "in the plane"), (2, "in height")):
         part = unknown[:, [0, 1]] if k == 0 else unknown[:, [2]]

@@ -32,35 +32,43 @@ class _NamedPoints(NamedTuple):
 
 def network_with_control(block: OrientedBlock, control: Points, choice: ControlChoice) -> Network:
     """The network at the solution with control, its measurements and positions."""
-    whole, network = block.network, readjustable_network(block.result)
-    named, ids, distances = set(control.id), network.points.id, network.distances
+    block_network, network = block.network, readjustable_network(block.result)
+    control_ids, ids, distances = set(control.id), network.points.id, network.distances
     ends = [(ids[a], ids[b]) for a, b in distances.points]
-    network = keep_points(network, np.array([id not in named for id in network.points.id]))
+    network = keep_points(network, np.array([id not in control_ids for id in network.points.id]))
     row = {id: k for k, id in enumerate(network.points.id)}
     # The rows of the points in the new network, −1: named ones, which are added anew.
-    new_row = np.array([row.get(id, -1) for id in whole.points.id])
-    rays = whole.observations.take(new_row[whole.observations.point] >= 0)
-    added = _gather_points(block, control, choice, len(row))
+    new_row = np.array([row.get(id, -1) for id in block_network.points.id])
+    rays = block_network.observations.take(new_row[block_network.observations.point] >= 0)
+    control_points = _gather_points(block, control, choice, len(row))
     xy, sigma = from_image_unit(
-        block.cameras, whole.images.camera[added.image], added.xy, added.spread, "px"
+        block.cameras,
+        block_network.images.camera[control_points.image],
+        control_points.xy,
+        control_points.spread,
+        "px",
     )
-    images, moved = network.images, [block.row_of_point[id] for id in network.points.id]
+    images, rows_in_block = network.images, [block.row_of_point[id] for id in network.points.id]
     # Check points are no points of the network, and distances to them are left out.
-    row |= {id: len(row) + k for k, id in enumerate(added.id) if added.role[k] != "check"}
-    here = np.array([a in row and b in row for a, b in ends], bool)
+    row |= {
+        id: len(row) + k
+        for k, id in enumerate(control_points.id)
+        if control_points.role[k] != "check"
+    }
+    has_both_ends = np.array([a in row and b in row for a, b in ends], bool)
     return network.replace(
         images=dataclasses.replace(images, position=block.X0, angles=block.angles),
         points=Points(
-            (*network.points.id, *added.id),
-            (*network.points.role, *added.role),
-            np.concatenate([block.X[moved], added.position]),
-            np.concatenate([network.points.sigma, added.sigma]),
-            colour=_colours_with_added(network.points, len(added.id)),
+            (*network.points.id, *control_points.id),
+            (*network.points.role, *control_points.role),
+            np.concatenate([block.X[rows_in_block], control_points.position]),
+            np.concatenate([network.points.sigma, control_points.sigma]),
+            colour=_colours_with_added(network.points, len(control_points.id)),
         ),
         observations=dataclasses.replace(
             rays,
-            image=np.concatenate([rays.image, added.image]),
-            point=np.concatenate([new_row[rays.point], added.point]),
+            image=np.concatenate([rays.image, control_points.image]),
+            point=np.concatenate([new_row[rays.point], control_points.point]),
             xy=np.concatenate([rays.xy, xy]),
             sigma=np.concatenate([rays.sigma, sigma]),
             source=Source("observations"),
@@ -71,19 +79,21 @@ def network_with_control(block: OrientedBlock, control: Points, choice: ControlC
             *_observe_positions(block, choice),
         ),
         distances=Distances(
-            np.array([[row[a], row[b]] for (a, b), keep in zip(ends, here) if keep], int).reshape(
-                -1, 2
-            ),
-            distances.value[here],
-            distances.sigma[here],
-            distances.source.take(here),
+            np.array(
+                [[row[a], row[b]] for (a, b), keep in zip(ends, has_both_ends) if keep], int
+            ).reshape(-1, 2),
+            distances.value[has_both_ends],
+            distances.sigma[has_both_ends],
+            distances.source.take(has_both_ends),
         ),
         datum="control",
         datum_points=(),
         object_unit="m",
-        warnings=whole.warnings,
-        notes=tuple(note for note in whole.notes if not says_left_out(note, added.id)),
-        left_out=without_names(network.left_out, added.id),
+        warnings=block_network.warnings,
+        notes=tuple(
+            note for note in block_network.notes if not says_left_out(note, control_points.id)
+        ),
+        left_out=without_names(network.left_out, control_points.id),
     )
 
 
@@ -99,23 +109,23 @@ def says_left_out(note: str, ids: tuple[str, ...]) -> bool:
     return note.startswith("left out ") and any(f" {id} " in f"{note} " for id in ids)
 
 
-def without_names(given: Sequence[LeftOut], ids: tuple[str, ...]) -> tuple[LeftOut, ...]:
+def without_names(notes: Sequence[LeftOut], ids: tuple[str, ...]) -> tuple[LeftOut, ...]:
     """What is left out although these points come back."""
     changed = (
-        dataclasses.replace(one, names=tuple(n for n in one.names if n not in ids))
-        if "point" in one.thing
-        else one
-        for one in given
+        dataclasses.replace(note, names=tuple(n for n in note.names if n not in ids))
+        if "point" in note.thing
+        else note
+        for note in notes
     )
-    return tuple(one for one in changed if one.names)
+    return tuple(note for note in changed if note.names)
 
 
 def _gather_points(
-    block: OrientedBlock, control: Points, choice: ControlChoice, first: int
+    block: OrientedBlock, control: Points, choice: ControlChoice, first_row: int
 ) -> _NamedPoints:
     """Control and check points that can be determined, with their good measurements."""
     ids, roles, position, sigma, rows, point = [], [], [], [], [], []
-    image, spread = [], []
+    image, sigmas = [], []
     for k, id in enumerate(control.id):
         measured = choice.points[id]
         # A point with wrong coordinates is a good tie point: its rays agree.
@@ -124,16 +134,16 @@ def _gather_points(
         # Known coordinates and one ray leave a residual, a tie point with one ray leaves none.
         if measured.good.sum() < (1 if choice.used[k] else 2):
             continue
-        there = np.isfinite(measured.position).all()
-        start = measured.position if there else _place_on_ray(block, measured)
+        has_position = np.isfinite(measured.position).all()
+        start = measured.position if has_position else _place_on_ray(block, measured)
         free = np.isinf(choice.sigma[k]) | (role == "tie")
         position.append(np.where(free, start, control.position[k]))
         exact = role in ("fixed", "tie")
         sigma.append(np.full(3, np.nan) if exact else choice.sigma[k])
         rows += measured.rows[measured.good].tolist()
         image += measured.image[measured.good].tolist()
-        spread += measured.sigma[measured.good].tolist()
-        point += [first + len(ids)] * int(measured.good.sum())
+        sigmas += measured.sigma[measured.good].tolist()
+        point += [first_row + len(ids)] * int(measured.good.sum())
         ids.append(id)
         roles.append(role)
     return _NamedPoints(
@@ -144,17 +154,17 @@ def _gather_points(
         np.array(image, int),
         np.array(point, int),
         block.frame.named.xy[np.array(rows, int)],
-        np.repeat(np.reshape(spread, (-1, 1)), 2, 1),
+        np.repeat(np.reshape(sigmas, (-1, 1)), 2, 1),
     )
 
 
 def _place_on_ray(block: OrientedBlock, measured: MeasuredPoint) -> Float[np.ndarray, "3"]:
     """A place on the first good ray, at the distance of the points around."""
-    first = int(np.flatnonzero(measured.good)[0])
-    X0, rays = block.X0[measured.image[first]], block.network.observations
-    seen = block.X[rays.point[rays.image == measured.image[first]]]
-    depth = np.nanmedian(np.linalg.norm(seen - X0, axis=1))
-    return X0 + depth * measured.rays[first]
+    first_good = int(np.flatnonzero(measured.good)[0])
+    X0, rays = block.X0[measured.image[first_good]], block.network.observations
+    points_seen = block.X[rays.point[rays.image == measured.image[first_good]]]
+    depth = np.nanmedian(np.linalg.norm(points_seen - X0, axis=1))
+    return X0 + depth * measured.rays[first_good]
 
 
 def _observe_positions(block: OrientedBlock, choice: ControlChoice) -> list[Antennas]:
@@ -164,8 +174,8 @@ def _observe_positions(block: OrientedBlock, choice: ControlChoice) -> list[Ante
     names = {name: k for k, name in enumerate(block.frame.names)}
     rows = np.array([names[id] for id in block.network.images.id])
     X, sigma = (values[rows] for values in block.frame.positions)
-    there = np.flatnonzero(np.isfinite(X).all(1) & np.isfinite(sigma).all(1))
-    if not len(there):
+    positioned_images = np.flatnonzero(np.isfinite(X).all(1) & np.isfinite(sigma).all(1))
+    if not len(positioned_images):
         return []
     # On an axis without control the offset and the block itself could not be separated.
     axes = [a for k, a in enumerate("XYZ") if np.isfinite(choice.sigma[choice.used, k]).any()]
@@ -176,11 +186,11 @@ def _observe_positions(block: OrientedBlock, choice: ControlChoice) -> list[Ante
     }
     return [
         Antennas(
-            image=tuple(block.network.images.id[k] for k in there),
-            position=X[there],
-            covariance=np.einsum("ni,ij->nij", sigma[there] ** 2, np.eye(3)),
-            strip=("all",) * len(there),
-            time=np.full(len(there), np.nan),
+            image=tuple(block.network.images.id[k] for k in positioned_images),
+            position=X[positioned_images],
+            covariance=np.einsum("ni,ij->nij", sigma[positioned_images] ** 2, np.eye(3)),
+            strip=("all",) * len(positioned_images),
+            time=np.full(len(positioned_images), np.nan),
             settings=settings,
         )
     ]

@@ -46,8 +46,8 @@ def choose_datum_points(
         return ()
     if network.points.has_role("control", "fixed").any():
         return ()
-    used = problem.used
-    image, point = problem.image[used], problem.point[used]
+    is_used = problem.used
+    image, point = problem.image[is_used], problem.point[is_used]
     rays = np.bincount(point, minlength=len(network.points))
     angle = angle_of_rays(problem, result.values)
     tie = network.points.has_role("tie")
@@ -57,14 +57,14 @@ def choose_datum_points(
     good &= angle >= min(settings.wide_angle, float(np.median(angle[good])))
     rows = np.flatnonzero(good[point])
     image, point = image[rows], point[rows]
-    cell = _cells(problem.image_coordinates()[used][rows], image, settings.cells)
+    cell = _cells(problem.image_coordinates()[is_used][rows], image, settings.cells)
     # The first of each cell: with the most rays, and the widest angle.
     order = np.lexsort((-angle[point], -rays[point], cell, image))
-    first = np.unique(np.stack([image[order], cell[order]]), axis=1, return_index=True)[1]
-    chosen = np.unique(point[order][first])
-    if len(chosen) < settings.min_points:
+    first_in_cell = np.unique(np.stack([image[order], cell[order]]), axis=1, return_index=True)[1]
+    chosen_points = np.unique(point[order][first_in_cell])
+    if len(chosen_points) < settings.min_points:
         return ()
-    return tuple(network.points.id[k] for k in chosen.tolist())
+    return tuple(network.points.id[k] for k in chosen_points.tolist())
 
 
 def _cells(
@@ -74,6 +74,6 @@ def _cells(
     low, high = np.full((image.max() + 1, 2), np.inf), np.full((image.max() + 1, 2), -np.inf)
     np.minimum.at(low, image, xy)
     np.maximum.at(high, image, xy)
-    along = (xy - low[image]) / np.maximum(high - low, 1e-12)[image]
-    column, row = np.minimum((number * along).astype(int), number - 1).T
+    share = (xy - low[image]) / np.maximum(high - low, 1e-12)[image]
+    column, row = np.minimum((number * share).astype(int), number - 1).T
     return number * row + column

@@ -96,25 +96,25 @@ def refuse_superimposed(
     clear = (number >= settings.min_points) & (
         np.minimum(expected, expected.T) >= settings.min_of_each
     )
-    few = shared < settings.min_shared * expected
+    shares_few = shared < settings.min_shared * expected
     for i, j in np.argwhere(np.triu(clear, 1)).tolist():
         if (min(place[i], place[j]), max(place[i], place[j])) in matched_pairs:
             compared += 1
             # In one direction only: a blurred photograph, which lacks the points of the other.
-            if few[i, j] and few[j, i]:
+            if shares_few[i, j] and shares_few[j, i]:
                 contradictory.append((i, j))
     contradictory.sort(key=lambda pair: -number[pair])
-    said = [
+    sentences = [
         f"{common[i, j]} of {number[i, j]} points expected in both {names[place[i]]} and "
         f"{names[place[j]]} were found"
         for i, j in contradictory
     ]
     bad = len(contradictory)
     if bad >= max(settings.max_pairs, settings.max_pair_share * compared):
-        raise _folded(f"{said[0]}, and too few in {bad} of {compared} such pairs", names)
+        raise _folded(f"{sentences[0]}, and too few in {bad} of {compared} such pairs", names)
     return [
         f"{words}: something hides them, or parts of the object are superimposed"
-        for words in said[:5]
+        for words in sentences[:5]
     ]
 
 
@@ -128,15 +128,15 @@ def count_shared_points(
     network, values = result.network, result.image_values
     X0, M = values[:, :3], np.asarray(batched.matrices(values[:, 3:]))
     X = np.asarray(result.point_values)
-    used = result.problem.used
-    known = np.all(np.isfinite(X), axis=1)
-    used &= known[result.problem.point]
+    is_used = result.problem.used
+    is_known = np.all(np.isfinite(X), axis=1)
+    is_used &= is_known[result.problem.point]
     n = len(X0)
-    agreeing = _points_of_images(n, result.problem.image[used], result.problem.point[used])
-    seen = _points_of_images(n, *_measured_rays(network, measured))
+    agreeing = _points_of_images(n, result.problem.image[is_used], result.problem.point[is_used])
+    measured_points = _points_of_images(n, *_measured_rays(network, measured))
     to_points = [X[points] - X0[i] for i, points in enumerate(agreeing)]
-    far = [np.linalg.norm(d, axis=1) for d in to_points]
-    farthest = np.array([lengths.max(initial=0.0) for lengths in far])
+    distances = [np.linalg.norm(d, axis=1) for d in to_points]
+    farthest = np.array([lengths.max(initial=0.0) for lengths in distances])
     fields = [
         _field_of_view(dataclasses.replace(c, parameters=result.camera_parameters(c.id)))
         for c in network.cameras
@@ -144,18 +144,20 @@ def count_shared_points(
     expected, shared = np.zeros((2, n, n), int)
     for j in range(n):
         # Measured counts, even if it was removed as a gross error: what is missing was not found.
-        there = np.zeros(len(X), bool)
-        there[agreeing[j]] = there[seen[j]] = True
+        is_measured = np.zeros(len(X), bool)
+        is_measured[agreeing[j]] = is_measured[measured_points[j]] = True
         # Within both limits the base is shorter than the rays: others have no expected points.
-        near = np.linalg.norm(X0 - X0[j], axis=1) < farthest
-        for i in np.flatnonzero(near & (np.arange(n) != j)):
+        is_near = np.linalg.norm(X0 - X0[j], axis=1) < farthest
+        for i in np.flatnonzero(is_near & (np.arange(n) != j)):
             d = X[agreeing[i]] - X0[j]
             length = np.linalg.norm(d, axis=1)
-            cosine = (d * to_points[i]).sum(1) / (length * far[i])
-            alike = cosine > np.cos(settings.max_angle)
-            alike &= (length < settings.max_scale * far[i]) & (far[i] < settings.max_scale * length)
-            alike &= _is_in_field(d @ M[j].T, fields[network.images.camera[j]])
-            expected[i, j], shared[i, j] = alike.sum(), there[agreeing[i][alike]].sum()
+            cosine = (d * to_points[i]).sum(1) / (length * distances[i])
+            is_alike = cosine > np.cos(settings.max_angle)
+            is_alike &= (length < settings.max_scale * distances[i]) & (
+                distances[i] < settings.max_scale * length
+            )
+            is_alike &= _is_in_field(d @ M[j].T, fields[network.images.camera[j]])
+            expected[i, j], shared[i, j] = is_alike.sum(), is_measured[agreeing[i][is_alike]].sum()
     return expected, shared
 
 
@@ -176,8 +178,8 @@ def _measured_rays(
     images = np.array([image.get(id, -1) for id in measured.images.id])
     points = np.array([point.get(id, -1) for id in measured.points.id])
     i, p = images[measured.observations.image], points[measured.observations.point]
-    both = (i >= 0) & (p >= 0)
-    return i[both], p[both]
+    is_in_both = (i >= 0) & (p >= 0)
+    return i[is_in_both], p[is_in_both]
 
 
 def _field_of_view(camera: Camera) -> Float[np.ndarray, "2 2"]:
@@ -197,9 +199,9 @@ def _is_in_field(
         return (d[:, 2] < 0) & ((xy > field[0]) & (xy < field[1])).all(1)
 
 
-def _folded(what: str, names: Sequence[str]) -> NotSolvedError:
+def _folded(finding: str, names: Sequence[str]) -> NotSolvedError:
     return NotSolvedError(
-        f"not solved: {what}: the object repeats itself, and parts of it would be superimposed; "
+        f"not solved: {finding}: the object repeats itself, and parts of it would be superimposed; "
         "take photographs with shorter bases, or leave out those that show only repeated parts",
         list(names),
     )

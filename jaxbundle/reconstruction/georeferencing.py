@@ -76,7 +76,7 @@ def georeference(
     # In object units: a pixel is larger on the ground the higher the camera.
     assumed = block.settings.assumed_pixels * block.ground_sample_distance
     usable, assessed = assess_control(block, control, usable, assumed)
-    given = control.sigma
+    given_sigma = control.sigma
     if has_doubtful_heights(control):
         control = with_heights_as_in_plane(control, assessed)
         usable, assessed = assess_control(block, control, usable, assumed)
@@ -97,16 +97,18 @@ def georeference(
     )
     if not result.converged:
         raise NotSolvedError(f"with control: {result.termination}", list(result.undetermined))
-    used = result.problem.used
+    is_used = result.problem.used
     fixed = [id for id, role in zip(control.id, control.role) if role == "fixed"]
     free = np.array([role == "control" for role in control.role])
-    as_in_plane = np.isnan(given[free, 2]) & np.isfinite(control.sigma[free, 2])
-    words = describe_sigma(given[free], choice.assessed(free), fixed, "m", bool(as_in_plane.any()))
+    as_in_plane = np.isnan(given_sigma[free, 2]) & np.isfinite(control.sigma[free, 2])
+    words = describe_sigma(
+        given_sigma[free], choice.assessed(free), fixed, "m", bool(as_in_plane.any())
+    )
     positions = camera_positions(result)
     notes = [heights] * bool(heights) + choice.remarks()
     notes += [] if positions is None else positions.contradictions(block.settings.offset_sigma, "m")
     table = ControlTable(tuple(_tabulate(result, block, control, choice)), words, tuple(notes), "m")
-    return dataclasses.replace(weighted, adjustment=result, agreeing_rays=int(used.sum())), table
+    return dataclasses.replace(weighted, adjustment=result, agreeing_rays=int(is_used.sum())), table
 
 
 def _tabulate(
@@ -182,8 +184,8 @@ def _predict(
 def _predict_rays(result: Adjustment, control: Points) -> dict[tuple[str, str], tuple]:
     """Distance and σ of the prediction of the image measurements that take part, pixels."""
     problem = result.problem
-    named = np.isin(np.array(problem.network.points.id, object), control.id)
-    rays = np.flatnonzero(named[problem.point])
+    is_control = np.isin(np.array(problem.network.points.id, object), control.id)
+    rays = np.flatnonzero(is_control[problem.point])
     names, error, sigma, _ = predict_measurements(result.inspection, result.sigma0, rays)
     scale = dict(zip(problem.network.images.id, _pixels(result)))
     return {
@@ -209,14 +211,14 @@ def _measurements(
     final: OrientedBlock,
     id: str,
     measured: MeasuredPoint,
-    away: np.ndarray,
+    distances: np.ndarray,
     rays: dict[tuple[str, str], tuple],
 ) -> Iterator[ControlMeasurement]:
     """Every measurement of a point: those that take part as all others predict them, the others
     against the place of the point."""
     for n in range(len(measured.rows)):
         image = final.name_of(measured, n)
-        distance, sigma = rays.get((image, id), (away[n], measured.sigma[n]))
+        distance, sigma = rays.get((image, id), (distances[n], measured.sigma[n]))
         finite = lambda x: float(x) if np.isfinite(x) else None
-        used = bool(measured.good[n]) and (image, id) in rays
-        yield ControlMeasurement(image, used, finite(distance), finite(sigma))
+        is_used = bool(measured.good[n]) and (image, id) in rays
+        yield ControlMeasurement(image, is_used, finite(distance), finite(sigma))

@@ -35,9 +35,9 @@ class NamedMeasurements:
     def __len__(self) -> int:
         return len(self.name)
 
-    def take(self, chosen: Bool[np.ndarray, " n"]) -> "NamedMeasurements":
+    def take(self, selection: Bool[np.ndarray, " n"]) -> "NamedMeasurements":
         """The chosen measurements."""
-        rows = np.flatnonzero(chosen)
+        rows = np.flatnonzero(selection)
         return NamedMeasurements(
             self.image[rows], tuple(self.name[k] for k in rows), self.xy[rows], self.sigma[rows]
         )
@@ -95,10 +95,10 @@ def find_named(
         ]
         notes.append(f"{len(set(name))} coded targets ({targets}) in {len(set(image))} photographs")
         if uncoded:
-            found = [getattr(points, "uncoded", None) for points in of_photographs]
+            uncoded_targets = [getattr(points, "uncoded", None) for points in of_photographs]
             discs = Discs(
-                tuple(np.zeros((0, 2)) if p is None else p.xy for p in found),
-                tuple(np.zeros((0, 2)) if p is None else p.sigma for p in found),
+                tuple(np.zeros((0, 2)) if p is None else p.xy for p in uncoded_targets),
+                tuple(np.zeros((0, 2)) if p is None else p.sigma for p in uncoded_targets),
             )
     if control is not None and control.sightings:
         index = {p.name: k for k, p in enumerate(photographs)}
@@ -123,43 +123,45 @@ def find_named(
     return NamedMeasurements(*columns), discs, notes
 
 
-def join_named(one: NamedMeasurements, other: NamedMeasurements) -> NamedMeasurements:
+def join_named(first_part: NamedMeasurements, second_part: NamedMeasurements) -> NamedMeasurements:
     """The measurements of both."""
     return NamedMeasurements(
-        np.concatenate([one.image, other.image]),
-        (*one.name, *other.name),
-        np.concatenate([one.xy, other.xy]),
-        np.concatenate([one.sigma, other.sigma]),
+        np.concatenate([first_part.image, second_part.image]),
+        (*first_part.name, *second_part.name),
+        np.concatenate([first_part.xy, second_part.xy]),
+        np.concatenate([first_part.sigma, second_part.sigma]),
     )
 
 
-def named_as_features(named: NamedMeasurements, photographs: int) -> list[Features]:
+def named_as_features(named_measurements: NamedMeasurements, photographs: int) -> list[Features]:
     """Named points as features, which have neither size nor descriptor."""
-    places = [named.xy[named.image == k] for k in range(photographs)]
+    places = [named_measurements.xy[named_measurements.image == k] for k in range(photographs)]
     nothing = lambda xy: (np.ones(len(xy)), np.zeros(len(xy)), np.zeros((len(xy), 1), np.uint8))
     return [Features(xy, *nothing(xy)) for xy in places]
 
 
-def match_named(named: NamedMeasurements, photographs: int, least: int) -> list[FeatureMatches]:
-    """Pairs of photographs with at least `least` common names, as matches of
+def match_named(
+    named_measurements: NamedMeasurements, photographs: int, min_common: int
+) -> list[FeatureMatches]:
+    """Pairs of photographs with at least `min_common` common names, as matches of
     `named_as_features`."""
-    names = np.array(named.name, object)
+    names = np.array(named_measurements.name, object)
     row = [
-        {name: k for k, name in enumerate(names[named.image == image])}
+        {name: k for k, name in enumerate(names[named_measurements.image == image])}
         for image in range(photographs)
     ]
     matches = []
     for i, j in itertools.combinations(range(photographs), 2):
         rows = np.array([(a, row[j][name]) for name, a in row[i].items() if name in row[j]])
-        if len(rows) >= least:
+        if len(rows) >= min_common:
             # By their names they are certain.
-            sure = np.zeros(len(rows)), np.ones(len(rows), bool)
-            matches.append(FeatureMatches((i, j), rows, *sure))
+            certainty = np.zeros(len(rows)), np.ones(len(rows), bool)
+            matches.append(FeatureMatches((i, j), rows, *certainty))
     return matches
 
 
 def name_unused(
-    named: NamedMeasurements,
+    named_measurements: NamedMeasurements,
     control: Control | None,
     distances: Sequence[dict],
     min_control: int,
@@ -169,21 +171,24 @@ def name_unused(
     **Raises:** `InputError` if no scale bar, or fewer than `min_control` control points, are left.
     """
     photographs = {
-        name: len(set(named.image[np.array(named.name) == name].tolist()))
-        for name in set(named.name)
+        name: len(set(named_measurements.image[np.array(named_measurements.name) == name].tolist()))
+        for name in set(named_measurements.name)
     }
     # An end in one photograph has no position, and a distance to it says nothing.
     ends = lambda d: min(photographs.get(d["from"], 0), photographs.get(d["to"], 0))
-    lost = [f"{d['from']} to {d['to']}" for d in distances if ends(d) < 2]
-    if distances and len(lost) == len(distances):
+    unseen = [f"{d['from']} to {d['to']}" for d in distances if ends(d) < 2]
+    if distances and len(unseen) == len(distances):
         raise InputError(
-            f"no scale bar has both ends in two photographs ({list_some(lost, 3, str)}): check the "
+            f"no scale bar has both ends in two photographs ({list_some(unseen, 3, str)}): check "
+            "the "
             "names of the targets"
         )
-    notes = [f"scale bars that are not in two photographs: {list_some(lost, 3, str)}"] * bool(lost)
+    notes = [f"scale bars that are not in two photographs: {list_some(unseen, 3, str)}"] * bool(
+        unseen
+    )
     if control is not None:
         points = control.points
-        lost = [id for id in points.id if id not in photographs]
+        unseen = [id for id in points.id if id not in photographs]
         number = sum(
             id in photographs and role != "check" for id, role in zip(points.id, points.role)
         )
@@ -191,9 +196,9 @@ def name_unused(
             raise InputError(
                 f"{points.source.name}: {number} control points are measured in the photographs, "
                 f"{min_control} are needed"
-                + (f"; not found: {list_some(lost, 5, str)}" if lost else "")
+                + (f"; not found: {list_some(unseen, 5, str)}" if unseen else "")
             )
-        notes += [f"control points in no photograph: {list_some(lost, 5, str)}"] * bool(lost)
+        notes += [f"control points in no photograph: {list_some(unseen, 5, str)}"] * bool(unseen)
     return notes
 
 

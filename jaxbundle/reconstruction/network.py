@@ -47,30 +47,30 @@ def photograph_network(
     results."""
     # Without tie points of features the named ones connect the photographs.
     rows = np.unique(measured.image if len(measured) else extra.named.image).tolist()
-    of = [cameras.camera_of[k] for k in rows]
-    used = sorted(set(of))
-    free = [cameras.cameras[c] for c in used]
+    camera_of_image = [cameras.camera_of[k] for k in rows]
+    used_cameras = sorted(set(camera_of_image))
+    free = [cameras.cameras[c] for c in used_cameras]
     if not cameras.calibrated:
         free = [dataclasses.replace(camera, free=PARAMETERS) for camera in free]
     tracks = [track_name(t) for t in np.unique(measured.track).tolist()]
     # Photographs without tie points are not in the network.
-    named = extra.named.take(np.isin(extra.named.image, rows))
-    points = [*tracks, *dict.fromkeys(named.name)]
+    named_measurements = extra.named.take(np.isin(extra.named.image, rows))
+    points = [*tracks, *dict.fromkeys(named_measurements.name)]
     names = np.array([p.name for p in photographs], dtype=object)
-    images = {"id": names[rows], "camera": [cameras.cameras[c].id for c in of]}
+    images = {"id": names[rows], "camera": [cameras.cameras[c].id for c in camera_of_image]}
     if extra.positions is not None:
         for values, prefix in zip(extra.positions, ("", "s")):
             images |= {f"{prefix}{axis}0": values[rows, i] for i, axis in enumerate("XYZ")}
     unknown = {axis: np.full(len(points), np.nan) for axis in "XYZ"}
-    xy = np.concatenate([measured.xy, named.xy])
-    sigma = np.concatenate([measured.sigma, named.sigma])
+    xy = np.concatenate([measured.xy, named_measurements.xy])
+    sigma = np.concatenate([measured.sigma, named_measurements.sigma])
     observations = {
-        "image": names[np.concatenate([measured.image, named.image])],
-        "point": [*map(track_name, measured.track.tolist()), *named.name],
+        "image": names[np.concatenate([measured.image, named_measurements.image])],
+        "point": [*map(track_name, measured.track.tolist()), *named_measurements.name],
     }
     observations |= {"x": xy[:, 0], "y": xy[:, 1], "sx": sigma[:, 0], "sy": sigma[:, 1]}
-    there = set(points)
-    distances = [d for d in extra.distances if {d["from"], d["to"]} <= there]
+    point_ids = set(points)
+    distances = [d for d in extra.distances if {d["from"], d["to"]} <= point_ids]
     network = make_network(
         free,
         images,
@@ -91,12 +91,14 @@ def photograph_network(
     colour_of = dict(zip(map(track_name, tracks.tolist()), colours.tolist()))
     network = network.replace(points=network.points.with_colours(colour_of))
     if not cameras.calibrated:
-        stated = [cameras.stated_distances[c] for c in used]
-        lens = [cameras.lens[c] for c in used]
+        stated_distances = [cameras.stated_distances[c] for c in used_cameras]
+        lens = [cameras.lens[c] for c in used_cameras]
         # With pixels that may not be square, fx of portrait format is fy of landscape format.
         of_lens = LENS_PARAMETERS if np.isfinite(aspect_sigma) else LENS_PARAMETERS[1:]
         network = with_common_lens_parameters(
-            with_camera_priors(network, stated, lens, of_lens, aspect_sigma), lens, of_lens
+            with_camera_priors(network, stated_distances, lens, of_lens, aspect_sigma),
+            lens,
+            of_lens,
         )
     return network
 

@@ -108,44 +108,46 @@ class OrientedBlock:
         )
         self.row = {id: k for k, id in enumerate(self.network.images.id)}
         points = self.network.points.id
-        known = np.all(np.isfinite(self.X), axis=1)
-        named = set(frame.points.id)
-        self.row_of_determined = {id: k for k, id in enumerate(points) if id in named and known[k]}
+        is_known = np.all(np.isfinite(self.X), axis=1)
+        named_ids = set(frame.points.id)
+        self.row_of_determined = {
+            id: k for k, id in enumerate(points) if id in named_ids and is_known[k]
+        }
         observed = np.all(np.isfinite(self.network.images.sigma[:, :3]), axis=1)
         self.has_positions = int(observed.sum()) > 2  # two leave a rotation open
         self.row_of_point = {id: k for k, id in enumerate(points)}
 
     def measure(self, id: str) -> MeasuredPoint:
         """The measurements of a point; all of them agree for now."""
-        named, names = self.frame.named, self.frame.names
+        named_measurements, names = self.frame.named, self.frame.names
         rows = [
             k
-            for k, name in enumerate(named.name)
-            if name == id and names[named.image[k]] in self.row
+            for k, name in enumerate(named_measurements.name)
+            if name == id and names[named_measurements.image[k]] in self.row
         ]
         rows = np.array(rows, int)
-        image = np.array([self.row[names[named.image[k]]] for k in rows], int)
+        image = np.array([self.row[names[named_measurements.image[k]]] for k in rows], int)
         camera = self.network.images.camera[image]
         # The measurements, and half a pixel to each side, for a central difference quotient.
         shifts = np.array([[0, 0], [0.5, 0], [-0.5, 0], [0, 0.5], [0, -0.5]])
-        xy = named.xy[rows] + shifts[:, None]
+        xy = named_measurements.xy[rows] + shifts[:, None]
         d = self._camera_rays(np.tile(camera, len(shifts)), xy.reshape(-1, 2))
         d = np.einsum("nij,sni->snj", self.M[image], d.reshape(len(shifts), -1, 3))
         # The ideal image of other cameras is not flat: the plane across the ray fits it best, and
         # there is one beyond 90° from the axis, too.
         flat = np.array([get_model(c.model).image == "perspective" for c in self.cameras], bool)
         axis = -self.M[image, 2]
-        before = np.einsum("ni,ni->n", axis, d[0]) > MIN_COSINE
-        normal = np.where((flat[camera] & before)[:, None], axis, d[0])
+        is_before = np.einsum("ni,ni->n", axis, d[0]) > MIN_COSINE
+        normal = np.where((flat[camera] & is_before)[:, None], axis, d[0])
         in_plane = d / np.einsum("ni,sni->sn", normal, d)[:, :, None]
         pixels = np.full((len(rows), 2, 3), np.nan)
         T = np.stack([in_plane[1] - in_plane[2], in_plane[3] - in_plane[4]], 2)
         # NaN: at the end of the range of the camera
-        known = np.all(np.isfinite(T), axis=(1, 2))
-        pixels[known] = np.linalg.pinv(T[known])
-        rays = np.where(known[:, None], d[0], np.nan)
-        sigma = named.sigma[rows].mean(1)
-        return MeasuredPoint(rows, image, rays, normal, pixels, sigma, known, np.full(3, np.nan))
+        is_known = np.all(np.isfinite(T), axis=(1, 2))
+        pixels[is_known] = np.linalg.pinv(T[is_known])
+        rays = np.where(is_known[:, None], d[0], np.nan)
+        sigma = named_measurements.sigma[rows].mean(1)
+        return MeasuredPoint(rows, image, rays, normal, pixels, sigma, is_known, np.full(3, np.nan))
 
     def _camera_rays(
         self, camera: Int[np.ndarray, " n"], xy: Float[np.ndarray, "n 2"]
@@ -161,12 +163,12 @@ class OrientedBlock:
         """Distances of the projections of X from its measurements, pixels: infinite behind the
         camera and of measurements without a ray, otherwise of the image without distortion, in
         pixels at the measurement."""
-        away = X - self.X0[point.image]
-        depth = np.einsum("ni,ni->n", away, point.normal)
+        sight = X - self.X0[point.image]
+        depth = np.einsum("ni,ni->n", sight, point.normal)
         in_plane = point.rays / np.einsum("ni,ni->n", point.rays, point.normal)[:, None]
         with np.errstate(divide="ignore", invalid="ignore"):
-            off = np.einsum("nki,ni->nk", point.pixels, away / depth[:, None] - in_plane)
-            length = np.nan_to_num(np.linalg.norm(off, axis=1), nan=np.inf)
+            misclosure = np.einsum("nki,ni->nk", point.pixels, sight / depth[:, None] - in_plane)
+            length = np.nan_to_num(np.linalg.norm(misclosure, axis=1), nan=np.inf)
             return np.where(depth > 0, length, np.inf)
 
     def distances(self, point: MeasuredPoint, X: Float[np.ndarray, "3"]) -> Float[np.ndarray, " n"]:
@@ -188,19 +190,19 @@ class OrientedBlock:
         σ of the measurements are multiplied by the robust scale of all their misclosures, if this
         is larger than 1: a point is identified worse than it is measured."""
         measured = {id: self.measure(id) for id in self.frame.points.id}
-        first = {id: self._find_consistent(point) for id, point in measured.items()}
+        consistent = {id: self._find_consistent(point) for id, point in measured.items()}
         # Normalised by the redundancy number 1 − 3/(2n) of a point with n rays.
-        off = [
+        misses = [
             self.misses(point, point.position)[point.good]
             / point.sigma[point.good]
             / np.sqrt(1 - 1.5 / point.good.sum())
-            for point in first.values()
+            for point in consistent.values()
             if point.good.sum() > 1
         ]
         # The median of a Rayleigh distribution (the length of two errors) is √(2·ln 2)·σ = 1.1774 σ
-        scale = max(1.0, float(np.median(np.concatenate(off))) / 1.1774) if off else 1.0
+        scale = max(1.0, float(np.median(np.concatenate(misses))) / 1.1774) if misses else 1.0
         if scale == 1.0:
-            return first
+            return consistent
         return {
             id: self._find_consistent(dataclasses.replace(point, sigma=scale * point.sigma))
             for id, point in measured.items()
@@ -211,17 +213,17 @@ class OrientedBlock:
         usable = np.flatnonzero(np.isfinite(point.rays).all(1))
         best = np.zeros(len(point.rows), bool)
         closest = np.inf
-        tried = usable[batched.spread(len(usable), self.settings.paired_rays)]
-        for i in tried:
-            for j in tried[tried > i]:
+        rays_tried = usable[batched.spread(len(usable), self.settings.paired_rays)]
+        for i in rays_tried:
+            for j in rays_tried[rays_tried > i]:
                 pair = np.isin(np.arange(len(point.rows)), [i, j])
-                off = self.misses(point, self._intersect(point, pair)) / point.sigma
-                good = off < self.settings.wrong_ray
-                if good[[i, j]].all() and (good.sum(), -np.median(off[good])) > (
+                misses = self.misses(point, self._intersect(point, pair)) / point.sigma
+                good = misses < self.settings.wrong_ray
+                if good[[i, j]].all() and (good.sum(), -np.median(misses[good])) > (
                     best.sum(),
                     -closest,
                 ):
-                    best, closest = good, np.median(off[good])
+                    best, closest = good, np.median(misses[good])
         if best.sum() < 2 or 2 * best.sum() <= len(usable):
             return dataclasses.replace(point, good=np.zeros(len(point.rows), bool))
         return dataclasses.replace(point, good=best, position=self._intersect(point, best))
@@ -273,16 +275,16 @@ class OrientedBlock:
             for id, k in self.row_of_determined.items()
         ]
         # NaN of measurements outside the range of their camera
-        known = [x for of_point in lengths for x in of_point if np.isfinite(x)]
-        return float(np.median(known)) if known else 1.0
+        known_lengths = [x for of_point in lengths for x in of_point if np.isfinite(x)]
+        return float(np.median(known_lengths)) if known_lengths else 1.0
 
     def compare(self, places: Sequence[int], points: Points) -> Discrepancies:
         """Coordinates from the block minus given ones, and their joint covariance."""
         rows = [self.row_of_determined[points.id[k]] for k in places]
         if not rows:
-            none = np.zeros((0, 3))
-            return Discrepancies(none, np.zeros((0, 3, 0, 3)), none, np.zeros((0, 3, 0)))
-        X, given = self.X[rows], points.position[list(places)]
+            no_points = np.zeros((0, 3))
+            return Discrepancies(no_points, np.zeros((0, 3, 0, 3)), no_points, np.zeros((0, 3, 0)))
+        X, given_position = self.X[rows], points.position[list(places)]
         C = self._joint_covariance(rows)
         n, sigma = len(rows), points.sigma[list(places)].copy()
         if self.has_positions:
@@ -296,7 +298,7 @@ class OrientedBlock:
         # Exact coordinates: σ 0, while NaN is to be estimated and infinity no observation.
         fixed = np.array([points.role[k] == "fixed" for k in places])
         sigma[fixed] = 0.0
-        return Discrepancies(X - given, C, sigma, G)
+        return Discrepancies(X - given_position, C, sigma, G)
 
     def _joint_covariance(self, rows: Sequence[int]) -> Float[np.ndarray, "n 3 n 3"]:
         """The covariance of the coordinates of some points among each other."""
@@ -314,19 +316,19 @@ class OrientedBlock:
     def removed_image_points(self) -> list[tuple[str, str]]:
         """Image and point, by id, of the image points without weight."""
         problem = self.result.problem
-        gone = ~problem.used
+        is_removed = ~problem.used
         images, points = self.network.images.id, self.network.points.id
         return [
             (images[i], points[p])
-            for i, p in zip(problem.image[gone].tolist(), problem.point[gone].tolist())
+            for i, p in zip(problem.image[is_removed].tolist(), problem.point[is_removed].tolist())
         ]
 
     def is_determined(self, id: str, point: MeasuredPoint) -> bool:
         """Whether a point was adjusted with the block, from the measurements that agree."""
         if id not in self.row_of_determined or point.good.sum() < 2:
             return False
-        off = self.misses(point, self.X[self.row_of_determined[id]])[point.good]
-        return bool((off < self.settings.wrong_ray * point.sigma[point.good]).all())
+        misses = self.misses(point, self.X[self.row_of_determined[id]])[point.good]
+        return bool((misses < self.settings.wrong_ray * point.sigma[point.good]).all())
 
     def name_of(self, point: MeasuredPoint, n: int) -> str:
         """The photograph of a measurement."""
@@ -338,11 +340,13 @@ class OrientedBlock:
         """Another point at the place of a measurement: measured in the same photograph, or
         intersected from others; empty without."""
         limit, xy = self.settings.wrong_ray * point.sigma[n], self.frame.named.xy
-        for other, its in measured.items():
-            there = its.rows[its.image == point.image[n]]
-            near = np.linalg.norm(xy[there] - xy[point.rows[n]], axis=1) < limit
-            if other != id and (near.any() or self.misses(point, its.position)[n] < limit):
-                return other
+        for other_id, other_point in measured.items():
+            rows_in_image = other_point.rows[other_point.image == point.image[n]]
+            is_near = np.linalg.norm(xy[rows_in_image] - xy[point.rows[n]], axis=1) < limit
+            if other_id != id and (
+                is_near.any() or self.misses(point, other_point.position)[n] < limit
+            ):
+                return other_id
         return ""
 
     @property

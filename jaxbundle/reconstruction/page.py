@@ -33,36 +33,36 @@ CONTROL = ("Control",)
 
 
 def compose_part(
-    whole: Reconstruction,
+    reconstruction: Reconstruction,
     part: ReconstructedPart,
     origin: Origin = UNKNOWN,
     also: Addition = NO_ADDITION,
 ) -> Iterator[str]:
     """The page of a part of a `Reconstruction`: HTML, in pieces; `also`: further findings and
     sections."""
-    return compose(part.adjustment, origin, also=_describe(whole, part).followed_by(also))
+    return compose(part.adjustment, origin, also=_describe(reconstruction, part).followed_by(also))
 
 
-def conclude_part(whole: Reconstruction, part: ReconstructedPart) -> Verdict:
+def conclude_part(reconstruction: Reconstruction, part: ReconstructedPart) -> Verdict:
     """The verdict on a part, with the use of the photographs."""
-    return conclude(part.adjustment, *_findings(whole, part), len(whole.warnings))
+    return conclude(part.adjustment, *_findings(reconstruction, part), len(reconstruction.warnings))
 
 
 def _findings(
-    whole: Reconstruction, part: ReconstructedPart
+    reconstruction: Reconstruction, part: ReconstructedPart
 ) -> tuple[list[Finding], tuple[str, ...]]:
     """The findings of a part, and those of its adjustment that they replace."""
     fit = [_judge_fit(part)] if part.factors else []
     controlled = part.control is not None or part.no_control
     return (
-        [*fit, _judge_photographs(whole, part), *_judge_control(part)],
+        [*fit, _judge_photographs(reconstruction, part), *_judge_control(part)],
         (*INAPPLICABLE, *CONTROL) if controlled else INAPPLICABLE,
     )
 
 
-def describe_part(whole: Reconstruction, part: ReconstructedPart) -> str:
+def describe_part(reconstruction: Reconstruction, part: ReconstructedPart) -> str:
     """What a surveyor asks of a part, as text: the block, control and check points."""
-    lines = heading(_name(whole, part))[1:]  # without the empty line before it
+    lines = heading(_name(reconstruction, part))[1:]  # without the empty line before it
     lines += text_facts(part.block.facts())
     if part.no_control:
         lines += ["", *text_paragraph(f"Control is not used: {part.no_control}")]
@@ -77,35 +77,35 @@ def describe_part(whole: Reconstruction, part: ReconstructedPart) -> str:
     return "\n".join([*lines, "", ""])
 
 
-def _describe(whole: Reconstruction, part: ReconstructedPart) -> Addition:
+def _describe(reconstruction: Reconstruction, part: ReconstructedPart) -> Addition:
     sections = [*_list_control(part), *_list_positions(part)]
     sections += [_list_factors(part)] if part.factors else []
-    if whole.left_out:
-        rows = grid(("photograph", "reason"), whole.left_out.items(), "words")
+    if reconstruction.left_out:
+        rows = grid(("photograph", "reason"), reconstruction.left_out.items(), "words")
         sections.append(Section("left-out", "Photographs left out", rows, "Left out"))
-    overview = f"<h3>Block {clean(whole.name)}</h3>\n{facts(part.block.facts())}"
-    overview += f"<h3>Reconstruction</h3>\n{facts(_count_parts(whole, part))}"
-    if whole.notes:
-        overview += items(whole.notes)
-    findings, without = _findings(whole, part)
+    overview = f"<h3>Block {clean(reconstruction.name)}</h3>\n{facts(part.block.facts())}"
+    overview += f"<h3>Reconstruction</h3>\n{facts(_count_parts(reconstruction, part))}"
+    if reconstruction.notes:
+        overview += items(reconstruction.notes)
+    findings, without = _findings(reconstruction, part)
     return Addition(
         "reconstruction",
         tuple(findings),
         overview=overview,
-        warnings=whole.warnings,
+        warnings=reconstruction.warnings,
         sections=tuple(sections),
-        tables={"pairs": _list_pairs(whole)},
-        name=_name(whole, part),
+        tables={"pairs": _list_pairs(reconstruction)},
+        name=_name(reconstruction, part),
         without=without,
     )
 
 
-def _name(whole: Reconstruction, part: ReconstructedPart) -> str:
+def _name(reconstruction: Reconstruction, part: ReconstructedPart) -> str:
     """The name of the reconstruction, with that of the part if there are several."""
     return (
-        whole.name
-        if whole.name and len(whole.parts) == 1
-        else ", ".join(filter(None, (whole.name, part.name)))
+        reconstruction.name
+        if reconstruction.name and len(reconstruction.parts) == 1
+        else ", ".join(filter(None, (reconstruction.name, part.name)))
     )
 
 
@@ -125,16 +125,16 @@ def _judge_fit(part: ReconstructedPart) -> Finding:
     )
 
 
-def _judge_photographs(whole: Reconstruction, part: ReconstructedPart) -> Finding:
-    used, total = len(part.adjustment.network.images), len(whole.photographs)
-    words = f"{used} of {count(total, 'photograph')} in this part"
-    if len(whole.parts) > 1:
-        words += f", {len(whole.parts)} unconnected parts"
-    if whole.left_out:
-        words += f", {len(whole.left_out)} left out"
+def _judge_photographs(reconstruction: Reconstruction, part: ReconstructedPart) -> Finding:
+    number_used, total = len(part.adjustment.network.images), len(reconstruction.photographs)
+    words = f"{number_used} of {count(total, 'photograph')} in this part"
+    if len(reconstruction.parts) > 1:
+        words += f", {len(reconstruction.parts)} unconnected parts"
+    if reconstruction.left_out:
+        words += f", {len(reconstruction.left_out)} left out"
     # A verdict is about the photographs that somebody took, not about those that were used.
-    complete = len(whole.parts) == 1 and not whole.left_out
-    brief = f"{total - used} of {count(total, 'photograph')} not in this result"
+    complete = len(reconstruction.parts) == 1 and not reconstruction.left_out
+    brief = f"{total - number_used} of {count(total, 'photograph')} not in this result"
     return Finding("Photographs", GOOD if complete else DOUBTFUL, words, brief)
 
 
@@ -144,33 +144,34 @@ def _judge_control(part: ReconstructedPart) -> list[Finding]:
         return [Finding("Control", BAD, f"not used: {part.no_control}")]
     if (control := part.control) is None:
         return []
-    given = [p for p in control.points if p.role != "check"]
+    given_points = [p for p in control.points if p.role != "check"]
     checks = [p for p in control.points if p.role == "check"]
     rms = lambda role: " ".join(
         f"{axis} {significant(x)}" for axis, x in zip("XYZ", control.rms(role)) if np.isfinite(x)
     )
-    used, left = [p for p in given if p.used], part.control.left_out
+    used_points, left_out = [p for p in given_points if p.used], part.control.left_out
     words = (
-        f"{len(used)} of {count(len(given), 'control point')} used, RMS {rms('control')} "
+        f"{len(used_points)} of {count(len(given_points), 'control point')} used, RMS "
+        f"{rms('control')} "
         f"{part.control.unit}; {part.control.sigma}"
     )
-    if left:
-        words += f"; left out: {', '.join(left)}"
+    if left_out:
+        words += f"; left out: {', '.join(left_out)}"
     wrong = [f"{clean(p.id)} in {clean(m)}" for p in control.points for m in p.wrong_measurements]
     if wrong:
         words += f"; wrong measurements: {', '.join(wrong)}"
-    held = any(p.verdict.startswith("held exactly") for p in used)
-    said = [f"control left out: {list_some(left, 3, clean)}"] if left else []
+    is_held = any(p.verdict.startswith("held exactly") for p in used_points)
+    doubts = [f"control left out: {list_some(left_out, 3, clean)}"] if left_out else []
     if wrong:
         name = "wrong measurement" if len(wrong) == 1 else "wrong measurements"
-        said.append(f"{name}: {list_some(wrong, 3, str)}")
-    said += ["control held exactly"] if held else []
-    state = DOUBTFUL if said else GOOD
-    findings = [Finding("Control", state, words, ", ".join(said))]
+        doubts.append(f"{name}: {list_some(wrong, 3, str)}")
+    doubts += ["control held exactly"] if is_held else []
+    state = DOUBTFUL if doubts else GOOD
+    findings = [Finding("Control", state, words, ", ".join(doubts))]
     if checks:
-        known = [p for p in checks if np.isfinite(p.residual).any()]
-        if len(known) < len(checks):
-            words = f"{len(known)} of {count(len(checks), 'check point')} compared"
+        compared = [p for p in checks if np.isfinite(p.residual).any()]
+        if len(compared) < len(checks):
+            words = f"{len(compared)} of {count(len(checks), 'check point')} compared"
             findings.append(Finding("Check points compared", DOUBTFUL, words, words))
     return findings
 
@@ -180,9 +181,9 @@ def _list_control(part: ReconstructedPart) -> list[Section]:
     if part.control is None:
         return []
     points = grid(HEADER, part.control.rows(), "remarks")
-    said = items([part.control.sigma, *part.control.notes])
+    notes = items([part.control.sigma, *part.control.notes])
     title = f"Control and check points: adjusted − given, in {clean(part.control.unit)}"
-    return [Section("control", title, points + said, "Control")]
+    return [Section("control", title, points + notes, "Control")]
 
 
 def _list_positions(part: ReconstructedPart) -> list[Section]:
@@ -196,20 +197,21 @@ def _list_positions(part: ReconstructedPart) -> list[Section]:
     return [Section("positions", title, grid(("photograph", "dX", "dY", "dZ"), rows), "Positions")]
 
 
-def _count_parts(whole: Reconstruction, part: ReconstructedPart) -> list[tuple[str, str]]:
+def _count_parts(reconstruction: Reconstruction, part: ReconstructedPart) -> list[tuple[str, str]]:
     """The parts, this one marked, and the pairs."""
     rows = []
-    for one in whole.parts:
-        network = one.adjustment.network
+    for listed_part in reconstruction.parts:
+        network = listed_part.adjustment.network
         rows.append(
             (
-                clean(one.name) + (" (this page)" if one is part and len(whole.parts) > 1 else ""),
+                clean(listed_part.name)
+                + (" (this page)" if listed_part is part and len(reconstruction.parts) > 1 else ""),
                 f"{count(len(network.images), 'photograph')}, "
-                f"{count(count_points(one.adjustment), 'point')}, "
-                f"σ0 {significant(one.adjustment.sigma0, 4)}",
+                f"{count(count_points(listed_part.adjustment), 'point')}, "
+                f"σ0 {significant(listed_part.adjustment.sigma0, 4)}",
             )
         )
-    return [*rows, ("Verified pairs", str(len(whole.pairs)))]
+    return [*rows, ("Verified pairs", str(len(reconstruction.pairs)))]
 
 
 def _list_factors(part: ReconstructedPart) -> Section:
@@ -219,14 +221,16 @@ def _list_factors(part: ReconstructedPart) -> Section:
     return Section("factors", "Variance factors", grid(note, rows), "Variance factors")
 
 
-def _list_pairs(whole: Reconstruction) -> Listing:
-    one, other, matches, verified, kind = zip(*whole.pairs) if whole.pairs else ((),) * 5
+def _list_pairs(reconstruction: Reconstruction) -> Listing:
+    image, partner, matches, verified, kind = (
+        zip(*reconstruction.pairs) if reconstruction.pairs else ((),) * 5
+    )
     words = lambda values: np.array(values, dtype=object)
     return Listing(
         "Pairs of photographs",
         {
-            "image": Column(words(one), "image"),
-            "other": Column(words(other), "other"),
+            "image": Column(words(image), "image"),
+            "other": Column(words(partner), "other"),
             "matches": Column(np.array(matches, int), "matches"),
             "verified": Column(np.array(verified, int), "verified"),
             "kind": Column(words(kind), "kind"),

@@ -26,11 +26,13 @@ def why_alone(
     overlapping = sorted({names[j] for p in pairs if k in p.images for j in p.images if j != k})
     if overlapping:
         return f"it overlaps only with {', '.join(overlapping[:3])}"
-    most, best = max(((len(m.rows), m.images) for m in matches if k in m.images), default=(0, None))
-    if best is None or not most:
+    largest_number, best = max(
+        ((len(m.rows), m.images) for m in matches if k in m.images), default=(0, None)
+    )
+    if best is None or not largest_number:
         return "it has no matches with any other photograph"
-    other = names[best[0] if best[1] == k else best[1]]
+    partner = names[best[0] if best[1] == k else best[1]]
     return (
-        f"it has too few matches with any other photograph: {most} with {other}, but "
+        f"it has too few matches with any other photograph: {largest_number} with {partner}, but "
         "too few of them agree on one object"
     )

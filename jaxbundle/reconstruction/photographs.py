@@ -30,16 +30,16 @@ class Photograph:
 
 
 def find_photographs(
-    given: Sequence[str | Path],
+    sources: Sequence[str | Path],
 ) -> tuple[list[Photograph], dict[str, str]]:
     """The photographs among files and folders, in the order of their names; and excluded files,
     with the reason.
 
     **Raises:** `InputError` if fewer than two can be used, or a name is given twice.
     """
-    paths, left_out = _list_files(given), {}
+    paths, left_out = _list_files(sources), {}
     names = _name_files(paths)
-    photographs, first = [], {}
+    photographs, first_name = [], {}
     for path, name in zip(paths, names):
         try:
             check_plain(path)
@@ -52,39 +52,41 @@ def find_photographs(
             left_out[name] = str(error).removeprefix(f"{path}: ")
             continue
         fingerprint = hashlib.blake2b(content, digest_size=8).hexdigest()
-        if fingerprint in first:
-            left_out[name] = f"the same file as {first[fingerprint]}"
+        if fingerprint in first_name:
+            left_out[name] = f"the same file as {first_name[fingerprint]}"
             continue
-        first[fingerprint] = name
+        first_name[fingerprint] = name
         photographs.append(Photograph(path, name, fingerprint, read_exif(path)))
     if len(photographs) < 2:
-        said = list_some((f"{name} ({why})" for name, why in left_out.items()), 3, str)
+        reasons = list_some((f"{name} ({why})" for name, why in left_out.items()), 3, str)
         raise InputError(
             f"{len(photographs)} of {len(paths)} photographs can be used; two or more are needed"
-            + (f": {said}" if left_out else "")
+            + (f": {reasons}" if left_out else "")
         )
     return photographs, left_out
 
 
-def name_other_files(given: Sequence[str | Path]) -> list[str]:
+def name_other_files(sources: Sequence[str | Path]) -> list[str]:
     """Notes about files in the given folders that are no photographs."""
-    said = [describe_other_files(folder) for folder in map(Path, given) if folder.is_dir()]
-    return [words for words in said if words]
+    descriptions = [
+        describe_other_files(folder) for folder in map(Path, sources) if folder.is_dir()
+    ]
+    return [words for words in descriptions if words]
 
 
-def _list_files(given: Sequence[str | Path]) -> list[Path]:
+def _list_files(sources: Sequence[str | Path]) -> list[Path]:
     """The files, and those of the folders, each once."""
     paths: list[Path] = []
-    for path in map(Path, given):
+    for path in map(Path, sources):
         if path.is_dir():
-            inside = list_photographs(path)
-            if not inside:
-                other = describe_other_files(path).removeprefix(f"{path}: ")
+            photographs = list_photographs(path)
+            if not photographs:
+                other_files = describe_other_files(path).removeprefix(f"{path}: ")
                 raise InputError(
                     f"{path}: no photographs in this folder ({', '.join(SUFFIXES)})"
-                    + (f"; {other}" if other else "")
+                    + (f"; {other_files}" if other_files else "")
                 )
-            paths += inside
+            paths += photographs
         elif not path.exists():
             raise InputError(f"{path}: no such file")
         else:
@@ -116,37 +118,37 @@ class Cameras:
 
 
 def assign_cameras(
-    photographs: Sequence[Photograph], given: Camera | None = None, per_folder: bool = False
+    photographs: Sequence[Photograph], given_camera: Camera | None = None, per_folder: bool = False
 ) -> Cameras:
     """Photographs of one make, model, serial number, focal length and size share a camera, of model
     `opencv`.
 
-    **Arguments:** `given`: a calibrated camera, shared by all photographs; `per_folder`: those of
-    every folder have a camera of their own.
+    **Arguments:** `given_camera`: a calibrated camera, shared by all photographs; `per_folder`:
+    those of every folder have a camera of their own.
 
     **Raises:** `InputError` if the given camera has another size.
     """
     notes = _rotation_messages(photographs)
-    if given is not None:
-        fitted = _fit_size(given, photographs)
+    if given_camera is not None:
+        fitted = _fit_size(given_camera, photographs)
         return Cameras((fitted,), (0,) * len(photographs), (None,), True, notes)
     # A zoom lens at another focal length is another camera, to the tenth of a millimetre.
     groups: dict[tuple, list[int]] = {}
     for k, photograph in enumerate(photographs):
         exif = photograph.exif
         focal = round(exif.focal_length or 0.0, 1), round(exif.focal_length_35 or 0.0)
-        own = photograph.path.parent.resolve() if per_folder else ""
-        groups.setdefault((exif.camera, exif.serial, own, *focal, exif.size), []).append(k)
-    cameras, stated, of = [], [], [0] * len(photographs)
+        own_folder = photograph.path.parent.resolve() if per_folder else ""
+        groups.setdefault((exif.camera, exif.serial, own_folder, *focal, exif.size), []).append(k)
+    cameras, stated_distances, camera_of = [], [], [0] * len(photographs)
     # The key of a lens is that of a camera with the sides in order.
     lenses: dict[tuple, int] = {}
     lens = [lenses.setdefault((*key[:-1], *sorted(key[-1])), len(lenses)) for key in groups]
     for number, rows in enumerate(groups.values()):
         exif = photographs[rows[0]].exif
-        told = exif.principal_distance()
+        stated_distance = exif.principal_distance()
         # Without a statement a start value: 45° of view, between telephones and normal lenses.
         columns, rows_of_image = exif.size
-        f = told.value if told else 1.2 * max(exif.size)
+        f = stated_distance.value if stated_distance else 1.2 * max(exif.size)
         id = (exif.camera or "camera") + (f" {number + 1}" if len(groups) > 1 else "")
         if per_folder and len(groups) == len({key[2] for key in groups}):
             id = photographs[rows[0]].path.parent.resolve().name
@@ -154,38 +156,41 @@ def assign_cameras(
         cameras.append(
             Camera(id, "opencv", {"fx": f, "fy": f, **centre}, image_size=(columns, rows_of_image))
         )
-        stated.append(told)
+        stated_distances.append(stated_distance)
         for k in rows:
-            of[k] = number
+            camera_of[k] = number
         where = (
-            f"{told.value:.0f} ± {told.sigma:.0f} px from {told.source}"
-            if told
+            f"{stated_distance.value:.0f} ± {stated_distance.sigma:.0f} px from "
+            f"{stated_distance.source}"
+            if stated_distance
             else "unknown: found from the photographs"
         )
-        same = f", the lens of camera {cameras[lens.index(lens[number])].id}" * (
+        same_lens = f", the lens of camera {cameras[lens.index(lens[number])].id}" * (
             lens[number] in lens[:number]
         )
         notes = (
             *notes,
             f"camera {id}: {count(len(rows), 'photograph')} of {exif.size[0]} × "
-            f"{exif.size[1]} pixels, principal distance {where}{same}",
+            f"{exif.size[1]} pixels, principal distance {where}{same_lens}",
         )
-    return Cameras(tuple(cameras), tuple(of), tuple(stated), False, notes, tuple(lens))
+    return Cameras(
+        tuple(cameras), tuple(camera_of), tuple(stated_distances), False, notes, tuple(lens)
+    )
 
 
-def _fit_size(given: Camera, photographs: Sequence[Photograph]) -> Camera:
+def _fit_size(given_camera: Camera, photographs: Sequence[Photograph]) -> Camera:
     """The given camera with the size of the photographs."""
-    size = given.image_size
+    size = given_camera.image_size
     for photograph in photographs:
         if size is None:
-            given = dataclasses.replace(given, image_size=photograph.size)
+            given_camera = dataclasses.replace(given_camera, image_size=photograph.size)
             size = photograph.size
         if tuple(size) != photograph.size:
             raise InputError(
                 f"{photograph.path}: {photograph.size[0]} × {photograph.size[1]} pixels, but "
-                f"camera {given.id} has {size[0]} × {size[1]}"
+                f"camera {given_camera.id} has {size[0]} × {size[1]}"
             )
-    return given
+    return given_camera
 
 
 def _rotation_messages(photographs: Sequence[Photograph]) -> tuple[str, ...]:

@@ -111,14 +111,14 @@ def reconstruct(
     require_x64()
     photographs, left_out = find_photographs(given)
     cameras = assign_cameras(photographs, camera, settings.camera_per_folder)
-    named, discs, notes = find_named(
+    named_measurements, discs, notes = find_named(
         photographs, settings.targets, control, settings.workers, settings.uncoded
     )
     notes += name_other_files(given)
     positions, messages = find_positions(photographs, control)
     notes += messages
     framed = positions is not None and positions.define_frame
-    notes += name_unused(named, control, distances, 1 if framed else MIN_CONTROL)
+    notes += name_unused(named_measurements, control, distances, 1 if framed else MIN_CONTROL)
     # Attitudes are those of the map: without positions in it the frame has another orientation.
     attitudes = None
     if positions is not None and framed:
@@ -127,21 +127,30 @@ def reconstruct(
     frame = None
     if control is not None:
         points = control.points.take(~control.points.has_role("tie"))
-        frame = FrameData(points, named, names, control.system, positions and positions[:2])
+        frame = FrameData(
+            points, named_measurements, names, control.system, positions and positions[:2]
+        )
         # Measurements of check points take no part, in the first adjustment either: a wrong one
         # would be judged by what it has changed.
         checks = {id for id, role in zip(points.id, points.role) if role == "check"}
-        named = named.take(np.array([id not in checks for id in named.name], bool))
-    further = FurtherData(
-        named, tuple(distances), positions[:2] if positions and framed else None, attitudes
+        named_measurements = named_measurements.take(
+            np.array([id not in checks for id in named_measurements.name], bool)
+        )
+    further_data = FurtherData(
+        named_measurements,
+        tuple(distances),
+        positions[:2] if positions and framed else None,
+        attitudes,
     )
     system = "" if control is None else control.system
     if positions is not None and (framed or control is not None):
         system = positions.words if control is None else system or positions.system
-    first = Path(given[0])
-    name = name or (first if first.is_dir() else first.parent).resolve().name
+    first_source = Path(given[0])
+    name = name or (first_source if first_source.is_dir() else first_source.parent).resolve().name
     stored = Store(store, settings.detection, settings.matching)
-    run = _ReconstructionRun(photographs, left_out, cameras, settings, stored, progress, further)
+    run = _ReconstructionRun(
+        photographs, left_out, cameras, settings, stored, progress, further_data
+    )
     run.notes += notes
     run.frame, run.system, run.title, run.discs = frame, system, name, discs
     return run.run()
@@ -158,11 +167,11 @@ class _ReconstructionRun:
         settings: ReconstructionSettings,
         store: Store,
         tell: Progress,
-        further: FurtherData,
+        further_data: FurtherData,
     ):
         self.photographs, self.left_out = photographs, dict(left_out)
         self.cameras, self.settings, self.store, self.tell = cameras, settings, store, tell
-        self.further = further
+        self.further = further_data
         self.workers = settings.workers or available_cores()
         self.names = [photograph.name for photograph in photographs]
         self.notes, self.stage = list(cameras.notes), ""
@@ -179,8 +188,8 @@ class _ReconstructionRun:
             programs = (prepare, windows, batched.prepare) if can_run_two_programs() else ()
             prepared = [ahead.submit(program) for program in programs]
             features, matches = self._match()
-            for first in prepared[:1]:
-                first.result()  # an error of the compilation is raised here, not lost
+            for first_program in prepared[:1]:
+                first_program.result()  # an error of the compilation is raised here, not lost
             self._find_cameras(features, matches)
             pairs = self._verify(features, matches)
             for program in prepared:
@@ -193,9 +202,10 @@ class _ReconstructionRun:
         files = {p.name: p.path for p in self.photographs}
         warnings = [text for _, text in sorted(self.warnings, key=lambda warning: -warning[0])]
         # The only part needs no name.
-        only = f"{parts[0].name}: " if len(parts) == 1 else ""
+        only_name = f"{parts[0].name}: " if len(parts) == 1 else ""
         notes, warned = (
-            tuple(text.removeprefix(only) for text in texts) for texts in (self.notes, warnings)
+            tuple(text.removeprefix(only_name) for text in texts)
+            for texts in (self.notes, warnings)
         )
         return Reconstruction(
             tuple(parts), self.left_out, notes, verified, files, warned, self.title
@@ -231,10 +241,10 @@ class _ReconstructionRun:
                 "dirt on the sensor, or the background of an object that turns"
             )
         duplicates = find_duplicates(matches, features, sizes, settings.duplicates)
-        for k, (other, still, number) in duplicates.items():
+        for k, (other_photograph, number_still, number) in duplicates.items():
             self.left_out.setdefault(
                 self.names[k],
-                f"it shows the same as {self.names[other]} ({still} of {number} "
+                f"it shows the same as {self.names[other_photograph]} ({number_still} of {number} "
                 "matches are at the same place): saved again, or taken from the same place",
             )
         self._require_two()
@@ -244,21 +254,21 @@ class _ReconstructionRun:
 
     def _match_named(self) -> tuple[list[Features], list[FeatureMatches]]:
         """Named points as features and matches."""
-        named, least = self.further.named, self.settings.min_common_targets
-        features = named_as_features(named, len(self.names))
+        named_measurements, min_common = self.further.named, self.settings.min_common_targets
+        features = named_as_features(named_measurements, len(self.names))
         for name, of_photograph in zip(self.names, features):
-            if (number := len(of_photograph)) < least:
+            if (number := len(of_photograph)) < min_common:
                 self.left_out.setdefault(
-                    name, f"{count(number, 'coded target')}, at least {least} are needed"
+                    name, f"{count(number, 'coded target')}, at least {min_common} are needed"
                 )
         self._require_two()
-        matches = match_named(named, len(self.names), least)
+        matches = match_named(named_measurements, len(self.names), min_common)
         self.matched_pairs = {m.images for m in matches}
         return features, matches
 
     def _detect(self) -> list[Features]:
         """The features of the photographs; those without are left out."""
-        read = [self._make_reader(p) for p in self.photographs]
+        readers = [self._make_reader(p) for p in self.photographs]
         prints = [p.fingerprint for p in self.photographs]
         detection = self.settings.detection
         columns, rows = max((p.size for p in self.photographs), key=math.prod)
@@ -266,7 +276,7 @@ class _ReconstructionRun:
         at_once = photographs_at_once(rows * columns, need, self.workers)
         features = detect(
             [p.path for p in self.photographs],
-            read,
+            readers,
             prints,
             detection,
             self.store,
@@ -283,8 +293,8 @@ class _ReconstructionRun:
     def _require_two(self) -> None:
         """Refuse to go on with a single photograph."""
         if sum(name not in self.left_out for name in self.names) < 2:
-            said = list_some((f"{n} ({w})" for n, w in self.left_out.items()), 3, str)
-            raise InputError(f"fewer than two photographs can be used: {said}")
+            reasons = list_some((f"{n} ({w})" for n, w in self.left_out.items()), 3, str)
+            raise InputError(f"fewer than two photographs can be used: {reasons}")
 
     def _make_reader(
         self, photograph: Photograph
@@ -312,7 +322,7 @@ class _ReconstructionRun:
             self.cameras.cameras,
             self.cameras.camera_of,
             self.cameras.lens,
-            [stated is not None for stated in self.cameras.stated_distances],
+            [stated_distance is not None for stated_distance in self.cameras.stated_distances],
             features,
             matches,
             self.settings.camera_starts,
@@ -329,10 +339,10 @@ class _ReconstructionRun:
         pairs = verify(*cameras, matches, self.tell, settings.verification)
         pairs, wrong = without_contradicted(*cameras, pairs, settings.loops)
         if wrong:
-            named = (" and ".join(self.names[k] for k in p.images) for p in wrong)
+            named_pairs = (" and ".join(self.names[k] for k in p.images) for p in wrong)
             self.notes.append(
                 f"{count(len(wrong), 'pair')} of photographs not used, contradicted "
-                f"by others in triplets: {list_some(named, 3, str)}"
+                f"by others in triplets: {list_some(named_pairs, 3, str)}"
             )
         if len(wrong) > settings.contradictory_share * (len(wrong) + len(pairs)):
             self._warn(
@@ -348,13 +358,13 @@ class _ReconstructionRun:
         """The adjusted parts, the largest first. What is left of a part is tried as another one:
         two scenes may be connected by a few wrong pairs."""
         # Two photographs in all are a part, two of many are not.
-        least = min(SMALLEST_PART, sum(name not in self.left_out for name in self.names))
+        min_size = min(SMALLEST_PART, sum(name not in self.left_out for name in self.names))
         waiting = group_connected(len(self.photographs), pairs)
         parts: list[ReconstructedPart] = []
-        failed: list[str] = []
+        failures: list[str] = []
         while waiting:
             group = waiting.pop(0)
-            if len(group) < least:
+            if len(group) < min_size:
                 for k in group:
                     self.left_out.setdefault(
                         self.names[k], why_alone(k, self.names, matches, pairs)
@@ -363,31 +373,33 @@ class _ReconstructionRun:
             try:
                 part, reasons = self._make_part(group, features, pairs, f"part {len(parts) + 1}")
             except (InputError, NotSolvedError) as error:
-                failed.append(str(error))
+                failures.append(str(error))
                 for k in group:
                     self.left_out.setdefault(self.names[k], "its part could not be oriented")
                 continue
             parts.append(part)
-            rest = [k for k in group if self.names[k] in reasons]
+            remaining = [k for k in group if self.names[k] in reasons]
             renumbered = [
-                dataclasses.replace(p, images=(rest.index(p.images[0]), rest.index(p.images[1])))
+                dataclasses.replace(
+                    p, images=(remaining.index(p.images[0]), remaining.index(p.images[1]))
+                )
                 for p in pairs
-                if set(p.images) <= set(rest)
+                if set(p.images) <= set(remaining)
             ]
-            for rows in group_connected(len(rest), renumbered):
-                again = [rest[k] for k in rows]
+            for rows in group_connected(len(remaining), renumbered):
+                next_group = [remaining[k] for k in rows]
                 # A smaller group than before: the loop ends.
-                if len(again) >= SMALLEST_PART and len(again) < len(group):
-                    waiting.append(again)
+                if len(next_group) >= SMALLEST_PART and len(next_group) < len(group):
+                    waiting.append(next_group)
                 else:
-                    self.left_out |= {self.names[k]: reasons[self.names[k]] for k in again}
+                    self.left_out |= {self.names[k]: reasons[self.names[k]] for k in next_group}
         if not parts:
-            raise NotSolvedError(self._explain_failure(pairs, failed), self.names)
+            raise NotSolvedError(self._explain_failure(pairs, failures), self.names)
         return sorted(parts, key=lambda part: -len(part.adjustment.network.images))
 
-    def _warn(self, said: str, weight: float = 1.0) -> None:
+    def _warn(self, message: str, weight: float = 1.0) -> None:
         """Keep a warning; those of larger weight are shown first."""
-        self.warnings.append((weight, said))
+        self.warnings.append((weight, message))
 
     def _begin(self, stage: str) -> None:
         """Begin a stage of unknown length, after the end of the one before."""
@@ -397,7 +409,7 @@ class _ReconstructionRun:
         if stage:
             self.tell(stage, 0, 1)
 
-    def _explain_failure(self, pairs: Sequence[Pair], failed: Sequence[str]) -> str:
+    def _explain_failure(self, pairs: Sequence[Pair], failures: Sequence[str]) -> str:
         """Why no part could be oriented, with a remedy."""
         kinds = {p.kind for p in pairs}
         # The remedy depends on what the verified pairs show.
@@ -406,12 +418,16 @@ class _ReconstructionRun:
                 "not solved: a rotation or a plane explains every pair: the photographs were taken "
                 "from one position, or show only a plane; take them from different positions"
             )
-        if failed:
-            return failed[0] if failed[0].startswith("not solved") else f"not solved: {failed[0]}"
-        said = list_some((f"{n} ({w})" for n, w in self.left_out.items()), 3, str)
+        if failures:
+            return (
+                failures[0]
+                if failures[0].startswith("not solved")
+                else f"not solved: {failures[0]}"
+            )
+        reasons = list_some((f"{n} ({w})" for n, w in self.left_out.items()), 3, str)
         some = "no three photographs overlap one another" if pairs else "no photographs overlap"
         return (
-            f"not solved: {some}: {said}; take sharp photographs, at most 20 degrees from one "
+            f"not solved: {some}: {reasons}; take sharp photographs, at most 20 degrees from one "
             "to the next, on which the object or its surroundings have texture"
         )
 
@@ -421,13 +437,13 @@ class _ReconstructionRun:
         if not settings.natural_points:
             return no_measurements()
         tracks, xy = make_tracks(features, pairs), [f.xy for f in features]
-        chosen = choose_tracks(tracks, xy, sizes, settings.points, settings.tracks)
-        done = iter(range(1, len(features) + 1))
+        is_chosen = choose_tracks(tracks, xy, sizes, settings.points, settings.tracks)
+        counter = iter(range(1, len(features) + 1))
         return measure_tracks(
-            [track for track, use in zip(tracks, chosen) if use],
+            [track for track, use in zip(tracks, is_chosen) if use],
             features,
             lambda k: read_photograph(self.photographs[k].path, colour=True),
-            lambda: self.tell("least squares matching", next(done), len(features)),
+            lambda: self.tell("least squares matching", next(counter), len(features)),
             settings.track_matching,
         )
 
@@ -436,14 +452,16 @@ class _ReconstructionRun:
     ) -> tuple[ReconstructedPart, dict[str, str]]:
         """An adjusted part; the photographs left out of it, with the reasons."""
         settings = self.settings
-        inside = [p for p in pairs if set(p.images) <= set(group)]
-        measured = self._measure(features, inside)
+        pairs_inside = [p for p in pairs if set(p.images) <= set(group)]
+        measured = self._measure(features, pairs_inside)
         network = self._make_network(name, measured, self.further)
         self._begin("start values")
-        named = {(self.names[p.images[0]], self.names[p.images[1]]): p for p in inside}
-        oriented, weighted, note = self._adjust_first(network, measured, named)
+        pair_of_names = {
+            (self.names[p.images[0]], self.names[p.images[1]]): p for p in pairs_inside
+        }
+        oriented, weighted, note = self._adjust_first(network, measured, pair_of_names)
         if self.discs is not None:
-            oriented, weighted, note = self._complete(name, weighted, measured, named)
+            oriented, weighted, note = self._complete(name, weighted, measured, pair_of_names)
         weighted, note = self._check_ratios(oriented, weighted, measured, note)
         self._begin("")
         # Before control, which fits a folded part as well as it can.
@@ -494,16 +512,18 @@ class _ReconstructionRun:
             self._warn(f"{name}: {misfit_in_words(part)}", part.misfit)
         return part
 
-    def _make_network(self, part: str, measured: Measurements, further: FurtherData) -> Network:
+    def _make_network(
+        self, part: str, measured: Measurements, further_data: FurtherData
+    ) -> Network:
         """The network of a part, without start values. Its name is that of the job, from the second
         part on with the part's own."""
-        first = part in ("", "part 1") and self.title
+        is_first = part in ("", "part 1") and self.title
         return photograph_network(
             self.photographs,
             self.cameras,
             measured,
-            further,
-            self.title if first else ", ".join(filter(None, (self.title, part))),
+            further_data,
+            self.title if is_first else ", ".join(filter(None, (self.title, part))),
             self.settings.aspect_sigma,
             self.settings.angle_unit,
         )
@@ -519,36 +539,40 @@ class _ReconstructionRun:
         assert self.discs is not None, "asked where discs were looked for"
         self._begin("uncoded targets")
         settings, discs = self.settings, self.discs
-        found = find_uncoded(weighted.adjustment, self.names, discs.xy, settings.uncoded_targets)
-        plain = name_uncoded(found, discs.xy, discs.sigma)
+        uncoded = find_uncoded(weighted.adjustment, self.names, discs.xy, settings.uncoded_targets)
+        uncoded_names = name_uncoded(uncoded, discs.xy, discs.sigma)
         self.notes.append(
-            f"{name}: {count(len(set(plain.name)), 'uncoded target')} in "
-            f"{len(plain)} of {len(discs)} discs"
+            f"{name}: {count(len(set(uncoded_names.name)), 'uncoded target')} in "
+            f"{len(uncoded_names)} of {len(discs)} discs"
         )
-        extra = dataclasses.replace(self.further, named=join_named(self.further.named, plain))
+        extra = dataclasses.replace(
+            self.further, named=join_named(self.further.named, uncoded_names)
+        )
         network = self._make_network(name, measured, extra)
         return self._adjust_first(network, measured, pairs)
 
     def _compare_with_files(self, result: Adjustment) -> list[str]:
         """Principal distances that contradict those of the files, in words."""
-        stated = {c.id: s for c, s in zip(self.cameras.cameras, self.cameras.stated_distances)}
-        said = []
+        stated_distances = {
+            c.id: s for c, s in zip(self.cameras.cameras, self.cameras.stated_distances)
+        }
+        messages = []
         for id, adjusted in principal_distances(result).items():
-            file = stated.get(id)
-            own = stated_sigma_of(adjusted)
-            if file is None or not own:
+            file = stated_distances.get(id)
+            adjusted_sigma = stated_sigma_of(adjusted)
+            if file is None or not adjusted_sigma:
                 continue
             # The file's value is also an observation of the adjustment, which draws the result
             # towards it: a contradiction is larger than it looks, and the test is cautious.
-            sigma = np.hypot(file.sigma, own)
-            off = abs(adjusted["value"] - file.value)
-            if off > square_pixels.CRITICAL_DEVIATION * sigma:
-                said.append(
+            sigma = np.hypot(file.sigma, adjusted_sigma)
+            deviation = abs(adjusted["value"] - file.value)
+            if deviation > square_pixels.CRITICAL_DEVIATION * sigma:
+                messages.append(
                     f"camera {id}: principal distance {adjusted['value']:.0f} px contradicts the "
                     f"{file.value:.0f} ± {file.sigma:.0f} px of the files ({file.source}): the "
                     "photographs were cropped or zoomed, or the result is wrong"
                 )
-        return said
+        return messages
 
     def _adjust_first(
         self, network: Network, measured: Measurements, pairs: NamedPairs
@@ -557,33 +581,33 @@ class _ReconstructionRun:
         attitudes."""
         guessed = [
             camera.id
-            for camera, stated in zip(self.cameras.cameras, self.cameras.stated_distances)
-            if stated is None and not self.cameras.calibrated
+            for camera, stated_distance in zip(self.cameras.cameras, self.cameras.stated_distances)
+            if stated_distance is None and not self.cameras.calibrated
         ]
-        failed: NotSolvedError | None = None
+        first_error: NotSolvedError | None = None
         settings = self.settings.start_values
         for oriented in start_values(network, guessed, pairs, settings):
             try:
                 weighted, note = self._adjust(oriented, measured)
             except NotSolvedError as error:
-                failed = failed or error
+                first_error = first_error or error
                 continue
             result = weighted.adjustment
             if not is_plausible(result, guessed, settings):
-                failed = failed or _not_solved(result)
+                first_error = first_error or _not_solved(result)
                 continue
             # Once more with the adjusted camera, if that orients more photographs.
-            again = start_again(network, oriented, result, pairs, settings)
-            if again is not None:
+            restarted = start_again(network, oriented, result, pairs, settings)
+            if restarted is not None:
                 try:
-                    better, other_note = self._adjust(again, measured)
+                    better, other_note = self._adjust(restarted, measured)
                 except NotSolvedError:
                     return oriented, weighted, note
                 if is_plausible(better.adjustment, guessed, settings):
-                    return again, better, other_note
+                    return restarted, better, other_note
             return oriented, weighted, note
-        assert failed is not None, "start values are there, or an error says why not"
-        raise failed
+        assert first_error is not None, "start values are there, or an error says why not"
+        raise first_error
 
     def _check_ratios(
         self, oriented: Oriented, weighted: WeightedAdjustment, measured: Measurements, note: str
@@ -597,18 +621,20 @@ class _ReconstructionRun:
         halves = square_pixels.replicated_ratios(weighted.adjustment)
         released = {}
         for id, ratio in contradicted.items():
-            both = halves.get(id)
-            said = f"camera {id}: the photographs alone give fy/fx {_ratio_in_words(ratio)}, "
-            if both is None:
-                said += "halves of them none: "
+            ratios_of_halves = halves.get(id)
+            message = f"camera {id}: the photographs alone give fy/fx {_ratio_in_words(ratio)}, "
+            if ratios_of_halves is None:
+                message += "halves of them none: "
             else:
-                said += f"halves of them {' and '.join(map(_ratio_in_words, both))}: "
-            if both is not None and square_pixels.is_replicated(*both):
+                message += (
+                    f"halves of them {' and '.join(map(_ratio_in_words, ratios_of_halves))}: "
+                )
+            if ratios_of_halves is not None and square_pixels.is_replicated(*ratios_of_halves):
                 released[id] = ratio
-                self.notes.append(f"{said}the pixels are not square")
+                self.notes.append(f"{message}the pixels are not square")
             else:
                 self.notes.append(
-                    f"{said}not confirmed, the pixels are taken as square (fy/fx "
+                    f"{message}not confirmed, the pixels are taken as square (fy/fx "
                     f"1 ± {self.settings.aspect_sigma:g})"
                 )
         if not released:
@@ -622,9 +648,9 @@ class _ReconstructionRun:
         placed, note = with_attitudes(oriented.network, self.names, self.further.attitudes)
         classes, class_names = _classify_measurements(placed, measured, self.names)
         significance, weighting = self.settings.significance, self.settings.weighting
-        placed, kept = leave_out_features(placed, classes == -1, weighting)
+        placed, is_kept = leave_out_features(placed, classes == -1, weighting)
         weighted = adjust_weighted(
-            placed, classes[kept], class_names, significance, self._begin, weighting
+            placed, classes[is_kept], class_names, significance, self._begin, weighting
         )
         return weighted, note
 

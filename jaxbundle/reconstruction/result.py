@@ -91,9 +91,13 @@ class Reconstruction(TableMethods):
         parts = [(part, part.adjustment) for part in self.parts]
         return {
             "part": np.array([part.name for part in self.parts], dtype=object),
-            "photographs": np.array([len(found.network.images) for _, found in parts], dtype=int),
-            "points": np.array([len(found.network.points) for _, found in parts], dtype=int),
-            "sigma0": np.array([found.sigma0 for _, found in parts], dtype=float),
+            "photographs": np.array(
+                [len(adjustment.network.images) for _, adjustment in parts], dtype=int
+            ),
+            "points": np.array(
+                [len(adjustment.network.points) for _, adjustment in parts], dtype=int
+            ),
+            "sigma0": np.array([adjustment.sigma0 for _, adjustment in parts], dtype=float),
             "misfit": np.array([part.misfit for part in self.parts], dtype=float),
         }
 
@@ -107,7 +111,7 @@ class Reconstruction(TableMethods):
         return "\n\n".join([str(self), *parts])
 
     def __str__(self) -> str:
-        lines = [f"warning: {said}" for said in self.warnings]
+        lines = [f"warning: {sentence}" for sentence in self.warnings]
         lines += [
             f"{self.prefix(part)}{count(len(part.adjustment.network.images), 'photograph')}, "
             f"{count(count_points(part.adjustment), 'point')}, "
@@ -115,9 +119,9 @@ class Reconstruction(TableMethods):
             for part in self.parts
         ]
         lines += [
-            f"warning: {self.prefix(part)}{said}"
+            f"warning: {self.prefix(part)}{sentence}"
             for part in self.parts
-            for said in (*part.adjustment.weakness.lines, *part.adjustment.doubts)
+            for sentence in (*part.adjustment.weakness.lines, *part.adjustment.doubts)
         ]
         lines += [
             f"{self.prefix(part)}{name}: {words}"
@@ -127,7 +131,7 @@ class Reconstruction(TableMethods):
         for part in self.parts:
             if part.control is not None:
                 lines.append(part.control.sigma)
-                lines += [f"control: {said}" for said in part.control.notes]
+                lines += [f"control: {sentence}" for sentence in part.control.notes]
         lines += [f"left out {name}: {why}" for name, why in self.left_out.items()]
         return "\n".join([*lines, *self.notes])
 

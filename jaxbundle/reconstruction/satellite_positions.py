@@ -15,14 +15,14 @@ def find_positions(
     """The satellite positions of the photographs in the system of control, else in their UTM zone,
     and what is done with them."""
     places = [p.exif.place for p in photographs]
-    there = sum(place is not None for place in places)
+    number_with_position = sum(place is not None for place in places)
     if control is None:
         positions = map_positions(places)
         if positions is None:
             return None, [
-                f"satellite positions of {there} photographs are not used: expected "
+                f"satellite positions of {number_with_position} photographs are not used: expected "
                 "three or more with heights"
-            ] * bool(there)
+            ] * bool(number_with_position)
         if not positions.define_frame:
             return positions, [
                 "satellite positions of the photographs extend over less than 8 σ: they "
@@ -30,7 +30,7 @@ def find_positions(
             ]
         return positions, [f"satellite positions of the photographs: {positions.words}"]
     notes = [f"control in {control.system or 'a system that its file does not name'}"]
-    if not there:
+    if not number_with_position:
         return None, [
             *notes,
             "no satellite positions in the photographs: control alone gives the frame",
@@ -39,13 +39,13 @@ def find_positions(
     if positions is None:
         return None, [
             *notes,
-            f"satellite positions of {there} photographs are not used: they need "
+            f"satellite positions of {number_with_position} photographs are not used: they need "
             "heights, three photographs, and a system of control in metres",
         ]
     # A system without a name is taken for the UTM zone of the positions, unless it is far from them
     if not control.system:
-        away = np.nanmedian(positions.X, 0) - np.median(control.points.position, axis=0)
-        distance = float(np.hypot(*away[:2]))
+        difference = np.nanmedian(positions.X, 0) - np.median(control.points.position, axis=0)
+        distance = float(np.hypot(*difference[:2]))
         # Metres in their UTM zone: a block from the air is smaller, another system is farther.
         if distance > 10_000:
             return None, [

@@ -65,36 +65,38 @@ def replicated_ratios(result: Adjustment) -> dict[str, tuple[Ratio, Ratio]]:
     of_halves = []
     # Every second photograph, so that both halves see the whole object.
     for parity in (0, 1):
-        half = keep_images(network, number % 2 == parity)
-        rays = np.bincount(half.observations.point, minlength=len(half.points))
-        half = keep_points(half, (rays > 1) | ~half.points.has_role("tie"))
-        half = half.replace(datum_points=())
+        half_network = keep_images(network, number % 2 == parity)
+        rays = np.bincount(half_network.observations.point, minlength=len(half_network.points))
+        half_network = keep_points(half_network, (rays > 1) | ~half_network.points.has_role("tie"))
+        half_network = half_network.replace(datum_points=())
         # Three photographs leave the principal point of an unknown camera to its prior.
-        if len(half.images) < 4:
+        if len(half_network.images) < 4:
             return {}
         # A half that does not determine its cameras confirms nothing.
         try:
-            alone = adjust(half)
+            half_result = adjust(half_network)
         except (InputError, NotSolvedError):
             return {}
-        if not alone.converged:
+        if not half_result.converged:
             return {}
-        used = {half.cameras[c].id for c in np.unique(half.images.camera)}
+        cameras_used = {half_network.cameras[c].id for c in np.unique(half_network.images.camera)}
         ratios = {}
-        for id in used:
-            d, q = _deviation(alone, id, 1.0)
-            ratios[id] = Ratio(d, alone.sigma0 * np.sqrt(q))
+        for id in cameras_used:
+            d, q = _deviation(half_result, id, 1.0)
+            ratios[id] = Ratio(d, half_result.sigma0 * np.sqrt(q))
         of_halves.append(ratios)
-    both = of_halves[0].keys() & of_halves[1].keys()
-    return {id: (of_halves[0][id], of_halves[1][id]) for id in both}
+    in_both = of_halves[0].keys() & of_halves[1].keys()
+    return {id: (of_halves[0][id], of_halves[1][id]) for id in in_both}
 
 
-def is_replicated(one: Ratio, other: Ratio) -> bool:
+def is_replicated(ratio_a: Ratio, ratio_b: Ratio) -> bool:
     """Whether two halves confirm each other that a ratio is not 1."""
     # The difference of the halves shows the correlated errors that their σ does not contain.
-    apart = abs(one.deviation - other.deviation)
-    clear = all(abs(r.deviation) > max(CRITICAL_DEVIATION * r.sigma, apart) for r in (one, other))
-    return clear and one.deviation * other.deviation > 0
+    difference = abs(ratio_a.deviation - ratio_b.deviation)
+    are_clear = all(
+        abs(r.deviation) > max(CRITICAL_DEVIATION * r.sigma, difference) for r in (ratio_a, ratio_b)
+    )
+    return are_clear and ratio_a.deviation * ratio_b.deviation > 0
 
 
 def release(network: Network, cameras: Collection[str]) -> Network:
@@ -110,15 +112,15 @@ def release(network: Network, cameras: Collection[str]) -> Network:
     network = with_observed(network, observed.take(np.array(keep)))
     return network.replace(
         further=tuple(
-            _without_focal_lengths(one, cameras) if isinstance(one, Ties) else one
-            for one in network.further
+            _without_focal_lengths(kind, cameras) if isinstance(kind, Ties) else kind
+            for kind in network.further
         )
     )
 
 
 def _without_focal_lengths(ties: Ties, cameras: Collection[str]) -> Ties:
     columns = zip(ties.camera, ties.other, ties.parameter)
-    keep = [name != "fx" or not {one, other} & {*cameras} for one, other, name in columns]
+    keep = [name != "fx" or not {camera, partner} & {*cameras} for camera, partner, name in columns]
     return ties.take(np.array(keep))
 
 
@@ -126,19 +128,21 @@ def _adjusted_network(result: Adjustment) -> Network:
     """The network with adjusted values as start values, without removed observations."""
     network, values = result.problem.network, result.image_values
     images, points, rays = network.images, network.points, network.observations
-    used = result.problem.used
+    is_used = result.problem.used
     tie = points.has_role("tie")[:, None]
     position = np.where(tie, result.point_values, points.position)
     cameras = tuple(
         dataclasses.replace(c, parameters=result.camera_parameters(c.id)) for c in network.cameras
     )
-    given = np.isfinite(images.sigma[:, :3])  # observed positions stay what was observed
-    start = np.concatenate([np.where(given, images.position, values[:, :3]), values[:, 3:]], 1)
+    is_observed = np.isfinite(images.sigma[:, :3])  # observed positions stay what was observed
+    start = np.concatenate(
+        [np.where(is_observed, images.position, values[:, :3]), values[:, 3:]], 1
+    )
     images = Images(
         images.id, images.camera, start[:, :3], start[:, 3:], images.sigma, images.source
     )
     points = dataclasses.replace(points, position=position)
-    rays = rays.take(used)
+    rays = rays.take(is_used)
     network = network.replace(cameras=cameras, images=images, points=points, observations=rays)
     return keep_points(network, np.all(np.isfinite(position), axis=1))
 

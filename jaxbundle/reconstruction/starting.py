@@ -81,31 +81,33 @@ def start_values(
 
     **Raises:** `NotSolvedError` if there are none.
     """
-    candidates, failed = [], None
+    candidates, first_error = [], None
     for tolerance in (settings.tolerance, TOLERANCE):
         try:
             candidates.append(_orient(network, tolerance, pairs, settings))
         except NotSolvedError as error:
-            failed = error
+            first_error = error
         else:
             # A wide tolerance lets wrong points in: only if the narrow one loses photographs.
             if not candidates[-1].images_not_placed:
                 break
     # Those that leave out the fewest photographs first.
     yield from sorted(candidates, key=lambda oriented: len(oriented.images_not_placed))
-    others = []
+    other_starts = []
     for changed in _try_other_distances(network, guessed, settings):
         try:
             # Without pairs: their orientations were found with the other distance.
-            others.append(_orient(changed, settings.tolerance, {}, settings))
+            other_starts.append(_orient(changed, settings.tolerance, {}, settings))
         except NotSolvedError:
             continue
-    least = settings.min_oriented * len(network.images)
-    enough = [oriented for oriented in others if len(oriented.network.images) >= least]
-    enough.sort(key=lambda oriented: -len(oriented.network.observations))
-    yield from enough[: settings.max_others]
-    if failed is not None and not candidates and not enough:
-        raise failed
+    min_oriented = settings.min_oriented * len(network.images)
+    sufficient = [
+        oriented for oriented in other_starts if len(oriented.network.images) >= min_oriented
+    ]
+    sufficient.sort(key=lambda oriented: -len(oriented.network.observations))
+    yield from sufficient[: settings.max_others]
+    if first_error is not None and not candidates and not sufficient:
+        raise first_error
 
 
 def _orient(
@@ -116,21 +118,21 @@ def _orient(
     oriented = orient(network, tolerance=tolerance)
     misplaced = find_misplaced(oriented.network, pairs, settings.misplaced)
     if misplaced:
-        others = _without(network, np.isin(np.array(network.images.id), [*misplaced]))
-        oriented = orient(others, tolerance=tolerance)
+        consistent = _without(network, np.isin(np.array(network.images.id), [*misplaced]))
+        oriented = orient(consistent, tolerance=tolerance)
     network, images = oriented.network, {**oriented.images_not_placed, **misplaced}
     # Leaving out one photograph takes rays from the points of others: until none has too few.
     while True:
         rays = np.bincount(network.observations.point, minlength=len(network.points))
-        tied = (rays > 1)[network.observations.point]
-        number = np.bincount(network.observations.image, tied, len(network.images))
-        few = number < settings.min_rays
-        if not few.any() or few.all():
+        has_several = (rays > 1)[network.observations.point]
+        number = np.bincount(network.observations.image, has_several, len(network.images))
+        has_few = number < settings.min_rays
+        if not has_few.any() or has_few.all():
             return dataclasses.replace(oriented, network=network, images_not_placed=images)
-        for k in np.flatnonzero(few):
+        for k in np.flatnonzero(has_few):
             why = f"only {int(number[k])} of its points agree with the others"
             images[network.images.id[k]] = why
-        network = _without(network, few)
+        network = _without(network, has_few)
 
 
 def _without(network: Network, images: Bool[np.ndarray, " images"]) -> Network:
@@ -209,12 +211,12 @@ def start_again(
     try:
         distance = lambda camera: camera.parameters.get("fx", 1.0)
         ratios = [distance(c) / distance(new) for c, new in zip(network.cameras, cameras)]
-        near = all(max(ratio, 1 / ratio) < settings.near_ratio for ratio in ratios)
+        are_near = all(max(ratio, 1 / ratio) < settings.near_ratio for ratio in ratios)
         changed = network.replace(cameras=cameras)
-        again = _orient(changed, settings.tolerance, pairs if near else {}, settings)
+        restarted = _orient(changed, settings.tolerance, pairs if are_near else {}, settings)
     except NotSolvedError:
         return None
-    return again if len(again.images_not_placed) < len(oriented.images_not_placed) else None
+    return restarted if len(restarted.images_not_placed) < len(oriented.images_not_placed) else None
 
 
 def _parameters(result: Adjustment, camera: Camera) -> dict[str, float]:

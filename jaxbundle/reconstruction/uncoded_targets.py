@@ -47,20 +47,22 @@ def find_uncoded(
     **Arguments:** `result`: oriented photographs; `names`: of all photographs; `discs`: pixels, of
     each of them."""
     search = _Search(result, names, discs, settings)
-    for least in range(min(len(search.rows), 6), settings.min_rays - 1, -1):
-        search.accept(least)
-    found = np.array(search.found, int).reshape(-1, 3)
-    return found[:, 0], found[:, 1], found[:, 2]
+    for min_rays in range(min(len(search.rows), 6), settings.min_rays - 1, -1):
+        search.accept(min_rays)
+    rows = np.array(search.found, int).reshape(-1, 3)
+    return rows[:, 0], rows[:, 1], rows[:, 2]
 
 
 def name_uncoded(
-    found: tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Int[np.ndarray, " n"]],
+    discs_of_points: tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Int[np.ndarray, " n"]],
     discs: Places,
     sigma: Places,
 ) -> NamedMeasurements:
     """The measurements of uncoded targets, named u1, u2, …"""
-    image, disc, point = found
-    pick = lambda of: np.array([of[k][d] for k, d in zip(image, disc)], float).reshape(-1, 2)
+    image, disc, point = discs_of_points
+    pick = lambda of_images: np.array(
+        [of_images[k][d] for k, d in zip(image, disc)], float
+    ).reshape(-1, 2)
     return NamedMeasurements(image, tuple(f"u{p}" for p in point), pick(discs), pick(sigma))
 
 
@@ -79,9 +81,11 @@ class _Search:
             dataclasses.replace(c, parameters=result.camera_parameters(c.id))
             for c in network.cameras
         ]
-        of = [cameras[c] for c in network.images.camera]
-        self.ideal = [ideal_features(camera, discs[k]) for camera, k in zip(of, self.rows)]
-        self.pixel = 1 / np.array([central_distance(camera) for camera in of])
+        camera_of_image = [cameras[c] for c in network.images.camera]
+        self.ideal = [
+            ideal_features(camera, discs[k]) for camera, k in zip(camera_of_image, self.rows)
+        ]
+        self.pixel = 1 / np.array([central_distance(camera) for camera in camera_of_image])
         self.ray = [self._rays(k) for k in range(len(self.rows))]
         self.free: list[Bool[np.ndarray, " _"]] = [
             np.asarray(np.isfinite(xy).all(1)) for xy in self.ideal
@@ -99,8 +103,8 @@ class _Search:
         d = np.concatenate([xy, -np.ones((len(xy), 1))], 1) @ self.M[k]
         return d / np.linalg.norm(d, axis=1, keepdims=True)
 
-    def accept(self, least: int) -> None:
-        """Accept the points with at least `least` rays, pair by pair."""
+    def accept(self, min_rays: int) -> None:
+        """Accept the points with at least `min_rays` rays, pair by pair."""
         n = len(self.rows)
         for i in range(n):
             for j in range(i + 1, n):
@@ -111,9 +115,9 @@ class _Search:
                 rays = (hits >= 0).sum(1)
                 # Of two that share a disc the one with more rays, of as many the closer one.
                 for row in np.lexsort((misfit, -rays)):
-                    if rays[row] < least:
+                    if rays[row] < min_rays:
                         break
-                    self._take(hits[row], least)
+                    self._take(hits[row], min_rays)
 
     def _cross(self, i: int, j: int) -> Float[np.ndarray, "m 3"]:
         """Points where free rays of two photographs meet within the tolerance."""
@@ -126,10 +130,10 @@ class _Search:
         # The angle of a ray with the epipolar plane of the other, in pixels of the photograph.
         planes = np.cross(self.ray[i][a], base)
         planes /= np.maximum(np.linalg.norm(planes, axis=1, keepdims=True), np.finfo(float).tiny)
-        off = np.abs(planes @ self.ray[j][b].T) / self.pixel[j]
+        distance = np.abs(planes @ self.ray[j][b].T) / self.pixel[j]
         cosine = np.abs(self.ray[i][a] @ self.ray[j][b].T)
-        near = (off < self.settings.tolerance) & (cosine < np.cos(self.settings.min_angle))
-        p, q = np.nonzero(near)
+        is_near = (distance < self.settings.tolerance) & (cosine < np.cos(self.settings.min_angle))
+        p, q = np.nonzero(is_near)
         u, v = self.ray[i][a[p]], self.ray[j][b[q]]
         # The point midway between two rays: from the normal equations of both distances.
         c = (u * v).sum(1)
@@ -149,23 +153,25 @@ class _Search:
             if tree is None:
                 continue
             d = (X - self.X0[k]) @ self.M[k].T
-            before = d[:, 2] < 0
-            xy = np.where(before[:, None], -d[:, :2] / np.where(before, d[:, 2], 1)[:, None], 1e9)
+            is_before = d[:, 2] < 0
+            xy = np.where(
+                is_before[:, None], -d[:, :2] / np.where(is_before, d[:, 2], 1)[:, None], 1e9
+            )
             reach = self.settings.tolerance * self.pixel[k]
-            distance, at = tree.query(xy, distance_upper_bound=reach)
+            distance, nearest = tree.query(xy, distance_upper_bound=reach)
             ok = np.isfinite(distance)
-            row = self.there[k][np.where(ok, at, 0)]
+            row = self.there[k][np.where(ok, nearest, 0)]
             ok &= self.free[k][row]
             hits[ok, k] = row[ok]
             misfit[ok] += distance[ok] / self.pixel[k]
         return hits, misfit / np.maximum((hits >= 0).sum(1), 1)
 
-    def _take(self, hits: Int[np.ndarray, " images"], least: int) -> None:
+    def _take(self, hits: Int[np.ndarray, " images"], min_rays: int) -> None:
         """Make a point of the discs that are still free, if these are enough."""
-        still = [(k, d) for k, d in enumerate(hits.tolist()) if d >= 0 and self.free[k][d]]
-        if len(still) < least:
+        free_discs = [(k, d) for k, d in enumerate(hits.tolist()) if d >= 0 and self.free[k][d]]
+        if len(free_discs) < min_rays:
             return
         self.points += 1
-        for k, d in still:
+        for k, d in free_discs:
             self.free[k][d] = False
             self.found.append((self.rows[k], d, self.points))

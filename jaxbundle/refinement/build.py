@@ -36,8 +36,8 @@ def choose_rays(
     points: GroundPoints, observations: Observations, frames: Network | None
 ) -> tuple[Rays, Rays, list[str]]:
     """The rays of the adjustment and those of check points; warnings about exclusions."""
-    at = {id: k for k, id in enumerate(points.id)}
-    row = np.array([] if frames is None else [at[id] for id in frames.points.id], int)
+    row_of = {id: k for k, id in enumerate(points.id)}
+    row = np.array([] if frames is None else [row_of[id] for id in frames.points.id], int)
     frame_point = row[frames.observations.point] if frames is not None else row
     number = np.bincount(observations.point, minlength=len(points))
     number += np.bincount(frame_point, minlength=len(points))
@@ -49,15 +49,15 @@ def choose_rays(
         warnings.append(
             f"tie points measured once are left out: {list_some(np.array(points.id)[lone])}"
         )
-    used = (role != "check") & (number > 0) & ~lone
+    is_used = (role != "check") & (number > 0) & ~lone
     check = (role == "check") & (number > 0)
-    if not used.any():
+    if not is_used.any():
         raise InputError(
             f"{points.source.name}: no control or tie point is measured; compare the ids of points "
             "and observations"
         )
-    if frames is not None and (lost := ~used[row[frames.distances.points]].all(1)).any():
-        warnings.append(f"left out {count(lost.sum(), 'distance')} to an excluded point")
+    if frames is not None and (is_lost := ~is_used[row[frames.distances.points]].all(1)).any():
+        warnings.append(f"left out {count(is_lost.sum(), 'distance')} to an excluded point")
 
     def rays_to(mask: Bool[np.ndarray, " points"]) -> Rays:
         return Rays(
@@ -66,33 +66,33 @@ def choose_rays(
             np.flatnonzero(mask),
         )
 
-    return rays_to(used), rays_to(check), warnings
+    return rays_to(is_used), rays_to(check), warnings
 
 
 def start_points(inputs: RefinementInput, rays: Rays) -> Float[np.ndarray, "points 3"]:
     """Given coordinates, or the intersection of the rays of a tie point."""
-    points, chosen = inputs.points, rays.points
-    X = points.X[chosen].copy()
-    wanted = np.any(np.isnan(X), axis=1)
-    if not wanted.any():
+    points, chosen_points = inputs.points, rays.points
+    X = points.X[chosen_points].copy()
+    is_wanted = np.any(np.isnan(X), axis=1)
+    if not is_wanted.any():
         return X
     centre, direction, point = (np.concatenate(x) for x in zip(*_sights(inputs, rays)))
-    at = np.searchsorted(chosen, point)
+    point_row = np.searchsorted(chosen_points, point)
     # The rays sorted by their points, without those of points whose coordinates are given.
-    order = np.argsort(at, kind="stable")
-    order = order[wanted[at[order]]]
-    rows, first, number = np.unique(at[order], return_index=True, return_counts=True)
+    order = np.argsort(point_row, kind="stable")
+    order = order[is_wanted[point_row[order]]]
+    rows, begin, number = np.unique(point_row[order], return_index=True, return_counts=True)
     # As many rays for every point as for the one with the most, the last repeated with weight 0:
     # one batch instead of a loop over points.
     place = np.minimum(np.arange(number.max()), number[:, None] - 1)
     weight = (np.arange(number.max()) < number[:, None]).astype(float)
-    mine = order[first[:, None] + place]
-    met = _meet(centre[mine], direction[mine], weight)
-    X[rows] = met.X
-    lost = (np.asarray(met.status) != Status.SOUND) | ~np.isfinite(X[rows]).all(1)
-    if lost.any():
-        p = int(chosen[rows[lost.argmax()]])
-        status = Status(int(met.status[lost.argmax()]))
+    rays_of_points = order[begin[:, None] + place]
+    intersected = _meet(centre[rays_of_points], direction[rays_of_points], weight)
+    X[rows] = intersected.X
+    is_lost = (np.asarray(intersected.status) != Status.SOUND) | ~np.isfinite(X[rows]).all(1)
+    if is_lost.any():
+        p = int(chosen_points[rows[is_lost.argmax()]])
+        status = Status(int(intersected.status[is_lost.argmax()]))
         raise InputError(
             f"{points.source(p)}: the rays of tie point {points.id[p]!r} do not meet "
             f"({status.name.lower().replace('_', ' ')}); give approximate coordinates, or measure "
@@ -108,15 +108,18 @@ def _sights(inputs: RefinementInput, rays: Rays) -> Iterator[tuple[np.ndarray, .
     """Origins, directions and points of the rays; image by image."""
     observations, frames = inputs.observations, inputs.frames
     image = observations.image[rays.scanner]
-    for i, one in enumerate(inputs.rigorous):
+    for i, scanner_image in enumerate(inputs.rigorous):
         rows = rays.scanner[image == i]
         if len(rows):
-            found = _scanner_sights(one.image, observations.xy[rows[fill_up(len(rows))]])
-            yield *(np.asarray(x)[: len(rows)] for x in found), observations.point[rows]
-    first = len(inputs.rigorous)
-    rows = rays.scanner[image >= first]
+            sights = _scanner_sights(scanner_image.image, observations.xy[rows[fill_up(len(rows))]])
+            yield *(np.asarray(x)[: len(rows)] for x in sights), observations.point[rows]
+    first_rpc = len(inputs.rigorous)
+    rows = rays.scanner[image >= first_rpc]
     if len(rows):
-        rpcs, of_rpc = [one.image.rpc for one in inputs.rpc], observations.image[rows] - first
+        rpcs, of_rpc = (
+            [scanner_image.image.rpc for scanner_image in inputs.rpc],
+            observations.image[rows] - first_rpc,
+        )
         yield *lines_of_sight(rpcs, of_rpc, observations.xy[rows]), observations.point[rows]
     if frames is None:
         return
@@ -163,24 +166,29 @@ def check_input(
             )
     check_points_table(points)
     check_observations(images, points, observations)
-    for i, one in enumerate(images):
-        if isinstance(one, ScannerImage):
-            _check_knots(one, int((observations.image == i).sum()))
+    for i, scanner_image in enumerate(images):
+        if isinstance(scanner_image, ScannerImage):
+            _check_knots(scanner_image, int((observations.image == i).sum()))
 
 
-def _check_knots(one: ScannerImage, measured: int) -> None:
+def _check_knots(scanner_image: ScannerImage, measured: int) -> None:
     """Refuse a jitter with more knots than its points can determine."""
-    free = np.isinf(one.freedom.jitter).any()
-    if not any(one.freedom.jitter):
+    free = np.isinf(scanner_image.freedom.jitter).any()
+    if not any(scanner_image.freedom.jitter):
         return
-    span = float(one.image.times.time(float(one.image.lines)) - one.image.times.time(0.0))
+    span = float(
+        scanner_image.image.times.time(float(scanner_image.image.lines))
+        - scanner_image.image.times.time(0.0)
+    )
     # Free coefficients need a measured point each. With a prior they are always determined, but ten
     # for each point already repeat their prior; more only take time.
-    most = max(measured if free else 10 * measured, MIN_INTERVALS)
-    knots = span / one.freedom.knot_spacing
-    if knots > most + 1:
+    max_intervals = max(measured if free else 10 * measured, MIN_INTERVALS)
+    knots = span / scanner_image.freedom.knot_spacing
+    if knots > max_intervals + 1:
         raise InputError(
-            f"image {one.id!r}: knot_spacing = {one.freedom.knot_spacing:g} s makes {knots:.0f} "
-            f"knots in {span:.4g} s, with {measured} measured points; give {span / most:.3g} s at "
+            f"image {scanner_image.id!r}: knot_spacing = {scanner_image.freedom.knot_spacing:g} s "
+            f"makes {knots:.0f} "
+            f"knots in {span:.4g} s, with {measured} measured points; give "
+            f"{span / max_intervals:.3g} s at "
             f"least{', or the jitter a prior σ' if free else ''}"
         )

@@ -52,37 +52,39 @@ class RefinementCheckPoints:
     @property
     def rms(self) -> Float[np.ndarray, "3"]:
         """RMS of the differences along each axis, NaN without any."""
-        known = np.isfinite(self.difference)
-        square = np.where(known, self.difference, 0.0) ** 2
-        number = known.sum(0)
+        is_known = np.isfinite(self.difference)
+        square = np.where(is_known, self.difference, 0.0) ** 2
+        number = is_known.sum(0)
         return np.where(number > 0, np.sqrt(square.sum(0) / np.maximum(number, 1)), np.nan)
 
 
-def intersect(found: RefinementInspection, rays: Rays) -> RefinementCheckPoints:
+def intersect(inspection: RefinementInspection, rays: Rays) -> RefinementCheckPoints:
     """The check points of these rays, with the refined images."""
-    inputs, adjusted = found.declared.inputs, found.solution.values
+    inputs, adjusted = inspection.declared.inputs, inspection.solution.values
     checks = declare(inputs, rays, inputs.points.X[rays.points], adjusted)
     problem, start = checks.problem, checks.problem.data.start
-    determined = determine_excluded(found.solution, problem)
-    values, Q = determined.values, determined.cofactors(found.solution)
-    known, axes = problem.table("point").free > 0, start["point"].axes
+    determined = determine_excluded(inspection.solution, problem)
+    values, Q = determined.values, determined.cofactors(inspection.solution)
+    is_known, axes = problem.table("point").free > 0, start["point"].axes
     change = np.asarray(values["point"].position - start["point"].position)
-    sigma = found.sigma0 * np.sqrt(np.diagonal(Q, axis1=1, axis2=2))
+    sigma = inspection.sigma0 * np.sqrt(np.diagonal(Q, axis1=1, axis2=2))
     # Residuals at the given coordinates, not at those that the rays determine.
-    here = Solution(problem, start)
-    A = _slopes(*here.arguments, found.shared_unknowns, found.estimate)
+    check_solution = Solution(problem, start)
+    A = _slopes(*check_solution.arguments, inspection.shared_unknowns, inspection.estimate)
     real = lambda o: np.asarray(A[o])[: problem.observations_of(o).number]
     # A·Q·Aᵀ of every ray
-    spread = {o: np.einsum("nrk,kl,nrl->nr", real(o), found.cofactor, real(o)) for o in A}
+    variance = {o: np.einsum("nrk,kl,nrl->nr", real(o), inspection.cofactor, real(o)) for o in A}
     weight = problem.data.weight  # 1/σ
     of_rays = lambda by_set: checks.image_by_image([np.asarray(x) for x in by_set])
     return RefinementCheckPoints(
         tuple(inputs.points.id[k] for k in rays.points),
-        np.where(known, np.einsum("pki,pi->pk", axes, change), np.nan),
-        np.where(known, sigma, np.nan),
+        np.where(is_known, np.einsum("pki,pi->pk", axes, change), np.nan),
+        np.where(is_known, sigma, np.nan),
         checks.number_of_rays,
-        of_rays(here.residuals[p.set] / weight[p.set] for p in checks.parts),
-        of_rays(found.sigma0 * np.sqrt(1 + spread[p.set]) / weight[p.set] for p in checks.parts),
+        of_rays(check_solution.residuals[p.set] / weight[p.set] for p in checks.parts),
+        of_rays(
+            inspection.sigma0 * np.sqrt(1 + variance[p.set]) / weight[p.set] for p in checks.parts
+        ),
     )
 
 
@@ -97,11 +99,16 @@ def _slopes(
 ) -> dict[str, Float[Array, "n r m"]]:
     """The derivatives of all v/σ by the shared unknowns, [n, r, m], the points where they are."""
     plan, laid = fill_places(plan, lay_out_data(plan, data))
-    put = lambda wide, x: wide.at[: len(x)].set(x)  # into tables padded to shared shapes
+    put_first_rows = lambda wide, x: wide.at[: len(x)].set(x)  # into tables padded to shared shapes
 
     def residuals_after(estimate: Float[AnyArray, " m"]) -> dict[str, Float[Array, "n r"]]:
-        now = shared.tables(estimate)
-        moved = {t: jax.tree.map(put, values[t], now[t]) if t in now else values[t] for t in values}
-        return restore_order(plan, residuals(declared, plan, moved, laid))
+        tables_now = shared.tables(estimate)
+        moved_tables = {
+            t: jax.tree.map(put_first_rows, values[t], tables_now[t])
+            if t in tables_now
+            else values[t]
+            for t in values
+        }
+        return restore_order(plan, residuals(declared, plan, moved_tables, laid))
 
     return jax.jacfwd(residuals_after)(estimate)

@@ -55,12 +55,12 @@ def declare_corrections(
 
 def _biases(images: list[RpcScannerImage]) -> tuple[CorrectionTable, list[SharedUnknown]]:
     """The table of RPC images with the terms of the highest degree, those of others held."""
-    terms = max(np.shape(one.bias_sigma)[1] for one in images)
+    terms = max(np.shape(rpc_image.bias_sigma)[1] for rpc_image in images)
     widen = lambda s: np.pad(np.asarray(s, float), ((0, 0), (0, terms - np.shape(s)[1])))
-    sigma = np.stack([widen(one.bias_sigma).ravel() for one in images])
+    sigma = np.stack([widen(rpc_image.bias_sigma).ravel() for rpc_image in images])
     free, names = sigma > 0, names_of_terms(terms)
-    start = stack_images([one.image.rpc for one in images], terms)
-    labels = [one.id for one in images]
+    start = stack_images([rpc_image.image.rpc for rpc_image in images], terms)
+    labels = [rpc_image.id for rpc_image in images]
     table = Table(RPC_IMAGE, start, BiasSpace(terms), free, labels, tuple(names))
     columns = [
         SharedUnknown(
@@ -83,33 +83,41 @@ def _rigorous_corrections(
     inputs: RefinementInput,
 ) -> tuple[list[CorrectionTable], list[SharedUnknown]]:
     """The corrections of rigorous images, and of their sensors."""
-    images, own = inputs.rigorous, inputs.forms[0].image_unknowns
-    sigma = np.stack([priors(form, one.freedom) for form, one in zip(inputs.forms, images)])
+    images, number_of_own = inputs.rigorous, inputs.forms[0].image_unknowns
+    sigma = np.stack(
+        [priors(form, scanner_image.freedom) for form, scanner_image in zip(inputs.forms, images)]
+    )
     # The unknowns of a sensor have the σ of its first image, or of the first that states one (NaN:
     # no such unknown).
-    first = np.unique(inputs.sensor, return_index=True)[1]
-    of_sensor = sigma[first, own:]
+    first_of_sensor = np.unique(inputs.sensor, return_index=True)[1]
+    of_sensor = sigma[first_of_sensor, number_of_own:]
     for i, row in enumerate(inputs.sensor):
         absent = np.isnan(of_sensor[row])
-        of_sensor[row, absent] = sigma[i, own:][absent]
-    named = [names(f.sizes, one.id, sensor_of(one)) for f, one in zip(inputs.forms, images)]
+        of_sensor[row, absent] = sigma[i, number_of_own:][absent]
+    names_of_unknowns = [
+        names(f.sizes, scanner_image.id, sensor_of(scanner_image))
+        for f, scanner_image in zip(inputs.forms, images)
+    ]
     tables, columns = [], [[] for _ in images]
     # The vector of an image is its own unknowns, then those of its sensor: two tables, so that
     # images of one sensor touch the same row. Columns that are held in all rows leave the space.
-    own_part = (IMAGE, sigma[:, :own], range(len(images)), 0)
-    for title, sigma, of, start in (own_part, (SENSOR, of_sensor, first, own)):
+    own_part = (IMAGE, sigma[:, :number_of_own], range(len(images)), 0)
+    for title, sigma, image_rows, start in (
+        own_part,
+        (SENSOR, of_sensor, first_of_sensor, number_of_own),
+    ):
         sigma = np.nan_to_num(sigma, nan=0.0, posinf=np.inf)
         moving = np.flatnonzero((sigma > 0).any(0)).tolist()
         space, free = kinds.VectorRow(sigma.shape[1], tuple(moving)), sigma[:, moving] > 0
-        labels = [images[i].id if title == IMAGE else sensor_of(images[i]) for i in of]
-        words = tuple(named[0][start + k].parameter for k in moving)
+        labels = [images[i].id if title == IMAGE else sensor_of(images[i]) for i in image_rows]
+        words = tuple(names_of_unknowns[0][start + k].parameter for k in moving)
         table = Table(title, np.zeros(sigma.shape), space, free, labels, words)
         prior, rows = np.where(sigma > 0, sigma, np.inf), (np.arange(table.rows),)
-        given = [kinds.priors(title)(rows, sigma=prior)] if np.isfinite(prior).any() else []
-        tables.append(CorrectionTable(table, given))
-        for row, i in enumerate(of):
+        prior_sets = [kinds.priors(title)(rows, sigma=prior)] if np.isfinite(prior).any() else []
+        tables.append(CorrectionTable(table, prior_sets))
+        for row, i in enumerate(image_rows):
             columns[i] += [
-                SharedUnknown(named[i][start + k], float(sigma[row, k]), title, row, d)
+                SharedUnknown(names_of_unknowns[i][start + k], float(sigma[row, k]), title, row, d)
                 for d, k in enumerate(moving)
                 if free[row, d]
             ]
@@ -120,9 +128,9 @@ def columns_of_photographs(
     network: Network, tables: list[Table], of_cameras: dict[str, tuple[str, int]]
 ) -> list[SharedUnknown]:
     """Their unknowns: of every image, and of its camera for the first image."""
-    columns, called = [], {t.name: t for t in tables}
+    columns, table_of = [], {t.name: t for t in tables}
     for i, id in enumerate(network.images.id):
-        for k in np.flatnonzero(called["image"].free[i]).tolist():
+        for k in np.flatnonzero(table_of["image"].free[i]).tolist():
             word = EXTERIOR[k]
             unit = ("m", 1.0) if k < 3 else ("arcsec", ARCSECONDS_PER_RADIAN)
             name = UnknownName(f"photograph {id}", word, *unit, word)
@@ -131,8 +139,8 @@ def columns_of_photographs(
         camera, (title, row) = network.cameras[c], of_cameras[network.cameras[c].id]
         if c in network.images.camera[:i]:  # named with its first image
             continue
-        for d in np.flatnonzero(called[title].free[row]).tolist():
-            word = called[title].parameters[d]
+        for d in np.flatnonzero(table_of[title].free[row]).tolist():
+            word = table_of[title].parameters[d]
             name = UnknownName(f"camera {camera.id}", word, "", 1.0, word)
             columns.append(SharedUnknown(name, camera.sigma.get(word, math.inf), title, row, d))
     return columns

@@ -89,14 +89,14 @@ class DeclaredRefinement:
         for part in self.parts:
             if part.table == IMAGE:
                 lines, _ = _lines(self.inputs, values, X, part.rows, part.image, part.point)
-                before, measured[part.set] = np.asarray(measured[part.set].scale), lines
+                scale_before, measured[part.set] = np.asarray(measured[part.set].scale), lines
                 # Relative to the largest element: those off the diagonal are nearly zero.
-                size = np.abs(before).max((1, 2), keepdims=True)
-                change = max(change, float((np.abs(lines.scale - before) / size).max()))
+                size = np.abs(scale_before).max((1, 2), keepdims=True)
+                change = max(change, float((np.abs(lines.scale - scale_before) / size).max()))
         if len(self.levelled):
             model, cells = not_none(self.inputs.terrain), measured[TERRAIN_HEIGHTS]
-            measured[TERRAIN_HEIGHTS], off = update_cells(model, cells, X[self.levelled])
-            change = max(change, off)
+            measured[TERRAIN_HEIGHTS], shift = update_cells(model, cells, X[self.levelled])
+            change = max(change, shift)
         data = dataclasses.replace(problem.data, measured=measured)
         return with_data(problem, data), change
 
@@ -110,10 +110,10 @@ def _lines(
     point: Int[np.ndarray, " n"],
 ) -> tuple[kinds.MeasuredLine, Float[np.ndarray, "n 2"]]:
     """`RefinementInput.lines` of rows that are sorted by their images."""
-    found = [
+    by_image = [
         inputs.lines(i, values, X[point[image == i]], rows[image == i]) for i in np.unique(image)
     ]
-    return jax.tree.map(lambda *parts: np.concatenate(parts), *found)
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *by_image)
 
 
 def declare(
@@ -129,33 +129,36 @@ def declare(
     and no terrain height, and points with one ray keep their height.
 
     **Raises:** `InputError` for points far from their measurement."""
-    points, chosen, n = inputs.points, rays.points, len(rays.points)
+    points, chosen_points, n = inputs.points, rays.points, len(rays.points)
     checking = values is not None
     index = np.full(len(points), -1)  # of every point among those used
-    index[chosen] = np.arange(n)
+    index[chosen_points] = np.arange(n)
     X = X - inputs.origin
     corrections, columns = declare_corrections(inputs)
-    tables = [one.table for one in corrections]
+    tables = [correction.table for correction in corrections]
     # S of the scanner points is evaluated here, at the start, and again in `rescale`
     values = values or {t.name: t.value for t in tables}
     observed, parts = _scanner_points(inputs, rays, values, X, index)
     of_cameras = {}
     if inputs.frames is not None:
         network = _network_of(inputs, rays, index, X + inputs.origin, checking)
-        more, of_cameras = _photographs(inputs, rays, network, parts)
-        observed += more.observations
-        tables += [t for t in more.tables if t.name != "point"]
+        of_photographs, of_cameras = _photographs(inputs, rays, network, parts)
+        observed += of_photographs.observations
+        tables += [t for t in of_photographs.tables if t.name != "point"]
         columns += columns_of_photographs(network, tables, of_cameras)
-    seen = np.bincount(np.concatenate([part.point for part in parts]), minlength=n)
-    table, control, at = _points(inputs, chosen, X, seen)
+    rays_of_point = np.bincount(np.concatenate([part.point for part in parts]), minlength=n)
+    table, control, controlled_rows = _points(inputs, chosen_points, X, rays_of_point)
     levelled, uncovered = np.zeros(0, int), np.zeros(0, int)
     if not checking:
-        observed += [*control, *(prior for one in corrections for prior in one.priors)]
+        observed += [
+            *control,
+            *(prior for correction in corrections for prior in correction.priors),
+        ]
         if not columns:
             raise InputError(
                 'refine: every unknown is held; free some, such as attitude = "free" in [unknowns]'
             )
-        heights, levelled, uncovered = _terrain_heights(inputs, chosen, X)
+        heights, levelled, uncovered = _terrain_heights(inputs, chosen_points, X)
         observed += heights
     tables = [dataclasses.replace(t, value=values.get(t.name, t.value)) for t in tables]
     # A point is touched by few observations, so that its 3 × 3 block is eliminated before the
@@ -164,7 +167,7 @@ def declare(
     problem = make_problem([*tables, table], observed, eliminate)
     parts, columns = tuple(parts), tuple(columns)
     return DeclaredRefinement(
-        inputs, rays, problem, parts, columns, at, levelled, uncovered, of_cameras
+        inputs, rays, problem, parts, columns, controlled_rows, levelled, uncovered, of_cameras
     )
 
 
@@ -189,12 +192,12 @@ def _photographs(
 
 def _terrain_heights(
     inputs: RefinementInput,
-    chosen: Int[np.ndarray, " points"],
+    chosen_points: Int[np.ndarray, " points"],
     X: Float[np.ndarray, "points 3"],
 ) -> tuple[list[ObservationSet], Int[np.ndarray, " heights"], Int[np.ndarray, " points"]]:
     """Heights of tie points by the terrain model, the points that have one, and those that have
     none."""
-    role = np.array(inputs.points.role, dtype=object)[chosen]
+    role = np.array(inputs.points.role, dtype=object)[chosen_points]
     ties = np.flatnonzero(role == "tie")
     if inputs.terrain is None or not len(ties):
         return [], np.zeros(0, int), np.zeros(0, int)
@@ -214,14 +217,14 @@ def _scanner_points(
 ) -> tuple[list[ObservationSet], list[ImagePointSet]]:
     """Observations of the rays of scanner images, one set for all images with the same equations,
     and what their rows are. `index`: of the points among those used."""
-    observed, parts, away = [], [], []
+    observed, parts, misses = [], [], []
     measured, sigma = inputs.observations, inputs.observations.sigma
     # Images differ in their equations by corrections and ellipsoid; their sizes were padded alike.
     kind_of_image: list = [inputs.kind(i) for i in range(len(inputs.rigorous))]
     kind_of_image += [RPC_POINTS] * len(inputs.rpc)
     for kind in dict.fromkeys(kind_of_image):
-        mine = np.array([other == kind for other in kind_of_image])
-        rows = rays.scanner[mine[measured.image[rays.scanner]]]
+        is_of_kind = np.array([other_kind == kind for other_kind in kind_of_image])
+        rows = rays.scanner[is_of_kind[measured.image[rays.scanner]]]
         rows = rows[np.argsort(measured.image[rows], kind="stable")]
         if not len(rows):
             continue
@@ -231,16 +234,18 @@ def _scanner_points(
             of_table, xy = image - len(inputs.rigorous), measured.xy[rows]
             v, _ = misclosures(values[RPC_IMAGE], of_table, X[point], xy)
             parts.append(ImagePointSet(name, RPC_IMAGE, rows, image, point))
-            given = RPC_POINTS((of_table, point), xy, sigma=sigma[rows], name=name)
+            observations = RPC_POINTS((of_table, point), xy, sigma=sigma[rows], name=name)
         else:
             lines, v = _lines(inputs, values, X, rows, image, point)
             parts.append(ImagePointSet(name, IMAGE, rows, image, point))
-            touched = image, inputs.sensor[image], point
-            given = kinds.scanner_points(kind)(touched, lines, sigma=sigma[rows], name=name)
-        away.append((rows, v))
-        observed.append(given)
-    if away:
-        rows, v = map(np.concatenate, zip(*away))
+            touched_rows = image, inputs.sensor[image], point
+            observations = kinds.scanner_points(kind)(
+                touched_rows, lines, sigma=sigma[rows], name=name
+            )
+        misses.append((rows, v))
+        observed.append(observations)
+    if misses:
+        rows, v = map(np.concatenate, zip(*misses))
         check_columns(inputs, rows, v)
         check_near(inputs, rows, v)
     return observed, parts
@@ -248,27 +253,31 @@ def _scanner_points(
 
 def _points(
     inputs: RefinementInput,
-    chosen: Int[np.ndarray, " points"],
+    chosen_points: Int[np.ndarray, " points"],
     X: Float[np.ndarray, "points 3"],
-    seen: Int[np.ndarray, " points"],
+    rays_of_point: Int[np.ndarray, " points"],
 ) -> tuple[Table, list[ObservationSet], np.ndarray]:
     """The table of points, observations of the controlled ones, and which these are."""
-    points, role = inputs.points, np.array(inputs.points.role, dtype=object)[chosen]
-    sigma = np.nan_to_num(points.sigma[chosen], nan=0.0, posinf=np.inf)
+    points, role = inputs.points, np.array(inputs.points.role, dtype=object)[chosen_points]
+    sigma = np.nan_to_num(points.sigma[chosen_points], nan=0.0, posinf=np.inf)
     control = (role == "control")[:, None]
     free = ~(control & (sigma == 0))
     # One ray gives no height: such a check point moves along its first two axes only.
-    free[(role == "check") & (seen < 2), 2] = False
-    placed = kinds.Placed(X, points.axes[chosen])
-    labels = [points.id[k] for k in chosen]
+    free[(role == "check") & (rays_of_point < 2), 2] = False
+    placed = kinds.Placed(X, points.axes[chosen_points])
+    labels = [points.id[k] for k in chosen_points]
     table = Table("point", placed, kinds.AlongAxes(), free, labels, points.axis_names)
     weighted = control & (sigma > 0) & np.isfinite(sigma)
-    at = np.flatnonzero(weighted.any(1))
-    if not len(at):
-        return table, [], at
-    sigma = np.where(weighted, sigma, np.inf)[at]
-    measured = kinds.Placed(*(x[at] for x in placed))
-    return table, [kinds.control(points.axis_names)((at,), measured, sigma=sigma)], at
+    controlled_rows = np.flatnonzero(weighted.any(1))
+    if not len(controlled_rows):
+        return table, [], controlled_rows
+    sigma = np.where(weighted, sigma, np.inf)[controlled_rows]
+    measured = kinds.Placed(*(x[controlled_rows] for x in placed))
+    return (
+        table,
+        [kinds.control(points.axis_names)((controlled_rows,), measured, sigma=sigma)],
+        controlled_rows,
+    )
 
 
 def _network_of(
@@ -281,18 +290,20 @@ def _network_of(
     """The photographs with the points and rays used; control is declared here (`_points`)."""
     frames, n = not_none(inputs.frames), len(X)
     # A camera without photographs would be undetermined.
-    used = list(dict.fromkeys(frames.images.camera.tolist()))
-    camera = np.array([used.index(c) for c in frames.images.camera], int)
-    seen, d = frames.observations.take(rays.frame), frames.distances
+    used_cameras = list(dict.fromkeys(frames.images.camera.tolist()))
+    camera = np.array([used_cameras.index(c) for c in frames.images.camera], int)
+    rays_used, d = frames.observations.take(rays.frame), frames.distances
     ends = index[inputs.frame_point[d.points]]
-    kept = (ends >= 0).all(1) & (not checking)
+    is_kept = (ends >= 0).all(1) & (not checking)
     ids = tuple(inputs.points.id[k] for k in rays.points)
     return frames.replace(
-        cameras=tuple(frames.cameras[c] for c in used),
+        cameras=tuple(frames.cameras[c] for c in used_cameras),
         images=dataclasses.replace(frames.images, camera=camera),
         # All of them tie points here: control is along the axes of each point, which the network
         # does not know.
         points=Points(ids, ("tie",) * n, X, np.full((n, 3), np.nan)),
-        observations=dataclasses.replace(seen, point=index[inputs.frame_point[seen.point]]),
-        distances=Distances(ends[kept], d.value[kept], d.sigma[kept]),
+        observations=dataclasses.replace(
+            rays_used, point=index[inputs.frame_point[rays_used.point]]
+        ),
+        distances=Distances(ends[is_kept], d.value[is_kept], d.sigma[is_kept]),
     )

@@ -110,9 +110,9 @@ class ChangedOptics(Optics):
         return change_slopes(self.base.slopes(u), self.relative_change, self.polynomials.slopes(u))
 
 
-def change_slopes(slopes: Pair, relative: Scalar, added: Pair) -> Pair:
+def change_slopes(slopes: Pair, relative: Scalar, added_slopes: Pair) -> Pair:
     """(ξ, η)/(1 + e) and what is added."""
-    (xi, eta), (more_xi, more_eta) = slopes, added
+    (xi, eta), (more_xi, more_eta) = slopes, added_slopes
     return xi / (1 + relative) + more_xi, eta / (1 + relative) + more_eta
 
 
@@ -148,11 +148,13 @@ def make_form(image: PushbroomImage, earth: Ellipsoid | None, freedom: Freedom) 
     """The form of the unknowns of one image."""
     spline = NO_SPLINE
     if any(freedom.jitter):
-        first, last = (float(image.times.time(line)) for line in (-0.5, image.lines - 0.5))
-        spline = make_spline(first, last, freedom.knot_spacing)
+        begin, end = (float(image.times.time(line)) for line in (-0.5, image.lines - 0.5))
+        spline = make_spline(begin, end, freedom.knot_spacing)
     axes = _axes(image, earth is None)
-    across, along = len(freedom.look_across), len(freedom.look_along)
-    return Form(axes, spline, Sizes(3, 3, 3 * spline.unknowns, 3, 3, 1, 3, across, along))
+    number_across, number_along = len(freedom.look_across), len(freedom.look_along)
+    return Form(
+        axes, spline, Sizes(3, 3, 3 * spline.unknowns, 3, 3, 1, 3, number_across, number_along)
+    )
 
 
 @compile_once
@@ -160,8 +162,8 @@ def _axes(image: PushbroomImage, local: bool) -> Float[Array, "3 3"]:
     """F: across, along, up at the middle line."""
     t, trajectory = image.middle_time, image.trajectory
     # In a local frame the centre of the Earth is nowhere; up is Z.
-    up = jnp.array([0.0, 0.0, 1.0]) if local else position_at(trajectory, t)
-    return orbital_frame(up, velocity_at(trajectory, t))
+    vertical = jnp.array([0.0, 0.0, 1.0]) if local else position_at(trajectory, t)
+    return orbital_frame(vertical, velocity_at(trajectory, t))
 
 
 def pad_forms(forms: list[Form]) -> list[Form]:
@@ -206,11 +208,14 @@ def change_optics(image: PushbroomImage, change: Change) -> ChangedOptics:
     """The optics with focal length and look angles changed."""
     # A zero coefficient more: a polynomial must have one.
     pad = lambda a: jnp.concatenate([a, jnp.zeros(1)])
-    middle, half = middle_and_half(image)
-    added = AnglePolynomial(
-        pad(change.look_across), pad(change.look_along), jnp.asarray(middle), jnp.asarray(half)
+    middle, half_width = middle_and_half(image)
+    added_angles = AnglePolynomial(
+        pad(change.look_across),
+        pad(change.look_along),
+        jnp.asarray(middle),
+        jnp.asarray(half_width),
     )
-    return ChangedOptics(image.optics, change.focal_length, added)
+    return ChangedOptics(image.optics, change.focal_length, added_angles)
 
 
 def middle_and_half(image: PushbroomImage) -> tuple[float, float]:
@@ -221,19 +226,19 @@ def middle_and_half(image: PushbroomImage) -> tuple[float, float]:
 def priors(form: Form, freedom: Freedom) -> Float[np.ndarray, " n"]:
     """The σ of every number of an image's vector; NaN where it has no such unknown."""
     room = lambda sigma, n: np.r_[sigma, np.full(n - len(sigma), np.nan)]
-    one, sizes, knots = freedom, form.sizes, form.spline.unknowns
-    jitter = [room(np.repeat(s, knots), sizes.jitter // 3) for s in one.jitter]
+    freedom_of_image, sizes, knots = freedom, form.sizes, form.spline.unknowns
+    jitter = [room(np.repeat(s, knots), sizes.jitter // 3) for s in freedom_of_image.jitter]
     return np.concatenate(
         [
-            one.attitude,
-            one.attitude_rate,
+            freedom_of_image.attitude,
+            freedom_of_image.attitude_rate,
             *jitter,
-            one.position,
-            one.position_rate,
-            [one.focal_length],
-            one.mounting,
-            room(one.look_across, sizes.look_across),
-            room(one.look_along, sizes.look_along),
+            freedom_of_image.position,
+            freedom_of_image.position_rate,
+            [freedom_of_image.focal_length],
+            freedom_of_image.mounting,
+            room(freedom_of_image.look_across, sizes.look_across),
+            room(freedom_of_image.look_along, sizes.look_along),
         ]
     )
 

@@ -59,12 +59,14 @@ class RefinementInput:
     def ids(self) -> list[str]:
         """The ids of all images, photographs after scanner images."""
         frames = () if self.frames is None else self.frames.images.id
-        return [*(one.id for one in self.images), *frames]
+        return [*(scanner_image.id for scanner_image in self.images), *frames]
 
     def kind(self, i: Index) -> kinds.ScannerPoint:
         """The equations of a rigorous image."""
-        one = self.rigorous[i]
-        return kinds.ScannerPoint(one.image.corrections, one.earth, self.forms[i].sizes)
+        scanner_image = self.rigorous[i]
+        return kinds.ScannerPoint(
+            scanner_image.image.corrections, scanner_image.earth, self.forms[i].sizes
+        )
 
     def lines(
         self,
@@ -76,8 +78,10 @@ class RefinementInput:
         """Of rows of the measurements in image i, of points X: what belongs to their places, and
         v."""
         p = values[IMAGE][i], values[SENSOR][self.sensor[i]]
-        one, places = self.rigorous[i].image, self.observations.xy[rows]
-        return kinds.lines_of(self.kind(i), one, self.forms[i], self.origin, *p, X, places)
+        scanner_image, places = self.rigorous[i].image, self.observations.xy[rows]
+        return kinds.lines_of(
+            self.kind(i), scanner_image, self.forms[i], self.origin, *p, X, places
+        )
 
 
 def gather(
@@ -89,28 +93,35 @@ def gather(
 ) -> RefinementInput:
     """The input with rigorous images before those with RPC; the forms of the unknowns, the sensors,
     the origin."""
-    rigorous = [one for one in images if isinstance(one, ScannerImage)]
-    rpc = [one for one in images if isinstance(one, RpcScannerImage)]
-    row = {one.id: k for k, one in enumerate([*rigorous, *rpc])}
-    rows = np.array([row[one.id] for one in images])[observations.image]
+    rigorous = [
+        scanner_image for scanner_image in images if isinstance(scanner_image, ScannerImage)
+    ]
+    rpc = [scanner_image for scanner_image in images if isinstance(scanner_image, RpcScannerImage)]
+    row = {scanner_image.id: k for k, scanner_image in enumerate([*rigorous, *rpc])}
+    rows = np.array([row[scanner_image.id] for scanner_image in images])[observations.image]
     observations = dataclasses.replace(observations, image=rows)
-    forms = pad_forms([make_form(one.image, one.earth, one.freedom) for one in rigorous])
+    forms = pad_forms(
+        [
+            make_form(scanner_image.image, scanner_image.earth, scanner_image.freedom)
+            for scanner_image in rigorous
+        ]
+    )
     sensors = list(dict.fromkeys(map(sensor_of, rigorous)))
-    sensor = np.array([sensors.index(sensor_of(one)) for one in rigorous], int)
-    at = {id: k for k, id in enumerate(points.id)}
-    of_frames = [] if frames is None else [at[id] for id in frames.points.id]
+    sensor = np.array([sensors.index(sensor_of(scanner_image)) for scanner_image in rigorous], int)
+    row_of = {id: k for k, id in enumerate(points.id)}
+    of_frames = [] if frames is None else [row_of[id] for id in frames.points.id]
     # Coordinates relative to a point near by lose fewer digits; but corrections, polynomials and
     # terrain need Earth-fixed positions.
     absolute = bool(rpc) or terrain is not None
-    absolute |= any(one.image.corrections.any for one in rigorous)
-    known = points.X[np.isfinite(points.X).all(1)]
-    origin = np.zeros(3) if absolute or not len(known) else np.round(known.mean(0))
+    absolute |= any(scanner_image.image.corrections.any for scanner_image in rigorous)
+    known_points = points.X[np.isfinite(points.X).all(1)]
+    origin = np.zeros(3) if absolute or not len(known_points) else np.round(known_points.mean(0))
     frame_point = np.array(of_frames, int)
     return RefinementInput(
         rigorous, rpc, points, observations, frames, terrain, forms, sensor, frame_point, origin
     )
 
 
-def sensor_of(one: ScannerImage) -> str:
+def sensor_of(scanner_image: ScannerImage) -> str:
     """The name of the sensor of an image, its own if it shares none."""
-    return one.sensor or one.id
+    return scanner_image.sensor or scanner_image.id

@@ -35,20 +35,23 @@ class SharedUnknowns(eqx.Module):
 
     def __call__(self, values: Values) -> Float[Array, " m"]:
         """The changes of the shared unknowns from the start to these tables."""
-        spaces, found = dict(self.spaces), jnp.zeros(sum(len(k) for k, *_ in self.places.values()))
+        spaces, changes = (
+            dict(self.spaces),
+            jnp.zeros(sum(len(k) for k, *_ in self.places.values())),
+        )
         for t, (k, row, direction) in self.places.items():
             change = jax.vmap(spaces[t].difference)(values[t], self.start[t])
-            found = found.at[k].set(change[row, direction])
-        return found
+            changes = changes.at[k].set(change[row, direction])
+        return changes
 
     def tables(self, changes: Float[AnyArray, " m"]) -> Values:
         """The tables after these changes."""
-        spaces, moved = dict(self.spaces), {}
+        spaces, moved_tables = dict(self.spaces), {}
         for t, (k, row, direction) in self.places.items():
             rows = jax.tree.leaves(self.start[t])[0].shape[0]
             change = jnp.zeros((rows, spaces[t].width)).at[row, direction].set(changes[k])
-            moved[t] = jax.vmap(spaces[t].retract)(self.start[t], change)
-        return moved
+            moved_tables[t] = jax.vmap(spaces[t].retract)(self.start[t], change)
+        return moved_tables
 
 
 _estimate = compile_once(lambda shared, values: shared(values))
@@ -80,13 +83,13 @@ class RefinementInspection:
     @functools.cached_property
     def shared_unknowns(self) -> SharedUnknowns:
         """The location of the shared unknowns."""
-        problem, at = self.declared.problem, {}
+        problem, places_by_table = self.declared.problem, {}
         for k, column in enumerate(self.declared.columns):
-            at.setdefault(column.table, []).append((k, column.row, column.direction))
+            places_by_table.setdefault(column.table, []).append((k, column.row, column.direction))
         # Columns, as index arrays of the tables.
-        at = {t: tuple(np.array(rows).T) for t, rows in at.items()}
-        start = {t: jax.device_get(problem.data.start[t]) for t in at}
-        return SharedUnknowns(at, start, problem.declared.named_spaces)
+        places_by_table = {t: tuple(np.array(rows).T) for t, rows in places_by_table.items()}
+        start = {t: jax.device_get(problem.data.start[t]) for t in places_by_table}
+        return SharedUnknowns(places_by_table, start, problem.declared.named_spaces)
 
     @functools.cached_property
     def estimate(self) -> Float[np.ndarray, " m"]:
@@ -130,9 +133,9 @@ class RefinementInspection:
         # With the weights before snooping: what a removed observation disagrees by is of interest.
         problem, weight = self.solution.problem, self.declared.problem.data.weight
         data = type(problem.data)(problem.data.start, problem.data.measured, weight)
-        found = Solution(with_data(problem, data), self.solution.values).residuals
+        residuals = Solution(with_data(problem, data), self.solution.values).residuals
         unit = lambda o: np.where(np.asarray(weight[o]) > 0, weight[o], 1.0)
-        return {o: v / unit(o) for o, v in found.items()}
+        return {o: v / unit(o) for o, v in residuals.items()}
 
     @property
     def has_weight(self) -> dict[str, np.ndarray]:
@@ -141,9 +144,14 @@ class RefinementInspection:
 
     def rows(self, o: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """v, r, w of a set of observations, NaN if missing, and the removed ones."""
-        used, found = self.has_weight[o], self.solution.reliability
-        tell = lambda x: np.where(used, x[o], np.nan)
-        return self.residuals[o], tell(found.redundancy), tell(found.w), ~np.any(used, axis=1)
+        has_weight, reliability = self.has_weight[o], self.solution.reliability
+        where_used = lambda x: np.where(has_weight, x[o], np.nan)
+        return (
+            self.residuals[o],
+            where_used(reliability.redundancy),
+            where_used(reliability.w),
+            ~np.any(has_weight, axis=1),
+        )
 
 
 def adjust(
@@ -166,30 +174,32 @@ def adjust(
             problem, change = declared.rescale(problem, values)
             if not (change > 1e-9 and converged(minimum.termination)):
                 break
-        found = Solution(problem, values)
-        _require_solved(declared, found, minimum, steps)
-        return found
+        solution = Solution(problem, values)
+        _require_solved(declared, solution, minimum, steps)
+        return solution
 
-    found, removed = adjust_from(declared.problem, declared.problem.data.start), []
+    solution, removed = adjust_from(declared.problem, declared.problem.data.start), []
     if snooping != "none":
-        found, removed = snoop(found, adjust_from, test=snooping, significance=significance)
-    return RefinementInspection(declared, found, steps, removed)
+        solution, removed = snoop(solution, adjust_from, test=snooping, significance=significance)
+    return RefinementInspection(declared, solution, steps, removed)
 
 
 def _require_solved(
-    declared: DeclaredRefinement, found: Solution, minimum: Minimum, steps: int
+    declared: DeclaredRefinement, solution: Solution, minimum: Minimum, steps: int
 ) -> None:
     settled = bool(converged(minimum.termination))
-    if settled and found.determined and found.problem.counts.redundancy >= 0:
+    if settled and solution.determined and solution.problem.counts.redundancy >= 0:
         return
     # A singular system often does not converge either: the cause is reported, not the symptom.
-    reasons = [w.sentence for w in weaknesses(declared, found)] if not found.determined else []
+    reasons = (
+        [w.sentence for w in weaknesses(declared, solution)] if not solution.determined else []
+    )
     if reasons or settled:
-        told = reasons[0] if reasons else "more unknowns than observations"
+        reason = reasons[0] if reasons else "more unknowns than observations"
         if reasons[1:]:
-            told += f", and {len(reasons) - 1} more directions"
+            reason += f", and {len(reasons) - 1} more directions"
         raise NotSolvedError(
-            f"the adjustment is singular: {told}; hold some, give them a prior σ, or add points",
+            f"the adjustment is singular: {reason}; hold some, give them a prior σ, or add points",
             reasons,
         )
     raise NotSolvedError(
@@ -200,7 +210,7 @@ def _require_solved(
 def _describe_removed(declared: DeclaredRefinement, blunder: RemovedRow) -> Removed:
     """Observations removed by snooping, in words; rows of image points as in
     `Refinement.image_points`, others as in their sets (three per control point)."""
-    inputs, chosen = declared.inputs, declared.rays.points
+    inputs, chosen_points = declared.inputs, declared.rays.points
     names = [part.set for part in declared.parts]
     points, set = inputs.points, declared.problem.observations_of(blunder.set)
     if blunder.set in names:
@@ -208,20 +218,20 @@ def _describe_removed(declared: DeclaredRefinement, blunder: RemovedRow) -> Remo
         part = declared.parts[number]
         # The rank of a row, set by set, in the order of the images.
         place = np.argsort(np.argsort(declared.image, kind="stable"))
-        before = sum(len(p.rows) for p in declared.parts[:number])
-        told = [
-            f"point {points.id[chosen[part.point[r]]]} in image {inputs.ids[part.image[r]]}"
+        rows_before = sum(len(p.rows) for p in declared.parts[:number])
+        image_points = [
+            f"point {points.id[chosen_points[part.point[r]]]} in image {inputs.ids[part.image[r]]}"
             for r in blunder.rows
         ]
-        rows = [int(place[before + r]) for r in blunder.rows]
-        return Removed("image", rows[0], either_of(told), blunder.test, tuple(rows[1:]))
+        rows = [int(place[rows_before + r]) for r in blunder.rows]
+        return Removed("image", rows[0], either_of(image_points), blunder.test, tuple(rows[1:]))
     if set.kind.name == "control points":
         p, axis = int(declared.control[blunder.row]), not_none(blunder.residual)
-        name = f"{points.axis_names[axis]} of control point {points.id[chosen[p]]}"
+        name = f"{points.axis_names[axis]} of control point {points.id[chosen_points[p]]}"
         return Removed("control", 3 * p + axis, name, blunder.test)
     if blunder.set == TERRAIN_HEIGHTS:
         p = int(declared.levelled[blunder.row])
-        name = f"terrain height of point {points.id[chosen[p]]}"
+        name = f"terrain height of point {points.id[chosen_points[p]]}"
         return Removed("terrain height", blunder.row, name, blunder.test)
-    a, b = (points.id[chosen[r[blunder.row]]] for r in set.rows)
+    a, b = (points.id[chosen_points[r[blunder.row]]] for r in set.rows)
     return Removed("distance", blunder.row, f"distance {a}–{b}", blunder.test)

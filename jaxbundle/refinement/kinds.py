@@ -85,8 +85,8 @@ class AlongAxes:
     def difference(self, value: Placed, origin: Placed) -> Float[Array, "3"]:
         return jnp.matmul(origin.axes, value.position - origin.position)
 
-    def hold(self, value: Placed, given: Placed, free: Float[AnyArray, "3"]) -> Placed:
-        return self.retract(given, free * self.difference(value, given))
+    def hold(self, value: Placed, start: Placed, free: Float[AnyArray, "3"]) -> Placed:
+        return self.retract(start, free * self.difference(value, start))
 
     def chart(self, value: Placed) -> None:  # noqa: ARG002
         return None
@@ -130,29 +130,29 @@ class ScannerPoint:
 
     def __call__(
         self,
-        own: Float[AnyArray, " p"],
+        unknowns_of_image: Float[AnyArray, " p"],
         sensor: Float[AnyArray, " q"],
         X: Float[AnyArray, "3"],
         line: MeasuredLine,
     ) -> Float[AnyArray, "2"]:
         """v = S·g, in lines and pixels."""
-        return line.scale @ self.misclosure(own, sensor, X, line)
+        return line.scale @ self.misclosure(unknowns_of_image, sensor, X, line)
 
     def misclosure(
         self,
-        own: Float[AnyArray, " p"],
+        unknowns_of_image: Float[AnyArray, " p"],
         sensor: Float[AnyArray, " q"],
         X: Float[AnyArray, "3"],
         line: MeasuredLine,
     ) -> Float[Array, "2"]:
         """g: the slopes of the point minus those of the pixel."""
-        change = change_of(self.sizes, jnp.concatenate([own, sensor]))
+        change = change_of(self.sizes, jnp.concatenate([unknowns_of_image, sensor]))
         jitter = change.jitter @ line.jitter
         offsets = change_offsets(line.offsets, line.axes, change, jitter)
         pose = move_pose(line.pose, line.dt, offsets, line.mounting + change.mounting)
-        added = line.across @ change.look_across, line.along @ change.look_along
+        added_slopes = line.across @ change.look_across, line.along @ change.look_along
         xi, eta = line.slopes
-        slopes = change_slopes((xi, eta), change.focal_length, added)
+        slopes = change_slopes((xi, eta), change.focal_length, added_slopes)
         return misclosure_of(pose, slopes, X, self.corrections, self.earth)
 
 
@@ -164,9 +164,9 @@ def line_of(
 ) -> MeasuredLine:
     """What belongs to a measured (line, pixel), in coordinates relative to an origin; without S."""
     t = image.times.time(place[0])
-    pose, (middle, half) = recorded_pose(image, t), middle_and_half(image)
+    pose, (middle, half_width) = recorded_pose(image, t), middle_and_half(image)
     weights = form.spline.weights(t)
-    powers = lambda n: jnp.array([((place[1] - middle) / half) ** k for k in range(n)])
+    powers = lambda n: jnp.array([((place[1] - middle) / half_width) ** k for k in range(n)])
     return MeasuredLine(
         pose._replace(P=pose.P - origin),
         t - image.middle_time,
@@ -186,18 +186,18 @@ def lines_of(
     image: PushbroomImage,
     form: Form,
     origin: Float[AnyArray, "3"],
-    own: Float[AnyArray, " p"],
+    unknowns_of_image: Float[AnyArray, " p"],
     sensor: Float[AnyArray, " q"],
     X: Float[AnyArray, "n 3"],
     places: Float[AnyArray, "n 2"],
 ) -> tuple[MeasuredLine, Float[np.ndarray, "n 2"]]:
     """What belongs to the measured places of points X [n, 3] of an image, S where its corrections
-    are `own` and `sensor`; and v."""
+    are `unknowns_of_image` and `sensor`; and v."""
     n = len(places)
     padded = fill_up(n)
     at_places = np.asarray(X)[padded], np.asarray(places)[padded]
-    found = _lines_of(kind, image, form, origin, own, sensor, *at_places)
-    return jax.tree.map(lambda x: np.asarray(x)[:n], found)
+    lines = _lines_of(kind, image, form, origin, unknowns_of_image, sensor, *at_places)
+    return jax.tree.map(lambda x: np.asarray(x)[:n], lines)
 
 
 @compile_once
@@ -206,7 +206,7 @@ def _lines_of(
     image: PushbroomImage,
     form: Form,
     origin: Float[AnyArray, "3"],
-    own: Float[AnyArray, " p"],
+    unknowns_of_image: Float[AnyArray, " p"],
     sensor: Float[AnyArray, " q"],
     X: Float[AnyArray, "n 3"],
     places: Float[AnyArray, "n 2"],
@@ -216,7 +216,7 @@ def _lines_of(
     ) -> tuple[MeasuredLine, Float[AnyArray, "2"]]:
         def misclosure(place: Float[Array, "2"]) -> tuple[Array, tuple[Array, MeasuredLine]]:
             line = line_of(image, form, origin, place)
-            g = kind.misclosure(own, sensor, X, line)
+            g = kind.misclosure(unknowns_of_image, sensor, X, line)
             # ∂g/∂(l, u) needs the trajectory's own derivative by time; g and the line come with it
             return g, (g, line)
 
@@ -229,8 +229,8 @@ def _lines_of(
 
 # Kinds are compared by their functions, as keys of compiled programs: a lambda in `control` or
 # `priors` would be another one, and compiled again, for every refinement.
-def _along_axes(X: Float[AnyArray, "3"], given: Placed) -> Float[AnyArray, "3"]:
-    return given.axes @ (X - given.position)
+def _along_axes(X: Float[AnyArray, "3"], place: Placed) -> Float[AnyArray, "3"]:
+    return place.axes @ (X - place.position)
 
 
 def _itself(correction: Float[AnyArray, " k"], _: None) -> Float[AnyArray, " k"]:
@@ -239,8 +239,8 @@ def _itself(correction: Float[AnyArray, " k"], _: None) -> Float[AnyArray, " k"]
 
 def scanner_points(residual: ScannerPoint) -> Kind:
     """Image points of scanner images with the same equations."""
-    of = ("scanner image", "sensor", "point")
-    return Kind("scanner coordinates", residual, of, ("line", "pixel"))
+    tables = ("scanner image", "sensor", "point")
+    return Kind("scanner coordinates", residual, tables, ("line", "pixel"))
 
 
 def control(axes: tuple[str, str, str]) -> Kind:

@@ -41,12 +41,16 @@ from jaxbundle.types import AnyArray, Scalar
 def refined_image(image: PushbroomImage, form: Form, change: Change) -> PushbroomImage:
     """An image without offsets that equals `image` with its changes."""
     # Without the jitter, which has no middle: the attitude is computed time by time below.
-    moved = change_image(image, form, change._replace(jitter=0 * change.jitter), image.middle_time)
+    without_jitter = change_image(
+        image, form, change._replace(jitter=0 * change.jitter), image.middle_time
+    )
     return PushbroomImage(
-        Trajectory(_position(moved), _attitude(image, form, change, _position(moved))),
+        Trajectory(
+            _position(without_jitter), _attitude(image, form, change, _position(without_jitter))
+        ),
         image.times,
         _optics(image, change),
-        moved.mounting,
+        without_jitter.mounting,
         no_offsets(),
         image.corrections,
         image.lines,
@@ -54,9 +58,9 @@ def refined_image(image: PushbroomImage, form: Form, change: Change) -> Pushbroo
     )
 
 
-def _position(moved: PushbroomImage) -> TimeTable:
-    table, offsets = moved.trajectory.position, moved.offsets
-    dt = (table.times - moved.middle_time)[:, None]
+def _position(changed: PushbroomImage) -> TimeTable:
+    table, offsets = changed.trajectory.position, changed.offsets
+    dt = (table.times - changed.middle_time)[:, None]
     values = table.values + offsets.position + dt * offsets.position_rate
     rates = None if table.rates is None else table.rates + offsets.position_rate
     return dataclasses.replace(table, values=values, rates=rates)
@@ -74,11 +78,11 @@ def _rotations(
     changed table."""
     old = image.trajectory
     new = Trajectory(position, old.attitude)
-    first, last = (old.position.times[k] for k in (0, -1))
+    begin, end = (old.position.times[k] for k in (0, -1))
 
     def turned_frame(t: Scalar) -> Float[Array, "3 3"]:
         # Rows of the attitude may be beyond those of the positions, where no line is.
-        t = jnp.clip(t, first, last)
+        t = jnp.clip(t, begin, end)
         frame = lambda table: orbital_frame(position_at(table, t), velocity_at(table, t))
         return frame(new).T @ frame(old)
 
@@ -97,36 +101,36 @@ def _attitude(
 ) -> AttitudeTable:
     old = image.trajectory.attitude
     rows = np.asarray(old.table.times)
-    first, last = (float(image.times.time(line)) for line in (-0.5, image.lines - 0.5))
+    begin, last = (float(image.times.time(line)) for line in (-0.5, image.lines - 0.5))
     # Two rows more than the image needs, so that readers may interpolate otherwise.
-    start = max(np.searchsorted(rows, first, side="right") - 1 - 2, 0)
+    start = max(np.searchsorted(rows, begin, side="right") - 1 - 2, 0)
     end = min(np.searchsorted(rows, last) + 2, len(rows) - 1)
-    covered = np.clip([first, last], *span(old.table))
+    covered = np.clip([begin, last], *span(old.table))
     # An extrapolated end becomes a row.
     times = np.union1d(rows[start : end + 1], covered[(covered < rows[0]) | (covered > rows[-1])])
     centres = form.spline.centres
-    times = np.union1d(times, centres[(centres > first) & (centres < last)])
+    times = np.union1d(times, centres[(centres > begin) & (centres < last)])
     gaps = rows[1:][np.diff(rows) > old.table.gap]
     R = lambda t: _pad(lambda t: _rotations(image, form, change, position, t), t)
     rotations, pending = R(times), np.ones(len(times) - 1, bool)
     while pending.any():
-        left = np.flatnonzero(pending)
-        middle = (times[left] + times[left + 1]) / 2
-        there = R(middle)
-        turn = _turns(rotations[left], rotations[left + 1])
-        half = rotations[left] @ _pad(_exponentials, turn / 2)
+        pending_intervals = np.flatnonzero(pending)
+        middle = (times[pending_intervals] + times[pending_intervals + 1]) / 2
+        rotation_at_middle = R(middle)
+        turn = _turns(rotations[pending_intervals], rotations[pending_intervals + 1])
+        rotation_halfway = rotations[pending_intervals] @ _pad(_exponentials, turn / 2)
         # 1e-9 rad is a millimetre from 1000 km. The error of slerp is largest in the middle; each
         # halving leaves a quarter of it.
-        wrong = np.linalg.norm(_turns(half, there), axis=1) > 1e-9
+        is_wrong = np.linalg.norm(_turns(rotation_halfway, rotation_at_middle), axis=1) > 1e-9
         # A gap has no values to be followed.
-        wrong &= ~np.isin(times[left + 1], gaps)
+        is_wrong &= ~np.isin(times[pending_intervals + 1], gaps)
         # Both halves of a split interval are checked again.
-        order = np.argsort(np.r_[times, middle[wrong]], kind="stable")
-        split = np.zeros(len(times) - 1, bool)
-        split[left[wrong]] = True
-        pending = np.repeat(split, 1 + split)
-        times = np.r_[times, middle[wrong]][order]
-        rotations = np.concatenate([rotations, there[wrong]])[order]
+        order = np.argsort(np.r_[times, middle[is_wrong]], kind="stable")
+        is_split = np.zeros(len(times) - 1, bool)
+        is_split[pending_intervals[is_wrong]] = True
+        pending = np.repeat(is_split, 1 + is_split)
+        times = np.r_[times, middle[is_wrong]][order]
+        rotations = np.concatenate([rotations, rotation_at_middle[is_wrong]])[order]
         if len(times) > 200_000:  # 20 MB of text: noise, not an attitude
             raise InputError(
                 "attitude: more than 200000 rows would be needed to write it; the "
@@ -164,18 +168,18 @@ def _pad(
 
 def _optics(image: PushbroomImage, change: Change) -> Optics:
     """Optics of the same kind if possible, else a table of angles."""
-    wanted = change_optics(image, change)
+    changed_optics = change_optics(image, change)
     base, e = image.optics, change.focal_length
     if isinstance(base, FocalLine):
         parameters = base.parameters
         # A longer principal distance is the same only without distortion.
         candidate = dataclasses.replace(base, parameters=jnp.asarray(parameters).at[0].mul(1 + e))
     elif isinstance(base, AnglePolynomial):
-        candidate = _sum(base, e, wanted.polynomials)
+        candidate = _sum(base, e, changed_optics.polynomials)
     else:
         candidate = base
     u = jnp.arange(image.pixels, dtype=float)
-    target = _slopes(wanted, u)
+    target = _slopes(changed_optics, u)
     # The same up to rounding: a nanometre in a kilometre.
     if float(jnp.abs(_slopes(candidate, u) - target).max()) <= 1e-12:
         return candidate
@@ -187,15 +191,26 @@ def _slopes(optics: Optics, u: Float[AnyArray, " pixels"]) -> Float[Array, "2 pi
     return jnp.stack(jax.vmap(optics.slopes)(u))
 
 
-def _sum(base: AnglePolynomial, e: Scalar, added: AnglePolynomial) -> AnglePolynomial:
+def _sum(base: AnglePolynomial, e: Scalar, added_polynomial: AnglePolynomial) -> AnglePolynomial:
     """base/(1 + e) + added as one polynomial about the middle of `base`."""
     total = []
-    for own, more in ((base.across, added.across), (base.along, added.along)):
-        # û of `added` as a polynomial of û of `base`, (û·half + middle − middle′)/half′
-        line = np.array([float(base.middle - added.middle), float(base.half)]) / float(added.half)
-        moved = np.polynomial.Polynomial(np.asarray(more))(np.polynomial.Polynomial(line)).coef
-        total.append(
-            jnp.asarray(np.polynomial.polynomial.polyadd(np.asarray(own) / (1 + float(e)), moved))
+    for own_coefficients, added_coefficients in (
+        (base.across, added_polynomial.across),
+        (base.along, added_polynomial.along),
+    ):
+        # û of `added_polynomial` as a polynomial of û of `base`, (û·half + middle − middle′)/half′
+        line = np.array([float(base.middle - added_polynomial.middle), float(base.half)]) / float(
+            added_polynomial.half
         )
-    across, along = total
-    return AnglePolynomial(across, along, base.middle, base.half)
+        shifted = np.polynomial.Polynomial(np.asarray(added_coefficients))(
+            np.polynomial.Polynomial(line)
+        ).coef
+        total.append(
+            jnp.asarray(
+                np.polynomial.polynomial.polyadd(
+                    np.asarray(own_coefficients) / (1 + float(e)), shifted
+                )
+            )
+        )
+    total_across, total_along = total
+    return AnglePolynomial(total_across, total_along, base.middle, base.half)

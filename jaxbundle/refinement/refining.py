@@ -126,8 +126,8 @@ class Refinement(TableMethods):
         n, rows = len(declared.rays.points), declared.parts
         number = np.zeros(n, int)
         for part in rows:
-            used = self.inspection.has_weight[part.set].any(1)
-            number += np.bincount(part.point[used], minlength=n)
+            has_weight = self.inspection.has_weight[part.set].any(1)
+            number += np.bincount(part.point[has_weight], minlength=n)
         rays, points = np.unique(number, return_counts=True)
         return dict(zip(rays.tolist(), points.tolist()))
 
@@ -135,23 +135,27 @@ class Refinement(TableMethods):
     def robust_sigma0(self) -> float:
         """σ0 by the median of the residuals of image points (MAD), which blunders hardly change;
         1 without redundancy."""
-        found = self.inspection.solution
+        solution = self.inspection.solution
         if self.redundancy <= 0:
             return 1.0
-        return robust_scale(found.problem, residual_lengths(found))
+        return robust_scale(solution.problem, residual_lengths(solution))
 
     def counts(self) -> dict[str, int]:
         """Observations with weight by their type, unknowns and redundancy: the first ones minus
         the second ones."""
-        declared, found = self.inspection.declared, self.inspection.solution
+        declared, solution = self.inspection.declared, self.inspection.solution
         images = {part.set for part in declared.parts}
         words = {"control points": "control coordinates", "distances": "distances"}
         words |= {TERRAIN_HEIGHTS: "terrain heights"}
         number = dict.fromkeys(("image coordinates", *words.values(), "priors"), 0)
-        for given in found.problem.observations:
-            word = "image coordinates" if given.name in images else words.get(given.kind.name)
-            number[word or "priors"] += int(self.inspection.has_weight[given.name].sum())
-        free = {t.name: int((t.free > 0).sum()) for t in found.problem.tables}
+        for observation_set in solution.problem.observations:
+            word = (
+                "image coordinates"
+                if observation_set.name in images
+                else words.get(observation_set.kind.name)
+            )
+            number[word or "priors"] += int(self.inspection.has_weight[observation_set.name].sum())
+        free = {t.name: int((t.free > 0).sum()) for t in solution.problem.tables}
         of_points = free.pop("point")
         return number | {
             "point coordinates": of_points,
@@ -171,7 +175,9 @@ class Refinement(TableMethods):
         frames = [] if inputs.frames is None else [inputs.frames.observations]
         sets = [inputs.observations, *frames]
         # One set of unstated σ makes vᵀPv a number without scale.
-        origin = next((one.sigma_origin for one in sets if one.sigma_origin != STATED), STATED)
+        origin = next(
+            (source.sigma_origin for source in sets if source.sigma_origin != STATED), STATED
+        )
         return chi_squared_test(r * self.sigma0**2, r, origin)
 
     @property
@@ -197,10 +203,10 @@ class Refinement(TableMethods):
     def image(self, id: str) -> PushbroomImage | RpcImage:
         """A refined scanner image, for `locate`, `project` and the correction; of an image with
         RPC one with coefficients that contain its bias (`compensated`)."""
-        at = {one.id: k for k, one in enumerate(self.images)}
-        if id not in at:
-            raise InputError(f"no scanner image {id!r}; there are {', '.join(at)}")
-        k, inputs = at[id], self.inputs
+        index_of = {scanner_image.id: k for k, scanner_image in enumerate(self.images)}
+        if id not in index_of:
+            raise InputError(f"no scanner image {id!r}; there are {', '.join(index_of)}")
+        k, inputs = index_of[id], self.inputs
         if k >= len(inputs.rigorous):
             return self.compensated[id][0]
         values, form = self.inspection.solution.values, inputs.forms[k]
@@ -209,22 +215,25 @@ class Refinement(TableMethods):
 
     def bias(self, id: str) -> RpcBias:
         """The estimated bias of an image with RPC, pixels."""
-        at = {one.id: k for k, one in enumerate(self.inputs.rpc)}
-        if id not in at:
-            raise InputError(f"no image with RPC {id!r}; there are {', '.join(at) or 'none'}")
-        terms = np.shape(self.inputs.rpc[at[id]].bias_sigma)[1]
-        bias = np.asarray(self.inspection.solution.values[RPC_IMAGE].bias)[at[id]]
+        index_of = {rpc_image.id: k for k, rpc_image in enumerate(self.inputs.rpc)}
+        if id not in index_of:
+            raise InputError(f"no image with RPC {id!r}; there are {', '.join(index_of) or 'none'}")
+        terms = np.shape(self.inputs.rpc[index_of[id]].bias_sigma)[1]
+        bias = np.asarray(self.inspection.solution.values[RPC_IMAGE].bias)[index_of[id]]
         return RpcBias(*bias[:, :terms])
 
     @functools.cached_property
     def compensated(self) -> dict[str, tuple[RpcImage, RpcCheck | None]]:
         """By id the images with RPC that contain their biases, and the residuals of their fit (None
         for a shift, which is exact)."""
-        found = {}
-        for one in self.inputs.rpc:
-            rpc, check = apply_bias(one.image.rpc, self.bias(one.id))
-            found[one.id] = dataclasses.replace(one.image, rpc=rpc), check
-        return found
+        images_and_residuals = {}
+        for rpc_image in self.inputs.rpc:
+            rpc, check = apply_bias(rpc_image.image.rpc, self.bias(rpc_image.id))
+            images_and_residuals[rpc_image.id] = (
+                dataclasses.replace(rpc_image.image, rpc=rpc),
+                check,
+            )
+        return images_and_residuals
 
     def image_points(self) -> list[dict]:
         """One row per image point used, image by image: ids, v, r and w of both
@@ -232,9 +241,18 @@ class Refinement(TableMethods):
         declared, points = self.inspection.declared, self.point_ids
         images = self.inputs.ids
         rows = [
-            {"image": images[i], "point": points[p], "v": v, "r": r, "w": w, "removed": bool(gone)}
+            {
+                "image": images[i],
+                "point": points[p],
+                "v": v,
+                "r": r,
+                "w": w,
+                "removed": bool(is_removed),
+            }
             for part in declared.parts
-            for i, p, v, r, w, gone in zip(part.image, part.point, *self.inspection.rows(part.set))
+            for i, p, v, r, w, is_removed in zip(
+                part.image, part.point, *self.inspection.rows(part.set)
+            )
         ]
         return [rows[k] for k in np.argsort(declared.image, kind="stable")]
 
@@ -245,8 +263,8 @@ class Refinement(TableMethods):
         if not len(levelled):
             return []
         return [
-            {"point": ids[p], "v": v, "r": r, "w": w, "removed": gone}
-            for p, v, r, w, gone in zip(
+            {"point": ids[p], "v": v, "r": r, "w": w, "removed": is_removed}
+            for p, v, r, w, is_removed in zip(
                 levelled.tolist(),
                 *(x.ravel().tolist() for x in self.inspection.rows(TERRAIN_HEIGHTS)),
             )
@@ -255,8 +273,8 @@ class Refinement(TableMethods):
     def distances(self) -> list[dict]:
         """One row per distance used: ids of both points, v, r, w, whether it was
         removed."""
-        found, rows = self.inspection, []
-        for distances in found.declared.problem.observations:
+        inspection, rows = self.inspection, []
+        for distances in inspection.declared.problem.observations:
             if distances.kind.name == "distances":
                 rows += [
                     {
@@ -265,9 +283,11 @@ class Refinement(TableMethods):
                         "v": float(v[0]),
                         "r": float(r[0]),
                         "w": float(w[0]),
-                        "removed": bool(gone),
+                        "removed": bool(is_removed),
                     }
-                    for a, b, v, r, w, gone in zip(*distances.rows, *found.rows(distances.name))
+                    for a, b, v, r, w, is_removed in zip(
+                        *distances.rows, *inspection.rows(distances.name)
+                    )
                 ]
         return rows
 
@@ -307,39 +327,41 @@ def refine(
     points = _checks_upright(points, images[0].earth)
     rays, check_rays, warnings = choose_rays(points, observations, frames)
     inputs = gather(images, points, observations, frames, terrain)
-    found = adjust(declare(inputs, rays, start_points(inputs, rays)), snooping, significance)
-    warnings += [*_without_terrain(found), *_outside_domains(found)]
-    for weak in weaknesses(found.declared, found.solution):
+    inspection = adjust(declare(inputs, rays, start_points(inputs, rays)), snooping, significance)
+    warnings += [*_without_terrain(inspection), *_outside_domains(inspection)]
+    for weak in weaknesses(inspection.declared, inspection.solution):
         warnings.append(f"{weak.sentence}; only priors, if any, separate them")
-    check = intersect(found, check_rays) if len(check_rays.points) else None
-    return Refinement(found, check, tuple(warnings))
+    check = intersect(inspection, check_rays) if len(check_rays.points) else None
+    return Refinement(inspection, check, tuple(warnings))
 
 
-def _without_terrain(found: RefinementInspection) -> Iterator[str]:
+def _without_terrain(inspection: RefinementInspection) -> Iterator[str]:
     """Tie points that the terrain model does not have, as a warning."""
-    inputs, uncovered = found.declared.inputs, found.declared.uncovered
+    inputs, uncovered = inspection.declared.inputs, inspection.declared.uncovered
     if len(uncovered):
-        ids = np.array(inputs.points.id)[found.declared.rays.points[uncovered]]
+        ids = np.array(inputs.points.id)[inspection.declared.rays.points[uncovered]]
         yield (
             f"{not_none(inputs.terrain).name} has no height at {count(len(ids), 'tie point')}, "
             f"adjusted without one: {list_some(ids)}"
         )
 
 
-def _outside_domains(found: RefinementInspection) -> Iterator[str]:
+def _outside_domains(inspection: RefinementInspection) -> Iterator[str]:
     """Images with RPC that have points outside the domain of their coefficients, as warnings."""
-    inputs, positions = found.declared.inputs, found.positions
-    for part in found.declared.parts:
+    inputs, positions = inspection.declared.inputs, inspection.positions
+    for part in inspection.declared.parts:
         if part.table != RPC_IMAGE:
             continue
         row, xy = part.image - len(inputs.rigorous), inputs.observations.xy[part.rows]
-        X, values = positions[part.point], found.solution.values[RPC_IMAGE]
-        outside = misclosures(values, row, X, xy)[1] != RpcStatus.INSIDE
-        for i in np.unique(row[outside]):
-            mine = outside & (row == i)
-            ids = np.array(inputs.points.id)[found.declared.rays.points[part.point[mine]]]
+        X, values = positions[part.point], inspection.solution.values[RPC_IMAGE]
+        is_outside = misclosures(values, row, X, xy)[1] != RpcStatus.INSIDE
+        for i in np.unique(row[is_outside]):
+            is_of_image = is_outside & (row == i)
+            ids = np.array(inputs.points.id)[
+                inspection.declared.rays.points[part.point[is_of_image]]
+            ]
             yield (
-                f"image {inputs.rpc[i].id!r}: {count(int(mine.sum()), 'point')} of "
+                f"image {inputs.rpc[i].id!r}: {count(int(is_of_image.sum()), 'point')} of "
                 f"{int((row == i).sum())} outside the domain of its coefficients, which are "
                 f"extrapolated there: {list_some(ids)}"
             )

@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
 def to_json(result: "Refinement") -> dict:
     """The result as plain values: unknowns, correlations, points, image points, checks."""
-    found = result.inspection
+    inspection = result.inspection
     document = {
         "sigma0": result.sigma0,
         "robust_sigma0": result.robust_sigma0,
         "redundancy": result.redundancy,
         "counts": result.counts(),
         "rays": {str(k): n for k, n in result.rays().items()},
-        "steps": found.steps,
+        "steps": inspection.steps,
         "global_test": result.global_test(),
         "warnings": list(result.warnings),
         "unknowns": _unknowns_as_rows(result),
@@ -37,7 +37,9 @@ def to_json(result: "Refinement") -> dict:
                 "axes": list(result.points.axis_names),
             }
             for k, X, s in zip(
-                found.declared.rays.points, result.positions.tolist(), found.point_sigma.tolist()
+                inspection.declared.rays.points,
+                result.positions.tolist(),
+                inspection.point_sigma.tolist(),
             )
         ],
         "image_points": [
@@ -90,8 +92,8 @@ def report(
     Correlations above `min_correlation` (the σ of one unknown is 1/√(1 − 0.9²) = 2.3 times what it
     would be with the other known) and image points are listed, the `most` largest.
     """
-    used = [row for row in result.image_points() if not row["removed"]]
-    lines = [*_summary(result, verdict), *_fits(result, used)]
+    used_points = [row for row in result.image_points() if not row["removed"]]
+    lines = [*_summary(result, verdict), *_fits(result, used_points)]
     if result.warnings:
         lines += ["", "Warnings", *(f"  {warning}" for warning in result.warnings)]
     lines += ["", "Unknowns", *_unknowns(result)]
@@ -101,7 +103,7 @@ def report(
         lines += ["", f"Correlations above {min_correlation:g}"]
         order = np.argsort(-np.abs(C[i, j]), kind="stable")[:most]
         lines += [f"  {C[a, b]:8.4f}  {names[a]} — {names[b]}" for a, b in zip(i[order], j[order])]
-    lines += ["", "Image points with the largest tests", *_tests(used, most)]
+    lines += ["", "Image points with the largest tests", *_tests(used_points, most)]
     if result.removed:
         lines += ["", "Removed as blunders"]
         lines += [f"  {b.name}: |w| = {b.test:.1f}" for b in result.removed]
@@ -112,7 +114,7 @@ def report(
 
 def _summary(result: "Refinement", verdict: str) -> list[str]:
     """The lines that say what was adjusted, and how well it fits."""
-    found = result.inspection
+    inspection = result.inspection
     roles = [result.points.role[k] for k in result.inspection.declared.rays.points]
     counts = ", ".join(f"{roles.count(role)} {role}" for role in ("control", "tie"))
     frames = 0 if result.frames is None else len(result.frames.images)
@@ -130,16 +132,16 @@ def _summary(result: "Refinement", verdict: str) -> list[str]:
         f"points by rays   {rays}",
         f"counts           {', '.join(f'{word} {n}' for word, n in sums.items() if n)}",
         f"sigma0           {result.sigma0:.4f} (robust {result.robust_sigma0:.4f})   redundancy "
-        f"{redundancy}, {found.steps} steps",
+        f"{redundancy}, {inspection.steps} steps",
         f"chi2 test        {describe_test(result.global_test(), UNIT_OF_WEIGHT)}",
     ]
 
 
-def _fits(result: "Refinement", used: list[dict]) -> Iterator[str]:
+def _fits(result: "Refinement", used_points: list[dict]) -> Iterator[str]:
     """The residuals of every image, and of the terrain model."""
     scanner_ids = [image.id for image in result.images]
     by_image = {id: [] for id in result.inputs.ids}
-    for row in used:
+    for row in used_points:
         by_image[row["image"]].append(row["v"])
     for id, v in by_image.items():
         if v:
@@ -164,10 +166,10 @@ def _unknowns(result: "Refinement") -> Iterator[str]:
         )
 
 
-def _tests(rows: list[dict], most: int) -> Iterator[str]:
+def _tests(rows: list[dict], number: int) -> Iterator[str]:
     worst = np.nan_to_num(np.abs([row["w"] for row in rows]).reshape(-1, 2)).max(1)
     yield f"  {'image':12s} {'point':12s} {'v':>17s} {'r':>11s} {'w':>15s} {'MDB/σ':>13s}"
-    for row in (rows[k] for k in np.argsort(-worst, kind="stable")[:most]):
+    for row in (rows[k] for k in np.argsort(-worst, kind="stable")[:number]):
         pair = lambda values, form: " ".join(
             format(x, form) if np.isfinite(x) else f"{'–':>{form.split('.')[0]}}" for x in values
         )

@@ -90,10 +90,10 @@ class BiasSpace(WithoutChart):
         return jnp.ravel(value.bias - origin.bias)
 
     def hold(
-        self, value: BiasedRpc, given: BiasedRpc, free: Float[AnyArray, " width"]
+        self, value: BiasedRpc, start: BiasedRpc, free: Float[AnyArray, " width"]
     ) -> BiasedRpc:
         moves = free.reshape(2, self.terms) > 0
-        return value._replace(bias=jnp.where(moves, value.bias, given.bias))
+        return value._replace(bias=jnp.where(moves, value.bias, start.bias))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,7 +107,7 @@ class RpcPoint:
     ) -> tuple[Scalar, ...]:
         place = geodetic(self.earth, X)
         computed = project_compensated(image.rpc, RpcBias(*image.bias), *place)
-        return tuple(value - given for value, given in zip(computed, measured))
+        return tuple(value - observed for value, observed in zip(computed, measured))
 
 
 def _bias_itself(image: RpcBlock, _: None) -> tuple[Scalar, ...]:
@@ -188,8 +188,8 @@ def misclosures(
     n, images = len(image), jax.tree.map(np.asarray, images)
     padded = fill_up(n)
     space = BiasSpace(images.bias.shape[-1])
-    at = np.asarray(image)[padded], np.asarray(X)[padded], np.asarray(places)[padded]
-    v, status = _misclosures(space, images, *at)
+    padded_inputs = np.asarray(image)[padded], np.asarray(X)[padded], np.asarray(places)[padded]
+    v, status = _misclosures(space, images, *padded_inputs)
     return np.asarray(v)[:n], np.asarray(status)[:n]
 
 
@@ -200,8 +200,8 @@ def _lines_of_sight(
     images = rpc, jax.vmap(fit_inverse)(rpc)
 
     def line_of_sight(row: Int[AnyArray, ""], place: Float[AnyArray, "2"]) -> tuple[Array, Array]:
-        one, inverse = jax.tree.map(lambda x: x[row], images)
-        top, d = sight(one, place[0], place[1], inverse=inverse)
+        rpc, inverse = jax.tree.map(lambda x: x[row], images)
+        top, d = sight(rpc, place[0], place[1], inverse=inverse)
         return jnp.stack(point_on_ray(top, d, -ABOVE_DOMAIN)), jnp.stack(d)
 
     return jax.vmap(line_of_sight)(image, places)
@@ -213,6 +213,6 @@ def lines_of_sight(
     """A point on the line of sight of each place in the images `image`, above all terrain, and the
     direction downwards; Earth-fixed, without a bias."""
     padded = fill_up(len(image))
-    found = _lines_of_sight(stack_images(rpcs, 1).rpc, image[padded], places[padded])
-    centre, direction = (np.asarray(x)[: len(image)] for x in found)
+    sights = _lines_of_sight(stack_images(rpcs, 1).rpc, image[padded], places[padded])
+    centre, direction = (np.asarray(x)[: len(image)] for x in sights)
     return centre, direction

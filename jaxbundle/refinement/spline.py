@@ -63,16 +63,16 @@ class JitterSpline:
             return jnp.zeros(0)
         x = jnp.abs((t - self.centres) / self.spacing)
         # All coefficients, as b is 0 beyond 2: they are few, and no index depends on the time.
-        near = 2 / 3 - x**2 + x**3 / 2
-        far = jnp.maximum(2 - x, 0.0) ** 3 / 6
-        return jnp.asarray(self.basis.T) @ jnp.where(x < 1, near, far)
+        inner_part = 2 / 3 - x**2 + x**3 / 2
+        outer_part = jnp.maximum(2 - x, 0.0) ** 3 / 6
+        return jnp.asarray(self.basis.T) @ jnp.where(x < 1, inner_part, outer_part)
 
 
-def make_spline(first: float, last: float, spacing: float) -> JitterSpline:
+def make_spline(begin: float, end: float, spacing: float) -> JitterSpline:
     """The spline over a span of time with knots at most `spacing` seconds apart."""
     # Less 1e-9, or rounding would make four intervals of three.
-    intervals = max(int(np.ceil((last - first) / spacing - 1e-9)), MIN_INTERVALS)
-    return JitterSpline(float(first), float((last - first) / intervals), intervals)
+    intervals = max(int(np.ceil((end - begin) / spacing - 1e-9)), MIN_INTERVALS)
+    return JitterSpline(float(begin), float((end - begin) / intervals), intervals)
 
 
 NO_SPLINE = JitterSpline(0.0, 1.0, 0)

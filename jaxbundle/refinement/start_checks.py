@@ -16,20 +16,23 @@ def check_columns(
     role = np.array(points.role, dtype=object)[observations.point[rows]]
     image = observations.image[rows]
     for i in np.unique(image):
-        mine = (image == i) & (role != "tie")
-        xy = observations.xy[rows][mine]
+        is_of_image = (image == i) & (role != "tie")
+        xy = observations.xy[rows][is_of_image]
         # Three points are not all on the diagonal, or near another's place, by chance.
         if len(xy) < 3:
             continue
-        off, other = (
-            np.median(np.linalg.norm(xy + v[mine] - places, axis=1)) for places in (xy, xy[:, ::-1])
+        distance, distance_exchanged = (
+            np.median(np.linalg.norm(xy + v[is_of_image] - places, axis=1))
+            for places in (xy, xy[:, ::-1])
         )
         # An order of magnitude: start values explain a hundred pixels, but not that these vanish.
-        if off > 10 * other:
+        if distance > 10 * distance_exchanged:
             raise InputError(
                 f"{observations.source.name}: line and pixel seem to be exchanged in image "
-                f"{inputs.ids[i]!r}: points with given coordinates are {off:.0f} pixels from their "
-                f"measurements (median), and {other:.0f} with line and pixel exchanged; check the "
+                f"{inputs.ids[i]!r}: points with given coordinates are {distance:.0f} pixels from "
+                "their "
+                f"measurements (median), and {distance_exchanged:.0f} with line and pixel "
+                "exchanged; check the "
                 "names of the columns"
             )
 
@@ -42,18 +45,18 @@ def check_near(
     size = np.array([(one.image.lines, one.image.pixels) for one in inputs.images])
     # Farther than two images off no start values are so bad: coordinates in another order, frame or
     # unit are; `~(… <=)` also catches NaN.
-    far = (~(np.abs(v) <= 2.0 * size[observations.image[rows]])).any(1)
-    if not far.any():
+    is_far = (~(np.abs(v) <= 2.0 * size[observations.image[rows]])).any(1)
+    if not is_far.any():
         return
-    row, away = int(rows[far.argmax()]), v[far.argmax()]
+    row, misclosure = int(rows[is_far.argmax()]), v[is_far.argmax()]
     p, id = observations.point[row], inputs.images[observations.image[row]].id
-    said = (
-        f"{away[0]:.0f} lines and {away[1]:.0f} pixels away"
-        if np.isfinite(away).all()
+    distance_words = (
+        f"{misclosure[0]:.0f} lines and {misclosure[1]:.0f} pixels away"
+        if np.isfinite(misclosure).all()
         else "where the camera does not look"
     )
     raise InputError(
         f"{observations.source(row)}: {points.role[p]} point {points.id[p]!r} of "
-        f"{points.source(p)} is off image {id!r}: its coordinates are {said}; check "
+        f"{points.source(p)} is off image {id!r}: its coordinates are {distance_words}; check "
         "their order, frame and units, and at the id"
     )

@@ -96,20 +96,20 @@ def with_frames(points: GroundPoints, frames: Network | None) -> GroundPoints:
     """The points with those of a frame network added; duplicates keep the values given here."""
     if frames is None:
         return points
-    theirs, known = frames.points, {id: k for k, id in enumerate(points.id)}
+    frame_points, row_of = frames.points, {id: k for k, id in enumerate(points.id)}
     X = points.X.copy()
-    for k, id in enumerate(theirs.id):
+    for k, id in enumerate(frame_points.id):
         # Coordinates of a network may be approximate: they only fill gaps.
-        if id in known and np.isnan(X[known[id]]).any():
-            X[known[id]] = theirs.position[k]
-    new = [k for k, id in enumerate(theirs.id) if id not in known]
-    role = ["control" if theirs.role[k] == "fixed" else theirs.role[k] for k in new]
-    fixed = theirs.has_role("fixed")[new, None]
+        if id in row_of and np.isnan(X[row_of[id]]).any():
+            X[row_of[id]] = frame_points.position[k]
+    new = [k for k, id in enumerate(frame_points.id) if id not in row_of]
+    role = ["control" if frame_points.role[k] == "fixed" else frame_points.role[k] for k in new]
+    fixed = frame_points.has_role("fixed")[new, None]
     return GroundPoints(
-        (*points.id, *(theirs.id[k] for k in new)),
+        (*points.id, *(frame_points.id[k] for k in new)),
         (*points.role, *role),
-        np.concatenate([X, theirs.position[new]]),
-        np.concatenate([points.sigma, np.where(fixed, 0.0, theirs.sigma[new])]),
+        np.concatenate([X, frame_points.position[new]]),
+        np.concatenate([points.sigma, np.where(fixed, 0.0, frame_points.sigma[new])]),
         np.concatenate([points.axes, np.tile(np.eye(3), (len(new), 1, 1))]),
         points.axis_names,
         points.source,
@@ -118,18 +118,18 @@ def with_frames(points: GroundPoints, frames: Network | None) -> GroundPoints:
 
 def check_points_table(points: GroundPoints) -> None:
     """Refuse unknown roles, duplicate ids, control points without coordinates, negative σ."""
-    seen = {}
+    first_row = {}
     for row, (id, role) in enumerate(zip(points.id, points.role)):
         if role not in ROLES:
             raise InputError(
                 f"{points.source(row)}: role {role!r}; expected one of {', '.join(ROLES)}"
             )
-        if id in seen:
+        if id in first_row:
             raise InputError(
                 f"{points.source(row)}: point {id!r} occurs twice, also at "
-                f"{points.source(seen[id])}; keep one"
+                f"{points.source(first_row[id])}; keep one"
             )
-        seen[id] = row
+        first_row[id] = row
         if role != "tie" and not np.isfinite(points.X[row]).all():
             raise InputError(f"{points.source(row)}: {role} point {id!r} needs all coordinates")
         if (points.sigma[row] < 0).any():
@@ -140,42 +140,47 @@ def check_images(images: Sequence[AnyScannerImage]) -> None:
     """Refuse images without ids of their own, in different frames, or with invalid unknowns."""
     if not images:
         raise InputError("refine: no scanner image; photographs alone are adjusted by `adjust`")
-    if len({one.id for one in images}) < len(images):
+    if len({scanner_image.id for scanner_image in images}) < len(images):
         raise InputError("refine: two scanner images have the same id; give each its own")
-    for one in images:
-        if not is_same_earth(one.earth, images[0].earth):
+    for scanner_image in images:
+        if not is_same_earth(scanner_image.earth, images[0].earth):
             raise InputError(
-                f"refine: images {images[0].id!r} and {one.id!r} have different ellipsoids or "
+                f"refine: images {images[0].id!r} and {scanner_image.id!r} have different "
+                "ellipsoids or "
                 "frames; points can be in one only (images with RPC are in WGS84)"
             )
-        if isinstance(one, ScannerImage):
-            if one.freedom.knot_spacing <= 0:
-                raise InputError(f"image {one.id!r}: knot_spacing must be positive, in seconds")
+        if isinstance(scanner_image, ScannerImage):
+            if scanner_image.freedom.knot_spacing <= 0:
+                raise InputError(
+                    f"image {scanner_image.id!r}: knot_spacing must be positive, in seconds"
+                )
             continue
-        shape = np.shape(one.bias_sigma)
+        shape = np.shape(scanner_image.bias_sigma)
         if len(shape) != 2 or shape[0] != 2 or shape[1] not in BIAS_TERMS:
             raise InputError(
-                f"image {one.id!r}: σ of its bias have the shape {list(shape)}; expected [2, 1], "
+                f"image {scanner_image.id!r}: σ of its bias have the shape {list(shape)}; "
+                "expected [2, 1], "
                 "[2, 3] or [2, 6], of lines and of samples"
             )
-        if not (np.asarray(one.bias_sigma) >= 0).all():
+        if not (np.asarray(scanner_image.bias_sigma) >= 0).all():
             raise InputError(
-                f"image {one.id!r}: a σ of its bias is negative or NaN; expected pixels, 0 to hold "
+                f"image {scanner_image.id!r}: a σ of its bias is negative or NaN; expected "
+                "pixels, 0 to hold "
                 "it, inf to free it"
             )
 
 
-def is_same_earth(one: Ellipsoid | None, other: Ellipsoid | None) -> bool:
+def is_same_earth(earth_a: Ellipsoid | None, earth_b: Ellipsoid | None) -> bool:
     """Whether two ellipsoids are the same but for digits of their axes in files."""
-    if one is None or other is None:
-        return one is other
+    if earth_a is None or earth_b is None:
+        return earth_a is earth_b
     # A millimetre in the axes is a millimetre in height.
-    return all(abs(float(a) - float(b)) < 1e-3 for a, b in zip(one, other))
+    return all(abs(float(a) - float(b)) < 1e-3 for a, b in zip(earth_a, earth_b))
 
 
-def _limits(one: AnyScannerImage) -> tuple[tuple[float, float], ...]:
+def _limits(scanner_image: AnyScannerImage) -> tuple[tuple[float, float], ...]:
     """The first and last line and pixel that a measurement can have."""
-    image = one.image
+    image = scanner_image.image
     if isinstance(image, RpcImage) and not image.sized:
         # A size that nobody stated is that of the domain.
         offsets = image.rpc.line_offset, image.rpc.sample_offset
@@ -190,24 +195,25 @@ def _check_on_image(
     images: Sequence[AnyScannerImage], points: GroundPoints, observations: Observations
 ) -> None:
     """Refuse measurements outside their images."""
-    limits = np.array([_limits(one) for one in images])[observations.image]
-    inside = lambda xy: (limits[:, :, 0] <= xy) & (xy <= limits[:, :, 1])
-    off = ~inside(observations.xy)
-    if not off.any():
+    limits = np.array([_limits(scanner_image) for scanner_image in images])[observations.image]
+    is_inside = lambda xy: (limits[:, :, 0] <= xy) & (xy <= limits[:, :, 1])
+    is_off = ~is_inside(observations.xy)
+    if not is_off.any():
         return
-    row = int(off.any(1).argmax())
-    k, i = int(off[row].argmax()), observations.image[row]
-    one, (low, high) = images[i], limits[row, k]
+    row = int(is_off.any(1).argmax())
+    k, i = int(is_off[row].argmax()), observations.image[row]
+    scanner_image, (low, high) = images[i], limits[row, k]
     rows = observations.image == i
     hint = ""
-    if len(rows) > 1 and inside(observations.xy[:, ::-1])[rows].all():
+    if len(rows) > 1 and is_inside(observations.xy[:, ::-1])[rows].all():
         hint = "; exchanged, line and pixel of all its points would be on it: check the columns"
-    size = (one.image.lines, one.image.pixels)[k]
-    sized = not isinstance(one.image, RpcImage) or one.image.sized
+    size = (scanner_image.image.lines, scanner_image.image.pixels)[k]
+    sized = not isinstance(scanner_image.image, RpcImage) or scanner_image.image.sized
     which = f"which has {size}" if sized else "as far as its coefficients hold"
     raise InputError(
         f"{observations.source(row)}: point {points.id[observations.point[row]]!r} in image "
-        f"{one.id!r}: {('line', 'pixel')[k]} {observations.xy[row, k]:g} is off the image, "
+        f"{scanner_image.id!r}: {('line', 'pixel')[k]} {observations.xy[row, k]:g} is off the "
+        "image, "
         f"{which}; expected {low:g} to {high:g}{hint}"
     )
 
@@ -224,37 +230,43 @@ def check_observations(
     wrong = ~(observations.sigma > 0).all(1)
     if wrong.any():
         raise InputError(f"{where(int(wrong.argmax()))}: σ must be positive, in lines and pixels")
-    seen = {}
-    for row, at in enumerate(zip(observations.image.tolist(), observations.point.tolist())):
-        if at in seen:
+    first_row = {}
+    for row, image_and_point in enumerate(
+        zip(observations.image.tolist(), observations.point.tolist())
+    ):
+        if image_and_point in first_row:
             raise InputError(
-                f"{where(row)} is measured twice, also at {observations.source(seen[at])}; keep one"
+                f"{where(row)} is measured twice, also at "
+                f"{observations.source(first_row[image_and_point])}; keep one"
             )
-        seen[at] = row
-    for i, one in enumerate(images):
-        if isinstance(one, ScannerImage):
-            _check_times(one, np.flatnonzero(observations.image == i), points, observations)
+        first_row[image_and_point] = row
+    for i, scanner_image in enumerate(images):
+        if isinstance(scanner_image, ScannerImage):
+            _check_times(
+                scanner_image, np.flatnonzero(observations.image == i), points, observations
+            )
 
 
 def _check_times(
-    one: ScannerImage,
+    scanner_image: ScannerImage,
     rows: Int[np.ndarray, " n"],
     points: GroundPoints,
     observations: Observations,
 ) -> None:
     """Refuse measurements at times that the ancillary data of their image do not have."""
-    t = jnp.asarray(one.image.times.time(observations.xy[rows, 0]))
-    trajectory = one.image.trajectory
+    t = jnp.asarray(scanner_image.image.times.time(observations.xy[rows, 0]))
+    trajectory = scanner_image.image.trajectory
     tables = {"positions": trajectory.position, "attitude": trajectory.attitude.table}
-    for what, table in tables.items():
-        out = ~np.asarray(covers(table, interval(table, t), t))
-        if out.any():
-            row, at = rows[out.argmax()], float(t[out.argmax()])
-            first, last = float(table.times[0]), float(table.times[-1])
-            wrong = "in a gap of" if first <= at <= last else "outside"
+    for table_name, table in tables.items():
+        is_outside = ~np.asarray(covers(table, interval(table, t), t))
+        if is_outside.any():
+            row, time_outside = rows[is_outside.argmax()], float(t[is_outside.argmax()])
+            begin, end = float(table.times[0]), float(table.times[-1])
+            where = "in a gap of" if begin <= time_outside <= end else "outside"
             raise InputError(
                 f"{observations.source(row)}: point {points.id[observations.point[row]]!r} in "
-                f"image {one.id!r}: its line is at {at:.9g} s, {wrong} the table of {what}, "
-                f"{first:.9g} to {last:.9g} s; give ancillary data for the whole image, or "
+                f"image {scanner_image.id!r}: its line is at {time_outside:.9g} s, {where} the "
+                f"table of {table_name}, "
+                f"{begin:.9g} to {end:.9g} s; give ancillary data for the whole image, or "
                 "leave the point out"
             )

@@ -77,9 +77,9 @@ def _cells(
     def of_one(X: Float[AnyArray, "3"]) -> tuple[Cell, Array]:
         column, row, h = equation.place(X)
         # A point on the last line of the grid is in the last cell.
-        last = [jnp.where(at == n - 1, n - 2.0, jnp.floor(at))
-                for at, n in zip((column, row), heights.shape[::-1])]  # fmt: skip
-        cell = cell_at(heights, *last)
+        cell_index = [jnp.where(coordinate == n - 1, n - 2.0, jnp.floor(coordinate))
+                for coordinate, n in zip((column, row), heights.shape[::-1])]  # fmt: skip
+        cell = cell_at(heights, *cell_index)
         return cell, jnp.asarray(h - height_in_cell(cell, column, row))
 
     return jax.vmap(of_one)(X)
@@ -91,8 +91,8 @@ def find_cells(
     """The cells that points are in, and v there; NaN where the model has no height."""
     n = len(X)
     padded = np.asarray(X)[fill_up(n)]
-    found = _cells(terrain_height(terrain), np.asarray(terrain.heights), padded)
-    return jax.tree.map(lambda x: np.asarray(x)[:n], found)
+    cells = _cells(terrain_height(terrain), np.asarray(terrain.heights), padded)
+    return jax.tree.map(lambda x: np.asarray(x)[:n], cells)
 
 
 def choose_covered(
@@ -121,12 +121,14 @@ def update_cells(
 ) -> tuple[Cell, float]:
     """The cells that points are in now, those before where there is no height; the largest change
     of v by another cell, in units of σ."""
-    equation, (found, v) = terrain_height(model.terrain), find_cells(model.terrain, X)
+    equation, (cells_now, v) = terrain_height(model.terrain), find_cells(model.terrain, X)
     covered = np.isfinite(v)
     choose = lambda new, old: np.where(covered, new, np.asarray(old))
-    updated = jax.tree.map(choose, found, cells)
-    before = np.asarray(_at_cells(equation, np.asarray(X), jax.tree.map(np.asarray, cells)))
-    change = np.abs(np.where(covered, v - before, 0.0)).max(initial=0.0)
+    updated = jax.tree.map(choose, cells_now, cells)
+    misclosures_before = np.asarray(
+        _at_cells(equation, np.asarray(X), jax.tree.map(np.asarray, cells))
+    )
+    change = np.abs(np.where(covered, v - misclosures_before, 0.0)).max(initial=0.0)
     return updated, float(change) / model.sigma
 
 

@@ -50,13 +50,13 @@ class WeakDirection(NamedTuple):
 
 
 def weaknesses(
-    declared: DeclaredRefinement, found: Solution, settings: WeaknessSettings = DEFAULTS
+    declared: DeclaredRefinement, solution: Solution, settings: WeaknessSettings = DEFAULTS
 ) -> list[WeakDirection]:
     """All weak directions, the weakest first; jitter is one per axis."""
-    S, names = _observe(declared, found)
+    S, names = _observe(declared, solution)
     if not np.isfinite(S).all():
         # A point that its own observations leave open, so that it could not be eliminated.
-        vague = undetermined_unknowns(found.problem, found.values)
+        vague = undetermined_unknowns(solution.problem, solution.values)
         sentence = f"the points do not determine {', '.join(vague[: settings.most_named])}"
         return [WeakDirection(0.0, tuple(vague), sentence)]
     values, vectors = np.linalg.eigh(S)
@@ -65,17 +65,23 @@ def weaknesses(
         if value >= settings.weak_eigenvalue:
             break
         shares = _shares(vector, names)
-        least = settings.min_component * shares[0][1]
-        named = [name for name, share in shares if share >= least][: settings.most_named]
+        min_share = settings.min_component * shares[0][1]
+        named_unknowns = [name for name, share in shares if share >= min_share][
+            : settings.most_named
+        ]
         is_null = bool(value < settings.null_eigenvalue)
-        if " jitter of " in named[0]:
+        if " jitter of " in named_unknowns[0]:
             # Many directions of one spline: one sentence.
-            jitter.add((named[0], is_null))
+            jitter.add((named_unknowns[0], is_null))
             continue
-        weak.append(WeakDirection(float(value), tuple(named), _sentence(named, value, is_null)))
+        weak.append(
+            WeakDirection(
+                float(value), tuple(named_unknowns), _sentence(named_unknowns, value, is_null)
+            )
+        )
     for name in sorted({name for name, _ in jitter}):
-        none = (name, True) in jitter
-        value = 0.0 if none else float(values[0])
+        is_listed = (name, True) in jitter
+        value = 0.0 if is_listed else float(values[0])
         sentence = (
             f"the points leave parts of the {name} undetermined, so that only its prior holds it; "
             "use wider knot spacing or more points"
@@ -84,11 +90,11 @@ def weaknesses(
     return weak
 
 
-def _sentence(named: list[str], value: float, null: bool) -> str:
+def _sentence(named_unknowns: list[str], value: float, null: bool) -> str:
     how = "do not determine" if null else "hardly determine"
-    text = f"the points {how} the {named[0]}"
-    if named[1:]:
-        text += f" against {', '.join(named[1:])}"
+    text = f"the points {how} the {named_unknowns[0]}"
+    if named_unknowns[1:]:
+        text += f" against {', '.join(named_unknowns[1:])}"
     if null:
         return text
     return f"{text} (σ {1 / np.sqrt(value):.2g} times as large as of one alone)"
@@ -105,24 +111,28 @@ def _shares(vector: Float[np.ndarray, " m"], names: list[UnknownName]) -> list[t
 
 
 def _observe(
-    declared: DeclaredRefinement, found: Solution
+    declared: DeclaredRefinement, solution: Solution
 ) -> tuple[Float[np.ndarray, "m m"], list[UnknownName]]:
     """The scaled reduced normal matrix without priors, of the shared unknowns, and their names;
     points that distances keep in the engine's reduced system are eliminated here."""
-    weight = dict(found.problem.data.weight)
+    weight = dict(solution.problem.data.weight)
     # Priors hide what the points leave open. Those of photographs stay: an orientation that was
     # measured is no weakness of the points.
-    for observations in found.problem.observations:
+    for observations in solution.problem.observations:
         if observations.kind.snooped == "" and observations.kind.of != ("image",):
             weight[observations.name] = 0 * weight[observations.name]
-    data = dataclasses.replace(found.problem.data, weight=weight)
-    problem = with_data(found.problem, data)
-    S = scaled_system(problem, found.values)[0]
+    data = dataclasses.replace(solution.problem.data, weight=weight)
+    problem = with_data(solution.problem, data)
+    S = scaled_system(problem, solution.values)[0]
     columns = {(c.table, c.row, c.direction): c.name for c in declared.columns}
-    places = [place_of(problem, *at) for at in kept_unknowns(problem)]
-    kept = np.array([place in columns for place in places])
+    places = [place_of(problem, *unknown) for unknown in kept_unknowns(problem)]
+    is_kept = np.array([place in columns for place in places])
     points = np.array([place[0] == "point" for place in places])
-    cross = S[np.ix_(kept, points)]
+    cross = S[np.ix_(is_kept, points)]
     # The pseudoinverse: what no observation determines of these points is not eliminated.
-    less = cross @ np.linalg.pinv(S[np.ix_(points, points)], 1e-13, hermitian=True) @ cross.T
-    return S[np.ix_(kept, kept)] - less, [columns[p] for p, k in zip(places, kept) if k]
+    explained_part = (
+        cross @ np.linalg.pinv(S[np.ix_(points, points)], 1e-13, hermitian=True) @ cross.T
+    )
+    return S[np.ix_(is_kept, is_kept)] - explained_part, [
+        columns[p] for p, k in zip(places, is_kept) if k
+    ]

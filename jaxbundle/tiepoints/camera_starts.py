@@ -52,7 +52,7 @@ def start_cameras(
     cameras: Sequence[Camera],
     camera_of: Sequence[int],
     lens: Sequence[int],
-    known: Sequence[bool],
+    is_stated: Sequence[bool],
     features: Sequence[Features],
     matches: Sequence[FeatureMatches],
     settings: CameraStartSettings = CameraStartSettings(),
@@ -60,7 +60,7 @@ def start_cameras(
 ) -> tuple[list[Camera], list[str]]:
     """Cameras with the principal distance and K1 of consistent pairs of their lens, and notes.
 
-    **Arguments:** `camera_of`: the camera of every photograph; `lens` of every camera; `known`:
+    **Arguments:** `camera_of`: the camera of every photograph; `lens` of every camera; `is_stated`:
     whether its principal distance is stated by the files: then it is also the result if that of the
     matches contradicts it (`CameraStartSettings.believed_ratio`).
     """
@@ -70,39 +70,47 @@ def start_cameras(
     size = lambda k: np.array(required_image_size(cameras[camera_of[k]]))
     centred = lambda k: features[k].xy - (size(k) - 1) / 2
     for number in dict.fromkeys(lens):
-        own = [c for c in range(len(cameras)) if lens[c] == number]
+        cameras_of_lens = [c for c in range(len(cameras)) if lens[c] == number]
         # The unique matches, if they are enough.
         pairs = [
             m.take(m.unique) if m.unique.sum() >= sufficient else m
             for m in matches
-            if {camera_of[k] for k in m.images} <= {*own}
+            if {camera_of[k] for k in m.images} <= {*cameras_of_lens}
         ]
-        first, name, told = cameras[own[0]], cameras[own[0]].id, known[own[0]]
+        first_camera, name, has_stated = (
+            cameras[cameras_of_lens[0]],
+            cameras[cameras_of_lens[0]].id,
+            is_stated[cameras_of_lens[0]],
+        )
         xy = [
             tuple(centred(k)[rows] for k, rows in zip(m.images, m.rows.T))
             for m in _choose_pairs(pairs, settings, sufficient)
         ]
-        begin = dataclasses.replace(first, parameters={**first.parameters, "cx": 0.0, "cy": 0.0})
-        start = estimate_interior(begin, xy, told, settings.coplanarity)
-        better = with_lens(better, own, start.camera)
+        begin = dataclasses.replace(
+            first_camera, parameters={**first_camera.parameters, "cx": 0.0, "cy": 0.0}
+        )
+        start = estimate_interior(begin, xy, has_stated, settings.coplanarity)
+        better = with_lens(better, cameras_of_lens, start.camera)
         if start.pairs:
-            prior = first.parameters["fx"] if told else start.camera.parameters["fx"]
-            chosen = _choose_loops(pairs, settings.loop_pairs, verification.min_matches)
+            prior = first_camera.parameters["fx"] if has_stated else start.camera.parameters["fx"]
+            chosen_pairs = _choose_loops(pairs, settings.loop_pairs, verification.min_matches)
             search = np.log(prior), settings.closure, verification
-            better = _close(better, own, camera_of, features, chosen, *search)
-            p = better[own[0]].parameters
-            said = f"start values from matches: principal distance {p['fx']:.0f} px"
-            stated, ratio = first.parameters["fx"], settings.believed_ratio
-            if told and not 1 / ratio < p["fx"] / stated < ratio:
-                plain = dataclasses.replace(first, parameters={**first.parameters, "k1": 0.0})
-                better = with_lens(better, own, plain)
+            better = _close(better, cameras_of_lens, camera_of, features, chosen_pairs, *search)
+            p = better[cameras_of_lens[0]].parameters
+            message = f"start values from matches: principal distance {p['fx']:.0f} px"
+            stated_distance, ratio = first_camera.parameters["fx"], settings.believed_ratio
+            if has_stated and not 1 / ratio < p["fx"] / stated_distance < ratio:
+                plain = dataclasses.replace(
+                    first_camera, parameters={**first_camera.parameters, "k1": 0.0}
+                )
+                better = with_lens(better, cameras_of_lens, plain)
                 notes.append(
-                    f"camera {name}: {said}, but {stated:.0f} px by the files: that of "
+                    f"camera {name}: {message}, but {stated_distance:.0f} px by the files: that of "
                     "the files is used"
                 )
             else:
-                notes.append(f"camera {name}: {said}, k1 {p['k1']:.3f}")
-        elif not told:
+                notes.append(f"camera {name}: {message}, k1 {p['k1']:.3f}")
+        elif not has_stated:
             notes.append(
                 f"camera {name}: the principal distance is a guess: no two of its "
                 "photographs agree on one"
@@ -110,17 +118,18 @@ def start_cameras(
     return better, notes
 
 
-def with_lens(cameras: Sequence[Camera], own: Sequence[int], camera: Camera) -> list[Camera]:
-    """The cameras; those at positions `own` with the principal distance and K1 of `camera`."""
+def with_lens(cameras: Sequence[Camera], positions: Sequence[int], camera: Camera) -> list[Camera]:
+    """The cameras; those at positions `positions` with the principal distance and K1 of "
+    "`camera`."""
     names = [name for name in ("fx", "fy", "k1") if name in camera.parameters]
-    same = {name: camera.parameters[name] for name in names}
-    with_same = lambda c: dataclasses.replace(c, parameters={**c.parameters, **same})
-    return [with_same(c) if k in own else c for k, c in enumerate(cameras)]
+    lens_parameters = {name: camera.parameters[name] for name in names}
+    with_same = lambda c: dataclasses.replace(c, parameters={**c.parameters, **lens_parameters})
+    return [with_same(c) if k in positions else c for k, c in enumerate(cameras)]
 
 
 def _close(
     cameras: Sequence[Camera],
-    own: Sequence[int],
+    cameras_of_lens: Sequence[int],
     camera_of: Sequence[int],
     features: Sequence[Features],
     matches: Sequence[FeatureMatches],
@@ -128,14 +137,14 @@ def _close(
     settings: ClosureSettings,
     verification: VerificationSettings,
 ) -> list[Camera]:
-    """The cameras, those at positions `own` with the interior orientation with which rotations
-    close; `middle`: ln c before."""
-    lens = cameras[own[0]]
+    """The cameras, those at positions `cameras_of_lens` with the interior orientation with which
+    rotations close; `middle`: ln c before."""
+    lens = cameras[cameras_of_lens[0]]
 
     def with_interior(x: Interior) -> list[Camera]:
         f = float(np.exp(x[0]))
         changed = {**lens.parameters, "fx": f, "fy": f, "k1": float(x[1])}
-        return with_lens(cameras, own, dataclasses.replace(lens, parameters=changed))
+        return with_lens(cameras, cameras_of_lens, dataclasses.replace(lens, parameters=changed))
 
     def orient(x: Interior) -> OrientedPairs:
         quiet = lambda *_: None
@@ -146,7 +155,9 @@ def _close(
             for pair in pairs
             if pair.kind != "rotation"
         ]
-        return OrientedPairs(pairs, _ideal_matches(pairs, own, camera_of, features, with_interior))
+        return OrientedPairs(
+            pairs, _ideal_matches(pairs, cameras_of_lens, camera_of, features, with_interior)
+        )
 
     start = np.array([np.log(lens.parameters["fx"]), lens.parameters["k1"]])
     return with_interior(close_rotations(orient, start, middle, settings))
@@ -154,7 +165,7 @@ def _close(
 
 def _ideal_matches(
     pairs: Sequence[Pair],
-    own: Sequence[int],
+    cameras_of_lens: Sequence[int],
     camera_of: Sequence[int],
     features: Sequence[Features],
     with_interior: Callable[[Interior], list[Camera]],
@@ -170,10 +181,10 @@ def _ideal_matches(
     # One call for each camera instead of two for each pair.
     def ideal_with(x: Interior) -> list[tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]]:
         xy, cameras = np.empty_like(uv), with_interior(x)
-        for c in own:
+        for c in cameras_of_lens:
             xy[camera == c] = ideal_features(cameras[c], uv[camera == c])
-        each = np.split(xy, ends)
-        return list(zip(each[::2], each[1::2]))
+        by_side = np.split(xy, ends)
+        return list(zip(by_side[::2], by_side[1::2]))
 
     return ideal_with
 
@@ -186,32 +197,34 @@ def _choose_pairs(
     if not pairs:
         return []
     many_matches = settings.min_share * len(pairs[0].rows)
-    alike = [m for m in pairs if len(m.rows) >= many_matches][: settings.most_alike]
-    others = [m for m in pairs if sufficient <= len(m.rows) < many_matches]
+    most_alike = [m for m in pairs if len(m.rows) >= many_matches][: settings.most_alike]
+    other_pairs = [m for m in pairs if sufficient <= len(m.rows) < many_matches]
     number = settings.coplanarity.candidates - settings.most_alike
-    step = max(1, len(others) // number)
-    return alike + others[: number * step : step]
+    step = max(1, len(other_pairs) // number)
+    return most_alike + other_pairs[: number * step : step]
 
 
 def _choose_loops(
-    own: Sequence[FeatureMatches], most: int, min_matches: int
+    pairs_of_lens: Sequence[FeatureMatches], max_pairs: int, min_matches: int
 ) -> list[FeatureMatches]:
     """The pairs of loops of three photographs, those whose weakest pair has the most matches, each
     next to others."""
-    number = {m.images: len(m.rows) for m in own if len(m.rows) >= min_matches}
+    number = {m.images: len(m.rows) for m in pairs_of_lens if len(m.rows) >= min_matches}
     loops = find_loops(list(number))
     weakest = np.array(list(number.values()), int)[loops].min(1)
     loops = loops[np.argsort(-weakest, kind="stable")]
     pairs = np.array(list(number)).reshape(-1, 2)
-    new, chosen = np.ones(len(loops), bool), np.zeros(len(pairs), bool)
+    new, is_chosen = np.ones(len(loops), bool), np.zeros(len(pairs), bool)
     # Each loop has at least a photograph in common with chosen ones, so that they can share pairs:
     # k loops of k + 2 photographs with 2k + 1 pairs are independent, those apart need 3k pairs. To
     # demand a common pair chose the same 60 pairs of three rendered sets of 24 photographs.
-    while chosen.sum() < most:
-        reached = np.any(np.isin(pairs, pairs[chosen]), axis=1) if chosen.any() else ~chosen
-        next_to = new & np.any(reached[loops], axis=1)
+    while is_chosen.sum() < max_pairs:
+        is_reached = (
+            np.any(np.isin(pairs, pairs[is_chosen]), axis=1) if is_chosen.any() else ~is_chosen
+        )
+        next_to = new & np.any(is_reached[loops], axis=1)
         if not next_to.any():
             break
-        first = np.argmax(next_to)
-        chosen[loops[first]], new[first] = True, False
-    return [m for m in own if m.images in set(map(tuple, pairs[chosen].tolist()))]
+        first_loop = np.argmax(next_to)
+        is_chosen[loops[first_loop]], new[first_loop] = True, False
+    return [m for m in pairs_of_lens if m.images in set(map(tuple, pairs[is_chosen].tolist()))]

@@ -89,48 +89,60 @@ class CoplanarityResult:
 def estimate_interior(
     camera: Camera,
     pairs: Sequence[tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]],
-    known: bool,
+    is_known: bool,
     settings: CoplanaritySettings = CoplanaritySettings(),
 ) -> CoplanarityResult:
     """The camera with the principal distance and K1 of consistent pairs.
 
     **Arguments:** `camera`: of model `opencv`; `pairs`: the matches of each in pixels, the most
-    distinct first, the best pairs first; `known`: whether the principal distance of the camera is a
-    usable start value.
-    """
-    least = settings.min_matches
-    pairs = [(one, other) for one, other in pairs if len(one) >= least][: settings.candidates]
+    distinct first, the best pairs first; `is_known`: whether the principal distance of the camera
+    is a usable start value."""
+    min_matches = settings.min_matches
+    pairs = [(side_1, side_2) for side_1, side_2 in pairs if len(side_1) >= min_matches][
+        : settings.candidates
+    ]
     if not pairs or camera.image_size is None:
         return CoplanarityResult(camera, 0, np.nan)
     size = max(camera.image_size)
     limit = settings.misclosure * size / 3000
     clear = [
-        batched.spread(max(int(settings.distinct_share * len(a)), least), SLOTS) for a, _ in pairs
+        batched.spread(max(int(settings.distinct_share * len(a)), min_matches), SLOTS)
+        for a, _ in pairs
     ]
     xy1, xy2 = ([pair[i][r] for pair, r in zip(pairs, clear)] for i in (0, 1))
-    tried = [camera.parameters["fx"]] if known else [size * factor for factor in settings.factors]
+    distances_tried = (
+        [camera.parameters["fx"]] if is_known else [size * factor for factor in settings.factors]
+    )
     if len(pairs) > PAIRS:
         # Every third distance suffices to see which pairs agree at all, and at which angle.
-        first = tried if known else tried[1::3]
-        _, _, part, _, angle = _orient([_with(camera, f) for f in first], xy1, xy2, limit)
+        first_tried = distances_tried if is_known else distances_tried[1::3]
+        _, _, part, _, angle = _orient(
+            [_with_distance(camera, f) for f in first_tried], xy1, xy2, limit
+        )
         # σ of c falls with the angle; matches that agree count more than it does
         worth = (part * np.sqrt(np.minimum(angle, settings.wide_angle))).max(0)
-        chosen = np.sort(np.argsort(-worth, kind="stable")[:PAIRS])
-        xy1, xy2 = ([side[k] for k in chosen] for side in (xy1, xy2))
-    M, b, part, costs, _ = _orient([_with(camera, f) for f in tried], xy1, xy2, limit)
-    unusual = np.abs(np.log(np.array(tried) / (settings.usual * size)))
+        chosen_pairs = np.sort(np.argsort(-worth, kind="stable")[:PAIRS])
+        xy1, xy2 = ([side[k] for k in chosen_pairs] for side in (xy1, xy2))
+    M, b, part, costs, _ = _orient(
+        [_with_distance(camera, f) for f in distances_tried], xy1, xy2, limit
+    )
+    unusual = np.abs(np.log(np.array(distances_tried) / (settings.usual * size)))
     doubt = 1 + settings.doubt * unusual * (1 + unusual) / 2
     # Of all pairs together: one pair alone often has a minimum at the end of the range.
-    best = int(np.argmin(costs.sum(1) * (1 if known else doubt)))
-    f, M, b, part = tried[best], M[best], b[best], part[best]
+    best = int(np.argmin(costs.sum(1) * (1 if is_known else doubt)))
+    f, M, b, part = distances_tried[best], M[best], b[best], part[best]
     use = np.flatnonzero(part > settings.min_agreeing)
     if not len(use):
-        return CoplanarityResult(_with(camera, f), 0, np.nan)
-    f, k1, e = _adjust(_with(camera, f), [(xy1[k], xy2[k]) for k in use], M[use], b[use], limit)
+        return CoplanarityResult(_with_distance(camera, f), 0, np.nan)
+    f, k1, e = _adjust(
+        _with_distance(camera, f), [(xy1[k], xy2[k]) for k in use], M[use], b[use], limit
+    )
     # Relative to what was known or tried: the files know lenses of any length.
-    sane = 1 / settings.max_ratio < f / tried[best] < settings.max_ratio
+    sane = 1 / settings.max_ratio < f / distances_tried[best] < settings.max_ratio
     sane &= abs(k1) < settings.max_k1
-    better = _with(camera, f, k1) if sane else _with(camera, tried[best])
+    better = (
+        _with_distance(camera, f, k1) if sane else _with_distance(camera, distances_tried[best])
+    )
     return CoplanarityResult(better, len(use), float(np.median(np.abs(e))))
 
 
@@ -143,7 +155,7 @@ def prepare() -> None:
     _adjust(camera, list(zip(xy, xy)), M, b, 1.0)
 
 
-def _with(camera: Camera, f: float, k1: float = 0.0) -> Camera:
+def _with_distance(camera: Camera, f: float, k1: float = 0.0) -> Camera:
     return dataclasses.replace(camera, parameters={**camera.parameters, "fx": f, "fy": f, "k1": k1})
 
 
@@ -156,9 +168,11 @@ def _orient(
     """Relative orientations M, b of all pairs with each camera, shares of agreeing matches, robust
     sums, and angles of intersection."""
     f = np.repeat([camera.parameters["fx"] for camera in cameras], len(xy1))
-    one, two = ([ideal_points(c, xy) for c in cameras for xy in side] for side in (xy1, xy2))
-    M, b, part, angle = batched.orient_pairs(one, two, limit / f)
-    filled = (np.stack([_fill(a) for a in side]) for side in (one, two))
+    points_1, points_2 = (
+        [ideal_points(c, xy) for c in cameras for xy in side] for side in (xy1, xy2)
+    )
+    M, b, part, angle = batched.orient_pairs(points_1, points_2, limit / f)
+    filled = (np.stack([_fill(a) for a in side]) for side in (points_1, points_2))
     e = np.asarray(batched.run_in_lanes(_sampson, batched.LANES, M, b, *filled)[0])
     # In pixels, so that the distances do not shrink with the scale of a larger c.
     e = np.nan_to_num(f[:, None] * e, nan=1e3)
@@ -214,11 +228,11 @@ def _self_calibrate(
     """f, K1 and the misclosures, by iteratively re-weighted least squares."""
     names = model.parameters
     fx, fy, k1 = (names.index(name) for name in ("fx", "fy", "k1"))
-    first = p[fx]
+    start_distance = p[fx]
 
     def camera(change: Float[Array, "2"]) -> Float[Array, " parameters"]:
         # ln c: it stays positive, and a change is relative to it
-        f = first * jnp.exp(change[0])
+        f = start_distance * jnp.exp(change[0])
         return p.at[fx].set(f).at[fy].set(f).at[k1].add(change[1])
 
     def ideal(q: Float[Array, " parameters"], xy: Float[Array, "2"]) -> Float[Array, "2"]:
@@ -233,8 +247,8 @@ def _self_calibrate(
     ) -> Float[Array, " matches"]:
         change, M, b = state
         q = camera(change)
-        one, two = (jax.vmap(jax.vmap(lambda xy: ideal(q, xy)))(xy) for xy in (xy1, xy2))
-        e = jax.vmap(jax.vmap(sampson_distance, (None, None, 0, 0)))(M, b, one, two)
+        points_1, points_2 = (jax.vmap(jax.vmap(lambda xy: ideal(q, xy)))(xy) for xy in (xy1, xy2))
+        e = jax.vmap(jax.vmap(sampson_distance, (None, None, 0, 0)))(M, b, points_1, points_2)
         return (root * q[fx] * e).ravel()
 
     def move(state: State, delta: Float[Array, " unknowns"]) -> State:

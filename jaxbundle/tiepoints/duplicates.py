@@ -53,27 +53,27 @@ def find_duplicates(
 ) -> dict[int, tuple[int, int, int]]:
     """By photograph to leave out: the one that shows the same, matches at the same place, and all
     their matches."""
-    same: dict[tuple[int, int], tuple[int, int]] = {}
+    same_pairs: dict[tuple[int, int], tuple[int, int]] = {}
     for m in matches:
-        still = _count_still(m, features, sizes, settings)
-        if still:
-            same[m.images] = still, len(m.rows)
-    return _choose_left_out(same, [len(f) for f in features])
+        number_still = _count_still(m, features, sizes, settings)
+        if number_still:
+            same_pairs[m.images] = number_still, len(m.rows)
+    return _choose_left_out(same_pairs, [len(f) for f in features])
 
 
 def _choose_left_out(
-    same: Mapping[tuple[int, int], tuple[int, int]], number: Sequence[int]
+    same_pairs: Mapping[tuple[int, int], tuple[int, int]], number: Sequence[int]
 ) -> dict[int, tuple[int, int, int]]:
     """Every photograph that shows the same as a better one that stays."""
     left_out: dict[int, tuple[int, int, int]] = {}
     # The best first: whether it stays is known before those that it replaces are judged.
     for k in sorted(range(len(number)), key=lambda k: (-number[k], k)):
-        for pair, counted in same.items():
+        for pair, counted in same_pairs.items():
             if k in pair:
-                other = pair[pair[0] == k]
-                better = (-number[other], other) < (-number[k], k)
-                if better and other not in left_out:
-                    left_out[k] = other, *counted
+                partner = pair[pair[0] == k]
+                better = (-number[partner], partner) < (-number[k], k)
+                if better and partner not in left_out:
+                    left_out[k] = partner, *counted
                     break
     return left_out
 
@@ -91,8 +91,8 @@ def _count_still(
         return 0
     i, j = m.images
     # Positions in a photograph, 0 to 1 in both directions.
-    one, other = ((features[k].xy + 0.5) / np.array(sizes[k]) for k in (i, j))
-    a, b = one[m.rows[:, 0]], other[m.rows[:, 1]]
+    places_i, places_j = ((features[k].xy + 0.5) / np.array(sizes[k]) for k in (i, j))
+    a, b = places_i[m.rows[:, 0]], places_j[m.rows[:, 1]]
     blur = [
         settings.feature_share * features[k].size[rows] / max(sizes[k])
         for k, rows in zip((i, j), m.rows.T)
@@ -100,11 +100,11 @@ def _count_still(
     limit = settings.max_motion + np.maximum(*blur)
     # One of them may have been saved upright, in either direction, or upside down.
     for turns in range(4):
-        still = _are_still(a, b, sizes[i], limit, turns, sizes[j])
-        number = int(still.sum())
-        if number >= max(needed, settings.min_share * len(still)) and all(
-            np.all(some[still].std(0) > settings.min_spread * every.std(0))
-            for some, every in ((a, one), (b, other))
+        is_still = _are_still(a, b, sizes[i], limit, turns, sizes[j])
+        number = int(is_still.sum())
+        if number >= max(needed, settings.min_share * len(is_still)) and all(
+            np.all(in_match[is_still].std(0) > settings.min_spread * in_photograph.std(0))
+            for in_match, in_photograph in ((a, places_i), (b, places_j))
         ):
             return number
     return 0

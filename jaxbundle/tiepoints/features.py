@@ -101,12 +101,14 @@ def find_features(
     size, angle, response = (
         np.array([getattr(p, name) for p in points]) for name in ("size", "angle", "response")
     )
-    chosen = _choose_evenly(xy, size, response, grey.shape, settings)
+    chosen_rows = _choose_evenly(xy, size, response, grey.shape, settings)
     scale = np.array([columns / grey.shape[1], rows / grey.shape[0]])
     # (0, 0) is the centre of the first pixel, so a reduction scales about (−0.5, −0.5)
-    xy = (xy[chosen] + 0.5) * scale - 0.5
-    descriptor = np.concatenate(descriptors)[chosen].astype(np.uint8)
-    return Features(xy, size[chosen] * scale.mean(), np.deg2rad(angle[chosen]), descriptor)
+    xy = (xy[chosen_rows] + 0.5) * scale - 0.5
+    descriptor = np.concatenate(descriptors)[chosen_rows].astype(np.uint8)
+    return Features(
+        xy, size[chosen_rows] * scale.mean(), np.deg2rad(angle[chosen_rows]), descriptor
+    )
 
 
 def memory_of_features(rows: int, columns: int, settings: FeatureSettings) -> float:
@@ -173,14 +175,14 @@ def _search_tile(
     points, descriptors = detector.detectAndCompute(part, None)
     if descriptors is None:
         return [], None
-    inside = []
+    rows_inside = []
     for k, point in enumerate(points):
         x, y = point.pt[0] + l, point.pt[1] + t
         point.pt = (x, y)
         # Half-open, so that a feature in the margin of two tiles is taken once.
         if left - 0.5 <= x < right - 0.5 and top - 0.5 <= y < bottom - 0.5:
-            inside.append(k)
-    return [points[k] for k in inside], descriptors[inside]
+            rows_inside.append(k)
+    return [points[k] for k in rows_inside], descriptors[rows_inside]
 
 
 def _choose_evenly(
@@ -197,9 +199,9 @@ def _choose_evenly(
     column, row = (xy // side).astype(int).T
     cell = row * (settings.cells + 1) + column
     order = np.lexsort((-response, cell))
-    first = np.searchsorted(cell[order], cell[order])
+    first_in_cell = np.searchsorted(cell[order], cell[order])
     # The rank of each feature within its cell: all first ones are taken, then all second ones, …
     rank = np.empty(len(xy), int)
-    rank[order] = np.arange(len(xy)) - first
-    chosen = np.lexsort((-response, rank))[: settings.number]
-    return chosen[np.argsort(-size[chosen], kind="stable")]
+    rank[order] = np.arange(len(xy)) - first_in_cell
+    chosen_rows = np.lexsort((-response, rank))[: settings.number]
+    return chosen_rows[np.argsort(-size[chosen_rows], kind="stable")]

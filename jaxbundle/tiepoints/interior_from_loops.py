@@ -90,8 +90,8 @@ def close_rotations(
     middle = float(start[0]) if middle is None else middle
     minima = []
     for factor in settings.first_factors:
-        first = start + [np.log(factor), 0.0]
-        minimum = _search(orient(first), first, middle, settings)
+        first_start = start + [np.log(factor), 0.0]
+        minimum = _search(orient(first_start), first_start, middle, settings)
         if minimum is not None:
             if minimum.per_loop < settings.clear_sum:
                 return minimum.interior
@@ -100,11 +100,11 @@ def close_rotations(
         return start
     # With a wrong camera few pairs are oriented, and a few loops may close by chance: only minima
     # with more than half of the largest number of loops are compared.
-    most = max(minimum.independent for minimum in minima)
-    many = [minimum for minimum in minima if 2 * minimum.independent > most]
-    best = min(many, key=lambda minimum: minimum.per_loop).interior
-    again = _search(orient(best), best, middle, settings)
-    return best if again is None else again.interior
+    largest_number = max(minimum.independent for minimum in minima)
+    with_many = [minimum for minimum in minima if 2 * minimum.independent > largest_number]
+    best = min(with_many, key=lambda minimum: minimum.per_loop).interior
+    searched_again = _search(orient(best), best, middle, settings)
+    return best if searched_again is None else searched_again.interior
 
 
 class ClosureMinimum(NamedTuple):
@@ -116,7 +116,7 @@ class ClosureMinimum(NamedTuple):
 
 
 def _search(
-    oriented: OrientedPairs, first: Interior, middle: float, settings: ClosureSettings
+    oriented: OrientedPairs, start: Interior, middle: float, settings: ClosureSettings
 ) -> ClosureMinimum | None:
     """The minimum next to a first interior orientation; None with too few loops."""
     from scipy.optimize import minimize
@@ -133,15 +133,15 @@ def _search(
         # A pair that cannot be refined with this camera counts as a half turn.
         angle = np.nan_to_num(loop_misclosure(ij, jk, ik), nan=np.pi)
         misclosure = independent * np.log1p((angle / settings.sigma_rotation) ** 2).mean()
-        off = (x[0] - middle) / settings.sigma_log_distance, x[1] / settings.sigma_k1
-        return misclosure + off[0] ** 2 + off[1] ** 2
+        deviations = (x[0] - middle) / settings.sigma_log_distance, x[1] / settings.sigma_k1
+        return misclosure + deviations[0] ** 2 + deviations[1] ** 2
 
     # Without derivatives: each evaluation refines every pair anew (and may lose rays at the
     # border), and the sum has kinks where wrong loops close.
-    simplex = first + np.array([[0, 0], [settings.step_log_distance, 0], [0, settings.step_k1]])
+    simplex = start + np.array([[0, 0], [settings.step_log_distance, 0], [0, settings.step_k1]])
     minimum = minimize(
         total,
-        first,
+        start,
         method="Nelder-Mead",
         options={
             "initial_simplex": simplex,
@@ -167,12 +167,12 @@ def find_loops(pairs: Sequence[tuple[int, int]]) -> Int[np.ndarray, "loops 3"]:
     """Positions of the pairs ij, jk and ik of every three photographs that have them; each pair
     (i, j) has i < j."""
     row = {pair: k for k, pair in enumerate(pairs)}
-    after: dict[int, set[int]] = {}
+    successors: dict[int, set[int]] = {}
     for i, j in pairs:
-        after.setdefault(i, set()).add(j)
+        successors.setdefault(i, set()).add(j)
     loops = [
         (row[i, j], row[j, k], row[i, k])
         for i, j in pairs
-        for k in sorted(after[i] & after.get(j, set()))
+        for k in sorted(successors[i] & successors.get(j, set()))
     ]
     return np.array(loops, int).reshape(-1, 3)

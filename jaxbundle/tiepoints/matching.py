@@ -53,16 +53,19 @@ class FeatureMatches(NamedTuple):
     distance_ratio: Float[np.ndarray, " n"]
     unique: Bool[np.ndarray, " n"]
 
-    def take(self, chosen: Int[np.ndarray, " m"] | Bool[np.ndarray, " n"]) -> "FeatureMatches":
+    def take(self, selection: Int[np.ndarray, " m"] | Bool[np.ndarray, " n"]) -> "FeatureMatches":
         """The chosen matches."""
         return FeatureMatches(
-            self.images, self.rows[chosen], self.distance_ratio[chosen], self.unique[chosen]
+            self.images,
+            self.rows[selection],
+            self.distance_ratio[selection],
+            self.unique[selection],
         )
 
 
 def match_features(
-    one: Features,
-    other: Features,
+    features_a: Features,
+    features_b: Features,
     settings: FeatureMatchingSettings = FeatureMatchingSettings(),
     within: tuple[Float[np.ndarray, " a"], Float[np.ndarray, " b"]] | None = None,
 ) -> tuple[Int[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
@@ -70,30 +73,33 @@ def match_features(
     of the second best.
 
     **Arguments:** `within`: `distances_within` both photographs."""
-    if min(len(one), len(other)) < 2 or one.descriptor.shape[1] != other.descriptor.shape[1]:
+    if (
+        min(len(features_a), len(features_b)) < 2
+        or features_a.descriptor.shape[1] != features_b.descriptor.shape[1]
+    ):
         return np.zeros((0, 2), int), np.zeros(0)
-    sift = one.descriptor.shape[1] == SIFT_LENGTH
+    sift = features_a.descriptor.shape[1] == SIFT_LENGTH
     nearest = _find_nearest if sift else _find_nearest_bits
-    a, b = (_root(f.descriptor) if sift else f.descriptor for f in (one, other))
-    best, distance, second = nearest(a, b)
+    a, b = (_root(f.descriptor) if sift else f.descriptor for f in (features_a, features_b))
+    best, distance, second_distance = nearest(a, b)
     if within is not None:
-        second = np.minimum(second, np.minimum(within[0], within[1][best]))
+        second_distance = np.minimum(second_distance, np.minimum(within[0], within[1][best]))
     # Most features are dropped here, and need no search in the other direction.
-    rows = np.flatnonzero(distance < settings.max_ratio * second)
+    rows = np.flatnonzero(distance < settings.max_ratio * second_distance)
     if not len(rows):
         return np.zeros((0, 2), int), np.zeros(0)
-    back, _, second_back = nearest(b[best[rows]], a)
+    nearest_back, _, second_back = nearest(b[best[rows]], a)
     # Descriptors closer than 1e-3 are equal: three times √ε of float32, the rounding of √(1 − a·b)
     # also the matched ones: two features equal to one of the other photograph have the ratio 1.
     equal = 1e-3
     distance_ratio = np.maximum(distance[rows], equal) / np.maximum(
-        np.minimum(second[rows], second_back), equal
+        np.minimum(second_distance[rows], second_back), equal
     )
-    mutual = np.flatnonzero((back == rows) & (distance_ratio < settings.max_ratio))
+    is_mutual = np.flatnonzero((nearest_back == rows) & (distance_ratio < settings.max_ratio))
     # Stable: equal ratios keep their order on every machine.
-    mutual = mutual[np.argsort(distance_ratio[mutual], kind="stable")]
-    rows = rows[mutual]
-    return np.stack([rows, best[rows]], 1), distance_ratio[mutual]
+    is_mutual = is_mutual[np.argsort(distance_ratio[is_mutual], kind="stable")]
+    rows = rows[is_mutual]
+    return np.stack([rows, best[rows]], 1), distance_ratio[is_mutual]
 
 
 def are_unique(
@@ -106,12 +112,12 @@ def are_unique(
     return nearest >= settings.similar_distance
 
 
-def count_matches_of_largest(one: Features, other: Features, most: int) -> int:
-    """The number of matches of the largest features, at most `most` of each photograph: a quick
-    check whether two overlap (Wu, 2013, preemptive matching)."""
+def count_matches_of_largest(features_a: Features, features_b: Features, max_features: int) -> int:
+    """The number of matches of the largest features, at most `max_features` of each photograph: a
+    quick check whether two overlap (Wu, 2013, preemptive matching)."""
     # Features are in order of their size; the largest survive the largest changes of scale.
-    largest = slice(most)
-    return len(match_features(one.take(largest), other.take(largest))[0])
+    largest = slice(max_features)
+    return len(match_features(features_a.take(largest), features_b.take(largest))[0])
 
 
 def _root(descriptor: UInt8[np.ndarray, "n 128"]) -> Float32[np.ndarray, "n 128"]:
@@ -128,13 +134,13 @@ def distances_within(features: Features) -> Float[np.ndarray, " n"]:
         return nearest
     a, xy = _root(features.descriptor), features.xy.astype(np.float32)
     squared_size = features.size.astype(np.float32) ** 2
-    for first in range(0, n, ROWS_AT_ONCE):
-        rows = slice(first, first + ROWS_AT_ONCE)
+    for begin in range(0, n, ROWS_AT_ONCE):
+        rows = slice(begin, begin + ROWS_AT_ONCE)
         s = a[rows] @ a.T
         # Not itself, nor the other directions and scales that SIFT gives one place: those are no
         # repetition.
-        away = (xy[rows, None, 0] - xy[:, 0]) ** 2 + (xy[rows, None, 1] - xy[:, 1]) ** 2
-        s[away <= squared_size[rows, None]] = -1
+        squared_distance = (xy[rows, None, 0] - xy[:, 0]) ** 2 + (xy[rows, None, 1] - xy[:, 1]) ** 2
+        s[squared_distance <= squared_size[rows, None]] = -1
         nearest[rows] = _distance(s.max(1))
     return nearest
 
@@ -143,15 +149,15 @@ def _find_nearest(
     a: Float32[np.ndarray, "n 128"], b: Float32[np.ndarray, "m 128"]
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """The nearest row of b for each row of a, its distance, and that of the second."""
-    best, distance, second = np.empty(len(a), int), np.empty(len(a)), np.empty(len(a))
-    for first in range(0, len(a), ROWS_AT_ONCE):
-        s = a[first : first + ROWS_AT_ONCE] @ b.T
-        rows, every = slice(first, first + len(s)), np.arange(len(s))
+    best, distance, second_distance = np.empty(len(a), int), np.empty(len(a)), np.empty(len(a))
+    for begin in range(0, len(a), ROWS_AT_ONCE):
+        s = a[begin : begin + ROWS_AT_ONCE] @ b.T
+        rows, all_rows = slice(begin, begin + len(s)), np.arange(len(s))
         k = s.argmax(1)
-        best[rows], distance[rows] = k, _distance(s[every, k])
-        s[every, k] = -1
-        second[rows] = _distance(s.max(1))
-    return best, distance, second
+        best[rows], distance[rows] = k, _distance(s[all_rows, k])
+        s[all_rows, k] = -1
+        second_distance[rows] = _distance(s.max(1))
+    return best, distance, second_distance
 
 
 def _distance(product: Float32[np.ndarray, " n"]) -> Float32[np.ndarray, " n"]:
@@ -165,5 +171,5 @@ def _find_nearest_bits(
     cv2 = need_opencv()
     pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(a, b, k=2)
     best = np.array([p[0].trainIdx for p in pairs], int)
-    distance, second = (np.array([float(p[k].distance) for p in pairs]) for k in (0, 1))
-    return best, distance, second
+    distance, second_distance = (np.array([float(p[k].distance) for p in pairs]) for k in (0, 1))
+    return best, distance, second_distance

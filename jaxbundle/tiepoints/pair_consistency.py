@@ -81,8 +81,8 @@ def split_contradicted(
     def strength(pair: Pair) -> tuple[bool, float]:
         """Matches times the estimated probability that a loop closes, (good + 1)/(good + bad + 1):
         1 without loops, so that these do not count against a pair."""
-        closed = votes.get(pair.images, [])
-        good, bad = closed.count(True), closed.count(False)
+        closures = votes.get(pair.images, [])
+        good, bad = closures.count(True), closures.count(False)
         return pair.sure, len(pair) * (1 + good) / (1 + good + bad)
 
     # Greedy, the strongest first, like Kruskal's spanning tree: a wrong pair is then judged by
@@ -91,14 +91,14 @@ def split_contradicted(
     group = {k: k for pair in pairs for k in pair.images}
     for pair in sorted(pairs, key=strength, reverse=True):
         i, j = pair.images
-        closed = [
+        closures = [
             loops.closes((i, j), k)
             for k in loops.thirds((i, j))
             if {_pair(i, k), _pair(j, k)} <= accepted
         ]
         # A pair by repeated features must be confirmed, unless nothing else connects its sides.
         needs_no_loop = pair.sure or group[i] != group[j]
-        if closed.count(False) <= closed.count(True) and (needs_no_loop or any(closed)):
+        if closures.count(False) <= closures.count(True) and (needs_no_loop or any(closures)):
             accepted.add((i, j))
             group = {k: group[i] if g == group[j] else g for k, g in group.items()}
     accepted = _without_weak(pairs, accepted, settings.accepted_share)
@@ -115,17 +115,17 @@ def _without_weak(
     others; a pair that alone connects photographs stays."""
     weak = []
     for k in {k for pair in pairs for k in pair.images}:
-        every = [p for p in pairs if k in p.images]
-        left = [p for p in every if p.images in accepted]
-        if len(left) < min_share * len(every):
-            most = max(map(len, left), default=0)
-            weak += [p for p in left if 2 * len(p) < most]
+        pairs_of_photograph = [p for p in pairs if k in p.images]
+        accepted_pairs = [p for p in pairs_of_photograph if p.images in accepted]
+        if len(accepted_pairs) < min_share * len(pairs_of_photograph):
+            largest_number = max(map(len, accepted_pairs), default=0)
+            weak += [p for p in accepted_pairs if 2 * len(p) < largest_number]
     number = max((k for pair in pairs for k in pair.images), default=0) + 1
     for pair in sorted(weak, key=len):
-        others, (i, j) = accepted - {pair.images}, pair.images
-        label = label_connected(number, others)
+        other_pairs, (i, j) = accepted - {pair.images}, pair.images
+        label = label_connected(number, other_pairs)
         if label[i] == label[j]:
-            accepted = others
+            accepted = other_pairs
     return accepted
 
 
@@ -179,40 +179,41 @@ class _Loops:
         # left. If ik is narrow, its base may be the small difference of two opposite ones, of any
         # direction; if ij or jk is narrow, its base is short, and ik nearly has that of the other.
         if np.isnan([at_j, at_i, at_k]).sum() > 1:
-            between = _is_between(ij.b, ij.M.T @ jk.b, ik.b, self.settings.max_aside)
-            return None if between or ik.angle < self.settings.narrow_angle else False
+            is_between = _is_between(ij.b, ij.M.T @ jk.b, ik.b, self.settings.max_aside)
+            return None if is_between or ik.angle < self.settings.narrow_angle else False
         of_jk = at_i - at_k if np.isnan(at_j) else at_j
         of_ik = at_j + at_k if np.isnan(at_i) else at_i
-        second, third = np.exp(of_jk) * ij.M.T @ jk.b, np.exp(of_ik) * ik.b
-        gap = np.linalg.norm(ij.b + second - third)
+        second_base, third_base = np.exp(of_jk) * ij.M.T @ jk.b, np.exp(of_ik) * ik.b
+        gap = np.linalg.norm(ij.b + second_base - third_base)
         longest = max(1.0, np.exp(of_jk), np.exp(of_ik))
         return bool(gap < self.settings.max_gap * longest)
 
     def _ratio(
-        self, one: PhotographPair, other: PhotographPair, of_one: int, of_other: int
+        self, pair_a: PhotographPair, pair_b: PhotographPair, of_one: int, of_other: int
     ) -> float:
-        """ln of the ratio of the base of `other` to that of `one`, by the depths in their common
-        photograph: the first or second (0, 1) of each; NaN: unknown."""
-        a, depth = self.pairs[one].matches[:, of_one], self.depth[one][of_one]
-        b, far = self.pairs[other].matches[:, of_other], self.depth[other][of_other]
+        """ln of the ratio of the base of `pair_b` to that of `pair_a`, by the depths in their
+        common photograph: the first or second (0, 1) of each; NaN: unknown."""
+        a, depth = self.pairs[pair_a].matches[:, of_one], self.depth[pair_a][of_one]
+        b, depth_b = self.pairs[pair_b].matches[:, of_other], self.depth[pair_b][of_other]
         _, rows, columns = np.intersect1d(a, b, return_indices=True)
-        ratio = depth[rows] / far[columns]
+        ratio = depth[rows] / depth_b[columns]
         ratio = ratio[np.isfinite(ratio) & (ratio > 0)]
-        enough = len(ratio) >= self.settings.min_common
-        return float(np.log(np.median(ratio))) if enough else np.nan
+        has_enough = len(ratio) >= self.settings.min_common
+        return float(np.log(np.median(ratio))) if has_enough else np.nan
 
 
 def _is_between(
-    one: Float[np.ndarray, "3"],
-    other: Float[np.ndarray, "3"],
+    direction_a: Float[np.ndarray, "3"],
+    direction_b: Float[np.ndarray, "3"],
     b: Float[np.ndarray, "3"],
-    most: float,
+    max_miss: float,
 ) -> bool:
-    """Whether a direction is a sum of two others with positive factors, to a distance `most`."""
+    """Whether a direction is a sum of two others with positive factors, to a distance "
+    "`max_miss`."""
     from scipy.optimize import nnls
 
-    factors, miss = nnls(np.stack([one, other], 1), b)
-    return bool(miss < most and factors.any())
+    factors, miss = nnls(np.stack([direction_a, direction_b], 1), b)
+    return bool(miss < max_miss and factors.any())
 
 
 def _depths(
@@ -223,6 +224,6 @@ def _depths(
         np.pad(ideal[k][rows], ((0, 0), (0, 1)), constant_values=-1.0)
         for k, rows in zip(pair.images, pair.matches.T)
     )
-    first, second, determinant = depths_of_rays(a, c @ pair.M, pair.b)
+    depth_1, depth_2, determinant = depths_of_rays(a, c @ pair.M, pair.b)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return first / determinant, second / determinant
+        return depth_1 / determinant, depth_2 / determinant

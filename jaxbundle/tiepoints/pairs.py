@@ -36,28 +36,28 @@ class CandidateSettings:
 
 def candidate_pairs(
     features: Sequence[Features],
-    way: str = "auto",
+    method: str = "auto",
     place: Float[np.ndarray, "photographs 3"] | None = None,
     run: Callable = map,
     settings: CandidateSettings = CandidateSettings(),
 ) -> list[tuple[int, int]]:
     """Pairs of photographs to match.
 
-    **Arguments:** `way`: `"all"`; `"sequence"`: neighbours in the order given; `"place"`: the
+    **Arguments:** `method`: `"all"`; `"sequence"`: neighbours in the order given; `"place"`: the
     nearest by the positions in their files; `"alike"`: those whose largest features match;
     `"auto"`: all of a few; of many the nearest if all positions are known, else those alike.
     `place`: positions, NaN: unknown; `run`: maps a function over many.
     """
     n = len(features)
-    known = place is not None and np.isfinite(place).all()
-    if way == "auto":
-        way = "all" if n <= settings.all_pairs_up_to else "place" if known else "alike"
-    if way == "all":
+    has_places = place is not None and np.isfinite(place).all()
+    if method == "auto":
+        method = "all" if n <= settings.all_pairs_up_to else "place" if has_places else "alike"
+    if method == "all":
         return list(combinations(range(n), 2))
-    if way == "sequence":
-        last = settings.sequence_neighbours
-        return [(i, j) for i in range(n) for j in range(i + 1, min(i + last + 1, n))]
-    if way == "place" and known:
+    if method == "sequence":
+        neighbours = settings.sequence_neighbours
+        return [(i, j) for i in range(n) for j in range(i + 1, min(i + neighbours + 1, n))]
+    if method == "place" and has_places:
         return _nearest_by_position(np.asarray(place), settings.neighbours)
     return _most_similar(features, run, settings)
 
@@ -76,11 +76,13 @@ def _nearest_by_position(
 def _most_similar(
     features: Sequence[Features], run: Callable, settings: CandidateSettings
 ) -> list[tuple[int, int]]:
-    every = list(combinations(range(len(features)), 2))
-    most = settings.largest_features
-    count = lambda pair: count_matches_of_largest(features[pair[0]], features[pair[1]], most)
+    all_pairs = list(combinations(range(len(features)), 2))
+    max_features = settings.largest_features
+    count = lambda pair: count_matches_of_largest(
+        features[pair[0]], features[pair[1]], max_features
+    )
     similar = [[] for _ in features]
-    for (i, j), number in zip(every, run(count, every)):
+    for (i, j), number in zip(all_pairs, run(count, all_pairs)):
         if number >= settings.min_matches:
             similar[i].append((number, j))
             similar[j].append((number, i))

@@ -74,20 +74,27 @@ def without_marks(
     settings: MarkSettings = MarkSettings(),
 ) -> tuple[list[FeatureMatches], int]:
     """The matches without those of marks, and the number of photographs with marks."""
-    still = [_find_still(m, features, sizes, settings) for m in matches]
+    still_and_motion = [_find_still(m, features, sizes, settings) for m in matches]
     marked_pairs, backgrounds = [], []
-    for k, (rows, motion) in enumerate(still):
-        moved = int((motion > 1).sum())
-        little = int(((motion > 1) & (motion < settings.small_motion)).sum())
+    for k, (rows, motion) in enumerate(still_and_motion):
+        number_moved = int((motion > 1).sum())
+        number_little = int(((motion > 1) & (motion < settings.small_motion)).sum())
         number = int(rows.sum())
-        if number and moved >= settings.min_moved and little <= settings.max_small_share * number:
-            (marked_pairs if moved >= number else backgrounds).append(k)
-    some = [matches[k] for k in backgrounds], [still[k] for k in backgrounds]
-    turns = _object_turns(*some, features, sizes, settings)
+        if (
+            number
+            and number_moved >= settings.min_moved
+            and number_little <= settings.max_small_share * number
+        ):
+            (marked_pairs if number_moved >= number else backgrounds).append(k)
+    pairs_on_background = (
+        [matches[k] for k in backgrounds],
+        [still_and_motion[k] for k in backgrounds],
+    )
+    turns = _object_turns(*pairs_on_background, features, sizes, settings)
     marked_pairs += [k for k, object_turns in zip(backgrounds, turns) if object_turns]
     images_of_cell: dict[Cell, set[int]] = {}
     for k in marked_pairs:
-        for cell in _cells(matches[k], features, sizes, still[k][0], settings):
+        for cell in _cells(matches[k], features, sizes, still_and_motion[k][0], settings):
             images_of_cell.setdefault(cell, set()).update(matches[k].images)
     marks = {
         cell for cell, images in images_of_cell.items() if len(images) >= settings.min_photographs
@@ -95,13 +102,15 @@ def without_marks(
     if not marks:
         return list(matches), 0
     # A mark at the border of a cell falls into its neighbour in another photograph.
-    near = {(size, i + a, j + b) for size, i, j in marks for a in (-1, 0, 1) for b in (-1, 0, 1)}
+    near_cells = {
+        (size, i + a, j + b) for size, i, j in marks for a in (-1, 0, 1) for b in (-1, 0, 1)
+    }
     remaining, marked = [], set()
-    for m, (_, motion) in zip(matches, still):
+    for m, (_, motion) in zip(matches, still_and_motion):
         # Of other features of a mark as well, whose positions are worse.
         rows = motion < settings.small_motion
         drop = np.zeros(len(m.rows), bool)
-        drop[rows] = [cell in near for cell in _cells(m, features, sizes, rows, settings)]
+        drop[rows] = [cell in near_cells for cell in _cells(m, features, sizes, rows, settings)]
         if drop.any():
             marked.update(m.images)
             m = m.take(~drop)
@@ -121,21 +130,21 @@ def _find_still(
         return np.zeros(len(m.rows), bool), np.full(len(m.rows), np.inf)
     a, b = features[i].take(m.rows[:, 0]), features[j].take(m.rows[:, 1])
     motion = np.linalg.norm(a.xy - b.xy, axis=1) / (settings.max_motion * max(sizes[i]))
-    same = np.abs(np.log(a.size / b.size)) < np.log(settings.max_size_ratio)
+    is_same = np.abs(np.log(a.size / b.size)) < np.log(settings.max_size_ratio)
     # The difference of two directions, in (−π, π].
-    same &= np.abs(np.angle(np.exp(1j * (a.angle - b.angle)))) < settings.max_turn
-    return same & (motion < 1), motion
+    is_same &= np.abs(np.angle(np.exp(1j * (a.angle - b.angle)))) < settings.max_turn
+    return is_same & (motion < 1), motion
 
 
 def _object_turns(
     matches: Sequence[FeatureMatches],
-    still: Sequence[tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]],
+    still_and_motion: Sequence[tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]],
     features: Sequence[Features],
     sizes: Sequence[tuple[int, int]],
     settings: MarkSettings,
 ) -> list[bool]:
     """By pair, whether the matches that have moved are of one object that has turned."""
-    moved = [m.take(motion > 1) for m, (_, motion) in zip(matches, still)]
+    moved_matches = [m.take(motion > 1) for m, (_, motion) in zip(matches, still_and_motion)]
 
     def ideal(m: FeatureMatches, side: int) -> Float[np.ndarray, "n 2"]:
         k = m.images[side]
@@ -143,11 +152,15 @@ def _object_turns(
         middle, c = np.array(sizes[k]) / 2, settings.principal_distance * max(sizes[k])
         return (features[k].xy[m.rows[:, side]] - middle) * (1, -1) / c
 
-    one, other = ([ideal(m, side) for m in moved] for side in (0, 1))
+    points_1, points_2 = ([ideal(m, side) for m in moved_matches] for side in (0, 1))
     verification = VerificationSettings(min_matches=settings.min_moved)
     tolerance = verification.tolerance / settings.principal_distance
     verified = verify_pairs(
-        one, other, np.full(len(moved), tolerance), [m.unique for m in moved], verification
+        points_1,
+        points_2,
+        np.full(len(moved_matches), tolerance),
+        [m.unique for m in moved_matches],
+        verification,
     )
     # By a rotation alone the moved matches have no depth: wrong ones, or something that passes.
     return [
@@ -157,7 +170,7 @@ def _object_turns(
             a[pair.good], b[pair.good], verification.first_factor * tolerance, settings
         )
         < settings.max_translated_share
-        for a, b, pair in zip(one, other, verified)
+        for a, b, pair in zip(points_1, points_2, verified)
     ]
 
 
@@ -168,9 +181,9 @@ def _most_translated(
     settings: MarkSettings,
 ) -> float:
     """The share of matches that the best of some trial translations explains."""
-    one, other = (np.pad(xy, ((0, 0), (0, 1)), constant_values=-1.0) for xy in (xy1, xy2))
+    rays_1, rays_2 = (np.pad(xy, ((0, 0), (0, 1)), constant_values=-1.0) for xy in (xy1, xy2))
     # A base is coplanar with both rays of a match, so it is normal to the normals of two matches.
-    normals, share = np.cross(one, other), 0.0
+    normals, share = np.cross(rays_1, rays_2), 0.0
     rng = np.random.default_rng(0)
     for _ in range(settings.translation_trials):
         base = np.cross(*normals[rng.choice(len(normals), 2, replace=False)])

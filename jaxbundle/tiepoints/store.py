@@ -50,8 +50,8 @@ class Store:
 
     def load_features(self, fingerprint: str) -> Features | None:
         """The stored features of a photograph, if any."""
-        found = self._load(self.name(fingerprint), "xy", "size", "angle", "descriptor")
-        return None if found is None else Features(*found)
+        arrays = self._load(self.name(fingerprint), "xy", "size", "angle", "descriptor")
+        return None if arrays is None else Features(*arrays)
 
     def save_features(self, fingerprint: str, features: Features) -> None:
         """Store the features of a photograph."""
@@ -63,21 +63,23 @@ class Store:
             descriptor=features.descriptor,
         )
 
-    def load_matches(self, one: str, other: str) -> tuple[np.ndarray, ...] | None:
+    def load_matches(self, photograph: str, partner: str) -> tuple[np.ndarray, ...] | None:
         """The stored rows of matching features of two photographs, the ratios of their
         distances, and which are unique, if any."""
-        return self._load(self.name(one, other), "rows", "distance_ratio", "unique")
+        return self._load(self.name(photograph, partner), "rows", "distance_ratio", "unique")
 
     def save_matches(
         self,
-        one: str,
-        other: str,
+        photograph: str,
+        partner: str,
         rows: Int[np.ndarray, "n 2"],
         distance_ratio: Float[np.ndarray, " n"],
         unique: Bool[np.ndarray, " n"],
     ) -> None:
         """Store the matches of two photographs."""
-        self._save(self.name(one, other), rows=rows, distance_ratio=distance_ratio, unique=unique)
+        self._save(
+            self.name(photograph, partner), rows=rows, distance_ratio=distance_ratio, unique=unique
+        )
 
     def drop_unused(self) -> None:
         """Remove the files of photographs that no longer exist."""
@@ -101,9 +103,9 @@ class Store:
             arrays = read_arrays(path, "a file of features or matches")
         except InputError:
             return None
-        found = tuple(arrays.get(column, np.zeros(0)) for column in columns)
-        whole = np.array_equal(arrays.get(DIGEST, np.zeros(0)), _digest(*found))
-        return found if whole else None
+        arrays_found = tuple(arrays.get(column, np.zeros(0)) for column in columns)
+        is_whole = np.array_equal(arrays.get(DIGEST, np.zeros(0)), _digest(*arrays_found))
+        return arrays_found if is_whole else None
 
     def _save(self, name: str, **arrays: np.ndarray) -> None:
         if self.folder is None:
@@ -121,8 +123,8 @@ class Store:
 
 
 def _digest(*arrays: np.ndarray) -> UInt8[np.ndarray, "16"]:
-    found = hashlib.blake2b(digest_size=16)
+    digest = hashlib.blake2b(digest_size=16)
     for array in arrays:
-        found.update(f"{array.dtype.str} {array.shape}".encode())
-        found.update(np.ascontiguousarray(array).tobytes())
-    return np.frombuffer(found.digest(), np.uint8)
+        digest.update(f"{array.dtype.str} {array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return np.frombuffer(digest.digest(), np.uint8)

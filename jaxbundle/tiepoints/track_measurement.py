@@ -112,10 +112,10 @@ class Measurements:
 
 def no_measurements() -> Measurements:
     """No measurements."""
-    none = np.zeros(0, int)
+    empty = np.zeros(0, int)
     places = np.zeros((0, 2))
     return Measurements(
-        none, none, places, places, none, np.zeros(0, bool), np.zeros((0, 3), np.uint8)
+        empty, empty, places, places, empty, np.zeros(0, bool), np.zeros((0, 3), np.uint8)
     )
 
 
@@ -157,7 +157,7 @@ class _TrackWindows:
 def measure_tracks(
     tracks: Sequence[Sequence[tuple[int, int]]],
     features: Sequence[Features],
-    read: Callable[[int], UInt8[np.ndarray, "rows columns 3"]],
+    read_photograph: Callable[[int], UInt8[np.ndarray, "rows columns 3"]],
     advance: Callable[[], object] = lambda: None,
     settings: TrackMatchingSettings = TrackMatchingSettings(),
 ) -> Measurements:
@@ -166,26 +166,28 @@ def measure_tracks(
     **Arguments:** `read(k)`: colours of a photograph; `advance`: called after each of them.
     """
     track_features = _place_windows(tracks, features, settings)
-    cutouts = _cut_out(track_features, len(features), read, advance, settings)
-    inside = cutouts.inside
+    cutouts = _cut_out(track_features, len(features), read_photograph, advance, settings)
+    is_inside = cutouts.inside
     # The window inside its own photograph, and a place for it in the other.
-    others = np.flatnonzero(~track_features.is_template & inside & inside[track_features.template])
-    half = settings.window // 2
+    to_match = np.flatnonzero(
+        ~track_features.is_template & is_inside & is_inside[track_features.template]
+    )
+    half_window = settings.window // 2
     bend = (
         settings.second_order_sigma
-        * half**2
+        * half_window**2
         * track_features.scale
         / cutouts.longer[track_features.image]
     )
     matches = _match_in_chunks(
-        cutouts.windows[track_features.track[others]],
+        cutouts.windows[track_features.track[to_match]],
         cutouts.pieces,
-        others,
-        track_features.start[others].astype(np.float32),
-        bend[others].astype(np.float32),
+        to_match,
+        track_features.start[to_match].astype(np.float32),
+        bend[to_match].astype(np.float32),
         settings.correlation_length,
     )
-    return _collect(track_features, others, matches, cutouts.colour, settings)
+    return _collect(track_features, to_match, matches, cutouts.colour, settings)
 
 
 def prepare(settings: TrackMatchingSettings = TrackMatchingSettings()) -> None:
@@ -268,7 +270,7 @@ def _predict_affine(
 def _cut_out(
     track_features: _TrackFeatures,
     photographs: int,
-    read: Callable[[int], UInt8[np.ndarray, "rows columns 3"]],
+    read_photograph: Callable[[int], UInt8[np.ndarray, "rows columns 3"]],
     advance: Callable[[], object],
     settings: TrackMatchingSettings,
 ) -> _TrackWindows:
@@ -281,30 +283,33 @@ def _cut_out(
     windows = np.zeros((int(is_template.sum()), window, window), np.uint8)
     row_of_window = np.cumsum(is_template) - 1
     pieces = np.zeros((n, side, side), np.uint8)
-    inside, colour = np.zeros(n, bool), np.zeros((n, 3), np.uint8)
+    is_inside, colour = np.zeros(n, bool), np.zeros((n, 3), np.uint8)
     longer = np.ones(photographs)
     order = np.argsort(track_features.image, kind="stable")
     for k in range(photographs):
         rows = order[slice(*np.searchsorted(track_features.image[order], [k, k + 1]))]
         if len(rows):
-            picture = read(k)
+            picture = read_photograph(k)
             longer[k] = max(picture.shape[:2])
-            last = np.array(picture.shape[1::-1]) - 1
-            u, v = np.clip(np.rint(track_features.xy[rows]), 0, last).astype(int).T
+            last_pixel = np.array(picture.shape[1::-1]) - 1
+            u, v = np.clip(np.rint(track_features.xy[rows]), 0, last_pixel).astype(int).T
             colour[rows] = picture[v, u]
             pyramid = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
             for step in range(track_features.level[rows].max() + 1):
                 pyramid = cv2.pyrDown(pyramid) if step else pyramid
-                here = rows[track_features.level[rows] == step]
-                first, other = here[is_template[here]], here[~is_template[here]]
-                windows[row_of_window[first]], inside[first] = _cut_squares(
-                    pyramid, track_features.corner[first].astype(int), window, margins[window]
+                rows_of_level = rows[track_features.level[rows] == step]
+                templates, search_windows = (
+                    rows_of_level[is_template[rows_of_level]],
+                    rows_of_level[~is_template[rows_of_level]],
                 )
-                pieces[other], inside[other] = _cut_squares(
-                    pyramid, track_features.corner[other].astype(int), side, margins[side]
+                windows[row_of_window[templates]], is_inside[templates] = _cut_squares(
+                    pyramid, track_features.corner[templates].astype(int), window, margins[window]
+                )
+                pieces[search_windows], is_inside[search_windows] = _cut_squares(
+                    pyramid, track_features.corner[search_windows].astype(int), side, margins[side]
                 )
         advance()
-    return _TrackWindows(windows, pieces, inside, colour, longer)
+    return _TrackWindows(windows, pieces, is_inside, colour, longer)
 
 
 def _cut_squares(
@@ -320,8 +325,8 @@ def _cut_squares(
     v = np.clip(corner[:, 1, None] + offset, 0, rows - 1)
     u = np.clip(corner[:, 0, None] + offset, 0, columns - 1)
     middle = corner + side // 2
-    inside = np.all((middle >= margin) & (middle < np.array([columns, rows]) - margin), axis=1)
-    return picture[v[:, :, None], u[:, None, :]], inside
+    is_inside = np.all((middle >= margin) & (middle < np.array([columns, rows]) - margin), axis=1)
+    return picture[v[:, :, None], u[:, None, :]], is_inside
 
 
 # A, covariance, correlation and status of matches.
@@ -356,29 +361,31 @@ def _match(
 def _match_in_chunks(
     windows: UInt8[np.ndarray, "m w w"],
     pieces: UInt8[np.ndarray, "n p p"],
-    others: Int[np.ndarray, " m"],
+    to_match: Int[np.ndarray, " m"],
     start: Float32[np.ndarray, "m 2 3"],
     bend: Float32[np.ndarray, " m"],
     correlation_length: int,
 ) -> Matched:
-    """The matches of the measurements `others`, whose search windows are among `pieces`."""
+    """The matches of the measurements `to_match`, whose search windows are among `pieces`."""
     parts = []
-    for begin in range(0, len(others), LANES):
-        rows = np.minimum(np.arange(begin, begin + LANES), len(others) - 1)
+    for begin in range(0, len(to_match), LANES):
+        rows = np.minimum(np.arange(begin, begin + LANES), len(to_match) - 1)
         parts.append(
-            _match(windows[rows], pieces[others[rows]], start[rows], bend[rows], correlation_length)
+            _match(
+                windows[rows], pieces[to_match[rows]], start[rows], bend[rows], correlation_length
+            )
         )
     if not parts:
         return np.zeros((0, 2, 3)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros(0, int)
     affine, covariance, rho, status = (
-        np.concatenate([np.asarray(p) for p in column])[: len(others)] for column in zip(*parts)
+        np.concatenate([np.asarray(p) for p in column])[: len(to_match)] for column in zip(*parts)
     )
     return affine, covariance, rho, status
 
 
 def _collect(
     track_features: _TrackFeatures,
-    others: Int[np.ndarray, " m"],
+    to_match: Int[np.ndarray, " m"],
     matches: Matched,
     colour: UInt8[np.ndarray, "n 3"],
     settings: TrackMatchingSettings,
@@ -386,14 +393,14 @@ def _collect(
     """Measurements by the good matches, and by the positions of features without one."""
     affine, covariance, rho, status = matches
     track, scale, corner = track_features.track, track_features.scale, track_features.corner
-    place = affine[:, :, 2] + corner[others]
-    away = np.linalg.norm(place - track_features.xy[others] / scale[others, None], axis=1)
+    place = affine[:, :, 2] + corner[to_match]
+    shift = np.linalg.norm(place - track_features.xy[to_match] / scale[to_match, None], axis=1)
     # Half of the variance of a match belongs to each of its two windows.
     sigma = np.sqrt(np.maximum(covariance[:, [0, 1], [0, 1]], 0) / 2)
     good = (status == int(MatchingStatus.CONVERGED)) & (rho > settings.min_correlation)
-    good &= (away < settings.max_shift) & (sigma < settings.max_sigma).all(1)
+    good &= (shift < settings.max_shift) & (sigma < settings.max_sigma).all(1)
     sigma = np.hypot(sigma, settings.added_sigma)
-    rows = others[good]
+    rows = to_match[good]
     sigma_of = np.repeat(settings.feature_sigma * track_features.size[:, None], 2, 1)
     sigma_of[rows] = sigma[good] * scale[rows, None]
     matched = np.zeros(len(track), bool)

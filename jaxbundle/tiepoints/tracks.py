@@ -31,27 +31,34 @@ class TrackSettings:
 
 def make_tracks(features: Sequence[Features], pairs: Sequence[Pair]) -> list[list[tuple[int, int]]]:
     """Tracks as lists of (photograph, feature), two photographs at least."""
-    # Every feature of all photographs has a number; `first` is that of the first of a photograph.
-    first = np.concatenate([[0], np.cumsum([len(f) for f in features])]).astype(int)
-    same = np.concatenate([_merge_directions(f.xy) + k for f, k in zip(features, first)] or [[]])
-    rows = [first[list(pair.images)] + pair.matches for pair in pairs if len(pair)]
+    # Every feature of all photographs has a number; `first_number` is that of the first of a
+    # photograph.
+    first_number = np.concatenate([[0], np.cumsum([len(f) for f in features])]).astype(int)
+    merged = np.concatenate(
+        [_merge_directions(f.xy) + k for f, k in zip(features, first_number)] or [[]]
+    )
+    rows = [first_number[list(pair.images)] + pair.matches for pair in pairs if len(pair)]
     if not rows:
         return []
     distance_ratio = np.concatenate([pair.distance_ratio for pair in pairs if len(pair)])
-    edges = same[np.concatenate(rows)[np.argsort(distance_ratio, kind="stable")]]
-    members = _join(edges, np.searchsorted(first, np.arange(first[-1]), side="right") - 1)
+    edges = merged[np.concatenate(rows)[np.argsort(distance_ratio, kind="stable")]]
+    members = _join(
+        edges, np.searchsorted(first_number, np.arange(first_number[-1]), side="right") - 1
+    )
     tracks = []
     for nodes in members:
-        images = np.searchsorted(first, nodes, side="right") - 1
-        tracks.append(sorted(zip(images.tolist(), (nodes - first[images]).tolist())))
+        images = np.searchsorted(first_number, nodes, side="right") - 1
+        tracks.append(sorted(zip(images.tolist(), (nodes - first_number[images]).tolist())))
     return tracks
 
 
 def _merge_directions(xy: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, " n"]:
     """For every feature the first one at its position: SIFT may give several directions."""
     # To a hundredth of a pixel, since it interpolates the position for each of them.
-    _, first, back = np.unique(np.round(xy, 2), axis=0, return_index=True, return_inverse=True)
-    return first[back.ravel()]
+    _, first_row, inverse = np.unique(
+        np.round(xy, 2), axis=0, return_index=True, return_inverse=True
+    )
+    return first_row[inverse.ravel()]
 
 
 def _join(
@@ -93,24 +100,24 @@ def choose_tracks(
 
     **Arguments:** `xy`: positions of the features of every photograph; `sizes`: columns, rows.
     """
-    cell, near, shape = _cells(xy, sizes, settings)
+    cell, fine_cell, shape = _cells(xy, sizes, settings)
     quota = [max(1, round(number / (nx * ny))) for nx, ny in shape]
     filled = [np.zeros(nx * ny, int) for nx, ny in shape]
-    taken: list[set] = [set() for _ in xy]
-    chosen = np.zeros(len(tracks), bool)
+    taken_cells: list[set] = [set() for _ in xy]
+    is_chosen = np.zeros(len(tracks), bool)
     for k in np.argsort([-len(track) for track in tracks], kind="stable").tolist():
         track = tracks[k]
-        wanted = sum(filled[i][cell[i][f]] < quota[i] for i, f in track)
-        double = sum(near[i][f] in taken[i] for i, f in track)
+        number_wanted = sum(filled[i][cell[i][f]] < quota[i] for i, f in track)
+        number_double = sum(fine_cell[i][f] in taken_cells[i] for i, f in track)
         # A track that fills a quota in one photograph only adds no connection; one that lies on a
         # chosen one in one photograph only is another point behind or in front of it.
-        if wanted < 2 or double >= 2:
+        if number_wanted < 2 or number_double >= 2:
             continue
-        chosen[k] = True
+        is_chosen[k] = True
         for i, f in track:
             filled[i][cell[i][f]] += 1
-            taken[i].add(near[i][f])
-    return chosen
+            taken_cells[i].add(fine_cell[i][f])
+    return is_chosen
 
 
 def _cells(
@@ -119,7 +126,7 @@ def _cells(
     settings: TrackSettings,
 ) -> tuple[list[Int[np.ndarray, " _"]], list[list[int]], list[tuple[int, int]]]:
     """For every feature its cell of the grid, and that of a fine grid; shape of the grids."""
-    cell, near, shape = [], [], []
+    cell, fine_cell, shape = [], [], []
     for places, (columns, rows) in zip(xy, sizes):
         side = max(columns, rows) / settings.cells
         nx, ny = (max(1, int(np.ceil(n / side))) for n in (columns, rows))
@@ -128,8 +135,8 @@ def _cells(
         shape.append((nx, ny))
         fine = np.floor(places / (settings.merging_distance * max(columns, rows))).astype(int)
         # Row and column as one number: there are fewer than 100 000 columns.
-        near.append((fine[:, 1] * 100_000 + fine[:, 0]).tolist())
-    return cell, near, shape
+        fine_cell.append((fine[:, 1] * 100_000 + fine[:, 0]).tolist())
+    return cell, fine_cell, shape
 
 
 def flatten(

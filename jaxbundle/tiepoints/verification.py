@@ -131,19 +131,23 @@ def verify_pairs(
     of Sampson's distance, c = 1; `unique`: which matches are unique; all, if not given.
     """
     unique = [np.ones(len(xy), bool) for xy in xy1] if unique is None else unique
-    least = settings.min_matches
-    usable = [k for k, xy in enumerate(xy1) if len(xy) >= least]
+    min_matches = settings.min_matches
+    usable = [k for k, xy in enumerate(xy1) if len(xy) >= min_matches]
     verified: list[VerifiedPair | None] = [None] * len(xy1)
     if not usable:
         return verified
     find = lambda rows: _find_agreeing(rows, xy1, xy2, tolerance, settings)
     # First the unique matches alone; then all, where enough are added to make it another trial.
-    sure = find({k: np.flatnonzero(unique[k]) for k in usable})
+    agreed_by_distinct = find({k: np.flatnonzero(unique[k]) for k in usable})
     agreed = find(
-        {k: np.arange(len(xy1[k])) for k in usable if k not in sure and (~unique[k]).sum() >= least}
+        {
+            k: np.arange(len(xy1[k]))
+            for k in usable
+            if k not in agreed_by_distinct and (~unique[k]).sum() >= min_matches
+        }
     )
-    agreed |= sure
-    for k in sure:
+    agreed |= agreed_by_distinct
+    for k in agreed_by_distinct:
         good, M, b = agreed[k]
         if (good & unique[k]).sum() >= settings.sufficient_matches:
             agreed[k] = good & unique[k], M, b
@@ -155,17 +159,17 @@ def verify_pairs(
         if k not in agreed
         and (turn := _find_rotation(xy1[k], xy2[k], tolerance[k], settings)) is not None
     }
-    left = sorted(agreed)
+    pairs_left = sorted(agreed)
     kinds = _classify(
-        [agreed[k] for k in left],
-        [xy1[k] for k in left],
-        [xy2[k] for k in left],
-        tolerance[left],
+        [agreed[k] for k in pairs_left],
+        [xy1[k] for k in pairs_left],
+        [xy2[k] for k in pairs_left],
+        tolerance[pairs_left],
         settings.explained_share,
     )
-    for k, (good, angle, kind) in zip(left, kinds):
+    for k, (good, angle, kind) in zip(pairs_left, kinds):
         _, M, b = agreed[k]
-        verified[k] = VerifiedPair(good, M, b, angle, kind, k in sure)
+        verified[k] = VerifiedPair(good, M, b, angle, kind, k in agreed_by_distinct)
     for k, (good, M) in turned.items():
         verified[k] = VerifiedPair(good, M, np.zeros(3), 0.0, "rotation", True)
     return verified
@@ -186,15 +190,18 @@ def _find_agreeing(
     distinct = lambda n: batched.spread(
         max(int(settings.distinct_share * n), min(n, batched.SLOTS))
     )
-    first = _orient_by_rows(rows, distinct, xy1, xy2, tolerance, settings)
+    by_distinct = _orient_by_rows(rows, distinct, xy1, xy2, tolerance, settings)
     # The first `batched.SLOTS` are another trial only if the first trial was spread over more.
-    again = {
+    rows_again = {
         k: r
         for k, r in rows.items()
-        if k not in first and settings.distinct_share * len(r) > batched.SLOTS
+        if k not in by_distinct and settings.distinct_share * len(r) > batched.SLOTS
     }
     most_distinct = lambda _: np.arange(batched.SLOTS)
-    return {**_orient_by_rows(again, most_distinct, xy1, xy2, tolerance, settings), **first}
+    return {
+        **_orient_by_rows(rows_again, most_distinct, xy1, xy2, tolerance, settings),
+        **by_distinct,
+    }
 
 
 def _orient_by_rows(
@@ -210,10 +217,10 @@ def _orient_by_rows(
     if not rows:
         return {}
     keys = np.array(list(rows))
-    few = [rows[k][choose(len(rows[k]))] for k in rows]
+    chosen_rows = [rows[k][choose(len(rows[k]))] for k in rows]
     M, b, share, _ = batched.orient_pairs(
-        [xy1[k][r] for k, r in zip(rows, few)],
-        [xy2[k][r] for k, r in zip(rows, few)],
+        [xy1[k][r] for k, r in zip(rows, chosen_rows)],
+        [xy2[k][r] for k, r in zip(rows, chosen_rows)],
         settings.first_factor * tolerance[keys],
     )
     poses = {k: (M[i], b[i]) for i, k in enumerate(rows) if share[i] > 0}
@@ -224,9 +231,9 @@ def _orient_by_rows(
     for k, (M, b) in poses.items():
         good = agreeing_matches(M, b, xy1[k], xy2[k], tolerance[k])
         use = rows[k][good[rows[k]]]
-        enough = len(use) >= max(settings.min_matches, settings.min_share * len(rows[k]))
+        has_enough = len(use) >= max(settings.min_matches, settings.min_share * len(rows[k]))
         # The smaller eigenvalue of the covariance is the variance across a line.
-        if enough and all(
+        if has_enough and all(
             np.linalg.eigvalsh(np.cov(xy[k][use].T))[0] > (settings.min_extent * xy[k].std()) ** 2
             for xy in (xy1, xy2)
         ):
@@ -251,20 +258,20 @@ def _find_rotation(
 ) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, "3 3"]] | None:
     """The matches explained by a rotation about the projection centre, and M, if they are most."""
     rays = [np.pad(xy, ((0, 0), (0, 1)), constant_values=-1.0) for xy in (xy1, xy2)]
-    one, two = (a / np.linalg.norm(a, axis=1, keepdims=True) for a in rays)
+    rays_1, rays_2 = (a / np.linalg.norm(a, axis=1, keepdims=True) for a in rays)
     rng, best = np.random.default_rng(0), None
-    most = max(settings.min_matches, len(xy1) // 2) - 1
+    largest_number = max(settings.min_matches, len(xy1) // 2) - 1
     for _ in range(settings.rotation_trials):
-        i, j = rng.choice(len(one), 2, replace=False)
-        first, second = (_triad(a[i], a[j]) for a in (one, two))
-        if first is None or second is None:
+        i, j = rng.choice(len(rays_1), 2, replace=False)
+        triad_1, triad_2 = (_triad(a[i], a[j]) for a in (rays_1, rays_2))
+        if triad_1 is None or triad_2 is None:
             continue
-        M = second.T @ first
+        M = triad_2.T @ triad_1
         # Twice the tolerance: Sampson's distance is 1/√2 of the distance from an epipolar line, and
         # that is one of the two components of the distance of two rays.
-        good = np.linalg.norm(one @ M.T - two, axis=1) < 2 * tolerance
-        if good.sum() > most:
-            most, best = good.sum(), (good, M)
+        good = np.linalg.norm(rays_1 @ M.T - rays_2, axis=1) < 2 * tolerance
+        if good.sum() > largest_number:
+            largest_number, best = good.sum(), (good, M)
     return best
 
 
@@ -287,15 +294,15 @@ def agreeing_matches(
 
     In NumPy: the number of matches differs from pair to pair, and each would be a compilation."""
     a1, a2 = (np.pad(xy, ((0, 0), (0, 1)), constant_values=-1.0) for xy in (xy1, xy2))
-    back = a2 @ M
+    rays_back = a2 @ M
     # e = |a₂ᵀ·l₂| / √(l₂ₓ² + l₂ᵧ² + l₁ₓ² + l₁ᵧ²) with the epipolar lines l₂ = M·(b × a₁) and
     # l₁ = (Mᵀ·a₂) × b (Sampson 1982)
-    line2, line1 = np.cross(b, a1) @ M.T, np.cross(back, b)
+    line2, line1 = np.cross(b, a1) @ M.T, np.cross(rays_back, b)
     square = (line2[:, :2] ** 2).sum(1) + (line1[:, :2] ** 2).sum(1)
     e = np.abs((a2 * line2).sum(1)) / np.sqrt(np.maximum(square, 1e-300))
     # The determinant is positive: the signs of both depths are those of the numerators.
-    first, second, _ = depths_of_rays(a1, back, b)
-    return (e < tolerance) & (first > 0) & (second > 0)
+    depth_1, depth_2, _ = depths_of_rays(a1, rays_back, b)
+    return (e < tolerance) & (depth_1 > 0) & (depth_2 > 0)
 
 
 def depths_of_rays(
@@ -305,8 +312,8 @@ def depths_of_rays(
     determinant (0 for parallel rays), and this: the normal equations of s·a − t·c = b. In NumPy, of
     many numbers of matches; `orientation.relative.distances_along_rays` is the same for JAX."""
     aa, cc, dot = (a**2).sum(1), (c**2).sum(1), (a * c).sum(1)
-    first, second = a @ b, c @ b
-    return cc * first - dot * second, dot * first - aa * second, aa * cc - dot * dot
+    a_b, c_b = a @ b, c @ b
+    return cc * a_b - dot * c_b, dot * a_b - aa * c_b, aa * cc - dot * dot
 
 
 def _improve(
@@ -315,15 +322,17 @@ def _improve(
     xy1: Sequence[Float[np.ndarray, "_ 2"]],
     xy2: Sequence[Float[np.ndarray, "_ 2"]],
     tolerance: Float[np.ndarray, " pairs"],
-    least: int,
+    min_matches: int,
 ) -> dict[int, tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]]:
     """M and b refined by those of the `candidates` (rows of matches) within the tolerance, of pairs
-    with at least `least` of them."""
+    with at least `min_matches` of them."""
     keys, rows = [], []
     for k, (M, b) in poses.items():
-        chosen = candidates[k]
-        good = chosen[agreeing_matches(M, b, xy1[k][chosen], xy2[k][chosen], tolerance[k])]
-        if len(good) >= least:
+        candidate_rows = candidates[k]
+        good = candidate_rows[
+            agreeing_matches(M, b, xy1[k][candidate_rows], xy2[k][candidate_rows], tolerance[k])
+        ]
+        if len(good) >= min_matches:
             keys.append(k)
             rows.append(good[batched.spread(len(good), MATCH_SLOTS)])
     if not keys:
@@ -353,8 +362,8 @@ def refine_rotations(
 def rotation_angle(M: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n"]:
     """The angle of rotations, radians."""
     # sin ω from M − Mᵀ, cos ω from the trace: each alone loses half of the digits near 0 or π.
-    across = M - np.swapaxes(M, -1, -2)
-    sine = np.sqrt((across**2).sum((-2, -1)) / 8)
+    antisymmetric = M - np.swapaxes(M, -1, -2)
+    sine = np.sqrt((antisymmetric**2).sum((-2, -1)) / 8)
     return np.arctan2(sine, (np.trace(M, axis1=-2, axis2=-1) - 1) / 2)
 
 
@@ -411,8 +420,13 @@ def _classify(
     angle, turn, plane = batched.run_in_lanes(_simpler, LANES, M, filled(xy1), filled(xy2), weights)
     kinds = []
     for k, (good, *_) in enumerate(agreed):
-        number, near = int((weights[k] > 0).sum()), 2 * tolerance[k]  # as in `_find_rotation`
-        by_rotation, by_plane = (float((e[k, :number] < near).mean()) for e in (turn, plane))
+        number, double_tolerance = (
+            int((weights[k] > 0).sum()),
+            2 * tolerance[k],
+        )  # as in `_find_rotation`
+        by_rotation, by_plane = (
+            float((e[k, :number] < double_tolerance).mean()) for e in (turn, plane)
+        )
         kind = "plane" if by_plane > explained_share else "relative"
         kinds.append((good, float(angle[k]), "rotation" if by_rotation > explained_share else kind))
     return kinds
@@ -429,8 +443,10 @@ def _simpler(
     """Median angle of intersection; misclosures of a rotation and of a homography."""
     unit = lambda a: a / jnp.linalg.norm(a)
     rays1, rays2 = (jax.vmap(lambda xy: unit(ray_of(xy)))(xy) for xy in (xy1, xy2))
-    back = rays2 @ M
-    angle = jnp.arctan2(jnp.linalg.norm(jnp.cross(rays1, back), axis=1), jnp.sum(rays1 * back, 1))
+    rays_back = rays2 @ M
+    angle = jnp.arctan2(
+        jnp.linalg.norm(jnp.cross(rays1, rays_back), axis=1), jnp.sum(rays1 * rays_back, 1)
+    )
     angle = jnp.nanmedian(jnp.where(weights > 0, angle, jnp.nan))
     turned = rays1 @ matrix_from_quaternion(rotation_between(rays1, rays2, weights)).T
     turn = jnp.linalg.norm(turned[:, :2] / -turned[:, 2:] - xy2, axis=1)

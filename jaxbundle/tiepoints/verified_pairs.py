@@ -36,7 +36,7 @@ def prepare() -> None:
 
 def detect(
     paths: Sequence[Path],
-    read: Sequence[Callable[[], UInt8[np.ndarray, "rows columns"]]],
+    readers: Sequence[Callable[[], UInt8[np.ndarray, "rows columns"]]],
     fingerprints: list[str],
     settings: FeatureSettings,
     store: Store,
@@ -49,19 +49,19 @@ def detect(
         features = store.load_features(fingerprints[k])
         if features is None:
             with image_errors(paths[k]):
-                features = find_features(read[k](), settings)
+                features = find_features(readers[k](), settings)
             store.save_features(fingerprints[k], features)
         return features
 
     return map_in_threads(
-        load_or_find, range(len(read)), workers, lambda n: tell("features", n, len(read))
+        load_or_find, range(len(readers)), workers, lambda n: tell("features", n, len(readers))
     )
 
 
 def match(
     features: Sequence[Features],
     fingerprints: list[str],
-    way: str,
+    method: str,
     place: Float[np.ndarray, "photographs 3"] | None,
     store: Store,
     workers: int,
@@ -71,7 +71,7 @@ def match(
 ) -> list[FeatureMatches]:
     """The matches of candidate pairs, stored ones if available."""
     with ThreadPoolExecutor(workers) as pool:
-        pairs = candidate_pairs(features, way, place, pool.map, candidates)
+        pairs = candidate_pairs(features, method, place, pool.map, candidates)
 
     names = lambda pair: (fingerprints[pair[0]], fingerprints[pair[1]])
     stored = {pair: store.load_matches(*names(pair)) for pair in pairs}
@@ -84,9 +84,11 @@ def match(
         columns = stored[pair]
         if columns is None:
             i, j = pair
-            both = within[i], within[j]
-            rows, distance_ratio = match_features(features[i], features[j], settings, both)
-            columns = rows, distance_ratio, are_unique(rows, both, settings)
+            distances_within_both = within[i], within[j]
+            rows, distance_ratio = match_features(
+                features[i], features[j], settings, distances_within_both
+            )
+            columns = rows, distance_ratio, are_unique(rows, distances_within_both, settings)
             store.save_matches(*names(pair), *columns)
         return FeatureMatches(pair, *columns)
 
@@ -113,19 +115,21 @@ def verify(
     matches = [m for m in matches if len(m.rows)]
     # 64 pairs at once fill eight runs of eight lanes; in between the progress is shown
     pairs, chunk = [], 64
-    for first in range(0, len(matches), chunk):
-        some = [_with_ideal(ideal, m) for m in matches[first : first + chunk]]
-        tolerance = np.array([settings.tolerance * size[list(m.images)].mean() for m in some])
-        one, other = ([ideal[m.images[k]][m.rows[:, k]] for m in some] for k in (0, 1))
-        verified = verify_pairs(one, other, tolerance, [m.unique for m in some], settings)
-        for m, pair in zip(some, verified):
+    for begin in range(0, len(matches), chunk):
+        portion = [_with_ideal(ideal, m) for m in matches[begin : begin + chunk]]
+        tolerance = np.array([settings.tolerance * size[list(m.images)].mean() for m in portion])
+        points_1, points_2 = ([ideal[m.images[k]][m.rows[:, k]] for m in portion] for k in (0, 1))
+        verified = verify_pairs(
+            points_1, points_2, tolerance, [m.unique for m in portion], settings
+        )
+        for m, pair in zip(portion, verified):
             if pair is not None:
-                good, M, b, angle, kind, sure = pair
+                good, M, b, angle, kind, is_unique = pair
                 rows, distance_ratio = m.rows[good], m.distance_ratio[good]
                 pairs.append(
-                    Pair(m.images, rows, distance_ratio, M, b, angle, kind, len(m.rows), sure)
+                    Pair(m.images, rows, distance_ratio, M, b, angle, kind, len(m.rows), is_unique)
                 )
-        tell("verification", min(first + chunk, len(matches)), len(matches))
+        tell("verification", min(begin + chunk, len(matches)), len(matches))
     return pairs
 
 

@@ -94,7 +94,7 @@ def test_principal_distance_and_distortion_from_pairs(cloud):
     camera = jaxbundle.Camera(
         "c", "opencv", {"fx": 1440.0, "fy": 1440.0, "cx": 599.5, "cy": 449.5}, image_size=SIZE
     )
-    found = estimate_interior(camera, pairs, known=False)
+    found = estimate_interior(camera, pairs, is_known=False)
     assert found.camera.parameters["fx"] == pytest.approx(F, rel=0.02)
     assert found.camera.parameters["k1"] == pytest.approx(K1, abs=0.03)
     assert found.misclosure < 0.5
@@ -114,7 +114,7 @@ def test_distortion_of_a_known_long_lens_from_pairs():
     camera = jaxbundle.Camera(
         "c", "opencv", {"fx": f, "fy": f, "cx": 0.0, "cy": 0.0}, image_size=SIZE
     )
-    found = estimate_interior(camera, pairs, known=True).camera.parameters
+    found = estimate_interior(camera, pairs, is_known=True).camera.parameters
     # K1 moves points of the corners, at r = 0.03, by 0.2 px; it is no more than a start value
     assert found["fx"] == pytest.approx(f, rel=0.02)
     assert found["k1"] == pytest.approx(k1, abs=0.1)
@@ -146,7 +146,7 @@ def test_rotations_close_with_the_right_principal_distance_and_distortion():
     middle = np.array([599.5, 449.5])
     xy = [tuple(features[k].xy[rows] - middle for k, rows in zip(m.images, m.rows.T)) for m in two]
     begin = dataclasses.replace(camera, parameters=told | {"cx": 0.0, "cy": 0.0})
-    by_pairs = estimate_interior(begin, xy, known=True).camera.parameters
+    by_pairs = estimate_interior(begin, xy, is_known=True).camera.parameters
     assert few.parameters["fx"] == pytest.approx(by_pairs["fx"], rel=1e-12)
 
 
