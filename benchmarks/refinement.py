@@ -45,7 +45,7 @@ def scene(count: int):
     points = dataclasses.replace(
         scenes.control(X), X=np.where(known[:, None], X, np.nan), role=roles
     )
-    frames = dataclasses.replace(photograph(X, rng), distances=Distances.empty())
+    frames = dataclasses.replace(photograph(X, rng), distances=Distances.none())
     return [one], points, scenes.measured(places, rng), frames
 
 

@@ -50,8 +50,8 @@ def along_segments(views, pyramids, uv):
         q = views[0].bounds(uv, -1.5, 1.5)
         shape = windows(views[0], other, views[0].points(uv, q.mean(1)))
         part = segments(views[0], other, uv, q)
-        correlate((views[0], other), (pyramids[0], pyramid), uv, part, shape, level=0, half=HALF,
-                  steps=POSITIONS)  # fmt: skip
+        correlate((views[0], other), (pyramids[0], pyramid), uv, part, shape, level=0,
+                  half_window=HALF, steps=POSITIONS)  # fmt: skip
     return time.perf_counter() - begin
 
 

@@ -122,7 +122,7 @@ def _part(
             points, position=model.X, role=roles, sigma=np.full((len(points), 3), np.nan)
         ),
         observations=network.observations.take(rows),
-        distances=Distances.empty(),
+        distances=Distances.none(),
         datum="control" if is_held.sum() >= 3 else "inner",
         datum_points=(),
         warnings=(),

@@ -23,14 +23,14 @@ def default_parameters(model: CameraModel) -> dict[str, float]:
     }
 
 
-def check_parameters(model: CameraModel, values: Mapping[str, float]) -> None:
+def check_parameters(model: CameraModel, given: Mapping[str, float]) -> None:
     """Refuses start values that cannot describe a camera of this model.
 
     **Raises:** `ValueError`, for a name the model does not have, a value that is not a finite
     number or out of its range, and a principal distance that is missing, zero or negative.
     """
     where = f"Camera model {model.name!r}"
-    for name, value in values.items():
+    for name, value in given.items():
         if name not in model.parameters:
             raise ValueError(
                 f"{where} has no parameter {name!r}{closest(name, model.parameters)} "
@@ -39,18 +39,18 @@ def check_parameters(model: CameraModel, values: Mapping[str, float]) -> None:
         if not _is_finite_number(value):
             raise ValueError(f"{where}: {name} must be a finite number, but is {value!r}.")
     for name in model.principal_distance:
-        if name not in values:
+        if name not in given:
             raise ValueError(
                 f"{where}: {name} is missing; give the principal distance in {model.unit}."
             )
     for name in (*model.principal_distance, "format_factor"):
-        if name in values and values[name] <= 0:
-            raise ValueError(f"{where}: {name} must be positive, but is {values[name]!r}.")
+        if name in given and given[name] <= 0:
+            raise ValueError(f"{where}: {name} must be positive, but is {given[name]!r}.")
     for name, (low, high) in dict(model.ranges).items():
-        if name in values and not low <= values[name] < high:
+        if name in given and not low <= given[name] < high:
             end = "" if high == math.inf else f" and below {high:g}"
             raise ValueError(
-                f"{where}: {name} must be at least {low:g}{end}, but is {values[name]!r}."
+                f"{where}: {name} must be at least {low:g}{end}, but is {given[name]!r}."
             )
 
 

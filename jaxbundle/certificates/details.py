@@ -121,25 +121,25 @@ class CertificateDetails:
 NO_DETAILS = CertificateDetails()
 
 
-def read_details(source: Any) -> CertificateDetails:
+def read_details(given: Any) -> CertificateDetails:
     """Details from the path of a TOML file, or its content as a dict.
 
     **Raises:** `InputError` naming file, section and key."""
-    if source is None:
+    if given is None:
         return NO_DETAILS
-    if isinstance(source, CertificateDetails):
-        return source
+    if isinstance(given, CertificateDetails):
+        return given
     where = "details"
-    if isinstance(source, str | Path):
-        where, source = str(source), read_toml(Path(source))
-    if not isinstance(source, Mapping):
-        raise InputError(f"details: expected the path of a TOML file, got {show(source)}")
-    _check_keys(source, ("certificate", "evaluation", "input"), where)
-    fields_stated = _section(source, "certificate", where)
+    if isinstance(given, str | Path):
+        where, given = str(given), read_toml(Path(given))
+    if not isinstance(given, Mapping):
+        raise InputError(f"details: expected the path of a TOML file, got {show(given)}")
+    _check_keys(given, ("certificate", "evaluation", "input"), where)
+    fields_stated = _section(given, "certificate", where)
     _check_keys(fields_stated, FIELDS, f"{where}, [certificate]")
-    evaluation = _section(source, "evaluation", where)
+    evaluation = _section(given, "evaluation", where)
     _check_keys(evaluation, EVALUATION, f"{where}, [evaluation]")
-    inputs = source.get("input", [])
+    inputs = given.get("input", [])
     if not isinstance(inputs, list) or not all(isinstance(entry, Mapping) for entry in inputs):
         raise InputError(f"{where}: expected [[input]] sections")
     return CertificateDetails(

@@ -117,19 +117,19 @@ class CalibratedLengths:
         return len(self.ends)
 
 
-def read_lengths(source: Any) -> CalibratedLengths:
+def read_lengths(given: Any) -> CalibratedLengths:
     """Calibrated lengths from a table with the columns from, to, value, sigma and, if wanted, line:
     the path of a CSV file, a dict of columns, a data frame.
 
     **Raises:** `InputError` naming file and row."""
-    if isinstance(source, CalibratedLengths):
-        return source
+    if isinstance(given, CalibratedLengths):
+        return given
     name = "lengths"
-    if isinstance(source, str | Path):
-        name = str(source)
-        columns = read_csv(Path(source))
+    if isinstance(given, str | Path):
+        name = str(given)
+        columns = read_csv(Path(given))
     else:
-        columns = as_columns(source, name)
+        columns = as_columns(given, name)
     columns.check_names(("from", "to", "value", "sigma"), ("line",))
     value = columns.numbers("value", required=True)
     sigma = columns.numbers("sigma", required=True)

@@ -107,7 +107,7 @@ def omega_phi_kappa_from_matrix(M: Float[AnyArray, "3 3"]) -> Float[Array, "3"]:
 
 @traced_once
 def omega_phi_kappa_near(
-    M: Float[AnyArray, "3 3"], reference: Float[AnyArray, "3"]
+    M: Float[AnyArray, "3 3"], given: Float[AnyArray, "3"]
 ) -> Float[Array, "3"]:
     """(ω, φ, κ) of M in radians, of all its representations the one nearest to the given angles.
 
@@ -117,9 +117,9 @@ def omega_phi_kappa_near(
     # (ω + π, π − φ, κ + π): the same rotation by the other branch of φ.
     second_solution = angles * jnp.array([1.0, -1.0, 1.0]) + jnp.pi
     # Whole turns nearest to the given angles.
-    nearest_turn = lambda a: a + 2 * jnp.pi * jnp.round((reference - a) / (2 * jnp.pi))
+    nearest_turn = lambda a: a + 2 * jnp.pi * jnp.round((given - a) / (2 * jnp.pi))
     angles, second_solution = nearest_turn(angles), nearest_turn(second_solution)
-    distance = lambda a: jnp.sum((a - reference) ** 2)
+    distance = lambda a: jnp.sum((a - given) ** 2)
     return jnp.where(distance(second_solution) < distance(angles), second_solution, angles)
 
 

@@ -36,39 +36,42 @@ def join_views(views: Mapping[str, BoardViews]) -> BoardViews:
     **Arguments:** by the name of the board its views, which are named as their photographs.
 
     **Returns:** views "PHOTOGRAPH:BOARD" in the order of the photographs, `photographs` their
-    photographs; `failed`: the photographs without any board.
+    photographs; `failures`: the photographs without any board.
 
     **Raises:** `InputError` if image sizes differ.
     """
-    sizes = {name: one.image_size for name, one in views.items()}
+    sizes = {name: views_of_board.image_size for name, views_of_board in views.items()}
     if len({*sizes.values()}) > 1:
-        shown = ", ".join(f"{c} × {r} of {name!r}" for name, (c, r) in sizes.items())
+        sizes_in_words = ", ".join(f"{c} × {r} of {name!r}" for name, (c, r) in sizes.items())
         raise InputError(
-            f"views of boards have different image sizes: {shown}; expected photographs of one "
+            f"views of boards have different image sizes: {sizes_in_words}; expected photographs "
+            "of one "
             "camera, all of one size"
         )
-    known = require_boards({name: one.board for name, one in views.items()})
-    boards = BoardSet(tuple(known), tuple(known.values()))
+    known_boards = require_boards(
+        {name: views_of_board.board for name, views_of_board in views.items()}
+    )
+    boards = BoardSet(tuple(known_boards), tuple(known_boards.values()))
     rows, number = [], boards.number
-    for b, one in enumerate(views.values()):
-        for name, xy in zip(one.names, one.xy):
-            whole = np.full((len(number), 2), np.nan)
-            whole[number == b] = xy
-            rows.append((name, b, whole))
+    for b, views_of_board in enumerate(views.values()):
+        for name, xy in zip(views_of_board.names, views_of_board.xy):
+            xy_of_all = np.full((len(number), 2), np.nan)
+            xy_of_all[number == b] = xy
+            rows.append((name, b, xy_of_all))
     rows.sort(key=lambda row: row[0])  # stable: the boards of a photograph in their order
-    seen, failed = {name for name, _, _ in rows}, {}
-    for board, one in views.items():
-        for name, why in one.failed:
-            if name not in seen:
-                failed.setdefault(name, f"{board}: {why}")
+    seen_photographs, failures = {name for name, _, _ in rows}, {}
+    for board, views_of_board in views.items():
+        for name, why in views_of_board.failed:
+            if name not in seen_photographs:
+                failures.setdefault(name, f"{board}: {why}")
     return BoardViews(
         boards,
         tuple(f"{name}:{boards.names[b]}" for name, b, _ in rows),
         next(iter(sizes.values())),
         np.array([xy for _, _, xy in rows]).reshape(-1, len(number), 2),
-        tuple(failed.items()),
-        tuple(warning for one in views.values() for warning in one.warnings),
-        tuple(note for one in views.values() for note in one.notes),
+        tuple(failures.items()),
+        tuple(warning for views_of_board in views.values() for warning in views_of_board.warnings),
+        tuple(note for views_of_board in views.values() for note in views_of_board.notes),
         photographs=tuple(name for name, _, _ in rows),
     )
 
@@ -99,16 +102,18 @@ def measure_board_set(
             progress(SEARCHING, done // len(boards), len(file_of))
 
     # As many at once as of the board whose search takes most memory.
-    at_once = min(searches_at_once([*file_of.values()], one) for one in boards.values())
+    at_once = min(
+        searches_at_once([*file_of.values()], searched_board) for searched_board in boards.values()
+    )
     looks = dict(zip(tasks, map_in_threads(search, tasks, at_once, tell)))
     refuse_sizes({name: look[0] for (name, _), look in looks.items() if not isinstance(look, str)})
     views, missed = {}, []
-    for board, one in boards.items():
-        own = {name: looks[name, board] for name in file_of}
-        if all(isinstance(look, str) for look in own.values()):
+    for board, searched_board in boards.items():
+        looks_of_board = {name: looks[name, board] for name in file_of}
+        if all(isinstance(look, str) for look in looks_of_board.values()):
             missed.append(board)
             continue
-        views[board] = collect_views(file_of, own, one, hints=False)
+        views[board] = collect_views(file_of, looks_of_board, searched_board, hints=False)
     if not views:
         name = next(iter(file_of))
         why = "; ".join(f"{board}: {looks[name, board]}" for board in boards)
@@ -131,4 +136,4 @@ def require_boards(boards: Any) -> dict[str, Board]:
     for name in boards:
         if not isinstance(name, str) or not name or ":" in name:
             raise InputError(f"board {show(name)}: expected a name without a colon")
-    return {name: require_board(one) for name, one in boards.items()}
+    return {name: require_board(board) for name, board in boards.items()}

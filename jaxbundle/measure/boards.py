@@ -78,7 +78,7 @@ class Board:
     def __post_init__(self):
         if not isinstance(self.kind, str) or self.kind not in BOARDS:
             raise InputError(f"kind of board {self.kind!r}{did_you_mean(self.kind, BOARDS)}")
-        least = SMALLEST_SIDE[self.kind]
+        smallest_side = SMALLEST_SIDE[self.kind]
         for name in ("columns", "rows"):
             integer(f"board: {name}", getattr(self, name), least=0)
         # 300 × 300 is more than any camera resolves; more is a slip that would fill the memory.
@@ -86,10 +86,10 @@ class Board:
             raise InputError(
                 f"board {self.columns}x{self.rows}: expected at most 100 000 of its fields"
             )
-        if min(self.columns, self.rows) < least:
+        if min(self.columns, self.rows) < smallest_side:
             raise InputError(
                 f"board {self.columns}x{self.rows}: a {self.kind} board needs at least "
-                f"{least} columns and rows"
+                f"{smallest_side} columns and rows"
             )
         for name in ("square", "diameter", "marker", "row_spacing"):
             value = getattr(self, name)
@@ -138,8 +138,8 @@ class Board:
         """Rows and columns of points."""
         if self.kind == "aprilgrid":
             return 2 * self.rows, 2 * self.columns
-        less = self.kind == "charuco"
-        return self.rows - less, self.columns - less
+        is_charuco = self.kind == "charuco"
+        return self.rows - is_charuco, self.columns - is_charuco
 
     @property
     def grids(self) -> tuple[tuple[int, int], ...]:
@@ -163,12 +163,16 @@ class Board:
         """Coordinates in the object unit, in the order of `ids`."""
         rows, columns = self.grid
         i, j = np.mgrid[0:rows, 0:columns].reshape(2, -1)
-        across, down = self.spacing
+        column_spacing, row_spacing = self.spacing
         if self.marker is not None and self.kind == "aprilgrid":
             place = lambda k, step: k // 2 * step + k % 2 * self.marker
-            return np.stack([place(j, across), place(rows - 1 - i, down), np.zeros(len(i))], 1)
-        along = 2 * j + i % 2 if self.kind == "asymmetric-circles" else j
-        return np.stack([across * along, down * (rows - 1 - i), np.zeros(len(i))], 1)
+            return np.stack(
+                [place(j, column_spacing), place(rows - 1 - i, row_spacing), np.zeros(len(i))], 1
+            )
+        half_columns = 2 * j + i % 2 if self.kind == "asymmetric-circles" else j
+        return np.stack(
+            [column_spacing * half_columns, row_spacing * (rows - 1 - i), np.zeros(len(i))], 1
+        )
 
     @property
     def unique(self) -> bool:
@@ -181,8 +185,8 @@ class Board:
 
     def __str__(self) -> str:
         sides = " × ".join(f"{side:g}" for side in dict.fromkeys(self.spacing))
-        first = f", markers from {self.first_marker}" if self.first_marker else ""
-        return f"{self.kind} {self.columns}x{self.rows}, square {sides}{first}"
+        first_marker_words = f", markers from {self.first_marker}" if self.first_marker else ""
+        return f"{self.kind} {self.columns}x{self.rows}, square {sides}{first_marker_words}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -199,12 +203,12 @@ class BoardSet:
     @property
     def ids(self) -> tuple[str, ...]:
         """Names of the points, "BOARD:row-column"."""
-        return tuple(f"{name}:{id}" for name, one in self.items for id in one.ids)
+        return tuple(f"{name}:{id}" for name, board in self.items for id in board.ids)
 
     @property
     def points(self) -> Float[np.ndarray, "points 3"]:
         """Coordinates in the frame of the own board, object unit, in the order of `ids`."""
-        return np.concatenate([one.points for one in self.boards])
+        return np.concatenate([board.points for board in self.boards])
 
     @property
     def items(self) -> tuple[tuple[str, Board], ...]:
@@ -214,41 +218,43 @@ class BoardSet:
     @property
     def number(self) -> Int[np.ndarray, " points"]:
         """The index of the board of each point."""
-        return np.repeat(np.arange(len(self.boards)), [len(one.ids) for one in self.boards])
+        return np.repeat(np.arange(len(self.boards)), [len(board.ids) for board in self.boards])
 
     @property
     def grids(self) -> tuple[tuple[int, int], ...]:
         """Rows and columns of points of each board."""
-        return tuple(one.grid for one in self.boards)
+        return tuple(board.grid for board in self.boards)
 
     @property
     def diameters(self) -> Float[np.ndarray, " points"]:
         """Diameters of the circles, object unit; 0 for corners and where none is given."""
-        return np.concatenate([one.diameters for one in self.boards])
+        return np.concatenate([board.diameters for board in self.boards])
 
     @property
     def unique(self) -> bool:
         """Whether the points of every board are identified even after a half turn of it."""
-        return all(one.unique for one in self.boards)
+        return all(board.unique for board in self.boards)
 
     def seen(self, visible: Bool[np.ndarray, "views points"]) -> Int[np.ndarray, " views"]:
         """The index of the board of each view."""
         return self.number[visible.argmax(1)]
 
     def __str__(self) -> str:
-        return "; ".join(f"{name}: {one}" for name, one in self.items)
+        return "; ".join(f"{name}: {board}" for name, board in self.items)
 
 
 def find_dictionary(name: str) -> str:
     """The dictionary of markers of this name, in capitals or not.
 
     **Raises:** `InputError` with all names, before any photograph is read."""
-    known = {one.casefold(): one for one in DICTIONARIES}
-    if not isinstance(name, str) or name.casefold() not in known:
+    by_folded_name = {
+        name_of_dictionary.casefold(): name_of_dictionary for name_of_dictionary in DICTIONARIES
+    }
+    if not isinstance(name, str) or name.casefold() not in by_folded_name:
         raise InputError(
             f"there is no dictionary {show(name)} of markers; known: {', '.join(DICTIONARIES)}"
         )
-    return known[name.casefold()]
+    return by_folded_name[name.casefold()]
 
 
 def require_board(board: Board) -> Board:

@@ -120,13 +120,13 @@ def _dictionary_of(name: str, option: str) -> str:
     return find_dictionary(f"DICT_APRILTAG_{option}" if option else APRILTAGS)
 
 
-def _without_repeated(found: Sequence[MeasuredPoint]) -> NamedPoints:
+def _without_repeated(measured_points: Sequence[MeasuredPoint]) -> NamedPoints:
     """Points whose name occurs once: of two, one is a wrong reading, and nothing says which."""
-    names = [name for name, *_ in found]
-    return _named([point for point in found if names.count(point[0]) == 1])
+    names = [name for name, *_ in measured_points]
+    return _as_named_points([point for point in measured_points if names.count(point[0]) == 1])
 
 
-def _named(points: Sequence[MeasuredPoint]) -> NamedPoints:
+def _as_named_points(points: Sequence[MeasuredPoint]) -> NamedPoints:
     return NamedPoints(
         tuple(name for name, *_ in points),
         np.array([xy for _, xy, _ in points], float).reshape(-1, 2),
@@ -144,20 +144,25 @@ def _markers(grey: Grey, dictionary: str, border: int) -> NamedPoints:
         if ids is not None:
             break
     ids = np.zeros(0, int) if ids is None else ids.ravel().astype(int)
-    once = np.bincount(ids, minlength=1)[ids] == 1
-    ids, near = ids[once], np.array([four[0] for four in corners], float).reshape(-1, 4, 2)[once]
+    occurs_once = np.bincount(ids, minlength=1)[ids] == 1
+    ids, corners_found = (
+        ids[occurs_once],
+        np.array([four[0] for four in corners], float).reshape(-1, 4, 2)[occurs_once],
+    )
     if not len(ids):
         return _without_repeated([])
     side = words.markerSize + 2 * border
     draw = lambda id: cv2.aruco.generateImageMarker(words, id, side, borderBits=border) > 0
-    found = fit_marker_corners(grey, near, np.array([draw(id) for id in ids.tolist()]), border)
+    fitted = fit_marker_corners(
+        grey, corners_found, np.array([draw(id) for id in ids.tolist()]), border
+    )
     names = np.array([[f"{id}-{k}" for k in range(1, 5)] for id in ids], dtype=object)
-    good = found.why == ""
+    good = fitted.why == ""
     return NamedPoints(
         tuple(names[good]),
-        found.xy[good],
-        found.covariance[good],
-        tuple(zip(names[~good], found.why[~good])),
+        fitted.xy[good],
+        fitted.covariance[good],
+        tuple(zip(names[~good], fitted.why[~good])),
     )
 
 
@@ -187,15 +192,15 @@ def _rings(
     grey: Grey, bits: int, numbered: bool, settings: RingSettings, uncoded: bool
 ) -> NamedPoints:
     """Ring-coded targets, light on dark or dark on light."""
-    for shown in (grey, 255 - grey):
-        found = find_ring_targets(shown, bits, settings, numbered)
-        if found:
+    for picture in (grey, 255 - grey):
+        targets = find_ring_targets(picture, bits, settings, numbered)
+        if targets:
             break
     else:
-        shown = grey
-    points = _without_repeated([(id, t.xy, t.covariance) for id, t in found])
+        picture = grey
+    points = _without_repeated([(id, t.xy, t.covariance) for id, t in targets])
     if not uncoded:
         return points
-    discs = find_plain_discs(shown, [t for _, t in found], settings)
-    plain = _named([("", t.xy, t.covariance) for t in discs])
+    discs = find_plain_discs(picture, [t for _, t in targets], settings)
+    plain = _as_named_points([("", t.xy, t.covariance) for t in discs])
     return dataclasses.replace(points, uncoded=plain)

@@ -81,10 +81,10 @@ def memory_of_search(rows: int, columns: int, kind: str) -> float:
 def _is_in_small(cv2: ModuleType, grey: Grey, board: Board) -> bool:
     """Whether a chessboard is in a small copy of a photograph: much faster than a full search."""
     small, _ = _reduce(cv2, grey, QUICK_SIDE)
-    found, _ = cv2.findChessboardCornersSB(
+    is_found, _ = cv2.findChessboardCornersSB(
         small, (board.columns, board.rows), flags=cv2.CALIB_CB_NORMALIZE_IMAGE
     )
-    return found
+    return is_found
 
 
 def other_sizes(grey: Grey, board: Board) -> Board | None:
@@ -95,19 +95,21 @@ def other_sizes(grey: Grey, board: Board) -> Board | None:
     or of another dictionary.
     """
     if board.kind == "chessboard":
-        other = largest_chessboard(grey, board)
-        return None if other == board else other
+        other_board = largest_chessboard(grey, board)
+        return None if other_board == board else other_board
     if board.kind in ("charuco", "aprilgrid"):
         return board_of_markers(grey, board)
     m, n = board.columns, board.rows
-    near = [(n, m)] + [(m + i, n + j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
+    similar_sizes = [(n, m)] + [
+        (m + i, n + j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)
+    ]
     grey, _ = _reduce(need_opencv(), grey, QUICK_SIDE)
     # A part of a board is a board too: the largest is searched first.
-    for columns, rows in sorted(near, key=lambda size: -size[0] * size[1]):
+    for columns, rows in sorted(similar_sizes, key=lambda size: -size[0] * size[1]):
         try:
-            other = dataclasses.replace(board, columns=columns, rows=rows)
-            find_board(grey, other)
-            return other
+            other_board = dataclasses.replace(board, columns=columns, rows=rows)
+            find_board(grey, other_board)
+            return other_board
         except InputError:
             continue
     return None
@@ -119,13 +121,15 @@ def largest_chessboard(grey: Grey, board: Board) -> Board | None:
     for a small board."""
     cv2 = need_opencv()
     grey, _ = _reduce(cv2, grey, QUICK_SIDE)
-    least = SMALLEST_SIDE["chessboard"]
+    smallest_side = SMALLEST_SIDE["chessboard"]
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
     try:
-        found, xy, grid = cv2.findChessboardCornersSBWithMeta(grey, (least, least), flags)
+        is_found, xy, grid = cv2.findChessboardCornersSBWithMeta(
+            grey, (smallest_side, smallest_side), flags
+        )
     except cv2.error:
         return None
-    if not found or not is_chessboard(cv2, grey, xy.reshape(*grid.shape[:2], 2).astype(float)):
+    if not is_found or not is_chessboard(cv2, grey, xy.reshape(*grid.shape[:2], 2).astype(float)):
         return None
     rows, columns = sorted(grid.shape[:2])
     if board.columns < board.rows:
@@ -166,13 +170,22 @@ def is_chessboard(
     plane = np.stack(np.meshgrid(np.arange(3.0), np.arange(3.0)), -1).reshape(-1, 2)
     misfit = 0.0
     for i, j in np.ndindex(len(xy) - 2, len(xy[0]) - 2):
-        near = xy[i : i + 3, j : j + 3].reshape(-1, 2)
-        H, _ = cv2.findHomography(plane, near)
+        nine_corners = xy[i : i + 3, j : j + 3].reshape(-1, 2)
+        H, _ = cv2.findHomography(plane, nine_corners)
         if H is None:
             return False
-        away = cv2.perspectiveTransform(plane[None], H)[0] - near
-        step = np.sqrt(abs(np.linalg.det([near[2] - near[0], near[6] - near[0]]))) / 2
-        misfit = max(misfit, np.sqrt(np.mean(np.sum(away**2, 1))) / max(step, 1.0))
+        difference = cv2.perspectiveTransform(plane[None], H)[0] - nine_corners
+        step = (
+            np.sqrt(
+                abs(
+                    np.linalg.det(
+                        [nine_corners[2] - nine_corners[0], nine_corners[6] - nine_corners[0]]
+                    )
+                )
+            )
+            / 2
+        )
+        misfit = max(misfit, np.sqrt(np.mean(np.sum(difference**2, 1))) / max(step, 1.0))
     return misfit <= min(misfit_of_four * shade.size / 4, largest_misfit)
 
 
@@ -182,11 +195,11 @@ def _chessboard(cv2: ModuleType, grey: Grey, board: Board) -> BoardPoints:
     def seek(grey: Grey) -> Any:
         # The detector of Duda and Frese (2018) first, the older one where it finds nothing.
         flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
-        found, xy = cv2.findChessboardCornersSB(grey, size, flags=flags)
-        if not found:
+        is_found, xy = cv2.findChessboardCornersSB(grey, size, flags=flags)
+        if not is_found:
             flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-            found, xy = cv2.findChessboardCorners(grey, size, flags=flags)
-        return xy if found else None
+            is_found, xy = cv2.findChessboardCorners(grey, size, flags=flags)
+        return xy if is_found else None
 
     xy = _in_copies(cv2, grey, seek)
     if xy is None:
@@ -224,8 +237,8 @@ def _reduce(cv2: ModuleType, grey: Grey, side: int) -> tuple[Grey, int]:
 
 def _turn_upright(xy: Grid) -> Grid:
     """Rows from the top, each from the left: not mirrored, the first row at the top."""
-    right, down = xy[:, -1] - xy[:, 0], xy[-1] - xy[0]
-    if np.linalg.det([right.sum(0), down.sum(0)]) < 0:
+    row_direction, column_direction = xy[:, -1] - xy[:, 0], xy[-1] - xy[0]
+    if np.linalg.det([row_direction.sum(0), column_direction.sum(0)]) < 0:
         xy = xy[:, ::-1]
     (x, y), (u, v) = xy[0, 0], xy[-1, -1]
     return xy if (y, x) <= (v, u) else xy[::-1, ::-1]
@@ -247,14 +260,14 @@ def _contrast(grey: Grey, xy: Grid) -> float:
     column, row = np.rint(middle).astype(int).reshape(-1, 2).T
     shade = grey[row, column].astype(float).reshape(middle.shape[:2])
     i, j = np.indices(shade.shape)
-    first = (i + j) % 2 == 0
-    return np.sign(shade[~first].mean() - shade[first].mean())
+    is_first_colour = (i + j) % 2 == 0
+    return np.sign(shade[~is_first_colour].mean() - shade[is_first_colour].mean())
 
 
 def _charuco(cv2: ModuleType, grey: Grey, board: Board) -> BoardPoints:
     aruco, dictionary = cv2.aruco, get_dictionary(board.dictionary)
     marker = board.marker_side
-    best, seen = None, {}
+    best, markers_seen = None, {}
     numbers = np.arange(board.first_marker, board.first_marker + board.markers)
     if numbers[-1] >= len(dictionary.bytesList):
         raise InputError(
@@ -263,13 +276,13 @@ def _charuco(cv2: ModuleType, grey: Grey, board: Board) -> BoardPoints:
     # OpenCV before 4.6 began boards of an even number of rows with a white square
     for legacy in (False, True):
         size = (board.columns, board.rows)
-        known = aruco.CharucoBoard(size, min(board.spacing), marker, dictionary, numbers)
-        known.setLegacyPattern(legacy)
+        known_board = aruco.CharucoBoard(size, min(board.spacing), marker, dictionary, numbers)
+        known_board.setLegacyPattern(legacy)
         # Markers are searched once: they take the time.
-        xy, ids, *markers = aruco.CharucoDetector(known).detectBoard(grey, **seen)
+        xy, ids, *markers = aruco.CharucoDetector(known_board).detectBoard(grey, **markers_seen)
         if markers[1] is None:
             break
-        seen = dict(zip(("markerCorners", "markerIds"), markers))
+        markers_seen = dict(zip(("markerCorners", "markerIds"), markers))
         if ids is not None and (best is None or len(ids) > len(best[1])):
             best = xy.reshape(-1, 2), ids.ravel()
     if best is None or len(best[1]) < 4:
@@ -305,10 +318,10 @@ def _strips(
     normal /= np.linalg.norm(normal, axis=2)[..., None]
     strips, rows = np.empty((len(X), 2, 2, 2)), np.arange(len(X))
     for right in (-1, 1):
-        for up in (-1, 1):
-            away = np.einsum("ni,nki->nk", image(X + width * [right, up]) - image(X), normal)
-            first, second = (away > 0).astype(int).T
-            strips[rows, first, second] = np.abs(away)
+        for side in (-1, 1):
+            distance = np.einsum("ni,nki->nk", image(X + width * [right, side]) - image(X), normal)
+            is_beyond_first, is_beyond_second = (distance > 0).astype(int).T
+            strips[rows, is_beyond_first, is_beyond_second] = np.abs(distance)
     return strips
 
 
@@ -320,9 +333,11 @@ def _circles(cv2: ModuleType, grey: Grey, board: Board) -> BoardPoints:
     def seek(grey: Grey) -> Any:
         for shade in (0, 255):
             finder = _blob_finder(cv2, grey, shade)
-            for more in (0, cv2.CALIB_CB_CLUSTERING):
-                found, xy = cv2.findCirclesGrid(grey, size, flags=flags | more, blobDetector=finder)
-                if found:
+            for further_flags in (0, cv2.CALIB_CB_CLUSTERING):
+                is_found, xy = cv2.findCirclesGrid(
+                    grey, size, flags=flags | further_flags, blobDetector=finder
+                )
+                if is_found:
                     return xy
         return None
 
@@ -347,25 +362,28 @@ def _circles(cv2: ModuleType, grey: Grey, board: Board) -> BoardPoints:
 
 def _blob_finder(cv2: ModuleType, grey: Grey, shade: int) -> Any:
     """Round blobs of any size in the image; the limit of OpenCV is 5000 pixels."""
-    wanted = cv2.SimpleBlobDetector_Params()
-    wanted.blobColor = shade
+    parameters = cv2.SimpleBlobDetector_Params()
+    parameters.blobColor = shade
     # Of 4 pixels across to an eighth of the image, a board of 3 × 3; ellipses of circles seen
     # obliquely, far from round; not the background between them, which is not convex.
-    wanted.minArea, wanted.maxArea = 15, grey.size / 8
-    wanted.minDistBetweenBlobs = 4
-    wanted.filterByInertia, wanted.minInertiaRatio = True, 0.05
-    wanted.filterByConvexity, wanted.minConvexity = True, 0.85
-    return cv2.SimpleBlobDetector_create(wanted)
+    parameters.minArea, parameters.maxArea = 15, grey.size / 8
+    parameters.minDistBetweenBlobs = 4
+    parameters.filterByInertia, parameters.minInertiaRatio = True, 0.05
+    parameters.filterByConvexity, parameters.minConvexity = True, 0.85
+    return cv2.SimpleBlobDetector_create(parameters)
 
 
 def _number_asymmetric(xy: Grid) -> Grid:
     """The numbering with the second row shifted to the right, not mirrored."""
 
     def fits(xy: Grid) -> bool:
-        right, down = xy[0, -1] - xy[0, 0], xy[-1] - xy[0]
+        row_direction, column_direction = xy[0, -1] - xy[0, 0], xy[-1] - xy[0]
         shift = (xy[1] - xy[0]).mean(0)
         straight = (xy[2] - xy[0]).mean(0) / 2 if len(xy) > 2 else 0 * shift
-        return np.linalg.det([right, down.mean(0)]) > 0 and (shift - straight) @ right > 0
+        return (
+            np.linalg.det([row_direction, column_direction.mean(0)]) > 0
+            and (shift - straight) @ row_direction > 0
+        )
 
     turns = [xy, xy[::-1, ::-1], xy[::-1], xy[:, ::-1]]
     good = [turned for turned in turns if fits(turned)]

@@ -61,8 +61,8 @@ def fit_ellipse(
     S1, S2, S3 = (
         a.T @ (p[:, None] * b) for a, b in ((square, square), (square, linear), (linear, linear))
     )
-    back = -jnp.linalg.solve(S3, S2.T)
-    T = S1 + S2 @ back
+    linear_from_quadratic = -jnp.linalg.solve(S3, S2.T)
+    T = S1 + S2 @ linear_from_quadratic
     # Points exactly on an ellipse leave T singular: rounding, some hundred ε, is added.
     T = T + 1e-13 * jnp.trace(S1) * jnp.eye(3)
     L = jnp.linalg.cholesky(T)
@@ -70,7 +70,7 @@ def fit_ellipse(
     constraint = jnp.array([[0, 0, 2.0], [0, -1, 0], [2, 0, 0]])
     M = inverse @ constraint @ inverse.T
     a = inverse.T @ jnp.linalg.eigh((M + M.T) / 2)[1][:, -1]
-    conic = jnp.concatenate([a, back @ a])
+    conic = jnp.concatenate([a, linear_from_quadratic @ a])
     conic = conic / jnp.linalg.norm(conic)
     conic = conic * jnp.sign(conic[0])
 

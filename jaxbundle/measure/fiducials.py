@@ -153,8 +153,8 @@ def _fit(
 
     # Linear ones end with the first step; the projective one starts from it.
     if kind == "projective":
-        first = affine.fit(source, target, p)
-        start = jnp.concatenate([first, jnp.zeros(2)])
+        affine_start = affine.fit(source, target, p)
+        start = jnp.concatenate([affine_start, jnp.zeros(2)])
     return adjust(residuals, jnp.add, start, (source, target, root), unknowns)
 
 

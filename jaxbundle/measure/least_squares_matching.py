@@ -155,13 +155,13 @@ def match_least_squares(
     textured = contrast > settings.min_contrast * jnp.max(jnp.abs(template))
     unit = jnp.where(textured, contrast, 1)
     grey = ((template - mean) / unit).ravel()
-    other = spline_coefficients((image.astype(dtype) - mean) / unit)
+    other_coefficients = spline_coefficients((image.astype(dtype) - mean) / unit)
     offset = jnp.arange(n, dtype=dtype) - n // 2
     y, x = (a.ravel() for a in jnp.meshgrid(offset, offset, indexing="ij"))
     # Unknowns scaled by their effect at the edge of the window.
     size = jnp.asarray([n // 2, n // 2, 1, n // 2, n // 2, 1, 1, 1], dtype)
-    computed = lambda p: jax.vmap(_compute, (None, None, 0, 0))(p / size, other, x, y)
-    p = size * _with_radiometry(start, other, x, y)
+    computed = lambda p: jax.vmap(_compute, (None, None, 0, 0))(p / size, other_coefficients, x, y)
+    p = size * _with_radiometry(start, other_coefficients, x, y)
     p, N, square, moving = _minimise(computed, grey, p, steps, settings)
     Q, determined = _inverse(N, settings.min_pivot)
     contrast2 = (p[7] / size[7]) ** 2
@@ -171,22 +171,22 @@ def match_least_squares(
         variance = square / (n * n - jnp.trace(Q @ M))
         N = N - variance * _expect_noise(contrast2, size, x, y, blur)
         Q, real = _inverse(N, settings.min_pivot)
-        determined, C, drawn = determined & real, variance * Q @ M @ Q, 0
+        determined, C, pulled = determined & real, variance * Q @ M @ Q, 0
     else:
         variance = square / (n * n - UNKNOWNS)
-        C, drawn = _white_noise(p, Q, determined, variance, contrast2, (size, x, y))
+        C, pulled = _white_noise(p, Q, determined, variance, contrast2, (size, x, y))
         if reach:
             J, v = jax.jacfwd(computed)(p), computed(p) - grey
             p, C = _bend(p, J, v, variance, bend, x, y, reach, settings.min_pivot)
-    p = (p + drawn) / size
-    known = textured & determined & (p[7] > 0)
+    p = (p + pulled) / size
+    is_determined = textured & determined & (p[7] > 0)
     return LeastSquaresMatch(
         affine=p[:6].reshape(2, 3),
         radiometry=jnp.stack([mean + unit * p[6] - p[7] * mean, p[7]]),
-        covariance=jnp.where(known, C[2:6:3, 2:6:3], jnp.inf),
+        covariance=jnp.where(is_determined, C[2:6:3, 2:6:3], jnp.inf),
         sigma0=unit * jnp.sqrt(variance),
         correlation=jnp.sqrt(jnp.maximum(1 - square / n**2, 0)),
-        status=_status(p, start, image.shape, n, textured, known, moving, settings),
+        status=_status(p, start, image.shape, n, textured, is_determined, moving, settings),
     )
 
 
@@ -196,7 +196,7 @@ def _status(
     shape: tuple[int, ...],
     n: int,
     textured: Bool[Array, ""],
-    known: Bool[Array, ""],
+    is_determined: Bool[Array, ""],
     moving: Bool[Array, ""],
     settings: LeastSquaresSettings,
 ) -> Int[Array, ""]:
@@ -206,17 +206,17 @@ def _status(
     h = n // 2
     corners = jnp.asarray([[-h, h, h, -h], [-h, -h, h, h], [1, 1, 1, 1]], affine.dtype)
     reach = jnp.max(jnp.abs(affine @ corners - middle[:, None]), 1)
-    away = jnp.linalg.norm(affine[:, 2] - start[:, 2])
+    shift = jnp.linalg.norm(affine[:, 2] - start[:, 2])
     area = jnp.linalg.det(affine[:, :2]) / jnp.linalg.det(start[:, :2])
     reasons = (
         (~textured, MatchingStatus.NO_TEXTURE),
         (jnp.any(reach > middle), MatchingStatus.OUTSIDE),
         (
             # So written that NaN counts, too.
-            ~((away < settings.max_shift * n) & (area > settings.min_scale)),
+            ~((shift < settings.max_shift * n) & (area > settings.min_scale)),
             MatchingStatus.DIVERGED,
         ),
-        (~known, MatchingStatus.NO_TEXTURE),
+        (~is_determined, MatchingStatus.NO_TEXTURE),
         (moving, MatchingStatus.NOT_CONVERGED),
     )
     return jnp.select(
@@ -231,8 +231,8 @@ def spline_coefficients(
 ) -> Float[Array, "rows+2 columns+2"]:
     """Coefficients of the cubic spline through the pixels of an image, without curvature at its
     edge (the natural spline): from one before the first pixel to one after the last."""
-    down, along = (jnp.asarray(_prefilter(n), image.dtype) for n in image.shape)
-    return down @ image @ along.T
+    filter_rows, filter_columns = (jnp.asarray(_prefilter(n), image.dtype) for n in image.shape)
+    return filter_rows @ image @ filter_columns.T
 
 
 def grey_value(
@@ -244,11 +244,11 @@ def grey_value(
     # From the pixel before: the first coefficient is before the first pixel.
     row = [jnp.clip(i.astype(int) + k, 0, rows - 1) for k in (0, 1, 2, 3)]
     column = [jnp.clip(j.astype(int) + k, 0, columns - 1) for k in (0, 1, 2, 3)]
-    down, along = _spline_weights(v - i), _spline_weights(u - j)
+    row_weights, column_weights = _spline_weights(v - i), _spline_weights(u - j)
     # Sums written out: one loop over the window, whereas small products are one call each.
     nil = jnp.zeros((), coefficients.dtype)
-    line = lambda r: sum((b * coefficients[r, c] for b, c in zip(along, column)), nil)
-    return sum((a * line(r) for a, r in zip(down, row)), nil)
+    line = lambda r: sum((b * coefficients[r, c] for b, c in zip(column_weights, column)), nil)
+    return sum((a * line(r) for a, r in zip(row_weights, row)), nil)
 
 
 def _spline_weights(t: Scalar) -> tuple[Scalar, Scalar, Scalar, Scalar]:
@@ -299,10 +299,10 @@ def _bend(
     """The unknowns after a step that includes terms of second order, observed as 0 ± `bend`, and
     their covariance from correlated residuals."""
     x, y = x / jnp.max(x), y / jnp.max(y)
-    second = [J[:, k] * term for k in (2, 5) for term in (x * x, x * y, y * y)]
+    second_order = [J[:, k] * term for k in (2, 5) for term in (x * x, x * y, y * y)]
     # As unknowns in units of their σ: columns of 0 if `bend` is 0, which change nothing.
-    J = jnp.column_stack([J, *(bend * column for column in second)])
-    weight = jnp.diag(variance * np.repeat([0, 1], [UNKNOWNS, len(second)]).astype(J.dtype))
+    J = jnp.column_stack([J, *(bend * column for column in second_order)])
+    weight = jnp.diag(variance * np.repeat([0, 1], [UNKNOWNS, len(second_order)]).astype(J.dtype))
     Q, _ = _inverse(J.T @ J + weight, min_pivot)
     step = Q @ (J.T @ v)
     g, n = J * (v - J @ step)[:, None], round(len(v) ** 0.5)
@@ -318,16 +318,16 @@ def _sum_over_pairs(
     products a pixel instead of n²."""
     k = np.arange(n)
     weight = jnp.asarray(K(k[:, None] - k), g.dtype)
-    near = jnp.einsum("ab,cd,bdp->acp", weight, weight, g.reshape(n, n, -1))
-    return g.T @ near.reshape(g.shape)
+    smoothed = jnp.einsum("ab,cd,bdp->acp", weight, weight, g.reshape(n, n, -1))
+    return g.T @ smoothed.reshape(g.shape)
 
 
 def _expect_noise(contrast2: Scalar, size: Unknowns, x: Pixels, y: Pixels, blur: float) -> Normal:
     """E JₙᵀJₙ for residuals of variance 1, for the share of the other image."""
-    one, nil = jnp.ones_like(x), jnp.zeros_like(x)
+    ones, nil = jnp.ones_like(x), jnp.zeros_like(x)
     slope = jnp.sqrt(contrast2 / (1 + contrast2) / (2 * blur**2))
-    u = jnp.stack([x, y, one, nil, nil, nil, nil, nil], 1) / size * slope
-    v = jnp.stack([nil, nil, nil, x, y, one, nil, nil], 1) / size * slope
+    u = jnp.stack([x, y, ones, nil, nil, nil, nil, nil], 1) / size * slope
+    v = jnp.stack([nil, nil, nil, x, y, ones, nil, nil], 1) / size * slope
     contrast = jnp.zeros((UNKNOWNS, UNKNOWNS), x.dtype).at[7, 7].set(len(x) / (1 + contrast2))
     return u.T @ u + v.T @ v + contrast
 
@@ -353,8 +353,8 @@ def _white_noise(
 
     remaining, pull = jax.value_and_grad(interpolated_noise)(p)
     noise = variance / (1 + contrast2 * remaining / (len(x) / 2))
-    drawn = contrast2 * noise * jnp.where(determined, Q @ pull, 0)
-    return noise * (1 + contrast2) * Q, drawn
+    pulled = contrast2 * noise * jnp.where(determined, Q @ pull, 0)
+    return noise * (1 + contrast2) * Q, pulled
 
 
 def _compute(
@@ -370,8 +370,10 @@ def _with_radiometry(
     """The eight unknowns: A, and h0, h1 from the mean and the variance of the covered pixels."""
     u, v = start @ jnp.stack([x, y, jnp.ones_like(x)])
     covered = jax.vmap(grey_value, (None, 0, 0))(image, u, v)
-    spread = jnp.std(covered)
-    h1 = jnp.where(spread > 0, 1 / jnp.where(spread > 0, spread, 1), 1)
+    standard_deviation = jnp.std(covered)
+    h1 = jnp.where(
+        standard_deviation > 0, 1 / jnp.where(standard_deviation > 0, standard_deviation, 1), 1
+    )
     return jnp.concatenate([start.ravel(), jnp.stack([-h1 * jnp.mean(covered), h1])])
 
 
@@ -407,11 +409,11 @@ def _minimise(
         N1, g1, square1 = normal_equations(p + step)
         better = square1 <= square
         new = (p + step, N1, g1, square1)
-        accepted = [jnp.where(better & moving, a, b) for a, b in zip(new, (p, N, g, square))]
-        still = jnp.max(jnp.abs(step[:6])) < settings.last_step
+        accepted_values = [jnp.where(better & moving, a, b) for a, b in zip(new, (p, N, g, square))]
+        is_still = jnp.max(jnp.abs(step[:6])) < settings.last_step
         rate = jnp.where(better, 0.1, 10.0).astype(damping.dtype)
         damping = jnp.maximum(damping * rate, settings.min_damping)
-        return count + 1, *accepted, damping, moving & ~still
+        return count + 1, *accepted_values, damping, moving & ~is_still
 
     damping = jnp.asarray(settings.damping, begin.dtype)
     start = (0, begin, *normal_equations(begin), damping, jnp.asarray(True))
@@ -428,8 +430,8 @@ def _inverse(
     scale = 1 / jnp.sqrt(jnp.diag(N) + 1e-20)
     scaled = N * scale * scale[:, None]
     factor = cho_factor(scaled)
-    least = jnp.min(jnp.diag(factor[0]) ** 2)
-    determined = jnp.isfinite(least) & (least > min_pivot)
+    smallest_pivot = jnp.min(jnp.diag(factor[0]) ** 2)
+    determined = jnp.isfinite(smallest_pivot) & (smallest_pivot > min_pivot)
     eye = jnp.eye(len(N), dtype=N.dtype)
     safe = jnp.where(determined, scaled, eye)
     return cho_solve(cho_factor(safe), eye) * scale * scale[:, None], determined

@@ -37,78 +37,92 @@ def board_of_markers(grey: Grey, board: Board) -> Board | None:
     """The board of the markers in a photograph: the given one with another number of columns and
     rows, another first marker, or another dictionary; None: not told by them, or no other."""
     for image in (grey, 255 - grey):
-        seen = _see_markers(image, board)
-        if len(seen.number) >= MIN_MARKERS:
-            other = _of_numbers(seen, board)
-            return None if other is None or _is_part(other, board) else other
+        markers_seen = _see_markers(image, board)
+        if len(markers_seen.number) >= MIN_MARKERS:
+            other_board = _of_numbers(markers_seen, board)
+            return None if other_board is None or _is_part(other_board, board) else other_board
         name = _other_dictionary(image, board)
         if name is not None:
-            other = dataclasses.replace(board, dictionary=name)
-            return _of_numbers(_see_markers(image, other), other) or other
+            other_board = dataclasses.replace(board, dictionary=name)
+            return _of_numbers(_see_markers(image, other_board), other_board) or other_board
     return None
 
 
 def _see_markers(grey: Grey, board: Board) -> SeenMarkers:
     """The markers of the board's dictionary in a photograph."""
     borders = BORDER_BITS if board.kind == "aprilgrid" else (1,)
-    found = (read_markers(grey, board.dictionary, bits) for bits in borders)
-    numbers, corners = max(found, key=lambda seen: len(seen[0]))
+    markers_by_border = (read_markers(grey, board.dictionary, bits) for bits in borders)
+    numbers, corners = max(
+        markers_by_border, key=lambda numbers_and_corners: len(numbers_and_corners[0])
+    )
     size = np.linalg.norm(corners[:, 0] - corners[:, 2], axis=1) / 2
     return SeenMarkers(numbers, corners.mean(1), size)
 
 
-def _is_part(other: Board, board: Board) -> bool:
+def _is_part(other_board: Board, board: Board) -> bool:
     """Whether the other board differs in nothing but rows that may not be seen."""
-    return dataclasses.replace(other, rows=board.rows) == board and other.rows <= board.rows
+    return (
+        dataclasses.replace(other_board, rows=board.rows) == board
+        and other_board.rows <= board.rows
+    )
 
 
 def _other_dictionary(grey: Grey, board: Board) -> str | None:
     """The dictionary of most markers in the photograph; of several with the same markers the
     smallest."""
     aruco = need_opencv().aruco
-    known = {name: get_dictionary(name) for name in sorted(DICTIONARIES) if hasattr(aruco, name)}
-    best, most = None, 3  # up to three markers may be false readings of another dictionary
-    for name, dictionary in sorted(known.items(), key=lambda item: len(item[1].bytesList)):
+    dictionaries = {
+        name: get_dictionary(name) for name in sorted(DICTIONARIES) if hasattr(aruco, name)
+    }
+    best, largest_number = (
+        None,
+        3,
+    )  # up to three markers may be false readings of another dictionary
+    for name, dictionary in sorted(dictionaries.items(), key=lambda item: len(item[1].bytesList)):
         if name == board.dictionary or len(dictionary.bytesList) < board.markers:
             continue
         numbers = _see_markers(grey, dataclasses.replace(board, dictionary=name)).number
         number = int((numbers < board.markers).sum())
-        if number > most:
-            best, most = name, number
+        if number > largest_number:
+            best, largest_number = name, number
     return best
 
 
-def _of_numbers(seen: SeenMarkers, board: Board) -> Board | None:
+def _of_numbers(markers_seen: SeenMarkers, board: Board) -> Board | None:
     """The board whose numbering puts the markers seen into a plane grid; None: none, or several."""
-    if len(seen.number) < MIN_MARKERS:
+    if len(markers_seen.number) < MIN_MARKERS:
         return None
-    for first in _first_numbers(seen, board):
+    for first_number in _first_numbers(markers_seen, board):
         fits = {
-            columns: max(_fits(seen, board.kind, seen.number - first, columns))
+            columns: max(
+                _fits(markers_seen, board.kind, markers_seen.number - first_number, columns)
+            )
             for columns in range(SMALLEST_SIDE[board.kind], MAX_COLUMNS)
         }
-        most = max(agreeing for agreeing, _ in fits.values())
-        best = [columns for columns, (agreeing, _) in fits.items() if agreeing == most]
+        largest_number = max(agreeing for agreeing, _ in fits.values())
+        best = [columns for columns, (agreeing, _) in fits.items() if agreeing == largest_number]
         # Wrongly read numbers are rare: the codes of a dictionary differ in several bits.
-        if most >= max(MIN_MARKERS, 0.9 * len(seen.number)) and len(best) == 1:
+        if largest_number >= max(MIN_MARKERS, 0.9 * len(markers_seen.number)) and len(best) == 1:
             rows = max(fits[best[0]][1], SMALLEST_SIDE[board.kind])
-            return dataclasses.replace(board, columns=best[0], rows=rows, first_marker=first)
+            return dataclasses.replace(board, columns=best[0], rows=rows, first_marker=first_number)
     return None
 
 
-def _first_numbers(seen: SeenMarkers, board: Board) -> Iterator[int]:
+def _first_numbers(markers_seen: SeenMarkers, board: Board) -> Iterator[int]:
     """First numbers to try: the given one, 0, and the ends of the numbers seen."""
-    least = int(seen.number.min())
-    yield from dict.fromkeys(n for n in (board.first_marker, 0, least) if n <= least)
+    smallest_number = int(markers_seen.number.min())
+    yield from dict.fromkeys(
+        n for n in (board.first_marker, 0, smallest_number) if n <= smallest_number
+    )
 
 
 def _fits(
-    seen: SeenMarkers, kind: str, k: Int[np.ndarray, " n"], columns: int
+    markers_seen: SeenMarkers, kind: str, k: Int[np.ndarray, " n"], columns: int
 ) -> Iterator[tuple[int, int]]:
     """How many markers a board of `columns` columns explains, and its least number of rows, for
     each numbering there is; `k` counts the markers from the first."""
     for place in _places(kind, k, columns):
-        yield int(_agree(seen, place).sum()), int(place[:, 1].max()) + 1
+        yield int(_agree(markers_seen, place).sum()), int(place[:, 1].max()) + 1
 
 
 def _places(
@@ -122,20 +136,26 @@ def _places(
     # boards of an even number of rows. Two rows of squares have as many markers as columns.
     for shift in (1, 0):
         in_first_row = len(range(shift, columns, 2))
-        pair, rest = np.divmod(k, columns)
-        second = rest >= in_first_row
-        along = np.where(second, 2 * (rest - in_first_row) + 1 - shift, 2 * rest + shift)
-        yield np.stack([along, 2 * pair + second], 1).astype(float)
+        pair, number_in_pair = np.divmod(k, columns)
+        is_second_row = number_in_pair >= in_first_row
+        column = np.where(
+            is_second_row,
+            2 * (number_in_pair - in_first_row) + 1 - shift,
+            2 * number_in_pair + shift,
+        )
+        yield np.stack([column, 2 * pair + is_second_row], 1).astype(float)
 
 
-def _agree(seen: SeenMarkers, place: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
+def _agree(markers_seen: SeenMarkers, place: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
     """Which markers are where a homography of the numbered places puts them."""
     cv2, nobody = need_opencv(), np.zeros(len(place), bool)
     if np.linalg.matrix_rank(place - place.mean(0)) < 2:
         return nobody
-    H, _ = cv2.findHomography(place, seen.middle, cv2.RANSAC, float(np.median(seen.size)))
+    H, _ = cv2.findHomography(
+        place, markers_seen.middle, cv2.RANSAC, float(np.median(markers_seen.size))
+    )
     if H is None:
         return nobody
-    there = cv2.perspectiveTransform(place[None], H)[0]
+    expected = cv2.perspectiveTransform(place[None], H)[0]
     # Half a diagonal of a marker: distortion bends a board less, and the next place is further.
-    return np.linalg.norm(there - seen.middle, axis=1) < seen.size
+    return np.linalg.norm(expected - markers_seen.middle, axis=1) < markers_seen.size

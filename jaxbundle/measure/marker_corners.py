@@ -88,41 +88,44 @@ class _Fitting:
 
 def fit_marker_corners(
     grey: Grey,
-    near: Quadrilaterals,
+    approximate: Quadrilaterals,
     cells: Float[np.ndarray, "markers cells cells"] | Bool[np.ndarray, "markers cells cells"],
     border: int,
     settings: MarkerSettings | None = None,
 ) -> MarkerCorners:
     """The corners of markers found in a photograph.
 
-    **Arguments:** `near`: the corners to a few pixels, clockwise from the upper left one of the
-    marker; `cells`: 1 for light and 0 for dark cells of the marker, with its `border`, their
-    number.
-    """
+    **Arguments:** `approximate`: the corners to a few pixels, clockwise from the upper left one of
+    the marker; `cells`: 1 for light and 0 for dark cells of the marker, with its `border`, their
+    number."""
     settings = settings or MarkerSettings()
     fitting = _Fitting(grey, border, settings.curvature / max(grey.shape), settings)
-    number = len(near)
-    xy = np.asarray(near, float)
+    number = len(approximate)
+    xy = np.asarray(approximate, float)
     blur = np.full((number, 4), settings.edges.blur_in_focus)
     # First from the detected corners, a few pixels off, then from the ones of the first fit.
     for coarse in (True, False):
         edges, fits, xy, covariance = _fit_sides(fitting, xy, cells, blur, coarse)
         # One lens, one distance: τ of a marker is the median over its sides.
-        own = fits.blur.reshape(-1, 4)
-        before, blur = blur, np.repeat(np.median(own, axis=1), 4).reshape(own.shape)
-        lost = ~_is_near(xy, near)
-        xy[lost] = near[lost]
+        own_blur = fits.blur.reshape(-1, 4)
+        blur_before, blur = blur, np.repeat(np.median(own_blur, axis=1), 4).reshape(own_blur.shape)
+        is_lost = ~_is_near(xy, approximate)
+        xy[is_lost] = approximate[is_lost]
     # Where the cells are narrow, or the blur was not the expected one, once more from there.
     strip = np.minimum(edges.inner, edges.outer).min(1).reshape(number, 4)
-    again = ((np.abs(np.log(blur / before)) > 0.2) | (strip < settings.wide_strip * blur)).any(1)
-    if again.any():
-        sides = np.repeat(again, 4)
-        parts = _fit_sides(fitting, xy[again], cells[again], blur[again], False)
-        _put(edges, sides, parts[0])
-        _put(fits, sides, parts[1])
-        xy[again], covariance[again] = parts[2:]
-        lost |= ~_is_near(xy, near)
-        xy[lost] = near[lost]
+    needs_repeat = (
+        (np.abs(np.log(blur / blur_before)) > 0.2) | (strip < settings.wide_strip * blur)
+    ).any(1)
+    if needs_repeat.any():
+        sides = np.repeat(needs_repeat, 4)
+        parts = _fit_sides(
+            fitting, xy[needs_repeat], cells[needs_repeat], blur[needs_repeat], False
+        )
+        _replace_rows(edges, sides, parts[0])
+        _replace_rows(fits, sides, parts[1])
+        xy[needs_repeat], covariance[needs_repeat] = parts[2:]
+        is_lost |= ~_is_near(xy, approximate)
+        xy[is_lost] = approximate[is_lost]
     shift = edge_shift(fitting, xy, cells, fits)
     if shift is not None:
         # The sides back outwards, by a shift in τ towards the dark side.
@@ -130,7 +133,7 @@ def fit_marker_corners(
         fits.covariance[:, 0, 0] += (shift[1] * fits.blur) ** 2
         xy, covariance = _intersect(edges, _with_model_errors(edges, fits, settings), number)
     why = _find_reasons(edges, fits, covariance, settings)
-    why[~_is_near(xy, near) | lost] = NO_EDGE
+    why[~_is_near(xy, approximate) | is_lost] = NO_EDGE
     return MarkerCorners(xy, covariance, why)
 
 
@@ -157,11 +160,11 @@ def _find_reasons(
     return why
 
 
-def _is_near(xy: Quadrilaterals, near: Quadrilaterals) -> Bool[np.ndarray, "markers 4"]:
+def _is_near(xy: Quadrilaterals, approximate: Quadrilaterals) -> Bool[np.ndarray, "markers 4"]:
     """Whether corners are where the marker was found: within 2.5 pixels or a seventh of its side,
     less than a cell."""
-    side = np.linalg.norm(near - np.roll(near, 1, 1), axis=2).min(1)
-    return np.linalg.norm(xy - near, axis=2) < np.maximum(side / 7, 2.5)[:, None]
+    side = np.linalg.norm(approximate - np.roll(approximate, 1, 1), axis=2).min(1)
+    return np.linalg.norm(xy - approximate, axis=2) < np.maximum(side / 7, 2.5)[:, None]
 
 
 def _fit_sides(
@@ -194,14 +197,14 @@ def _fit_sides(
     return edges, fits, *_intersect(edges, _with_model_errors(edges, fits, settings), len(xy))
 
 
-def _put(
-    whole: StraightEdges | EdgeFits,
+def _replace_rows(
+    all_rows: StraightEdges | EdgeFits,
     rows: Bool[np.ndarray, " sides"],
     part: StraightEdges | EdgeFits,
 ) -> None:
     """Replace some rows of the arrays of a dataclass."""
-    for field in dataclasses.fields(whole):
-        getattr(whole, field.name)[rows] = getattr(part, field.name)
+    for field in dataclasses.fields(all_rows):
+        getattr(all_rows, field.name)[rows] = getattr(part, field.name)
 
 
 def edge_shift(
@@ -237,27 +240,29 @@ def edge_shift(
     if not parts:
         return None
     marker, start, end, factor, bent, width = map(np.concatenate, zip(*parts))
-    along = end - start
-    across = np.stack([-along[:, 1], along[:, 0]], 1)
+    edge_direction = end - start
+    perpendicular = np.stack([-edge_direction[:, 1], edge_direction[:, 0]], 1)
     ends = np.zeros((len(start), 2))
-    inside = StraightEdges(
+    inner_edges = StraightEdges(
         start,
         end,
-        np.stack([start, -across], 1),
-        np.stack([end, across], 1),
+        np.stack([start, -perpendicular], 1),
+        np.stack([end, perpendicular], 1),
         ends + width[:, None],
         ends + width[:, None],
         np.tile([-1.0, 1.0], (len(start), 1)),
         np.zeros((len(start), 1)),
     )
-    for direction in (inside.before, inside.after):
+    for direction in (inner_edges.before, inner_edges.after):
         direction[:, 1] /= np.linalg.norm(direction[:, 1], axis=1)[:, None]
-    found = fit_edges(fitting.grey, inside, blur[marker], fitting.curvature, settings.edges)
-    shift = (found.curve[:, 0] - bent) / (found.blur * factor)
-    sigma = np.sqrt(found.covariance[:, 0, 0]) / (found.blur * factor)
+    edge_fits = fit_edges(
+        fitting.grey, inner_edges, blur[marker], fitting.curvature, settings.edges
+    )
+    shift = (edge_fits.curve[:, 0] - bent) / (edge_fits.blur * factor)
+    sigma = np.sqrt(edge_fits.covariance[:, 0, 0]) / (edge_fits.blur * factor)
     # Shifts by gamma are of the order of τ/3: an edge of σ 0.5 says nothing; edges of the other
     # sign of contrast are not the ones meant.
-    good = found.solved & (sigma < 0.5) & (found.contrast * fits.contrast[4 * marker] > 0)
+    good = edge_fits.solved & (sigma < 0.5) & (edge_fits.contrast * fits.contrast[4 * marker] > 0)
     if good.sum() < settings.min_shift_edges:
         return None
     return _robust_mean(shift, sigma, good)
@@ -300,10 +305,10 @@ def _inner_edges(
     mean = bend.mean()
     start, end, factor, bent = [], [], [], []
     for turn in (0, 1):  # edges along columns, along rows
-        here = light if turn == 0 else light.T
-        row, column = np.nonzero(here[:, 1:] != here[:, :-1])
+        cells = light if turn == 0 else light.T
+        row, column = np.nonzero(cells[:, 1:] != cells[:, :-1])
         x = column + 1.0
-        dark_beyond = here[row, column]  # the cell before is light
+        dark_beyond = cells[row, column]  # the cell before is light
         a, b = np.stack([x, row], 1), np.stack([x, row + 1.0], 1)
         if turn:
             a, b = a[:, ::-1], b[:, ::-1]
@@ -314,9 +319,9 @@ def _inner_edges(
         s = np.where(dark_beyond, 1.0, -1.0)
         factor.append(1 - s * (1 - 2 * x / n))
         p, q = 2 * x / n - 1, 2 * (row + 0.5) / n - 1
-        beyond, before = ((bend[1], bend[3]), (bend[2], bend[0]))[turn]
-        along = (1 + p) / 2 * (beyond - mean) - (1 - p) / 2 * (before - mean)
-        bent.append(s * (along * (1 - q**2) - mean * p * (p**2 + q**2 - 2)))
+        bend_beyond, bend_before = ((bend[1], bend[3]), (bend[2], bend[0]))[turn]
+        bend_along = (1 + p) / 2 * (bend_beyond - mean) - (1 - p) / 2 * (bend_before - mean)
+        bent.append(s * (bend_along * (1 - q**2) - mean * p * (p**2 + q**2 - 2)))
     start, end = (_image(H[marker : marker + 1], np.concatenate(x))[0] for x in (start, end))
     factor, bent = np.concatenate(factor), np.concatenate(bent)
     useful = factor > 0.5  # others hardly show the shift: the corners share it
@@ -340,7 +345,10 @@ def _with_model_errors(edges: StraightEdges, fits: EdgeFits, settings: MarkerSet
     """The fits with the σ of what the model neglects in narrow strips added to a."""
     strip = np.minimum(edges.inner, edges.outer).min(1) / fits.blur
     oblique = np.abs(
-        [np.einsum("ni,ni->n", near[:, 1], edges.along) for near in (edges.before, edges.after)]
+        [
+            np.einsum("ni,ni->n", adjacent[:, 1], edges.along)
+            for adjacent in (edges.before, edges.after)
+        ]
     ).max(0)
     neglected = settings.neglected + settings.neglected_oblique * oblique
     covariance = fits.covariance.copy()
@@ -356,32 +364,32 @@ def _sides_of(
     """The sides of markers as edges: upper, right, lower, left; each from corner k to k + 1."""
     n = cells.shape[1]
     following = np.roll(xy, -1, axis=1)
-    along = following - xy
-    before = np.stack([np.roll(xy, 1, 1), np.roll(along, 1, 1)], 2)
-    after = np.stack([following, np.roll(along, -1, 1)], 2)
-    for near in (before, after):
-        near[:, :, 1] /= np.linalg.norm(near[:, :, 1], axis=2)[..., None]
-    along = along / np.linalg.norm(along, axis=2)[..., None]
-    inward = np.stack([-along[..., 1], along[..., 0]], -1)
+    direction = following - xy
+    adjacent_before = np.stack([np.roll(xy, 1, 1), np.roll(direction, 1, 1)], 2)
+    adjacent_after = np.stack([following, np.roll(direction, -1, 1)], 2)
+    for adjacent in (adjacent_before, adjacent_after):
+        adjacent[:, :, 1] /= np.linalg.norm(adjacent[:, :, 1], axis=2)[..., None]
+    direction = direction / np.linalg.norm(direction, axis=2)[..., None]
+    inward = np.stack([-direction[..., 1], direction[..., 0]], -1)
     H = _homographies(xy, n)
     ticks = np.arange(n + 1.0)
-    inner, outer, far, level = [], [], [], []
+    inner, outer, far_ticks, level = [], [], [], []
     for k in range(4):
         turned = np.rot90(cells, k, axes=(1, 2))  # the side k is the first row
         middle = (xy[:, k] + following[:, k]) / 2
-        half = np.linalg.norm(following[:, k] - xy[:, k], axis=1)[:, None] / 2
+        half_length = np.linalg.norm(following[:, k] - xy[:, k], axis=1)[:, None] / 2
 
         def along_and_inside(
             t: Float[np.ndarray, " n"],
             depth: float,
             k: int = k,
             middle: Float[np.ndarray, "markers 2"] = middle,
-            half: Float[np.ndarray, "markers 1"] = half,
+            half_length: Float[np.ndarray, "markers 1"] = half_length,
         ) -> tuple[Float[np.ndarray, "markers n"], Float[np.ndarray, "markers n"]]:
-            away = _image(H, _on_side(k, n, t, depth)) - middle[:, None]
+            from_middle = _image(H, _on_side(k, n, t, depth)) - middle[:, None]
             return (
-                np.einsum("mti,mi->mt", away, along[:, k]) / half,
-                np.einsum("mti,mi->mt", away, inward[:, k]),
+                np.einsum("mti,mi->mt", from_middle, direction[:, k]) / half_length,
+                np.einsum("mti,mi->mt", from_middle, inward[:, k]),
             )
 
         for widths, depth in ((inner, border), (outer, -1)):
@@ -390,17 +398,17 @@ def _sides_of(
             slope = (s[:, 1] - s[:, 0]) / (t[:, 1] - t[:, 0])
             ends = s[:, :1] + slope[:, None] * (np.array([-1.0, 1.0]) - t[:, :1])
             widths.append(np.maximum(np.abs(ends), 0.1))
-        far.append(along_and_inside(ticks, border)[0])
+        far_ticks.append(along_and_inside(ticks, border)[0])
         level.append(turned[:, border].astype(float))
     flat = lambda x: np.stack(x, 1).reshape(4 * len(xy), -1)
     return StraightEdges(
         xy.reshape(-1, 2),
         following.reshape(-1, 2),
-        before.reshape(-1, 2, 2),
-        after.reshape(-1, 2, 2),
+        adjacent_before.reshape(-1, 2, 2),
+        adjacent_after.reshape(-1, 2, 2),
         flat(inner),
         flat(outer),
-        flat(far),
+        flat(far_ticks),
         flat(level),
     )
 
@@ -441,23 +449,25 @@ def _intersect(
     """Corners [markers, 4, 2], corner k between the sides k − 1 and k, and their covariance."""
     side = np.arange(4 * number).reshape(number, 4)
     pair = np.stack([np.roll(side, 1, 1), side], 2)  # [markers, 4, 2 sides]
-    middle, along, inward, half, curve, Q = (
+    middle, direction, inward, half_length, curve, Q = (
         x[pair]
         for x in (edges.middle, edges.along, edges.inward, edges.half, fits.curve, fits.covariance)
     )
     xy = edges.start.reshape(number, 4, 2)
     for _ in range(4):  # Newton: the curvature is small
-        away = xy[:, :, None] - middle
-        t = np.einsum("mksi,mksi->mks", away, along) / half
+        from_middle = xy[:, :, None] - middle
+        t = np.einsum("mksi,mksi->mks", from_middle, direction) / half_length
         powers = np.stack([np.ones_like(t), t, t * t], -1)
-        f = np.einsum("mksi,mksi->mks", away, inward) - np.einsum("mksi,mksi->mks", powers, curve)
-        slope = (curve[..., 1] + 2 * curve[..., 2] * t) / half
-        A = inward - slope[..., None] * along
+        f = np.einsum("mksi,mksi->mks", from_middle, inward) - np.einsum(
+            "mksi,mksi->mks", powers, curve
+        )
+        slope = (curve[..., 1] + 2 * curve[..., 2] * t) / half_length
+        A = inward - slope[..., None] * direction
         parallel = np.abs(np.linalg.det(A)) < 0.05  # 3° between two sides
         A = np.where(parallel[..., None, None], np.eye(2), A)
-        back = np.linalg.inv(A)
-        step = np.einsum("mkis,mks->mki", back, f)
+        inverse_A = np.linalg.inv(A)
+        step = np.einsum("mkis,mks->mki", inverse_A, f)
         xy = xy - np.clip(step, -10, 10)
     variance = np.einsum("mksi,mksij,mksj->mks", powers, Q, powers)
-    covariance = np.einsum("mkis,mks,mkjs->mkij", back, variance, back)
+    covariance = np.einsum("mkis,mks,mkjs->mkij", inverse_A, variance, inverse_A)
     return xy, np.where(parallel[..., None, None], np.nan, covariance)

@@ -42,8 +42,10 @@ def correlation(a: Float[AnyArray, " n"], b: Float[AnyArray, " n"]) -> Float[Arr
     """Normalised cross-correlation ρ of two windows; −1 if one has no contrast."""
     a, b = a - jnp.mean(a), b - jnp.mean(b)
     square = jnp.sum(a * a) * jnp.sum(b * b)
-    there = square > 0
-    return jnp.where(there, jnp.sum(a * b) / jnp.sqrt(jnp.where(there, square, 1.0)), -1.0)
+    has_contrast = square > 0
+    return jnp.where(
+        has_contrast, jnp.sum(a * b) / jnp.sqrt(jnp.where(has_contrast, square, 1.0)), -1.0
+    )
 
 
 def find_match(
@@ -70,10 +72,12 @@ def find_match(
     if window < 3 or window % 2 == 0:
         raise InputError(f"matching: window {window} must be an odd number of at least 3 pixels")
     grey, other_grey = jnp.asarray(base, float), jnp.asarray(other, float)
-    place, half = jnp.asarray(xy, float), window // 2
+    place, half_window = jnp.asarray(xy, float), window // 2
     rows, columns = grey.shape
     x, y = np.asarray(place)
-    if not (half <= x <= columns - 1 - half and half <= y <= rows - 1 - half):
+    if not (
+        half_window <= x <= columns - 1 - half_window and half_window <= y <= rows - 1 - half_window
+    ):
         raise InputError(f"matching: the window at ({x:.1f}, {y:.1f}) is not within the base image")
     ends = np.asarray(_locus(view, other_view, place, jnp.array([Zmin, Zmax])))
     length = np.linalg.norm(ends[1] - ends[0])
@@ -83,23 +87,23 @@ def find_match(
     steps = math.ceil(length / 0.5) + 1 if np.isfinite(length) else 1
     steps = min(2 ** math.ceil(math.log2(max(steps, 16))), 4096)
     Z = jnp.linspace(Zmin, Zmax, steps)
-    rho = np.asarray(_correlations(grey, other_grey, view, other_view, place, Z, half))
+    rho = np.asarray(_correlations(grey, other_grey, view, other_view, place, Z, half_window))
     best = int(np.nanargmax(rho)) if np.isfinite(rho).any() else -1
     if best < 0 or rho[best] <= -1:
         raise InputError("matching: no height puts the window into the other image with contrast")
     height = float(Z[best]) + _peak(rho, best) * float(Z[1] - Z[0])
     point = np.asarray(_ground(view, place, height))
-    found = np.asarray(_locus(view, other_view, place, jnp.array([height])))[0]
-    return Match(found, point, float(rho[best]))
+    place_in_other = np.asarray(_locus(view, other_view, place, jnp.array([height])))[0]
+    return Match(place_in_other, point, float(rho[best]))
 
 
 def _peak(rho: Float[np.ndarray, " n"], best: int) -> float:
     """The vertex of a parabola through three neighbours, in steps from the middle one."""
     if not 0 < best < len(rho) - 1 or not np.isfinite(rho[best - 1 : best + 2]).all():
         return 0.0
-    left, middle, right = rho[best - 1 : best + 2]
-    bend = left - 2 * middle + right
-    return 0.5 * (left - right) / bend if bend < 0 else 0.0
+    before, middle, after = rho[best - 1 : best + 2]
+    bend = before - 2 * middle + after
+    return 0.5 * (before - after) / bend if bend < 0 else 0.0
 
 
 _ground = compile_once(ground_point)
@@ -120,18 +124,18 @@ def _correlations(
     other_view: View,
     xy: Float[AnyArray, "2"],
     Z: Float[AnyArray, " n"],
-    half: int,
+    half_window: int,
 ) -> Float[Array, " n"]:
-    offset = jnp.arange(-half, half + 1.0)
+    offset = jnp.arange(-half_window, half_window + 1.0)
     window = xy + jnp.stack(jnp.meshgrid(offset, offset), -1).reshape(-1, 2)
     grey = _sample(base, window)
     high = jnp.array(other.shape)[::-1] - 1
 
     def correlate(Z: Float[Array, ""]) -> Float[Array, ""]:
         places = jax.vmap(lambda place: image_to_image(view, place, Z, other_view))(window)
-        inside = jnp.all((places >= 0) & (places <= high))
-        rho = correlation(grey, _sample(other, jnp.where(inside, places, 0.0)))
-        return jnp.where(inside, rho, jnp.nan)
+        is_inside = jnp.all((places >= 0) & (places <= high))
+        rho = correlation(grey, _sample(other, jnp.where(is_inside, places, 0.0)))
+        return jnp.where(is_inside, rho, jnp.nan)
 
     return jax.lax.map(correlate, Z, batch_size=16)
 

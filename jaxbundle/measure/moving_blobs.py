@@ -62,36 +62,36 @@ def find_still_scene(frames: Iterable[Grey], settings: BlobSettings) -> StillSce
 
     **Raises:** `InputError` for fewer than three frames, frames of different sizes, and if nothing
     moves."""
-    kept: list[Grey] = []
+    frames_kept: list[Grey] = []
     stride = number = 0
     for grey in frames:
-        if kept and grey.shape != kept[0].shape:
-            sizes = (" × ".join(map(str, one.shape[::-1])) for one in (grey, kept[0]))
+        if frames_kept and grey.shape != frames_kept[0].shape:
+            sizes = (" × ".join(map(str, frame.shape[::-1])) for frame in (grey, frames_kept[0]))
             raise InputError(
                 "frame {} has {} pixels, the first {}; expected frames of one size".format(
                     number + 1, *sizes
                 )
             )
         if number % (1 << stride) == 0:
-            kept.append(grey)
-            if len(kept) > settings.sampled:
+            frames_kept.append(grey)
+            if len(frames_kept) > settings.sampled:
                 # Every second of them, and from here on half as many.
-                kept, stride = kept[::2], stride + 1
+                frames_kept, stride = frames_kept[::2], stride + 1
         number += 1
     if number < 3:
         raise InputError(
             f"{count(number, 'frame')}; expected three or more, with the wand at different places"
         )
-    stack = _brighten(np.array(kept), settings)
+    stack = _brighten(np.array(frames_kept), settings)
     # Of an even number the lower of the middle two: a marker in half of the frames is none of it.
     row = (len(stack) - 1) // 2
     background = np.partition(stack, row, axis=0)[row]
     # Signed: darker than the background is less than 0, not 255.
-    strongest = max(int((one.astype(np.int16) - background).max()) for one in stack)
-    least = SpotSettings().min_contrast
-    if strongest < least:
+    strongest = max(int((frame.astype(np.int16) - background).max()) for frame in stack)
+    min_contrast = SpotSettings().min_contrast
+    if strongest < min_contrast:
         raise InputError("nothing moves in the frames; expected a wand that is waved")
-    return StillScene(background, max(settings.min_level * strongest, least))
+    return StillScene(background, max(settings.min_level * strongest, min_contrast))
 
 
 def find_moving_blobs(grey: Grey, scene: StillScene, settings: BlobSettings) -> list[Target]:
@@ -103,26 +103,26 @@ def find_moving_blobs(grey: Grey, scene: StillScene, settings: BlobSettings) -> 
     # So many are noise or another light, and measuring each would take long.
     if number > 10 * settings.max_blobs:
         return []
-    found: list[Target] = []
+    targets: list[Target] = []
     for label, window in enumerate(scipy.ndimage.find_objects(labels), 1):
-        inside = labels[window] == label
-        if not _is_ellipse(inside, settings.max_area_misfit):
+        is_inside = labels[window] == label
+        if not _is_ellipse(is_inside, settings.max_area_misfit):
             continue
         # The blurred edge of a neighbour would pull the centre.
         around = labels[tuple(slice(max(s.start - MARGIN, 0), s.stop + MARGIN) for s in window)]
         if np.any((around != 0) & (around != label)):
             continue
-        rows, columns = np.nonzero(inside)
-        near = np.array([columns.mean() + window[1].start, rows.mean() + window[0].start])
+        rows, columns = np.nonzero(is_inside)
+        approximate = np.array([columns.mean() + window[1].start, rows.mean() + window[0].start])
         try:
-            target = centre_by_grey_values(signal, near)
+            target = centre_by_grey_values(signal, approximate)
         except InputError:
             # Cut by the edge of the image, or within the noise.
             continue
         # A centre outside of the blob is that of something else.
-        if target.bright and np.linalg.norm(target.xy - near) < max(inside.shape):
-            found.append(target)
-    return found if len(found) <= settings.max_blobs else []
+        if target.bright and np.linalg.norm(target.xy - approximate) < max(is_inside.shape):
+            targets.append(target)
+    return targets if len(targets) <= settings.max_blobs else []
 
 
 def _brighten(grey: np.ndarray, settings: BlobSettings) -> np.ndarray:
@@ -130,12 +130,12 @@ def _brighten(grey: np.ndarray, settings: BlobSettings) -> np.ndarray:
     return 255 - grey if settings.dark else grey
 
 
-def _is_ellipse(inside: Bool[np.ndarray, "rows columns"], tolerance: float) -> bool:
+def _is_ellipse(is_inside: Bool[np.ndarray, "rows columns"], tolerance: float) -> bool:
     """Whether the pixels of a blob fill the ellipse of their second moments."""
-    xy: Float[np.ndarray, "2 n"] = np.array(np.nonzero(inside), float)
+    xy: Float[np.ndarray, "2 n"] = np.array(np.nonzero(is_inside), float)
     if xy.shape[1] < SpotSettings().min_pixels:
         return False
-    away = xy - xy.mean(1, keepdims=True)
+    from_mean = xy - xy.mean(1, keepdims=True)
     # The area of a pixel has the moment 1/12; an ellipse with the moments C has 4π·√det C.
-    C = away @ away.T / xy.shape[1] + np.eye(2) / 12
+    C = from_mean @ from_mean.T / xy.shape[1] + np.eye(2) / 12
     return abs(xy.shape[1] / (4 * np.pi * np.sqrt(np.linalg.det(C))) - 1) < tolerance

@@ -58,8 +58,8 @@ def ring_codes(bits: int) -> tuple[int, ...]:
         turned = (turned >> 1) | (turned & 1) << (bits - 1)
         smallest = np.minimum(smallest, turned)
         ones = ones + (turned & 1)
-    half = bits // 2
-    opposite = (code & (code >> half)) != 0
+    half_bits = bits // 2
+    opposite = (code & (code >> half_bits)) != 0
     return tuple(code[(code == smallest) & (ones % 2 == 0) & opposite].tolist())
 
 
@@ -71,18 +71,18 @@ def find_ring_targets(
     **Arguments:** `numbered`: named by the printed number, without codes that have none; otherwise
     by the code."""
     number = {c: k for k, c in enumerate(ring_codes(bits), 1)} if numbered else None
-    found: list[tuple[float, str, Target]] = []
+    readings: list[tuple[float, str, Target]] = []
     for target in find_discs(grey, settings):
-        read = _read_code(grey, target, bits, settings)
-        if read is None:
+        reading = _read_code(grey, target, bits, settings)
+        if reading is None:
             continue
-        misfit, code = read
+        misfit, code = reading
         if number is None:
-            found.append((misfit, str(code), target))
+            readings.append((misfit, str(code), target))
         elif code in number:
-            found.append((misfit, str(number[code]), target))
+            readings.append((misfit, str(number[code]), target))
     distinct: list[tuple[str, Target]] = []
-    for _, name, target in sorted(found, key=lambda read: read[0]):
+    for _, name, target in sorted(readings, key=lambda reading: reading[0]):
         # A sector of a ring may look like a disc with a ring; the more distinct one is right.
         ring = 3 * target.axes[0]
         if all(np.linalg.norm(target.xy - t.xy) > max(ring, 3 * t.axes[0]) for _, t in distinct):
@@ -102,9 +102,9 @@ def find_plain_discs(grey: Grey, coded: Sequence[Target], settings: RingSettings
 
 def find_discs(grey: Grey, settings: RingSettings) -> Iterator[Target]:
     """Light discs, each measured."""
-    for near in _blobs(grey, settings):
+    for approximate in _blobs(grey, settings):
         try:
-            target = centre_by_ellipse(grey, near)
+            target = centre_by_ellipse(grey, approximate)
         except InputError:
             continue
         if target.bright:
@@ -150,13 +150,13 @@ def _read_code(
     # the dark ground.
     places = target.xy + np.array([1.5, 2.5, 3.4])[:, None, None] * rim
     u, v = places[..., 0], places[..., 1]
-    inside = (u >= 0) & (v >= 0) & (u <= grey.shape[1] - 1) & (v <= grey.shape[0] - 1)
+    is_inside = (u >= 0) & (v >= 0) & (u <= grey.shape[1] - 1) & (v <= grey.shape[0] - 1)
     # A ring at the edge of the photograph is whole; the ground beyond it need not be.
-    if not inside[:2].all():
+    if not is_inside[:2].all():
         return None
     gap, ring, beyond = map_coordinates(grey.astype(float), [v, u], order=1)
     dark = np.median(gap)
-    gap, value, beyond = ((a - dark) / target.contrast for a in (gap, ring, beyond[inside[2]]))
+    gap, value, beyond = ((a - dark) / target.contrast for a in (gap, ring, beyond[is_inside[2]]))
     if np.abs(gap).max() > tolerance or beyond.mean() > 0.5:
         return None
     # The sectors begin where the values within them vary least; their blurred ends do not count.
@@ -164,12 +164,12 @@ def _read_code(
     inner = by_start[:, :, samples // 5 : -(samples // 5)]
     best = int(inner.var(2).sum(1).argmin())
     means = inner[best].mean(1)
-    off = np.minimum(np.abs(means), np.abs(means - 1))
-    if np.any(off > tolerance):
+    deviation = np.minimum(np.abs(means), np.abs(means - 1))
+    if np.any(deviation > tolerance):
         return None
     word = (means > 0.5).astype(int)
     if not word.any() or word.all():
         return None
     weights = 1 << np.arange(bits - 1, -1, -1)
-    misfit = float(off.mean() + np.abs(gap).mean())
+    misfit = float(deviation.mean() + np.abs(gap).mean())
     return misfit, min(int(np.roll(word, -k) @ weights) for k in range(bits))

@@ -101,30 +101,30 @@ class Saddles:
 
 def fit_saddles(
     grey: Real[np.ndarray, "rows columns"],
-    near: Float[np.ndarray, "n 2"],
+    approximate: Float[np.ndarray, "n 2"],
     lines: Float[np.ndarray, "n 2 2"],
     strips: Strips | None = None,
     settings: SaddleSettings | None = None,
 ) -> Saddles:
     """Corners of squares in a photograph.
 
-    **Arguments:** `near`: the corners to a pixel or two; `lines`: the vectors to the next
+    **Arguments:** `approximate`: the corners to a pixel or two; `lines`: the vectors to the next
     corner (or other edge) along both lines, pixels; `strips`, for ChArUco boards: distances of the
     marker's corner from both lines, in the quarter of these signs of s₁ and s₂ (0: negative).
     """
     settings = settings or SaddleSettings()
-    found, blur = _fit(grey, near, lines, strips, settings.max_half, settings)
+    saddles, blur = _fit(grey, approximate, lines, strips, settings.max_half, settings)
     if (half := settings.complete * np.median(blur)) > settings.max_half:
-        found, blur = _fit(grey, near, lines, strips, half, settings)
+        saddles, blur = _fit(grey, approximate, lines, strips, half, settings)
     if np.median(blur) < settings.blur_to_reduce or min(grey.shape) < settings.min_rows_to_reduce:
-        return found
+        return saddles
     # An image blurred over several pixels loses nothing in half the pixels, and the windows then
     # contain the whole change.
     rows, columns = (n // 2 * 2 for n in grey.shape)
     small = grey[:rows, :columns].reshape(rows // 2, 2, columns // 2, 2).mean((1, 3))
     strips = None if strips is None else strips / 2
-    found = fit_saddles(small, (near - 0.5) / 2, lines / 2, strips, settings)
-    return Saddles(2 * found.xy + 0.5, 4 * found.covariance, found.why)
+    saddles = fit_saddles(small, (approximate - 0.5) / 2, lines / 2, strips, settings)
+    return Saddles(2 * saddles.xy + 0.5, 4 * saddles.covariance, saddles.why)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,34 +142,36 @@ class _Windows:
     def cut(
         cls,
         grey: Real[np.ndarray, "rows columns"],
-        near: Float[np.ndarray, "n 2"],
-        half: Float[np.ndarray, " n"],
+        approximate: Float[np.ndarray, "n 2"],
+        half_window: Float[np.ndarray, " n"],
         strips: Strips | None,
     ) -> "_Windows":
         """Those of the largest window for all corners."""
-        window = int(np.ceil(half.max()))
+        window = int(np.ceil(half_window.max()))
         v, u = np.mgrid[-window : window + 1, -window : window + 1].reshape(2, -1)
-        place = np.rint(near)[:, None] + np.stack([u, v], 1)
+        place = np.rint(approximate)[:, None] + np.stack([u, v], 1)
         height, width = grey.shape
-        inside = np.all((place >= 0) & (place < [width, height]), axis=2)
-        column, row = np.where(inside[..., None], place, 0).astype(int).transpose(2, 0, 1)
+        is_inside = np.all((place >= 0) & (place < [width, height]), axis=2)
+        column, row = np.where(is_inside[..., None], place, 0).astype(int).transpose(2, 0, 1)
         # Single precision is faster by half, and exact to 1e-5 pixels.
         g, place = grey[row, column].astype(np.float32), place.astype(np.float32)
-        return cls(place, g, inside, half, None if strips is None else strips.astype(np.float32))
+        return cls(
+            place, g, is_inside, half_window, None if strips is None else strips.astype(np.float32)
+        )
 
     def weight(self, theta: Theta, settings: SaddleSettings) -> Pixels:
         """1 for the pixels of the model about the corners as they are."""
-        away = np.linalg.norm(self.place - theta[:, None, :2], axis=2)
-        used = self.inside & (away <= self.half[:, None])
+        distance = np.linalg.norm(self.place - theta[:, None, :2], axis=2)
+        is_used = self.inside & (distance <= self.half[:, None])
         if self.strips is not None:
             wide = settings.wide_strip
-            used &= _beside_lines(theta.astype(np.float32), self.place, self.strips, wide)
-        return used.astype(np.float32)
+            is_used &= _beside_lines(theta.astype(np.float32), self.place, self.strips, wide)
+        return is_used.astype(np.float32)
 
 
 def _fit(
     grey: Real[np.ndarray, "rows columns"],
-    near: Float[np.ndarray, "n 2"],
+    approximate: Float[np.ndarray, "n 2"],
     lines: Float[np.ndarray, "n 2 2"],
     strips: Strips | None,
     largest: float,
@@ -177,18 +179,18 @@ def _fit(
 ) -> tuple[Saddles, Float[np.ndarray, " n"]]:
     """The corners, and τ of each."""
     length = np.linalg.norm(lines, axis=2)
-    half = np.clip(settings.part * length.min(1), 2.0, largest)
+    half_window = np.clip(settings.part * length.min(1), 2.0, largest)
     angle = np.arctan2(lines[..., 1], lines[..., 0])
-    windows = _Windows.cut(grey, near, half, strips)
-    theta = np.zeros((len(near), UNKNOWNS))
-    theta[:, :2], theta[:, 2:4] = near, angle
+    windows = _Windows.cut(grey, approximate, half_window, strips)
+    theta = np.zeros((len(approximate), UNKNOWNS))
+    theta[:, :2], theta[:, 2:4] = approximate, angle
     theta[:, 6] = np.log(settings.first_blur)
     # Weights 1/σ² of weak pseudo-observations: lines to 0.3 rad, τ of a lens in focus to a factor
     # of e, light that changes by 10 % a pixel.
     reference, prior = theta.copy(), np.zeros(UNKNOWNS)
     reference[:, 6] = np.log(0.8)
     prior[2:4], prior[6], prior[7:] = 0.3**-2.0, 1.0, 0.1**-2.0
-    noise = np.ones(len(near))
+    noise = np.ones(len(approximate))
     for step in range(settings.max_steps):
         weight = windows.weight(theta, settings)
         if step < 2:
@@ -209,13 +211,15 @@ def _fit(
     r = windows.grey - model
     N, _ = normal_equations(J, r, weight, prior, 0 * theta, noise)
     Q = np.linalg.inv(N)
-    away = windows.place - theta[:, None, :2]
-    scale = noise * _excess(J, r, weight, Q, noise, away, settings.pairs)
+    from_corner = windows.place - theta[:, None, :2]
+    scale = noise * _excess(J, r, weight, Q, noise, from_corner, settings.pairs)
     covariance = scale[:, None, None] ** 2 * Q[:, :2, :2]
-    moved = np.linalg.norm(theta[:, :2] - near, axis=1)
-    few = weight.sum(1) < 2 * UNKNOWNS
-    lost = few | ~(moved < np.maximum(half, 2.5))
-    covariance, why = _judge(theta, covariance, noise, half, angle, strips, lost, settings)
+    shift = np.linalg.norm(theta[:, :2] - approximate, axis=1)
+    has_few = weight.sum(1) < 2 * UNKNOWNS
+    is_lost = has_few | ~(shift < np.maximum(half_window, 2.5))
+    covariance, why = _judge(
+        theta, covariance, noise, half_window, angle, strips, is_lost, settings
+    )
     return Saddles(theta[:, :2], covariance, why), np.exp(theta[:, 6])
 
 
@@ -223,16 +227,16 @@ def _judge(
     theta: Theta,
     covariance: Float[np.ndarray, "n 2 2"],
     noise: Float[np.ndarray, " n"],
-    half: Float[np.ndarray, " n"],
+    half_window: Float[np.ndarray, " n"],
     angle: Float[np.ndarray, "n 2"],
     strips: Strips | None,
-    lost: Bool[np.ndarray, " n"],
+    is_lost: Bool[np.ndarray, " n"],
     settings: SaddleSettings,
 ) -> tuple[Float[np.ndarray, "n 2 2"], np.ndarray]:
     """The covariance with what the model neglects, and why corners are left out, or ""."""
     blur, contrast = np.exp(theta[:, 6]), np.abs(theta[:, 5])
     oblique = np.abs(np.sin(angle[:, 0] - angle[:, 1]))
-    narrow = half * oblique
+    narrow = half_window * oblique
     if strips is not None:
         narrow = np.minimum(narrow, strips.astype(np.float32).min((1, 2, 3)))
         ratio = narrow / blur
@@ -247,7 +251,7 @@ def _judge(
     # Residuals far above those of the other corners, and visible beside the contrast (D is half of
     # it): something covers the window in part; at 0.4·D there is no saddle at all.
     covered = (noise > settings.max_relative_noise * np.median(noise)) & (noise > 0.05 * contrast)
-    why[lost | (noise > 0.4 * contrast) | covered] = NO_CORNER
+    why[is_lost | (noise > 0.4 * contrast) | covered] = NO_CORNER
     return covariance, why
 
 
@@ -258,9 +262,11 @@ def lines_of_grid(xy: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, 
     for axis in (1, 0):
         step = np.diff(xy, axis=axis)
         gap = np.full_like(np.take(xy, [0], axis), np.nan)
-        both = np.stack([np.concatenate([step, gap], axis), np.concatenate([gap, step], axis)])
-        length = np.nan_to_num(np.linalg.norm(both, axis=3), nan=np.inf)
-        lines.append(np.take_along_axis(both, length.argmin(0)[None, ..., None], 0)[0])
+        steps_both_ways = np.stack(
+            [np.concatenate([step, gap], axis), np.concatenate([gap, step], axis)]
+        )
+        length = np.nan_to_num(np.linalg.norm(steps_both_ways, axis=3), nan=np.inf)
+        lines.append(np.take_along_axis(steps_both_ways, length.argmin(0)[None, ..., None], 0)[0])
     return np.stack(lines, 2)
 
 
@@ -277,8 +283,8 @@ def _strip_of(
     s: Float[np.ndarray, "n pixels 2"], strips: Strips
 ) -> Float[np.ndarray, "n pixels 2"]:
     """The strips of the quarters of pixels, [n, pixels, 2]."""
-    first, second = (s > 0).astype(int).transpose(2, 0, 1)
-    return strips[np.arange(len(s))[:, None], first, second]
+    is_beyond_first, is_beyond_second = (s > 0).astype(int).transpose(2, 0, 1)
+    return strips[np.arange(len(s))[:, None], is_beyond_first, is_beyond_second]
 
 
 def _beside_lines(
@@ -318,22 +324,22 @@ def _model(
     tau, M, D = np.exp(theta[:, None, 6]), theta[:, None, 4], theta[:, None, 5]
     rho = np.cos(theta[:, 2] - theta[:, 3])[:, None]
     z = s / tau[..., None]
-    P, along = _joint(z, rho, settings)
+    P, derivative = _joint(z, rho, settings)
     E = 2 * scipy.special.ndtr(z) - 1
     X = 4 * (P - 0.25 * (1 + E[..., 0]) * (1 + E[..., 1])) + E[..., 0] * E[..., 1]
-    slope = (4 * along - 2 * _density(z)) / tau[..., None]  # of X by s
+    slope = (4 * derivative - 2 * _density(z)) / tau[..., None]  # of X by s
     of_blur = -(s * slope).sum(2)
     if strips is not None:
         k = (np.abs(s) - _strip_of(s, strips)) / tau[..., None]
         side = np.sign(s)
-        P, along = _joint(k, rho * side[..., 0] * side[..., 1], settings)
-        there = 2 * np.sign(D) * (side[..., 0] * side[..., 1] == np.sign(D))
-        X = X - there * P
-        slope = slope - there[..., None] * along * side / tau[..., None]
-        of_blur += there * (k * along).sum(2)
-    away = place - theta[:, None, :2]
+        P, derivative = _joint(k, rho * side[..., 0] * side[..., 1], settings)
+        correction = 2 * np.sign(D) * (side[..., 0] * side[..., 1] == np.sign(D))
+        X = X - correction * P
+        slope = slope - correction[..., None] * derivative * side / tau[..., None]
+        of_blur += correction * (k * derivative).sum(2)
+    from_corner = place - theta[:, None, :2]
     c, n = np.cos(theta[:, None, 2:4]), np.sin(theta[:, None, 2:4])
-    light = 1 + (away * theta[:, None, 7:]).sum(2)
+    light = 1 + (from_corner * theta[:, None, 7:]).sum(2)
     squares = M + D * X
     slope, of_blur = slope * (D * light)[..., None], of_blur * D * light
     J = np.stack(
@@ -345,8 +351,8 @@ def _model(
             light,
             X * light,
             of_blur,
-            squares * away[..., 0],
-            squares * away[..., 1],
+            squares * from_corner[..., 0],
+            squares * from_corner[..., 1],
         ],
         2,
     )
@@ -369,7 +375,7 @@ def _joint(
     and its derivatives φ(z₁)·Φ((z₂ − ρ·z₁)/√(1 − ρ²)), … by both."""
     ndtr, f = scipy.special.ndtr, _density(z)
     F = ndtr(z)
-    before, He = np.zeros_like(z), np.ones_like(z)
+    previous_polynomial, He = np.zeros_like(z), np.ones_like(z)
     total, factor = 0.0, np.ones_like(rho)
     largest = np.abs(rho).max()
     for k in range(settings.max_terms):
@@ -377,11 +383,13 @@ def _joint(
             break
         factor = factor * rho / (k + 1)
         total = total + factor * He[..., 0] * He[..., 1]
-        before, He = He, z * He - k * before
+        previous_polynomial, He = He, z * He - k * previous_polynomial
     P = F[..., 0] * F[..., 1] + f[..., 0] * f[..., 1] * total
     # ρ² = 0.99: lines at 6°, which are no corner
-    other = (z[..., ::-1] - rho[..., None] * z) / np.sqrt(1 - np.minimum(rho**2, 0.99))[..., None]
-    return P, f * ndtr(other)
+    other_coordinate = (z[..., ::-1] - rho[..., None] * z) / np.sqrt(1 - np.minimum(rho**2, 0.99))[
+        ..., None
+    ]
+    return P, f * ndtr(other_coordinate)
 
 
 def _excess(
@@ -390,18 +398,18 @@ def _excess(
     weight: Pixels,
     Q: Float[np.ndarray, "n 9 9"],
     noise: Float[np.ndarray, " n"],
-    away: Float[np.ndarray, "n pixels 2"],
+    from_corner: Float[np.ndarray, "n pixels 2"],
     pairs: int,
 ) -> Float[np.ndarray, " n"]:
     """By how much the corners from opposite pairs of sectors scatter more than the noise says (1:
     not); what is alike on opposite sides does not move the corner."""
-    angle = np.arctan2(away[..., 1], away[..., 0])
+    angle = np.arctan2(from_corner[..., 1], from_corner[..., 0])
     pair = ((angle / np.pi + 1) * pairs).astype(int) % pairs
     total, inverse = np.zeros(len(r)), np.linalg.inv(Q[:, :2, :2])
     for k in range(pairs):
         score = np.einsum("npi,np->ni", J, weight * r * (pair == k))
-        moved = np.einsum("nij,nj->ni", Q[:, :2], score)
-        total += np.einsum("ni,nij,nj->n", moved, inverse, moved)
+        shift = np.einsum("nij,nj->ni", Q[:, :2], score)
+        total += np.einsum("ni,nij,nj->n", shift, inverse, shift)
     ratio = total / (2 * (pairs - 1) * noise**2)
     # χ²/f of f = 2·pairs coordinates has the σ √(2/f): only beyond 3 of it
     return np.where(ratio > 1 + 3 * np.sqrt(1 / pairs), np.sqrt(ratio), 1.0)

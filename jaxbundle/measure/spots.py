@@ -67,36 +67,36 @@ class Spot:
 
 
 def find_spot(
-    grey: Window, near: Float[np.ndarray, "2"], settings: SpotSettings | None = None
+    grey: Window, approximate: Float[np.ndarray, "2"], settings: SpotSettings | None = None
 ) -> Spot:
-    """The spot nearest to `near` (column, row) in `grey` [rows, columns].
+    """The spot nearest to `approximate` (column, row) in `grey` [rows, columns].
 
     **Raises:** `InputError` if none stands out, or it is cut by the edge of the image.
     """
     settings = settings or SpotSettings()
-    where = f"at ({near[0]:.1f}, {near[1]:.1f})"
+    where = f"at ({approximate[0]:.1f}, {approximate[1]:.1f})"
     rows, columns = grey.shape
-    if not (0 <= near[0] < columns and 0 <= near[1] < rows):
+    if not (0 <= approximate[0] < columns and 0 <= approximate[1] < rows):
         raise InputError(f"{where}: outside the image of {columns} × {rows} pixels")
     why = "no target stands out from its surroundings"
-    half = settings.first_half_window
-    while half <= settings.last_half_window:
-        low = np.maximum(np.rint(near).astype(int) - half, 0)
-        high = np.minimum(np.rint(near).astype(int) + half + 1, [columns, rows])
+    half_window = settings.first_half_window
+    while half_window <= settings.last_half_window:
+        low = np.maximum(np.rint(approximate).astype(int) - half_window, 0)
+        high = np.minimum(np.rint(approximate).astype(int) + half_window + 1, [columns, rows])
         window = grey[low[1] : high[1], low[0] : high[0]]
-        inside, threshold = _nearest_spot(window, near - low, settings)
-        if inside is not None:
-            if _ends_inside(inside):
-                return _levels(low, window, inside, threshold, settings)
+        is_inside, threshold = _nearest_spot(window, approximate - low, settings)
+        if is_inside is not None:
+            if _ends_inside(is_inside):
+                return _levels(low, window, is_inside, threshold, settings)
             why = "the target reaches the edge of the image, or joins its surroundings"
         if (low == 0).all() and (high == [columns, rows]).all():
             break
-        half *= 2
+        half_window *= 2
     raise InputError(f"{where}: {why}")
 
 
 def _nearest_spot(
-    window: Window, near: Float[np.ndarray, "2"], settings: SpotSettings
+    window: Window, approximate: Float[np.ndarray, "2"], settings: SpotSettings
 ) -> tuple[Mask | None, float]:
     """Pixels of the spot nearest to a position, and the threshold; None if there is none."""
     threshold = otsu(window)
@@ -112,16 +112,16 @@ def _nearest_spot(
     rows, columns = np.nonzero(np.isin(labels, large))
     if not len(rows):
         return None, threshold
-    nearest = np.argmin((columns - near[0]) ** 2 + (rows - near[1]) ** 2)
-    inside = labels == labels[rows[nearest], columns[nearest]]
-    return scipy.ndimage.binary_fill_holes(inside), threshold
+    nearest = np.argmin((columns - approximate[0]) ** 2 + (rows - approximate[1]) ** 2)
+    is_inside = labels == labels[rows[nearest], columns[nearest]]
+    return scipy.ndimage.binary_fill_holes(is_inside), threshold
 
 
-def _ends_inside(inside: Mask) -> bool:
+def _ends_inside(is_inside: Mask) -> bool:
     """Whether the spot, including its blurred edge, is within the window."""
-    rows, columns = (np.flatnonzero(inside.any(axis)) for axis in (1, 0))
+    rows, columns = (np.flatnonzero(is_inside.any(axis)) for axis in (1, 0))
     free = min(
-        rows[0], columns[0], inside.shape[0] - 1 - rows[-1], inside.shape[1] - 1 - columns[-1]
+        rows[0], columns[0], is_inside.shape[0] - 1 - rows[-1], is_inside.shape[1] - 1 - columns[-1]
     )
     return free >= MARGIN
 
@@ -129,35 +129,38 @@ def _ends_inside(inside: Mask) -> bool:
 def _levels(
     low: Int[np.ndarray, "2"],
     window: Window,
-    inside: Mask,
+    is_inside: Mask,
     threshold: float,
     settings: SpotSettings,
 ) -> Spot:
     """The spot in the smallest window around it, with the levels of target and background."""
-    rows, columns = np.nonzero(inside)
+    rows, columns = np.nonzero(is_inside)
     room = 2 * MARGIN
-    first = np.maximum([columns.min() - room, rows.min() - room], 0)
-    last = np.array([columns.max() + room + 1, rows.max() + room + 1])
-    cut = (slice(first[1], last[1]), slice(first[0], last[0]))
-    window, inside = window[cut], inside[cut]
-    bright = window[inside].mean() > window[~inside].mean()
+    first_corner = np.maximum([columns.min() - room, rows.min() - room], 0)
+    last_corner = np.array([columns.max() + room + 1, rows.max() + room + 1])
+    window_of_spot = (
+        slice(first_corner[1], last_corner[1]),
+        slice(first_corner[0], last_corner[0]),
+    )
+    window, is_inside = window[window_of_spot], is_inside[window_of_spot]
+    is_bright = window[is_inside].mean() > window[~is_inside].mean()
     # The level of the target two pixels within it, where the blurred edge ends; a spot that small
     # is nowhere at its level, which is then between its middle and its extreme.
-    core = inside & ~scipy.ndimage.binary_dilation(~inside, iterations=2)
+    core = is_inside & ~scipy.ndimage.binary_dilation(~is_inside, iterations=2)
     level = (
         np.median(window[core])
         if core.sum() >= settings.min_pixels
-        else np.quantile(window[inside], 0.9 if bright else 0.1)
+        else np.quantile(window[is_inside], 0.9 if is_bright else 0.1)
     )
     # The background from a ring of two pixels beyond the blurred edge, without neighbours.
-    around = scipy.ndimage.binary_dilation(inside, iterations=MARGIN + 2)
-    around &= ~scipy.ndimage.binary_dilation(inside, iterations=MARGIN)
-    around &= ~(window > threshold if bright else window < threshold)
-    background = np.median(window[around]) if around.any() else np.median(window[~inside])
+    around = scipy.ndimage.binary_dilation(is_inside, iterations=MARGIN + 2)
+    around &= ~scipy.ndimage.binary_dilation(is_inside, iterations=MARGIN)
+    around &= ~(window > threshold if is_bright else window < threshold)
+    background = np.median(window[around]) if around.any() else np.median(window[~is_inside])
     return Spot(
-        low + first,
+        low + first_corner,
         window,
-        inside,
+        is_inside,
         float(background),
         float(level),
         float(background + level) / 2,
@@ -170,12 +173,18 @@ def otsu(grey: Real[np.ndarray, "rows columns"]) -> float:
     low, high = float(grey.min()), float(grey.max())
     counts, edges = np.histogram(grey, 256, (low, max(high, low + 1e-9)))
     middle = (edges[:-1] + edges[1:]) / 2
-    below, total = np.cumsum(counts), np.cumsum(counts * middle)
-    above = below[-1] - below
+    number_below, total = np.cumsum(counts), np.cumsum(counts * middle)
+    number_above = number_below[-1] - number_below
     with np.errstate(divide="ignore", invalid="ignore"):
-        between = below * above * (total / below - (total[-1] - total) / above) ** 2
+        variance_between = (
+            number_below
+            * number_above
+            * (total / number_below - (total[-1] - total) / number_above) ** 2
+        )
     # Between two peaks all empty bins are equally good: their middle.
-    best = np.flatnonzero(between >= np.nanmax(between, initial=0.0) * (1 - 1e-12))
+    best = np.flatnonzero(
+        variance_between >= np.nanmax(variance_between, initial=0.0) * (1 - 1e-12)
+    )
     return float(edges[1:][best].mean()) if len(best) else low
 
 

@@ -132,9 +132,9 @@ def take(edges: StraightEdges, rows: Int[np.ndarray, " rows"]) -> StraightEdges:
     )
 
 
-def _right_of(along: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+def _right_of(direction: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
     """To the right in the image, whose v points down: (1, 0) → (0, 1)."""
-    return np.stack([-along[..., 1], along[..., 0]], -1)
+    return np.stack([-direction[..., 1], direction[..., 0]], -1)
 
 
 def fit_edges(
@@ -154,8 +154,8 @@ def fit_edges(
     theta = _start(pixels, blur, coarse)
     prior, expected = _pseudo_observations(edges, curvature, settings)
     noise = np.full(len(theta), 1.0)
-    last = settings.parts - 1
-    part = np.minimum(((pixels.t + 1) / 2 * settings.parts).astype(int).clip(0), last)
+    last_part = settings.parts - 1
+    part = np.minimum(((pixels.t + 1) / 2 * settings.parts).astype(int).clip(0), last_part)
     weight = pixels.weight
     for step in range(settings.max_steps):
         model, J = _model(theta, pixels)
@@ -181,14 +181,18 @@ def fit_edges(
     N, _ = normal_equations(J, r, weight, prior, expected - theta, noise)
     Q = np.linalg.inv(N)[:, :3, :3]
     contrast = theta[:, 5] - theta[:, 3]
-    used = weight.sum(1)
+    sum_of_weights = weight.sum(1)
     # An edge has twice as many pixels as unknowns, stands out of its residuals five times, and
     # keeps 60 % of its pixels.
-    solved = (used > 2 * UNKNOWNS) & (noise < 0.2 * np.abs(contrast)) & np.isfinite(Q).all((1, 2))
-    solved &= (weight * pixels.weight).sum(1) > 0.6 * pixels.weight.sum(1)
+    is_solved = (
+        (sum_of_weights > 2 * UNKNOWNS)
+        & (noise < 0.2 * np.abs(contrast))
+        & np.isfinite(Q).all((1, 2))
+    )
+    is_solved &= (weight * pixels.weight).sum(1) > 0.6 * pixels.weight.sum(1)
     scale = noise * excess
     return EdgeFits(
-        theta[:, :3], scale[:, None, None] ** 2 * Q, np.exp(theta[:, 8]), contrast, noise, solved
+        theta[:, :3], scale[:, None, None] ** 2 * Q, np.exp(theta[:, 8]), contrast, noise, is_solved
     )
 
 
@@ -214,8 +218,8 @@ class _Pixels:
         settings: EdgeSettings,
     ) -> "_Pixels":
         """Those between the adjacent edges, in the strips, and within reach of the step."""
-        along, inward, half = edges.along, edges.inward, edges.half
-        flat = np.abs(along[:, 0]) > np.abs(along[:, 1])
+        direction, inward, half_length = edges.along, edges.inward, edges.half
+        flat = np.abs(direction[:, 0]) > np.abs(direction[:, 1])
         k = np.where(flat, 0, 1)  # the axis that runs along the edge
         row = np.arange(len(k))
         low = np.minimum(edges.start, edges.end)[row, k]
@@ -223,7 +227,7 @@ class _Pixels:
         number = int(min(np.ceil(np.max(high - low)) + 1, settings.max_columns))
         step = np.maximum((high - low) / max(number - 1, 1), 1.0)
         major = np.rint(low[:, None] + step[:, None] * np.arange(number))
-        slope = along[row, 1 - k] / along[row, k]
+        slope = direction[row, 1 - k] / direction[row, k]
         line = edges.middle[row, 1 - k, None] + slope[:, None] * (
             major - edges.middle[row, k, None]
         )
@@ -235,26 +239,28 @@ class _Pixels:
             flat[:, None, None, None], np.stack([major, minor], -1), np.stack([minor, major], -1)
         ).reshape(len(k), -1, 2)
         height, width = grey.shape
-        inside = np.all((place >= 0) & (place < [width, height]), axis=2)
-        u, v = np.where(inside[..., None], place, 0).astype(int).transpose(2, 0, 1)
-        away = place - edges.middle[:, None]
-        s = np.einsum("npk,nk->np", away, inward)
-        t = np.einsum("npk,nk->np", away, along) / half[:, None]
+        is_inside = np.all((place >= 0) & (place < [width, height]), axis=2)
+        u, v = np.where(is_inside[..., None], place, 0).astype(int).transpose(2, 0, 1)
+        from_middle = place - edges.middle[:, None]
+        s = np.einsum("npk,nk->np", from_middle, inward)
+        t = np.einsum("npk,nk->np", from_middle, direction) / half_length[:, None]
         ends = np.stack([(1 - t) / 2, (1 + t) / 2], 2)
         inner, outer = (np.einsum("npe,ne->np", ends, w) for w in (edges.inner, edges.outer))
-        weight = np.asarray(inside & (s < np.minimum(inner, reach)))
+        weight = np.asarray(is_inside & (s < np.minimum(inner, reach)))
         weight &= s > -np.minimum(outer, reach)
-        for near in (edges.before, edges.after):
-            apart = place - near[:, None, 0]
-            clear = np.einsum("npk,nk->np", apart, _right_of(near[:, 1]))
+        for adjacent in (edges.before, edges.after):
+            from_adjacent = place - adjacent[:, None, 0]
+            clear = np.einsum("npk,nk->np", from_adjacent, _right_of(adjacent[:, 1]))
             weight &= clear > np.maximum(settings.clearance * blur, 0.5)[:, None]
         weight &= np.abs(t) < 1
         level = np.zeros_like(t)
         if np.any(weight & (s > inner - settings.reach * blur[:, None])):
             # The cells behind the strip, blurred along the edge.
-            sharp = (half / blur)[:, None, None]
-            passed = scipy.special.ndtr(sharp * (t[:, :, None] - edges.far[:, None]))
-            level = np.einsum("npc,nc->np", passed[:, :, :-1] - passed[:, :, 1:], edges.level)
+            sharp = (half_length / blur)[:, None, None]
+            share_passed = scipy.special.ndtr(sharp * (t[:, :, None] - edges.far[:, None]))
+            level = np.einsum(
+                "npc,nc->np", share_passed[:, :, :-1] - share_passed[:, :, 1:], edges.level
+            )
         # Single precision is faster, and exact to 1e-5 pixels.
         return cls(*(x.astype(np.float32) for x in (s, t, grey[v, u], weight, inner, outer, level)))
 
@@ -265,9 +271,9 @@ def _start(pixels: _Pixels, blur: Float[np.ndarray, " n"], coarse: bool) -> Thet
     w, s, g = pixels.weight, pixels.s, pixels.grey
     theta[:, 8] = np.log(blur)
     for column, side in ((3, s < 0), (5, s > 0)):
-        most = np.where(w * side > 0, np.abs(s), 0.0)
-        far = w * side * (most > 0.5 * most.max(1, keepdims=True))
-        theta[:, column] = (far * g).sum(1) / np.maximum(far.sum(1), 1)
+        reach_of_side = np.where(w * side > 0, np.abs(s), 0.0)
+        is_far = w * side * (reach_of_side > 0.5 * reach_of_side.max(1, keepdims=True))
+        theta[:, column] = (is_far * g).sum(1) / np.maximum(is_far.sum(1), 1)
     if coarse:
         # Pixels between the levels, weighted by q·(1 − q) of their place q between them, lie about
         # the step, also from far away; a line through them, robust by 1/(1 + d²) (Cauchy) of their
@@ -281,8 +287,8 @@ def _start(pixels: _Pixels, blur: Float[np.ndarray, " n"], coarse: bool) -> Thet
             N = np.einsum("npi,np,npj->nij", basis, middle, basis) + 1e-6 * np.eye(2)
             b = np.einsum("npi,np,np->ni", basis, middle, s)
             line = np.linalg.solve(N, b[..., None])[..., 0]
-            away = s - np.einsum("npi,ni->np", basis, line)
-            middle = middle / (1 + (away / 1.0) ** 2)
+            from_line = s - np.einsum("npi,ni->np", basis, line)
+            middle = middle / (1 + (from_line / 1.0) ** 2)
         theta[:, :2] = line
     return theta
 
@@ -310,7 +316,7 @@ def _model(
     tau, t = np.exp(lntau), pixels.t
     s = pixels.s - (a + t * (b + t * c))
     W, B = W + W1 * t, B + B1 * t
-    z, far, out = s / tau, (s - pixels.inner) / tau, (s + pixels.outer) / tau
+    z, to_far_edge, to_outer_edge = s / tau, (s - pixels.inner) / tau, (s + pixels.outer) / tau
     ndtr, density = (
         scipy.special.ndtr,
         lambda z: np.exp(-z * z / 2) * np.float32((2 * np.pi) ** -0.5),
@@ -319,10 +325,10 @@ def _model(
     F, f, zf = ndtr(z), density(z), 0.0
     zf = z * f
     if q.any():
-        of_far = q * density(far)
-        F, f, zf = F - q * ndtr(far), f - of_far, zf - far * of_far
-    beyond = ndtr(-out)
-    of_out = density(out)
+        density_at_far = q * density(to_far_edge)
+        F, f, zf = F - q * ndtr(to_far_edge), f - density_at_far, zf - to_far_edge * density_at_far
+    beyond = ndtr(-to_outer_edge)
+    of_out = density(to_outer_edge)
     step = B - W
     shift = (-step * f + V * of_out) / tau
     J = np.stack(
@@ -335,7 +341,7 @@ def _model(
             F,
             t * F,
             beyond,
-            -step * zf + V * out * of_out,
+            -step * zf + V * to_outer_edge * of_out,
         ],
         2,
     )
@@ -355,20 +361,20 @@ def _consistent_parts(
     index = (part + parts * np.arange(n)[:, None]).ravel()
     add = lambda x: np.bincount(index, x.ravel(), n * parts).reshape(n, parts)
     information = add(weight * J[:, :, 0] ** 2)
-    known = information > 0.02 * information.max(1, keepdims=True)
-    shift = add(weight * J[:, :, 0] * r) / np.where(known, information, np.inf)
+    is_known = information > 0.02 * information.max(1, keepdims=True)
+    shift = add(weight * J[:, :, 0] * r) / np.where(is_known, information, np.inf)
     noise = noise_of_residuals(r, weight, UNKNOWNS)[:, None]
     z = shift * np.sqrt(information) / noise
     # The median over the known parts: unknown ones come last.
-    order = np.sort(np.where(known, np.abs(z), np.inf), axis=1)
-    middle = np.maximum(known.sum(1) - 1, 0) // 2
-    spread = NORMAL_SIGMA_BY_MAD * np.take_along_axis(order, middle[:, None], 1)
-    good = known & (np.abs(z) < settings.max_part_shift * np.maximum(spread, 1.0))
+    order = np.sort(np.where(is_known, np.abs(z), np.inf), axis=1)
+    middle = np.maximum(is_known.sum(1) - 1, 0) // 2
+    scatter = NORMAL_SIGMA_BY_MAD * np.take_along_axis(order, middle[:, None], 1)
+    good = is_known & (np.abs(z) < settings.max_part_shift * np.maximum(scatter, 1.0))
     redundancy = good.sum(1) - 3  # a, b, c
     chi2 = np.where(good, z, 0.0) ** 2
     excess = np.sqrt(chi2.sum(1) / np.maximum(redundancy, 1))
     # Not where it is within the spread of χ² itself, √(2/f), twice.
     significant = excess**2 > 1 + 2 * np.sqrt(2 / np.maximum(redundancy, 1))
     excess = np.where((redundancy > 2) & significant, excess, 1.0)
-    keep = np.take_along_axis(good | ~known, part, 1)
+    keep = np.take_along_axis(good | ~is_known, part, 1)
     return keep.astype(float), excess

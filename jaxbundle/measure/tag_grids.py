@@ -52,9 +52,9 @@ def read_markers(
     detector = cv2.aruco.ArucoDetector(get_dictionary(dictionary), parameters)
     corners, ids, _ = detector.detectMarkers(grey)
     ids = np.zeros(0, int) if ids is None else ids.ravel().astype(int)
-    once = np.bincount(ids, minlength=1)[ids] == 1
-    seen = np.array([four[0] for four in corners], float).reshape(-1, 4, 2)
-    return ids[once], seen[once]
+    occurs_once = np.bincount(ids, minlength=1)[ids] == 1
+    corners_seen = np.array([four[0] for four in corners], float).reshape(-1, 4, 2)
+    return ids[occurs_once], corners_seen[occurs_once]
 
 
 def find_tags(cv2: ModuleType, grey: Grey, board: Board) -> BoardPoints:
@@ -62,8 +62,9 @@ def find_tags(cv2: ModuleType, grey: Grey, board: Board) -> BoardPoints:
 
     **Raises:** `InputError` for fewer than four tags, or tags in one row.
     """
-    ids, seen = max(
-        (_read_tags(grey, board, bits) for bits in BORDER_BITS), key=lambda found: len(found[0])
+    ids, corners_seen = max(
+        (_read_tags(grey, board, bits) for bits in BORDER_BITS),
+        key=lambda numbers_and_corners: len(numbers_and_corners[0]),
     )
     rows, columns = np.divmod(ids - board.first_marker, board.columns)
     if len(ids) < MIN_TAGS or not (np.ptp(rows) and np.ptp(columns)):
@@ -75,24 +76,24 @@ def find_tags(cv2: ModuleType, grey: Grey, board: Board) -> BoardPoints:
         # Points of the board that are the corners of the tags, by their row from the top.
         i, j = 2 * place[:, None] + [0, 0, 1, 1], 2 * columns[:, None] + [0, 1, 1, 0]
         corners: Int[np.ndarray, "tags 4"] = i * 2 * board.columns + j
-        near = _places(cv2, board.points[corners, :2], seen)
-        if near is not None:
+        expected = _places(cv2, board.points[corners, :2], corners_seen)
+        if expected is not None:
             break
     else:
         raise InputError(f"the tags found are not those of a flat grid: {board}")
-    side = np.linalg.norm(np.diff(seen, axis=1), axis=2).min(1)
+    side = np.linalg.norm(np.diff(corners_seen, axis=1), axis=2).min(1)
     # The squares of the gaps end where the next tag begins, in sides of a tag.
     gap = min(1.0, min(board.spacing) / board.marker_side - 1)
     xy, rows, lines = [], [], []
-    for which, there, four, length in zip(corners, near, seen, side):
-        apart = np.linalg.norm(there[:, None] - four, axis=2)
+    for which, expected_corners, four, length in zip(corners, expected, corners_seen, side):
+        distance = np.linalg.norm(expected_corners[:, None] - four, axis=2)
         # In sides of the tag; larger: wrongly read tags pass; smaller: tags at the edge of a wide
         # lens are lost, where the homographies fit worst; not critical.
-        if len({*apart.argmin(1).tolist()}) == 4 and apart.min(1).max() < 0.25 * length:
-            xy += list(there)  # OpenCV's corners reach into the squares of the gaps
+        if len({*distance.argmin(1).tolist()}) == 4 and distance.min(1).max() < 0.25 * length:
+            xy += list(expected_corners)  # OpenCV's corners reach into the squares of the gaps
             rows += which.tolist()
-            along = gap * (np.roll(there, -1, 0) - there)
-            lines += list(np.stack([along, np.roll(along, 1, 0)], 1))
+            step = gap * (np.roll(expected_corners, -1, 0) - expected_corners)
+            lines += list(np.stack([step, np.roll(step, 1, 0)], 1))
     if not rows:
         raise InputError(f"the tags found are not those of a flat grid: {board}")
     return make_points(fit_saddles(grey, np.array(xy), np.array(lines)), np.array(rows), board)
@@ -102,27 +103,31 @@ def _read_tags(
     grey: Grey, board: Board, bits: int
 ) -> tuple[Int[np.ndarray, " tags"], Float[np.ndarray, "tags 4 2"]]:
     """Numbers and corners of the tags of a board; those read twice are left out."""
-    ids, seen = read_markers(grey, board.dictionary, bits)
+    ids, corners_seen = read_markers(grey, board.dictionary, bits)
     number = ids - board.first_marker
     of_board = (number >= 0) & (number < board.markers)
-    return ids[of_board], seen[of_board]
+    return ids[of_board], corners_seen[of_board]
 
 
 def _places(
-    cv2: ModuleType, X: Float[np.ndarray, "tags 4 2"], seen: Float[np.ndarray, "tags 4 2"]
+    cv2: ModuleType, X: Float[np.ndarray, "tags 4 2"], corners_seen: Float[np.ndarray, "tags 4 2"]
 ) -> Float[np.ndarray, "tags 4 2"] | None:
     """Corners [tags, 4, 2] by homographies of the middles of neighbouring tags, so that distortion
     matters little; None for a mirror image."""
-    middle, there = X.mean(1), seen.mean(1)
-    H, _ = cv2.findHomography(middle, there, cv2.LMEDS)
+    middle, middle_seen = X.mean(1), corners_seen.mean(1)
+    H, _ = cv2.findHomography(middle, middle_seen, cv2.LMEDS)
     if H is None or np.linalg.det(H / H[2, 2]) > 0:  # Y of the board is up, v down
         return None
-    found = np.empty(X.shape)
+    places = np.empty(X.shape)
     for tag, four in enumerate(X):
         # 3 × 3 tags about this one: over more, distortion bends the homography; over fewer, the
         # places scatter by the noise of the middles
-        near = np.argsort(np.linalg.norm(middle - middle[tag], axis=1))[:9]
-        flat = np.linalg.matrix_rank(middle[near] - middle[tag]) == 2
-        local = cv2.findHomography(middle[near], there[near])[0] if flat and len(near) > 3 else H
-        found[tag] = cv2.perspectiveTransform(four[None], H if local is None else local)[0]
-    return found
+        nearest = np.argsort(np.linalg.norm(middle - middle[tag], axis=1))[:9]
+        flat = np.linalg.matrix_rank(middle[nearest] - middle[tag]) == 2
+        local = (
+            cv2.findHomography(middle[nearest], middle_seen[nearest])[0]
+            if flat and len(nearest) > 3
+            else H
+        )
+        places[tag] = cv2.perspectiveTransform(four[None], H if local is None else local)[0]
+    return places

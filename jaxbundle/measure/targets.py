@@ -101,12 +101,12 @@ def centre_by_grey_values(
     **Raises:** `InputError` if no target stands out, or it is cut by the edge of the image.
     """
     spot = find_spot(np.asarray(grey, float), np.asarray(near, float))
-    xy, spread, total = _moments(spot)
-    away = _places(spot) - xy[:, None, None]
+    xy, second_moments, total = _moments(spot)
+    from_centre = _places(spot) - xy[:, None, None]
     region = _region(spot)
-    away = (away * region).reshape(2, -1)
-    covariance = (spot.noise / (spot.contrast * total)) ** 2 * away @ away.T
-    return _target(spot, xy, covariance, *_axes_of(spread))
+    from_centre = (from_centre * region).reshape(2, -1)
+    covariance = (spot.noise / (spot.contrast * total)) ** 2 * from_centre @ from_centre.T
+    return _target(spot, xy, covariance, *_axes_of(second_moments))
 
 
 def centre_by_ellipse(
@@ -118,10 +118,12 @@ def centre_by_ellipse(
     edge; arguments and errors as in `centre_by_grey_values`."""
     settings = settings or DiscSettings()
     spot = find_spot(np.asarray(grey, float), np.asarray(near, float))
-    xy, spread, _ = _moments(spot)
-    centre, covariance, axes, angle, seen = _fit_disc(spot, xy, *_axes_of(spread), settings)
+    xy, second_moments, _ = _moments(spot)
+    centre, covariance, axes, angle, share_seen = _fit_disc(
+        spot, xy, *_axes_of(second_moments), settings
+    )
     where = "at ({:.1f}, {:.1f})".format(*(xy + spot.corner))
-    if seen < settings.min_seen:
+    if share_seen < settings.min_seen:
         raise InputError(f"{where}: the edge of the target is not fully visible")
     # The centre of grey values is that of the ellipse, but for a neighbour in the window.
     if not np.isfinite(covariance).all() or np.linalg.norm(centre - xy) > 0.3 * axes[0] + 1:
@@ -164,14 +166,14 @@ def _moments(
     w = np.where(_region(spot), (spot.grey - spot.background) / spot.contrast, 0.0)
     places, total = _places(spot), w.sum()
     xy = (w * places).sum((1, 2)) / total
-    away = np.where(spot.inside, places - xy[:, None, None], 0.0).reshape(2, -1)
-    return xy, away @ away.T / spot.inside.sum(), total
+    from_centre = np.where(spot.inside, places - xy[:, None, None], 0.0).reshape(2, -1)
+    return xy, from_centre @ from_centre.T / spot.inside.sum(), total
 
 
-def _axes_of(spread: Float[np.ndarray, "2 2"]) -> tuple[Float[np.ndarray, "2"], float]:
+def _axes_of(second_moments: Float[np.ndarray, "2 2"]) -> tuple[Float[np.ndarray, "2"], float]:
     """Semi-axes and angle of the ellipse with these second moments: an axis a has a²/4, and the
     area of a pixel adds its own, 1/12."""
-    values, vectors = np.linalg.eigh(spread + np.eye(2) / 12)
+    values, vectors = np.linalg.eigh(second_moments + np.eye(2) / 12)
     x, y = vectors[:, 1]
     return 2 * np.sqrt(values[::-1]), np.arctan2(y, x)
 
@@ -203,11 +205,11 @@ def _fit_disc(
     inverse = np.linalg.inv(_normal_matrix(A))
     excess = _excess(A, r, inverse, sector, noise, settings.sectors)
     covariance = (noise * excess) ** 2 * inverse[:2, :2]
-    seen = np.unique(sector[weight > 0]).size / settings.sectors
+    share_seen = np.unique(sector[weight > 0]).size / settings.sectors
     values, vectors = np.linalg.eigh([[theta[2], theta[3]], [theta[3], theta[4]]])
     angle = np.arctan2(vectors[1, 0], vectors[0, 0])
     angle = np.remainder(angle + np.pi / 2, np.pi) - np.pi / 2
-    return theta[:2], covariance, values**-0.5, angle, seen
+    return theta[:2], covariance, values**-0.5, angle, share_seen
 
 
 def _iterate(
@@ -241,8 +243,8 @@ def _iterate(
         # A pixel's area alone has τ = 1/√12 = 0.29; a blur of half the disc leaves no rim.
         theta[7] = np.clip(theta[7], np.log(0.35), np.log(0.5 * minor + 1))
         step += 1
-        still = np.abs(change[:2]).max() < settings.last_step
-        if step == settings.max_steps or step > 3 and still:
+        is_still = np.abs(change[:2]).max() < settings.last_step
+        if step == settings.max_steps or step > 3 and is_still:
             return theta, A, r, weight, sector
 
 
@@ -287,8 +289,14 @@ def _blurred_disc(
         ]
     )
     sector = ((np.arctan2(v, u) / np.pi + 1) / 2 * sectors).astype(int) % sectors
-    half, other = (A + C) / 2, np.hypot((A - C) / 2, B)
-    return ground + contrast * step + mx * u + my * v, J, d, sector, (half + other) ** -0.5
+    half_trace, half_difference = (A + C) / 2, np.hypot((A - C) / 2, B)
+    return (
+        ground + contrast * step + mx * u + my * v,
+        J,
+        d,
+        sector,
+        (half_trace + half_difference) ** -0.5,
+    )
 
 
 def _consistent_sectors(
@@ -305,8 +313,8 @@ def _consistent_sectors(
     shift = np.bincount(sector, normal * r * np.sign(J[6]), settings.sectors)
     z = shift / np.sqrt(np.maximum(information, 1e-12))
     noise = np.sqrt(max(r @ r / max(weight.sum() - UNKNOWNS, 1), 1 / 12))
-    spread = max(NORMAL_SIGMA_BY_MAD * np.median(np.abs(z)), noise)
-    return (np.abs(z) < settings.max_sector_shift * spread)[sector].astype(float)
+    scatter = max(NORMAL_SIGMA_BY_MAD * np.median(np.abs(z)), noise)
+    return (np.abs(z) < settings.max_sector_shift * scatter)[sector].astype(float)
 
 
 def _excess(
@@ -324,5 +332,5 @@ def _excess(
     ratio = np.einsum("is,ij,js->", pairs, np.linalg.inv(inverse[:2, :2]), pairs)
     ratio /= (sectors - 2) * noise**2
     # χ²/f has the σ √(2/f), and the pairs have f = sectors coordinates: only beyond 3 of it
-    spread = np.sqrt(2 / sectors)
-    return np.sqrt(ratio) if ratio > 1 + 3 * spread else 1.0
+    sigma_of_ratio = np.sqrt(2 / sectors)
+    return np.sqrt(ratio) if ratio > 1 + 3 * sigma_of_ratio else 1.0

@@ -115,7 +115,7 @@ class BoardViews:
     def centres(self) -> Float[np.ndarray, "views 3"]:
         """The centre of the board of every view, in the frame of its board, object unit."""
         if isinstance(self.board, BoardSet):
-            middle = np.array([one.points.mean(0) for one in self.board.boards])
+            middle = np.array([board.points.mean(0) for board in self.board.boards])
             return middle[self.board.seen(self.visible)]
         return np.broadcast_to(self.board.points.mean(0), (len(self), 3))
 
@@ -125,9 +125,9 @@ class BoardViews:
         """Some of the views (a mask or indices); the others count as failed if `why` is given."""
         keep = np.zeros(len(self), bool)
         keep[rows] = True
-        out = [(name, why) for name, kept in zip(self.names, keep) if not kept and why]
-        names = tuple(name for name, kept in zip(self.names, keep) if kept)
-        photographs = tuple(name for name, kept in zip(self.photographs, keep) if kept)
+        out = [(name, why) for name, is_kept in zip(self.names, keep) if not is_kept and why]
+        names = tuple(name for name, is_kept in zip(self.names, keep) if is_kept)
+        photographs = tuple(name for name, is_kept in zip(self.photographs, keep) if is_kept)
         return dataclasses.replace(
             self,
             names=names,
@@ -137,13 +137,13 @@ class BoardViews:
         )
 
 
-def photographs(given: Sequence[str | Path]) -> list[Path]:
+def photographs(sources: Sequence[str | Path]) -> list[Path]:
     """Files of paths, patterns (`left/*.jpg`) and folders, each once and in order.
 
     **Raises:** `InputError` if a pattern or a folder has none.
     """
-    found: dict[Path, None] = {}
-    for item in given:
+    files_found: dict[Path, None] = {}
+    for item in sources:
         path = Path(item)
         if path.is_dir():
             files = list_photographs(path)
@@ -155,8 +155,8 @@ def photographs(given: Sequence[str | Path]) -> list[Path]:
                 raise InputError(f"{item}: no file matches this pattern")
         else:
             files = [path]
-        found |= dict.fromkeys(files)
-    return list(found)
+        files_found |= dict.fromkeys(files)
+    return list(files_found)
 
 
 def measure_boards(
@@ -189,8 +189,8 @@ def measure_boards(
         if progress is not None:
             progress(SEARCHING, done, len(file_of))
 
-    found = map_in_threads(search, file_of, searches_at_once(files, board), tell)
-    for name, (look, negative) in zip(file_of, found):
+    searched = map_in_threads(search, file_of, searches_at_once(files, board), tell)
+    for name, (look, negative) in zip(file_of, searched):
         looks[name], negatives[name] = look, negative
     if one_size:
         refuse_sizes({name: look[0] for name, look in looks.items() if not isinstance(look, str)})
@@ -214,30 +214,31 @@ def collect_views(
 
     **Raises:** `InputError` if no photograph shows the board.
     """
-    failed = {name: look for name, look in looks.items() if isinstance(look, str)}
-    found = [(name, *look) for name, look in looks.items() if not isinstance(look, str)]
-    if hints and len(found) < len(looks) / 2:
-        failed |= _other_boards(file_of, board, failed)
-    if not found:
-        raise InputError(_nothing_found(file_of, failed))
-    sizes = Counter(size for _, size, _ in found)
+    failures = {name: look for name, look in looks.items() if isinstance(look, str)}
+    views_found = [(name, *look) for name, look in looks.items() if not isinstance(look, str)]
+    if hints and len(views_found) < len(looks) / 2:
+        failures |= _other_boards(file_of, board, failures)
+    if not views_found:
+        raise InputError(_nothing_found(file_of, failures))
+    sizes = Counter(size for _, size, _ in views_found)
     size = sizes.most_common(1)[0][0]
-    for name, other, _ in found:
-        if other != size:
-            turned = ": it was rotated after exposure" if other == size[::-1] else ""
-            failed[name] = (
-                f"has {other[0]} × {other[1]} pixels, most have {size[0]} × {size[1]}{turned}"
+    for name, image_size, _ in views_found:
+        if image_size != size:
+            hint = ": it was rotated after exposure" if image_size == size[::-1] else ""
+            failures[name] = (
+                f"has {image_size[0]} × {image_size[1]} pixels, most have {size[0]} × "
+                f"{size[1]}{hint}"
             )
-    used = [(name, xy) for name, other, xy in found if other == size]
-    failed |= _find_saved_again(used)
-    used = [(name, xy) for name, xy in used if name not in failed]
+    used_views = [(name, xy) for name, image_size, xy in views_found if image_size == size]
+    failures |= _find_saved_again(used_views)
+    used_views = [(name, xy) for name, xy in used_views if name not in failures]
     order = {name: i for i, name in enumerate(file_of)}
     return BoardViews(
         board,
-        tuple(name for name, _ in used),
+        tuple(name for name, _ in used_views),
         size,
-        np.array([xy for _, xy in used]),
-        tuple(sorted(failed.items(), key=lambda item: order[item[0]])),
+        np.array([xy for _, xy in used_views]),
+        tuple(sorted(failures.items(), key=lambda item: order[item[0]])),
     )
 
 
@@ -251,13 +252,18 @@ def refuse_sizes(sizes: Mapping[str, tuple[int, int]]) -> None:
     numbers = Counter(sizes.values())
     if len(numbers) < 2:
         return
-    first = {size: next(name for name, of in sizes.items() if of == size) for size in numbers}
-    shown = ", ".join(
-        f"{count(number, 'photograph')} of {columns} × {rows} pixels ({first[columns, rows]})"
+    first_of_size = {
+        size: next(name for name, size_of_photograph in sizes.items() if size_of_photograph == size)
+        for size in numbers
+    }
+    sizes_in_words = ", ".join(
+        f"{count(number, 'photograph')} of {columns} × {rows} pixels "
+        f"({first_of_size[columns, rows]})"
         for (columns, rows), number in numbers.most_common()
     )
     raise InputError(
-        f"photographs have different sizes: {shown}; expected those of one camera, all of one "
+        f"photographs have different sizes: {sizes_in_words}; expected those of one camera, all "
+        "of one "
         "size: move the others to a folder of their own"
     )
 
@@ -273,8 +279,8 @@ def _search(path: str | Path, board: Board) -> tuple[Look, bool]:
     try:
         with image_errors(path):
             grey = read_photograph(path)
-            found = find_board_points(grey, board)
-        return ((grey.shape[1], grey.shape[0]), found.xy), found.negative
+            points_found = find_board_points(grey, board)
+        return ((grey.shape[1], grey.shape[0]), points_found.xy), points_found.negative
     except InputError as error:
         return str(error).removeprefix(f"{path}: "), False
 
@@ -300,103 +306,106 @@ def search_alone(task: tuple[str | Path, Board]) -> Look:
 
 def _find_repeated(paths: Mapping[str, Path]) -> dict[str, str]:
     """The files with the content of an earlier one, and the earlier one."""
-    first: dict[bytes, str] = {}
-    found = {}
+    first_of_content: dict[bytes, str] = {}
+    repeated = {}
     for name, path in paths.items():
         try:
             content = read_content(path, text=False)
         except InputError:
             continue
-        same = first.setdefault(hashlib.blake2b(content).digest(), name)
-        if same != name and content:
-            found[name] = f"is the same file as {same}"
-    return found
+        earlier = first_of_content.setdefault(hashlib.blake2b(content).digest(), name)
+        if earlier != name and content:
+            repeated[name] = f"is the same file as {earlier}"
+    return repeated
 
 
-def _find_saved_again(used: Sequence[tuple[str, np.ndarray]]) -> dict[str, str]:
+def _find_saved_again(used_views: Sequence[tuple[str, np.ndarray]]) -> dict[str, str]:
     """Views with the same points as an earlier one: one photograph in another
     compression or format.
 
     JPEG at quality 70 moves corners by 0.015 pixels (RMS); two photographs of one pose, with noise
     of their own, agree to 0.022 and more (real ones, a contrast of 100 grey values)."""
-    found: dict[str, str] = {}
-    for i, (name, xy) in enumerate(used):
-        for other, earlier in used[:i]:
-            away = np.linalg.norm(xy - earlier, axis=1)
-            same = np.isfinite(away)
-            if other in found or same.mean() < 0.8:  # most of the board
+    repeated: dict[str, str] = {}
+    for i, (name, xy) in enumerate(used_views):
+        for earlier_name, earlier in used_views[:i]:
+            distance = np.linalg.norm(xy - earlier, axis=1)
+            in_both = np.isfinite(distance)
+            if earlier_name in repeated or in_both.mean() < 0.8:  # most of the board
                 continue
-            rms = float(np.sqrt(np.mean(away[same] ** 2)))
+            rms = float(np.sqrt(np.mean(distance[in_both] ** 2)))
             if rms < 0.02:
-                found[name] = (
-                    f"shows the board where {other} does, to {rms:.1g} px: the same photograph "
+                repeated[name] = (
+                    f"shows the board where {earlier_name} does, to {rms:.1g} px: the same "
+                    "photograph "
                     "saved again, or another of the same pose; one is used"
                 )
                 break
-    return found
+    return repeated
 
 
-def _nothing_found(paths: Mapping[str, Path], failed: Mapping[str, str]) -> str:
+def _nothing_found(paths: Mapping[str, Path], failures: Mapping[str, str]) -> str:
     """One line about photographs without a board, preferably about one with another board."""
-    hinted = (name for name in failed if HINT in failed[name])
-    first = next(hinted, next(iter(failed)))
-    return f"no photograph of {len(failed)} shows the board: {paths[first]}: {failed[first]}"
+    hinted = (name for name in failures if HINT in failures[name])
+    first_failure = next(hinted, next(iter(failures)))
+    reason = f"{paths[first_failure]}: {failures[first_failure]}"
+    return f"no photograph of {len(failures)} shows the board: {reason}"
 
 
 def _other_boards(
-    paths: Mapping[str, Path], board: Board, failed: Mapping[str, str]
+    paths: Mapping[str, Path], board: Board, failures: Mapping[str, str]
 ) -> dict[str, str]:
     """Reasons of some photographs without the board, with the size of another board in them."""
     sizes = {}
-    for name in list(failed)[:MAX_SEARCHED]:
+    for name in list(failures)[:MAX_SEARCHED]:
         try:
             sizes[name] = other_sizes(read_photograph(paths[name]), board)
         except InputError:
             continue
     if board.kind in ("charuco", "aprilgrid"):
         return {
-            name: f"{failed[name]}. But {_markers_seen(other, board)}"
-            for name, other in sizes.items()
-            if other is not None
+            name: f"{failures[name]}. But {_markers_seen(other_board, board)}"
+            for name, other_board in sizes.items()
+            if other_board is not None
         }
     return {
-        name: f"{failed[name]}. But there is one of {other.columns}x{other.rows}: {HINT}board "
-        f"{other.columns}x{other.rows}, if it is seen whole"
-        for name, other in sizes.items()
-        if other is not None
+        name: f"{failures[name]}. But there is one of {other_board.columns}x{other_board.rows}: "
+        f"{HINT}board {other_board.columns}x{other_board.rows}, if it is seen whole"
+        for name, other_board in sizes.items()
+        if other_board is not None
     }
 
 
-def _markers_seen(other: Board, board: Board) -> str:
+def _markers_seen(other_board: Board, board: Board) -> str:
     """The board that the markers seen tell, and what to give."""
     options = []
-    if other.dictionary != board.dictionary:
-        options.append(f"--dictionary {other.dictionary}")
-    if (other.columns, other.rows) != (board.columns, board.rows):
-        options.append(f"--board {other.columns}x{other.rows} (or more rows)")
-    if other.first_marker != board.first_marker:
-        options.append(f"--first-marker {other.first_marker}")
+    if other_board.dictionary != board.dictionary:
+        options.append(f"--dictionary {other_board.dictionary}")
+    if (other_board.columns, other_board.rows) != (board.columns, board.rows):
+        options.append(f"--board {other_board.columns}x{other_board.rows} (or more rows)")
+    if other_board.first_marker != board.first_marker:
+        options.append(f"--first-marker {other_board.first_marker}")
     return f"the markers seen are those of another board: give {', '.join(options)}"
 
 
 def _part_of_a_larger(
-    paths: Mapping[str, Path], used: Sequence[str], board: Board
+    paths: Mapping[str, Path], used_views: Sequence[str], board: Board
 ) -> tuple[str, ...]:
     """A warning if most of some photographs show the same larger board; one may be wrong."""
     if board.kind != "chessboard":
         return ()
-    few = used[:MAX_SEARCHED]
-    sizes = Counter(largest_chessboard(read_photograph(paths[name]), board) for name in few)
-    (other, times), *_ = sizes.most_common(1) or [(None, 0)]
-    if other is None or times <= len(few) / 2:
+    searched = used_views[:MAX_SEARCHED]
+    sizes = Counter(largest_chessboard(read_photograph(paths[name]), board) for name in searched)
+    (larger_board, times), *_ = sizes.most_common(1) or [(None, 0)]
+    if larger_board is None or times <= len(searched) / 2:
         return ()
-    larger = other.columns >= board.columns and other.rows >= board.rows
-    if not larger or other == board:
+    larger = larger_board.columns >= board.columns and larger_board.rows >= board.rows
+    if not larger or larger_board == board:
         return ()
-    size = f"{other.columns}x{other.rows}"
+    size = f"{larger_board.columns}x{larger_board.rows}"
     return (
         f"the board of {board.columns}x{board.rows} is a part of a larger one, of {size} "
-        f"({few[0]}), and not the same part everywhere; if {size} is the board: {HINT}board {size}",
+        f"({searched[0]}), and not the same part everywhere; if {size} is the board: {HINT}board "
+        f"{size}",
     )
 
 

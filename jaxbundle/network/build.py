@@ -150,7 +150,7 @@ def make_network(  # noqa: PLR0913 - the tables of a network
         images=images,
         points=points,
         observations=dataclasses.replace(observations, xy=xy, sigma=sigma),
-        distances=Distances.empty()
+        distances=Distances.none()
         if distances is None
         else _make_distances(as_columns(distances, "distances"), points),
         datum_points=tuple(str(id) for id in datum_points),
@@ -410,7 +410,7 @@ def _rows_in(table_of_ids: Images | Points, table: Columns, name: str) -> Int[np
 
 def _make_distances(table: Columns, points: Points) -> Distances:
     if not len(table):
-        return Distances.empty()
+        return Distances.none()
     table.check_names(DISTANCE_COLUMNS)
     index = _index(points.id)
     ends = [table.indices(name, "point", index, points.source.name) for name in ("from", "to")]

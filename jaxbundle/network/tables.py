@@ -235,7 +235,7 @@ class Distances:
         return len(self.value)
 
     @staticmethod
-    def empty() -> "Distances":
+    def none() -> "Distances":
         """An empty table of distances."""
         return Distances(np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0))
 
@@ -269,7 +269,7 @@ class Network:
     images: Images
     points: Points
     observations: Observations
-    distances: Distances = dataclasses.field(default_factory=Distances.empty)
+    distances: Distances = dataclasses.field(default_factory=Distances.none)
     datum: str = "control"
     datum_points: tuple[str, ...] = ()
     residuals: str = "corrected"

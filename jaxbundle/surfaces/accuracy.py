@@ -17,12 +17,12 @@ AXES = ("X", "Y", "Z")
 def accuracy_of(cloud: Cloud) -> dict[str, Any]:
     """Mean, largest and smallest σ of each axis, and numbers of points by class of all three."""
     sigma = cloud.sigma
-    known = np.isfinite(sigma).all(1)
-    sigma = sigma[known]
-    found: dict[str, Any] = {"points": int(known.sum())}
+    is_known = np.isfinite(sigma).all(1)
+    sigma = sigma[is_known]
+    figures: dict[str, Any] = {"points": int(is_known.sum())}
     for k, axis in enumerate(AXES):
         s = sigma[:, k]
-        found[f"s{axis}"] = (
+        figures[f"s{axis}"] = (
             {}
             if not len(s)
             else {
@@ -34,11 +34,11 @@ def accuracy_of(cloud: Cloud) -> dict[str, Any]:
         )
     largest = sigma.max(1) if len(sigma) else np.zeros(0)
     number, _ = np.histogram(largest, CLASSES)
-    found["classes"] = [
+    figures["classes"] = [
         {"from": a, "to": None if np.isinf(b) else b, "points": int(n)}
         for a, b, n in zip(CLASSES, CLASSES[1:], number)
     ]
-    return found
+    return figures
 
 
 def at_check_points(
@@ -55,10 +55,10 @@ def at_check_points(
         radius = 4.0 * float(np.median(tree.query(some, 2)[0][:, 1])) if len(cloud) > 1 else 0.0
     misclosure = []
     for place in np.asarray(check, float):
-        near = tree.query_ball_point(place[:2], radius)
-        if len(near) >= min_points:
-            d = cloud.X[near] - place
-            A = np.column_stack([np.ones(len(near)), d[:, :2]])
+        neighbours = tree.query_ball_point(place[:2], radius)
+        if len(neighbours) >= min_points:
+            d = cloud.X[neighbours] - place
+            A = np.column_stack([np.ones(len(neighbours)), d[:, :2]])
             misclosure.append(np.linalg.lstsq(A, d[:, 2], rcond=None)[0][0])
     v = np.array(misclosure)
     return {

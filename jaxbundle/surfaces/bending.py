@@ -120,10 +120,10 @@ def _fit_polynomials(
     A = np.column_stack([np.ones_like(x), x, y, x * x / 2, x * y, y * y / 2])
     row, column = i[:, None] + y + reach, j[:, None] + x + reach
     around = lambda a, **how: np.pad(a, reach, **how)[row, column]
-    there = around(guide.good)
+    is_good = around(guide.good)
     rate = guide.rate[i, j][:, None]
     values = (around(guide.q, mode="edge") - guide.q[i, j][:, None]) * rate
-    weight = there / (around(nodes.sigma, mode="edge") ** 2 + settings.node_sigma**2)
+    weight = is_good / (around(nodes.sigma, mode="edge") ** 2 + settings.node_sigma**2)
     N = np.einsum("nk,ka,kb->nab", weight, A, A, optimize=True)
     # Against a singular N without nodes; of the weights, 10 and more, it is nothing.
     tiny = 1e-6
@@ -131,10 +131,10 @@ def _fit_polynomials(
     p = np.linalg.solve(N, ((weight * values) @ A)[..., None])[..., 0]
     square = np.sum(weight * (values - p @ A.T) ** 2, 1)
     misfit = np.sqrt(square / np.maximum(weight.sum(1), tiny))
-    known = there.mean(1) >= 1 - settings.max_missing
-    known &= misfit < settings.max_misfit * size
-    found = p[:, 1:] / rate / np.array([size, size, size**2, size**2, size**2])
-    return Bend(np.where(known[:, None], found, 0.0), known)
+    is_known = is_good.mean(1) >= 1 - settings.max_missing
+    is_known &= misfit < settings.max_misfit * size
+    derivatives = p[:, 1:] / rate / np.array([size, size, size**2, size**2, size**2])
+    return Bend(np.where(is_known[:, None], derivatives, 0.0), is_known)
 
 
 def sharpen(
@@ -148,22 +148,22 @@ def sharpen(
     """The guide with good nodes refined by least squares matching in the first of the other images
     that shows them: correlation is not accurate enough for the polynomials."""
     row, column, node_uv = guide.good_nodes()
-    q, left = guide.q.copy(), np.ones(len(row), bool)
+    q, is_remaining = guide.q.copy(), np.ones(len(row), bool)
     sigma = np.full(q.shape, settings.unmatched_sigma)
     rough = GuideNodes(guide, sigma.copy())
     uv = np.rint(node_uv)
     for other in others:
-        k = np.flatnonzero(left)
+        k = np.flatnonzero(is_remaining)
         if not len(k):
             break
-        here, normal = guide.q[row[k], column[k]], guide.normal[row[k], column[k]]
+        q_at_node, normal = guide.q[row[k], column[k]], guide.normal[row[k], column[k]]
         # The node is between pixels if the guide ends above the finest level.
         shift = uv[k] - node_uv[k]
         slope = bend_at(rough, uv[k], settings).derivatives[:, :2]
-        here = here + np.sum(slope * shift, 1)
-        window = windows(base, other, base.points(uv[k], here), normal)
+        q_at_node = q_at_node + np.sum(slope * shift, 1)
+        window = windows(base, other, base.points(uv[k], q_at_node), normal)
         # Pixels of this image per pixel of the guide's rate, by a step of a thousandth.
-        ends = here[:, None] + [0.0, 1e-3] / guide.rate[row[k], column[k]][:, None]
+        ends = q_at_node[:, None] + [0.0, 1e-3] / guide.rate[row[k], column[k]][:, None]
         places = positions(base, other, uv[k], ends)
         start, rate = places[:, 0], (places[:, 1] - places[:, 0]) * 1e3
         match = refine(base, other, uv[k], start, window.A, half, window_settings)
@@ -172,12 +172,16 @@ def sharpen(
             good = (match.status == int(MatchingStatus.CONVERGED)) & window.usable
             good &= np.abs(change) < settings.max_node_shift
             good &= match.rho > settings.min_node_correlation
-        moved = k[good]
-        step = change[good] / guide.rate[row[moved], column[moved]]
-        q[row[moved], column[moved]] = (here - np.sum(slope * shift, 1))[good] + step
-        along = np.einsum("ni,nij,nj->n", rate[good], match.covariance[good], rate[good])
-        sigma[row[moved], column[moved]] = np.sqrt(along) / np.sum(rate[good] ** 2, 1)
-        left[moved] = False
+        refined_rows = k[good]
+        step = change[good] / guide.rate[row[refined_rows], column[refined_rows]]
+        q[row[refined_rows], column[refined_rows]] = (q_at_node - np.sum(slope * shift, 1))[
+            good
+        ] + step
+        variance_along = np.einsum("ni,nij,nj->n", rate[good], match.covariance[good], rate[good])
+        sigma[row[refined_rows], column[refined_rows]] = np.sqrt(variance_along) / np.sum(
+            rate[good] ** 2, 1
+        )
+        is_remaining[refined_rows] = False
     return GuideNodes(dataclasses.replace(guide, q=q), sigma)
 
 
@@ -196,8 +200,8 @@ def second_differences(
         for b in (-1, 0, 1):
             du, dv = step * a, step * b
             terms = np.array([du, dv, du * du / 2, du * dv, dv * dv / 2])
-            there = base.points(uv + [du, dv], q + bend.derivatives @ terms)
-            places[a, b] = other.project(there)
+            displaced = base.points(uv + [du, dv], q + bend.derivatives @ terms)
+            places[a, b] = other.project(displaced)
     middle = places[0, 0]
     uu = places[1, 0] - 2 * middle + places[-1, 0]
     vv = places[0, 1] - 2 * middle + places[0, -1]
@@ -209,7 +213,7 @@ def response(
     grey: Float[np.ndarray, "rows columns"],
     uv: Float[np.ndarray, "n 2"],
     A: Float[np.ndarray, "n 2 2"],
-    second: Float[np.ndarray, "n 3 2"],
+    second_derivatives: Float[np.ndarray, "n 3 2"],
     half: int,
     max_correction: float,
 ) -> Float[np.ndarray, "n 2"]:
@@ -219,23 +223,28 @@ def response(
     k = np.arange(-half, half + 1, dtype=float)
     y, x = (a.ravel() for a in np.meshgrid(k, k, indexing="ij"))
     squares = np.stack([x * x / 2, x * y, y * y / 2])
-    for first in range(0, len(uv), MATRICES_AT_ONCE):
-        part = slice(first, first + MATRICES_AT_ONCE)
+    for begin in range(0, len(uv), MATRICES_AT_ONCE):
+        part = slice(begin, begin + MATRICES_AT_ONCE)
         T, gx, gy = _cut_out_with_gradient(grey, np.rint(uv[part]).astype(int), half)
         # The unknowns: c, the four elements of B, brightness, contrast.
         G = np.stack([gx, gy, gx * x, gx * y, gy * x, gy * y, np.ones_like(T), T], 2)
-        w = np.einsum("nij,nkj->nki", np.linalg.inv(A[part]), second[part])
-        moved = np.einsum("nki,kp->nip", w, squares)
-        away = gx * moved[:, 0] + gy * moved[:, 1]
+        w = np.einsum("nij,nkj->nki", np.linalg.inv(A[part]), second_derivatives[part])
+        displacement = np.einsum("nki,kp->nip", w, squares)
+        change_of_grey = gx * displacement[:, 0] + gy * displacement[:, 1]
         # Columns of length 1: gradients and grey values have different units.
         scale = 1 / np.maximum(np.linalg.norm(G, axis=1), 1e-9)
         G = G * scale[:, None]
         # 1e-9 of the unit diagonal: without texture N is singular, and `solve` would raise
         N = np.swapaxes(G, 1, 2) @ G + 1e-9 * np.eye(8)
-        c = np.linalg.solve(N, np.einsum("npi,np->ni", G, away)[:, :, None])[:, :, 0] * scale
-        found = np.einsum("nij,nj->ni", A[part], c[:, :2])
-        small = np.isfinite(found).all(1) & (np.linalg.norm(found, axis=1) < max_correction)
-        out[part] = np.where(small[:, None], found, np.nan)
+        c = (
+            np.linalg.solve(N, np.einsum("npi,np->ni", G, change_of_grey)[:, :, None])[:, :, 0]
+            * scale
+        )
+        correction = np.einsum("nij,nj->ni", A[part], c[:, :2])
+        is_small = np.isfinite(correction).all(1) & (
+            np.linalg.norm(correction, axis=1) < max_correction
+        )
+        out[part] = np.where(is_small[:, None], correction, np.nan)
     return out
 
 
@@ -251,26 +260,30 @@ def correct_bending(
     """Matches, and their covariances, corrected for bending."""
     bend = bend_at(nodes, uv, settings)
     base, other = pair
-    second = second_differences(base, other, uv, q, bend, settings.difference_step)
-    good = bend.reliable & np.isfinite(second).all((1, 2)) & np.isfinite(match.A).all((1, 2))
+    second_derivatives = second_differences(base, other, uv, q, bend, settings.difference_step)
+    good = (
+        bend.reliable
+        & np.isfinite(second_derivatives).all((1, 2))
+        & np.isfinite(match.A).all((1, 2))
+    )
     # An area in the other image of a fiftieth: a window seen from its side, or a failed match.
     good &= np.abs(np.linalg.det(np.where(good[:, None, None], match.A, np.eye(2)))) > 0.02
     rows = np.flatnonzero(good)
-    found = np.full((len(uv), 2), np.nan)
-    found[rows] = response(
-        base.grey, uv[rows], match.A[rows], second[rows], half, settings.max_correction
+    correction = np.full((len(uv), 2), np.nan)
+    correction[rows] = response(
+        base.grey, uv[rows], match.A[rows], second_derivatives[rows], half, settings.max_correction
     )
-    corrected = np.isfinite(found[:, 0])  # both components or none
-    off = np.where(corrected[:, None], found, 0.0)
-    squares = off[:, :, None] * off[:, None]
+    is_corrected = np.isfinite(correction[:, 0])  # both components or none
+    applied = np.where(is_corrected[:, None], correction, 0.0)
+    squares = applied[:, :, None] * applied[:, None]
     # Without a fitting polynomial the effect of bending may be as large as elsewhere.
-    unknown = squares[corrected].mean(0) if corrected.any() else np.zeros((2, 2))
+    unknown = squares[is_corrected].mean(0) if is_corrected.any() else np.zeros((2, 2))
     doubt = np.where(
-        corrected[:, None, None],
+        is_corrected[:, None, None],
         settings.relative_sigma**2 * squares,
         settings.unknown_factor * unknown,
     )
-    return match.uv - off, match.covariance + doubt
+    return match.uv - applied, match.covariance + doubt
 
 
 def _cut_out_with_gradient(

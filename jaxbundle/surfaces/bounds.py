@@ -20,13 +20,15 @@ class Bounds:
 
     def __call__(self, uv: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """[n, 2], ascending."""
-        whole = np.broadcast_to(np.array(self.q, float), (len(uv), 2))
+        whole_range = np.broadcast_to(np.array(self.q, float), (len(uv), 2))
         if self.low is None or self.high is None:
-            return whole.copy()
+            return whole_range.copy()
         q = self.view.bounds(uv, self.low, self.high)
-        inside = np.stack([np.fmax(q[:, 0], whole[:, 0]), np.fmin(q[:, 1], whole[:, 1])], 1)
+        clipped = np.stack(
+            [np.fmax(q[:, 0], whole_range[:, 0]), np.fmin(q[:, 1], whole_range[:, 1])], 1
+        )
         # A line of sight that never reaches these heights keeps a range without matches.
-        return np.where((inside[:, :1] < inside[:, 1:]), inside, whole)
+        return np.where((clipped[:, :1] < clipped[:, 1:]), clipped, whole_range)
 
 
 def bounds_from_points(
@@ -55,15 +57,15 @@ def bounds_from_geometry(
         return None
     # Angles of intersection of 1.2 and 0.003 radians: nearer surfaces are not alike in both images,
     # and of farther ones the parallax is a few pixels. A wide range costs only time.
-    near, far = base / np.tan(1.2), base / np.tan(0.003)
+    nearest, farthest = base / np.tan(1.2), base / np.tan(0.003)
     meetings = [s for o in others if (s := _distance_to_axis(view, o)) is not None]
     if meetings:
         # Cameras that look at one thing: a quarter to four times its distance.
         s = float(np.median(meetings))
-        near, far = max(near, s / 4), min(far, s * 4)
-        if near >= far:
-            near, far = s / 4, s * 4
-    return 1 / far, 1 / near
+        nearest, farthest = max(nearest, s / 4), min(farthest, s * 4)
+        if nearest >= farthest:
+            nearest, farthest = s / 4, s * 4
+    return 1 / farthest, 1 / nearest
 
 
 def angle_at(

@@ -134,40 +134,49 @@ def find_change(
     # A tile most of which are cells around it would be slow.
     tiles = SurfaceTiles(before, after, same_errors, max(side, 8 * settings.reach), settings.reach)
     # Of one tile, all three passes use what the first has read; of several only one has room.
-    read = lru_cache(1)(tiles.read)
-    every, quiet = (SharedErrorEquations(np.zeros((k, k)), np.zeros(k)) for _ in range(2))
-    usable = _sum_up(tiles, read, every, quiet, stable)
-    rho, ratio = scatter_of(usable, read, every.solve(1.0)[0], settings)
+    read_tile = lru_cache(1)(tiles.read)
+    equations_of_all, equations_of_stable = (
+        SharedErrorEquations(np.zeros((k, k)), np.zeros(k)) for _ in range(2)
+    )
+    known_tiles = _sum_up(tiles, read_tile, equations_of_all, equations_of_stable, stable)
+    rho, ratio = scatter_of(known_tiles, read_tile, equations_of_all.solve(1.0)[0], settings)
     # No cell counts for more than one, as an estimate of ρ from few cells may say.
-    together, limit = max(float(rho.sum()), 1.0), normal_quantile(1 - level / 2)
+    cells_as_one, limit = max(float(rho.sum()), 1.0), normal_quantile(1 - level / 2)
     enlarge = lambda ratio: max(ratio, 1.0) if settings.enlarge_sigma else 1.0
     reduction = EstimatedSharedErrors(np.zeros(k), np.eye(k), enlarge(ratio), enlarge(ratio))
     tail = ratio
     if stable is not None:
         # Σ of cells is s² times the given one, and only every together-th cell is a new one.
-        reduce = lambda s, q: EstimatedSharedErrors.solve(quiet, together, enlarge(s), enlarge(q))
-        within = [corner for corner in usable if stable[tiles.parts(corner, 0)].any()]
-        found = scatter_of_stable(
-            sample_of(within, settings), read, stable, reduce(ratio, ratio), together, level
+        reduce = lambda s, q: EstimatedSharedErrors.solve(
+            equations_of_stable, cells_as_one, enlarge(s), enlarge(q)
         )
-        ratio, tail = found if found is not None else (ratio, ratio)
+        within = [corner for corner in known_tiles if stable[tiles.parts(corner, 0)].any()]
+        stable_scatter = scatter_of_stable(
+            sample_of(within, settings),
+            read_tile,
+            stable,
+            reduce(ratio, ratio),
+            cells_as_one,
+            level,
+        )
+        ratio, tail = stable_scatter if stable_scatter is not None else (ratio, ratio)
         reduction = reduce(ratio, tail)
     # Of several tiles in single precision: half the memory, and 1e-7 of a difference.
     dtype = np.float64 if len(tiles.corners) == 1 else np.float32
     d, sigma = (np.full(before.shape, np.nan, dtype) for _ in range(2))
     sign, total = np.zeros(before.shape, np.int8), VolumeSums(0, k)
-    for corner in usable:
-        tile = read(corner)
-        rest, own, LP = reduction(tile)
+    for corner in known_tiles:
+        tile = read_tile(corner)
+        remainder, own_sigma, LP = reduction(tile)
         s = np.sqrt((reduction.tail * tile.own) ** 2 + np.sum(LP**2, axis=0))
         with np.errstate(invalid="ignore"):
-            sure = np.where(np.abs(rest) > limit * s, np.sign(rest), 0)
-        d[tile.place], sigma[tile.place] = rest[tile.core], s[tile.core]
-        sign[tile.place] = np.where(tile.known, sure, 0)[tile.core]
-        total.add(tile.core, (rest, own, LP), tile.known, rho)
+            significant_sign = np.where(np.abs(remainder) > limit * s, np.sign(remainder), 0)
+        d[tile.place], sigma[tile.place] = remainder[tile.core], s[tile.core]
+        sign[tile.place] = np.where(tile.known, significant_sign, 0)[tile.core]
+        total.add(tile.core, (remainder, own_sigma, LP), tile.known, rho)
     if labels is None:
         labels = significant_regions(sign, d, settings)
-    regions = volumes_of_regions(labels, usable, tiles, read, reduction, rho)
+    regions = volumes_of_regions(labels, known_tiles, tiles, read_tile, reduction, rho)
     return SurfaceChange(
         d,
         sigma,
@@ -178,7 +187,7 @@ def find_change(
         before.system,
         level,
         limit,
-        together,
+        cells_as_one,
         ratio,
         tail,
         k,
@@ -189,21 +198,21 @@ def find_change(
 
 def _sum_up(
     tiles: SurfaceTiles,
-    read: Callable[[tuple[int, int]], SurfaceTile],
-    every: SharedErrorEquations,
+    read_tile: Callable[[tuple[int, int]], SurfaceTile],
+    equations_of_all: SharedErrorEquations,
     quiet: SharedErrorEquations,
     stable: Cells | None,
 ) -> list[tuple[int, int]]:
     """The normal equations of t̂ of all cells and of stable ones; the tiles with known cells."""
     usable, heights = [], False
     for corner in tiles.corners:
-        tile = read(corner)
+        tile = read_tile(corner)
         core = tile.in_core(tile.known)
         heights = heights or bool(core.any())
         if not core.any():
             continue
         usable.append(corner)
-        every.add(tile, core)
+        equations_of_all.add(tile, core)
         if stable is not None:
             quiet.add(tile, core & stable[tile.rows, tile.columns])
     if not usable:

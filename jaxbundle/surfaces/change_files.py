@@ -34,7 +34,7 @@ def write_change(change: SurfaceChange, difference: str | Path, significant: str
         raster.describe(["difference", "sigma of difference", "difference over sigma"])
     with write_raster(significant, columns, rows, 1, "uint8", nodata=UNKNOWN, **profile) as raster:
         for part in parts:
-            known = np.isfinite(change.difference[part])
-            values = np.where(known, UNCHANGED + change.sign[part], UNKNOWN).astype(np.uint8)
+            is_known = np.isfinite(change.difference[part])
+            values = np.where(is_known, UNCHANGED + change.sign[part], UNKNOWN).astype(np.uint8)
             raster.write(values[None], part.start)
         raster.describe(["1 fallen, 2 unchanged, 3 risen"])

@@ -32,9 +32,9 @@ class SurfaceTile:
 
     def from_core(self, cells: Cells) -> Cells:
         """Cells of the core as those of the tile."""
-        inside = np.zeros_like(self.known)
-        inside[self.core] = cells
-        return inside
+        in_tile = np.zeros_like(self.known)
+        in_tile[self.core] = cells
+        return in_tile
 
     @property
     def place(self) -> tuple[slice, slice]:
@@ -77,14 +77,24 @@ class SurfaceTiles:
             slice(i.start - o.start, i.stop - o.start) for i, o in zip(inner, (rows, columns))
         )
         # The cells around are for the sums of pairs; for slopes `UncertainCells` reads more itself.
-        before, after = self.before.window(rows, columns), self.after.window(rows, columns)
-        d, own = after.height - before.height, np.hypot(before.sigma, after.sigma)
+        part_before, part_after = (
+            self.before.window(rows, columns),
+            self.after.window(rows, columns),
+        )
+        d, own_sigma = (
+            part_after.height - part_before.height,
+            np.hypot(part_before.sigma, part_after.sigma),
+        )
         with np.errstate(invalid="ignore"):
-            known = np.isfinite(d) & (own > 0)
-        d, own = np.where(known, d, np.nan), np.where(known, own, np.nan)
-        one, two = before.modes, after.modes
-        L = two - one if self.same_errors else np.concatenate([one, two])
-        return SurfaceTile(d, own, np.where(known, L, 0.0), known, rows, columns, core)  # type: ignore[arg-type] of two
+            is_known = np.isfinite(d) & (own_sigma > 0)
+        d, own_sigma = np.where(is_known, d, np.nan), np.where(is_known, own_sigma, np.nan)
+        modes_before, modes_after = part_before.modes, part_after.modes
+        L = (
+            modes_after - modes_before
+            if self.same_errors
+            else np.concatenate([modes_before, modes_after])
+        )
+        return SurfaceTile(d, own_sigma, np.where(is_known, L, 0.0), is_known, rows, columns, core)  # type: ignore[arg-type] of two
 
 
 @dataclasses.dataclass
@@ -101,12 +111,14 @@ class SharedErrorEquations:
         self.right += A.T @ (tile.d[cells] / tile.own[cells])
         self.cells += int(cells.sum())
 
-    def solve(self, together: float) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
-        """t̂ and P; `together` of the cells count as one."""
+    def solve(
+        self, cells_as_one: float
+    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
+        """t̂ and P; `cells_as_one` of the cells count as one."""
         # The identity is the prior of t, whose σ are in L: with fewer stable cells than errors the
         # matrix is regular, too, and t of an error that they do not show is 0.
-        P = np.linalg.inv(np.eye(len(self.right)) + self.matrix / together)
-        return P @ self.right / together, P
+        P = np.linalg.inv(np.eye(len(self.right)) + self.matrix / cells_as_one)
+        return P @ self.right / cells_as_one, P
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,10 +133,10 @@ class EstimatedSharedErrors:
 
     @classmethod
     def solve(
-        cls, stable: SharedErrorEquations, together: float, scale: float, tail: float
+        cls, stable: SharedErrorEquations, cells_as_one: float, scale: float, tail: float
     ) -> "EstimatedSharedErrors":
-        """From the normal equations of stable cells, of which `together` count as one."""
-        t, P = stable.solve(together * scale**2)
+        """From the normal equations of stable cells, of which `cells_as_one` count as one."""
+        t, P = stable.solve(cells_as_one * scale**2)
         return cls(t, _root(P).T, scale, tail)
 
     def __call__(self, tile: SurfaceTile) -> tuple[Grid, Grid, Modes]:

@@ -29,7 +29,7 @@ def volumes_of_regions(
     labels: Int[np.ndarray, "rows columns"],
     usable: list[tuple[int, int]],
     tiles: SurfaceTiles,
-    read: Callable[[tuple[int, int]], SurfaceTile],
+    read_tile: Callable[[tuple[int, int]], SurfaceTile],
     reduction: EstimatedSharedErrors,
     rho: Float[np.ndarray, "m m"],
 ) -> tuple[Region, ...]:
@@ -38,13 +38,13 @@ def volumes_of_regions(
     for corner in usable:
         if not labels[tiles.parts(corner, 0)].any():
             continue
-        tile = read(corner)
+        tile = read_tile(corner)
         reduced = reduction(tile)
-        mine = np.where(tile.known, labels[tile.rows, tile.columns], 0)
-        for label in np.unique(mine[tile.core]).tolist():
+        labels_of_tile = np.where(tile.known, labels[tile.rows, tile.columns], 0)
+        for label in np.unique(labels_of_tile[tile.core]).tolist():
             if label:
-                one = sums.setdefault(label, VolumeSums(label, len(reduction.t)))
-                one.add(tile.core, reduced, mine == label, rho)
+                sums_of_region = sums.setdefault(label, VolumeSums(label, len(reduction.t)))
+                sums_of_region.add(tile.core, reduced, labels_of_tile == label, rho)
     return tuple(sums[label].region(tiles.before.size) for label in sorted(sums))
 
 
@@ -71,22 +71,22 @@ class VolumeSums:
             return
         reach = len(rho) // 2
         part = tuple(
-            slice(max(at[0] - reach, 0), at[-1] + reach + 1)
-            for at in (np.flatnonzero(core.any(axis)) for axis in (1, 0))
+            slice(max(rows_or_columns[0] - reach, 0), rows_or_columns[-1] + reach + 1)
+            for rows_or_columns in (np.flatnonzero(core.any(axis)) for axis in (1, 0))
         )
         core, cells = core[part], cells[part]
-        own = np.where(cells, sigma[part], 0.0)
+        sigma_of_cells = np.where(cells, sigma[part], 0.0)
         self.cells += int(core.sum())
         self.sum += float(np.sum(d[part], where=core))
         self.shared += np.sum(LP[:, *part], axis=(1, 2), where=core)
         # ΣΣ ρᵢⱼ·σᵢ·σⱼ by one convolution; i in the core and j also around it, so that pairs across
         # the edges of tiles count twice in all, as within them.
-        if min(own.shape) < len(rho):
-            beside = ndimage.convolve(own, rho, mode="constant")
+        if min(sigma_of_cells.shape) < len(rho):
+            weighted_neighbours = ndimage.convolve(sigma_of_cells, rho, mode="constant")
         else:
-            beside = fftconvolve(own, rho, "same")
-        self.variance += float(np.sum(own * beside, where=core))
-        self.squares += float(np.sum(own**2, where=core))
+            weighted_neighbours = fftconvolve(sigma_of_cells, rho, "same")
+        self.variance += float(np.sum(sigma_of_cells * weighted_neighbours, where=core))
+        self.squares += float(np.sum(sigma_of_cells**2, where=core))
 
     def region(self, size: float) -> Region:
         """The volume."""
@@ -103,9 +103,9 @@ def significant_regions(
     sign: Int[np.ndarray, "rows columns"], d: Grid, settings: ChangeSettings
 ) -> Int[np.ndarray, "rows columns"]:
     """Connected significant cells of one sign, numbered from the largest sum of differences on."""
-    kept, found = np.zeros(sign.shape, np.int32), []
-    for wanted in (1, -1):
-        labels, number = ndimage.label(sign == wanted, np.ones((3, 3)))
+    region_of_cell, sizes_and_numbers = np.zeros(sign.shape, np.int32), []
+    for wanted_sign in (1, -1):
+        labels, number = ndimage.label(sign == wanted_sign, np.ones((3, 3)))
         cells, sums = np.zeros(number + 1, int), np.zeros(number + 1)
         for rows in _bands(len(sign)):
             flat = labels[rows].ravel()
@@ -113,21 +113,21 @@ def significant_regions(
             sums += np.bincount(flat, np.nan_to_num(d[rows]).ravel(), minlength=number + 1)
         sums[0] = 0.0
         large = [k for k in np.argsort(-np.abs(sums)) if k and cells[k] >= settings.least_cells]
-        mine = np.zeros(number + 1, np.int32)
+        number_of_label = np.zeros(number + 1, np.int32)
         for k in large[: settings.most_regions]:
-            found.append((abs(sums[k]), len(found) + 1))
-            mine[k] = len(found)
+            sizes_and_numbers.append((abs(sums[k]), len(sizes_and_numbers) + 1))
+            number_of_label[k] = len(sizes_and_numbers)
         for rows in _bands(len(sign)):
-            kept[rows] += mine[labels[rows]]
-    found.sort(key=lambda pair: -pair[0])
-    order = np.zeros(len(found) + 1, np.int32)
-    for place, (_, number) in enumerate(found[: settings.most_regions], 1):
+            region_of_cell[rows] += number_of_label[labels[rows]]
+    sizes_and_numbers.sort(key=lambda pair: -pair[0])
+    order = np.zeros(len(sizes_and_numbers) + 1, np.int32)
+    for place, (_, number) in enumerate(sizes_and_numbers[: settings.most_regions], 1):
         order[number] = place
     for rows in _bands(len(sign)):
-        kept[rows] = order[kept[rows]]
-    return kept
+        region_of_cell[rows] = order[region_of_cell[rows]]
+    return region_of_cell
 
 
-def _bands(rows: int, together: int = 512) -> Iterator[slice]:
+def _bands(rows: int, rows_at_once: int = 512) -> Iterator[slice]:
     """Some rows at a time: of 10 000 cells each, 40 MB."""
-    return (slice(k, min(k + together, rows)) for k in range(0, rows, together))
+    return (slice(k, min(k + rows_at_once, rows)) for k in range(0, rows, rows_at_once))

@@ -65,11 +65,11 @@ class Cloud:
         """Some of the points."""
         fields = ("X", "covariance", "rays", "image", "uv")
         some = {name: getattr(self, name)[rows] for name in fields}
-        more = {
-            name: None if (given := getattr(self, name)) is None else given[rows]
+        optional = {
+            name: None if (values := getattr(self, name)) is None else values[rows]
             for name in ("colour", "shared")
         }
-        return dataclasses.replace(self, **some, **more)
+        return dataclasses.replace(self, **some, **optional)
 
 
 def empty_cloud(image: str) -> Cloud:

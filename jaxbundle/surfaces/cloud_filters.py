@@ -33,13 +33,13 @@ def thin(cloud: Cloud, size: float, least: int = 1, place: str = "mean") -> Clou
     group = group.ravel()
     trace = np.einsum("nii->n", cloud.covariance)
     trace = np.where(np.isfinite(trace) & (trace > 0), trace, np.nan)
-    known = bool(np.isfinite(trace).any())
-    filled = np.where(np.isfinite(trace), trace, np.nanmax(trace) if known else 1.0)
+    has_covariance = bool(np.isfinite(trace).any())
+    filled = np.where(np.isfinite(trace), trace, np.nanmax(trace) if has_covariance else 1.0)
     order = np.lexsort((filled, group))
     best = order[np.searchsorted(group[order], np.arange(len(cubes)))]
-    found = cloud.take(best)
+    thinned = cloud.take(best)
     if place == "corner":
-        found = dataclasses.replace(found, X=cubes * size)
+        thinned = dataclasses.replace(thinned, X=cubes * size)
     elif place == "mean":
         weight = 1 / filled
         total = np.bincount(group, weight)
@@ -47,12 +47,14 @@ def thin(cloud: Cloud, size: float, least: int = 1, place: str = "mean") -> Clou
         X = np.stack([mean(a) for a in cloud.X.T], 1)
         # Not 1/total: the errors of neighbours are not independent (see above).
         harmonic = count / total
-        C = found.covariance * (harmonic / filled[best])[:, None, None]
-        if found.shared is not None:
-            scaled = found.shared * harmonic / filled[best]
-            found = dataclasses.replace(found, shared=scaled)
-        found = dataclasses.replace(found, X=X, covariance=C if known else found.covariance)
-    return found.take(count >= least)
+        C = thinned.covariance * (harmonic / filled[best])[:, None, None]
+        if thinned.shared is not None:
+            scaled = thinned.shared * harmonic / filled[best]
+            thinned = dataclasses.replace(thinned, shared=scaled)
+        thinned = dataclasses.replace(
+            thinned, X=X, covariance=C if has_covariance else thinned.covariance
+        )
+    return thinned.take(count >= least)
 
 
 def drop_isolated(cloud: Cloud, neighbours: int = 8, limit: float = 3.0) -> Cloud:
@@ -70,8 +72,8 @@ def drop_isolated(cloud: Cloud, neighbours: int = 8, limit: float = 3.0) -> Clou
     mean = distance[:, 1:].mean(1)
     middle = np.median(mean)
     # At least a tenth of the median distance: the distances of a regular grid have no spread.
-    spread = max(robust_sigma(mean), 0.1 * float(middle))
-    return cloud.take(mean <= middle + limit * spread)
+    scatter = max(robust_sigma(mean), 0.1 * float(middle))
+    return cloud.take(mean <= middle + limit * scatter)
 
 
 def drop_weak(

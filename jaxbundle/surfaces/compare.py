@@ -35,11 +35,13 @@ def compare(
     spacing = float(np.median(tree.query(other.X[:: max(1, len(other) // 20_000)], 2)[0][:, 1]))
     distance, sigma = np.full(len(cloud), np.nan), np.full(len(cloud), np.nan)
     # The neighbours of 65 536 points and their matrices take under 100 MB.
-    together = 1 << 16
-    for first in range(0, len(cloud), together):
-        part = slice(first, min(first + together, len(cloud)))
-        found = _distances_to_planes(cloud, other, tree, k, part, max_distance * spacing)
-        distance[part], sigma[part] = found
+    points_at_once = 1 << 16
+    for begin in range(0, len(cloud), points_at_once):
+        part = slice(begin, min(begin + points_at_once, len(cloud)))
+        distances_and_sigma = _distances_to_planes(
+            cloud, other, tree, k, part, max_distance * spacing
+        )
+        distance[part], sigma[part] = distances_and_sigma
     v = distance[np.isfinite(distance)]
     if not len(v):
         raise InputError("the clouds have nothing in common: check their coordinate systems")
@@ -61,7 +63,7 @@ def _distances_to_planes(
     cloud: Cloud, other: Cloud, tree: cKDTree, k: int, part: slice, farthest: float
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     X = cloud.X[part]
-    near, index = tree.query(X, k)
+    distance_to_neighbours, index = tree.query(X, k)
     neighbours = other.X[index]
     middle = neighbours.mean(1)
     d = neighbours - middle[:, None]
@@ -73,4 +75,4 @@ def _distances_to_planes(
     # Neighbours share the errors of their base image: their mean is not more precise than one.
     C = cloud.covariance[part] + np.nan_to_num(other.covariance[index]).mean(1)
     sigma = np.sqrt(np.einsum("ni,nij,nj->n", normal, C, normal))
-    return np.where(near[:, min(3, k - 1)] <= farthest, distance, np.nan), sigma
+    return np.where(distance_to_neighbours[:, min(3, k - 1)] <= farthest, distance, np.nan), sigma

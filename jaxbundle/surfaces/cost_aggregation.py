@@ -36,20 +36,20 @@ def _sweep(
     large: float,
 ) -> None:
     """Along one direction: from line to line, each moved by `shift` nodes."""
-    before = None
+    previous_path = None
     for line, out in zip(cost, total):
-        if before is None:
+        if previous_path is None:
             path = line.copy()
         else:
-            came = _move(before, shift)
-            least = came.min(1, keepdims=True)
-            path = np.minimum(came, least + large)
-            np.minimum(path[:, 1:], came[:, :-1] + small, out=path[:, 1:])
-            np.minimum(path[:, :-1], came[:, 1:] + small, out=path[:, :-1])
+            shifted_path = _move(previous_path, shift)
+            smallest_cost = shifted_path.min(1, keepdims=True)
+            path = np.minimum(shifted_path, smallest_cost + large)
+            np.minimum(path[:, 1:], shifted_path[:, :-1] + small, out=path[:, 1:])
+            np.minimum(path[:, :-1], shifted_path[:, 1:] + small, out=path[:, :-1])
             # Min L(p') is subtracted: it changes no decision, and without it L grows with the path.
-            path += line - least
+            path += line - smallest_cost
         out += path
-        before = path
+        previous_path = path
 
 
 def _move(a: Float[np.ndarray, "nodes k"], shift: int) -> Float[np.ndarray, "nodes k"]:

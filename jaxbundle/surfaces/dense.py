@@ -80,17 +80,17 @@ class RowPair(Protocol):
 def match_dense(pair: RowPair, span: int, settings: DenseSettings = DenseSettings()) -> Disparities:
     """Disparities from 0 to `span` of a rectified pair, at the pixels of its left image."""
     left, right = _prepare(pair)
-    inside = np.isfinite(pair.left)
-    start = _search(left, right, inside, np.isfinite(pair.right), span, settings)
+    is_inside = np.isfinite(pair.left)
+    start = _search(left, right, is_inside, np.isfinite(pair.right), span, settings)
     # Parts visible in one image only match the repetition of their texture in the other.
     start[find_repetitions(left, start, span, settings.search)] = np.nan
-    return refine_disparities(left, right, start, settings.refinement, inside)
+    return refine_disparities(left, right, start, settings.refinement, is_inside)
 
 
 def _search(
     left: RowImage,
     right: RowImage,
-    inside: RowMask,
+    is_inside: RowMask,
     right_inside: RowMask,
     span: int,
     settings: DenseSettings,
@@ -98,16 +98,18 @@ def _search(
     """Disparities to about a quarter of a pixel, NaN where none was found; a large pair, or one of
     a range beyond OpenCV's, at half its size."""
     if left.size * (span + 1) <= settings.max_searched and span <= MAX_SPAN:
-        left, right = equalise_exposures(left, right, inside, right_inside, settings.search)
-        found = search_both_ways(left, right, span, settings.search)
+        left, right = equalise_exposures(left, right, is_inside, right_inside, settings.search)
+        disparities = search_both_ways(left, right, span, settings.search)
     else:
-        half, right_half = _halve(left), _halve(right)
-        whole, right_whole = (_halve(a.astype(np.float32)) == 1 for a in (inside, right_inside))
-        coarse = _search(half, right_half, whole, right_whole, span // 2 + 1, settings)
-        finer = refine_disparities(half, right_half, coarse, settings.refinement).disparity
-        known = np.where(np.isfinite(finer), finer, coarse)
-        found = _double(known, left.shape, settings.refinement.step / 2)
-    return np.where(inside & (found <= span), found, np.nan)
+        half_left, right_half = _halve(left), _halve(right)
+        is_whole, right_whole = (
+            _halve(a.astype(np.float32)) == 1 for a in (is_inside, right_inside)
+        )
+        coarse = _search(half_left, right_half, is_whole, right_whole, span // 2 + 1, settings)
+        finer = refine_disparities(half_left, right_half, coarse, settings.refinement).disparity
+        filled = np.where(np.isfinite(finer), finer, coarse)
+        disparities = _double(filled, left.shape, settings.refinement.step / 2)
+    return np.where(is_inside & (disparities <= span), disparities, np.nan)
 
 
 def _halve(a: RowImage) -> Float[np.ndarray, "half_rows half_columns"]:
@@ -128,10 +130,10 @@ def _double(
     size = 2 * columns, 2 * rows
     scale = lambda a, way: cv2.resize(a, size, interpolation=way)
     nearest = scale(disparity, cv2.INTER_NEAREST)
-    between = scale(disparity, cv2.INTER_LINEAR)
+    interpolated = scale(disparity, cv2.INTER_LINEAR)
     with np.errstate(invalid="ignore"):
-        similar = np.abs(between - nearest) < tolerance
-    return 2 * np.where(similar, between, nearest)[: shape[0], : shape[1]]
+        similar = np.abs(interpolated - nearest) < tolerance
+    return 2 * np.where(similar, interpolated, nearest)[: shape[0], : shape[1]]
 
 
 def _prepare(pair: RowPair) -> tuple[RowImage, RowImage]:

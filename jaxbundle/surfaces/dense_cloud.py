@@ -43,8 +43,8 @@ def dense_cloud(
     columns, rows = base.size
     v, u = np.mgrid[0:rows:step, 0:columns:step].reshape(2, -1)
     uv = np.stack([u, v], 1).astype(float)
-    found: list[_PairDepths] = []
-    used, left_out = [], []
+    pair_depths: list[_PairDepths] = []
+    used_images, left_out = [], []
     for other in others:
         span = disparity_range(base, other, all_points)
         narrow = span is not None and span < settings.max_disparities
@@ -58,18 +58,18 @@ def dense_cloud(
             continue
         pair, span = rectified
         disparities = match_dense(pair, span, settings)
-        found.append(_look_up(base, other, uv, pair, disparities, settings))
-        used.append((other.name, disparities.factor))
-    if not found:
-        return empty_cloud(base.name), used, left_out
+        pair_depths.append(_look_up(base, other, uv, pair, disparities, settings))
+        used_images.append((other.name, disparities.factor))
+    if not pair_depths:
+        return empty_cloud(base.name), used_images, left_out
     parts = [
-        _points(base, found, uv, slice(k, k + PIXELS_AT_ONCE), settings)
+        _points(base, pair_depths, uv, slice(k, k + PIXELS_AT_ONCE), settings)
         for k in range(0, len(uv), PIXELS_AT_ONCE)
     ]
     X, covariance, rays, places, shared = (np.concatenate(p) for p in zip(*parts))
     image = np.zeros(len(X), np.int16)
     cloud = Cloud(X, covariance, rays, image, places, (base.name,), shared=shared)
-    return cloud, used, left_out
+    return cloud, used_images, left_out
 
 
 def guide_points(base: FrameView, guide: Guide) -> Float[np.ndarray, "n 3"]:
@@ -110,8 +110,8 @@ def _look_up(
     """What the disparities of a pair say of pixels of the base."""
     q, sigma = np.empty(len(uv)), np.empty(len(uv))
 
-    def fill(first: int) -> None:
-        rows = slice(first, first + PIXELS_AT_ONCE)
+    def fill(begin: int) -> None:
+        rows = slice(begin, begin + PIXELS_AT_ONCE)
         d = base.points(uv[rows], np.ones(len(uv[rows]))) - base.X0
         q[rows], sigma[rows] = _inverse_distance(
             base, d, pair, disparities, settings.max_interpolated_difference
@@ -123,52 +123,66 @@ def _look_up(
 
 
 def _points(
-    base: FrameView, found: Sequence[_PairDepths], uv: Places, rows: slice, settings: DenseSettings
+    base: FrameView,
+    pair_depths: Sequence[_PairDepths],
+    uv: Places,
+    rows: slice,
+    settings: DenseSettings,
 ) -> tuple[np.ndarray, ...]:
     """Points of some pixels, their covariance, numbers of rays, their pixels, and of the variance
     of Z that of the orientations."""
-    q, s = (np.stack([getattr(pair, name)[rows] for pair in found]) for name in ("q", "sigma"))
-    across = np.stack([pair.axis for pair in found])
-    across = across - (across @ base.M[2])[:, None] * base.M[2]
-    across = across / np.linalg.norm(across, axis=1, keepdims=True)
-    q, variance, number = combine(q, s, across @ across.T, settings.max_difference)
+    q, s = (
+        np.stack([getattr(pair, name)[rows] for pair in pair_depths]) for name in ("q", "sigma")
+    )
+    bases_in_image_plane = np.stack([pair.axis for pair in pair_depths])
+    bases_in_image_plane = (
+        bases_in_image_plane - (bases_in_image_plane @ base.M[2])[:, None] * base.M[2]
+    )
+    bases_in_image_plane = bases_in_image_plane / np.linalg.norm(
+        bases_in_image_plane, axis=1, keepdims=True
+    )
+    q, variance, number = combine(
+        q, s, bases_in_image_plane @ bases_in_image_plane.T, settings.max_difference
+    )
     good = np.isfinite(q) & (q > 0)
     uv, q, variance, number = (a[good] for a in (uv[rows], q, variance, number))
     d = base.points(uv, np.ones(len(uv))) - base.X0
     length = 1 / q
-    along = variance / q**4  # of the distance 1/q: σ = σ_q/q²
+    variance_of_distance = variance / q**4  # of the distance 1/q: σ = σ_q/q²
     # Across the line of sight: the part of a match's error due to the base image.
-    pixel = np.sqrt(variance / 2) * found[0].length * length
+    pixel = np.sqrt(variance / 2) * pair_depths[0].length * length
     dd = d[:, :, None] * d[:, None]
-    covariance = along[:, None, None] * dd + (pixel**2)[:, None, None] * (np.eye(3) - dd)
+    covariance = variance_of_distance[:, None, None] * dd + (pixel**2)[:, None, None] * (
+        np.eye(3) - dd
+    )
     X = base.X0 + length[:, None] * d
-    used = np.concatenate([np.ones((1, len(X)), bool), np.isfinite(s[:, good])]).T
-    views = [base, *(pair.other for pair in found)]
-    of_orientation = orientation_covariance(views, X, used)
+    is_used = np.concatenate([np.ones((1, len(X)), bool), np.isfinite(s[:, good])]).T
+    views = [base, *(pair.other for pair in pair_depths)]
+    of_orientation = orientation_covariance(views, X, is_used)
     covariance = (covariance + of_orientation).astype(np.float32)
     shared = of_orientation[:, 2, 2].astype(np.float32)
     return X, covariance, (number + 1).astype(np.int16), uv.astype(np.float32), shared
 
 
 def _inverse_distance(
-    base: FrameView, d: Points, pair: RectifiedPair, found: Disparities, max_difference: float
+    base: FrameView, d: Points, pair: RectifiedPair, disparities: Disparities, max_difference: float
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """q and its σ along directions; NaN without disparity."""
     place = pair.places(base.X0 + d)
-    rows, columns = found.disparity.shape
-    inside = np.isfinite(place).all(1) & (place >= 0).all(1)
-    inside &= (place[:, 0] <= columns - 1) & (place[:, 1] <= rows - 1)
-    x, y = np.where(inside[:, None], place, 0.0).T
+    rows, columns = disparities.disparity.shape
+    is_inside = np.isfinite(place).all(1) & (place >= 0).all(1)
+    is_inside &= (place[:, 0] <= columns - 1) & (place[:, 1] <= rows - 1)
+    x, y = np.where(is_inside[:, None], place, 0.0).T
     j, i = (np.minimum(a.astype(int), n - 2) for a, n in ((x, columns), (y, rows)))
-    four = np.stack([found.disparity[i + a, j + b] for a in (0, 1) for b in (0, 1)])
+    four = np.stack([disparities.disparity[i + a, j + b] for a in (0, 1) for b in (0, 1)])
     smooth = np.isfinite(four).all(0) & (np.ptp(four, axis=0) < max_difference)
-    known = np.where(np.isfinite(found.disparity), found.disparity, 0)
-    between = ndimage.map_coordinates(known, [y, x], order=1, mode="nearest")
+    known_disparities = np.where(np.isfinite(disparities.disparity), disparities.disparity, 0)
+    interpolated = ndimage.map_coordinates(known_disparities, [y, x], order=1, mode="nearest")
     nearest = np.rint(y).astype(int), np.rint(x).astype(int)
-    disparity = np.where(smooth, between, found.disparity[nearest]) + pair.lowest
+    disparity = np.where(smooth, interpolated, disparities.disparity[nearest]) + pair.lowest
     scale = pair.f * pair.base / (d @ pair.R[2])
-    q = np.where(inside, disparity / scale, np.nan)
-    return q, np.where(inside, found.sigma[nearest] / scale, np.nan)
+    q = np.where(is_inside, disparity / scale, np.nan)
+    return q, np.where(is_inside, disparities.sigma[nearest] / scale, np.nan)
 
 
 def combine(
@@ -180,9 +194,9 @@ def combine(
     """The weighted mean of consistent values, its variance, and their number. NaN if two
     disagree and no third decides. `cosine`: of the angles between epipolar lines, 1 if not
     given."""
-    known = np.isfinite(q) & np.isfinite(sigma)
+    is_known = np.isfinite(q) & np.isfinite(sigma)
     if len(q) == 1:
-        return np.where(known[0], q[0], np.nan), sigma[0] ** 2, known[0].astype(int)
+        return np.where(is_known[0], q[0], np.nan), sigma[0] ** 2, is_known[0].astype(int)
     use = consistent(q, sigma, max_difference)
     number = use.sum(0)
     weight = np.where(use, 1 / np.where(use, sigma, 1) ** 2, 0)
@@ -201,11 +215,11 @@ def consistent(
 ) -> Bool[np.ndarray, "pairs n"]:
     """Which values agree with the one that most agree with, within `max_difference` σ of the
     difference; none where two disagree and no third decides. NaN: no value."""
-    known = np.isfinite(q) & np.isfinite(sigma)
-    q, sigma = np.where(known, q, np.nan), np.where(known, sigma, np.nan)
+    is_known = np.isfinite(q) & np.isfinite(sigma)
+    q, sigma = np.where(is_known, q, np.nan), np.where(is_known, sigma, np.nan)
     with np.errstate(invalid="ignore"):
-        apart = np.abs(q[:, None] - q) / np.hypot(sigma[:, None], sigma)
-        votes = (apart < max_difference).sum(1)
-        best = np.where(known, votes, -1).argmax(0)
-        use = known & (apart[best, :, np.arange(q.shape[1])].T < max_difference)
-    return use & ((known.sum(0) < 2) | (use.sum(0) > 1))
+        difference = np.abs(q[:, None] - q) / np.hypot(sigma[:, None], sigma)
+        votes = (difference < max_difference).sum(1)
+        best = np.where(is_known, votes, -1).argmax(0)
+        use = is_known & (difference[best, :, np.arange(q.shape[1])].T < max_difference)
+    return use & ((is_known.sum(0) < 2) | (use.sum(0) > 1))

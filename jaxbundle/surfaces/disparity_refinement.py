@@ -126,21 +126,21 @@ def refine_disparities(
     right: RowImage,
     start: RowImage,
     settings: DisparityRefinementSettings = DisparityRefinementSettings(),
-    inside: RowMask | None = None,
+    is_inside: RowMask | None = None,
 ) -> Disparities:
-    """Least squares at every pixel with a disparity. `inside`: pixels of the left image, all if not
-    given."""
+    """Least squares at every pixel with a disparity. `is_inside`: pixels of the left image, all if
+    not given."""
     sizes, own_texture = _match_windows(left, right, start, settings)
-    found = _choose_windows(sizes, settings)
-    whole = np.ones(start.shape, bool) if inside is None else inside
-    distance, step = _find_steps(start, whole, settings)
+    chosen = _choose_windows(sizes, settings)
+    in_image = np.ones(start.shape, bool) if is_inside is None else is_inside
+    distance, step = _find_steps(start, in_image, settings)
     outliers = settings.outliers_at_step * np.exp(-distance / settings.outlier_range)
     outliers = np.where(own_texture, settings.textured_outliers * outliers, outliers)
     # A step itself, and its neighbours: two surfaces in their smallest windows.
-    good = np.isfinite(found.disparity) & (outliers <= settings.max_outliers) & (distance >= 1)
-    d = np.where(good, found.disparity, np.float32(np.nan))
+    good = np.isfinite(chosen.disparity) & (outliers <= settings.max_outliers) & (distance >= 1)
+    d = np.where(good, chosen.disparity, np.float32(np.nan))
     relief = _measure_relief(d, settings.shape_half_window)
-    sigma = _add_scatter(d, found, relief, settings)
+    sigma = _add_scatter(d, chosen, relief, settings)
     likely = outliers > settings.likely_outliers
     step = np.where(likely, np.maximum(step, settings.unseen_step), step)
     step = np.minimum(step, settings.max_step)
@@ -148,7 +148,7 @@ def refine_disparities(
     with np.errstate(invalid="ignore"):
         good &= sigma < settings.max_sigma
     keep = lambda a: np.where(good, a, np.float32(np.nan)).astype(np.float32)
-    return Disparities(keep(d), keep(sigma), keep(outliers), found.factor)
+    return Disparities(keep(d), keep(sigma), keep(outliers), chosen.factor)
 
 
 class _SizeMatches(NamedTuple):
@@ -185,12 +185,12 @@ def _match_windows(
     reach = max(settings.shape_half_window, largest) + largest + 2
     margin = settings.rounds * reach
     # Many rounds have larger pieces: a third of one side, at least, is not margin.
-    most = [max(n, 3 * margin) - 2 * margin for n in settings.piece]
+    piece_sizes = [max(n, 3 * margin) - 2 * margin for n in settings.piece]
     # Pieces of one size without an almost empty last one.
-    height, width = (-(-n // -(-n // m)) for n, m in zip(left.shape, most))
+    height, width = (-(-n // -(-n // m)) for n, m in zip(left.shape, piece_sizes))
     sides = height + 2 * margin, width + 2 * margin
-    made = np.full((len(settings.half_windows), 3, rows, columns), np.nan, np.float32)
-    own_texture = np.zeros(left.shape, bool)
+    matches = np.full((len(settings.half_windows), 3, rows, columns), np.nan, np.float32)
+    has_own_texture = np.zeros(left.shape, bool)
 
     def refine(corner: tuple[int, int]) -> None:
         inner = tuple(slice(k, k + n) for k, n in zip(corner, (height, width)))
@@ -200,18 +200,18 @@ def _match_windows(
             _reflect(np.arange(n) + k - margin, size)
             for k, n, size in zip(corner, sides, left.shape)
         )
-        found, textured = _refine_piece(left, spline, start, filled, v, u, settings)
-        place = own_texture[inner]
+        piece_matches, textured = _refine_piece(left, spline, start, filled, v, u, settings)
+        place = has_own_texture[inner]
         middle = tuple(slice(margin, margin + n) for n in place.shape)
         place[:] = textured[middle]
-        for out, size in zip(made, found):
+        for out, size in zip(matches, piece_matches):
             for values, piece in zip(out, size):
                 values[inner] = piece[middle]
 
     corners = [(r, c) for r in range(0, rows, height) for c in range(0, columns, width)]
     with ThreadPoolExecutor(available_cores()) as pool:
         list(pool.map(refine, corners))
-    return [_SizeMatches(*size) for size in made], own_texture
+    return [_SizeMatches(*size) for size in matches], has_own_texture
 
 
 def _refine_piece(
@@ -227,40 +227,48 @@ def _refine_piece(
     of their own."""
     piece = np.ix_(rows, columns)
     left, start, filled = left[piece], start[piece], filled[piece]
-    known = np.isfinite(start)
-    half, tolerance = settings.shape_half_window, settings.surface_tolerance
+    is_known = np.isfinite(start)
+    half_window, tolerance = settings.shape_half_window, settings.surface_tolerance
     limit = settings.max_change
-    first_shape = _smooth(_remove_noise(start, known), known, half, tolerance)
-    follow = lambda shape: RowWindows(left, spline.sample(rows, columns, shape, filled), known)
-    first, found, own_texture = follow(first_shape), [], np.zeros(left.shape, bool)
+    first_shape = _smooth(_remove_noise(start, is_known), is_known, half_window, tolerance)
+    follow = lambda shape: RowWindows(left, spline.sample(rows, columns, shape, filled), is_known)
+    first_windows, matches, own_texture = follow(first_shape), [], np.zeros(left.shape, bool)
     # Every size has shapes of its own: where they differ, windows of some sizes are bent.
     for size in settings.half_windows:
-        shape, windows = first_shape, first
+        shape, windows = first_shape, first_windows
         for _ in range(settings.rounds - 1):
             delta = np.clip(np.nan_to_num(windows.correct(size).delta), -limit, limit)
             # A smooth shape and the windows' mean of what is left of it: no bias from curvature.
             shape = _smooth(
-                np.where(known, shape + delta, np.nan), known, max(half, size), tolerance
+                np.where(is_known, shape + delta, np.nan),
+                is_known,
+                max(half_window, size),
+                tolerance,
             )
             windows = follow(shape)
         corrections = windows.correct(size)
-        if not found:
+        if not matches:
             own_texture = windows.find_own_texture(size, corrections.noise)
-        found.append(_accept(corrections, shape, start, settings))
-    return found, own_texture
+        matches.append(_accept(corrections, shape, start, settings))
+    return matches, own_texture
 
 
 def _accept(
-    found: RowCorrections, shape: RowImage, start: RowImage, settings: DisparityRefinementSettings
+    corrections: RowCorrections,
+    shape: RowImage,
+    start: RowImage,
+    settings: DisparityRefinementSettings,
 ) -> _SizeMatches:
     """The matches by windows of one size, NaN where they are not accepted."""
-    d = shape + found.delta
+    d = shape + corrections.delta
     with np.errstate(invalid="ignore"):
         good = np.abs(d - start) <= settings.max_change
-        good &= np.abs(found.delta) < settings.max_last_change
-        good &= found.rho >= settings.min_correlation
-        good &= found.contrast > settings.min_contrast_ratio
-    return _SizeMatches(np.where(good, d, np.nan), found.sigma, found.normalised_row_shift)
+        good &= np.abs(corrections.delta) < settings.max_last_change
+        good &= corrections.rho >= settings.min_correlation
+        good &= corrections.contrast > settings.min_contrast_ratio
+    return _SizeMatches(
+        np.where(good, d, np.nan), corrections.sigma, corrections.normalised_row_shift
+    )
 
 
 def _choose_windows(
@@ -275,108 +283,113 @@ def _choose_windows(
     shapes, bends = [], []
     for k in range(1, len(sizes)):
         with np.errstate(invalid="ignore"):
-            apart = (sizes[k].disparity - smallest.disparity) ** 2
+            squared_difference = (sizes[k].disparity - smallest.disparity) ** 2
             expected = np.maximum(factors[0] * noise[0] - factors[k] * noise[k], 0)
-            apart, expected = (
-                _mean_of_known(np.where(np.isfinite(apart), a, np.nan), reach)
-                for a in (apart, expected)
+            squared_difference, expected = (
+                _mean_of_known(np.where(np.isfinite(squared_difference), a, np.nan), reach)
+                for a in (squared_difference, expected)
             )
-            shapes.append(np.maximum(apart - expected, 0))
-            bends.append(np.maximum(apart - limit * expected, 0))
+            shapes.append(np.maximum(squared_difference - expected, 0))
+            bends.append(np.maximum(squared_difference - limit * expected, 0))
     # What bends the surface moves a disparity by the square of the side of the window, so that its
     # variance grows by the fourth power.
     halves = settings.half_windows
     for values in (shapes, bends):
         values.insert(0, values[0] * (halves[0] / halves[1]) ** 4)
     shape = smallest.disparity.shape
-    best, *chosen = (np.full(shape, value, np.float32) for value in (np.inf, *[np.nan] * 4))
+    best, *chosen_arrays = (np.full(shape, value, np.float32) for value in (np.inf, *[np.nan] * 4))
     for size, factor, variance, bent, bend in zip(sizes, factors, noise, shapes, bends):
         with np.errstate(invalid="ignore"):
             error = factor * variance + bend
             better = np.isfinite(size.disparity) & (error < best)
         best[better] = error[better]
-        for out, values in zip(chosen, (size.disparity, variance, factor * variance, bent)):
+        for out, values in zip(chosen_arrays, (size.disparity, variance, factor * variance, bent)):
             out[better] = values[better]
-    return _ChosenMatches(*chosen, factor=factors[len(factors) // 2])
+    return _ChosenMatches(*chosen_arrays, factor=factors[len(factors) // 2])
 
 
-def _mean_of_known(a: RowImage, half: int) -> RowImage:
+def _mean_of_known(a: RowImage, half_window: int) -> RowImage:
     """Means of the known values in windows around each pixel; NaN where there are none."""
-    known = np.isfinite(a)
+    is_known = np.isfinite(a)
     cv2 = need_opencv()
-    window = (2 * half + 1, 2 * half + 1)
+    window = (2 * half_window + 1, 2 * half_window + 1)
     total, weight = (
         cv2.boxFilter(x, -1, window, normalize=False, borderType=cv2.BORDER_REFLECT_101)
-        for x in (np.where(known, a, 0).astype(a.dtype), known.astype(a.dtype))
+        for x in (np.where(is_known, a, 0).astype(a.dtype), is_known.astype(a.dtype))
     )
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(weight > 0.5, total / weight, np.nan)
 
 
-def _measure_relief(d: RowImage, half: int) -> RowImage:
+def _measure_relief(d: RowImage, half_window: int) -> RowImage:
     """Root mean squares of disparities about their planes in windows."""
     cv2 = need_opencv()
     # Double precision: squares of disparities of hundreds of pixels, and relief of hundredths.
     d = d.astype(np.float64)
-    mean = _mean_of_known(d, half)
-    square = _mean_of_known(d * d, half) - mean * mean
+    mean = _mean_of_known(d, half_window)
+    square = _mean_of_known(d * d, half_window) - mean * mean
     # An unknown disparity has no effect on the slopes as the mean of those known.
     around = np.nan_to_num(np.where(np.isfinite(d), d, mean))
-    offset = np.arange(-half, half + 1, dtype=float)
-    spread = float(np.mean(offset**2))
-    slope, even = offset / (len(offset) * spread), np.full(len(offset), 1 / len(offset))
+    offset = np.arange(-half_window, half_window + 1, dtype=float)
+    variance_of_offset = float(np.mean(offset**2))
+    slope, mean_kernel = (
+        offset / (len(offset) * variance_of_offset),
+        np.full(len(offset), 1 / len(offset)),
+    )
     border = cv2.BORDER_REFLECT_101
-    along = cv2.sepFilter2D(around, cv2.CV_64F, slope, even, borderType=border)
-    across = cv2.sepFilter2D(around, cv2.CV_64F, even, slope, borderType=border)
-    return np.sqrt(np.maximum(square - spread * (along**2 + across**2), 0))
+    slope_along = cv2.sepFilter2D(around, cv2.CV_64F, slope, mean_kernel, borderType=border)
+    slope_across = cv2.sepFilter2D(around, cv2.CV_64F, mean_kernel, slope, borderType=border)
+    return np.sqrt(np.maximum(square - variance_of_offset * (slope_along**2 + slope_across**2), 0))
 
 
 def _add_scatter(
-    d: RowImage, found: _ChosenMatches, relief: RowImage, settings: DisparityRefinementSettings
+    d: RowImage, chosen: _ChosenMatches, relief: RowImage, settings: DisparityRefinementSettings
 ) -> RowImage:
     """σ by noise, shape, relief, and what the scatter of the disparities has beyond them."""
-    added = found.shape + settings.added_sigma**2
-    sigma = np.sqrt(np.maximum(found.scaled_noise, 2 * relief**2) + added)
-    apart = 2 * max(settings.half_windows) + 1  # windows that do not overlap
+    added_variance = chosen.shape + settings.added_sigma**2
+    sigma = np.sqrt(np.maximum(chosen.scaled_noise, 2 * relief**2) + added_variance)
+    window_distance = 2 * max(settings.half_windows) + 1  # windows that do not overlap
     side, quantile = settings.block_side, settings.scatter_quantile
-    missing = missing_sigma(d, sigma, np.ones_like(sigma), apart, side, quantile)
-    if missing is not None:
-        return np.hypot(sigma, missing)
+    missing_noise = missing_sigma(d, sigma, np.ones_like(sigma), window_distance, side, quantile)
+    if missing_noise is not None:
+        return np.hypot(sigma, missing_noise)
     # The shifts across the rows show only the noise. Where the scatter is not known, a factor below
     # 1 could not be told from one of windows that are bent.
-    return np.maximum(sigma, np.sqrt(found.noise + added))
+    return np.maximum(sigma, np.sqrt(chosen.noise + added_variance))
 
 
 def _fill_from_background(d: RowImage) -> RowImage:
     """Unknown disparities as the smaller of the nearest known ones on their row: those hidden in
     the other image are of the surface behind. 0 in rows without any."""
     columns = np.arange(d.shape[1])
-    known = np.isfinite(d)
-    before = np.maximum.accumulate(np.where(known, columns, -1), axis=1)
-    after = np.minimum.accumulate(np.where(known, columns, len(columns))[:, ::-1], axis=1)[:, ::-1]
-    take = lambda at: np.take_along_axis(d, np.clip(at, 0, len(columns) - 1), axis=1)
+    is_known = np.isfinite(d)
+    column_before = np.maximum.accumulate(np.where(is_known, columns, -1), axis=1)
+    column_after = np.minimum.accumulate(
+        np.where(is_known, columns, len(columns))[:, ::-1], axis=1
+    )[:, ::-1]
+    take_columns = lambda at: np.take_along_axis(d, np.clip(at, 0, len(columns) - 1), axis=1)
     beyond = np.float32(np.inf)
     lower = np.minimum(
-        np.where(before >= 0, take(before), beyond),
-        np.where(after < len(columns), take(after), beyond),
+        np.where(column_before >= 0, take_columns(column_before), beyond),
+        np.where(column_after < len(columns), take_columns(column_after), beyond),
     )
-    return np.where(known, d, np.where(np.isfinite(lower), lower, 0)).astype(np.float32)
+    return np.where(is_known, d, np.where(np.isfinite(lower), lower, 0)).astype(np.float32)
 
 
 def _find_steps(
-    d: RowImage, inside: RowMask, settings: DisparityRefinementSettings
+    d: RowImage, is_inside: RowMask, settings: DisparityRefinementSettings
 ) -> tuple[RowImage, RowImage]:
-    """Distances to the nearest step of the disparities, or to the nearest pixel `inside` the image
-    without one; and the height of the highest step in a window."""
+    """Distances to the nearest step of the disparities, or to the nearest pixel `is_inside` the
+    image without one; and the height of the highest step in a window."""
     cv2 = need_opencv()
-    filled, known = _fill_from_background(d), np.isfinite(d)
+    filled, is_known = _fill_from_background(d), np.isfinite(d)
     span = lambda a, side: (
         cv2.dilate(a, np.ones((side, side))),
         cv2.erode(a, np.ones((side, side))),
     )
-    high, low = (np.where(known, d, value).astype(np.float32) for value in (-1e4, 1e4))
-    at_step = known & (span(high, 3)[0] - span(low, 3)[1] > settings.step)
-    clear = ~(at_step | (inside & ~known))
+    high, low = (np.where(is_known, d, value).astype(np.float32) for value in (-1e4, 1e4))
+    at_step = is_known & (span(high, 3)[0] - span(low, 3)[1] > settings.step)
+    clear = ~(at_step | (is_inside & ~is_known))
     distance = cv2.distanceTransform(clear.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     high, low = span(filled, 2 * settings.shape_half_window + 1)
     return distance, np.maximum(high - filled, filled - low)
@@ -402,20 +415,22 @@ class _RowSpline(NamedTuple):
         """Grey values at some rows, and at columns moved to the left by the disparities, or by
         others where these are unknown; beyond the edge those of the edge."""
         disparity = np.where(np.isfinite(disparity), disparity, otherwise)
-        whole = np.floor(-disparity)
-        t = -disparity - whole
-        first = columns + whole.astype(np.int32)
-        last = self.coefficients.shape[1] - 5
-        t = np.where((first < 0) | (first >= last), 0, t)
-        first = np.clip(first, 0, last) + self.coefficients.shape[1] * rows[:, None]
+        whole_shift = np.floor(-disparity)
+        t = -disparity - whole_shift
+        first_column = columns + whole_shift.astype(np.int32)
+        last_column = self.coefficients.shape[1] - 5
+        t = np.where((first_column < 0) | (first_column >= last_column), 0, t)
+        first_column = (
+            np.clip(first_column, 0, last_column) + self.coefficients.shape[1] * rows[:, None]
+        )
         flat = self.coefficients.ravel()
         t2, t3 = t * t, t * t * t
         # 6 times the cubic B-spline at −1 − t, −t, 1 − t, 2 − t
         weights = 1 - 3 * t + 3 * t2 - t3, 4 - 6 * t2 + 3 * t3, 1 + 3 * (t + t2 - t3), t3
-        found = np.zeros(first.shape, np.float32)
+        sums = np.zeros(first_column.shape, np.float32)
         for k, weight in enumerate(weights):
-            found += weight * flat.take(first + k + 1)
-        return found / 6
+            sums += weight * flat.take(first_column + k + 1)
+        return sums / 6
 
 
 def _reflect(index: Int[np.ndarray, " k"], n: int) -> Int[np.ndarray, " k"]:
@@ -424,20 +439,22 @@ def _reflect(index: Int[np.ndarray, " k"], n: int) -> Int[np.ndarray, " k"]:
     return (n - 1) - np.abs((n - 1) - index % period)
 
 
-def _remove_noise(disparity: RowImage, known: RowMask) -> RowImage:
+def _remove_noise(disparity: RowImage, is_known: RowMask) -> RowImage:
     """Medians of 5 × 5. Where one differs by 1.5 pixels or more, it may be of the other side of an
     edge, and the disparity is kept."""
     cv2 = need_opencv()
-    median = cv2.medianBlur(np.where(known, disparity, -1e3).astype(np.float32), 5)
+    median = cv2.medianBlur(np.where(is_known, disparity, -1e3).astype(np.float32), 5)
     with np.errstate(invalid="ignore"):
         return np.where(np.abs(median - disparity) < 1.5, median, disparity)
 
 
-def _smooth(disparity: RowImage, known: RowMask, half: int, tolerance: float) -> RowImage:
+def _smooth(disparity: RowImage, is_known: RowMask, half_window: int, tolerance: float) -> RowImage:
     """Means of the similar disparities in a window."""
     cv2 = need_opencv()
     # OpenCV tabulates the weights between the smallest and the largest value: not too far apart
-    far = np.min(disparity, initial=np.inf, where=known) - 10 * tolerance
-    filled = np.where(known, disparity, far if known.any() else 0.0).astype(np.float32)
-    smooth = cv2.bilateralFilter(filled, 2 * half + 1, tolerance, float(half))
-    return np.where(known, smooth, np.nan).astype(np.float32)
+    beyond_range = np.min(disparity, initial=np.inf, where=is_known) - 10 * tolerance
+    filled = np.where(is_known, disparity, beyond_range if is_known.any() else 0.0).astype(
+        np.float32
+    )
+    smooth = cv2.bilateralFilter(filled, 2 * half_window + 1, tolerance, float(half_window))
+    return np.where(is_known, smooth, np.nan).astype(np.float32)

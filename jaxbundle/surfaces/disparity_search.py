@@ -71,22 +71,24 @@ class DisparitySearchSettings:
 def equalise_exposures(
     left: RowImage,
     right: RowImage,
-    inside: RowMask,
+    is_inside: RowMask,
     right_inside: RowMask,
     settings: DisparitySearchSettings,
 ) -> tuple[RowImage, RowImage]:
     """Grey values around 128 without differences of exposure and light."""
     cv2 = need_opencv()
     mean = lambda a: cv2.blur(a.astype(np.float32), (2 * settings.mean_half_window + 1,) * 2)
-    found, spread = [], 0.0
-    for a, there in ((left, inside), (right, right_inside)):
-        away = np.where(there, a - mean(a * there) / np.maximum(mean(there), 1e-6), 0)
-        contrast = float(np.std(away[there])) if there.any() else 0.0
+    equalised, common_contrast = [], 0.0
+    for a, has_value in ((left, is_inside), (right, right_inside)):
+        deviation = np.where(
+            has_value, a - mean(a * has_value) / np.maximum(mean(has_value), 1e-6), 0
+        )
+        contrast = float(np.std(deviation[has_value])) if has_value.any() else 0.0
         # The right image gets the contrast of the left one.
-        spread = spread or max(contrast, settings.min_contrast)
-        stretched = 128 + away * (spread / max(contrast, 1.0))
-        found.append(np.clip(stretched, 0, 255).astype(np.float32))
-    return found[0], found[1]
+        common_contrast = common_contrast or max(contrast, settings.min_contrast)
+        stretched = 128 + deviation * (common_contrast / max(contrast, 1.0))
+        equalised.append(np.clip(stretched, 0, 255).astype(np.float32))
+    return equalised[0], equalised[1]
 
 
 def semi_global(
@@ -113,8 +115,8 @@ def semi_global(
     margin = 128
     block = settings.block_side
 
-    def match_strip(first: int) -> Int[np.ndarray, "strip columns"]:
-        low, high = max(first - margin, 0), min(first + strip + margin, rows)
+    def match_strip(begin: int) -> Int[np.ndarray, "strip columns"]:
+        low, high = max(begin - margin, 0), min(begin + strip + margin, rows)
         matcher = cv2.StereoSGBM.create(
             minDisparity=0,
             numDisparities=number,
@@ -130,13 +132,13 @@ def semi_global(
             speckleRange=2,  # pixels; OpenCV recommends 1 or 2
             mode=mode,
         )
-        found = matcher.compute(*(np.ascontiguousarray(a[low:high]) for a in wide))
-        return found[first - low : first - low + strip, number:]
+        disparities = matcher.compute(*(np.ascontiguousarray(a[low:high]) for a in wide))
+        return disparities[begin - low : begin - low + strip, number:]
 
     with ThreadPoolExecutor(available_cores()) as pool:
-        found = np.concatenate([*pool.map(match_strip, range(0, rows, strip))])
-    found = found.astype(np.float32) / 16  # OpenCV's unit is 1/16 pixel
-    return np.where((found >= 0) & (found <= span), found, np.nan)
+        disparities = np.concatenate([*pool.map(match_strip, range(0, rows, strip))])
+    disparities = disparities.astype(np.float32) / 16  # OpenCV's unit is 1/16 pixel
+    return np.where((disparities >= 0) & (disparities <= span), disparities, np.nan)
 
 
 def search_both_ways(
@@ -151,15 +153,15 @@ def search_both_ways(
     image. A search of the mirrored pair has others: of the wrong disparities of real pairs, mostly
     of pixels hidden in the right image, it finds a third to a half more, and loses 2 % of the right
     ones."""
-    found = semi_global(left, right, span, settings)
+    from_left = semi_global(left, right, span, settings)
     mirror = lambda a: np.ascontiguousarray(a[:, ::-1])
-    other = semi_global(mirror(right), mirror(left), span, settings)[:, ::-1]
-    columns = np.arange(found.shape[1])
-    match = columns - np.rint(np.nan_to_num(found)).astype(int)
-    confirmed = np.take_along_axis(other, np.clip(match, 0, len(columns) - 1), axis=1)
+    from_right = semi_global(mirror(right), mirror(left), span, settings)[:, ::-1]
+    columns = np.arange(from_left.shape[1])
+    match = columns - np.rint(np.nan_to_num(from_left)).astype(int)
+    confirmed = np.take_along_axis(from_right, np.clip(match, 0, len(columns) - 1), axis=1)
     with np.errstate(invalid="ignore"):
-        agree = (match >= 0) & (np.abs(confirmed - found) <= settings.max_left_right)
-    return np.where(agree, found, np.float32(np.nan))
+        agree = (match >= 0) & (np.abs(confirmed - from_left) <= settings.max_left_right)
+    return np.where(agree, from_left, np.float32(np.nan))
 
 
 def find_repetitions(
@@ -179,15 +181,15 @@ def find_repetitions(
     repeated = (
         cv2.resize(repeated.astype(np.uint8), left.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
     )
-    known = np.isfinite(disparity)
+    is_known = np.isfinite(disparity)
     # Units of a sixteenth of a pixel, OpenCV's, or larger ones for ranges beyond its 16 bits.
     per_pixel = max(1, min(16, MAX_INT16 // (span + 1)))
     unknown = -MAX_INT16
-    whole = np.where(known, per_pixel * np.nan_to_num(disparity), unknown).astype(np.int16)
+    scaled = np.where(is_known, per_pixel * np.nan_to_num(disparity), unknown).astype(np.int16)
     min_surface_pixels = int(settings.min_repetitive_share * left.size)
     # Neighbours of one surface differ by up to a pixel.
-    remaining, _ = cv2.filterSpeckles(whole, unknown, min_surface_pixels, per_pixel)
-    return known & repeated & (remaining == unknown)
+    remaining, _ = cv2.filterSpeckles(scaled, unknown, min_surface_pixels, per_pixel)
+    return is_known & repeated & (remaining == unknown)
 
 
 def _autocorrelate_rows(a: RowImage, farthest: int) -> RowImage:
@@ -197,16 +199,16 @@ def _autocorrelate_rows(a: RowImage, farthest: int) -> RowImage:
     are alike in any texture.
     """
     cv2 = need_opencv()
-    half = 4
-    side = (2 * half + 1, 2 * half + 1)
+    half_window = 4
+    side = (2 * half_window + 1, 2 * half_window + 1)
     mean = lambda x: cv2.boxFilter(x, -1, side)
     a = a - a.mean()
     m = mean(a)
-    spread = np.sqrt(np.maximum(mean(a * a) - m * m, 1e-3))
+    standard_deviation = np.sqrt(np.maximum(mean(a * a) - m * m, 1e-3))
     best = np.full(a.shape, -1.0, np.float32)
-    for lag in range(half, min(farthest, a.shape[1] - 1) + 1):
+    for lag in range(half_window, min(farthest, a.shape[1] - 1) + 1):
         rho = mean(a[:, lag:] * a[:, :-lag]) - m[:, lag:] * m[:, :-lag]
-        rho /= spread[:, lag:] * spread[:, :-lag]
+        rho /= standard_deviation[:, lag:] * standard_deviation[:, :-lag]
         np.maximum(best[:, lag:], rho, out=best[:, lag:])
         np.maximum(best[:, :-lag], rho, out=best[:, :-lag])
     return best

@@ -131,10 +131,10 @@ def make_dsm(
     Z, sigma_Z, number = cloud.X[:, 2], cloud.sigma[:, 2], rows * columns
     if cloud.shared is not None:
         sigma_Z = np.sqrt(np.maximum(sigma_Z**2 - cloud.shared, 0.0))
-    alike = _points_that_count_as_one(cloud, cell, settings.window)
-    height, sigma, count = _average_cells(cell, Z, sigma_Z, size, number, alike, settings)
+    points_as_one = _points_that_count_as_one(cloud, cell, settings.window)
+    height, sigma, count = _average_cells(cell, Z, sigma_Z, size, number, points_as_one, settings)
     shape = rows, columns
-    found = Dsm(
+    model = Dsm(
         height.reshape(shape),
         sigma.reshape(shape),
         count.reshape(shape),
@@ -144,8 +144,8 @@ def make_dsm(
         cloud.system,
     )
     if fill:
-        found = _fill(found, fill, settings)
-    return found if cloud.shared is None else _add_shared(found, cell, cloud.shared)
+        model = _fill(model, fill, settings)
+    return model if cloud.shared is None else _add_shared(model, cell, cloud.shared)
 
 
 def _add_shared(dsm: Dsm, cell: Int[np.ndarray, " n"], shared: Float[np.ndarray, " n"]) -> Dsm:
@@ -158,8 +158,8 @@ def _add_shared(dsm: Dsm, cell: Int[np.ndarray, " n"], shared: Float[np.ndarray,
     filled = np.isfinite(dsm.height) & (number == 0)
     if filled.any():
         nearest = {"return_distances": False, "return_indices": True}
-        at = np.asarray(ndimage.distance_transform_edt(number == 0, **nearest))
-        mean[filled] = mean[tuple(at[:, filled])]
+        nearest_cell = np.asarray(ndimage.distance_transform_edt(number == 0, **nearest))
+        mean[filled] = mean[tuple(nearest_cell[:, filled])]
     return dataclasses.replace(dsm, sigma=np.sqrt(dsm.sigma**2 + mean), own_sigma=dsm.sigma)
 
 
@@ -198,15 +198,15 @@ def _points_that_count_as_one(
 ) -> Float[np.ndarray, " cells"]:
     """n/m of every cell with points, in ascending order; 1 without pixels of base images."""
     cells, group = np.unique(cell, return_inverse=True)
-    known = np.isfinite(cloud.uv).all(1)
-    if not known.any():
+    is_known = np.isfinite(cloud.uv).all(1)
+    if not is_known.any():
         return np.ones(len(cells))
-    both = group * len(cloud.images) + cloud.image
-    order = np.argsort(both, kind="stable")
-    keys, first, count = np.unique(both[order], return_index=True, return_counts=True)
-    uv = np.where(np.expand_dims(known, 1), cloud.uv, np.inf)[order]
+    group_and_image = group * len(cloud.images) + cloud.image
+    order = np.argsort(group_and_image, kind="stable")
+    keys, begin, count = np.unique(group_and_image[order], return_index=True, return_counts=True)
+    uv = np.where(np.expand_dims(is_known, 1), cloud.uv, np.inf)[order]
     with np.errstate(invalid="ignore"):
-        reach = np.maximum.reduceat(uv, first) - np.minimum.reduceat(uv, first)
+        reach = np.maximum.reduceat(uv, begin) - np.minimum.reduceat(uv, begin)
     independent = np.prod(1 + reach / window, axis=1)
     # Without a pixel a point stands for itself.
     independent = np.minimum(np.where(np.isfinite(independent), independent, count), count)
@@ -220,33 +220,35 @@ def _average_cells(
     sigma: Float[np.ndarray, " n"],
     size: float,
     number: int,
-    alike: Float[np.ndarray, " cells"],
+    points_as_one: Float[np.ndarray, " cells"],
     settings: DsmSettings,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Weighted means by cell, their σ and numbers of points; `alike`: for each cell
+    """Weighted means by cell, their σ and numbers of points; `points_as_one`: for each cell
     with points, how many of them count as one."""
     order = np.lexsort((Z, cell))
     cell, Z, sigma = cell[order], Z[order], sigma[order]
-    cells, first, count = np.unique(cell, return_index=True, return_counts=True)
+    cells, begin, count = np.unique(cell, return_index=True, return_counts=True)
     group = np.repeat(np.arange(len(cells)), count)
-    middle = _sorted_medians(Z, first, count)
-    away = np.abs(Z - middle[group])
-    again = np.lexsort((away, group))
-    spread = NORMAL_SIGMA_BY_MAD * _sorted_medians(away[again], first, count)
-    least = settings.min_spread * size
-    keep = away <= settings.max_deviation * np.maximum(spread, least)[group]
+    middle = _sorted_medians(Z, begin, count)
+    deviation = np.abs(Z - middle[group])
+    by_deviation = np.lexsort((deviation, group))
+    scatter = NORMAL_SIGMA_BY_MAD * _sorted_medians(deviation[by_deviation], begin, count)
+    min_scatter = settings.min_spread * size
+    keep = deviation <= settings.max_deviation * np.maximum(scatter, min_scatter)[group]
     # A point without σ, or of a σ that no measurement has, 0 or ∞, counts as one of the median σ.
     with np.errstate(divide="ignore", over="ignore", under="ignore"):
         weight = np.where(sigma > 0, 1 / sigma**2, np.nan)
-    known = np.isfinite(weight) & (weight > 0)
-    weight = np.where(known, weight, np.median(weight[known]) if known.any() else 1.0) * keep
+    is_known = np.isfinite(weight) & (weight > 0)
+    weight = (
+        np.where(is_known, weight, np.median(weight[is_known]) if is_known.any() else 1.0) * keep
+    )
     total = np.bincount(group, weight)
     mean = np.bincount(group, weight * Z) / total
     n = np.bincount(group, keep)
     square = np.bincount(group, weight * (Z - mean[group]) ** 2)
-    ratio = np.maximum(alike, square / np.maximum(n - 1, 1))
+    ratio = np.maximum(points_as_one, square / np.maximum(n - 1, 1))
     out = np.full((2, number), np.nan)
-    out[0, cells], out[1, cells] = mean, np.sqrt(ratio / total) if known.any() else np.nan
+    out[0, cells], out[1, cells] = mean, np.sqrt(ratio / total) if is_known.any() else np.nan
     numbers = np.zeros(number, int)
     numbers[cells] = n
     return out[0], out[1], numbers
@@ -254,28 +256,28 @@ def _average_cells(
 
 def _sorted_medians(
     values: Float[np.ndarray, " n"],
-    first: Int[np.ndarray, " groups"],
+    begin: Int[np.ndarray, " groups"],
     count: Int[np.ndarray, " groups"],
 ) -> Float[np.ndarray, " groups"]:
     """Medians of sorted, consecutive groups."""
-    low, high = first + (count - 1) // 2, first + count // 2
+    low, high = begin + (count - 1) // 2, begin + count // 2
     return (values[low] + values[high]) / 2
 
 
 def _fill(dsm: Dsm, reach: int, settings: DsmSettings) -> Dsm:
     """Gaps near heights filled by the mean of those around, weighted by distance."""
-    known = np.isfinite(dsm.height)
-    if known.all():
+    is_known = np.isfinite(dsm.height)
+    if is_known.all():
         return dsm
-    distance = np.asarray(ndimage.distance_transform_edt(~known))
+    distance = np.asarray(ndimage.distance_transform_edt(~is_known))
     k = np.arange(-2 * reach, 2 * reach + 1)
     # Inverse squares of distances; a cell itself, at distance 0, has no height where this is used.
     kernel = 1 / np.maximum(np.hypot(k[:, None], k), 0.5) ** 2
-    weigh = lambda a: ndimage.convolve(np.where(known, a, 0.0), kernel, mode="constant")
-    weight = weigh(1.0 * known)
-    gap = ~known & (distance <= reach) & (weight > 0)
+    weigh = lambda a: ndimage.convolve(np.where(is_known, a, 0.0), kernel, mode="constant")
+    weight = weigh(1.0 * is_known)
+    gap = ~is_known & (distance <= reach) & (weight > 0)
     # Only cells with heights on opposite sides, not the outer edge.
-    around = ndimage.binary_closing(np.pad(known, 2 * reach), iterations=reach)
+    around = ndimage.binary_closing(np.pad(is_known, 2 * reach), iterations=reach)
     gap &= around[2 * reach : -2 * reach, 2 * reach : -2 * reach]
     safe = np.where(weight > 0, weight, 1.0)
     # Heights above their mean: squares of large heights would lose the digits of their scatter.
@@ -291,17 +293,17 @@ def _fill(dsm: Dsm, reach: int, settings: DsmSettings) -> Dsm:
 def _mean_lower_heights(
     height: Float[np.ndarray, "rows columns"],
     kernel: Float[np.ndarray, "w w"],
-    at: Bool[np.ndarray, "rows columns"],
+    is_gap: Bool[np.ndarray, "rows columns"],
     bound: Float[np.ndarray, " k"],
 ) -> Float[np.ndarray, " k"]:
     """The weighted means of the heights around some cells that are not above a bound each."""
     reach = len(kernel) // 2
     wide = np.pad(height, reach, constant_values=np.nan)
-    rows, columns = np.nonzero(at)
+    rows, columns = np.nonzero(is_gap)
     total, weight = np.zeros((2, len(rows)))
     for (i, j), w in np.ndenumerate(kernel):
-        found = wide[rows + i, columns + j]
-        low = found <= bound
-        total += np.where(low, w * found, 0.0)
-        weight += w * low
+        neighbours = wide[rows + i, columns + j]
+        is_lower = neighbours <= bound
+        total += np.where(is_lower, w * neighbours, 0.0)
+        weight += w * is_lower
     return total / weight

@@ -28,9 +28,9 @@ def write_cloud_csv(cloud: Cloud, path: str | Path) -> None:
     """A row for each point, columns `COLUMNS`; unknown σ are left empty."""
     names = np.array([*map(_quote, cloud.images), ""], dtype=object)
     # 65 536 lines at once, about 8 MB of text, whatever the size of the cloud
-    together = 1 << 16
-    starts = range(0, len(cloud), together)
-    lines = (_format_rows(cloud, names, slice(k, k + together)) for k in starts)
+    rows_at_once = 1 << 16
+    starts = range(0, len(cloud), rows_at_once)
+    lines = (_format_rows(cloud, names, slice(k, k + rows_at_once)) for k in starts)
     write_text(Path(path), itertools.chain([",".join(COLUMNS) + "\n"], lines))
 
 
@@ -98,7 +98,7 @@ def make_cloud(
             f"{n} points have coordinates that are not finite, or too large"
         )
     columns = {name: np.asarray(values, float) for name, values in columns.items()}
-    for name, limit, what in (
+    for name, limit, expected in (
         *((name, max_coordinate, "a positive number, or nothing,") for name in SIGMAS),
         ("rays", np.iinfo(np.int32).max, "a number of images"),
     ):
@@ -109,16 +109,18 @@ def make_cloud(
             raise InputError(f"{source.name}: {name} has {values.shape[1:]} values a point; one is")
         if (bad := (values < 0) | (values > limit)).any():
             row = int(bad.argmax())
-            raise InputError(f"{source(row)}: {name} is {values[row]:g}; expected {what}")
+            raise InputError(f"{source(row)}: {name} is {values[row]:g}; expected {expected}")
     # What the file does not have is one value for all points, without memory of its own.
-    same = lambda value, shape, kind=float: np.broadcast_to(np.array(value, kind), shape)
-    covariance = same(np.diag(np.full(3, np.nan)), (n, 3, 3))
+    repeated = lambda value, shape, kind=float: np.broadcast_to(np.array(value, kind), shape)
+    covariance = repeated(np.diag(np.full(3, np.nan)), (n, 3, 3))
     if columns.keys() & {*SIGMAS}:
         covariance = np.zeros((n, 3, 3))
         for k, name in enumerate(SIGMAS):
             covariance[:, k, k] = columns.get(name, np.full(n, np.nan)) ** 2
-    rays = np.nan_to_num(columns["rays"]).astype(int) if "rays" in columns else same(0, n, int)
-    return Cloud(X, covariance, rays, same(0, n, int), same(np.nan, (n, 2)), ("",), colour, system)
+    rays = np.nan_to_num(columns["rays"]).astype(int) if "rays" in columns else repeated(0, n, int)
+    return Cloud(
+        X, covariance, rays, repeated(0, n, int), repeated(np.nan, (n, 2)), ("",), colour, system
+    )
 
 
 def report_of(
@@ -149,30 +151,30 @@ def report_of(
 
 def text_of(report: Mapping[str, Any]) -> str:
     """The report in lines."""
-    found = report["accuracy"]
+    accuracy = report["accuracy"]
     lines = [
         f"{report['points']} points, by rays: "
         + ", ".join(f"{k}: {n}" for k, n in report["rays"].items())
     ]
     if report.get("system"):
-        above = f", heights {report['heights']}" if report.get("heights") else ""
-        lines.append(f"coordinates in {name_system(report['system'])}{above}")
+        heights_in_words = f", heights {report['heights']}" if report.get("heights") else ""
+        lines.append(f"coordinates in {name_system(report['system'])}{heights_in_words}")
     for row in report["images"]:
         factor = row["variance_factor"]
-        said = "" if factor is None else f", variance factor {factor:.3g}"
+        factor_in_words = "" if factor is None else f", variance factor {factor:.3g}"
         lines.append(
             f"{row['image']} with {', '.join(row['with'])}: {row['matched']} of "
-            f"{row['points']} points{said}"
+            f"{row['points']} points{factor_in_words}"
         )
         lines += [f"    {n:8} {reason}" for reason, n in row["rejected"].items()]
     for axis in "XYZ":
-        s = found[f"s{axis}"]
+        s = accuracy[f"s{axis}"]
         if s:
             lines.append(
                 f"σ{axis}  mean {s['mean']:.4g}  smallest {s['smallest']:.4g}  "
                 f"largest {s['largest']:.4g}"
             )
-    for c in found["classes"]:
+    for c in accuracy["classes"]:
         upper = "∞" if c["to"] is None else f"{c['to']:g}"
         lines.append(f"σ from {c['from']:g} to {upper}: {c['points']} points")
     lines.append(f"σ contains: {', '.join(report['sigma_includes'])}")

@@ -68,11 +68,13 @@ def straighten(
     axes = np.array([e, [-e[1], e[0]]])
     uv, q = base.project(X), base.parameter(X)
     # Where the piece's epipolar line sees at q0 what the other image has of X.
-    here = other.project(base.points(uv, np.full(len(uv), q0)))
-    there = other.project(X)
-    along = np.sum((there - here) * shape.other_axis, 1) / np.sum(shape.other_axis**2, 1)
+    places_at_q0 = other.project(base.points(uv, np.full(len(uv), q0)))
+    places_of_points = other.project(X)
+    distance_along = np.sum((places_of_points - places_at_q0) * shape.other_axis, 1) / np.sum(
+        shape.other_axis**2, 1
+    )
     # A − δ looks at q0 where X is: its image is there.
-    shift = -along[shape.usable & np.isfinite(along) & np.isfinite(q)]
+    shift = -distance_along[shape.usable & np.isfinite(distance_along) & np.isfinite(q)]
     if not len(shift):
         return None
     # Without the few wrong nodes of a guide.
@@ -81,9 +83,9 @@ def straighten(
     lowest = int(np.floor(low - margin))
     span = int(np.ceil(high + margin) - np.floor(low - margin))
     ab = corners @ axes.T
-    first = np.floor(ab.min(0)) - [span, 0]
-    columns, rows = (int(n) for n in np.ceil(ab.max(0)) - first + 1)
-    corner = first @ axes
+    first_column_and_row = np.floor(ab.min(0)) - [span, 0]
+    columns, rows = (int(n) for n in np.ceil(ab.max(0)) - first_column_and_row + 1)
+    corner = first_column_and_row @ axes
     pair = StraightenedPair(np.zeros((0, 0)), np.zeros((0, 0)), corner, axes, lowest, q0)
     r, c = np.indices((rows, columns)).reshape(2, -1)
     left = _sample(base, pair.base_places(np.stack([c, r], 1).astype(float)))
@@ -117,16 +119,16 @@ def _sample_other(
 
 def _sample(view: OrientedImage, uv: Places) -> Float32[np.ndarray, " n"]:
     """Grey values by cubic splines, NaN outside the image."""
-    inside = (uv > -0.5).all(1) & (uv < np.array(view.size) - 0.5).all(1)
-    if not inside.any():
+    is_inside = (uv > -0.5).all(1) & (uv < np.array(view.size) - 0.5).all(1)
+    if not is_inside.any():
         return np.full(len(uv), np.nan, np.float32)
     # The spline's coefficients at a pixel depend on others by 0.27 per pixel of distance: 16 pixels
     # more on all sides, and the part has the grey values of the whole image.
-    low = np.maximum(np.floor(uv[inside].min(0)).astype(int) - 16, 0)
-    high = np.ceil(uv[inside].max(0)).astype(int) + 17
+    low = np.maximum(np.floor(uv[is_inside].min(0)).astype(int) - 16, 0)
+    high = np.ceil(uv[is_inside].max(0)).astype(int) + 17
     piece = np.asarray(view.grey[low[1] : high[1], low[0] : high[0]], np.float32)
-    place = np.where(np.expand_dims(inside, 1), uv - low, 0.0)
+    place = np.where(np.expand_dims(is_inside, 1), uv - low, 0.0)
     grey = ndimage.map_coordinates(
         piece, [place[:, 1], place[:, 0]], output=np.float32, order=3, mode="nearest"
     )
-    return np.where(inside, grey, np.nan)
+    return np.where(is_inside, grey, np.nan)

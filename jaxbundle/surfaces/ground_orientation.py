@@ -46,12 +46,12 @@ class GroundOrientation:
 
 def _orientation(
     joint: OrientationCovariance,
-    every: tuple[Unknown, ...],
+    all_unknowns: tuple[Unknown, ...],
     form: Form | None = None,
     domain: BiasDomain | None = None,
 ) -> GroundOrientation:
-    owners = {unknown[:2] for unknown in every}
-    strange = [u for u in joint.unknowns if u[:2] in owners and u not in every]
+    owners = {unknown[:2] for unknown in all_unknowns}
+    strange = [u for u in joint.unknowns if u[:2] in owners and u not in all_unknowns]
     if strange:
         # Left out it would count as held, and σ would be too small.
         raise InputError(
@@ -59,17 +59,17 @@ def _orientation(
             "that pushbroom refine writes"
         )
     # Without a row in the covariance: held in the refinement, so that it has no error.
-    held = joint.index(every) < 0
-    columns = tuple(np.flatnonzero(~held).tolist())
-    return GroundOrientation(joint, tuple(every[k] for k in columns), columns, form, domain)
+    is_held = joint.index(all_unknowns) < 0
+    columns = tuple(np.flatnonzero(~is_held).tolist())
+    return GroundOrientation(joint, tuple(all_unknowns[k] for k in columns), columns, form, domain)
 
 
 def rpc_orientation(joint: OrientationCovariance, id: str, domain: BiasDomain) -> GroundOrientation:
     """Of an image with RPC; `domain` of the coefficients that were refined.
 
     **Raises:** `InputError` for unknowns that it cannot have."""
-    every = tuple(("image", id, name) for name in names_of_terms(len(TERM_NAMES)))
-    return _orientation(joint, every, domain=domain)
+    all_terms = tuple(("image", id, name) for name in names_of_terms(len(TERM_NAMES)))
+    return _orientation(joint, all_terms, domain=domain)
 
 
 def scanner_orientation(
@@ -83,14 +83,14 @@ def scanner_orientation(
     """Of a rigorous image; `knot_spacing` of its jitter, seconds.
 
     **Raises:** `InputError` for unknowns that it cannot have."""
-    of = lambda *owner: [name for *known, name in joint.unknowns if (*known,) == owner]
-    jitter = any(" jitter " in name for name in of("image", id))
+    names_of = lambda *owner: [name for *known, name in joint.unknowns if (*known,) == owner]
+    jitter = any(" jitter " in name for name in names_of("image", id))
     look = {"across": 0, "along": 0}
     for word in look:
         # Coefficients are counted by their largest exponent: lower ones may be held, and not listed
-        named = [name for name in of("sensor", sensor) if f"look angle {word}" in name]
+        look_angles = [name for name in names_of("sensor", sensor) if f"look angle {word}" in name]
         # One without a number is refused below, like all that is not known.
-        exponents = [text for name in named if (text := name.rpartition("^")[2]).isdecimal()]
+        exponents = [text for name in look_angles if (text := name.rpartition("^")[2]).isdecimal()]
         look[word] = max((int(text) + 1 for text in exponents), default=0)
     # Only which unknowns there are matters here: σ are those of the covariance.
     freedom = Freedom(
@@ -102,8 +102,8 @@ def scanner_orientation(
     form = make_form(image, earth, freedom)
     owners = (name.owner.partition(" ") for name in names(form.sizes, id, sensor))
     parameters = (name.parameter for name in names(form.sizes, id, sensor))
-    every = tuple((kind, owner, name) for (kind, _, owner), name in zip(owners, parameters))
-    return _orientation(joint, every, form)
+    all_unknowns = tuple((kind, owner, name) for (kind, _, owner), name in zip(owners, parameters))
+    return _orientation(joint, all_unknowns, form)
 
 
 def scanner_derivative(
@@ -129,12 +129,12 @@ def scanner_derivative(
 
 @compile_once
 def _by_unknowns(
-    kind: ScannerPoint, number: int, own: int, X: Float[Array, "n 3"], lines: MeasuredLine
+    kind: ScannerPoint, number: int, number_of_own: int, X: Float[Array, "n 3"], lines: MeasuredLine
 ) -> Float[Array, "n 2 k"]:
     def residual(
         p: Float[Array, " k"], X: Float[Array, "3"], line: MeasuredLine
     ) -> Float[AnyArray, "2"]:
-        return kind(p[:own], p[own:], X, line)
+        return kind(p[:number_of_own], p[number_of_own:], X, line)
 
     return jax.vmap(jax.jacfwd(residual), (None, 0, 0))(jnp.zeros(number), X, lines)
 
@@ -145,5 +145,5 @@ def bias_derivative(
     """∂(sample, line) of one point by all terms of a bias, of lines before those of samples."""
     terms = jnp.stack(bias_terms(domain, *project(rpc, longitude, latitude, h)))
     # Rows are (u, v) = (sample, line), columns as `names_of_terms`: those of lines first.
-    none = jnp.zeros_like(terms)
-    return jnp.stack([jnp.concatenate([none, terms]), jnp.concatenate([terms, none])])
+    zeros = jnp.zeros_like(terms)
+    return jnp.stack([jnp.concatenate([zeros, terms]), jnp.concatenate([terms, zeros])])

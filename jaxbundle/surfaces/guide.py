@@ -135,12 +135,12 @@ def make_guide(
             break
         q = bounds(uv)
         if guide is None:
-            found = _search_all(base, others, pyramids, uv, q, level, shape, settings)
-            if found is None:
+            matches = _search_all(base, others, pyramids, uv, q, level, shape, settings)
+            if matches is None:
                 return None
         else:
-            found = _search_near(base, others, pyramids, uv, q, level, guide, settings)
-        guide = _smooth(base, level, uv, shape, found, settings)
+            matches = _search_near(base, others, pyramids, uv, q, level, guide, settings)
+        guide = _smooth(base, level, uv, shape, matches, settings)
     return guide
 
 
@@ -202,19 +202,19 @@ def _search_all(
     common = q[:, :1] + np.linspace(0, 1, steps) * (q[:, 1:] - q[:, :1])
     curves, rates = [], []
     for pair in searches:
-        both, segment = (pyramids[0], pair.pyramid), pair.segment
+        both_pyramids, segment = (pyramids[0], pair.pyramid), pair.segment
         curves.append(
             _correlate_at(
                 common,
                 (base, pair.other),
-                both,
+                both_pyramids,
                 uv,
                 segment,
                 pair.window,
                 pair.visible,
                 level=level,
                 steps=pair.steps,
-                half=settings.half_window,
+                half_window=settings.half_window,
             )
         )
         rate = segment.length / (segment.q[:, 1] - segment.q[:, 0])
@@ -227,9 +227,9 @@ def _search_all(
         cost.reshape(*shape, steps), settings.small_change, settings.large_change
     ).reshape(-1, steps)
     _, best, _ = find_peaks(-total)
-    near = np.clip(np.rint(np.nan_to_num(best)).astype(int), 0, steps - 1)
-    found = q[:, 0] + best / (steps - 1) * (q[:, 1] - q[:, 0])
-    return NodeMatches(found, np.max(rates, axis=0), rho[np.arange(len(rho)), near])
+    nearest = np.clip(np.rint(np.nan_to_num(best)).astype(int), 0, steps - 1)
+    q_found = q[:, 0] + best / (steps - 1) * (q[:, 1] - q[:, 0])
+    return NodeMatches(q_found, np.max(rates, axis=0), rho[np.arange(len(rho)), nearest])
 
 
 def _prepare_searches(
@@ -276,21 +276,23 @@ def _correlate_at(
     *,
     level: int,
     steps: int,
-    half: int,
+    half_window: int,
 ) -> Float[np.ndarray, "n k"]:
     """ρ at common parameters, interpolated along each segment."""
-    rho, _ = correlate(pair, pyramids, uv, segment, window, level=level, half=half, steps=steps)
+    rho, _ = correlate(
+        pair, pyramids, uv, segment, window, level=level, half_window=half_window, steps=steps
+    )
     step_length = 2.0**level * np.linalg.norm(window.other_axis, axis=1)[:, None]
     with np.errstate(invalid="ignore", divide="ignore"):
         index = (segment.length_at(common) - segment.length[:, None] / 2) / step_length + (
             steps - 1
         ) / 2
-        inside = (index >= 0) & (index <= steps - 1) & visible[:, None]
-        inside &= (common >= segment.q[:, :1]) & (common <= segment.q[:, 1:])
+        is_inside = (index >= 0) & (index <= steps - 1) & visible[:, None]
+        is_inside &= (common >= segment.q[:, :1]) & (common <= segment.q[:, 1:])
         low = np.clip(np.nan_to_num(index).astype(int), 0, steps - 2)
         part = index - low
         a, b = (np.take_along_axis(rho, low + k, axis=1) for k in (0, 1))
-        return np.where(inside, a + part * (b - a), np.nan)
+        return np.where(is_inside, a + part * (b - a), np.nan)
 
 
 def _search_near(
@@ -307,9 +309,9 @@ def _search_near(
     margin = settings.search_margin * 2.0 ** (level + 1)
     q0, q, normal, rate = guide.look_up(uv, margin)
     q = np.clip(q, bounds[:, :1], bounds[:, 1:])
-    found, rho, _ = search(base, others, pyramids, uv, q, normal, level, settings)
-    lost = ~np.isfinite(found)
-    return NodeMatches(np.where(lost, q0, found), rate, np.where(lost, np.nan, rho))
+    q_found, rho, _ = search(base, others, pyramids, uv, q, normal, level, settings)
+    is_lost = ~np.isfinite(q_found)
+    return NodeMatches(np.where(is_lost, q0, q_found), rate, np.where(is_lost, np.nan, rho))
 
 
 def search(
@@ -343,25 +345,25 @@ def search(
         common = q[rows, :1] + np.linspace(0, 1, steps) * (q[rows, 1:] - q[rows, :1])
         curves = []
         for k, other in enumerate(others):
-            both = pyramids[0], pyramids[1][k]
+            both_pyramids = pyramids[0], pyramids[1][k]
             s, w = _take(segment[k], rows), _take(window[k], rows)
             curves.append(
                 _correlate_at(
                     common,
                     (base, other),
-                    both,
+                    both_pyramids,
                     uv[rows],
                     s,
                     w,
                     w.usable,
                     level=level,
                     steps=int(steps),
-                    half=settings.half_window,
+                    half_window=settings.half_window,
                 )
             )
-        peak, best, second = find_peaks(combine(curves))
+        peak, best, second_peak = find_peaks(combine(curves))
         out[0, rows] = common[:, 0] + best / (steps - 1) * (common[:, -1] - common[:, 0])
-        out[1, rows], out[2, rows] = peak, second
+        out[1, rows], out[2, rows] = peak, second_peak
     return out
 
 
@@ -376,19 +378,19 @@ def _smooth(
     level: int,
     uv: Places,
     shape: tuple[int, int],
-    found: NodeMatches,
+    matches: NodeMatches,
     settings: GuideSettings,
 ) -> Guide:
     """A guide from matches: poor or isolated nodes follow their neighbours."""
     step = settings.spacing * 2.0**level
-    q, rate, rho = (np.asarray(a, float).reshape(shape) for a in found)
-    known = np.isfinite(q) & (rho > settings.min_correlation)
+    q, rate, rho = (np.asarray(a, float).reshape(shape) for a in matches)
+    is_known = np.isfinite(q) & (rho > settings.min_correlation)
     rate = np.where((rate > 0) & np.isfinite(rate), rate, np.nan)
     rate = np.where(np.isfinite(rate), rate, np.nanmedian(rate))
-    middle = _median(np.where(known, q, np.nan))
+    middle = _median(np.where(is_known, q, np.nan))
     with np.errstate(invalid="ignore"):
-        known &= np.abs(q - middle) * rate <= settings.max_deviation * 2.0**level
-    filled = np.where(known, q, middle)
+        is_known &= np.abs(q - middle) * rate <= settings.max_deviation * 2.0**level
+    filled = np.where(is_known, q, middle)
     filled = _fill_from_nearest(filled, q)
     X = base.points(uv, filled.ravel()).reshape(*shape, 3)
     return Guide(
@@ -398,7 +400,7 @@ def _smooth(
         rate,
         np.nan_to_num(rho, nan=-1.0),
         _normals(base, uv, X, filled, rate, settings.max_slope * step),
-        known,
+        is_known,
     )
 
 
@@ -407,20 +409,20 @@ def _median(q: Nodes) -> Nodes:
     one may be the median."""
     padded = np.pad(q, 1, constant_values=np.nan)
     nine = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).reshape(*q.shape, 9)
-    enough = np.isfinite(nine).sum(-1) >= 3
-    safe = np.where(enough[..., None], nine, 0.0)
-    return np.where(enough, np.nanmedian(safe, axis=-1), np.nan)
+    has_enough = np.isfinite(nine).sum(-1) >= 3
+    safe = np.where(has_enough[..., None], nine, 0.0)
+    return np.where(has_enough, np.nanmedian(safe, axis=-1), np.nan)
 
 
 def _fill_from_nearest(q: Nodes, fallback: Nodes) -> Nodes:
     """Unknown nodes filled with the nearest known node."""
-    known = np.isfinite(q)
-    if not known.any():
+    is_known = np.isfinite(q)
+    if not is_known.any():
         return np.where(np.isfinite(fallback), fallback, np.nanmedian(fallback))
-    if known.all():
+    if is_known.all():
         return q
-    near = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
-    return q[tuple(near)]
+    nearest = ndimage.distance_transform_edt(~is_known, return_distances=False, return_indices=True)
+    return q[tuple(nearest)]
 
 
 def _normals(
@@ -439,18 +441,18 @@ def _normals(
     bent = np.zeros(q.shape, bool)
     for axis in (0, 1):
         change = np.abs(np.diff(q, axis=axis)) * (rate[1:] if axis == 0 else rate[:, 1:])
-        off = change > max_change
+        is_bent = change > max_change
         width = [(0, 0), (0, 0)]
         width[axis] = (1, 0)
-        bent |= np.pad(off, width)
+        bent |= np.pad(is_bent, width)
         width[axis] = (0, 1)
-        bent |= np.pad(off, width)
+        bent |= np.pad(is_bent, width)
     # The line of sight, to a point one pixel of the other image nearer (q itself may be 0: a
     # height).
     d = X - base.points(uv, (q + 1 / rate).ravel()).reshape(X.shape)
     bent |= ~(np.linalg.norm(normal, axis=-1) > 0)
-    found = np.where(bent[..., None], d, normal)
-    return found / np.linalg.norm(found, axis=-1, keepdims=True)
+    normals = np.where(bent[..., None], d, normal)
+    return normals / np.linalg.norm(normals, axis=-1, keepdims=True)
 
 
 def _difference(X: Float[np.ndarray, "r c 3"], axis: int) -> Float[np.ndarray, "r c 3"]:

@@ -66,7 +66,7 @@ class HeightGrid:
 
     def slopes(self) -> Float[np.ndarray, "2 rows columns"]:
         """∂z/∂x and ∂z/∂y, 0 beside gaps."""
-        down, right = (
+        change_by_row, change_by_column = (
             np.gradient(self.height, self.size, axis=axis)
             if self.height.shape[axis] > 1
             else np.zeros_like(self.height)
@@ -74,7 +74,7 @@ class HeightGrid:
         )
         # Rows go south. Beside a gap the slope is unknown: taken as level, since NaN would make all
         # shared errors of the cell NaN.
-        return np.nan_to_num(np.stack([right, -down]))
+        return np.nan_to_num(np.stack([change_by_column, -change_by_row]))
 
 
 class CellSource(Protocol):
@@ -151,8 +151,8 @@ class StatedSurfaceErrors:
             # shift of 5 m.
             east = grid.x + (np.arange(columns) + 0.5) * grid.size - self.middle[0]
             north = grid.y - (np.arange(rows) + 0.5) * grid.size - self.middle[1]
-            both = (east, north[:, None])
-            modes += [self.tilt * np.broadcast_to(v, (rows, columns)) for v in both]
+            directions = (east, north[:, None])
+            modes += [self.tilt * np.broadcast_to(v, (rows, columns)) for v in directions]
         return np.stack(modes) if modes else np.zeros((0, rows, columns))
 
 
@@ -228,15 +228,15 @@ def align(before: CellSource, after: CellSource) -> tuple[CellSource, CellSource
     """
     grids = before, after
     places = [place_of(grid, before) for grid in grids]
-    first = [max(p[k] for p in places) for k in (0, 1)]
-    last = [min(p[k] + g.shape[k] for p, g in zip(places, grids)) for k in (0, 1)]
-    if min(last[k] - first[k] for k in (0, 1)) < 1:
+    begins = [max(p[k] for p in places) for k in (0, 1)]
+    ends = [min(p[k] + g.shape[k] for p, g in zip(places, grids)) for k in (0, 1)]
+    if min(ends[k] - begins[k] for k in (0, 1)) < 1:
         raise InputError("the two surfaces do not overlap: check their coordinate systems")
-    one, other = (
-        grid.part(*(slice(first[k] - p[k], last[k] - p[k]) for k in (0, 1)))
+    part_before, part_after = (
+        grid.part(*(slice(begins[k] - p[k], ends[k] - p[k]) for k in (0, 1)))
         for grid, p in zip(grids, places)
     )
-    return one, other
+    return part_before, part_after
 
 
 def place_of(grid: CellSource, lattice: CellSource) -> tuple[int, int]:
@@ -244,13 +244,13 @@ def place_of(grid: CellSource, lattice: CellSource) -> tuple[int, int]:
 
     **Raises:** `InputError` if they are not on one lattice.
     """
-    at = (lattice.y - grid.y) / lattice.size, (grid.x - lattice.x) / lattice.size
+    row_and_column = (lattice.y - grid.y) / lattice.size, (grid.x - lattice.x) / lattice.size
     # A hundredth of a cell over the whole grid.
     longer = abs(grid.size / lattice.size - 1) * max(grid.shape)
-    if longer > 0.01 or max(abs(v - round(v)) for v in at) > 0.01:
+    if longer > 0.01 or max(abs(v - round(v)) for v in row_and_column) > 0.01:
         raise InputError(
             f"the cells of {grid.size:g} from ({grid.x:.10g}, {grid.y:.10g}) are not those of "
             f"{lattice.size:g} from ({lattice.x:.10g}, {lattice.y:.10g}); make both with the same "
             "--dsm, whose edges are multiples of it, or resample one (gdalwarp -tap -tr)"
         )
-    return round(at[0]), round(at[1])
+    return round(row_and_column[0]), round(row_and_column[1])

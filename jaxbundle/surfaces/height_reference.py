@@ -49,8 +49,8 @@ class HeightReference:
         longitude, latitude = to_degrees(x, y, self.horizontal)
         N = undulations_at(self.geoid, longitude, latitude)
         # Never 0: heights that are tens of metres off would look like an answer.
-        if (missing := np.isnan(N)).any():
-            k = int(missing.argmax())
+        if (is_missing := np.isnan(N)).any():
+            k = int(is_missing.argmax())
             raise InputError(
                 f"--geoid {self.geoid}: no height of the geoid at longitude {longitude[k]:.6g}°, "
                 f"latitude {latitude[k]:.6g}°; give a geoid that covers the images"
@@ -71,9 +71,11 @@ class HeightReference:
         """The range of computed heights that contains a range of wanted ones at all of some
         places."""
         # Computed = wanted − added, and added differs over the area.
-        added = self.correction(x, y)
+        corrections = self.correction(x, y)
         low, high = heights
-        return float(low - added.max(initial=-np.inf)), float(high - added.min(initial=np.inf))
+        return float(low - corrections.max(initial=-np.inf)), float(
+            high - corrections.min(initial=np.inf)
+        )
 
 
 def heights_of_ground_images(
@@ -147,8 +149,8 @@ def heights_of_photographs(
     if parts.vertical is not None:
         words = f"above the geoid: {parts.vertical.name}, of the block"
     else:
-        stated = heights is not None or parts.above_ellipsoid
-        words = "above the ellipsoid, of the block" if stated else ""
+        is_stated = heights is not None or parts.above_ellipsoid
+        words = "above the ellipsoid, of the block" if is_stated else ""
     return HeightReference(crs, parts.horizontal, words)
 
 
@@ -183,17 +185,18 @@ def no_height_reference(geoid: str | Path | None, heights: str | None) -> Height
     return HeightReference()
 
 
-def _above_geoid(crs: str, geoid: str | Path | None, before: str) -> HeightReference:
+def _above_geoid(crs: str, geoid: str | Path | None, beginning: str) -> HeightReference:
     """Heights above a geoid, from computed ones above the ellipsoid."""
     parts = split_system(crs)
     code = None if parts.vertical is None else parts.vertical.to_epsg()
     if geoid is None:
         grid = usual_grid(code)
-        asked = f"--heights {GEOID}"
+        requested_by = f"--heights {GEOID}"
         if parts.vertical is not None:
-            asked = f"--crs {crs}: its heights are those of {parts.vertical.name!r}"
+            requested_by = f"--crs {crs}: its heights are those of {parts.vertical.name!r}"
         raise InputError(
-            f"{asked}: heights of scanner and RPC images are computed above the ellipsoid; give "
+            f"{requested_by}: heights of scanner and RPC images are computed above the ellipsoid; "
+            "give "
             f"the geoid: --geoid {grid} (a grid of PROJ: projsync --file {grid})"
         )
     if parts.vertical is None:
@@ -208,15 +211,15 @@ def _above_geoid(crs: str, geoid: str | Path | None, before: str) -> HeightRefer
             )
         # A known grid of another system is a mistake; an unknown file may be a copy of the right
         # one.
-        known, grid = GRIDS.get(code or 0), Path(geoid).name
-        if known is not None and grid in GRIDS.values() and grid != known:
+        grid_of_system, grid = GRIDS.get(code or 0), Path(geoid).name
+        if grid_of_system is not None and grid in GRIDS.values() and grid != grid_of_system:
             raise InputError(
                 f"--geoid {geoid}: is not that of --crs {crs}, {parts.vertical.name}, which has "
-                f"the grid {known}; give that one, or another system"
+                f"the grid {grid_of_system}; give that one, or another system"
             )
         system = crs
     vertical = split_system(system).vertical
     name = "" if vertical is None or vertical.to_epsg() is None else f" ({vertical.name})"
     return HeightReference(
-        system, parts.horizontal, f"{before}above the geoid {geoid}{name}", Path(geoid), -1
+        system, parts.horizontal, f"{beginning}above the geoid {geoid}{name}", Path(geoid), -1
     )

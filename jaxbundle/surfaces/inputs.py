@@ -35,15 +35,16 @@ def read_views(
     network = read_oriented(path)
     images = network.images
     values = np.concatenate([images.position, images.angles], 1)
-    known = np.asarray(np.isfinite(values).all(1))
+    is_oriented = np.asarray(np.isfinite(values).all(1))
     messages = []
-    if not known.all():
-        left = [images.id[k] for k in np.flatnonzero(~known)]
-        messages.append(f"without orientation, left out: {list_some(left, 5, str)}")
-        network = network.replace(images=images.take(known))
-    if known.sum() < 2:
+    if not is_oriented.all():
+        left_out = [images.id[k] for k in np.flatnonzero(~is_oriented)]
+        messages.append(f"without orientation, left out: {list_some(left_out, 5, str)}")
+        network = network.replace(images=images.take(is_oriented))
+    if is_oriented.sum() < 2:
         raise InputError(
-            f"{path}: {known.sum()} oriented images; a surface needs at least two: orient them by "
+            f"{path}: {is_oriented.sum()} oriented images; a surface needs at least two: orient "
+            "them by "
             "jaxbundle adjust --out and give its folder here"
         )
     files = find_photographs(network.images.id, Path(folder))
@@ -61,10 +62,12 @@ def read_orientations(path: str | Path) -> tuple[FrameView, ...]:
     """
     network = read_oriented(path)
     images = network.images
-    known = np.asarray(np.isfinite(np.concatenate([images.position, images.angles], 1)).all(1))
-    network = network.replace(images=images.take(known))
-    if known.sum() < 2:
-        raise InputError(f"{path}: {known.sum()} oriented images; a surface has at least two")
+    is_oriented = np.asarray(
+        np.isfinite(np.concatenate([images.position, images.angles], 1)).all(1)
+    )
+    network = network.replace(images=images.take(is_oriented))
+    if is_oriented.sum() < 2:
+        raise InputError(f"{path}: {is_oriented.sum()} oriented images; a surface has at least two")
     greys = []
     for camera in (network.cameras[c] for c in network.images.camera):
         if camera.image_size is None:
@@ -81,12 +84,12 @@ def _read_joint_covariance(path: Path, network: Network) -> OrientationCovarianc
     file = next((f / FILE for f in (folder, folder / ADJUSTED) if (f / FILE_NAME).is_file()), None)
     if file is None or not file.is_file():
         return None
-    found = read_orientation_covariance(file, ANGLE_UNITS[network.angle_unit])
-    known = {("image", id) for id in network.images.id}
-    known |= {("camera", camera.id) for camera in network.cameras}
-    if not known & {(kind, id) for kind, id, _ in found.unknowns}:
+    covariance = read_orientation_covariance(file, ANGLE_UNITS[network.angle_unit])
+    owners_in_network = {("image", id) for id in network.images.id}
+    owners_in_network |= {("camera", camera.id) for camera in network.cameras}
+    if not owners_in_network & {(kind, id) for kind, id, _ in covariance.unknowns}:
         raise InputError(f"{file}: not of this project: contains none of its images; remove it")
-    return found
+    return covariance
 
 
 def find_photographs(names: Sequence[str], folder: Path) -> list[Path]:
@@ -99,33 +102,34 @@ def find_photographs(names: Sequence[str], folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise InputError(f"--photos {folder}: no such folder")
     files = [p for p in sorted(folder.rglob("*")) if p.is_file()]
-    found, missing = [], []
+    files_found, missing_names = [], []
     for name in names:
         exact = folder / name
         if exact.is_file():
-            found.append(exact)
+            files_found.append(exact)
             continue
         key = Path(name).name.lower()
-        same = _foremost([p for p in files if p.name.lower() == key]) or _foremost(
+        same_name = _foremost([p for p in files if p.name.lower() == key]) or _foremost(
             [p for p in files if p.stem.lower() == key]
         )
-        if len(same) > 1:
-            raise InputError(f"--photos {folder}: {name}: there are {list_some(same, 3, str)}")
-        found += same
-        missing += [name] * (not same)
-    if missing:
+        if len(same_name) > 1:
+            raise InputError(f"--photos {folder}: {name}: there are {list_some(same_name, 3, str)}")
+        files_found += same_name
+        missing_names += [name] * (not same_name)
+    if missing_names:
         raise InputError(
-            f"--photos {folder}: no photograph {list_some(missing, 5, str)}; the ids of the images "
+            f"--photos {folder}: no photograph {list_some(missing_names, 5, str)}; the ids of the "
+            "images "
             "are the names of their files"
         )
-    return found
+    return files_found
 
 
 def _foremost(files: Sequence[Path]) -> list[Path]:
     """Among files of one name the images, and of these those in the nearest folder."""
     files = [p for p in files if p.suffix.lower() in SUFFIXES] or files
-    near = min((len(p.parts) for p in files), default=0)
-    return [p for p in files if len(p.parts) == near]
+    smallest_depth = min((len(p.parts) for p in files), default=0)
+    return [p for p in files if len(p.parts) == smallest_depth]
 
 
 def tie_points(network: Network) -> np.ndarray:

@@ -29,18 +29,18 @@ def interest_points(grey: Grey, kind: str, step: int) -> Float[np.ndarray, "n 2"
     rows, columns = grey.shape
     # Tiles, for memory. Their edges have no gap of `step` pixels: two points may be nearer there.
     side = 2048
-    found = []
+    points_by_tile = []
     for v in range(0, rows, side):
         for u in range(0, columns, side):
             tile = grey[v : v + side, u : u + side].astype(np.float32)
-            found.append(find(to_eight_bits(tile, limits), step) + [u, v])
-    return np.concatenate(found)
+            points_by_tile.append(find(to_eight_bits(tile, limits), step) + [u, v])
+    return np.concatenate(points_by_tile)
 
 
 def sample_percentiles(grey: Grey, low: float, high: float) -> Float[np.ndarray, "2"]:
     """Percentiles of about a million pixels, spread over the image."""
-    every = max(1, grey.size // (1 << 20))
-    return np.percentile(grey.ravel()[::every], [low, high])
+    step = max(1, grey.size // (1 << 20))
+    return np.percentile(grey.ravel()[::step], [low, high])
 
 
 def to_eight_bits(
@@ -54,8 +54,8 @@ def to_eight_bits(
 def _find_corners(eight: UInt8[np.ndarray, "rows columns"], step: int) -> Float[np.ndarray, "n 2"]:
     # Corners of a thousandth of the strongest: with the distance of `step` pixels the strongest of
     # each neighbourhood is taken, and matching rejects those without texture.
-    found = need_opencv().goodFeaturesToTrack(eight, 0, 1e-3, step)
-    places = np.zeros((0, 2)) if found is None else found.reshape(-1, 2)
+    corners = need_opencv().goodFeaturesToTrack(eight, 0, 1e-3, step)
+    places = np.zeros((0, 2)) if corners is None else corners.reshape(-1, 2)
     return np.unique(np.rint(places).astype(float), axis=0)
 
 
@@ -67,5 +67,5 @@ def _find_edges(eight: UInt8[np.ndarray, "rows columns"], step: int) -> Float[np
     # 15 % of all pixels may begin an edge, which continues down to 40 % of that gradient
     strong = float(np.percentile(slope, 85)) + 1.0
     v, u = np.nonzero(cv2.Canny(smooth, 0.4 * strong, strong))
-    _, first = np.unique(np.stack([v // step, u // step], 1), axis=0, return_index=True)
-    return np.stack([u[first], v[first]], 1).astype(float)
+    _, first_of_cell = np.unique(np.stack([v // step, u // step], 1), axis=0, return_index=True)
+    return np.stack([u[first_of_cell], v[first_of_cell]], 1).astype(float)

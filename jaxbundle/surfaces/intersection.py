@@ -36,15 +36,15 @@ def intersect(
     views: Sequence[OrientedImage],
     uv: Float[np.ndarray, "n views 2"],
     covariance: Float[np.ndarray, "n views 2 2"],
-    used: Bool[np.ndarray, "n views"],
+    is_used: Bool[np.ndarray, "n views"],
     start: Float[np.ndarray, "n 3"],
 ) -> IntersectedPoints:
     """Intersect rays from approximate points; NaN if fewer than two are used or they are
     parallel."""
-    n, m = used.shape
+    n, m = is_used.shape
     X = start.copy()
     weight = np.zeros((n, m, 2, 2))
-    weight[used] = np.linalg.inv(covariance[used])
+    weight[is_used] = np.linalg.inv(covariance[is_used])
     J, PJ = np.zeros((n, m, 2, 3)), np.zeros((n, m, 2, 3))
     v, sights = np.zeros((n, m, 2)), np.zeros((n, m, 3))
     Q = np.full((n, 3, 3), np.nan)
@@ -56,7 +56,7 @@ def intersect(
         N, g = np.zeros((n, 3, 3)), np.zeros((n, 3))
         renewed = step in (0, steps)  # J, and N with it, hardly change in between
         for k, view in enumerate(views):
-            rows = np.flatnonzero(used[:, k])
+            rows = np.flatnonzero(is_used[:, k])
             if renewed:
                 J[rows, k] = view.derivative(X[rows])
                 PJ[rows, k] = weight[rows, k] @ J[rows, k]
@@ -68,12 +68,12 @@ def intersect(
         if step < steps:
             X = X - np.einsum("nij,nj->ni", Q, g)
     for k in range(m):
-        rows = np.flatnonzero(used[:, k])
+        rows = np.flatnonzero(is_used[:, k])
         sights[rows, k] = line_of_sight(J[rows, k])
     square = np.einsum("nki,nkij,nkj->nk", v, weight, v)
-    rays = used.sum(1)
+    rays = is_used.sum(1)
     return IntersectedPoints(
-        X, Q, square.sum(1), 2 * rays - 3, rays, _widest_angles(sights, used), np.sqrt(square)
+        X, Q, square.sum(1), 2 * rays - 3, rays, _widest_angles(sights, is_used), np.sqrt(square)
     )
 
 
@@ -93,14 +93,14 @@ def _inverse(N: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3 3"]:
 
 
 def _widest_angles(
-    sights: Float[np.ndarray, "n views 3"], used: Bool[np.ndarray, "n views"]
+    sights: Float[np.ndarray, "n views 3"], is_used: Bool[np.ndarray, "n views"]
 ) -> Float[np.ndarray, " n"]:
     """The widest angle between two of the lines of sight of each point, radians."""
     angle = np.zeros(len(sights))
     for i in range(sights.shape[1]):
         for j in range(i):
-            both = used[:, i] & used[:, j]
-            sine = np.linalg.norm(np.cross(sights[both, i], sights[both, j]), axis=1)
-            cosine = np.abs(np.sum(sights[both, i] * sights[both, j], 1))
-            angle[both] = np.maximum(angle[both], np.arctan2(sine, cosine))
+            in_both = is_used[:, i] & is_used[:, j]
+            sine = np.linalg.norm(np.cross(sights[in_both, i], sights[in_both, j]), axis=1)
+            cosine = np.abs(np.sum(sights[in_both, i] * sights[in_both, j], 1))
+            angle[in_both] = np.maximum(angle[in_both], np.arctan2(sine, cosine))
     return angle

@@ -42,7 +42,7 @@ def check_las(path: Path) -> None:
         minor = head[25] if len(head) > 25 else 0
         if len(head) < HEADER_SIZES.get(minor, 227):
             raise InputError(f"{path}: is cut: {size} bytes are less than the header of LAS")
-        field = lambda form, at: struct.unpack_from("<" + form, head, at)[0]
+        field = lambda form, offset: struct.unpack_from("<" + form, head, offset)[0]
         if (head[24], minor) not in {(1, known) for known in HEADER_SIZES}:
             raise InputError(f"{path}: LAS {head[24]}.{minor} is not read; 1.0 to 1.4 are")
         length, begin, records = field("H", 94), field("I", 96), field("I", 100)
@@ -53,20 +53,21 @@ def check_las(path: Path) -> None:
             raise _beyond(path, "bytes before the points")
         if kind & 63 >= len(POINT_SIZES) or row < POINT_SIZES[kind & 63]:
             raise InputError(f"{path}: damaged: points of format {kind & 63} with {row} bytes")
-        for at, what in ((131, "scale"), (155, "offset")):
-            for axis, value in zip("XYZ", struct.unpack_from("<3d", head, at)):
-                if not math.isfinite(value) or (what == "scale" and value == 0):
+        for offset, field_name in ((131, "scale"), (155, "offset")):
+            for axis, value in zip("XYZ", struct.unpack_from("<3d", head, offset)):
+                if not math.isfinite(value) or (field_name == "scale" and value == 0):
                     raise InputError(
-                        f"{path}: damaged: the {what} of {axis} is {value:g}; expected a finite "
-                        "number" + (", not 0" if what == "scale" else "")
+                        f"{path}: damaged: the {field_name} of {axis} is {value:g}; expected a "
+                        "finite "
+                        "number" + (", not 0" if field_name == "scale" else "")
                     )
-        found = _check_records(path, file, "records", records, length, begin)
+        laszip_record = _check_records(path, file, "records", records, length, begin)
         if minor >= 4 and (extended := field("I", 243)):
             _check_records(path, file, "extended records", extended, field("Q", 235), size)
         if kind & 128:
             if points * row > largest_unpacked_size(size):
                 raise _beyond(path, "points")
-            _check_compression(path, file, found, begin, size, points, row)
+            _check_compression(path, file, laszip_record, begin, size, points, row)
         elif begin + points * row > size:
             raise InputError(
                 f"{path}: is cut, or damaged: its header states {points} points, there are "
@@ -75,23 +76,23 @@ def check_las(path: Path) -> None:
 
 
 def _check_records(
-    path: Path, file: BinaryIO, what: str, number: int, place: int, end: int
+    path: Path, file: BinaryIO, kind: str, number: int, place: int, end: int
 ) -> Mapping[tuple[bytes, int], bytes]:
     """The content of the record of LAZ; refuses records that go beyond `end`."""
     # Reserved H, user 16s, record H, length H or Q, description 32s.
-    extended = what.startswith("extended")
+    extended = kind.startswith("extended")
     form = struct.Struct("<2x16sHQ32x" if extended else "<2x16sHH32x")
-    found = {}
+    records = {}
     for _ in range(number):
         if place + form.size > end:
-            raise _beyond(path, what)
+            raise _beyond(path, kind)
         user, record, length = form.unpack(_read(path, file, place, form.size))
         place += form.size + length
         if place > end:
-            raise _beyond(path, what)
+            raise _beyond(path, kind)
         if user.startswith(b"laszip encoded"):
-            found[user.rstrip(b"\0"), record] = file.read(length)
-    return found
+            records[user.rstrip(b"\0"), record] = file.read(length)
+    return records
 
 
 def _check_compression(
@@ -118,8 +119,8 @@ def _check_compression(
     if len(laszip) < 34 + 6 * number:
         raise _beyond(path, "items of a point")
     items = list(struct.iter_unpack("<3H", laszip[34 : 34 + 6 * number]))
-    known = all(k in ITEMS and ITEMS[k][0] in (None, length) for k, length, _ in items)
-    if not known or sum(length for _, length, _ in items) != row or not chunk:
+    are_known = all(k in ITEMS and ITEMS[k][0] in (None, length) for k, length, _ in items)
+    if not are_known or sum(length for _, length, _ in items) != row or not chunk:
         raise InputError(f"{path}: damaged: its compression does not fit points of {row} bytes")
     # Lazrs makes room for a whole chunk, of 50 000 points unless a program was told otherwise.
     room = largest_unpacked_size(size, harmless=2**28)
@@ -127,7 +128,9 @@ def _check_compression(
         raise InputError(f"{path}: damaged: chunks of {chunk} points in a file of {size} bytes")
     if not points:
         return
-    unpack = lambda form, at: struct.unpack(form, _read(path, file, at, struct.calcsize(form)))
+    unpack = lambda form, offset: struct.unpack(
+        form, _read(path, file, offset, struct.calcsize(form))
+    )
     (table,) = unpack("<q", begin)
     if table == -1:  # written at the end, by a program that could not go back
         (table,) = unpack("<q", size - 8)
@@ -138,7 +141,7 @@ def _check_compression(
     if (fixed and chunks != -(-points // chunk)) or chunks > min(points, size):
         raise InputError(f"{path}: damaged: its header states {chunks} chunks for {points} points")
     file.seek(begin)
-    for held, length in _read_chunks(path, file, laszip):
+    for number_held, length in _read_chunks(path, file, laszip):
         place = begin + 8
         begin += length
         if begin + 8 > table:
@@ -147,7 +150,7 @@ def _check_compression(
         layers = sum(number or 0 for number in layers)
         if layers:  # a point, the number of points, the sizes of the layers, the layers
             counted, *sizes = unpack(f"<{1 + layers}I", place + row)
-            if counted > held or row + 4 * (1 + layers) + sum(sizes) > length:
+            if counted > number_held or row + 4 * (1 + layers) + sum(sizes) > length:
                 raise _beyond(path, "bytes of layers")
 
 
@@ -168,5 +171,5 @@ def _read(path: Path, file: BinaryIO, place: int, length: int) -> bytes:
     return content
 
 
-def _beyond(path: Path, what: str) -> InputError:
-    return InputError(f"{path}: damaged: its header states more {what} than the file holds")
+def _beyond(path: Path, kind: str) -> InputError:
+    return InputError(f"{path}: damaged: its header states more {kind} than the file holds")

@@ -124,36 +124,36 @@ def match_points(
 ) -> SurfaceMatches:
     """Match whole pixels of the base in the others, from its guide; `guides` of the others, if
     any, identify hidden points."""
-    lost: Counter[str] = Counter()
+    losses: Counter[str] = Counter()
     inner = is_inside(base, uv, settings.edge_margin)
-    lost["at the edge"] += int((~inner).sum())
+    losses["at the edge"] += int((~inner).sum())
     uv = uv[inner]
     # q: the parameter along the line of sight (`views`), first its bounds, then its value.
     _, reach, normal, _ = guide.look_up(uv, settings.search_margin)
-    q, rho, second = search(base, others, pyramids, uv, reach, normal, 0, guide_settings)
+    q, rho, second_peak = search(base, others, pyramids, uv, reach, normal, 0, guide_settings)
     with np.errstate(invalid="ignore"):
-        found = np.isfinite(q) & (rho >= settings.min_correlation)
-        ambiguous = found & (second > settings.max_second_ratio * rho)
-    lost["in no other image at a similar scale"] += int((~np.isfinite(rho)).sum())
-    lost["low correlation"] += int((~found & np.isfinite(rho)).sum())
-    lost["not unique"] += int(ambiguous.sum())
-    rows = np.flatnonzero(found & ~ambiguous)
+        is_found = np.isfinite(q) & (rho >= settings.min_correlation)
+        ambiguous = is_found & (second_peak > settings.max_second_ratio * rho)
+    losses["in no other image at a similar scale"] += int((~np.isfinite(rho)).sum())
+    losses["low correlation"] += int((~is_found & np.isfinite(rho)).sum())
+    losses["not unique"] += int(ambiguous.sum())
+    rows = np.flatnonzero(is_found & ~ambiguous)
     uv, q, normal = uv[rows], q[rows], normal[rows]
     X = base.points(uv, q)
     matches = _match_windows(base, others, guide, (uv, q, normal), guides, settings)
-    enough = matches.is_used.sum(1) + 1 >= settings.min_rays
-    lost["not confirmed by least squares matching"] += int((~enough).sum())
-    uv, X = uv[enough], X[enough]
-    places, used, covariance, in_base = (a[enough] for a in matches)
-    mean = in_base.sum(1) / np.maximum(used.sum(1), 1)[:, None, None]
+    has_enough = matches.is_used.sum(1) + 1 >= settings.min_rays
+    losses["not confirmed by least squares matching"] += int((~has_enough).sum())
+    uv, X = uv[has_enough], X[has_enough]
+    places, is_used, covariance, in_base = (a[has_enough] for a in matches)
+    mean = in_base.sum(1) / np.maximum(is_used.sum(1), 1)[:, None, None]
     table = _Rays(
         (base, *others),
         np.concatenate([uv[:, None], places], 1),
         # Half of a match's variance is due to the window in the base, half to the other window.
         np.concatenate([mean[:, None], covariance], 1) / 2,
-        np.concatenate([np.ones((len(uv), 1), bool), used], 1),
+        np.concatenate([np.ones((len(uv), 1), bool), is_used], 1),
     )
-    return _accept(table, X, settings, lost)
+    return _accept(table, X, settings, losses)
 
 
 class WindowMatches(NamedTuple):
@@ -176,8 +176,8 @@ def _match_windows(
 ) -> WindowMatches:
     """Least squares matching in each of the other images, from pixels, their q and normals."""
     uv, q, normal = start
-    X, half = base.points(uv, q), settings.half_fine_window
-    nodes = sharpen(base, others, guide, half, settings.bending, settings.windows)
+    X, half_window = base.points(uv, q), settings.half_fine_window
+    nodes = sharpen(base, others, guide, half_window, settings.bending, settings.windows)
     n, m = len(uv), len(others)
     out = WindowMatches(
         np.full((n, m, 2), np.nan),
@@ -188,16 +188,16 @@ def _match_windows(
     for k, other in enumerate(others):
         window = windows(base, other, X, normal)
         begin = positions(base, other, uv, q[:, None])[:, 0]
-        match = refine(base, other, uv, begin, window.A, half, settings.windows)
+        match = refine(base, other, uv, begin, window.A, half_window, settings.windows)
         pair = base, other
-        place, uncertain = correct_bending(pair, nodes, uv, q, match, half, settings.bending)
+        place, uncertain = correct_bending(pair, nodes, uv, q, match, half_window, settings.bending)
         uncertain = uncertain + settings.added_sigma**2 * np.eye(2)
         good = window.usable & is_confirmed(match, begin, settings)
         good &= _agrees(other, guides[k], X, settings.max_guide_distance)
-        good &= has_texture(base.grey, uv, match.sigma0, half, settings.windows.min_texture)
-        back = np.linalg.inv(np.where(good[:, None, None], match.A, np.eye(2)))
+        good &= has_texture(base.grey, uv, match.sigma0, half_window, settings.windows.min_texture)
+        inverse_A = np.linalg.inv(np.where(good[:, None, None], match.A, np.eye(2)))
         safe = np.where(good[:, None, None], uncertain, 0)
-        shifted = back @ safe @ np.swapaxes(back, 1, 2)
+        shifted = inverse_A @ safe @ np.swapaxes(inverse_A, 1, 2)
         out.places[:, k], out.is_used[:, k] = place, good
         out.covariance[:, k] = uncertain
         out.in_base[:, k] = np.where(good[:, None, None], shifted, 0)
@@ -233,37 +233,39 @@ def _accept(
     table: _Rays,
     X: Float[np.ndarray, "n 3"],
     settings: MatchingSettings,
-    lost: Counter[str],
+    losses: Counter[str],
 ) -> SurfaceMatches:
     """Intersect; an inconsistent point with rays to spare loses its worst one, and is rejected if
     it stays inconsistent."""
-    found = table.intersect(X)
-    factor = variance_factor(found.vtpv, found.redundancy)
-    shape = _shape_variance(table, found, factor, settings) if factor < 1 else None
+    intersected = table.intersect(X)
+    factor = variance_factor(intersected.vtpv, intersected.redundancy)
+    shape = _shape_variance(table, intersected, factor, settings) if factor < 1 else None
     if shape is None:
-        factor, shape = max(factor, 1.0), np.zeros_like(found.covariance)
-    bad = _find_misfits(found, factor, settings.significance)
+        factor, shape = max(factor, 1.0), np.zeros_like(intersected.covariance)
+    bad = _find_misfits(intersected, factor, settings.significance)
     # With two rays it cannot be told which is wrong.
-    several = bad & (found.rays > max(settings.min_rays, 2))
-    if several.any():
-        table, found = _drop_worst_rays(table, found, several)
-        bad = _find_misfits(found, factor, settings.significance)
-    narrow = ~(found.angle >= settings.min_angle)
-    undetermined = ~np.isfinite(found.covariance).all((1, 2)) | ~np.isfinite(found.X).all(1)
-    lost["undetermined"] += int(undetermined.sum())
-    lost["narrow angle"] += int((narrow & ~undetermined).sum())
-    lost["rays do not meet"] += int((bad & ~narrow & ~undetermined).sum())
+    has_several = bad & (intersected.rays > max(settings.min_rays, 2))
+    if has_several.any():
+        table, intersected = _drop_worst_rays(table, intersected, has_several)
+        bad = _find_misfits(intersected, factor, settings.significance)
+    narrow = ~(intersected.angle >= settings.min_angle)
+    undetermined = ~np.isfinite(intersected.covariance).all((1, 2)) | ~np.isfinite(
+        intersected.X
+    ).all(1)
+    losses["undetermined"] += int(undetermined.sum())
+    losses["narrow angle"] += int((narrow & ~undetermined).sum())
+    losses["rays do not meet"] += int((bad & ~narrow & ~undetermined).sum())
     good = ~(bad | narrow | undetermined)
-    covariance = factor * found.covariance[good] + shape[good]
-    of_orientation = orientation_covariance(table.views, found.X[good], table.is_used[good])
+    covariance = factor * intersected.covariance[good] + shape[good]
+    of_orientation = orientation_covariance(table.views, intersected.X[good], table.is_used[good])
     covariance += of_orientation
     return SurfaceMatches(
         table.uv[good, 0],
-        found.X[good],
+        intersected.X[good],
         covariance,
-        found.rays[good],
+        intersected.rays[good],
         factor,
-        {reason: number for reason, number in lost.items() if number},
+        {reason: number for reason, number in losses.items() if number},
         of_orientation[:, 2, 2],
     )
 
@@ -280,21 +282,21 @@ def variance_factor(
 
 
 def _shape_variance(
-    table: _Rays, found: IntersectedPoints, factor: float, settings: MatchingSettings
+    table: _Rays, intersected: IntersectedPoints, factor: float, settings: MatchingSettings
 ) -> Float[np.ndarray, "n 3 3"] | None:
     """The variance along the lines of sight that points on a grid have, by their scatter, beyond
     the covariances of their matches; None if it is not known."""
-    good = np.isfinite(found.covariance).all((1, 2)) & np.isfinite(found.X).all(1)
+    good = np.isfinite(intersected.covariance).all((1, 2)) & np.isfinite(intersected.X).all(1)
     if good.sum() < settings.block_side**2:
         return None
     base, *others = table.views
-    X, place = found.X[good], table.uv[good, 0].astype(int)
+    X, place = intersected.X[good], table.uv[good, 0].astype(int)
     step = int(np.gcd.reduce(np.diff(np.unique(place[:, 0])))) or 1
     column, row = ((place - place.min(0)) // step).T
     # Along the line of sight d: σ of each point, and the length that moves it by one pixel in the
     # other image where it moves most.
     d = line_of_sight(base.derivative(X))
-    sigma_along = np.sqrt(factor * np.einsum("ni,nij,nj->n", d, found.covariance[good], d))
+    sigma_along = np.sqrt(factor * np.einsum("ni,nij,nj->n", d, intersected.covariance[good], d))
     pixels_per_length = [
         np.linalg.norm(o.derivative(X) @ d[:, :, None], axis=(1, 2)) for o in others
     ]
@@ -310,48 +312,50 @@ def _shape_variance(
         return grid
 
     # Points whose windows do not overlap.
-    apart = -(-(2 * settings.half_fine_window + 1) // step)
-    missing = missing_sigma(
+    window_distance = -(-(2 * settings.half_fine_window + 1) // step)
+    missing_noise = missing_sigma(
         on_grid(q),
         on_grid(rate * sigma_along),
         on_grid(rate * length_of_pixel),
-        apart,
+        window_distance,
         settings.block_side,
         settings.scatter_quantile,
     )
-    if missing is None:
+    if missing_noise is None:
         return None
     # Scatter beyond the σ that the matches have without the factor is the shape of the surface.
-    missing = min(missing, np.sqrt(1 / factor - 1) * np.median(sigma_along / length_of_pixel))
-    C = np.zeros_like(found.covariance)
-    C[good] = ((missing * length_of_pixel) ** 2)[:, None, None] * d[:, :, None] * d[:, None]
+    missing_noise = min(
+        missing_noise, np.sqrt(1 / factor - 1) * np.median(sigma_along / length_of_pixel)
+    )
+    C = np.zeros_like(intersected.covariance)
+    C[good] = ((missing_noise * length_of_pixel) ** 2)[:, None, None] * d[:, :, None] * d[:, None]
     return C
 
 
 def _find_misfits(
-    found: IntersectedPoints, factor: float, significance: float
+    intersected: IntersectedPoints, factor: float, significance: float
 ) -> Bool[np.ndarray, " n"]:
     """Points whose rays do not meet: vᵀPv beyond its distribution, or not known."""
-    limit = special.chdtri(np.maximum(found.redundancy, 1), significance)
-    return ~(found.vtpv <= limit * factor)
+    limit = special.chdtri(np.maximum(intersected.redundancy, 1), significance)
+    return ~(intersected.vtpv <= limit * factor)
 
 
 def _drop_worst_rays(
-    table: _Rays, found: IntersectedPoints, several: Bool[np.ndarray, " n"]
+    table: _Rays, intersected: IntersectedPoints, has_several: Bool[np.ndarray, " n"]
 ) -> tuple[_Rays, IntersectedPoints]:
     """Intersect some points again without the ray of the largest residual; the base ray stays."""
-    used = table.is_used.copy()
-    rows = np.flatnonzero(several)
-    misfit = np.where(used[rows][:, 1:], found.misfit[rows][:, 1:], -1)
-    used[rows, 1 + misfit.argmax(1)] = False
-    table = dataclasses.replace(table, is_used=used)
-    again = dataclasses.replace(
-        table, uv=table.uv[rows], covariance=table.covariance[rows], is_used=used[rows]
-    ).intersect(found.X[rows])
+    is_used = table.is_used.copy()
+    rows = np.flatnonzero(has_several)
+    misfit = np.where(is_used[rows][:, 1:], intersected.misfit[rows][:, 1:], -1)
+    is_used[rows, 1 + misfit.argmax(1)] = False
+    table = dataclasses.replace(table, is_used=is_used)
+    intersected_again = dataclasses.replace(
+        table, uv=table.uv[rows], covariance=table.covariance[rows], is_used=is_used[rows]
+    ).intersect(intersected.X[rows])
     fields = {}
-    for field in dataclasses.fields(found):
-        values = getattr(found, field.name).copy()
-        values[rows] = getattr(again, field.name)
+    for field in dataclasses.fields(intersected):
+        values = getattr(intersected, field.name).copy()
+        values[rows] = getattr(intersected_again, field.name)
         fields[field.name] = values
     return table, IntersectedPoints(**fields)
 
@@ -364,9 +368,9 @@ def _agrees(
     if guide is None:
         return np.ones(len(X), bool)
     uv = other.project(X)
-    there = is_inside(other, uv)
-    safe = np.where(there[:, None], uv, 0.0)
+    is_in_image = is_inside(other, uv)
+    safe = np.where(is_in_image[:, None], uv, 0.0)
     _, reach, _, _ = guide.look_up(safe, max_distance)
     with np.errstate(invalid="ignore"):
         q = other.parameter(X)
-        return there & (q >= reach[:, 0]) & (q <= reach[:, 1])
+        return is_in_image & (q >= reach[:, 0]) & (q <= reach[:, 1])

@@ -40,7 +40,7 @@ class OrientationErrors:
     root: Float[np.ndarray, "unknowns k"]
 
     def factors(
-        self, X: Float[np.ndarray, "n 3"], used: Bool[np.ndarray, "n views"]
+        self, X: Float[np.ndarray, "n 3"], is_used: Bool[np.ndarray, "n views"]
     ) -> Float[np.ndarray, "n 3 k"]:
         """S·W of points."""
         T = np.zeros((len(X), 3, self.root.shape[1]))
@@ -48,24 +48,26 @@ class OrientationErrors:
             return T
         J = np.zeros((len(X), len(self.views), 2, 3))
         for k, view in enumerate(self.views):
-            if used[:, k].any():
-                J[used[:, k], k] = view.derivative(X[used[:, k]])
+            if is_used[:, k].any():
+                J[is_used[:, k], k] = view.derivative(X[is_used[:, k]])
         N = np.einsum("nkij,nkil->njl", J, J)
         # Without a ray a point has no errors from any.
         scale = np.maximum(np.trace(N, axis1=1, axis2=2), 1e-300)[:, None, None]
         # Of a point with one ray, or parallel rays, N is singular: 1e-14 of its trace is added, 50
         # roundings, which changes no other point.
         Q = np.linalg.inv(N / scale + 1e-14 * np.eye(3)) / scale
-        first = 0
+        first_row = 0
         for k in self.uncertain:
-            view, mine = self.views[k], used[:, k]
+            view, is_of_view = self.views[k], is_used[:, k]
             assert isinstance(view, FrameView | GroundView)
-            rows = slice(first, first + len(view.unknowns))
-            first = rows.stop
-            if mine.any():
-                B = view.derivative_by_orientation(X[mine])
-                S = Q[mine] @ np.swapaxes(J[mine, k], 1, 2) @ B
-                T[mine] += (S.reshape(-1, S.shape[2]) @ self.root[rows]).reshape(*S.shape[:2], -1)
+            rows = slice(first_row, first_row + len(view.unknowns))
+            first_row = rows.stop
+            if is_of_view.any():
+                B = view.derivative_by_orientation(X[is_of_view])
+                S = Q[is_of_view] @ np.swapaxes(J[is_of_view, k], 1, 2) @ B
+                T[is_of_view] += (S.reshape(-1, S.shape[2]) @ self.root[rows]).reshape(
+                    *S.shape[:2], -1
+                )
         return T
 
 
@@ -92,42 +94,42 @@ def orientation_errors(views: Sequence[OrientedImage]) -> OrientationErrors:
 def orientation_covariance(
     views: Sequence[OrientedImage],
     X: Float[np.ndarray, "n 3"],
-    used: Bool[np.ndarray, "n views"],
+    is_used: Bool[np.ndarray, "n views"],
 ) -> Float[np.ndarray, "n 3 3"]:
     """The covariance of points due to that of the orientations of their images."""
     C, errors = np.zeros((len(X), 3, 3)), orientation_errors(views)
     if not errors.uncertain:
         return C
-    together = _points_at_once(errors)
+    points_at_once = _points_at_once(errors)
 
-    def compute(first: int) -> None:
-        rows = slice(first, first + together)
-        factor = errors.factors(X[rows], used[rows])
+    def compute(begin: int) -> None:
+        rows = slice(begin, begin + points_at_once)
+        factor = errors.factors(X[rows], is_used[rows])
         C[rows] = factor @ np.swapaxes(factor, 1, 2)
 
     with ThreadPoolExecutor(available_cores()) as pool:
-        list(pool.map(compute, range(0, len(X), together)))
+        list(pool.map(compute, range(0, len(X), points_at_once)))
     return C
 
 
 def orientation_modes(
     views: Sequence[OrientedImage] | OrientationErrors,
     X: Float[np.ndarray, "n 3"],
-    used: Bool[np.ndarray, "n views"],
+    is_used: Bool[np.ndarray, "n views"],
     direction: Float[np.ndarray, "n 3"],
 ) -> Float[np.ndarray, "n k"]:
     """The errors of points along a direction for a unit of each independent error of the
     orientations, S·W: points that share images share them, and M·Mᵀ is their covariance."""
     errors = views if isinstance(views, OrientationErrors) else orientation_errors(views)
     M = np.zeros((len(X), errors.root.shape[1]))
-    together = _points_at_once(errors)
+    points_at_once = _points_at_once(errors)
 
-    def compute(first: int) -> None:
-        rows = slice(first, first + together)
-        M[rows] = np.einsum("ni,nik->nk", direction[rows], errors.factors(X[rows], used[rows]))
+    def compute(begin: int) -> None:
+        rows = slice(begin, begin + points_at_once)
+        M[rows] = np.einsum("ni,nik->nk", direction[rows], errors.factors(X[rows], is_used[rows]))
 
     with ThreadPoolExecutor(available_cores()) as pool:
-        list(pool.map(compute, range(0, len(X), together)))
+        list(pool.map(compute, range(0, len(X), points_at_once)))
     return M
 
 

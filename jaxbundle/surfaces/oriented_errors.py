@@ -51,8 +51,8 @@ def choose_images(path: str | Path, patterns: str) -> ChosenImages:
     some = [pattern.strip() for pattern in patterns.split(",")]
     names = {v.name for v in views if any(fnmatchcase(v.name, p) for p in some)}
     if len(names) < 2:
-        known = list_some([view.name for view in views], 5, str)
-        raise InputError(f"{path}: {patterns} names {len(names)} of its images ({known})")
+        known_names = list_some([view.name for view in views], 5, str)
+        raise InputError(f"{path}: {patterns} names {len(names)} of its images ({known_names})")
     return ChosenImages(path, tuple(views), around, names)
 
 
@@ -71,55 +71,60 @@ class OrientedErrors:
         return self.errors.root.shape[1]
 
     def __call__(self, grid: HeightGrid) -> Modes:
-        found = np.zeros((self.number, *grid.shape))
+        modes = np.zeros((self.number, *grid.shape))
         rows, columns = np.nonzero(np.isfinite(grid.height))
         if not len(rows):
-            return found
+            return modes
         slopes = grid.slopes()[:, rows, columns]
         direction = np.stack([-slopes[0], -slopes[1], np.ones(len(rows))], 1)
         X = _centres(grid, rows, columns)
         X, direction = self._to_images(X, direction)
-        used = self._used(X)
-        seen = used.any(1)
-        M = orientation_modes(self.errors, X[seen], used[seen], direction[seen])
-        found[:, rows[seen], columns[seen]] = M.T
-        return found
+        is_used = self._used(X)
+        is_seen = is_used.any(1)
+        M = orientation_modes(self.errors, X[is_seen], is_used[is_seen], direction[is_seen])
+        modes[:, rows[is_seen], columns[is_seen]] = M.T
+        return modes
 
     def are_those_of(self, other: "OrientedErrors") -> bool:
         """Whether the independent errors are the same ones, column by column."""
-        one, two = self.errors, other.errors
-        if [v.name for v in one.views] != [v.name for v in two.views]:
+        own_errors, other_errors = self.errors, other.errors
+        if [v.name for v in own_errors.views] != [v.name for v in other_errors.views]:
             return False
-        if one.root.shape != two.root.shape:
+        if own_errors.root.shape != other_errors.root.shape:
             return False
         # Unknowns have different units; W of the same covariance differs by roundings at most.
-        scale = np.maximum(np.abs(one.root).max(1, initial=0.0), 1e-300)[:, None]
-        return bool(np.allclose(one.root / scale, two.root / scale, rtol=0.0, atol=1e-6))
+        scale = np.maximum(np.abs(own_errors.root).max(1, initial=0.0), 1e-300)[:, None]
+        return bool(
+            np.allclose(own_errors.root / scale, other_errors.root / scale, rtol=0.0, atol=1e-6)
+        )
 
     def share_seen(self, cells: CellSource) -> float:
         """The share of the cells with a height that two of the images see; 1 without heights."""
         rows, columns = cells.shape
-        seen, number = 0, 0
+        number_seen, number = 0, 0
         # 512 rows of 10 000 cells are 40 MB, of which 10 000 cells tell the share within 1 %
-        for first in range(0, rows, 512):
-            grid = cells.window(slice(first, min(first + 512, rows)), slice(0, columns))
-            at = np.argwhere(np.isfinite(grid.height))
-            every = max(1, len(at) // 10_000)
-            at = at[::every]
-            if len(at):
-                X = _centres(grid, *at.T)
-                used = self._used(self._to_images(X, np.zeros_like(X))[0]).any(1)
-                seen, number = seen + every * int(used.sum()), number + every * len(at)
-        return seen / number if number else 1.0
+        for begin in range(0, rows, 512):
+            grid = cells.window(slice(begin, min(begin + 512, rows)), slice(0, columns))
+            cells_with_height = np.argwhere(np.isfinite(grid.height))
+            step = max(1, len(cells_with_height) // 10_000)
+            cells_with_height = cells_with_height[::step]
+            if len(cells_with_height):
+                X = _centres(grid, *cells_with_height.T)
+                is_used = self._used(self._to_images(X, np.zeros_like(X))[0]).any(1)
+                number_seen, number = (
+                    number_seen + step * int(is_used.sum()),
+                    number + step * len(cells_with_height),
+                )
+        return number_seen / number if number else 1.0
 
     def _used(self, X: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n views"]:
         """Which images a cell is from: all that it is made of and that contain it."""
-        used = np.zeros((len(X), len(self.uses)), bool)
-        for k, (view, mine) in enumerate(zip(self.errors.views, self.uses)):
-            if mine:
-                used[:, k] = is_inside(view, view.project(X))
+        is_used = np.zeros((len(X), len(self.uses)), bool)
+        for k, (view, is_of_view) in enumerate(zip(self.errors.views, self.uses)):
+            if is_of_view:
+                is_used[:, k] = is_inside(view, view.project(X))
         # A cell of one image has no height from it.
-        return used & (used.sum(1, keepdims=True) > 1)
+        return is_used & (is_used.sum(1, keepdims=True) > 1)
 
     def _to_images(
         self, X: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "n 3"]
@@ -141,26 +146,32 @@ def _centres(
     return np.stack([x, y, grid.height[rows, columns]], 1)
 
 
-def oriented_errors(chosen: ChosenImages, others: Set[str], system: str | None) -> OrientedErrors:
-    """The errors of the chosen images; `others`: images whose errors belong to the same ones, of
-    another surface of the same adjustment.
+def oriented_errors(
+    chosen_images: ChosenImages, further_names: Set[str], system: str | None
+) -> OrientedErrors:
+    """The errors of the chosen images; `further_names`: images whose errors belong to the same
+    ones, of another surface of the same adjustment.
 
     **Raises:** `InputError` without covariance, or of a surface without coordinate system.
     """
-    if chosen.around is not None and system is None:
+    if chosen_images.around is not None and system is None:
         raise InputError(
-            f"{chosen.path}: its images are on the Earth, the surface has no coordinate system; "
+            f"{chosen_images.path}: its images are on the Earth, the surface has no coordinate "
+            "system; "
             "give it one (gdal_edit.py -a_srs)"
         )
     # In the order of the project, and with those of the other surface: L of both then have the same
     # columns, and the common part of an error leaves their difference.
-    kept = [view for view in chosen.views if view.name in (chosen.names | others)]
-    errors = orientation_errors(kept)
+    views_kept = [
+        view for view in chosen_images.views if view.name in (chosen_images.names | further_names)
+    ]
+    errors = orientation_errors(views_kept)
     if not errors.uncertain:
         raise InputError(
-            f"{chosen.path}: no covariance of its orientations; adjust it with --out (images of "
+            f"{chosen_images.path}: no covariance of its orientations; adjust it with --out "
+            "(images of "
             "scanners and RPC: pushbroom refine --out) and give the folder"
         )
-    uses = tuple(view.name in chosen.names for view in kept)
+    uses = tuple(view.name in chosen_images.names for view in views_kept)
     # Heights above a geoid are taken as they are: 100 m at 500 km change the effects by 2e-4.
-    return OrientedErrors(errors, uses, chosen.around, horizontal_system(system))
+    return OrientedErrors(errors, uses, chosen_images.around, horizontal_system(system))

@@ -31,19 +31,22 @@ def orthophoto(
     """
     x, y = dsm.centres()
     X = np.stack([x, y, dsm.height], -1).reshape(-1, 3)
-    known = np.isfinite(X[:, 2])
-    P = to_view(X[known])
+    is_known = np.isfinite(X[:, 2])
+    P = to_view(X[is_known])
     uv = view.project(P)
-    inside = is_inside(view, uv)
+    in_image = is_inside(view, uv)
     d = line_of_sight(view.derivative(P))
     d = d * np.where(d[:, 2:] < 0, -1.0, 1.0)
-    seen = inside & ~_are_hidden(dsm, X[known], d)
-    safe = np.where(inside[:, None], uv, 0.0)
+    is_seen = in_image & ~_are_hidden(dsm, X[is_known], d)
+    safe = np.where(in_image[:, None], uv, 0.0)
     grey = ndimage.map_coordinates(
         np.asarray(view.grey, np.float32), [safe[:, 1], safe[:, 0]], order=1, mode="nearest"
     )
     out = np.full((2, len(X)), np.nan)
-    out[0, known], out[1, known] = np.where(seen, grey, np.nan), np.where(seen, d[:, 2], np.nan)
+    out[0, is_known], out[1, is_known] = (
+        np.where(is_seen, grey, np.nan),
+        np.where(is_seen, d[:, 2], np.nan),
+    )
     return out[0].reshape(x.shape), out[1].reshape(x.shape)
 
 
@@ -97,10 +100,10 @@ def _are_hidden(
     # 64 points of the line of sight up to the height of the highest cell: a hidden cell is missed
     # only beside something narrower than 1/64 of that length
     for share in np.linspace(0, 1, 64 + 1)[1:]:
-        there = X + (share * reach)[:, None] * d
-        row, column = (np.rint(a).astype(int) for a in dsm.place(there))
-        inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-        Z = height[np.where(inside, row, 0), np.where(inside, column, 0)]
+        points_on_ray = X + (share * reach)[:, None] * d
+        row, column = (np.rint(a).astype(int) for a in dsm.place(points_on_ray))
+        in_model = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+        Z = height[np.where(in_model, row, 0), np.where(in_model, column, 0)]
         # Higher by a whole cell: a slope of 45° does not hide itself by the steps of its cells.
-        hidden |= inside & (Z > there[:, 2] + dsm.size)
+        hidden |= in_model & (Z > points_on_ray[:, 2] + dsm.size)
     return hidden

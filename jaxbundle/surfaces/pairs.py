@@ -11,16 +11,16 @@ from jaxbundle.surfaces.views import OrientedImage, is_inside
 
 
 def choose_partners(
-    views: Sequence[OrientedImage], bounds: Sequence[Bounds], most: int = 3
+    views: Sequence[OrientedImage], bounds: Sequence[Bounds], max_partners: int = 3
 ) -> dict[int, list[int]]:
     """For every image its matching partners, best first; may be empty."""
-    found = {}
+    partners = {}
     for i, view in enumerate(views):
         scores = [(score(view, bounds[i], o), j) for j, o in enumerate(views) if j != i]
-        good = sorted((s for s in scores if s[0] > 0), reverse=True)[:most]
+        good = sorted((s for s in scores if s[0] > 0), reverse=True)[:max_partners]
         if good:
-            found[i] = [j for _, j in good]
-    return found
+            partners[i] = [j for _, j in good]
+    return partners
 
 
 def score(view: OrientedImage, bounds: Bounds, other: OrientedImage) -> float:
@@ -36,15 +36,15 @@ def score(view: OrientedImage, bounds: Bounds, other: OrientedImage) -> float:
     best = 0.0
     for share in (0.25, 0.5, 0.75):
         X = view.points(uv, q[:, 0] + share * (q[:, 1] - q[:, 0]))
-        seen = is_inside(other, other.project(X))
+        is_seen = is_inside(other, other.project(X))
         # A tenth of the image is a pair not worth its time.
-        if seen.mean() < 0.1:
+        if is_seen.mean() < 0.1:
             continue
-        angle = float(np.median(angle_at((view, other), X[seen])))
+        angle = float(np.median(angle_at((view, other), X[is_seen])))
         if narrowest <= angle <= widest:
             wide = (widest - angle) / (widest - 2 * best_angle)
             worth = min(angle / best_angle, 1.0) * min(1.0, wide)
-            best = max(best, float(seen.mean()) * worth)
+            best = max(best, float(is_seen.mean()) * worth)
     return best
 
 
@@ -52,7 +52,7 @@ def parse_partners(pairs: Sequence[str], names: Sequence[str]) -> dict[int, list
     """Pairs as texts BASE,OTHER[,OTHER…] of image names, as indices.
 
     **Raises:** `InputError`."""
-    found: dict[int, list[int]] = {}
+    partners_of: dict[int, list[int]] = {}
     for text in pairs:
         parts = [part.strip() for part in text.split(",") if part.strip()]
         if len(parts) < 2:
@@ -65,5 +65,7 @@ def parse_partners(pairs: Sequence[str], names: Sequence[str]) -> dict[int, list
         base, *others = (list(names).index(part) for part in parts)
         if base in others:
             raise InputError(f"--pairs {text!r}: an image cannot be matched with itself")
-        found.setdefault(base, []).extend(j for j in others if j not in found.get(base, []))
-    return found
+        partners_of.setdefault(base, []).extend(
+            j for j in others if j not in partners_of.get(base, [])
+        )
+    return partners_of

@@ -97,11 +97,11 @@ def _write_ply(cloud: Cloud, path: Path) -> None:
 
 
 def _read_ply(path: Path) -> Cloud:
-    head, *rest = PLY_END.split(read_content(path, text=False), maxsplit=1)
+    head, *after_header = PLY_END.split(read_content(path, text=False), maxsplit=1)
     lines = head.decode("ascii", "replace").splitlines()
-    if not rest or not lines or lines[0].strip() != "ply":
+    if not after_header or not lines or lines[0].strip() != "ply":
         raise InputError(f"{path}: not a PLY file")
-    (body,) = rest
+    (body,) = after_header
     form, number, fields = _ply_head(path, lines)
     names = [n for n, _ in fields]
     if not {"x", "y", "z"} <= {*names}:
@@ -143,9 +143,9 @@ def _add_base_images(
 
 
 def _ply_numbers(
-    path: Path, body: bytes, names: Sequence[str], number: int, first: int
+    path: Path, body: bytes, names: Sequence[str], number: int, first_line: int
 ) -> dict[str, np.ndarray]:
-    """The columns of an ASCII file, whose first point is in the line `first`."""
+    """The columns of an ASCII file, whose first point is in the line `first_line`."""
     lines = body.decode("ascii", "replace").splitlines()
     _check_ply_count(path, number, len(lines))
     lines = lines[:number]
@@ -153,15 +153,16 @@ def _ply_numbers(
         table = np.array([line.split()[: len(names)] for line in lines], float)
         table = table.reshape(number, len(names))
     except ValueError:  # which point? the slow way
-        rows = [TextRow(path, k, line) for k, line in enumerate(lines, first)]
+        rows = [TextRow(path, k, line) for k, line in enumerate(lines, first_line)]
         table = np.array([row.numbers(names, more=True) for row in rows])
     return dict(zip(names, table.T))
 
 
-def _check_ply_count(path: Path, stated: int, present: int) -> None:
-    if stated > present:
+def _check_ply_count(path: Path, number_stated: int, number_present: int) -> None:
+    if number_stated > number_present:
         raise InputError(
-            f"{path}: is cut, or damaged: its header states {stated} points, there are {present}"
+            f"{path}: is cut, or damaged: its header states {number_stated} points, there are "
+            f"{number_present}"
         )
 
 
@@ -229,9 +230,9 @@ def _write_las(cloud: Cloud, path: Path) -> None:
     write_bytes(path, file.getvalue())
 
 
-def _read_las(path: Path, together: int = 1 << 18) -> Cloud:
-    """A cloud; **Arguments:** `together`: points read at once, some megabytes, which stay in the
-    cache of the processor for their coordinates and colours."""
+def _read_las(path: Path, points_at_once: int = 1 << 18) -> Cloud:
+    """A cloud; **Arguments:** `points_at_once`: points read at once, some megabytes, which stay in
+    the cache of the processor for their coordinates and colours."""
     laspy = _laspy()
     check_las(path)
     with foreign_parser(path, EXPECTED), laspy.open(path) as reader:
@@ -239,8 +240,8 @@ def _read_las(path: Path, together: int = 1 << 18) -> Cloud:
         names = {*header.point_format.dimension_names}
         X = np.empty((header.point_count, 3))
         colour = np.empty(X.shape, np.uint8) if {*COLOURS} <= names else None
-        more = {name: [] for name in (*SIGMAS, "rays") if name in names}
-        for points in reader.chunk_iterator(together):
+        extra_columns = {name: [] for name in (*SIGMAS, "rays") if name in names}
+        for points in reader.chunk_iterator(points_at_once):
             part = slice(begin, begin := begin + len(points))
             # As laspy's x, without the arrays between.
             for k, raw in enumerate((points.X, points.Y, points.Z)):
@@ -249,7 +250,7 @@ def _read_las(path: Path, together: int = 1 << 18) -> Cloud:
             if colour is not None:
                 for k, name in enumerate(COLOURS):
                     np.floor_divide(points[name], 257, out=colour[part, k], casting="unsafe")
-            for name, columns in more.items():
+            for name, columns in extra_columns.items():
                 columns.append(np.array(points[name]))
         if begin < len(X):
             raise InputError(
@@ -257,7 +258,10 @@ def _read_las(path: Path, together: int = 1 << 18) -> Cloud:
             )
         crs = header.parse_crs() if len(X) else None
         system = None if crs is None else (crs.to_string() if crs.to_epsg() else crs.to_wkt())
-    columns = {name: np.concatenate(some) if some else np.zeros(0) for name, some in more.items()}
+    columns = {
+        name: np.concatenate(parts) if parts else np.zeros(0)
+        for name, parts in extra_columns.items()
+    }
     return make_cloud(Source(str(path), None, "point"), X, columns, colour, system)
 
 

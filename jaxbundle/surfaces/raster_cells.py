@@ -70,27 +70,32 @@ class RasterCells:
             sigma=None if self.sigma is None else self.sigma.part(rows, columns),
         )
 
-    def with_sigma(self, path: Path, own: bool) -> "RasterCells":
-        """With the σ of a file; `own`: without the errors of the orientations, if it has them in a
-        band of their own.
+    def with_sigma(self, path: Path, without_orientation: bool) -> "RasterCells":
+        """With the σ of a file; `without_orientation`: without the errors of the orientations, if
+        it has them in a band of their own.
 
         **Raises:** `InputError` if the file does not have all cells.
         """
-        found = open_cells(path)
-        if own:
+        sigma_cells = open_cells(path)
+        if without_orientation:
             with open_raster(path) as source:
                 names = list(source.descriptions)
             # The first band contains the errors that the columns of L carry: they would count twice
             if OWN_SIGMA in names:
                 band = names.index(OWN_SIGMA) + 1
-                found = dataclasses.replace(found, band=band, without_orientation=True)
-        row, column = place_of(self, found)
-        inside = row >= 0 and column >= 0
-        inside &= row + self.shape[0] <= found.shape[0] and column + self.shape[1] <= found.shape[1]
-        if not inside:
+                sigma_cells = dataclasses.replace(sigma_cells, band=band, without_orientation=True)
+        row, column = place_of(self, sigma_cells)
+        is_inside = row >= 0 and column >= 0
+        is_inside &= (
+            row + self.shape[0] <= sigma_cells.shape[0]
+            and column + self.shape[1] <= sigma_cells.shape[1]
+        )
+        if not is_inside:
             raise InputError(f"{path}: does not have the cells of {self.path}")
-        cut = found.part(slice(row, row + self.shape[0]), slice(column, column + self.shape[1]))
-        return dataclasses.replace(self, sigma=cut)
+        sigma_part = sigma_cells.part(
+            slice(row, row + self.shape[0]), slice(column, column + self.shape[1])
+        )
+        return dataclasses.replace(self, sigma=sigma_part)
 
 
 def open_cells(path: str | Path) -> RasterCells:

@@ -66,26 +66,26 @@ def find_bounds(
 ) -> tuple[tuple[Bounds, ...], tuple[str, ...]]:
     """The bounds of every image: heights, if given; tie points; else the geometry, with a
     message."""
-    found, messages = [], []
+    all_bounds, messages = [], []
     low, high = heights or (None, None)
     guessed = []
     for view in views:
         others = [o for o in views if o is not view]
         # A view between the heights is not bounded by them.
-        between = heights is not None and low <= view.X0[2] <= high
-        q = bounds_from_points(view, tie) if len(tie) and (heights is None or between) else None
+        is_between = heights is not None and low <= view.X0[2] <= high
+        q = bounds_from_points(view, tie) if len(tie) and (heights is None or is_between) else None
         if q is None:
-            wide = bounds_from_geometry(view, others)
-            if wide is None:
+            usual_bounds = bounds_from_geometry(view, others)
+            if usual_bounds is None:
                 raise InputError(
                     f"{view.name}: all images are at one position: a surface needs a base"
                 )
             # Given heights are searched at any distance: q of the geometry says only the order.
-            bounded = heights is not None and not between
-            q = (1e-2 * wide[0], 1e2 * wide[1]) if bounded else wide
-            if not bounded:
+            is_bounded = heights is not None and not is_between
+            q = (1e-2 * usual_bounds[0], 1e2 * usual_bounds[1]) if is_bounded else usual_bounds
+            if not is_bounded:
                 guessed.append((view.name, q))
-        found.append(Bounds(view, q, low, high))
+        all_bounds.append(Bounds(view, q, low, high))
     if guessed:
         name, q = guessed[0]
         messages.append(
@@ -93,7 +93,7 @@ def find_bounds(
             f"{1 / q[0]:.4g} are searched ({name})"
             + ("; give --zmin and --zmax" if heights is None else ", the heights are all around it")
         )
-    return tuple(found), tuple(messages)
+    return tuple(all_bounds), tuple(messages)
 
 
 def ground_bounds(
@@ -180,29 +180,31 @@ def reconstruct_surface(
         tell("depths", len(beforehand), len(beforehand))
     # Pixels between the points of a dense cloud, so that those of all base images fit into memory.
     pixels = sum(views[i].size[0] * views[i].size[1] for i in partners)
-    every = step or max(1, int(np.ceil(np.sqrt(pixels / settings.dense.max_points))))
-    thinned = f"every {every}th pixel in both directions, to limit memory; --step 1 takes all"
-    messages = [thinned] if dense and not step and every > 1 else []
-    clouds, told = [], []
+    every_nth = step or max(1, int(np.ceil(np.sqrt(pixels / settings.dense.max_points))))
+    thinned = f"every {every_nth}th pixel in both directions, to limit memory; --step 1 takes all"
+    messages = [thinned] if dense and not step and every_nth > 1 else []
+    clouds, counts_of_images = [], []
     for done, (i, others) in enumerate(partners.items()):
         tell("matching", done, len(partners))
-        base, used = views[i], [views[j] for j in others]
+        base, used_views = views[i], [views[j] for j in others]
         counts = {"points": 0, "matched": 0, "variance_factor": None, "rejected": {}}
         if dense:
             find_guide = partial(guides.__getitem__, i)
-            cloud, counts, more = _match_every_pixel(
-                base, used, find_guide, bounds[i], every, settings.dense
+            cloud, counts, pair_messages = _match_every_pixel(
+                base, used_views, find_guide, bounds[i], every_nth, settings.dense
             )
             clouds.append(cloud)
-            messages += more
+            messages += pair_messages
         elif (guide := guides[i]) is not None:
             others_guides = [guides[j] for j in others]
             group = guides.pyramids.select(i, others)
             cloud, counts = _match_interest_points(
-                base, used, group, guide, others_guides, points, step, settings
+                base, used_views, group, guide, others_guides, points, step, settings
             )
             clouds.append(cloud)
-        told.append({"image": base.name, "with": [view.name for view in used], **counts})
+        counts_of_images.append(
+            {"image": base.name, "with": [view.name for view in used_views], **counts}
+        )
     tell("matching", len(partners), len(partners))
     if not any(len(c) for c in clouds):
         raise NotSolvedError(
@@ -210,7 +212,7 @@ def reconstruct_surface(
             "orientation or the bounds of the heights are wrong"
         )
     uncertain = any(is_uncertain(views[j]) for i, others in partners.items() for j in (i, *others))
-    return SurfaceResult(merge(clouds), tuple(told), tuple(messages), uncertain)
+    return SurfaceResult(merge(clouds), tuple(counts_of_images), tuple(messages), uncertain)
 
 
 def _match_interest_points(
@@ -227,25 +229,25 @@ def _match_interest_points(
     columns, rows = base.size
     spacing = step or max(2, int(np.ceil(np.sqrt(columns * rows / settings.points))))
     uv = interest_points(base.grey, points, spacing)
-    found = match_points(
+    matched = match_points(
         base, others, pyramids, guide, uv, guides, settings.guide, settings.matching
     )
-    n = len(found.X)
+    n = len(matched.X)
     cloud = Cloud(
-        found.X,
-        found.covariance,
-        found.rays,
+        matched.X,
+        matched.covariance,
+        matched.rays,
         np.zeros(n, int),
-        found.uv,
+        matched.uv,
         (base.name,),
-        _colour(base, found.uv),
-        shared=found.shared,
+        _colour(base, matched.uv),
+        shared=matched.shared,
     )
     return cloud, {
         "points": len(uv),
         "matched": n,
-        "variance_factor": found.factor,
-        "rejected": found.rejected,
+        "variance_factor": matched.factor,
+        "rejected": matched.rejected,
     }
 
 
@@ -262,17 +264,21 @@ def _match_every_pixel(
     **Arguments:** `find_guide()`: the guide of the image, made when it is needed."""
     if isinstance(base, FrameView):
         photographs = [view for view in others if isinstance(view, FrameView)]
-        cloud, used, left_out = dense_cloud(base, photographs, find_guide, bounds, step, settings)
+        cloud, used_images, left_out = dense_cloud(
+            base, photographs, find_guide, bounds, step, settings
+        )
     elif (guide := find_guide()) is not None:
-        cloud, used, left_out = dense_ground_cloud(base, others, guide, bounds, step, settings)
+        cloud, used_images, left_out = dense_ground_cloud(
+            base, others, guide, bounds, step, settings
+        )
     else:
-        cloud, used, left_out = empty_cloud(base.name), [], []
+        cloud, used_images, left_out = empty_cloud(base.name), [], []
     cloud = dataclasses.replace(cloud, colour=_colour(base, cloud.uv))
     columns, rows = base.size
     number = -(-columns // step) * -(-rows // step)
-    factor = float(np.mean([f for _, f in used])) if used else None
+    factor = float(np.mean([f for _, f in used_images])) if used_images else None
     reason = "no disparity, or not confirmed by least squares"
-    if len(used) > 1:
+    if len(used_images) > 1:
         reason += ", or pairs disagree"
     return (
         cloud,
@@ -347,9 +353,11 @@ def _level(
         segments(views[i], views[j], uv, visible_range(views[i], views[j], uv, q)).length
         for j in others
     ]
-    seen = np.concatenate(lengths)
-    seen = seen[np.isfinite(seen)]
-    return coarsest_level(views[i].size, float(np.max(seen)) if len(seen) else 0.0, settings)
+    lengths_seen = np.concatenate(lengths)
+    lengths_seen = lengths_seen[np.isfinite(lengths_seen)]
+    return coarsest_level(
+        views[i].size, float(np.max(lengths_seen)) if len(lengths_seen) else 0.0, settings
+    )
 
 
 def _colour(view: OrientedImage, uv: Places) -> UInt8[np.ndarray, "n 3"]:

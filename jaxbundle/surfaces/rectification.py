@@ -64,8 +64,8 @@ class RectifiedPair:
         """Columns and rows of points in the left image."""
         x, y, z = self.R @ (points - self.X0).T
         with np.errstate(invalid="ignore", divide="ignore"):
-            found = np.stack([self.f * x / z, self.f * y / z], 1) - self.origin
-        return np.where(z[:, None] > 0, found, np.nan)
+            places = np.stack([self.f * x / z, self.f * y / z], 1) - self.origin
+        return np.where(z[:, None] > 0, places, np.nan)
 
     def disparity(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """Columns in the left minus those in the right image."""
@@ -110,8 +110,8 @@ def rectify(
         return None
     f = _resolution(base)
     low, high = (f * d[:, :2] / d[:, 2:]).min(0), (f * d[:, :2] / d[:, 2:]).max(0)
-    first = np.floor(low)
-    columns, rows = (int(n) for n in np.ceil(high) - first + 1)
+    first_column_and_row = np.floor(low)
+    columns, rows = (int(n) for n in np.ceil(high) - first_column_and_row + 1)
     if columns * rows > settings.max_size_ratio * base.size[0] * base.size[1]:
         return None
     depth = (X - base.X0) @ z
@@ -126,7 +126,7 @@ def rectify(
     span = int(np.ceil(d_high + margin)) - lowest
     # `span` columns more on the left: a pixel of the base image at column c ≥ span has its match at
     # a column from c − span to c of the right image
-    origin = first - [span, 0]
+    origin = first_column_and_row - [span, 0]
     shape = (rows, columns + span)
     left = _look_up(base, R, f, origin, shape)
     right = _look_up(other, R, f, origin - [lowest, 0], shape)
@@ -170,19 +170,19 @@ def _look_up(
     coefficients = ndimage.spline_filter(np.asarray(view.grey, np.float32), 3, np.float32)
     out = np.empty(shape, np.float32)
     x = (np.arange(columns) + origin[0]) / f
-    together = max(1, PIXELS_AT_ONCE // columns)
+    rows_at_once = max(1, PIXELS_AT_ONCE // columns)
 
-    def fill(first: int) -> None:
-        y = (np.arange(first, min(first + together, rows)) + origin[1]) / f
+    def fill(begin: int) -> None:
+        y = (np.arange(begin, min(begin + rows_at_once, rows)) + origin[1]) / f
         d = np.stack([*np.meshgrid(x, y), np.ones((len(y), columns))], -1).reshape(-1, 3)
         uv = view.project(view.X0 + d @ R)
-        inside = (uv > -0.5).all(1) & (uv < np.array(view.size) - 0.5).all(1)
+        is_inside = (uv > -0.5).all(1) & (uv < np.array(view.size) - 0.5).all(1)
         grey = np.full(len(uv), np.nan, np.float32)
-        grey[inside] = ndimage.map_coordinates(
-            coefficients, uv[inside, ::-1].T, order=3, prefilter=False, mode="nearest"
+        grey[is_inside] = ndimage.map_coordinates(
+            coefficients, uv[is_inside, ::-1].T, order=3, prefilter=False, mode="nearest"
         )
-        out[first : first + together] = grey.reshape(len(y), -1)
+        out[begin : begin + rows_at_once] = grey.reshape(len(y), -1)
 
     with ThreadPoolExecutor(available_cores()) as pool:
-        list(pool.map(fill, range(0, rows, together)))
+        list(pool.map(fill, range(0, rows, rows_at_once)))
     return out

@@ -58,21 +58,21 @@ def align(
     """Shift the projections of the other image; returns the shift in pixels, None if too few points
     match."""
     grey = base.grey
-    spread = max(8, int(np.sqrt(grey.size / settings.points)))
-    uv = interest_points(grey, "corners", spread)
+    point_spacing = max(8, int(np.sqrt(grey.size / settings.points)))
+    uv = interest_points(grey, "corners", point_spacing)
     q = visible_range(base, other, uv, bounds(uv), margin=2 * settings.half_window)
-    seen = np.isfinite(q).all(1) & (q[:, 0] < q[:, 1])
-    chosen = np.flatnonzero(seen)[:: max(1, -(-int(seen.sum()) // settings.points))]
-    uv, q = uv[chosen], q[chosen]
+    is_seen = np.isfinite(q).all(1) & (q[:, 0] < q[:, 1])
+    chosen_points = np.flatnonzero(is_seen)[:: max(1, -(-int(is_seen.sum()) // settings.points))]
+    uv, q = uv[chosen_points], q[chosen_points]
     if len(uv) < settings.min_matches:
         return None
     shape = windows(base, other, base.points(uv, q.mean(1)))
     if not shape.usable.any():
         return None
-    along = np.median(shape.other_axis[shape.usable], axis=0)
-    across = np.array([-along[1], along[0]]) / np.linalg.norm(along)
-    both, guide_settings = (pyramids[0], [pyramids[1]]), GuideSettings()
-    first = np.array(other.shift, float)
+    axis_along = np.median(shape.other_axis[shape.usable], axis=0)
+    axis_across = np.array([-axis_along[1], axis_along[0]]) / np.linalg.norm(axis_along)
+    both_pyramids, guide_settings = (pyramids[0], [pyramids[1]]), GuideSettings()
+    first_shift = np.array(other.shift, float)
     levels = len(pyramids[0].levels) - 1
     best, step = 0.0, 2.0**levels
     width = settings.search_width
@@ -80,21 +80,21 @@ def align(
     for level in range(levels, -1, -1):
         scores = []
         for t in tries:
-            other.shift = tuple(first + t * across)
-            _, rho, _ = search(base, [other], both, uv, q, None, level, guide_settings)
+            other.shift = tuple(first_shift + t * axis_across)
+            _, rho, _ = search(base, [other], both_pyramids, uv, q, None, level, guide_settings)
             scores.append(float(np.mean(np.nan_to_num(rho) > settings.likely_correlation)))
         best = float(tries[int(np.argmax(scores))])
         step /= 2
         tries = best + step * np.arange(-2, 3)
-    other.shift = tuple(first + best * across)
+    other.shift = tuple(first_shift + best * axis_across)
     # Twice: the first matches may start a pixel beside.
     for _ in range(2):
-        rest = _median_offset(base, other, both, uv, q, across, settings)
-        if rest is None:
-            other.shift = tuple(first)
+        remaining_offset = _median_offset(base, other, both_pyramids, uv, q, axis_across, settings)
+        if remaining_offset is None:
+            other.shift = tuple(first_shift)
             return None
-        best += rest
-        other.shift = tuple(first + best * across)
+        best += remaining_offset
+        other.shift = tuple(first_shift + best * axis_across)
     return best
 
 
@@ -104,24 +104,24 @@ def _median_offset(
     pyramids: ImagePyramids,
     uv: Places,
     q: Float[np.ndarray, "n 2"],
-    across: Float[np.ndarray, "2"],
+    axis_across: Float[np.ndarray, "2"],
     settings: AlignmentSettings,
 ) -> float | None:
     """The median distance of matches from their epipolar lines; None for too few."""
-    found, rho, _ = search(base, [other], pyramids, uv, q, None, 0, GuideSettings())
+    q_found, rho, _ = search(base, [other], pyramids, uv, q, None, 0, GuideSettings())
     with np.errstate(invalid="ignore"):
-        good = np.isfinite(found) & (rho > settings.min_correlation)
-    uv, found = uv[good], found[good]
+        good = np.isfinite(q_found) & (rho > settings.min_correlation)
+    uv, q_found = uv[good], q_found[good]
     if len(uv) < settings.min_matches:
         return None
-    shape = windows(base, other, base.points(uv, found))
-    start = positions(base, other, uv, found[:, None])[:, 0]
+    shape = windows(base, other, base.points(uv, q_found))
+    start = positions(base, other, uv, q_found[:, None])[:, 0]
     match = refine(base, other, uv, start, shape.A, settings.half_window)
     good = match.status == int(MatchingStatus.CONVERGED)
     good &= match.rho > settings.min_correlation
     if good.sum() < settings.min_matches:
         return None
-    return float(np.median((match.uv - start)[good] @ across))
+    return float(np.median((match.uv - start)[good] @ axis_across))
 
 
 def align_all(
@@ -130,16 +130,16 @@ def align_all(
     settings: AlignmentSettings = AlignmentSettings(),
 ) -> tuple[str, ...]:
     """Align every image with the first; returns messages."""
-    said = []
+    messages = []
     pyramids = [make_pyramid(view.grey, settings.levels) for view in views]
     for k in range(1, len(views)):
-        found = align(views[0], views[k], (pyramids[0], pyramids[k]), bounds[0], settings)
+        shift = align(views[0], views[k], (pyramids[0], pyramids[k]), bounds[0], settings)
         pair = f"{views[k].name} and {views[0].name}"
-        if found is None:
-            said.append(f"{pair}: too few matches to align them across the epipolar lines")
-        elif abs(found) > settings.min_reported:
-            said.append(
-                f"{pair}: {found:.3g} pixels between them across the epipolar lines, taken "
+        if shift is None:
+            messages.append(f"{pair}: too few matches to align them across the epipolar lines")
+        elif abs(shift) > settings.min_reported:
+            messages.append(
+                f"{pair}: {shift:.3g} pixels between them across the epipolar lines, taken "
                 "off the second"
             )
-    return tuple(said)
+    return tuple(messages)

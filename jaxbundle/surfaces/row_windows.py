@@ -39,15 +39,15 @@ class RowWindows:
     """Both images of a piece, the right one moved, and the products of their grey values and
     gradients; `correct` sums them over windows of any size."""
 
-    def __init__(self, left: Piece, right: Piece, known: PieceMask) -> None:
-        offset = np.float32(left[known].mean() if known.any() else 0.0)
-        self.weight = known.astype(np.float32)
+    def __init__(self, left: Piece, right: Piece, is_known: PieceMask) -> None:
+        offset = np.float32(left[is_known].mean() if is_known.any() else 0.0)
+        self.weight = is_known.astype(np.float32)
         L, R = left - offset, right - offset
         ratio = self._contrast_ratio(L, R)
         # Gradients in grey values of the left image, for any exposure of the right one; the
         # disparity moves the right image against its columns: −∂R/∂x.
         x, y = (-0.5 * (_gradient(L, axis) + ratio * _gradient(R, axis)) for axis in (1, 0))
-        self.known, self.left = known, L
+        self.known, self.left = is_known, L
         L, R, x, y = (a * self.weight for a in (L, R, x, y))
         self.first = {"L": L, "R": R, "x": x, "y": y}
         self.second = {
@@ -67,27 +67,27 @@ class RowWindows:
         """Contrast of the left image by that of the right one, in windows of 15 × 15 pixels,
         limited, since noise decides it where there is no texture (half and double of the limit: no
         difference)."""
-        half, limit = 7, 5.0
-        n = np.maximum(_sum_windows(self.weight, half), 1)
+        half_window, limit = 7, 5.0
+        n = np.maximum(_sum_windows(self.weight, half_window), 1)
         # At least a standard deviation of one grey value.
         LL, RR = (
             np.maximum(
-                _sum_windows(self.weight * a * a, half) / n
-                - (_sum_windows(self.weight * a, half) / n) ** 2,
+                _sum_windows(self.weight * a * a, half_window) / n
+                - (_sum_windows(self.weight * a, half_window) / n) ** 2,
                 1.0,
             )
             for a in (L, R)
         )
         return np.clip(np.sqrt(LL / RR), 1 / limit, limit)
 
-    def correct(self, half: int) -> RowCorrections:
-        """Corrections by windows of 2·`half` + 1 pixels, those at the edges continued by
+    def correct(self, half_window: int) -> RowCorrections:
+        """Corrections by windows of 2·`half_window` + 1 pixels, those at the edges continued by
         reflection."""
-        n = np.maximum(_sum_windows(self.weight, half), 1)
-        mean = {name: _sum_windows(a, half) / n for name, a in self.first.items()}
+        n = np.maximum(_sum_windows(self.weight, half_window), 1)
+        mean = {name: _sum_windows(a, half_window) / n for name, a in self.first.items()}
         # Moments about the means of the windows, times the number of their pixels.
         moment = lambda name: (
-            _sum_windows(self.second[name], half) - n * mean[name[0]] * mean[name[1]]
+            _sum_windows(self.second[name], half_window) - n * mean[name[0]] * mean[name[1]]
         )
         LL, f, LR = moment("LL"), moment("RR"), moment("LR")
         a, b, c, d, e = (moment(name) for name in ("xx", "xy", "xR", "yy", "yR"))
@@ -100,8 +100,10 @@ class RowWindows:
         # A standard deviation of 1 grey value of 256: less is rounding. Half of a window must be
         # known. The determinant is 0 for a texture of one direction; its limit is not critical,
         # since σ, which grows with the inverse of the determinant, is tested as well.
-        least, scale = 1.0, a * d * f
-        good = (LL > n * least) & (f > n * least) & (2 * n > (2 * half + 1) ** 2)
+        min_variance, scale = 1.0, a * d * f
+        good = (
+            (LL > n * min_variance) & (f > n * min_variance) & (2 * n > (2 * half_window + 1) ** 2)
+        )
         good &= (determinant > 1e-9 * scale) & (scale > 0)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             inverse = 1 / np.where(good, determinant, np.float32(np.nan))
@@ -109,8 +111,8 @@ class RowWindows:
                 (u * g[0] + v * g[1] + w * g[2]) * inverse
                 for u, v, w in ((A, B, C), (B, D, E), (C, E, F))
             )
-            rest = np.maximum(LL - delta * g[0] - epsilon * g[1] - contrast * g[2], 0)
-            variance = rest / (n - 4)
+            unexplained = np.maximum(LL - delta * g[0] - epsilon * g[1] - contrast * g[2], 0)
+            variance = unexplained / (n - 4)
             return RowCorrections(
                 delta,
                 np.sqrt(variance * A * inverse),
@@ -120,23 +122,23 @@ class RowWindows:
                 variance / 2,  # the other half is the noise of the right image
             )
 
-    def find_own_texture(self, half: int, noise: Piece) -> PieceMask:
+    def find_own_texture(self, half_window: int, noise: Piece) -> PieceMask:
         """Windows whose middle has texture of its own, as have their four sides: others show the
         surroundings of their pixel, such as the ground beside a roof without texture."""
-        least = 1.0
-        inner = half // 2
+        min_variance = 1.0
+        inner = half_window // 2
         number = (2 * inner + 1) ** 2
         L = self.left
         middle = _sum_windows(L * L, inner) / number - (_sum_windows(L, inner) / number) ** 2
-        side = half * (2 * half + 1)
+        side = half_window * (2 * half_window + 1)
         with np.errstate(invalid="ignore"):
-            found = middle > least + _noise_limit(number) * noise
-            return found & (_min_side_variance(L, half) > _noise_limit(side) * noise)
+            has_texture = middle > min_variance + _noise_limit(number) * noise
+            return has_texture & (_min_side_variance(L, half_window) > _noise_limit(side) * noise)
 
 
-def _sum_windows(a: Piece, half: int) -> Piece:
+def _sum_windows(a: Piece, half_window: int) -> Piece:
     cv2 = need_opencv()
-    window = (2 * half + 1, 2 * half + 1)
+    window = (2 * half_window + 1, 2 * half_window + 1)
     return cv2.boxFilter(a, cv2.CV_32F, window, normalize=False, borderType=cv2.BORDER_REFLECT_101)
 
 
@@ -149,23 +151,25 @@ def _noise_limit(number: int) -> float:
     return 1 + 3.0 * float(np.sqrt(2 / (number - 1)))
 
 
-def _min_side_variance(a: Piece, half: int) -> Piece:
+def _min_side_variance(a: Piece, half_window: int) -> Piece:
     """The smallest variance of the four sides of each window, without its middle row and column."""
     cv2 = need_opencv()
     rows, columns = a.shape
-    wide = cv2.copyMakeBorder(a, half, half, half, half, cv2.BORDER_REFLECT_101)
-    found = np.full(a.shape, np.inf, np.float32)
-    for window in ((2 * half + 1, half), (half, 2 * half + 1)):
+    wide = cv2.copyMakeBorder(
+        a, half_window, half_window, half_window, half_window, cv2.BORDER_REFLECT_101
+    )
+    smallest = np.full(a.shape, np.inf, np.float32)
+    for window in ((2 * half_window + 1, half_window), (half_window, 2 * half_window + 1)):
         mean, square = (
             cv2.boxFilter(x, cv2.CV_32F, window, anchor=(0, 0), borderType=cv2.BORDER_REFLECT_101)
             for x in (wide, wide * wide)
         )
         variance = square - mean * mean
         # From the first pixel of the window, and from the one after its middle.
-        down, right = (half + 1, 0) if window[1] == half else (0, half + 1)
+        down, right = (half_window + 1, 0) if window[1] == half_window else (0, half_window + 1)
         for r, c in ((0, 0), (down, right)):
-            np.minimum(found, variance[r : r + rows, c : c + columns], out=found)
-    return found
+            np.minimum(smallest, variance[r : r + rows, c : c + columns], out=smallest)
+    return smallest
 
 
 def _gradient(a: Piece, axis: int) -> Piece:
@@ -173,6 +177,6 @@ def _gradient(a: Piece, axis: int) -> Piece:
     fourth order)."""
     cv2 = need_opencv()
     difference = np.array([1, -8, 0, 8, -1], np.float32) / 12
-    one = np.ones(1, np.float32)
-    along = (difference, one) if axis == 1 else (one, difference)
+    identity = np.ones(1, np.float32)
+    along = (difference, identity) if axis == 1 else (identity, difference)
     return cv2.sepFilter2D(a, cv2.CV_32F, *along, borderType=cv2.BORDER_REPLICATE)

@@ -69,23 +69,29 @@ def read_ground_views(
     """
     files, blocks = _with_blocks(files)
     refined = [None if b is None else b.image_of(path) for b, path in zip(blocks, files)]
-    found = [
-        _orientation(path, folder, None if one is None else _pixels_of(one, folder))
-        for path, one in zip(files, refined)
+    orientations_and_rasters = [
+        _orientation(
+            path, folder, None if refined_file is None else _pixels_of(refined_file, folder)
+        )
+        for path, refined_file in zip(files, refined)
     ]
-    around = _common_neighbourhood(files, [orientation for orientation, _ in found])
-    rasters = [raster.resolve() for _, raster in found]
+    around = _common_neighbourhood(
+        files, [orientation for orientation, _ in orientations_and_rasters]
+    )
+    rasters = [raster.resolve() for _, raster in orientations_and_rasters]
     for k, raster in enumerate(rasters):
         if raster in rasters[:k]:
             raise InputError(
                 f"{files[k]}: its raster {raster.name} is also that of "
                 f"{files[rasters.index(raster)]}; a surface needs different images"
             )
-    names = [raster.name for _, raster in found]
+    names = [raster.name for _, raster in orientations_and_rasters]
     if len({*names}) < len(names):
-        names = [str(raster) for _, raster in found]
+        names = [str(raster) for _, raster in orientations_and_rasters]
     views = []
-    for name, (orientation, raster), one, block in zip(names, found, refined, blocks):
+    for name, (orientation, raster), refined_file, block in zip(
+        names, orientations_and_rasters, refined, blocks
+    ):
         if not isinstance(orientation, Rpc):
             with open_raster(raster) as source:
                 check_raw(raster, source)
@@ -93,8 +99,8 @@ def read_ground_views(
         if not isinstance(orientation, Rpc):
             _check_size(raster, grey, orientation[0])
         view = _view(name, grey, orientation, around)
-        if one is not None and block is not None:
-            _add_covariance(view, orientation, one, block)
+        if refined_file is not None and block is not None:
+            _add_covariance(view, orientation, refined_file, block)
         views.append(view)
     return tuple(views), around
 
@@ -132,60 +138,64 @@ def read_refined_views(
     block = read_refined_orientations(folder)
     if block is None:
         return None
-    found = [
-        read_rpc(one.file) if has_rpc_only(one.file) else _scanner_of(one.file)
-        for one in block.images
+    orientations = [
+        read_rpc(refined_file.file)
+        if has_rpc_only(refined_file.file)
+        else _scanner_of(refined_file.file)
+        for refined_file in block.images
     ]
-    around = _common_neighbourhood([one.file for one in block.images], found)
+    around = _common_neighbourhood(
+        [refined_file.file for refined_file in block.images], orientations
+    )
     views = []
-    for one, orientation in zip(block.images, found):
+    for refined_file, orientation in zip(block.images, orientations):
         image = (
-            read_rpc_image(one.file, one.raster).image
+            read_rpc_image(refined_file.file, refined_file.raster).image
             if isinstance(orientation, Rpc)
             else orientation[0]
         )
         # The size alone is needed: a view of one number instead of gigabytes of pixels.
         nothing = np.broadcast_to(np.uint8(0), (image.lines, image.pixels))
-        view = _view(one.id, nothing, orientation, around)
-        _add_covariance(view, orientation, one, block)
+        view = _view(refined_file.id, nothing, orientation, around)
+        _add_covariance(view, orientation, refined_file, block)
         views.append(view)
     return tuple(views), around
 
 
 def _with_blocks(files: Sequence[Path]) -> tuple[list[Path], list[RefinedBlock | None]]:
     """Files, for the folder of a refinement all of its images, and the refinements they are of."""
-    every: list[Path] = []
+    all_files: list[Path] = []
     of_every: list[RefinedBlock | None] = []
-    known: dict[Path, RefinedBlock | None] = {}
+    block_of_folder: dict[Path, RefinedBlock | None] = {}
     for path in files:
         place = path if path.is_dir() else path.parent
-        if place not in known:
-            known[place] = read_refined_orientations(place)
-        block = known[place]
-        mine = [one.file for one in block.images] if path.is_dir() and block else [path]
-        every += mine
-        of_every += [block] * len(mine)
-    return every, of_every
+        if place not in block_of_folder:
+            block_of_folder[place] = read_refined_orientations(place)
+        block = block_of_folder[place]
+        files_of_entry = [one.file for one in block.images] if path.is_dir() and block else [path]
+        all_files += files_of_entry
+        of_every += [block] * len(files_of_entry)
+    return all_files, of_every
 
 
-def _pixels_of(one: RefinedFile, folder: Path | None) -> Path | None:
+def _pixels_of(refined_file: RefinedFile, folder: Path | None) -> Path | None:
     """The raster of a refined image: where it was, or of its name in a folder."""
-    if one.raster is not None or folder is None:
-        return one.raster
-    named = folder / one.raster_name
-    return named if one.raster_name and named.is_file() else None
+    if refined_file.raster is not None or folder is None:
+        return refined_file.raster
+    raster_in_folder = folder / refined_file.raster_name
+    return raster_in_folder if refined_file.raster_name and raster_in_folder.is_file() else None
 
 
 def _common_neighbourhood(
-    files: Sequence[Path], found: Sequence[Orientation]
+    files: Sequence[Path], orientations: Sequence[Orientation]
 ) -> Neighbourhood | None:
     """The place of images that are all on the Earth; None if all are in a local frame."""
-    local = [not isinstance(o, Rpc) and o[1] is None for o in found]
+    local = [not isinstance(o, Rpc) and o[1] is None for o in orientations]
     if any(local) and not all(local):
         raise InputError(
             f"{files[local.index(True)]}: is in a local frame, the other images are on the Earth"
         )
-    return None if all(local) else _central_neighbourhood(found[0])
+    return None if all(local) else _central_neighbourhood(orientations[0])
 
 
 def _view(
@@ -198,7 +208,7 @@ def _view(
 
 
 def _add_covariance(
-    view: GroundView, orientation: Orientation, one: RefinedFile, block: RefinedBlock
+    view: GroundView, orientation: Orientation, refined_file: RefinedFile, block: RefinedBlock
 ) -> None:
     """What the refinement of an image says of its errors."""
     joint = block.covariance
@@ -207,13 +217,22 @@ def _add_covariance(
     try:
         if isinstance(orientation, Rpc):
             # Compensated coefficients have a domain of their own; the bias belongs to the given.
-            domain = one.domain if one.domain is not None else domain_of_bias(orientation)
-            view.orientation = rpc_orientation(joint, one.id, domain)
+            domain = (
+                refined_file.domain
+                if refined_file.domain is not None
+                else domain_of_bias(orientation)
+            )
+            view.orientation = rpc_orientation(joint, refined_file.id, domain)
         else:
-            given = one.id, one.sensor, *orientation, one.knot_spacing
-            view.orientation = scanner_orientation(joint, *given)
+            scanner_arguments = (
+                refined_file.id,
+                refined_file.sensor,
+                *orientation,
+                refined_file.knot_spacing,
+            )
+            view.orientation = scanner_orientation(joint, *scanner_arguments)
     except InputError as error:
-        raise InputError(f"{one.file.parent / COVARIANCE_FILE}: {error}") from None
+        raise InputError(f"{refined_file.file.parent / COVARIANCE_FILE}: {error}") from None
 
 
 def is_ground_image(path: Path) -> bool:
@@ -244,8 +263,8 @@ def read_grey(path: Path, pixels_at_once: int = 1 << 23) -> Grey:
         rows = max(1, pixels_at_once // source.width)
         check_pixels(path, source, bands)
         out = np.empty(source.shape, source.dtypes[0] if plain else np.float32)
-        for first in range(0, source.height, rows):
-            window = (first, min(first + rows, source.height)), (0, source.width)
+        for begin in range(0, source.height, rows):
+            window = (begin, min(begin + rows, source.height)), (0, source.width)
             values = read_pixels(path, source, bands, window).filled(0)
             if not plain:
                 values = np.nan_to_num(values.astype(np.float32))
@@ -270,9 +289,9 @@ def to_map(cloud: Cloud, around: Neighbourhood, crs: str) -> Cloud:
     **Raises:** `InputError` for a system unknown to pyproj."""
     X, covariance = np.empty_like(cloud.X), np.empty_like(cloud.covariance)
     # The arrays of 262 144 points take about 50 MB.
-    together = 1 << 18
-    for first in range(0, len(cloud), together):
-        part = slice(first, first + together)
+    points_at_once = 1 << 18
+    for begin in range(0, len(cloud), points_at_once):
+        part = slice(begin, begin + points_at_once)
         X[part] = np.stack([*map_coordinates(cloud.X[part], around, crs), cloud.X[part, 2]], 1)
         J = map_derivative(cloud.X[part], around, crs)
         covariance[part] = J @ cloud.covariance[part] @ np.swapaxes(J, 1, 2)
@@ -357,11 +376,11 @@ def _scanner_of(path: Path) -> Orientation:
 
 
 def _raster_of(path: Path, folder: Path | None) -> Path:
-    found = find_raster(path, *([folder] if folder else []))
-    if found is None:
+    raster = find_raster(path, *([folder] if folder else []))
+    if raster is None:
         where = f"beside it or in {folder}" if folder else "beside it; --photos names its folder"
         raise InputError(f"{path}: no raster {path.stem}.tif {where}")
-    return found
+    return raster
 
 
 def _central_neighbourhood(orientation: Orientation) -> Neighbourhood:

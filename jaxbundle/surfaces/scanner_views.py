@@ -127,8 +127,8 @@ class RpcView(_GroundView):
 
     def range(self) -> tuple[float, float]:
         """The range of heights of the polynomials."""
-        middle, half = float(self.rpc.height_offset), abs(float(self.rpc.height_scale))
-        return middle - half, middle + half
+        middle, half_range = float(self.rpc.height_offset), abs(float(self.rpc.height_scale))
+        return middle - half_range, middle + half_range
 
 
 class ScannerView(_GroundView):
@@ -155,8 +155,8 @@ class ScannerView(_GroundView):
     def _locate(self, X: Float[Array, "3 n"]) -> Places:
         # Positions up to 200 pixels outside the image are found as well, so that segments that
         # leave it have both ends.
-        found = project_points(self.image, self.search, X, margin=200.0)
-        return np.stack([np.asarray(found.pixel[0]), np.asarray(found.line[0])], 1)
+        projected = project_points(self.image, self.search, X, margin=200.0)
+        return np.stack([np.asarray(projected.pixel[0]), np.asarray(projected.line[0])], 1)
 
     def derivative(self, X: Points) -> Float[np.ndarray, "n 2 3"]:
         places = np.nan_to_num(self.project(X) - np.array(self.shift))

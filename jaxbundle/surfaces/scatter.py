@@ -42,22 +42,22 @@ def scatter_factor(
 ) -> list[float]:
     """The variance factor of values on a grid (NaN: none), along columns and rows, by differences
     over `step`, of blocks of `side`; none if no block has enough values."""
-    found = []
+    factors = []
     for a, s in ((d, sigma), (d.T, sigma.T)):
         rows, n = a.shape[0], a.shape[1] - 3 * step
         if n < side:
             continue
         # Strips of a grid of more than 4 million values are sampled: a quantile of its thousands of
         # blocks needs no more.
-        every = side * max(1, round(a.size / 4_000_000))
+        row_step = side * max(1, round(a.size / 4_000_000))
         full = [
             robust_factor(block)
-            for first in range(0, rows, every)
+            for first in range(0, rows, row_step)
             for block in _blocks(a[first : first + side], s[first : first + side], step, side)
         ]
         if full:
-            found.append(float(np.quantile(full, quantile)))
-    return found
+            factors.append(float(np.quantile(full, quantile)))
+    return factors
 
 
 def missing_sigma(
@@ -101,6 +101,6 @@ def _blocks(
     square = sum(w * w * s[:, part] ** 2 for w, part in parts)
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio = difference / np.sqrt(square)
-    blocks = (ratio[:, first : first + side] for first in range(0, n, side))
+    blocks = (ratio[:, begin : begin + side] for begin in range(0, n, side))
     # A block of which two thirds are missing lies across the edge of a surface.
     return [b for b in blocks if np.isfinite(b).sum() > max(MIN_VALUES, side**2 / 3)]

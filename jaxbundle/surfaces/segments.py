@@ -82,12 +82,12 @@ def visible_range(
     x = np.linspace(0, 1, number)
     sampled = q[:, :1] + x * (q[:, 1:] - q[:, :1])
     places = other.project(_points(base, uv, sampled))
-    inside = np.asarray(is_inside(other, places, margin)).reshape(-1, number)
-    first = np.maximum(np.argmax(inside, axis=1) - 1, 0)
-    last = np.minimum(number - np.argmax(inside[:, ::-1], axis=1), number - 1)
+    in_image = np.asarray(is_inside(other, places, margin)).reshape(-1, number)
+    first_visible = np.maximum(np.argmax(in_image, axis=1) - 1, 0)
+    last_visible = np.minimum(number - np.argmax(in_image[:, ::-1], axis=1), number - 1)
     rows = np.arange(len(q))
-    found = np.stack([sampled[rows, first], sampled[rows, last]], axis=1)
-    return np.where(np.any(inside, axis=1)[:, None], found, np.nan)
+    range_found = np.stack([sampled[rows, first_visible], sampled[rows, last_visible]], axis=1)
+    return np.where(np.any(in_image, axis=1)[:, None], range_found, np.nan)
 
 
 def segments(
@@ -100,11 +100,15 @@ def segments(
     # λ(½) and λ(1) determine α and γ
     three = np.stack([q[:, 0], q.mean(1), q[:, 1]], axis=1)
     a, b, c = np.moveaxis(other.project(_points(base, uv, three)).reshape(-1, 3, 2), 1, 0)
-    half = np.linalg.norm(b - a, axis=1)
-    whole = half + np.linalg.norm(c - b, axis=1)
+    first_half = np.linalg.norm(b - a, axis=1)
+    whole_length = first_half + np.linalg.norm(c - b, axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        gamma = np.where(whole > half, (2 * half - whole) / (whole - half), 0.0)
-    return Segments(q, whole * (1 + gamma), gamma)
+        gamma = np.where(
+            whole_length > first_half,
+            (2 * first_half - whole_length) / (whole_length - first_half),
+            0.0,
+        )
+    return Segments(q, whole_length * (1 + gamma), gamma)
 
 
 def positions(
@@ -129,26 +133,26 @@ def windows(
     d, f = line_of_sight(J), line_of_sight(K)
     # J₁ × J₂ has either sign: both in the direction of that of the base
     f = f * np.sign(np.sum(f * d, 1, keepdims=True))
-    across = d + f
-    across = across / np.linalg.norm(across, axis=1, keepdims=True)
+    plane_normal = d + f
+    plane_normal = plane_normal / np.linalg.norm(plane_normal, axis=1, keepdims=True)
     if normal is not None:
         # Sine of the smaller angle between the plane and a line of sight: 1 if seen from the front.
         facing = np.minimum(np.abs(np.sum(normal * d, 1)), np.abs(np.sum(normal * f, 1)))
         # A plane seen from nearly its side is stretched without limit. Below a sine of 0.2 (12°)
         # the windows would be five times as long in one direction; a normal of the guide is rarely
         # that steep, and mostly by an error.
-        across = np.where((facing > 0.2)[:, None], normal, across)
+        plane_normal = np.where((facing > 0.2)[:, None], normal, plane_normal)
     with np.errstate(invalid="ignore", divide="ignore"):
-        A = K @ steps_on_plane(J, across)
+        A = K @ steps_on_plane(J, plane_normal)
         # The image in the base of the line of sight of the other: its epipolar line.
         e = np.einsum("nij,nj->ni", J, f)
         e = e / np.linalg.norm(e, axis=1, keepdims=True)
-        along = np.einsum("nij,nj->ni", A, e)
+        axis_along = np.einsum("nij,nj->ni", A, e)
         beside = np.einsum("nij,nj->ni", A, np.stack([-e[:, 1], e[:, 0]], 1))
         singular = np.linalg.svd(np.nan_to_num(A), compute_uv=False)
         usable = (singular[:, 1] > 1 / MAX_SCALE) & (singular[:, 0] < MAX_SCALE)
     usable &= np.isfinite(e).all(1)
-    return Windows(e, along, beside, A, usable)
+    return Windows(e, axis_along, beside, A, usable)
 
 
 def _points(base: OrientedImage, uv: Places, q: Float[np.ndarray, "n k"]) -> Points:

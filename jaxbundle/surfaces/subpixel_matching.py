@@ -71,10 +71,10 @@ def refine(
     uv: Float[np.ndarray, "n 2"],
     start: Float[np.ndarray, "n 2"],
     A: Float[np.ndarray, "n 2 2"],
-    half: int,
+    half_window: int,
     settings: WindowSettings = WindowSettings(),
 ) -> SubpixelMatches:
-    """Match windows of 2·`half` + 1 pixels around whole pixels of the base.
+    """Match windows of 2·`half_window` + 1 pixels around whole pixels of the base.
 
     **Arguments:** `start`: positions in the other image, within a few pixels; `A`: start of the
     affine transformation, from the base to the other image.
@@ -88,17 +88,22 @@ def refine(
         np.full(n, np.nan),
         np.full(n, int(MatchingStatus.OUTSIDE)),
     )
-    known = is_inside(base, uv, half)
+    is_inside_base = is_inside(base, uv, half_window)
     # How far the corners of the windows are from their middle, along the rows or the columns; half
     # a pixel more, as pieces begin at whole pixels; NaN, where A does not exist, is within nothing.
-    reach = half * np.abs(A).sum(2).max(1) + 0.5
-    held = -1.0
+    reach = half_window * np.abs(A).sum(2).max(1) + 0.5
+    margin_done = -1.0
     for stretch in (settings.max_stretch, max(settings.max_stretch, np.sqrt(2) * MAX_SCALE)):
-        margin = int(np.ceil(stretch * half)) + settings.search_margin
-        rows = known & (reach > held) & (reach <= margin) & is_inside(other, start, margin + 1)
-        _refine_rows(base, other, uv, out, np.flatnonzero(rows), half, margin)
+        margin = int(np.ceil(stretch * half_window)) + settings.search_margin
+        rows = (
+            is_inside_base
+            & (reach > margin_done)
+            & (reach <= margin)
+            & is_inside(other, start, margin + 1)
+        )
+        _refine_rows(base, other, uv, out, np.flatnonzero(rows), half_window, margin)
         # Few windows are larger: in pieces of their own, which take more time.
-        held = float(margin)
+        margin_done = float(margin)
     return out
 
 
@@ -108,37 +113,39 @@ def _refine_rows(
     uv: Float[np.ndarray, "n 2"],
     out: SubpixelMatches,
     rows: Int[np.ndarray, " k"],
-    half: int,
+    half_window: int,
     margin: int,
 ) -> None:
     """Match some of the windows from their starts in `out`, which is changed, in pieces of the
     other image with `margin` pixels around the start."""
     start, A = out.uv.copy(), out.A.copy()
     # 256 windows a call: all iterate until the last has converged
-    together = 256
-    for first in range(0, len(rows), together):
-        part = rows[first : first + together]
-        lanes = part[np.minimum(np.arange(together), len(part) - 1)]
+    windows_at_once = 256
+    for first_row in range(0, len(rows), windows_at_once):
+        part = rows[first_row : first_row + windows_at_once]
+        lanes = part[np.minimum(np.arange(windows_at_once), len(part) - 1)]
         origin = np.rint(start[lanes]).astype(int) - margin
-        template = _cut_out(base.grey, np.rint(uv[lanes]).astype(int) - half, 2 * half + 1)
+        template = _cut_out(
+            base.grey, np.rint(uv[lanes]).astype(int) - half_window, 2 * half_window + 1
+        )
         piece = _cut_out(other.grey, origin, 2 * margin + 1)
         begin = np.concatenate([A[lanes], (start[lanes] - origin)[:, :, None]], 2)
-        found: LeastSquaresMatch = _match(template, piece, begin.astype(np.float32))
+        matched: LeastSquaresMatch = _match(template, piece, begin.astype(np.float32))
         k = len(part)
-        affine = np.asarray(found.affine, float)[:k]
+        affine = np.asarray(matched.affine, float)[:k]
         out.uv[part] = affine[:, :, 2] + origin[:k]
         out.A[part] = affine[:, :, :2]
-        out.covariance[part] = np.asarray(found.covariance)[:k]
-        out.rho[part] = np.asarray(found.correlation)[:k]
-        out.sigma0[part] = np.asarray(found.sigma0)[:k]
-        out.status[part] = np.asarray(found.status)[:k]
+        out.covariance[part] = np.asarray(matched.covariance)[:k]
+        out.rho[part] = np.asarray(matched.correlation)[:k]
+        out.sigma0[part] = np.asarray(matched.sigma0)[:k]
+        out.status[part] = np.asarray(matched.status)[:k]
 
 
 def has_texture(
     grey: Grey,
     uv: Float[np.ndarray, "n 2"],
     sigma0: Float[np.ndarray, " n"],
-    half: int,
+    half_window: int,
     min_texture: float = WindowSettings.min_texture,
 ) -> Bool[np.ndarray, " n"]:
     """Whether windows have texture on all sides of their points, by the squares of the gradients
@@ -148,25 +155,30 @@ def has_texture(
     Noise of variance σ² has σ²/4πs² after smoothing; twice this is σ0². Central differences of the
     grey values, which are not smoothed here, have σ²/2 on each axis, σ² in all.
     """
-    k = np.arange(-half - 1, half + 2)
+    k = np.arange(-half_window - 1, half_window + 2)
     rows, columns = grey.shape
     noise = 2 * np.pi * BLUR**2 * sigma0**2
     good = np.zeros(len(uv), bool)
-    # 15 × 15 pixels of each (`half` 6): 4 MB
-    together = 4096
-    for first in range(0, len(uv), together):
-        part = slice(first, first + together)
+    # 15 × 15 pixels of each (`half_window` 6): 4 MB
+    points_at_once = 4096
+    for begin in range(0, len(uv), points_at_once):
+        part = slice(begin, begin + points_at_once)
         u, v = np.rint(uv[part]).astype(int).T
         r = np.clip(v[:, None] + k, 0, rows - 1)
         c = np.clip(u[:, None] + k, 0, columns - 1)
         a = grey[r[:, :, None], c[:, None]].astype(np.float32)
         gx, gy = a[:, 1:-1, 2:] - a[:, 1:-1, :-2], a[:, 2:, 1:-1] - a[:, :-2, 1:-1]
         square = (gx * gx + gy * gy) / 4
-        near, far = slice(0, half), slice(half + 1, None)
-        sides = square[:, near], square[:, far], square[:, :, near], square[:, :, far]
-        least = np.min([side.mean((1, 2)) for side in sides], axis=0)
+        before_middle, after_middle = slice(0, half_window), slice(half_window + 1, None)
+        sides = (
+            square[:, before_middle],
+            square[:, after_middle],
+            square[:, :, before_middle],
+            square[:, :, after_middle],
+        )
+        weakest_side = np.min([side.mean((1, 2)) for side in sides], axis=0)
         with np.errstate(invalid="ignore"):
-            good[part] = least > min_texture * noise[part]
+            good[part] = weakest_side > min_texture * noise[part]
     return good
 
 
@@ -192,7 +204,7 @@ def _match(
 def _smooth(pieces: Float32[Array, "n wide wide"]) -> Float32[Array, "n side side"]:
     """The pieces smoothed, without the `BLUR_EXTENT` pixels on all sides."""
     side = pieces.shape[-1] - 2 * BLUR_EXTENT
-    away = np.arange(side + 2 * BLUR_EXTENT) - np.arange(side)[:, None] - BLUR_EXTENT
-    weight = np.where(np.abs(away) <= BLUR_EXTENT, np.exp(-(away**2) / (2 * BLUR**2)), 0.0)
+    distance = np.arange(side + 2 * BLUR_EXTENT) - np.arange(side)[:, None] - BLUR_EXTENT
+    weight = np.where(np.abs(distance) <= BLUR_EXTENT, np.exp(-(distance**2) / (2 * BLUR**2)), 0.0)
     S = jnp.asarray(weight / weight.sum(1, keepdims=True), pieces.dtype)
     return jnp.einsum("ab,cd,nbd->nac", S, S, pieces)

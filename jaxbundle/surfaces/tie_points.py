@@ -106,10 +106,10 @@ class TiePoints(TableMethods):
 
     def __str__(self) -> str:
         """Counts in lines."""
-        found = self.to_dict()
-        rays = ", ".join(f"{n} with {k}" for k, n in found["rays"].items())
-        median = f"median σ {found['median_sigma']:.3g} pixels"
-        lines = [f"{found['points']} tie points, by rays: {rays}; {median}"]
+        figures = self.to_dict()
+        rays = ", ".join(f"{n} with {k}" for k, n in figures["rays"].items())
+        median = f"median σ {figures['median_sigma']:.3g} pixels"
+        lines = [f"{figures['points']} tie points, by rays: {rays}; {median}"]
         lines += [f"    {n:8} matches: {reason}" for reason, n in self.rejected.items()]
         return "\n".join([*lines, *self.messages])
 
@@ -135,40 +135,47 @@ def match_tie_points(
     **Raises:** `NotSolvedError` if no pair has enough matches.
     """
     pyramids = [make_pyramid(view.grey, settings.levels) for view in views]
-    lost: Counter[str] = Counter()
-    failed: list[tuple[int, int]] = []
+    losses: Counter[str] = Counter()
+    failed_pairs: list[tuple[int, int]] = []
     rows: list[tuple[np.ndarray, np.ndarray, Places, np.ndarray]] = []
-    known: list[list[Places]] = [[] for _ in views]
+    known_places: list[list[Places]] = [[] for _ in views]
     number, bases = 0, []
     for i, base in enumerate(views):
-        uv = _new_corners(base, known[i], spacing, settings)
+        uv = _new_corners(base, known_places[i], spacing, settings)
         partners = [j for j in range(len(views)) if j != i and score(base, bounds[i], views[j])]
-        found = np.zeros((len(uv), len(views)), bool)
+        is_found = np.zeros((len(uv), len(views)), bool)
         place = np.zeros((len(uv), len(views), 2))
         sigma, in_base = np.zeros((2, len(uv), len(views), 2))
         for j in partners:
             pair = _match_pair(
-                (base, views[j]), (pyramids[i], pyramids[j]), uv, bounds[i], settings, lost
+                (base, views[j]), (pyramids[i], pyramids[j]), uv, bounds[i], settings, losses
             )
             if pair is None:
                 # From the other side it is the same.
                 if i < j:
-                    failed.append((i, j))
+                    failed_pairs.append((i, j))
                 continue
-            place[:, j], found[:, j], sigma[:, j], in_base[:, j] = pair
-        others = found.sum(1)
-        tied = np.flatnonzero(others)
-        found[tied, i], place[tied, i] = True, uv[tied]
+            place[:, j], is_found[:, j], sigma[:, j], in_base[:, j] = pair
+        number_of_partners = is_found.sum(1)
+        tied_rows = np.flatnonzero(number_of_partners)
+        is_found[tied_rows, i], place[tied_rows, i] = True, uv[tied_rows]
         # The base is measured once, at the corner: the mean variance of what its pairs say.
-        mean = (in_base[tied] ** 2).sum(1) / others[tied, None]
-        sigma[tied, i] = np.sqrt(mean)
+        mean = (in_base[tied_rows] ** 2).sum(1) / number_of_partners[tied_rows, None]
+        sigma[tied_rows, i] = np.sqrt(mean)
         for j in range(len(views)):
-            mine = tied[found[tied, j]]
-            at = number + np.searchsorted(tied, mine)
-            rows.append((np.full(len(mine), j), at, place[mine, j], sigma[mine, j]))
-            known[j].append(place[mine, j])
-        number += len(tied)
-        bases.append(np.full(len(tied), i))
+            rows_of_partner = tied_rows[is_found[tied_rows, j]]
+            point_numbers = number + np.searchsorted(tied_rows, rows_of_partner)
+            rows.append(
+                (
+                    np.full(len(rows_of_partner), j),
+                    point_numbers,
+                    place[rows_of_partner, j],
+                    sigma[rows_of_partner, j],
+                )
+            )
+            known_places[j].append(place[rows_of_partner, j])
+        number += len(tied_rows)
+        bases.append(np.full(len(tied_rows), i))
         if progress:
             progress("tie points", i + 1, len(views))
     if not number:
@@ -178,39 +185,39 @@ def match_tie_points(
         )
     image, point, uv, s = (np.concatenate(columns) for columns in zip(*rows))
     names = tuple(view.name for view in views)
-    messages = _describe_untied(names, failed, image, point)
+    messages = _describe_untied(names, failed_pairs, image, point)
     places, sigmas = uv[:, ::-1], s[:, ::-1]
     base_of = np.concatenate(bases)
-    return TiePoints(names, image, point, places, sigmas, base_of, dict(lost), messages)
+    return TiePoints(names, image, point, places, sigmas, base_of, dict(losses), messages)
 
 
 def _describe_untied(
     names: Sequence[str],
-    failed: Sequence[tuple[int, int]],
+    failed_pairs: Sequence[tuple[int, int]],
     image: Int[np.ndarray, " n"],
     point: Int[np.ndarray, " n"],
 ) -> tuple[str, ...]:
     """Which pairs whose matching has failed share no point."""
-    shown = np.zeros((int(point.max(initial=-1)) + 1, len(names)), bool)
-    shown[point, image] = True
+    is_shown = np.zeros((int(point.max(initial=-1)) + 1, len(names)), bool)
+    is_shown[point, image] = True
     # Corners near known points are not matched again: a pair may be tied by an earlier base alone.
     return tuple(
         f"{names[i]} and {names[j]}: too few matches"
-        for i, j in failed
-        if not (shown[:, i] & shown[:, j]).any()
+        for i, j in failed_pairs
+        if not (is_shown[:, i] & is_shown[:, j]).any()
     )
 
 
 def _new_corners(
-    base: GroundView, known: Sequence[Places], spacing: int, settings: TiePointSettings
+    base: GroundView, known_places: Sequence[Places], spacing: int, settings: TiePointSettings
 ) -> Places:
     """Corners of an image that are not near those it has."""
     uv = interest_points(base.grey, "corners", spacing)
     uv = uv[is_inside(base, uv, settings.matching.edge_margin)]
-    every = np.concatenate([np.zeros((0, 2)), *known])
-    if not len(every) or not len(uv):
+    all_known = np.concatenate([np.zeros((0, 2)), *known_places])
+    if not len(all_known) or not len(uv):
         return uv
-    return uv[cKDTree(every).query(uv)[0] > spacing / 2]
+    return uv[cKDTree(all_known).query(uv)[0] > spacing / 2]
 
 
 def _match_pair(
@@ -219,28 +226,28 @@ def _match_pair(
     uv: Places,
     bounds: Bounds,
     settings: TiePointSettings,
-    lost: Counter[str],
+    losses: Counter[str],
 ) -> _PairMatches | None:
     """The matches of points of the first image in the second; None: too few."""
     base, other = pair
-    before = other.shift
+    shift_before = other.shift
     try:
         if len(uv) < settings.least_matches or align(base, other, pyramids, bounds) is None:
             return None
-        q, rho, second = _search_heights(pair, pyramids, uv, bounds, settings)
-        found, limits = np.isfinite(q), settings.matching
+        q, rho, second_peak = _search_heights(pair, pyramids, uv, bounds, settings)
+        is_found, limits = np.isfinite(q), settings.matching
         with np.errstate(invalid="ignore"):
-            low = found & ~(rho >= limits.min_correlation)
-            twice = found & ~low & (second > limits.max_second_ratio * rho)
-        lost["low correlation"] += int(low.sum())
-        lost["not unique"] += int(twice.sum())
-        q = np.where(found & ~low & ~twice, q, np.nan)
+            is_low = is_found & ~(rho >= limits.min_correlation)
+            is_ambiguous = is_found & ~is_low & (second_peak > limits.max_second_ratio * rho)
+        losses["low correlation"] += int(is_low.sum())
+        losses["not unique"] += int(is_ambiguous.sum())
+        q = np.where(is_found & ~is_low & ~is_ambiguous, q, np.nan)
         if np.isfinite(q).sum() < settings.least_matches:
             return None
-        return _refine_pair(pair, uv, q, settings, lost)
+        return _refine_pair(pair, uv, q, settings, losses)
     finally:
         # Another base has another error.
-        other.shift = before
+        other.shift = shift_before
 
 
 def _search_heights(
@@ -252,24 +259,28 @@ def _search_heights(
 ) -> Float[np.ndarray, "3 n"]:
     """Heights of the best correlation, ρ, and ρ of the second best; NaN: none."""
     base, other = pair
-    both = pyramids[0], [pyramids[1]]
-    wide = visible_range(base, other, uv, bounds(uv), settings.matching.edge_margin)
+    both_pyramids = pyramids[0], [pyramids[1]]
+    whole_range = visible_range(base, other, uv, bounds(uv), settings.matching.edge_margin)
     out = np.full((3, len(uv)), np.nan)
-    rows = np.flatnonzero(np.isfinite(wide).all(1) & (wide[:, 0] < wide[:, 1]))
-    wide = wide[rows]
+    rows = np.flatnonzero(np.isfinite(whole_range).all(1) & (whole_range[:, 0] < whole_range[:, 1]))
+    whole_range = whole_range[rows]
     # Heights per pixel of the curve; below a pixel the whole range is one step.
-    pixels = np.maximum(segments(base, other, uv[rows], wide).length, 1.0)
-    rate, q = (wide[:, 1] - wide[:, 0]) / pixels, wide
+    pixels = np.maximum(segments(base, other, uv[rows], whole_range).length, 1.0)
+    rate, q = (whole_range[:, 1] - whole_range[:, 0]) / pixels, whole_range
     for level in range(len(pyramids[0].levels) - 1, -1, -1):
-        found = search(base, [other], both, uv[rows], q, None, level, settings.guide)
-        middle = np.where(np.isfinite(found[0]), found[0], q.mean(1))
+        q_and_correlation = search(
+            base, [other], both_pyramids, uv[rows], q, None, level, settings.guide
+        )
+        middle = np.where(np.isfinite(q_and_correlation[0]), q_and_correlation[0], q.mean(1))
         # What the search of this level may be off is searched in the next one.
         reach = settings.matching.search_margin * 2.0**level * rate
-        q = np.clip(middle[:, None] + reach[:, None] * [-1, 1], wide[:, :1], wide[:, 1:])
-        out[:2, rows] = found[:2]
+        q = np.clip(
+            middle[:, None] + reach[:, None] * [-1, 1], whole_range[:, :1], whole_range[:, 1:]
+        )
+        out[:2, rows] = q_and_correlation[:2]
         if level == len(pyramids[0].levels) - 1:
             # Only the search of all heights tells whether there are two.
-            out[2, rows] = found[2]
+            out[2, rows] = q_and_correlation[2]
     return out
 
 
@@ -278,7 +289,7 @@ def _refine_pair(
     uv: Places,
     q: Float[np.ndarray, " n"],
     settings: TiePointSettings,
-    lost: Counter[str],
+    losses: Counter[str],
 ) -> _PairMatches | None:
     """Least squares matching at heights (NaN: none), and the checks against neighbours."""
     base, other = pair
@@ -286,29 +297,29 @@ def _refine_pair(
     uv, q = uv[rows], q[rows]
     window = windows(base, other, base.points(uv, q))
     start = positions(base, other, uv, q[:, None])[:, 0]
-    half = limits.half_fine_window
-    match = refine(base, other, uv, start, window.A, half, limits.windows)
+    half_window = limits.half_fine_window
+    match = refine(base, other, uv, start, window.A, half_window, limits.windows)
     good = window.usable & is_confirmed(match, start, limits)
-    good &= has_texture(base.grey, uv, match.sigma0, half, limits.windows.min_texture)
-    lost["not confirmed by least squares matching"] += int((~good).sum())
+    good &= has_texture(base.grey, uv, match.sigma0, half_window, limits.windows.min_texture)
+    losses["not confirmed by least squares matching"] += int((~good).sum())
     # Along the curve heights move a match, across it only errors do.
-    across = np.stack([-window.other_axis[:, 1], window.other_axis[:, 0]], 1)
-    across = across / np.linalg.norm(across, axis=1, keepdims=True)
-    off = np.einsum("ni,ni->n", match.uv - start, across)
-    good, rest = _near_the_curve(uv, off, good, settings)
-    lost["far from the epipolar curve"] += int(np.isfinite(rest).sum() - good.sum())
-    near = _as_high_as_neighbours(uv, q, good, settings)
-    lost["other height than its neighbours"] += int((good & ~near).sum())
-    good &= near
+    axis_across = np.stack([-window.other_axis[:, 1], window.other_axis[:, 0]], 1)
+    axis_across = axis_across / np.linalg.norm(axis_across, axis=1, keepdims=True)
+    distance_from_curve = np.einsum("ni,ni->n", match.uv - start, axis_across)
+    good, remainder = _near_the_curve(uv, distance_from_curve, good, settings)
+    losses["far from the epipolar curve"] += int(np.isfinite(remainder).sum() - good.sum())
+    is_near = _as_high_as_neighbours(uv, q, good, settings)
+    losses["other height than its neighbours"] += int((good & ~is_near).sum())
+    good &= is_near
     if good.sum() < settings.least_matches:
         return None
     C = match.covariance + limits.added_sigma**2 * np.eye(2)
     C = np.where(good[:, None, None], C, 0.0)
-    predicted = np.sqrt(np.einsum("ni,nij,nj->n", across, C, across)[good])
-    C = C * robust_sigma(rest[good] / predicted) ** 2
+    predicted = np.sqrt(np.einsum("ni,nij,nj->n", axis_across, C, axis_across)[good])
+    C = C * robust_sigma(remainder[good] / predicted) ** 2
     # A carries the base to the other image: errors there are A⁻¹ times as large in the base
-    back = np.linalg.inv(np.where(good[:, None, None], match.A, np.eye(2)))
-    in_base = back @ C @ np.swapaxes(back, 1, 2)
+    inverse_A = np.linalg.inv(np.where(good[:, None, None], match.A, np.eye(2)))
+    in_base = inverse_A @ C @ np.swapaxes(inverse_A, 1, 2)
     out = _PairMatches(np.zeros((n, 2)), np.zeros(n, bool), np.zeros((n, 2)), np.zeros((n, 2)))
     out.place[rows], out.good[rows] = match.uv, good
     for target, values in ((out.sigma, C), (out.in_base, in_base)):
@@ -318,7 +329,7 @@ def _refine_pair(
 
 def _near_the_curve(
     uv: Places,
-    off: Float[np.ndarray, " n"],
+    distance: Float[np.ndarray, " n"],
     good: Bool[np.ndarray, " n"],
     settings: TiePointSettings,
 ) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
@@ -326,18 +337,18 @@ def _near_the_curve(
     left of all that were good; NaN for others."""
     A = np.column_stack([np.ones(len(uv)), uv - uv.mean(0)])
     A[:, 1:] /= np.maximum(np.abs(A[:, 1:]).max(0), 1.0)
-    kept, rest = good.copy(), np.full(len(uv), np.nan)
+    is_kept, remainder = good.copy(), np.full(len(uv), np.nan)
     # The first fit has the blunders in it, the last ones have not.
     for _ in range(5):
-        if kept.sum() < settings.least_matches:
-            return np.zeros_like(good), rest
-        x = np.linalg.lstsq(A[kept], off[kept], rcond=None)[0]
-        rest = np.where(good, off - A @ x, np.nan)
-        rest -= np.median(rest[kept])
-        limit = settings.max_deviation * max(robust_sigma(rest[kept]), 1e-3)
+        if is_kept.sum() < settings.least_matches:
+            return np.zeros_like(good), remainder
+        x = np.linalg.lstsq(A[is_kept], distance[is_kept], rcond=None)[0]
+        remainder = np.where(good, distance - A @ x, np.nan)
+        remainder -= np.median(remainder[is_kept])
+        limit = settings.max_deviation * max(robust_sigma(remainder[is_kept]), 1e-3)
         with np.errstate(invalid="ignore"):
-            kept = good & (np.abs(rest) < limit)
-    return kept, rest
+            is_kept = good & (np.abs(remainder) < limit)
+    return is_kept, remainder
 
 
 def _as_high_as_neighbours(
@@ -350,9 +361,9 @@ def _as_high_as_neighbours(
     rows, k = np.flatnonzero(good), settings.neighbours
     if len(rows) <= k:
         return good
-    _, near = cKDTree(uv[rows]).query(uv[rows], k + 1)
-    off = q[rows] - np.median(q[rows][near[:, 1:]], axis=1)
-    limit = settings.max_height_deviation * max(robust_sigma(off), 1e-9)
-    kept = good.copy()
-    kept[rows] = np.abs(off) < limit
-    return kept
+    _, nearest = cKDTree(uv[rows]).query(uv[rows], k + 1)
+    difference = q[rows] - np.median(q[rows][nearest[:, 1:]], axis=1)
+    limit = settings.max_height_deviation * max(robust_sigma(difference), 1e-9)
+    is_kept = good.copy()
+    is_kept[rows] = np.abs(difference) < limit
+    return is_kept

@@ -107,9 +107,9 @@ class FrameView:
             origin, step = pixel_frame(model, self.size, camera.pixel_size)
         except ValueError as error:
             raise InputError(f"camera {camera.id}: {error}") from None
-        given = {**default_parameters(model), **camera.parameters}
+        parameters = {**default_parameters(model), **camera.parameters}
         self.camera, self.X0, self.M = camera, np.asarray(X0, float), np.asarray(M, float)
-        p = np.array([float(given.get(n, 0.0)) for n in model.parameters])
+        p = np.array([float(parameters.get(n, 0.0)) for n in model.parameters])
         self.frame = PhotographFrame(model, *map(jnp.asarray, (p, self.X0, self.M, origin, step)))
         edge = self.edge()
         axis = self.points(edge, np.ones(len(edge))) - self.X0
@@ -183,8 +183,8 @@ def frame_views(
     M = np.asarray(jax.vmap(matrix_from_omega_phi_kappa)(jnp.asarray(images.angles)))
     colours = colours or [None] * len(images)
     return tuple(
-        FrameView(name, grey, network.cameras[c], X0, m, sigma, read, joint)
-        for name, grey, c, X0, m, sigma, read in zip(
+        FrameView(name, grey, network.cameras[c], X0, m, sigma, sigma_of_reading, joint)
+        for name, grey, c, X0, m, sigma, sigma_of_reading in zip(
             images.id, greys, images.camera, images.position, M, images.sigma, colours
         )
     )
@@ -225,12 +225,12 @@ def run_in_lanes(
     # The small one is for the few points of bounds and overlaps.
     lanes = 8192 if n > 512 else 512
     parts = []
-    for first in range(0, max(n, 1), lanes):
-        chosen = np.minimum(np.arange(first, first + lanes), max(n - 1, 0))
+    for begin in range(0, max(n, 1), lanes):
+        lane_rows = np.minimum(np.arange(begin, begin + lanes), max(n - 1, 0))
         if n == 0:
             arrays = tuple(np.zeros((1, *np.shape(a)[1:])) for a in arrays)
-            chosen = np.zeros(lanes, int)
-        parts.append(np.asarray(program(frame, *(np.asarray(a)[chosen] for a in arrays))))
+            lane_rows = np.zeros(lanes, int)
+        parts.append(np.asarray(program(frame, *(np.asarray(a)[lane_rows] for a in arrays))))
     return np.concatenate(parts)[:n]
 
 
@@ -270,8 +270,8 @@ def _by_orientation(frame: PhotographFrame, X: Float[Array, "n 3"]) -> Float[Arr
 
     def pixel(theta: Float[Array, " k"], X: Float[Array, "3"]) -> Float[Array, "2"]:
         M = matrix_from_omega_phi_kappa(theta[3:6])
-        moved = eqx.tree_at(lambda f: (f.X0, f.M, f.p), frame, (theta[:3], M, theta[6:]))
-        return pixel_of(moved, X)
+        moved_frame = eqx.tree_at(lambda f: (f.X0, f.M, f.p), frame, (theta[:3], M, theta[6:]))
+        return pixel_of(moved_frame, X)
 
     theta = jnp.concatenate([frame.X0, angles, frame.p])
     return jax.vmap(jax.jacfwd(pixel), (None, 0))(theta, X)

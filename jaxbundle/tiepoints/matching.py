@@ -53,19 +53,19 @@ class FeatureMatches(NamedTuple):
     distance_ratio: Float[np.ndarray, " n"]
     unique: Bool[np.ndarray, " n"]
 
-    def take(self, selection: Int[np.ndarray, " m"] | Bool[np.ndarray, " n"]) -> "FeatureMatches":
+    def take(self, chosen: Int[np.ndarray, " m"] | Bool[np.ndarray, " n"]) -> "FeatureMatches":
         """The chosen matches."""
         return FeatureMatches(
             self.images,
-            self.rows[selection],
-            self.distance_ratio[selection],
-            self.unique[selection],
+            self.rows[chosen],
+            self.distance_ratio[chosen],
+            self.unique[chosen],
         )
 
 
 def match_features(
-    features_a: Features,
-    features_b: Features,
+    one: Features,
+    other: Features,
     settings: FeatureMatchingSettings = FeatureMatchingSettings(),
     within: tuple[Float[np.ndarray, " a"], Float[np.ndarray, " b"]] | None = None,
 ) -> tuple[Int[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
@@ -73,14 +73,11 @@ def match_features(
     of the second best.
 
     **Arguments:** `within`: `distances_within` both photographs."""
-    if (
-        min(len(features_a), len(features_b)) < 2
-        or features_a.descriptor.shape[1] != features_b.descriptor.shape[1]
-    ):
+    if min(len(one), len(other)) < 2 or one.descriptor.shape[1] != other.descriptor.shape[1]:
         return np.zeros((0, 2), int), np.zeros(0)
-    sift = features_a.descriptor.shape[1] == SIFT_LENGTH
+    sift = one.descriptor.shape[1] == SIFT_LENGTH
     nearest = _find_nearest if sift else _find_nearest_bits
-    a, b = (_root(f.descriptor) if sift else f.descriptor for f in (features_a, features_b))
+    a, b = (_root(f.descriptor) if sift else f.descriptor for f in (one, other))
     best, distance, second_distance = nearest(a, b)
     if within is not None:
         second_distance = np.minimum(second_distance, np.minimum(within[0], within[1][best]))

@@ -220,7 +220,7 @@ def _projection(name):
 
 def _distances(point, ends, rng, noise):
     if not len(ends):
-        return Distances.empty()
+        return Distances.none()
     ends = np.asarray(ends)
     sigma = np.full(len(ends), 1e-3)
     true = np.linalg.norm(point[ends[:, 0]] - point[ends[:, 1]], axis=1)

@@ -174,7 +174,7 @@ class Block:
                    nothing),
             Observations(np.concatenate(image), np.concatenate(point), xy,
                          np.full(xy.shape, SIGMA_PHOTOGRAPH)),
-            Distances.empty(),
+            Distances.none(),
         )  # fmt: skip
         return network, np.concatenate([-moved, to_truth], 1), off
 

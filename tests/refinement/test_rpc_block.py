@@ -278,7 +278,7 @@ def test_together_with_a_photograph():
     scene = block(rpc=4, scanner=2, points=40, control=6, checks=0, rays=3)
     arguments, bias = scene.draw(np.random.default_rng(3))
     frames = photograph(scene.X, np.random.default_rng(1))
-    frames = dataclasses.replace(frames, distances=Distances.empty())
+    frames = dataclasses.replace(frames, distances=Distances.none())
     result = refine(*arguments, frames)
     of_rpc = [k for k, n in enumerate(result.names) if n.owner.startswith("image R")]
     error = (result.estimate[of_rpc] - bias.ravel()) / result.inspection.sigma[of_rpc]

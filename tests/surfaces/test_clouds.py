@@ -354,7 +354,7 @@ def test_an_orthophoto_has_as_many_bits_as_its_grey_values(tmp_path, values, kin
 def test_clouds_are_read_in_pieces(tmp_path, suffix):
     path = tmp_path / f"c.{suffix}"
     write_cloud(cloud_on_plane(900, system="EPSG:32633"), path)
-    whole, pieces = read_cloud(path), _read_las(path, together=7)
+    whole, pieces = read_cloud(path), _read_las(path, points_at_once=7)
     for name in ("X", "covariance", "rays", "colour"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(pieces, name))
     assert whole.system == pieces.system

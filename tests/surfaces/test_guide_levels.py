@@ -40,14 +40,16 @@ def test_an_image_says_nothing_beyond_the_part_of_a_line_of_sight_that_it_shows(
     window = SimpleNamespace(other_axis=np.array([[1.0, 0.0]]))
     q = np.array([[0.5, 1.0, 1.4, 2.0, 2.5]])
     rho = guide._correlate_at(
-        q, (None, None), (None, None), None, segment, window, one, level=0, steps=steps, half=2
+        q, (None, None), (None, None), None, segment, window, one, level=0, steps=steps,
+        half_window=2,
     )
     np.testing.assert_array_equal(rho, [[np.nan, 1, 1, 1, np.nan]])
     # Of a line of 40 pixels only the 10 in the middle are searched.
     segment = Segments(np.array([[1.0, 2.0]]), np.array([40.0]), np.zeros(1))
     q = np.array([[1.0, 1.35, 1.4, 1.6, 1.65, 2.0]])
     rho = guide._correlate_at(
-        q, (None, None), (None, None), None, segment, window, one, level=0, steps=steps, half=2
+        q, (None, None), (None, None), None, segment, window, one, level=0, steps=steps,
+        half_window=2,
     )
     np.testing.assert_array_equal(rho, [[np.nan, np.nan, 1, 1, np.nan, np.nan]])
 

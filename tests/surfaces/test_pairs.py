@@ -72,7 +72,7 @@ def test_partners_are_the_images_that_overlap_the_best_first():
     flat = [lambda uv: np.zeros((len(uv), 2))] * 4
     found = choose_partners(views, flat)
     assert found.keys() == {0, 1, 2} and found[0] == [2, 1] and set(found[2]) == {0, 1}
-    assert choose_partners(views, flat, most=1)[0] == [2]
+    assert choose_partners(views, flat, max_partners=1)[0] == [2]
 
 
 def test_bounds_need_five_points():

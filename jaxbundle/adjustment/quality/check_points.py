@@ -67,7 +67,7 @@ def intersect_check_points(
     network = problem.network.replace(
         points=dataclasses.replace(points, role=role, sigma=np.full((len(points), 3), np.nan)),
         observations=observations,
-        distances=Distances.empty(),
+        distances=Distances.none(),
     )
     checks = shifted_problem(network, problem, inspection.adjusted)
     # With estimated variance components the rays of check points have the estimated σ as well.
